@@ -1,0 +1,68 @@
+"""Bayesian identification of nonlinear systems from their periodic equilibrium states.
+
+You give a model (equations) and recordings (measured periods); you get back what the recordings say about the
+parameters, how far to trust it, and which combinations they cannot tell you.
+
+Names are imported at their first use, so that ``import bayesperiodic`` is quick.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from bayesperiodic import models, plot
+    from bayesperiodic.data.experiment import Experiment
+    from bayesperiodic.data.recording import Recording
+    from bayesperiodic.diagnosis.comparison import Comparison, compare
+    from bayesperiodic.diagnosis.predictive import Prediction, predict
+    from bayesperiodic.inference.map_estimate import MapEstimate, map_estimate
+    from bayesperiodic.inference.posterior import Posterior
+    from bayesperiodic.inference.priors import LogNormal, Normal, Uniform
+    from bayesperiodic.inference.problem import Problem
+    from bayesperiodic.inference.sampling import sample
+    from bayesperiodic.models.model import Model
+    from bayesperiodic.models.smooth import smooth_abs, smooth_sign
+    from bayesperiodic.periodic.schemes import Scheme
+    from bayesperiodic.periodic.solution import PeriodicSolution, solve_periodic
+    from bayesperiodic.simulate import simulate
+    from bayesperiodic.store import load
+
+_HOMES = {
+    "bayesperiodic.data.experiment": ["Experiment"],
+    "bayesperiodic.data.recording": ["Recording"],
+    "bayesperiodic.diagnosis.comparison": ["Comparison", "compare"],
+    "bayesperiodic.diagnosis.predictive": ["Prediction", "predict"],
+    "bayesperiodic.inference.map_estimate": ["MapEstimate", "map_estimate"],
+    "bayesperiodic.inference.posterior": ["Posterior"],
+    "bayesperiodic.inference.priors": ["LogNormal", "Normal", "Uniform"],
+    "bayesperiodic.inference.problem": ["Problem"],
+    "bayesperiodic.inference.sampling": ["sample"],
+    "bayesperiodic.models.model": ["Model"],
+    "bayesperiodic.models.smooth": ["smooth_abs", "smooth_sign"],
+    "bayesperiodic.periodic.schemes": ["Scheme"],
+    "bayesperiodic.periodic.solution": ["PeriodicSolution", "solve_periodic"],
+    "bayesperiodic.simulate": ["simulate"],
+    "bayesperiodic.store": ["load"],
+}
+_MODULES = ["models", "plot"]
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [  # noqa: PLE0604
+    "Comparison", "Experiment", "LogNormal", "MapEstimate", "Model", "Normal", "PeriodicSolution", "Posterior",
+    "Prediction", "Problem", "Recording", "Scheme", "Uniform", "compare", "load", "map_estimate", "models", "plot",
+    "predict", "sample", "simulate", "smooth_abs", "smooth_sign", "solve_periodic",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        value = getattr(import_module(_HOME[name]), name)
+        globals()[name] = value
+        return value
+    if name in _MODULES:
+        return import_module(f"bayesperiodic.{name}")
+    raise AttributeError(f"module 'bayesperiodic' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

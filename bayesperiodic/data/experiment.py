@@ -1,0 +1,112 @@
+"""Experiment: one measured period on the grid, with what stands behind it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bayesperiodic import checks, fourier
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """One response period of measured outputs, and of the inputs that caused them.
+
+    Parameters
+    ----------
+    name : str
+        Any text without ``/``, ``[`` and ``]``.
+    frequency : float
+        Forcing frequency [Hz].
+    outputs, inputs : mapping of str to array (samples·periods,)
+        End point excluded.
+    samples : int
+        Grid points per forcing period.
+    periods : int
+        Forcing periods per response period.
+    winding : int or mapping of str to int
+        Turns of an angle per response period.
+    scatter : mapping of str to float, optional
+        Standard deviation of **one** cycle about the mean, within the kept harmonics, by channel.
+    cycles : int
+        Cycles behind the mean.
+    independent : mapping of str to int, optional
+        Number of independent values behind the samples, by output; by default every sample is one.
+    harmonics : mapping of str to int, optional
+        Highest harmonic of the response period that each channel keeps; the model's outputs are projected onto the
+        same harmonics before they are compared. By default nothing was removed.
+    amplitude_variance : mapping of str to array (harmonics + 1,), optional
+        Variance of the mean's complex Fourier amplitudes.
+    frequency_se : float
+        Standard error of the frequency [Hz]; zero where it is known.
+    periodicity : float
+        Fraction of the variance that the mean period explains, of the channel where it is least.
+    origin : float
+        Time [s] of the recording at which τ = 0.
+    synthetic : bool
+        True if the data were simulated.
+
+    Raises
+    ------
+    ValueError
+        For arrays of a wrong length, NaN, a frequency ≤ 0, an unknown channel, a name with ``/``, ``[`` or ``]``.
+    """
+
+    name: str
+    frequency: float
+    outputs: Mapping[str, np.ndarray]
+    inputs: Mapping[str, np.ndarray] = field(default_factory=dict)
+    samples: int = field(kw_only=True)
+    periods: int = field(default=1, kw_only=True)
+    winding: int | Mapping[str, int] = field(default=0, kw_only=True)
+    scatter: Mapping[str, float] | None = field(default=None, kw_only=True)
+    cycles: int = field(default=1, kw_only=True)
+    independent: Mapping[str, int] | None = field(default=None, kw_only=True)
+    harmonics: Mapping[str, int] | None = field(default=None, kw_only=True)
+    amplitude_variance: Mapping[str, np.ndarray] | None = field(default=None, kw_only=True)
+    frequency_se: float = field(default=0.0, kw_only=True)
+    periodicity: float = field(default=1.0, kw_only=True)
+    origin: float = field(default=0.0, kw_only=True)
+    synthetic: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not self.name or any(c in self.name for c in "/[]"):
+            raise ValueError(f"name: {self.name!r} is not allowed; any text without '/', '[' and ']' is.")
+        checks.positive("frequency", self.frequency)
+        points = checks.integer("samples", self.samples, 4) * checks.integer("periods", self.periods, 1)
+        for kind in ("outputs", "inputs"):
+            channels = {
+                key: checks.finite_vector(f"{kind}[{key!r}]", values, points)
+                for key, values in getattr(self, kind).items()
+            }
+            checks.identifiers(kind, channels)
+            object.__setattr__(self, kind, channels)
+        if self.independent is None:
+            object.__setattr__(self, "independent", dict.fromkeys(self.outputs, points))
+        checks.same_names("independent", self.independent or {}, self.outputs)
+        for argument in ("scatter", "harmonics", "amplitude_variance"):
+            for key in getattr(self, argument) or {}:
+                checks.one_of(argument, key, (*self.inputs, *self.outputs))
+
+    @property
+    def tau(self) -> np.ndarray:
+        """Time in forcing periods, (samples·periods,)."""
+        return np.arange(self.samples * self.periods) / self.samples
+
+    @property
+    def time(self) -> np.ndarray:
+        """Time within the response period [s], (samples·periods,)."""
+        return self.tau / self.frequency
+
+    def project(self, channel: str, values: np.ndarray) -> np.ndarray:
+        """Return signals (…, points) with the harmonics removed that the measured channel did not keep."""
+        if not self.harmonics or channel not in self.harmonics:
+            return values
+        return fourier.project(values, self.harmonics[channel])
+
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{k} ({n} independent values)" for k, n in (self.independent or {}).items())
+        return (
+            f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples a "
+            f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''})"
+        )

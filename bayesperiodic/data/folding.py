@@ -1,0 +1,259 @@
+"""Folding: from a long recording to its mean steady period, with an honest count of what stands behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.special import fdtrc
+
+from bayesperiodic import checks, fourier
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.data.harmonic_fit import HarmonicFit, fit_harmonics, guess_frequency, refine_frequency
+
+if TYPE_CHECKING:
+    from bayesperiodic.data.recording import Recording
+
+MINIMUM_CYCLES = 3
+MINIMUM_PERIODICITY = 0.5
+FALSE_ALARM_RATE = 0.01
+
+
+@dataclass(frozen=True)
+class CycleScatter:
+    """How the cycles of one channel differ from their mean, harmonic by harmonic.
+
+    Attributes
+    ----------
+    one_cycle : array (harmonics + 1,)
+        Variance E|c − c̄|² of one cycle's complex amplitude.
+    mean : array (harmonics + 1,)
+        Variance of the mean's complex amplitude, corrected for correlation between successive cycles.
+    """
+
+    one_cycle: np.ndarray
+    mean: np.ndarray
+
+
+def fold(
+    recording: Recording, samples: int = 800, *, frequency: float | None = None, periods: int = 1,
+    harmonics: int | Mapping[str, int] | None = None, origin: float = 0.0, name: str | None = None,
+) -> Experiment:
+    """Fold the steady part of a recording into its mean period on an equidistant grid.
+
+    The fundamental frequency is found by least squares over the whole steady part, the mean period is a least-squares
+    Fourier series (the sampling rate need not divide the period), and only whole cycles after the transient are used.
+
+    Parameters
+    ----------
+    recording : Recording
+    samples : int
+        Grid points per forcing period.
+    frequency : float, optional
+        Forcing frequency [Hz], taken as exact; by default it is estimated, with a standard error.
+    periods : int
+        Forcing periods per response period.
+    harmonics : int or mapping of str to int, optional
+        Harmonics of the response period to keep, for all channels or by channel. By default each channel keeps all up
+        to the last one that stands out of the cycle-to-cycle scatter: an F-test on its squared amplitude with a
+        false-alarm rate of 1 % over all harmonics tested.
+    origin : float
+        Time [s] at which τ = 0.
+    name : str, optional
+        By default the recording's name.
+
+    Returns
+    -------
+    Experiment
+        With `.frequency_se`, `.cycles` (how many were used), `.scatter`, `.independent` (2·harmonics + 1, at most the
+        number of samples), `.harmonics` and `.periodicity`.
+
+    Raises
+    ------
+    ValueError
+        For fewer than three cycles, a constant channel, a signal that is not periodic (its periodicity is told),
+        more harmonics than the samples resolve, an unknown channel in `harmonics`.
+    """
+    periods = checks.integer("periods", periods, 1)
+    samples = checks.integer("samples", samples, 4)
+    origin = checks.finite_number("origin", origin)
+    names = [*recording.inputs, *recording.outputs]
+    signals = np.stack([*recording.inputs.values(), *recording.outputs.values()])
+    for channel, values in zip(names, signals, strict=True):
+        if np.ptp(values) == 0.0:
+            kind = "inputs" if channel in recording.inputs else "outputs"
+            raise ValueError(f"{kind}[{channel!r}]: the constant {values[0]:g} is not allowed; a channel must vary.")
+    time = recording.time - origin
+
+    fundamental = _first_guess(recording, time, signals, frequency, periods)
+    if frequency is None:
+        fundamental = _track(time, signals, fundamental)
+    steady = _steady_part(time, signals, fundamental)
+    time, signals = time[steady], signals[:, steady]
+    limit = _resolved(time, fundamental, samples * periods)
+    if frequency is None:
+        fit, fundamental_se = refine_frequency(time, signals, fundamental, limit)
+    else:
+        fit, fundamental_se = fit_harmonics(time, signals, fundamental, limit), 0.0
+    periodicity = _periodicity(recording, names, signals, fit)
+
+    cycles = round(np.ptp(time) * fit.frequency)
+    scatter = [_cycle_scatter(time, fit, channel, cycles) for channel in range(len(names))]
+    kept = {
+        channel: _last_significant(fit.amplitudes[i], scatter[i].mean, cycles) for i, channel in enumerate(names)
+    } | _chosen(harmonics, names, limit)
+    mean = {
+        channel: fourier.on_grid(fit.amplitudes[i, : kept[channel] + 1], samples * periods)
+        for i, channel in enumerate(names)
+    }
+    return Experiment(
+        name or recording.name,
+        fit.frequency * periods,
+        {channel: mean[channel] for channel in recording.outputs},
+        {channel: mean[channel] for channel in recording.inputs},
+        samples=samples,
+        periods=periods,
+        scatter={
+            channel: float(np.sqrt(_power(scatter[i].one_cycle[: kept[channel] + 1])))
+            for i, channel in enumerate(names)
+        },
+        cycles=cycles,
+        independent={channel: min(2 * kept[channel] + 1, time.size) for channel in recording.outputs},
+        frequency_se=fundamental_se * periods,
+        harmonics=kept,
+        amplitude_variance={channel: scatter[i].mean[: kept[channel] + 1] for i, channel in enumerate(names)},
+        periodicity=periodicity,
+        origin=origin,
+        synthetic=recording.synthetic,
+    )
+
+
+def _first_guess(
+    recording: Recording, time: np.ndarray, signals: np.ndarray, frequency: float | None, periods: int
+) -> float:
+    if frequency is not None:
+        fundamental: float | None = checks.positive("frequency", frequency) / periods
+    elif recording.inputs:
+        guess = guess_frequency(time, signals[: len(recording.inputs)])
+        fundamental = guess / periods if guess else None
+    else:
+        fundamental = guess_frequency(time, signals)
+    duration = float(np.ptp(time))
+    if fundamental is None or duration * fundamental < MINIMUM_CYCLES:
+        found = "no period was found" if fundamental is None else f"it has {duration * fundamental:.2f} cycles"
+        raise ValueError(
+            f"recording: {recording.name!r} of {duration:g} s is not allowed; {found}, and at least {MINIMUM_CYCLES} "
+            "cycles are needed. Record longer, or give the forcing frequency."
+        )
+    return fundamental
+
+
+def _track(time: np.ndarray, signals: np.ndarray, fundamental: float) -> float:
+    """Refine a frequency on the last few cycles, then on more and more, so that no cycle is miscounted."""
+    cycles, total = MINIMUM_CYCLES, np.ptp(time) * fundamental
+    while True:
+        part = time >= time[-1] - cycles / fundamental
+        few = min(10, _resolved(time[part], fundamental, time.size))
+        fundamental = refine_frequency(time[part], signals[:, part], fundamental, few)[0].frequency
+        if cycles >= total / 2:
+            return fundamental
+        cycles = min(2 * cycles, total / 2)
+
+
+def _resolved(time: np.ndarray, fundamental: float, points: int) -> int:
+    per_cycle = (time.size - 1) / (np.ptp(time) * fundamental)
+    resolved = min(int((per_cycle - 1.0) / 2.0), fourier.highest_harmonic(points), (time.size - 2) // 2)
+    if resolved < 1:
+        raise ValueError(
+            f"recording: {per_cycle:.1f} samples a cycle are not allowed; at least 3 are needed to resolve the "
+            "fundamental."
+        )
+    return resolved
+
+
+def _steady_part(time: np.ndarray, signals: np.ndarray, fundamental: float) -> np.ndarray:
+    """Return a mask of the last whole cycles, without the first ones that differ from the later half."""
+    period = 1.0 / fundamental
+    total = int(np.ptp(time) * fundamental * (1 + 1e-9))
+    back = np.minimum(((time[-1] - time) / period).astype(int), total)
+    harmonics = min(5, _resolved(time, fundamental, time.size))
+    scale = signals.std(axis=1)[:, None]
+    shape = np.array(
+        [
+            fit_harmonics(time[back == k], signals[:, back == k] / scale, fundamental, harmonics).amplitudes
+            for k in range(total)
+        ]
+    )
+    half = max(total // 2, MINIMUM_CYCLES)
+    middle = np.median(shape[:half].real, axis=0) + 1j * np.median(shape[:half].imag, axis=0)
+    distance = np.max(np.sqrt(np.sum(np.abs(shape - middle) ** 2, axis=2)), axis=1)
+    settled = distance <= 3.0 * np.median(distance[:half]) + 1e-9
+    used = total
+    while used > MINIMUM_CYCLES and not settled[used - 1 - min(2, used - 1) : used].all():
+        used -= 1
+    return back < used
+
+
+def _periodicity(recording: Recording, names: list[str], signals: np.ndarray, fit: HarmonicFit) -> float:
+    share = 1.0 - fit.variances / np.var(signals, axis=1, ddof=1)
+    worst = int(np.argmin(share))
+    if not share[worst] >= MINIMUM_PERIODICITY:
+        raise ValueError(
+            f"recording: {recording.name!r} is not periodic; at {fit.frequency:.6g} Hz the mean period explains only "
+            f"{max(share[worst], 0.0):.1%} of the variance of {names[worst]!r} (periodicity {share[worst]:.3f}), at "
+            f"least {MINIMUM_PERIODICITY:.0%} is needed. Check the frequency and `periods`."
+        )
+    return float(share[worst])
+
+
+def _cycle_scatter(time: np.ndarray, fit: HarmonicFit, channel: int, cycles: int) -> CycleScatter:
+    count = fit.amplitudes.shape[1]
+    cycle = np.minimum(((time - time[0]) * fit.frequency).astype(int), cycles - 1)
+    size = np.bincount(cycle, minlength=cycles)
+    turn, power = np.exp(-2j * np.pi * fit.frequency * time), np.ones(time.size, dtype=complex)
+    deviation = np.empty((cycles, count), dtype=complex)
+    for h in range(count):
+        wave = fit.residuals[channel] * power
+        total = np.bincount(cycle, wave.real, cycles) + 1j * np.bincount(cycle, wave.imag, cycles)
+        deviation[:, h] = total / size * (1.0 if h == 0 else 2.0)
+        power *= turn
+    one_cycle = np.sum(np.abs(deviation) ** 2, axis=0) / (cycles - 1)
+    follow = np.sum((deviation[1:] * np.conj(deviation[:-1])).real, axis=0)
+    return CycleScatter(one_cycle, one_cycle / cycles * _inflation(follow, np.sum(np.abs(deviation) ** 2, axis=0)))
+
+
+def _inflation(follow: np.ndarray, total: np.ndarray) -> np.ndarray:
+    """Return (1 + r) / (1 − r) for the lag-one correlation r between cycles, pooled over five harmonics."""
+    pooled = uniform_filter1d(total, 5)
+    r = np.divide(uniform_filter1d(follow, 5), pooled, out=np.zeros_like(pooled), where=pooled > 0)
+    r = np.clip(r, 0.0, 0.9)
+    return (1.0 + r) / (1.0 - r)
+
+
+def _last_significant(amplitudes: np.ndarray, variance: np.ndarray, cycles: int) -> int:
+    tested = amplitudes.size - 1
+    floor = (1e-12 * np.abs(amplitudes).max()) ** 2
+    ratio = np.abs(amplitudes[1:]) ** 2 / np.maximum(variance[1:], floor)
+    significant = fdtrc(2, 2 * (cycles - 1), ratio) < FALSE_ALARM_RATE / tested
+    return int(np.flatnonzero(significant)[-1]) + 1 if significant.any() else 1
+
+
+def _chosen(harmonics: int | Mapping[str, int] | None, names: list[str], limit: int) -> dict[str, int]:
+    if harmonics is None:
+        return {}
+    given = harmonics if isinstance(harmonics, Mapping) else dict.fromkeys(names, harmonics)
+    for channel, count in given.items():
+        checks.one_of("harmonics", channel, names)
+        if checks.integer(f"harmonics[{channel!r}]", count, 1) > limit:
+            raise ValueError(
+                f"harmonics[{channel!r}]: {count} is not allowed; samples and grid resolve at most {limit} harmonics."
+            )
+    return {channel: int(count) for channel, count in given.items()}
+
+
+def _power(variance: np.ndarray) -> float:
+    """Return the variance of a signal whose complex amplitudes have these variances."""
+    return float(variance[0] + 0.5 * variance[1:].sum())

@@ -1,0 +1,80 @@
+"""Columns of measured numbers from CSV, NPZ and MAT files."""
+
+import zipfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bayesperiodic import checks
+
+
+def read_csv(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
+    """Return named columns of a CSV file with a header line."""
+    try:
+        table = pd.read_csv(existing(path), skipinitialspace=True, low_memory=False)
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+        raise ValueError(f"path: {str(path)!r} cannot be read as CSV ({error}); it needs a header line.") from None
+    table.columns = [str(name).strip() for name in table.columns]
+    return {column: _numbers(path, column, _pick(path, table, column)) for column in columns}
+
+
+def read_npz(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
+    """Return named arrays of an NPZ file; pickled objects are never loaded."""
+    try:
+        with np.load(existing(path), allow_pickle=False) as archive:
+            return {c: _numbers(path, c, _pick(path, archive, c)) for c in columns}
+    except (zipfile.BadZipFile, EOFError, AttributeError) as error:
+        raise ValueError(f"path: {str(path)!r} cannot be read as NPZ ({error}).") from None
+    except ValueError as error:
+        if "allow_pickle" in str(error):
+            raise ValueError(f"path: {str(path)!r} holds pickled objects; only plain arrays are read.") from None
+        raise
+
+
+def read_mat(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
+    """Return named variables of a MAT file, version 5 or 7.3."""
+    import h5py
+    from scipy.io import loadmat
+
+    file = existing(path)
+    if h5py.is_hdf5(file):
+        with h5py.File(file, "r") as archive:
+            return {c: _numbers(path, c, np.asarray(_pick(path, archive, c))) for c in columns}
+    try:
+        variables = {name: value for name, value in loadmat(file).items() if not name.startswith("__")}
+    except (ValueError, TypeError, NotImplementedError, EOFError) as error:
+        raise ValueError(f"path: {str(path)!r} cannot be read as MAT ({error}).") from None
+    return {c: _numbers(path, c, _pick(path, variables, c)) for c in columns}
+
+
+def existing(path: str | Path) -> Path:
+    """Return the path; raise a FileNotFoundError if no file is there."""
+    file = Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"path: {str(path)!r} is not allowed; there is no such file.")
+    return file
+
+
+def _pick(path: str | Path, source: Mapping[str, Any], column: str) -> Any:
+    checks.one_of(f"column of {Path(path).name}", column, list(source.keys()))
+    return source[column]
+
+
+def _numbers(path: str | Path, column: str, values: Any) -> np.ndarray:
+    argument = f"column {column!r} of {Path(path).name}"
+    if isinstance(values, pd.Series) and not pd.api.types.is_numeric_dtype(values):
+        numbers = pd.to_numeric(values, errors="coerce")
+        row = int(np.flatnonzero(numbers.isna() & values.notna())[0])
+        raise ValueError(
+            f"{argument}: {values.iloc[row]!r} in data row {row + 1} is not allowed; every cell must be a number."
+        )
+    array = np.squeeze(np.asarray(values))
+    if array.ndim != 1 or array.dtype.kind not in "fiub":
+        raise ValueError(
+            f"{argument}: an array of shape {np.shape(values)} and type {array.dtype} is not allowed; it must be one "
+            "column of real numbers."
+        )
+    return array.astype(float)

@@ -1,0 +1,64 @@
+"""Periodic signals as arrays and as Fourier coefficients.
+
+A real signal over one response period is held on an equidistant grid without its end point. Its complex
+coefficients c[h] satisfy y(t) = Re Σ_h c[h] exp(2πi h t / period), so that |c[h]| is the amplitude of harmonic h
+and c[0] the mean.
+"""
+
+import numpy as np
+
+
+def coefficients(values: np.ndarray, harmonics: int | None = None) -> np.ndarray:
+    """Return the complex amplitudes 0 … `harmonics` of signals on a grid.
+
+    Parameters
+    ----------
+    values : array (…, points)
+        One response period, end point excluded.
+    harmonics : int, optional
+        The highest harmonic wanted; by default all below the grid's Nyquist harmonic.
+
+    Returns
+    -------
+    array (…, harmonics + 1), complex
+    """
+    points = values.shape[-1]
+    limit = highest_harmonic(points)
+    amplitudes = np.fft.rfft(values, axis=-1)[..., : 1 + (limit if harmonics is None else min(harmonics, limit))]
+    amplitudes *= 2.0 / points
+    amplitudes[..., 0] *= 0.5
+    return amplitudes
+
+
+def on_grid(amplitudes: np.ndarray, points: int) -> np.ndarray:
+    """Return signals (…, points) from complex amplitudes (…, harmonics + 1)."""
+    spectrum = np.zeros((*amplitudes.shape[:-1], points // 2 + 1), dtype=complex)
+    count = min(amplitudes.shape[-1], highest_harmonic(points) + 1)
+    spectrum[..., :count] = amplitudes[..., :count] * (0.5 * points)
+    spectrum[..., 0] *= 2.0
+    return np.fft.irfft(spectrum, n=points, axis=-1)
+
+
+def at_times(amplitudes: np.ndarray, phase: np.ndarray) -> np.ndarray:
+    """Return one signal at any phases (fractions of the period), by Horner's rule in exp(2πi phase)."""
+    turn = np.exp(2j * np.pi * np.asarray(phase))
+    total = np.zeros_like(turn)
+    for amplitude in amplitudes[::-1]:
+        total = total * turn + amplitude
+    return total.real
+
+
+def derivative(amplitudes: np.ndarray, frequency: float, order: int = 1) -> np.ndarray:
+    """Return the complex amplitudes of a time derivative; `frequency` [Hz] is that of harmonic 1."""
+    harmonic = np.arange(amplitudes.shape[-1])
+    return amplitudes * (2j * np.pi * frequency * harmonic) ** order
+
+
+def project(values: np.ndarray, harmonics: int) -> np.ndarray:
+    """Return signals (…, points) with everything above the given harmonic removed."""
+    return on_grid(coefficients(values, harmonics), values.shape[-1])
+
+
+def highest_harmonic(points: int) -> int:
+    """Return the highest harmonic that a grid of that many points represents without ambiguity."""
+    return (points - 1) // 2

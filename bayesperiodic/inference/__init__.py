@@ -1,0 +1,1 @@
+"""What we conclude: priors, posterior density, estimates, samples."""

@@ -1,0 +1,50 @@
+"""Where a sampling run is kept while it goes on: emcee's HDF5 backend, one group an ensemble."""
+
+import hashlib
+from pathlib import Path
+
+import emcee
+import h5py
+import numpy as np
+
+from bayesperiodic.inference.problem import Problem
+from bayesperiodic.models.compile import kernel_source
+
+
+def backends(checkpoint: str | Path | None, problem: Problem, settings: str, ensembles: int) -> list:
+    """Return one emcee backend an ensemble, in memory or in a file that carries the problem's fingerprint.
+
+    Raises
+    ------
+    ValueError
+        If the file is no HDF5 file, or belongs to another problem, seed or number of walkers.
+    """
+    if checkpoint is None:
+        return [emcee.backends.Backend() for _ in range(ensembles)]
+    path, mark = Path(checkpoint), fingerprint(problem) + "; " + settings
+    try:
+        with h5py.File(path, "a") as file:
+            if not len(file) and "fingerprint" not in file.attrs:
+                file.attrs["fingerprint"] = mark
+            found = file.attrs.get("fingerprint", "no run of this package")
+            if found != mark:
+                raise ValueError(
+                    f"checkpoint: {str(path)!r} belongs to another run ({found}), this one is ({mark}); name another "
+                    "file or delete it."
+                )
+    except OSError as error:
+        raise ValueError(f"checkpoint: {str(path)!r} cannot be used ({error}).") from None
+    return [emcee.backends.HDFBackend(str(path), name=f"ensemble {k}") for k in range(ensembles)]
+
+
+def fingerprint(problem: Problem) -> str:
+    """Return a digest of model, data, priors, fixed values and scheme."""
+    digest = hashlib.sha256(kernel_source(problem.model).encode())
+    for experiment in problem.experiments:
+        digest.update(repr((experiment.name, experiment.frequency, experiment.samples, experiment.periods,
+                            experiment.winding, experiment.independent, experiment.harmonics)).encode())
+        for signals in (experiment.outputs, experiment.inputs):
+            for name, values in signals.items():
+                digest.update(name.encode() + np.ascontiguousarray(values).tobytes())
+    digest.update(repr((problem.priors, problem.fixed, problem.fixed_variances, problem.scheme)).encode())
+    return f"problem {digest.hexdigest()[:16]}"

@@ -1,0 +1,334 @@
+"""Problem: a model, experiments and priors, and the posterior density they define."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bayesperiodic import checks, fourier
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.inference.priors import Prior
+from bayesperiodic.models.model import Model
+from bayesperiodic.periodic.batch import Anchor, solve_batch
+from bayesperiodic.periodic.equations import PeriodicEquations
+from bayesperiodic.periodic.newton import CONVERGED
+from bayesperiodic.periodic.schemes import Scheme
+from bayesperiodic.periodic.solution import PeriodicSolution, describe, periodic_part
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The model against the data at one θ: residuals e = y − ŷ and ∂ŷ/∂θ, both within the harmonics kept.
+
+    Attributes
+    ----------
+    solutions : dict of str to PeriodicSolution
+    residuals : dict of str to dict of str to array (points,)
+        By experiment and channel.
+    sensitivities : dict of str to dict of str to array (names, points)
+    """
+
+    solutions: dict[str, PeriodicSolution]
+    residuals: dict[str, dict[str, np.ndarray]]
+    sensitivities: dict[str, dict[str, np.ndarray]]
+
+
+class Problem:
+    """What the estimator and the samplers work on ([1]_, eq. 5-6).
+
+    Errors are taken as independent and normal with an unknown variance per channel, Jeffreys' prior 1/v unless the
+    variance is fixed. The density is over (θ, log v),
+
+        −½ Σ_β [ n_β ln v_β + M_β / v_β ] + Σ_α ln p(θ_α),
+
+    where n_β counts the independent values behind the samples of channel β, and M_β weighs each squared residual by
+    independent values per sample. It is eq. (6) where every sample is independent. Outputs are projected onto the
+    harmonics that the experiment keeps before they are compared.
+
+    Parameters
+    ----------
+    model : Model
+    experiments : sequence of Experiment
+    priors : mapping of str to prior
+        Makes a parameter free.
+    fixed : mapping of str to float, optional
+        Values of the other parameters; ``"variance[force]"`` fixes the variance of a channel.
+    scheme : str or Scheme
+        See `solve_periodic`.
+
+    Raises
+    ------
+    ValueError
+        For a parameter without prior or value, or with both, an unknown name, an experiment without the model's
+        inputs or with outputs that the model lacks, no more independent values than free parameters in a channel whose
+        variance is unknown.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
+    """
+
+    def __init__(
+        self, model: Model, experiments: Iterable[Experiment], *, priors: Mapping[str, Prior],
+        fixed: Mapping[str, float] | None = None, scheme: str | Scheme = "central2",
+    ):
+        self.model = model
+        self.experiments = _checked_experiments(model, experiments)
+        measured = {channel for experiment in self.experiments for channel in experiment.outputs}
+        self.channels = tuple(channel for channel in model.outputs if channel in measured)
+        fixed = dict(fixed or {})
+        variance_names = {f"variance[{channel}]": channel for channel in self.channels}
+        for name in priors:
+            checks.one_of("priors", name, model.parameters)
+            if name in fixed:
+                raise ValueError(f"fixed: {name!r} has a prior too; give a prior or a value.")
+        for name in fixed:
+            checks.one_of("fixed", name, (*model.parameters, *variance_names))
+        if without := [n for n in model.parameters if n not in priors and n not in fixed]:
+            raise ValueError(
+                f"priors: {', '.join(map(repr, without))} has neither a prior nor a value; a free parameter needs a "
+                "prior, any other a value in `fixed`."
+            )
+        self.names = tuple(name for name in model.parameters if name in priors)
+        if not self.names:
+            raise ValueError("priors: {} is not allowed; at least one parameter must be free.")
+        self.priors = {name: priors[name] for name in self.names}
+        self.fixed = {n: checks.finite_number(f"fixed[{n!r}]", fixed[n]) for n in model.parameters if n in fixed}
+        self.fixed_variances = {
+            channel: checks.positive(f"fixed[{name!r}]", fixed[name])
+            for name, channel in variance_names.items() if name in fixed
+        }
+        self.free_variances = tuple(c for c in self.channels if c not in self.fixed_variances)
+        self.scheme = scheme
+        self.independent = np.array(
+            [sum((e.independent or {}).get(c, 0) for e in self.experiments) for c in self.channels], dtype=float
+        )
+        self._check_counts()
+        self._anchors: dict[str, Anchor] | None = None
+
+    def _check_counts(self) -> None:
+        for channel, count in zip(self.channels, self.independent, strict=True):
+            if channel in self.free_variances and count <= len(self.names):
+                raise ValueError(
+                    f"priors: {len(self.names)} free parameters ({', '.join(self.names)}) are not allowed; the channel "
+                    f"{channel!r} has only {count:.0f} independent values and its variance is unknown. Fix parameters "
+                    f"or 'variance[{channel}]', keep more harmonics, or add experiments."
+                )
+
+    @cached_property
+    def equations(self) -> dict[str, PeriodicEquations]:
+        """The discretised equations of every experiment."""
+        return {
+            e.name: PeriodicEquations.build(
+                self.model, e.inputs, frequency=e.frequency, samples=e.samples, scheme=self.scheme,
+                periods=e.periods, winding=e.winding,
+            )
+            for e in self.experiments
+        }
+
+    @property
+    def anchors(self) -> dict[str, Anchor]:
+        """Solved points from which `log_posterior` predicts all others; at the medians of the priors unless set."""
+        if self._anchors is None:
+            self._anchors = self._anchors_at(self.median())
+        return self._anchors
+
+    def anchored(self, theta: Mapping[str, float] | np.ndarray) -> "Problem":
+        """Return the same problem with its anchors at another θ."""
+        other = object.__new__(Problem)
+        other.__dict__.update(self.__dict__)
+        other._anchors = self._anchors_at(self.vector(theta))
+        return other
+
+    def _anchors_at(self, theta: np.ndarray) -> dict[str, Anchor]:
+        parameters = self._parameters(theta[None])[0]
+        anchors = {}
+        for name, equations in self.equations.items():
+            guess = equations.static_guess(parameters)
+            z = equations.solve(parameters, guess).z
+            derivative = equations.parameter_sensitivities(z, parameters) if np.isfinite(z).all() else None
+            if derivative is None or not np.isfinite(derivative.states).all():
+                anchors[name] = Anchor(parameters, guess, np.zeros((parameters.size, *guess.shape)))
+            else:
+                anchors[name] = Anchor(parameters, z, derivative.states)
+        return anchors
+
+    def median(self) -> np.ndarray:
+        """Return the medians of the priors, (names,)."""
+        return np.array([float(self.priors[name].quantile(np.array(0.5))) for name in self.names])
+
+    def vector(self, theta: Mapping[str, float] | np.ndarray | Sequence[float]) -> np.ndarray:
+        """Return θ as an array (…, names) from a mapping or an array."""
+        if isinstance(theta, Mapping):
+            checks.same_names("theta", theta, self.names)
+            theta = np.stack(np.broadcast_arrays(*(np.asarray(theta[name], dtype=float) for name in self.names)), -1)
+        values = np.asarray(theta, dtype=float)
+        if values.shape[-1:] != (len(self.names),):
+            raise ValueError(f"theta: shape {values.shape} is not allowed; the last axis must be {list(self.names)}.")
+        return values
+
+    def _variances(self, variances: Mapping[str, Any] | np.ndarray) -> np.ndarray:
+        if isinstance(variances, Mapping):
+            given = {**self.fixed_variances, **variances}
+            checks.same_names("variances", given, self.channels)
+            variances = np.stack(np.broadcast_arrays(*(np.asarray(given[c], dtype=float) for c in self.channels)), -1)
+        values = np.asarray(variances, dtype=float)
+        if values.shape[-1:] != (len(self.channels),):
+            raise ValueError(
+                f"variances: shape {values.shape} is not allowed; the last axis must be {list(self.channels)}."
+            )
+        return values
+
+    def log_prior(self, theta: Mapping[str, float] | np.ndarray) -> np.ndarray:
+        """Return Σ ln p(θ_α), shape (…); −inf outside the support."""
+        values = self.vector(theta)
+        return np.sum([p.log_prob(values[..., i]) for i, p in enumerate(self.priors.values())], axis=0)
+
+    def log_likelihood(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> np.ndarray:
+        """Return −½ Σ_β [n_β ln v_β + M_β/v_β], shape (…); −inf where a periodic solve fails."""
+        return self.likelihood_from_moments(self.moments(theta)[0], self._variances(variances))
+
+    def log_posterior(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> np.ndarray:
+        """Return log-prior plus log-likelihood, shape (…), a density over (θ, log v)."""
+        values = self.vector(theta)
+        prior = np.asarray(self.log_prior(values))
+        result = np.full(prior.shape, -np.inf)
+        inside = np.isfinite(prior)
+        if inside.any():
+            v = np.broadcast_to(self._variances(variances), (*prior.shape, len(self.channels)))
+            result[inside] = prior[inside] + self.log_likelihood(values[inside], v[inside])
+        return result
+
+    def likelihood_from_moments(self, moments: np.ndarray, variances: np.ndarray) -> np.ndarray:
+        """Return −½ Σ_β [n_β ln v_β + M_β/v_β] of moments and variances (…, channels)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            terms = self.independent * np.log(variances) + moments / variances
+            value = -0.5 * terms.sum(axis=-1)
+        return np.where(np.isfinite(value), value, -np.inf)
+
+    def moments(self, theta: Mapping[str, float] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return M (…, channels), the diagonal of the moment matrix (eq. 6), and the worst status code, shape (…).
+
+        M is infinite where a periodic solve fails.
+        """
+        values = self.vector(theta)
+        parameters = self._parameters(values.reshape(-1, len(self.names)))
+        moments = np.zeros((len(parameters), len(self.channels)))
+        status = np.full(len(parameters), CONVERGED)
+        for experiment in self.experiments:
+            y, codes, _ = solve_batch(self.equations[experiment.name], parameters, self.anchors[experiment.name])
+            status = np.maximum(status, codes)
+            for c, channel in enumerate(self.channels):
+                if channel in experiment.outputs:
+                    moments[:, c] += _moment(experiment, channel, y[:, :, self.model.outputs.index(channel)])
+        moments[(status != CONVERGED) | ~np.isfinite(moments).all(axis=1)] = np.inf
+        return moments.reshape(*values.shape[:-1], -1), status.reshape(values.shape[:-1])
+
+    def solve(self, theta: Mapping[str, float] | np.ndarray) -> dict[str, PeriodicSolution]:
+        """Return the periodic solution of every experiment at one θ."""
+        parameters = self._parameters(self.vector(theta)[None])[0]
+        solutions = {}
+        for name, equations in self.equations.items():
+            solved = equations.solve(parameters, self.anchors[name].z)
+            if solved.code != CONVERGED:
+                solved = equations.solve(parameters, equations.static_guess(parameters))
+            solutions[name] = describe(equations, parameters, solved)
+        return solutions
+
+    def evaluate(self, theta: Mapping[str, float] | np.ndarray) -> Evaluation:
+        """Solve at one θ and compare with the data (eq. 4-5)."""
+        solutions = self.solve(theta)
+        residuals: dict[str, dict[str, np.ndarray]] = {}
+        sensitivities: dict[str, dict[str, np.ndarray]] = {}
+        for e in self.experiments:
+            solution = solutions[e.name]
+            if not solution.converged:
+                continue
+            residuals[e.name] = {c: y - e.project(c, solution.outputs[c]) for c, y in e.outputs.items()}
+            sensitivities[e.name] = {
+                c: e.project(c, np.stack([solution.sensitivities[c][name] for name in self.names])) for c in e.outputs
+            }
+        return Evaluation(solutions, residuals, sensitivities)
+
+    def perturbed_inputs(self, theta: Mapping[str, float] | np.ndarray) -> dict[str, dict[str, float]]:
+        """Return the sd that the inputs' measurement noise brings to every output, by experiment and channel.
+
+        The noise of each kept Fourier amplitude of an input, and of its derivatives, is carried through the linearised
+        periodic problem; the result is the root of the mean variance over the period, within the harmonics kept.
+        """
+        parameters = self._parameters(self.vector(theta)[None])[0]
+        result = {}
+        for e in self.experiments:
+            equations, total = self.equations[e.name], {channel: 0.0 for channel in e.outputs}
+            z = periodic_part(equations, self.solve(theta)[e.name].states)
+            directions = _input_noise(e)
+            derivative = equations.input_sensitivities(z, parameters, directions) if len(directions) else None
+            if derivative is not None:
+                for channel in total:
+                    moved = e.project(channel, derivative.outputs[:, :, self.model.outputs.index(channel)])
+                    total[channel] = float(np.sqrt(np.sum(np.mean(moved**2, axis=1))))
+            result[e.name] = total
+        return result
+
+    def sample_prior(self, size: int, seed: int) -> dict[str, np.ndarray]:
+        """Return independent draws of every free parameter from its prior, (size,) each."""
+        generator = np.random.default_rng(seed)
+        return {name: self.priors[name].sample(size, generator) for name in self.names}
+
+    def _parameters(self, theta: np.ndarray) -> np.ndarray:
+        parameters = np.empty((len(theta), len(self.model.parameters)))
+        for column, name in enumerate(self.model.parameters):
+            parameters[:, column] = theta[:, self.names.index(name)] if name in self.names else self.fixed[name]
+        return parameters
+
+    def __repr__(self) -> str:
+        return (
+            f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
+            f"channels: {', '.join(self.channels)} with {self.independent.sum():.0f} independent values)"
+        )
+
+
+def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tuple[Experiment, ...]:
+    result = tuple(experiments)
+    if not result:
+        raise ValueError("experiments: () is not allowed; at least one experiment is needed.")
+    names = [experiment.name for experiment in result]
+    if len(set(names)) < len(names):
+        raise ValueError(f"experiments: the names {names} are not allowed; they must differ, see fold(name=…).")
+    for experiment in result:
+        checks.same_names(f"inputs of experiment {experiment.name!r}", experiment.inputs, model.inputs)
+        for channel in experiment.outputs:
+            checks.one_of(f"outputs of experiment {experiment.name!r}", channel, model.outputs)
+    return result
+
+
+def _moment(experiment: Experiment, channel: str, predicted: np.ndarray) -> np.ndarray:
+    """Return independent · (mean square of y − ŷ within the kept harmonics), one a row of `predicted`."""
+    measured = experiment.outputs[channel]
+    count = (experiment.independent or {})[channel]
+    if not experiment.harmonics or channel not in experiment.harmonics:
+        return count * np.mean((measured - predicted) ** 2, axis=-1)
+    kept = experiment.harmonics[channel]
+    amplitudes = fourier.coefficients(measured, kept) - fourier.coefficients(predicted, kept)
+    power = amplitudes.real**2 + amplitudes.imag**2
+    return count * (power[..., 0] + 0.5 * power[..., 1:].sum(axis=-1))
+
+
+def _input_noise(experiment: Experiment) -> np.ndarray:
+    """Return one-sd perturbations (directions, points, 3·inputs) of (u, u̇, ü), two a noisy Fourier amplitude."""
+    points = experiment.samples * experiment.periods
+    count, directions = len(experiment.inputs), []
+    for i, name in enumerate(experiment.inputs):
+        for h, variance in enumerate((experiment.amplitude_variance or {}).get(name, ())):
+            for part in (1.0,) if h == 0 else (1.0, 1j):
+                amplitude = np.zeros(h + 1, dtype=complex)
+                amplitude[h] = part * np.sqrt(variance if h == 0 else 0.5 * variance)
+                direction = np.zeros((points, 3 * count))
+                for order in range(3):
+                    rate = fourier.derivative(amplitude, experiment.frequency / experiment.periods, order)
+                    direction[:, order * count + i] = fourier.on_grid(rate, points)
+                directions.append(direction)
+    return np.array(directions)

@@ -1,0 +1,115 @@
+"""The disk cache of compiled kernels: one folder a generated source, private to its user.
+
+An entry is built in a folder of its own and renamed into place, so that any number of processes may fill the cache
+at once. Before anything of an entry is executed, the folder must belong to the user and be closed to others, the
+source must equal the one just generated, and every compiled file must have the digest recorded when it was written.
+Anything else is compiled in memory, with a warning.
+"""
+
+import hashlib
+import json
+import os
+import platform
+import shutil
+import stat
+import sys
+import tempfile
+import types
+import warnings
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding
+import numba
+import platformdirs
+
+FUNCTIONS = ("residual_jacobian", "outputs", "derivatives")
+SOURCE, MANIFEST = "kernels.py", "manifest.json"
+
+
+class CacheProblem(Exception):
+    """The cache cannot be used; the message says why."""
+
+
+def cache_folder() -> Path:
+    """Return the folder of the kernel cache, below $BAYESPERIODIC_CACHE or the user's own cache folder."""
+    return Path(os.environ.get("BAYESPERIODIC_CACHE") or platformdirs.user_cache_dir("bayesperiodic")) / "kernels"
+
+
+def load(body: str) -> dict[str, Any]:
+    """Return the functions of a generated source, from the cache or freshly compiled (and then cached)."""
+    source = _header() + body
+    try:
+        entry = _private_folder() / hashlib.sha256(source.encode()).hexdigest()[:32]
+        if not entry.is_dir():
+            return _build(source, entry)
+        _check(entry, source)
+        return _execute(source, entry / SOURCE, cache=True)
+    except (CacheProblem, OSError) as problem:
+        reason = str(problem)
+    except Exception as problem:  # whatever a damaged compiled file provokes in the loader
+        reason = f"{type(problem).__name__}: {problem}"
+    warnings.warn(
+        f"The kernel cache in {cache_folder()} cannot be used ({reason}); compiling in memory, which every start "
+        "will repeat. Delete the folder or set BAYESPERIODIC_CACHE to one that you own.",
+        RuntimeWarning, stacklevel=2,
+    )
+    return _execute(source, Path("<kernels compiled in memory>"), cache=False)
+
+
+def _header() -> str:
+    python = ".".join(map(str, sys.version_info[:3]))
+    machine = f"{platform.machine()} {llvmlite.binding.get_host_cpu_name()}"
+    versions = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, python {python}, {machine}"
+    return f"# generated; {versions}\nimport math\n\nfrom numba import njit\n\n\n"
+
+
+def _private_folder() -> Path:
+    folder = cache_folder()
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if hasattr(os, "getuid"):
+        status = folder.stat()
+        if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
+            raise CacheProblem("it is not private to this user (owner only, mode 0700)")
+    return folder
+
+
+def _build(source: str, entry: Path) -> dict[str, Any]:
+    workshop = Path(tempfile.mkdtemp(prefix="building-", dir=entry.parent))
+    try:
+        (workshop / SOURCE).write_text(source, encoding="utf-8")
+        functions = _execute(source, workshop / SOURCE, cache=True)
+        (workshop / MANIFEST).write_text(json.dumps(_digests(workshop)), encoding="utf-8")
+        try:
+            workshop.rename(entry)
+        except OSError:
+            if not entry.is_dir():
+                raise
+        return functions
+    finally:
+        shutil.rmtree(workshop, ignore_errors=True)
+
+
+def _check(entry: Path, source: str) -> None:
+    try:
+        if (entry / SOURCE).read_text(encoding="utf-8") != source:
+            raise CacheProblem(f"the source in {entry.name} is not the one expected")
+        if json.loads((entry / MANIFEST).read_text(encoding="utf-8")) != _digests(entry):
+            raise CacheProblem(f"the compiled files in {entry.name} have changed since they were written")
+    except (FileNotFoundError, ValueError):
+        raise CacheProblem(f"the entry {entry.name} is incomplete") from None
+
+
+def _digests(entry: Path) -> dict[str, str]:
+    files = sorted(p for p in (entry / "__pycache__").glob("*") if p.suffix in (".nbi", ".nbc"))
+    if len(files) < 2 * len(FUNCTIONS):
+        raise CacheProblem(f"the entry {entry.name} lacks compiled files")
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def _execute(source: str, path: Path, cache: bool) -> dict[str, Any]:
+    module = types.ModuleType(f"bayesperiodic_kernels_{hashlib.sha256(source.encode()).hexdigest()[:32]}")
+    module.__dict__.update(__file__=str(path), CACHE=cache)
+    sys.modules[module.__name__] = module
+    exec(compile(source, str(path), "exec"), module.__dict__)
+    return {name: getattr(module, name) for name in FUNCTIONS}

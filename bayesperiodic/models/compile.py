@@ -1,0 +1,183 @@
+"""From symbolic expressions to compiled functions that sweep the whole time grid.
+
+Every generated function has the signature ``(states, inputs, parameters, tau, frequency, out)`` with
+
+- states (points, 3·states): q, then q̇, then q̈ (per second);
+- inputs (points, 3·inputs): u, u̇, ü;
+- parameters (parameters,), tau (points,) in forcing periods, frequency [Hz];
+- out (points, size): filled, one row a grid point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import sympy as sp
+from numba import types
+from numba.core import sigutils
+from sympy.printing.codeprinter import PrintMethodNotImplementedError
+from sympy.printing.pycode import PythonCodePrinter
+
+from bayesperiodic.models.cache import load
+
+if TYPE_CHECKING:
+    from bayesperiodic.models.model import Model
+
+GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
+
+
+class GridFunction(types.WrapperAddressProtocol):
+    """A compiled grid function that other compiled code takes as an argument.
+
+    Handing over the compiled function itself would look its address up at every call, for longer than a solve takes.
+    """
+
+    def __init__(self, compiled: Any):
+        arguments, result = sigutils.normalize_signature(GRID_SIGNATURE)
+        self._signature = result(*arguments)
+        self._compiled = compiled
+        code = compiled.get_compile_result(self._signature)
+        self._address = code.library.get_pointer_to_function(code.fndesc.llvm_cfunc_wrapper_name)
+
+    def __wrapper_address__(self) -> int:
+        return self._address
+
+    def signature(self) -> Any:
+        """Return the signature, as the protocol asks."""
+        return self._signature
+
+    def __call__(self, *arguments: Any) -> None:
+        self._compiled(*arguments)
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """The compiled grid functions of one model.
+
+    Attributes
+    ----------
+    residual_jacobian : GridFunction
+        Columns: g (states), then ∂g/∂(q, q̇, q̈) row by row (states × 3·states).
+    outputs : GridFunction
+        Columns: ŷ (outputs).
+    derivatives : GridFunction
+        Columns: ∂g/∂θ, ∂g/∂(u, u̇, ü), ∂f/∂(q, q̇, q̈), ∂f/∂θ, ∂f/∂(u, u̇, ü), each row by row; see `split_derivatives`.
+    """
+
+    residual_jacobian: GridFunction
+    outputs: GridFunction
+    derivatives: GridFunction
+    states: int
+    inputs: int
+    parameters: int
+    channels: int
+
+    def evaluate(
+        self, name: str, states: np.ndarray, inputs: np.ndarray, parameters: np.ndarray, tau: np.ndarray,
+        frequency: float,
+    ) -> np.ndarray:
+        """Return one of the functions on a grid, (points, size)."""
+        size = {
+            "residual_jacobian": self.states * (1 + 3 * self.states),
+            "outputs": self.channels,
+            "derivatives": sum(rows * columns for rows, columns in self._derivative_shapes()),
+        }[name]
+        out = np.empty((tau.size, size))
+        getattr(self, name)(states, inputs, parameters, tau, frequency, out)
+        return out
+
+    def split_derivatives(self, columns: np.ndarray) -> list[np.ndarray]:
+        """Return g_θ, g_u, f_q, f_θ, f_u as arrays (points, rows, columns)."""
+        parts, start = [], 0
+        for shape in self._derivative_shapes():
+            stop = start + shape[0] * shape[1]
+            parts.append(columns[:, start:stop].reshape(-1, *shape))
+            start = stop
+        return parts
+
+    def _derivative_shapes(self) -> list[tuple[int, int]]:
+        g, f = self.states, self.channels
+        return [(g, self.parameters), (g, 3 * self.inputs), (f, 3 * g), (f, self.parameters), (f, 3 * self.inputs)]
+
+
+def compile_kernels(model: Model) -> Kernels:
+    """Return the compiled functions of a model, from the disk cache where they are there and undamaged."""
+    functions = load(kernel_source(model))
+    return Kernels(
+        **{name: GridFunction(compiled) for name, compiled in functions.items()},
+        states=len(model.states), inputs=len(model.inputs),
+        parameters=len(model.parameters), channels=len(model.outputs),
+    )
+
+
+def kernel_source(model: Model) -> str:
+    """Return the generated module as text; the same model always gives the same text."""
+    g, f = sp.Matrix(model.equations), sp.Matrix(model.output_expressions)
+    q, u = list(model.state_symbols.values()), list(model.input_symbols.values())
+    theta = list(model.parameter_symbols.values())
+    needs = {
+        "residual_jacobian": [*g, *g.jacobian(q)],
+        "outputs": [*f],
+        "derivatives": [
+            entry
+            for rows, columns in ((g, theta), (g, u), (f, q), (f, theta), (f, u))
+            for entry in (rows.jacobian(columns) if columns else [])
+        ],
+    }
+    arguments = {
+        **{symbol: f"states[i, {column}]" for column, symbol in enumerate(q)},
+        **{symbol: f"inputs[i, {column}]" for column, symbol in enumerate(u)},
+        **{symbol: f"parameters[{index}]" for index, symbol in enumerate(theta)},
+        model.time_symbols["tau"]: "tau[i]",
+        model.time_symbols["frequency"]: "frequency",
+    }
+    return "\n\n".join(_function(name, expressions, arguments) for name, expressions in needs.items())
+
+
+def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str]) -> str:
+    common, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("common"), order="canonical")
+    used = set().union(*(e.free_symbols for e in reduced), *(e.free_symbols for _, e in common))
+    lines = [f"    {s} = {place}" for s, place in arguments.items() if s in used and "[i" not in place and s.name != place]
+    lines += ["    for i in range(out.shape[0]):"]
+    lines += [f"        {s} = {place}" for s, place in arguments.items() if s in used and "[i" in place]
+    lines += [f"        {symbol} = {_code(expression)}" for symbol, expression in common]
+    lines += [f"        out[i, {column}] = {_code(expression)}" for column, expression in enumerate(reduced)]
+    header = f'@njit("{GRID_SIGNATURE}", cache=CACHE, nogil=True, error_model="numpy")\n'
+    return header + f"def {name}(states, inputs, parameters, tau, frequency, out):\n" + "\n".join(lines) + "\n"
+
+
+class _Printer(PythonCodePrinter):
+    """SymPy's Python printer with the generalised functions that differentiation leaves behind."""
+
+    def _print_sign(self, expression: sp.Expr) -> str:
+        argument = self._print(expression.args[0])
+        return f"(({argument} > 0.0) - ({argument} < 0.0))"
+
+    def _print_Heaviside(self, expression: sp.Expr) -> str:
+        argument = self._print(expression.args[0])
+        return f"(0.5*(({argument} > 0.0) + ({argument} >= 0.0)))"
+
+    def _print_DiracDelta(self, expression: sp.Expr) -> str:
+        return "0.0"
+
+
+def _code(expression: sp.Expr) -> str:
+    try:
+        text = _Printer({"strict": True, "allow_unknown_functions": False}).doprint(expression)
+    except PrintMethodNotImplementedError:
+        text = "# not supported"
+    if "#" in text or "\n" in text:
+        raise ValueError(
+            f"equations or outputs: {expression} is not allowed; it has a function (or a derivative of one) that "
+            "cannot be compiled. Elementary functions, abs, sign, Min, Max and Piecewise are."
+        )
+    return text
+
+
+def as_columns(values: Iterable[np.ndarray], points: int) -> np.ndarray:
+    """Return signals (or their derivatives) side by side as a C-contiguous array (points, columns)."""
+    stacked = [np.asarray(v, dtype=float) for v in values]
+    return np.ascontiguousarray(np.stack(stacked, axis=-1)) if stacked else np.empty((points, 0))

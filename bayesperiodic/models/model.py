@@ -1,0 +1,194 @@
+"""Model: differential and output equations written once, symbolically."""
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property
+from typing import Any
+
+import sympy as sp
+
+from bayesperiodic import checks
+from bayesperiodic.models.compile import Kernels, compile_kernels
+
+RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
+
+
+class Names:
+    """Symbols by attribute: ``s.dx``, ``p.k3``; an unknown name is answered with the nearest known one."""
+
+    def __init__(self, what: str, symbols: Mapping[str, sp.Symbol]):
+        self._what = what
+        self._symbols = dict(symbols)
+
+    def __getattr__(self, name: str) -> sp.Symbol:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        try:
+            checks.one_of(self._what, name, self._symbols)
+        except ValueError as error:
+            raise AttributeError(str(error)) from None
+        return self._symbols[name]
+
+
+class Model:
+    """A nonlinear model, g(q, q̇, q̈, u, τ, θ) = 0 with outputs ŷ = f(q, q̇, q̈, u, τ, θ) ([1]_, eq. 1).
+
+    Parameters
+    ----------
+    name : str
+        A Python identifier.
+    states : sequence of str
+        Degrees of freedom q. A state is of second order if its second derivative appears in an equation,
+        of first order if only its first does.
+    parameters : mapping of str to str, or sequence of str
+        Names of θ, with their units.
+    equations : callable (s, p, u) -> sequence of expressions
+        The residuals g, one a state, in SymPy expressions of ``s.x, s.dx, s.ddx`` (state and its time derivatives,
+        per second), ``s.tau`` (time in forcing periods), ``s.frequency`` [Hz], parameters ``p.c`` and inputs
+        ``u.force, u.dforce, u.ddforce``.
+    outputs : callable (s, p, u) -> mapping of str to expression
+        The measured channels f.
+    inputs : sequence of str, optional
+        Prescribed periodic signals.
+    angles : sequence of str, optional
+        States that may wind (advance by a multiple of 2π a period) and outputs compared modulo 2π.
+    units : mapping of str to str, optional
+        Units of states, inputs and outputs, for tables and axes.
+
+    Raises
+    ------
+    ValueError
+        For names that are reserved, repeated or no identifiers, a number of equations other than that of the states,
+        an expression with a symbol or a function that the model does not know, a state without a derivative.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, in: D. H. van Campen (Ed.), Interaction between Dynamics and Control in Advanced
+       Mechanical Systems, Kluwer, 1997, 191-198.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> model = bp.Model("spring", states=["x"], inputs=["force"], parameters={"m": "kg", "k": "N/m"},
+    ...     equations=lambda s, p, u: [p.m * s.ddx + p.k * s.x - u.force],
+    ...     outputs=lambda s, p, u: {"displacement": s.x})
+    >>> model.orders
+    {'x': 2}
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        states: Iterable[str],
+        parameters: Mapping[str, str] | Iterable[str],
+        equations: Callable[..., Iterable[Any]],
+        outputs: Callable[..., Mapping[str, Any]],
+        inputs: Iterable[str] = (),
+        angles: Iterable[str] = (),
+        units: Mapping[str, str] | None = None,
+    ):
+        (self.name,) = checks.identifiers("name", [name])
+        self.states = checks.identifiers("states", states, RESERVED)
+        self.inputs = checks.identifiers("inputs", inputs, (*RESERVED, *self.states))
+        self.parameters = checks.identifiers("parameters", parameters, RESERVED)
+        for argument, names in (("states", self.states), ("inputs", self.inputs)):
+            checks.identifiers(argument, [d + n for d in ("", "d", "dd") for n in names], RESERVED)
+        if not self.states:
+            raise ValueError("states: () is not allowed; a model needs at least one state.")
+
+        self.state_symbols = _with_derivatives("s", self.states)
+        self.input_symbols = _with_derivatives("u", self.inputs)
+        self.parameter_symbols = {n: sp.Symbol(f"p_{n}", real=True) for n in self.parameters}
+        self.time_symbols = {n: sp.Symbol(f"t_{n}", real=True) for n in ("tau", "frequency")}
+        spaces = (
+            Names("states", self.state_symbols | self.time_symbols),
+            Names("parameters", self.parameter_symbols),
+            Names("inputs", self.input_symbols),
+        )
+        self.equations = tuple(self._expression("equations", e) for e in equations(*spaces))
+        if len(self.equations) != len(self.states):
+            raise ValueError(
+                f"equations: {len(self.equations)} are not allowed; there must be one a state, {len(self.states)}."
+            )
+        given = dict(outputs(*spaces))
+        self.outputs = checks.identifiers("outputs", given, RESERVED)
+        self.output_expressions = tuple(self._expression("outputs", given[n]) for n in self.outputs)
+        if not self.outputs:
+            raise ValueError("outputs: {} is not allowed; a model needs at least one output.")
+
+        self.angles = tuple(angles)
+        for angle in self.angles:
+            checks.one_of("angles", angle, (*self.states, *self.outputs))
+        self.units = dict(parameters) if isinstance(parameters, Mapping) else {}
+        for channel, unit in (units or {}).items():
+            checks.one_of("units", channel, (*self.states, *self.inputs, *self.outputs))
+            self.units[channel] = unit
+        self.orders = {state: self._order(state) for state in self.states}
+
+    def _expression(self, argument: str, given: Any) -> sp.Expr:
+        if isinstance(given, int | float):
+            given = sp.Float(given)
+        if not isinstance(given, sp.Expr):
+            raise ValueError(f"{argument}: {given!r} is not allowed; write SymPy expressions of s, p and u.")
+        known = {*self.state_symbols.values(), *self.input_symbols.values()}
+        known |= {*self.parameter_symbols.values(), *self.time_symbols.values()}
+        if strangers := sorted(map(str, given.free_symbols - known)):
+            raise ValueError(f"{argument}: unknown symbols {', '.join(strangers)}; use only what s, p and u carry.")
+        return given
+
+    def _order(self, state: str) -> int:
+        appearing = set().union(*(e.free_symbols for e in self.equations))
+        for order, prefix in ((2, "dd"), (1, "d")):
+            if self.state_symbols[prefix + state] in appearing:
+                return order
+        raise ValueError(f"states: {state!r} has no derivative in any equation; eliminate it or add its equation.")
+
+    @property
+    def autonomous(self) -> bool:
+        """True if neither inputs nor the time appear in the equations, so that the period is part of the solution."""
+        forcing = {*self.input_symbols.values(), self.time_symbols["tau"]}
+        return not any(e.free_symbols & forcing for e in self.equations)
+
+    @cached_property
+    def kernels(self) -> Kernels:
+        """The compiled grid functions; loaded from the user's cache folder or compiled at the first use."""
+        return compile_kernels(self)
+
+    def input_derivatives(self) -> dict[str, int]:
+        """Return for every input the highest time derivative of it that the model uses."""
+        used = set().union(*(e.free_symbols for e in (*self.equations, *self.output_expressions)))
+        return {
+            name: max(order for order, prefix in enumerate(("", "d", "dd"))
+                      if order == 0 or self.input_symbols[prefix + name] in used)
+            for name in self.inputs
+        }
+
+    def latex(self) -> str:
+        """Return the equations and outputs as a LaTeX ``aligned`` environment."""
+        written = {symbol: sp.latex(sp.Symbol(name)) for name, symbol in self.parameter_symbols.items()}
+        for names, symbols in ((self.states, self.state_symbols), (self.inputs, self.input_symbols)):
+            for name in names:
+                plain = sp.latex(sp.Symbol(name)) if len(name) <= 2 or "_" in name else rf"\mathrm{{{name}}}"
+                written |= {symbols[name]: plain, symbols["d" + name]: rf"\dot{{{plain}}}"}
+                written[symbols["dd" + name]] = rf"\ddot{{{plain}}}"
+        written |= {self.time_symbols["tau"]: r"\tau", self.time_symbols["frequency"]: "f"}
+        rows = [f"{sp.latex(e, symbol_names=written)} &= 0" for e in self.equations]
+        rows += [
+            rf"\hat{{y}}_{{\mathrm{{{name}}}}} &= {sp.latex(e, symbol_names=written)}"
+            for name, e in zip(self.outputs, self.output_expressions, strict=True)
+        ]
+        return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "kernels"}
+
+    def __repr__(self) -> str:
+        return (
+            f"Model({self.name!r}, states={list(self.states)}, inputs={list(self.inputs)}, "
+            f"parameters={list(self.parameters)}, outputs={list(self.outputs)})"
+        )
+
+
+def _with_derivatives(prefix: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]:
+    return {d + n: sp.Symbol(f"{prefix}_{d}_{n}", real=True) for d in ("", "d", "dd") for n in names}

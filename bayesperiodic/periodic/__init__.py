@@ -1,0 +1,1 @@
+"""From parameters to a periodic equilibrium state."""

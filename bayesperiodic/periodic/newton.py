@@ -1,0 +1,183 @@
+"""Damped Newton iteration with step halving on the discretised equations ([1]_, eq. 3).
+
+A failed solve is a status, not an exception. Everything here is compiled, generic in the model, and takes the model's
+grid function as an argument.
+
+References
+----------
+.. [1] de Kraker, Verbeek & van de Wouw 1997.
+"""
+
+import numpy as np
+from numba import njit
+
+from bayesperiodic.models.compile import GRID_SIGNATURE
+from bayesperiodic.periodic.cyclic import factor, solve
+
+STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit")
+CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT = range(len(STATUSES))
+
+STEP_TOLERANCE = 1e-9
+MAX_ITERATIONS = 50
+MAX_HALVINGS = 20
+ROUNDING = 4.0 * np.finfo(float).eps
+
+MATRIX, VECTOR, INDICES = "float64[:,::1]", "float64[::1]", "int64[:,::1]"
+FUNCTION = f"FunctionType({GRID_SIGNATURE})"
+GRID = f"{VECTOR}, {VECTOR}, {INDICES}, int64[::1]"
+OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+
+
+@njit(f"void({MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, {INDICES}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
+def differentiate(z, drift, first, second, neighbours, tau, frequency, states):
+    """Fill `states` (points, 3·states) with q = z + drift·tau and its time derivatives by the scheme."""
+    points, count = z.shape
+    for i in range(points):
+        for s in range(count):
+            rate, acceleration = 0.0, 0.0
+            for o in range(first.size):
+                value = z[neighbours[i, o], s]
+                rate += first[o] * value
+                acceleration += second[o] * value
+            states[i, s] = z[i, s] + drift[s] * tau[i]
+            states[i, count + s] = (rate + drift[s]) * frequency
+            states[i, 2 * count + s] = acceleration * frequency**2
+
+
+@njit(f"void({MATRIX}, {VECTOR}, {VECTOR}, {INDICES}, int64[::1], float64, int64, {MATRIX})", **OPTIONS)
+def assemble(columns, first, second, neighbours, place, frequency, lower, band):
+    """Fill the folded band of ∂g/∂z from the columns g, ∂g/∂(q, q̇, q̈) of the model's grid function."""
+    points = columns.shape[0]
+    count = 0
+    while count * (1 + 3 * count) < columns.shape[1]:
+        count += 1
+    band[:] = 0.0
+    for o in range(first.size):
+        rate, acceleration = first[o] * frequency, second[o] * frequency**2
+        for i in range(points):
+            shift = (place[neighbours[i, o]] - place[i]) * count + lower
+            static = 1.0 if neighbours[i, o] == i else 0.0
+            for e in range(count):
+                start = count + e * 3 * count
+                for s in range(count):
+                    band[place[i] * count + e, shift + s - e] += (
+                        static * columns[i, start + s]
+                        + rate * columns[i, start + count + s]
+                        + acceleration * columns[i, start + 2 * count + s]
+                    )
+
+
+@njit(f"void({MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR})", **OPTIONS)
+def scales(columns, states, drift, first, second, amplitude, frequency, size, rounding):
+    """Fill, for each equation, the size of its terms and the rounding error that its residual cannot fall below."""
+    points, count = states.shape[0], amplitude.size
+    one, two = 0.0, 0.0
+    for o in range(first.size):
+        one += abs(first[o]) * frequency
+        two += abs(second[o]) * frequency**2
+    for e in range(count):
+        start = count + e * 3 * count
+        size[e], rounding[e] = 0.0, 0.0
+        for i in range(points):
+            terms, error = 0.0, 0.0
+            for s in range(count):
+                stiffness = abs(columns[i, start + s])
+                damping = abs(columns[i, start + count + s])
+                inertia = abs(columns[i, start + 2 * count + s])
+                terms += stiffness * abs(states[i, s]) + damping * abs(states[i, count + s])
+                terms += inertia * abs(states[i, 2 * count + s])
+                error += amplitude[s] * (stiffness + damping * one + inertia * two)
+            size[e] = max(size[e], terms, abs(columns[i, e]))
+            rounding[e] = max(rounding[e], error)
+        rounding[e] *= ROUNDING
+
+
+@njit(f"float64({MATRIX}, {VECTOR})", **OPTIONS)
+def norm(columns, size):
+    """Return the root of the mean square of the residuals, each in units of its equation's size."""
+    total = 0.0
+    for i in range(columns.shape[0]):
+        for e in range(size.size):
+            if size[e] > 0.0:
+                total += (columns[i, e] / size[e]) ** 2
+    return np.sqrt(total / (columns.shape[0] * size.size))
+
+
+@njit(
+    f"Tuple((int64, int64))({FUNCTION}, {GRID}, int64, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, "
+    f"{MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, int64[::1])",
+    **OPTIONS,
+)
+def newton(
+    residual_jacobian, first, second, neighbours, place, half_width, inputs, parameters, tau, frequency, drift,
+    z, states, columns, history, band, pivots,
+):
+    """Solve g(z) = 0 in place and return (status, iterations).
+
+    Parameters
+    ----------
+    residual_jacobian : compiled grid function of the model
+    first, second, neighbours, place, half_width : see `schemes.CyclicGrid`
+    inputs : array (points, 3·inputs)
+    parameters, tau, frequency : as the grid function takes them
+    drift : array (states,)
+        Secular rate of each state, per forcing period (a winding angle).
+    z : array (points, states)
+        The guess, overwritten by the periodic part of the solution.
+    states, columns, band, pivots : work arrays
+    history : array (MAX_ITERATIONS, 3)
+        Filled for each iteration with the scaled residual before it, the scaled full step, and the damping factor.
+    """
+    points, count = z.shape
+    lower = half_width * count + count - 1
+    size, rounding, amplitude = np.empty(count), np.empty(count), np.empty(count)
+    step, trial = np.empty((1, points * count)), np.empty((points, count))
+    differentiate(z, drift, first, second, neighbours, tau, frequency, states)
+    residual_jacobian(states, inputs, parameters, tau, frequency, columns)
+    for iteration in range(MAX_ITERATIONS):
+        for s in range(count):
+            amplitude[s] = np.max(np.abs(z[:, s]))
+        scales(columns, states, drift, first, second, amplitude, frequency, size, rounding)
+        before = norm(columns, size)
+        if not np.isfinite(before):
+            return NOT_FINITE, iteration
+        if norm(columns, rounding) <= 1.0 and np.all(amplitude > 0.0):
+            return CONVERGED, iteration
+        assemble(columns, first, second, neighbours, place, frequency, lower, band)
+        if not factor(band, lower, lower, pivots):
+            return SINGULAR, iteration
+        for i in range(points):
+            for s in range(count):
+                step[0, place[i] * count + s] = -columns[i, s]
+        solve(band, lower, lower, pivots, step)
+        full = 0.0
+        for s in range(count):
+            moved, reached = 0.0, amplitude[s]
+            for i in range(points):
+                change = step[0, place[i] * count + s]
+                moved = max(moved, abs(change))
+                reached = max(reached, abs(z[i, s] + change))
+            if not np.isfinite(moved):
+                return SINGULAR, iteration
+            if moved > 0.0:
+                full = max(full, moved / reached)
+        history[iteration, 0], history[iteration, 1] = before, full
+        damping, accepted = 1.0, False
+        for _ in range(MAX_HALVINGS):
+            for i in range(points):
+                for s in range(count):
+                    trial[i, s] = z[i, s] + damping * step[0, place[i] * count + s]
+            differentiate(trial, drift, first, second, neighbours, tau, frequency, states)
+            residual_jacobian(states, inputs, parameters, tau, frequency, columns)
+            after = norm(columns, size)
+            if after <= (1.0 - 1e-4 * damping) * before or full <= STEP_TOLERANCE:
+                accepted = True
+                break
+            damping *= 0.5
+        history[iteration, 2] = damping
+        if not accepted:
+            return STALLED, iteration + 1
+        z[:] = trial
+        if full <= STEP_TOLERANCE:
+            return CONVERGED, iteration + 1
+    return STALLED, MAX_ITERATIONS
