@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bayesperiodic import checks, fourier
+from bayesperiodic.store import Result
 
 
 @dataclass(frozen=True)
-class Experiment:
+class Experiment(Result):
     """One response period of measured outputs, and of the inputs that caused them.
 
     Parameters

@@ -10,6 +10,7 @@ import numpy as np
 from bayesperiodic import checks
 from bayesperiodic.data import reading
 from bayesperiodic.data.units import convert
+from bayesperiodic.store import Result
 
 if TYPE_CHECKING:
     from bayesperiodic.data.experiment import Experiment
@@ -18,7 +19,7 @@ Units = Mapping[str, float | Sequence[str]]
 
 
 @dataclass(frozen=True)
-class Recording:
+class Recording(Result):
     """Signals measured together over time.
 
     Attributes

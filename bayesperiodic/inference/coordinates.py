@@ -19,6 +19,8 @@ class SamplingDensity:
     ----------
     problem : Problem
         With its anchors set.
+    threads : int
+        Shared by the points of one call.
 
     Attributes
     ----------
@@ -28,8 +30,9 @@ class SamplingDensity:
         Points with a failed periodic solve, by status.
     """
 
-    def __init__(self, problem: Problem):
+    def __init__(self, problem: Problem, threads: int = 1):
         self.problem = problem
+        self.threads = threads
         self.logarithmic = np.array([p.support == (0.0, np.inf) for p in problem.priors.values()])
         self.labels = (*problem.names, *(f"variance[{c}]" for c in problem.free_variances))
         self._free = [problem.channels.index(c) for c in problem.free_variances]
@@ -76,7 +79,7 @@ class SamplingDensity:
         values = values + points[:, : len(self.problem.names)][:, self.logarithmic].sum(axis=1)
         inside = np.isfinite(values)
         if inside.any():
-            moments, status = self.problem.moments(theta[inside])
+            moments, status = self.problem.moments(theta[inside], self.threads)
             for code in status[status != CONVERGED]:
                 self.failures[STATUSES[code]] += 1
             values[inside] += self.problem.likelihood_from_moments(moments, variances[inside])

@@ -12,6 +12,7 @@ from bayesperiodic import checks
 from bayesperiodic.inference.problem import Evaluation, Problem
 from bayesperiodic.inference.whiteness import Whiteness, whiteness
 from bayesperiodic.periodic.solution import PeriodicSolution
+from bayesperiodic.store import Result
 
 MAX_ITERATIONS = 100
 MAX_HALVINGS = 30
@@ -20,7 +21,7 @@ NOISE_SHARE = 0.1
 
 
 @dataclass(frozen=True)
-class MapEstimate:
+class MapEstimate(Result):
     """The maximum of the posterior density and the normal approximation around it.
 
     Attributes

@@ -6,9 +6,11 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from bayesperiodic.store import Result
+
 
 @dataclass(frozen=True)
-class Posterior:
+class Posterior(Result):
     """Draws from the posterior of θ and the channel variances.
 
     Attributes

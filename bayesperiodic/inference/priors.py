@@ -4,6 +4,7 @@ Every prior has `log_prob`, its first derivative `gradient`, its negative second
 `quantile` and `support`. A support of (0, ∞) means that the parameter is sampled in its logarithm.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -12,7 +13,7 @@ from scipy.special import ndtri
 
 from bayesperiodic import checks
 
-LOG_ROOT_TWO_PI = 0.5 * float(np.log(2.0 * np.pi))
+LOG_ROOT_TWO_PI = 0.5 * math.log(2.0 * math.pi)
 
 
 class Prior(Protocol):
@@ -72,7 +73,7 @@ class Normal(_Sampled):
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
         """Return the log-density."""
-        return -0.5 * ((x - self.mean) / self.sd) ** 2 - np.log(self.sd) - LOG_ROOT_TWO_PI
+        return -0.5 * ((x - self.mean) / self.sd) ** 2 - (math.log(self.sd) + LOG_ROOT_TWO_PI)
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         """Return d log p / dx."""
@@ -114,10 +115,11 @@ class LogNormal(_Sampled):
     def log_prob(self, x: np.ndarray) -> np.ndarray:
         """Return the log-density, −inf for x ≤ 0."""
         x = np.asarray(x, dtype=float)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            logarithm = np.log(x)
-            value = -0.5 * (self._score(x)) ** 2 - np.log(self.spread) - LOG_ROOT_TWO_PI - logarithm
-        return np.where(x > 0.0, value, -np.inf)
+        inside = (x > 0.0) & (x < np.inf)
+        logarithm = np.log(np.where(inside, x, 1.0))
+        score = (logarithm - math.log(self.median)) / self.spread
+        value = -0.5 * score**2 - logarithm - (math.log(self.spread) + LOG_ROOT_TWO_PI)
+        return np.where(inside, value, -np.inf)
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         """Return d log p / dx."""

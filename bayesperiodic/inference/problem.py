@@ -209,23 +209,56 @@ class Problem:
             value = -0.5 * terms.sum(axis=-1)
         return np.where(np.isfinite(value), value, -np.inf)
 
-    def moments(self, theta: Mapping[str, float] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def moments(
+        self, theta: Mapping[str, float] | np.ndarray, threads: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return M (…, channels), the diagonal of the moment matrix (eq. 6), and the worst status code, shape (…).
 
-        M is infinite where a periodic solve fails.
+        M is infinite where a periodic solve fails. The result does not depend on the number of threads.
         """
         values = self.vector(theta)
         parameters = self._parameters(values.reshape(-1, len(self.names)))
         moments = np.zeros((len(parameters), len(self.channels)))
         status = np.full(len(parameters), CONVERGED)
         for experiment in self.experiments:
-            y, codes, _ = solve_batch(self.equations[experiment.name], parameters, self.anchors[experiment.name])
+            equations, anchor = self.equations[experiment.name], self.anchors[experiment.name]
+            y, codes, _ = solve_batch(equations, parameters, anchor, threads)
             status = np.maximum(status, codes)
             for c, channel in enumerate(self.channels):
                 if channel in experiment.outputs:
-                    moments[:, c] += _moment(experiment, channel, y[:, :, self.model.outputs.index(channel)])
+                    moments[:, c] += self._moment(experiment, channel, y[:, :, self.model.outputs.index(channel)])
         moments[(status != CONVERGED) | ~np.isfinite(moments).all(axis=1)] = np.inf
         return moments.reshape(*values.shape[:-1], -1), status.reshape(values.shape[:-1])
+
+    def _moment(self, experiment: Experiment, channel: str, predicted: np.ndarray) -> np.ndarray:
+        """Return independent · (mean square of y − ŷ within the kept harmonics), one a row of `predicted`."""
+        count = (experiment.independent or {})[channel]
+        target = self._kept_amplitudes.get((experiment.name, channel))
+        if target is None:
+            return count * np.mean((experiment.outputs[channel] - predicted) ** 2, axis=-1)
+        amplitudes = fourier.coefficients(predicted, target.size - 1) - target
+        power = amplitudes.real**2 + amplitudes.imag**2
+        return count * (power[..., 0] + 0.5 * power[..., 1:].sum(axis=-1))
+
+    @cached_property
+    def _kept_amplitudes(self) -> dict[tuple[str, str], np.ndarray]:
+        return {
+            (e.name, channel): fourier.coefficients(e.outputs[channel], kept)
+            for e in self.experiments for channel, kept in (e.harmonics or {}).items() if channel in e.outputs
+        }
+
+    def outputs(
+        self, theta: Mapping[str, float] | np.ndarray
+    ) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
+        """Return ŷ of many θ (draws, names), by experiment and channel (draws, points), and which solves converged."""
+        parameters = self._parameters(self.vector(theta))
+        converged = np.full(len(parameters), True)
+        result = {}
+        for e in self.experiments:
+            y, codes, _ = solve_batch(self.equations[e.name], parameters, self.anchors[e.name])
+            converged &= codes == CONVERGED
+            result[e.name] = {channel: y[:, :, self.model.outputs.index(channel)] for channel in e.outputs}
+        return result, converged
 
     def solve(self, theta: Mapping[str, float] | np.ndarray) -> dict[str, PeriodicSolution]:
         """Return the periodic solution of every experiment at one θ."""
@@ -303,18 +336,6 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
         for channel in experiment.outputs:
             checks.one_of(f"outputs of experiment {experiment.name!r}", channel, model.outputs)
     return result
-
-
-def _moment(experiment: Experiment, channel: str, predicted: np.ndarray) -> np.ndarray:
-    """Return independent · (mean square of y − ŷ within the kept harmonics), one a row of `predicted`."""
-    measured = experiment.outputs[channel]
-    count = (experiment.independent or {})[channel]
-    if not experiment.harmonics or channel not in experiment.harmonics:
-        return count * np.mean((measured - predicted) ** 2, axis=-1)
-    kept = experiment.harmonics[channel]
-    amplitudes = fourier.coefficients(measured, kept) - fourier.coefficients(predicted, kept)
-    power = amplitudes.real**2 + amplitudes.imag**2
-    return count * (power[..., 0] + 0.5 * power[..., 1:].sum(axis=-1))
 
 
 def _input_noise(experiment: Experiment) -> np.ndarray:

@@ -1,6 +1,8 @@
 """Sampling of θ and the channel variances with emcee."""
 
 import importlib.metadata
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from bayesperiodic.inference.coordinates import SamplingDensity
 from bayesperiodic.inference.map_estimate import MapEstimate
 from bayesperiodic.inference.posterior import Posterior
 from bayesperiodic.inference.problem import Problem
+from bayesperiodic.parallel import available_cores
 
 BLOCK = 250
 OVERDISPERSION = 2.0
@@ -75,17 +78,18 @@ def sample(
     C. J. F. ter Braak, A Markov chain Monte Carlo version of the genetic algorithm differential evolution, Statistics
     and Computing 16 (2006) 239-249.
     """
-    density = SamplingDensity(problem.anchored(fit.theta))
-    walkers = _checked_walkers(walkers, density)
     checks.integer("ensembles", ensembles, 2)
     checks.integer("max_steps", max_steps, BLOCK)
     checks.integer("seed", seed, 0)
-    samplers = _samplers(problem, fit, density, seed, ensembles, walkers, checkpoint)
+    anchored = problem.anchored(fit.theta)
+    densities = [SamplingDensity(anchored, max(1, available_cores() // ensembles)) for _ in range(ensembles)]
+    walkers = _checked_walkers(walkers, densities[0])
+    samplers = _samplers(problem, fit, densities, seed, walkers, checkpoint)
     converged, reason, passes, last = False, f"max_steps = {max_steps} reached", 0, np.inf
     bar = tqdm(total=max_steps, unit="step", desc="sampling", disable=not progress)
     for steps in range(BLOCK, max_steps + 1, BLOCK):
-        for sampler in samplers:
-            _advance(sampler, steps)
+        with ThreadPoolExecutor(available_cores()) as pool:
+            list(pool.map(_advance, samplers, [steps] * ensembles))
         kept = _kept(samplers)
         tau = chains.autocorrelation_time(kept)
         shortfall = _shortfall(kept, tau, last)
@@ -100,7 +104,7 @@ def sample(
     else:
         reason += f" with {', '.join(shortfall) or 'the stop rule passed only once'}"
     bar.close()
-    return _posterior(density, samplers, converged, reason, seed)
+    return _posterior(densities, samplers, converged, reason, seed)
 
 
 def _checked_walkers(walkers: int | None, density: SamplingDensity) -> int:
@@ -116,13 +120,15 @@ def _checked_walkers(walkers: int | None, density: SamplingDensity) -> int:
 
 
 def _samplers(
-    problem: Problem, fit: MapEstimate, density: SamplingDensity, seed: int, ensembles: int, walkers: int,
+    problem: Problem, fit: MapEstimate, densities: list[SamplingDensity], seed: int, walkers: int,
     checkpoint: str | Path | None,
 ) -> list[emcee.EnsembleSampler]:
-    settings = f"seed {seed}, {ensembles} ensembles of {walkers} walkers"
-    stores = backends(checkpoint, problem, settings, ensembles)
+    settings = f"seed {seed}, {len(densities)} ensembles of {walkers} walkers"
+    stores = backends(checkpoint, problem, settings, len(densities))
     samplers = []
-    for sequence, store in zip(np.random.SeedSequence(seed).spawn(ensembles), stores, strict=True):
+    for density, sequence, store in zip(
+        densities, np.random.SeedSequence(seed).spawn(len(densities)), stores, strict=True
+    ):
         moves = [(emcee.moves.DEMove(), 0.6), (emcee.moves.DESnookerMove(), 0.1), (emcee.moves.StretchMove(), 0.3)]
         sampler = emcee.EnsembleSampler(
             walkers, density.dimension, density, moves=moves, vectorize=True, backend=store
@@ -184,9 +190,10 @@ def _shortfall(kept: np.ndarray, tau: np.ndarray, last: Any) -> list[str]:
 
 
 def _posterior(
-    density: SamplingDensity, samplers: list[emcee.EnsembleSampler], converged: bool, reason: str, seed: int
+    densities: list[SamplingDensity], samplers: list[emcee.EnsembleSampler], converged: bool, reason: str, seed: int
 ) -> Posterior:
-    problem, kept = density.problem, _kept(samplers)
+    density, kept = densities[0], _kept(samplers)
+    problem, calls = density.problem, sum(d.calls for d in densities)
     ensembles, steps, walkers, _ = kept.shape
     tau = chains.autocorrelation_time(kept)
     points = kept.transpose(0, 2, 1, 3).reshape(ensembles * walkers, steps, -1)
@@ -196,8 +203,13 @@ def _posterior(
         "chain": np.arange(ensembles * walkers), "draw": np.arange(steps), "channel": list(problem.channels),
         "ensemble": ("chain", np.repeat(np.arange(ensembles), walkers)),
     }
-    variables: dict[str, Any] = {name: (("chain", "draw"), theta[..., i]) for i, name in enumerate(problem.names)}
-    variables["variance"] = (("chain", "draw", "channel"), variances)
+    units = problem.model.units
+    variables: dict[str, Any] = {
+        name: (("chain", "draw"), theta[..., i], {"units": units.get(name, "")})
+        for i, name in enumerate(problem.names)
+    }
+    squared = {f"units of {c}": f"({units[c]})²" for c in problem.channels if c in units}
+    variables["variance"] = (("chain", "draw", "channel"), variances, squared)
     stats = {"lp": (("chain", "draw"), lp.transpose(0, 2, 1).reshape(ensembles * walkers, steps))}
     data = xr.DataTree.from_dict(
         {
@@ -219,8 +231,8 @@ def _posterior(
         ess={label: draws / t for label, t in by_label.items()},
         rhat=dict(zip(density.labels, chains.rhat(kept).tolist(), strict=True)),
         acceptance=_acceptance(samplers),
-        failures={status: count / density.calls for status, count in density.failures.items()},
-        log_posterior_calls=density.calls, seed=seed,
+        failures={s: n / calls for s, n in sum((d.failures for d in densities), Counter()).items()},
+        log_posterior_calls=calls, seed=seed,
     )
 
 

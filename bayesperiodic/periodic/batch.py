@@ -3,15 +3,16 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
 
 from bayesperiodic.parallel import available_cores
 from bayesperiodic.periodic.equations import PeriodicEquations
-from bayesperiodic.periodic.newton import CONVERGED, FUNCTION, GRID, MATRIX, MAX_ITERATIONS, OPTIONS, VECTOR, differentiate, newton
+from bayesperiodic.periodic.newton import CONVERGED, FUNCTION, GRID, MATRIX, MAX_ITERATIONS, OPTIONS, VECTOR, newton
 
-CHUNK = 8
+SMALLEST_PART = 4
 CUBE = "float64[:,:,::1]"
 
 
@@ -37,7 +38,7 @@ class Anchor:
     **OPTIONS,
 )
 def _solve_many(
-    residual_jacobian, outputs, first, second, neighbours, place, half_width, inputs, parameters, tau, frequency, drift,
+    residual_jacobian, outputs, first, second, neighbours, shift, place, half_width, inputs, parameters, tau, frequency, drift,
     anchor_parameters, anchor_z, anchor_sensitivities, y, status, iterations,
 ):
     points, count = anchor_z.shape
@@ -59,17 +60,16 @@ def _solve_many(
             if attempt == 1:
                 z[:] = anchor_z
             status[b], iterations[b] = newton(
-                residual_jacobian, first, second, neighbours, place, half_width, inputs, theta, tau, frequency,
+                residual_jacobian, first, second, neighbours, shift, place, half_width, inputs, theta, tau, frequency,
                 drift, z, states, columns, history, band, pivots,
             )
             if status[b] == CONVERGED:
                 break
-        differentiate(z, drift, first, second, neighbours, tau, frequency, states)
         outputs(states, inputs, theta, tau, frequency, y[b])
 
 
 def solve_batch(
-    equations: PeriodicEquations, parameters: np.ndarray, anchor: Anchor
+    equations: PeriodicEquations, parameters: np.ndarray, anchor: Anchor, threads: int | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Solve for many parameter vectors; the result does not depend on the number of threads.
 
@@ -80,6 +80,8 @@ def solve_batch(
     equations : PeriodicEquations
     parameters : array (solves, parameters)
     anchor : Anchor
+    threads : int, optional
+        By default as many as there are cores.
 
     Returns
     -------
@@ -94,20 +96,20 @@ def solve_batch(
     y = np.empty((solves, grid.points, kernels.channels))
     status, iterations = np.empty(solves, dtype=np.int64), np.empty(solves, dtype=np.int64)
 
-    def part(start: int) -> None:
-        block = slice(start, start + CHUNK)
+    def part(block: slice) -> None:
         _solve_many(
-            kernels.residual_jacobian, kernels.outputs, grid.first, grid.second, grid.neighbours, grid.place,
-            grid.half_width, equations.inputs, parameters[block], grid.tau, equations.frequency, equations.drift,
+            kernels.residual_jacobian, kernels.outputs, grid.first, grid.second, grid.neighbours, grid.shift,
+            grid.place, grid.half_width, equations.inputs, parameters[block], grid.tau, equations.frequency, equations.drift,
             anchor.parameters, anchor.z, anchor.sensitivities, y[block], status[block], iterations[block],
         )
 
-    starts = range(0, solves, CHUNK)
-    if len(starts) == 1 or available_cores() == 1:
-        for start in starts:
-            part(start)
-    else:
-        list(_threads().map(part, starts))
+    parts = max(1, min(threads or available_cores(), solves // SMALLEST_PART))
+    edges = [solves * k // parts for k in range(parts + 1)]
+    first, *others = [slice(*pair) for pair in pairwise(edges)]
+    elsewhere = [_threads().submit(part, block) for block in others]
+    part(first)
+    for future in elsewhere:
+        future.result()
     return y, status, iterations
 
 

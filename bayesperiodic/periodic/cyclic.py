@@ -15,7 +15,7 @@ BAND = "float64[:,::1]"
 
 @njit(f"boolean({BAND}, int64, int64, int64[::1])", cache=True, nogil=True, error_model="numpy")
 def factor(band, lower, upper, pivots):
-    """Factor in place, P·A = L·U; return False where a pivot is zero or not finite.
+    """Factor in place, P·A = L·U, the pivots kept as their inverses; return False for one that is zero or not finite.
 
     Parameters
     ----------
@@ -43,14 +43,15 @@ def factor(band, lower, upper, pivots):
                 here, there = column - j + lower, column - pivot + lower
                 band[j, here], band[pivot, there] = band[pivot, there], band[j, here]
         inverse = 1.0 / band[j, lower]
+        band[j, lower] = inverse
+        width = last - j
         for i in range(j + 1, end + 1):
-            multiplier = band[i, j - i + lower] * inverse
-            band[i, j - i + lower] = multiplier
+            start = j - i + lower
+            multiplier = band[i, start] * inverse
+            band[i, start] = multiplier
             if multiplier != 0.0:
-                shift = lower - i
-                base = lower - j
-                for column in range(j + 1, last + 1):
-                    band[i, column + shift] -= multiplier * band[j, column + base]
+                for k in range(1, width + 1):
+                    band[i, start + k] -= multiplier * band[j, lower + k]
     return True
 
 
@@ -71,4 +72,4 @@ def solve(band, lower, upper, pivots, right):
             value = x[i]
             for j in range(1, min(lower + upper, size - 1 - i) + 1):
                 value -= band[i, j + lower] * x[i + j]
-            x[i] = value / band[i, lower]
+            x[i] = value * band[i, lower]

@@ -93,8 +93,8 @@ class PeriodicEquations:
         lower = self._lower
         history = np.zeros((newton.MAX_ITERATIONS, 3))
         code, iterations = newton.newton(
-            self.model.kernels.residual_jacobian, grid.first, grid.second, grid.neighbours, grid.place,
-            grid.half_width, self.inputs, parameters, grid.tau, self.frequency, self.drift, z,
+            self.model.kernels.residual_jacobian, grid.first, grid.second, grid.neighbours, grid.shift,
+            grid.place, grid.half_width, self.inputs, parameters, grid.tau, self.frequency, self.drift, z,
             np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count))), history,
             np.empty((points * count, 3 * lower + 1)), np.empty(points * count, dtype=np.int64),
         )
@@ -145,7 +145,7 @@ class PeriodicEquations:
         band = np.empty((points * count, 3 * self._lower + 1))
         pivots = np.empty(points * count, dtype=np.int64)
         newton.assemble(
-            columns, grid.first, grid.second, grid.neighbours, grid.place, self.frequency, self._lower, band
+            columns, grid.first, grid.second, grid.shift, grid.place, self.frequency, self._lower, band
         )
         if not factor(band, self._lower, self._lower, pivots):
             return None

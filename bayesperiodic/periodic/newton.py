@@ -24,7 +24,7 @@ ROUNDING = 4.0 * np.finfo(float).eps
 
 MATRIX, VECTOR, INDICES = "float64[:,::1]", "float64[::1]", "int64[:,::1]"
 FUNCTION = f"FunctionType({GRID_SIGNATURE})"
-GRID = f"{VECTOR}, {VECTOR}, {INDICES}, int64[::1]"
+GRID = f"{VECTOR}, {VECTOR}, {INDICES}, {INDICES}, int64[::1]"
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
@@ -45,26 +45,27 @@ def differentiate(z, drift, first, second, neighbours, tau, frequency, states):
 
 
 @njit(f"void({MATRIX}, {VECTOR}, {VECTOR}, {INDICES}, int64[::1], float64, int64, {MATRIX})", **OPTIONS)
-def assemble(columns, first, second, neighbours, place, frequency, lower, band):
+def assemble(columns, first, second, shift, place, frequency, lower, band):
     """Fill the folded band of ∂g/∂z from the columns g, ∂g/∂(q, q̇, q̈) of the model's grid function."""
     points = columns.shape[0]
     count = 0
     while count * (1 + 3 * count) < columns.shape[1]:
         count += 1
-    band[:] = 0.0
-    for o in range(first.size):
-        rate, acceleration = first[o] * frequency, second[o] * frequency**2
-        for i in range(points):
-            shift = (place[neighbours[i, o]] - place[i]) * count + lower
-            static = 1.0 if neighbours[i, o] == i else 0.0
-            for e in range(count):
-                start = count + e * 3 * count
-                for s in range(count):
-                    band[place[i] * count + e, shift + s - e] += (
-                        static * columns[i, start + s]
-                        + rate * columns[i, start + count + s]
-                        + acceleration * columns[i, start + 2 * count + s]
-                    )
+    one, two = first * frequency, second * frequency**2
+    for i in range(points):
+        for e in range(count):
+            row = band[place[i] * count + e]
+            row[:] = 0.0
+            for s in range(count):
+                column = count + e * 3 * count + s
+                stiffness = columns[i, column]
+                damping = columns[i, column + count]
+                inertia = columns[i, column + 2 * count]
+                for o in range(first.size):
+                    value = damping * one[o] + inertia * two[o]
+                    if shift[i, o] == 0:
+                        value += stiffness
+                    row[shift[i, o] * count + lower + s - e] += value
 
 
 @njit(f"void({MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR})", **OPTIONS)
@@ -109,7 +110,7 @@ def norm(columns, size):
     **OPTIONS,
 )
 def newton(
-    residual_jacobian, first, second, neighbours, place, half_width, inputs, parameters, tau, frequency, drift,
+    residual_jacobian, first, second, neighbours, shift, place, half_width, inputs, parameters, tau, frequency, drift,
     z, states, columns, history, band, pivots,
 ):
     """Solve g(z) = 0 in place and return (status, iterations).
@@ -117,7 +118,7 @@ def newton(
     Parameters
     ----------
     residual_jacobian : compiled grid function of the model
-    first, second, neighbours, place, half_width : see `schemes.CyclicGrid`
+    first, second, neighbours, shift, place, half_width : see `schemes.CyclicGrid`
     inputs : array (points, 3·inputs)
     parameters, tau, frequency : as the grid function takes them
     drift : array (states,)
@@ -141,9 +142,9 @@ def newton(
         before = norm(columns, size)
         if not np.isfinite(before):
             return NOT_FINITE, iteration
-        if norm(columns, rounding) <= 1.0 and np.all(amplitude > 0.0):
-            return CONVERGED, iteration
-        assemble(columns, first, second, neighbours, place, frequency, lower, band)
+        if iteration == 0 and norm(columns, rounding) <= 1.0 and np.all(amplitude > 0.0):
+            return CONVERGED, 0
+        assemble(columns, first, second, shift, place, frequency, lower, band)
         if not factor(band, lower, lower, pivots):
             return SINGULAR, iteration
         for i in range(points):
@@ -178,6 +179,6 @@ def newton(
         if not accepted:
             return STALLED, iteration + 1
         z[:] = trial
-        if full <= STEP_TOLERANCE:
+        if full <= STEP_TOLERANCE or (damping == 1.0 and norm(columns, rounding) <= 1.0):
             return CONVERGED, iteration + 1
     return STALLED, MAX_ITERATIONS

@@ -112,6 +112,11 @@ class CyclicGrid:
         return np.where(i < (self.points + 1) // 2, 2 * i, 2 * (self.points - 1 - i) + 1)
 
     @cached_property
+    def shift(self) -> np.ndarray:
+        """Distance in the folded order to the point at each offset, (points, offsets)."""
+        return self.place[self.neighbours] - self.place[:, None]
+
+    @cached_property
     def half_width(self) -> int:
         """Half-width, in points, of the folded band."""
-        return int(np.max(np.abs(self.place[self.neighbours] - self.place[:, None])))
+        return int(np.max(np.abs(self.shift)))

@@ -10,10 +10,11 @@ from bayesperiodic.models.model import Model
 from bayesperiodic.periodic import newton
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved, winding_numbers
 from bayesperiodic.periodic.schemes import Scheme
+from bayesperiodic.store import Result
 
 
 @dataclass(frozen=True)
-class PeriodicSolution:
+class PeriodicSolution(Result):
     """A periodic equilibrium state, stable or unstable, or the account of a failed attempt to find one.
 
     Attributes

@@ -1,0 +1,80 @@
+"""Posterior predictive bands on the measured periods."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri
+
+from bayesperiodic import checks
+from bayesperiodic.inference.posterior import Posterior
+from bayesperiodic.inference.problem import Problem
+from bayesperiodic.store import Result
+
+PROBABILITY = 0.9
+NOISE_LEVELS = 21
+
+
+@dataclass(frozen=True)
+class Prediction(Result):
+    """What the posterior expects of the mean period of each experiment.
+
+    Attributes
+    ----------
+    median, low, high : dict of str to dict of str to array (points,)
+        By experiment and channel: the median and the central 90 % band of the mean period, residual variance included
+        and taken as normal at each point, within the harmonics kept.
+    probability : float
+        Of the band.
+    draws : int
+        Posterior draws used.
+    failed : int
+        Of these, how many had no periodic solution.
+    """
+
+    median: dict[str, dict[str, np.ndarray]]
+    low: dict[str, dict[str, np.ndarray]]
+    high: dict[str, dict[str, np.ndarray]]
+    probability: float
+    draws: int
+    failed: int
+
+
+def predict(problem: Problem, posterior: Posterior, *, draws: int = 200) -> Prediction:
+    """Predict the mean period of every experiment from equally spaced posterior draws.
+
+    Parameters
+    ----------
+    problem : Problem
+    posterior : Posterior
+    draws : int
+        At least 20.
+
+    Raises
+    ------
+    RuntimeError
+        If no draw has a periodic solution.
+    """
+    count = checks.integer("draws", draws, 20)
+    columns = {name: posterior.draws(name) for name in posterior.names}
+    chosen = np.linspace(0, next(iter(columns.values())).size - 1, count).astype(int)
+    theta = {name: float(np.median(columns[name])) for name in problem.names}
+    anchored = problem.anchored(theta)
+    points = np.stack([columns[name][chosen] for name in problem.names], axis=-1)
+    outputs, converged = anchored.outputs(points)
+    if not converged.any():
+        raise RuntimeError("posterior: none of its draws has a periodic solution, so nothing can be predicted.")
+    quantiles = [0.5, 0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY]
+    scores = ndtri((np.arange(NOISE_LEVELS) + 0.5) / NOISE_LEVELS)
+    bands: list[dict[str, dict[str, np.ndarray]]] = [{}, {}, {}]
+    for e in problem.experiments:
+        for channel in e.outputs:
+            label = f"variance[{channel}]"
+            variance = columns[label][chosen] if label in columns else np.full(count, problem.fixed_variances[channel])
+            expected = e.project(channel, outputs[e.name][channel])
+            noise = np.sqrt(variance)[:, None, None] * scores[:, None]
+            values = (expected[:, None] + noise)[converged].reshape(-1, expected.shape[1])
+            for band, q in zip(bands, quantiles, strict=True):
+                level = np.median(expected[converged], axis=0) if q == 0.5 else np.quantile(values, q, axis=0)
+                band.setdefault(e.name, {})[channel] = level
+    median, low, high = bands
+    return Prediction(median, low, high, PROBABILITY, count, int(count - converged.sum()))

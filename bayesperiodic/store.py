@@ -1,0 +1,135 @@
+"""Results as files: HDF5, written whole or not at all, read back without the model and without evaluating anything."""
+
+import json
+import os
+import tempfile
+from dataclasses import fields, is_dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+HEADER = "bayesperiodic_result"
+ARRAYS = "arrays"
+
+
+class Result:
+    """A frozen dataclass of plain data that saves itself; `load` reads it back."""
+
+    def save(self, path: str | Path) -> None:
+        """Write the result to an HDF5 file, replacing an older one only when the new one is complete.
+
+        A result that holds draws is a netCDF file whose groups xarray and ArviZ open directly.
+        """
+        import h5py
+
+        target = Path(path)
+        arrays: dict[str, Any] = {}
+        trees: list[Any] = []
+        header = json.dumps(_encode(self, arrays, trees))
+        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+        os.close(handle)
+        try:
+            if trees:
+                trees[0].to_netcdf(name, engine="h5netcdf")
+            with h5py.File(name, "a" if trees else "w") as file:
+                file.attrs[HEADER] = header
+                for key, values in arrays.items():
+                    file.create_dataset(f"{ARRAYS}/{key}", data=values)
+            os.replace(name, target)
+        finally:
+            Path(name).unlink(missing_ok=True)
+
+
+def load(path: str | Path) -> Any:
+    """Return a saved result.
+
+    Parameters
+    ----------
+    path : path
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the file is not one that a result was saved to.
+    """
+    import h5py
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"path: {str(path)!r} is not allowed; there is no such file.")
+    try:
+        with h5py.File(path, "r") as file:
+            header = json.loads(file.attrs[HEADER])
+            stored = file.get(ARRAYS, {})
+            arrays = {key: stored[key][()] for key in stored}
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"path: {str(path)!r} is not a saved result ({error}).") from None
+    return _decode(header, arrays, path)
+
+
+def _encode(value: Any, arrays: dict[str, Any], trees: list[Any]) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        kind = type(value)
+        content = {f.name: _encode(getattr(value, f.name), arrays, trees) for f in fields(value)}
+        return {"result": f"{kind.__module__}:{kind.__qualname__}", "fields": content}
+    if isinstance(value, np.ndarray):
+        key = str(len(arrays))
+        arrays[key] = value
+        return {"array": key}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, dict):
+        return {"mapping": [[key, _encode(item, arrays, trees)] for key, item in value.items()]}
+    if isinstance(value, list | tuple):
+        return {"sequence": [_encode(item, arrays, trees) for item in value]}
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if type(value).__name__ == "DataFrame":
+        columns = {str(name): value[name].tolist() for name in value.columns}
+        return {"table": columns, "index": [str(label) for label in value.index]}
+    if type(value).__name__ == "DataTree":
+        trees.append(value)
+        return {"tree": True}
+    raise TypeError(f"A {type(value).__name__} cannot be saved.")
+
+
+def _decode(value: Any, arrays: dict[str, Any], path: str | Path) -> Any:
+    if not isinstance(value, dict):
+        return value
+    if "array" in value:
+        return arrays[value["array"]]
+    if "mapping" in value:
+        return {key: _decode(item, arrays, path) for key, item in value["mapping"]}
+    if "sequence" in value:
+        return tuple(_decode(item, arrays, path) for item in value["sequence"])
+    if "table" in value:
+        import pandas as pd
+
+        return pd.DataFrame(value["table"], index=value["index"])
+    if "tree" in value:
+        return _read_tree(path)
+    return _result_class(value["result"])(
+        **{name: _decode(item, arrays, path) for name, item in value["fields"].items()}
+    )
+
+
+def _read_tree(path: str | Path) -> Any:
+    import xarray as xr
+
+    with xr.open_datatree(path, engine="h5netcdf") as tree:
+        loaded = tree.load()
+    groups = {name: group.to_dataset() for name, group in loaded.children.items() if name != ARRAYS}
+    result = xr.DataTree.from_dict(groups)
+    result.attrs = {key: value for key, value in loaded.attrs.items() if key != HEADER}
+    return result
+
+
+def _result_class(name: str) -> Any:
+    module, _, qualname = name.partition(":")
+    found = getattr(import_module(module), qualname, None) if module.startswith("bayesperiodic.") else None
+    if not is_dataclass(found):
+        raise ValueError(f"path: a saved {name!r} is not known to this version.")
+    return found

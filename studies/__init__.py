@@ -1,0 +1,1 @@
+"""Runnable studies: ``python -m studies`` lists them, ``python -m studies NAME`` runs one."""

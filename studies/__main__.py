@@ -1,0 +1,46 @@
+"""Command line of the studies."""
+
+import argparse
+import importlib
+import pkgutil
+import sys
+from pathlib import Path
+
+import matplotlib
+
+import studies
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """List the studies or run one; return the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m studies", description="Without a name: list the studies.")
+    parser.add_argument("name", nargs="?", help="the study to run")
+    parser.add_argument("--data", type=Path, help="the measured file, instead of the places searched by default")
+    parser.add_argument("--out", type=Path, help="folder for results.json and figures (default figures/NAME)")
+    parser.add_argument("--seed", type=int, default=1, help="of everything random (default 1)")
+    parser.add_argument("--quick", action="store_true", help="short chains, into figures/quick/NAME; not for quoting")
+    options = parser.parse_args(arguments)
+    known = {m.name: m for m in pkgutil.iter_modules(studies.__path__) if m.name not in ("__main__", "common")}
+    if options.name is None:
+        for name in sorted(known):
+            print(f"{name:12s} {_first_line(name)}")
+        return 0
+    if options.name not in known:
+        print(f"error: name: {options.name!r} is not a study; known: {', '.join(sorted(known))}.", file=sys.stderr)
+        return 2
+    matplotlib.use("Agg")
+    options.out = options.out or Path("figures", *(["quick"] if options.quick else []), options.name)
+    try:
+        importlib.import_module(f"studies.{options.name}").run(options)
+    except (ValueError, RuntimeError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _first_line(name: str) -> str:
+    return (importlib.import_module(f"studies.{name}").__doc__ or "").splitlines()[0]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,214 @@
+"""A measured magneto-rheological damper: Dahl friction from displacement in, force out.
+
+The record is 30 s at 100 Hz of a near-sinusoidal displacement, coil at 0 V (A. N. Vargas, doi 10.5281/zenodo.4445334;
+github.com/labcontrol-data/mr-damper, mr_damper_4.1.csv). Model: F = Kx·v + K·x + F0 + Kw·w, w' = ρ (v − |v|·w),
+in SI units; the source has mm, s and N.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+import bayesperiodic as bp
+from studies import common
+
+FILE = "mr_damper/mr_damper_4.1.csv"
+ADDRESS = "github.com/labcontrol-data/mr-damper (commit e42439f0), mr_damper_4.1.csv"
+SHA256 = "86fde635ae4dc78174cdbd3bafafb415c8a05a89c6862004ebc4e7ff970a9d64"
+PUBLISHED = {"Kx": 768.0, "K": 0.0, "F0": 0.0, "Kw": 57.4, "rho": 27_500.0}
+PRIORS = {
+    "Kx": bp.LogNormal(1e3, 1.0),
+    "K": bp.Normal(0.0, 5e3),
+    "F0": bp.Normal(0.0, 50.0),
+    "Kw": bp.LogNormal(50.0, 1.0),
+    "rho": bp.LogNormal(2e4, 1.5),
+}
+RULE = (
+    "the displacement keeps all harmonics up to the last one that stands out of the cycle-to-cycle scatter "
+    "(F-test, false-alarm rate 1 % over all harmonics)"
+)
+SYNTHETIC_SHAPE = {1: 12.6e-3, 2: 0.05e-3, 3: 0.4e-3j, 9: 0.012e-3}
+SYNTHETIC_FREQUENCY = 0.8397
+SYNTHETIC_NOISE = {"displacement": 5e-5, "force": 4.0}
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the study."""
+    watch = common.Stopwatch()
+    with watch.part("read", "reading the recording and folding it into its mean period"):
+        recording, data = read_recording(options.data, options.seed)
+        experiment = recording.fold()
+    what = "SYNTHETIC recording" if data["synthetic"] else "measured recording"
+    harmonics = experiment.harmonics
+    print(
+        f"  {what} {data['path']}: {experiment.frequency:.6f} ± {experiment.frequency_se:.1g} Hz, "
+        f"{experiment.cycles} steady cycles, periodicity {experiment.periodicity:.4f}\n"
+        f"  kept: {harmonics['displacement']} harmonics of the displacement, {harmonics['force']} of the force, "
+        f"{experiment.independent['force']} independent values"
+    )
+    if data["synthetic"]:
+        print(f"  the measured file was not found; it is at {ADDRESS}, sha256 {SHA256}")
+    with watch.part("compile", "compiling the model, or loading it from the cache"):
+        problem = bp.Problem(bp.models.dahl, [experiment], priors=PRIORS)
+        solution = bp.solve_periodic(
+            bp.models.dahl, PUBLISHED, experiment.inputs, frequency=experiment.frequency, samples=experiment.samples
+        )
+    print(f"  periodic solution at the published parameters: {solution.status} in {solution.iterations} iterations")
+    with watch.part("map", "finding the MAP point and the Laplace covariance"):
+        fit = bp.map_estimate(problem)
+    with watch.part("harmonics", "repeating it with other numbers of displacement harmonics"):
+        choices = [fit_with(recording, count) for count in other_choices(harmonics["displacement"])]
+    with watch.part("sample", "sampling the posterior with emcee"):
+        posterior = bp.sample(problem, fit, seed=options.seed, max_steps=500 if options.quick else 20_000)
+    print(f"  {posterior.reason}")
+    with watch.part("figures", "drawing"):
+        comparison = bp.compare(problem, fit, posterior)
+        prediction = bp.predict(problem, posterior)
+        figures = {
+            "fit": bp.plot.fit(problem, fit, prediction),
+            "loops": bp.plot.loops(problem, fit),
+            "corner": bp.plot.corner(posterior, laplace=fit),
+            "traces": bp.plot.traces(posterior),
+        }
+        paths = common.save_figures(options.out, figures)
+
+    choices = sorted([summary(experiment, fit), *choices], key=lambda choice: choice["harmonics"])
+    print("\n" + tables(data, experiment, fit, posterior, comparison, choices) + "\n")
+    results = collect(data, experiment, fit, posterior, comparison, choices, options.seed)
+    path = common.write_results(options.out, results | {"seconds": watch.total(), "versions": common.versions()})
+    print(f"figures{' (synthetic data)' if data['synthetic'] else ''}: {', '.join(map(str, paths))}\nresults: {path}")
+
+
+def read_recording(given: Path | None, seed: int) -> tuple[bp.Recording, dict[str, Any]]:
+    """Return the measured recording, or a generated one of the same kind, and what to report about it."""
+    found = common.find_data(given, FILE)
+    if found is None:
+        return generate(seed), {"path": "generated", "sha256": None, "synthetic": True}
+    path, name = found
+    recording = bp.Recording.from_csv(
+        path, time="time_s", inputs={"displacement": "displacement_mm"}, outputs={"force": "force_N"},
+        units={"displacement": ("mm", "m")}, name="magneto-rheological damper, 0 V",
+    )
+    return recording, {"path": name, "sha256": common.sha256(path), "synthetic": False}
+
+
+def generate(seed: int) -> bp.Recording:
+    """Return a synthetic recording of the same kind: the published parameters, integrated in time, with noise."""
+    amplitudes = np.zeros(max(SYNTHETIC_SHAPE) + 1, dtype=complex)
+    for harmonic, amplitude in SYNTHETIC_SHAPE.items():
+        amplitudes[harmonic] = amplitude
+    phase = 2j * np.pi * np.arange(64)[:, None] / 64 * np.arange(amplitudes.size)
+    return bp.simulate(
+        bp.models.dahl, PUBLISHED, {"displacement": (np.exp(phase) @ amplitudes).real}, frequency=SYNTHETIC_FREQUENCY,
+        duration=30.0, sampling_rate=100.0, noise=SYNTHETIC_NOISE, seed=seed,
+    )
+
+
+def other_choices(default: int) -> list[int]:
+    """Return two other numbers of kept input harmonics, well below and well above the default."""
+    return [max(1, round(default / 4)), min(58, 2 * default)]
+
+
+def fit_with(recording: bp.Recording, count: int) -> dict[str, Any]:
+    """Return the estimate with another number of displacement harmonics."""
+    experiment = recording.fold(harmonics={"displacement": count})
+    return summary(experiment, bp.map_estimate(bp.Problem(bp.models.dahl, [experiment], priors=PRIORS)))
+
+
+def summary(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, Any]:
+    """Return what one choice of harmonics leads to."""
+    return {
+        "harmonics": experiment.harmonics["displacement"], "map": fit.theta, "laplace_sd": fit.sd,
+        "rms": fit.rms["force"], "fvu": fit.fvu["force"], "input_noise": fit.input_noise["force"],
+    }
+
+
+def collect(
+    data: dict[str, Any], experiment: bp.Experiment, fit: bp.MapEstimate, posterior: bp.Posterior,
+    comparison: bp.Comparison, choices: list[dict[str, Any]], seed: int,
+) -> dict[str, Any]:
+    """Return the content of results.json, times and versions excepted."""
+    table = posterior.summary()
+    return {
+        "data": data,
+        "seed": seed,
+        "units": {name: bp.models.dahl.units[name] for name in fit.theta} | {"variance[force]": "N²"},
+        "frequency": {"value": experiment.frequency, "se": experiment.frequency_se},
+        "cycles": experiment.cycles,
+        "periodicity": experiment.periodicity,
+        "independent_values": experiment.independent["force"],
+        "harmonics": dict(experiment.harmonics),
+        "whiteness": {"p": fit.whiteness["force"].p, "lag1": fit.whiteness["force"].lag1},
+        "map": fit.theta,
+        "laplace_sd": fit.sd,
+        "posterior": {
+            name: {key: float(row[key]) for key in ("mean", "sd", "q05", "q50", "q95")} for name, row in table.iterrows()
+        },
+        "comparison": comparison.table["verdict"].to_dict(),
+        "rms": fit.rms["force"],
+        "fvu": fit.fvu["force"],
+        "input_noise": fit.input_noise["force"],
+        "input_harmonics": {"rule": RULE, "choices": choices},
+        "converged": posterior.converged,
+        "reason": posterior.reason,
+        "tau_max": max(posterior.tau.values()),
+        "ess_min": min(posterior.ess.values()),
+        "rhat_max": max(posterior.rhat.values()),
+        "acceptance": posterior.acceptance,
+        "failures": posterior.failures,
+        "log_posterior_calls": posterior.log_posterior_calls,
+    }
+
+
+def tables(
+    data: dict[str, Any], experiment: bp.Experiment, fit: bp.MapEstimate, posterior: bp.Posterior,
+    comparison: bp.Comparison, choices: list[dict[str, Any]],
+) -> str:
+    """Return the tables that the study prints, with what must be said about them."""
+    kind = "SYNTHETIC data" if data["synthetic"] else "measured data"
+    table = comparison.table
+    rows = pd.DataFrame(
+        {
+            "unit": [bp.models.dahl.units[name] for name in table.index],
+            "MAP": table["map"], "Laplace sd": table["laplace_sd"], "mean": table["mean"], "sd": table["sd"],
+            "5 %": table["q05"], "95 %": table["q95"], "skewness": table["skewness"],
+            "published": [PUBLISHED[name] or np.nan for name in table.index], "Laplace is": table["verdict"],
+        },
+        index=table.index,
+    )
+    lines = [
+        f"Dahl model of the damper, {kind}, SI units (the source has mm): Laplace against MCMC",
+        rows.to_string(float_format="{:.4g}".format, na_rep="-"),
+        f"variance of the mean period (prior 1/v): {fit.variances['force']:.3g} N² (eq. 7), posterior mean "
+        f"{posterior.draws('variance[force]').mean():.3g} N²",
+        f"residual {fit.rms['force']:.2f} N rms, {fit.fvu['force']:.2%} of the force's variance",
+    ]
+    white = fit.whiteness["force"]
+    if white.p < 0.01:
+        lines.append(
+            f"The residual is not white (p = {white.p:.1g}, autocorrelation {white.lag1:.2f} from one independent "
+            "value to the next):\nit is model error, not noise, and neighbouring values repeat it. All standard "
+            "deviations above are therefore too small."
+        )
+    lines += ["", f"The same with other numbers of displacement harmonics; the rule: {RULE}."]
+    lines.append(
+        pd.DataFrame(
+            [
+                {"harmonics": c["harmonics"], "default": "*" if c["harmonics"] == experiment.harmonics["displacement"] else ""}
+                | {name: f"{c['map'][name]:.4g} ± {c['laplace_sd'][name]:.2g}" for name in c["map"]}
+                | {"fvu": f"{c['fvu']:.3%}"}
+                for c in choices
+            ]
+        ).to_string(index=False)
+    )
+    rho = [c["map"]["rho"] for c in choices]
+    widest = max(c["laplace_sd"]["rho"] for c in choices)
+    lines.append(
+        f"rho runs from {min(rho):.3g} to {max(rho):.3g} 1/m over these choices, {np.ptp(rho) / widest:.1f} of its "
+        "largest standard deviation: it depends on\nhow sharply the measured motion reverses, and no posterior width "
+        "shows that."
+    )
+    return "\n".join(lines)
