@@ -8,6 +8,7 @@ from scipy.linalg import solve_toeplitz
 from bayesperiodic import fourier
 
 MOST_HARMONICS = 600
+CLEAR = 10.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ def refine_frequency(
 
     Gauss-Newton on the fundamental with the amplitudes projected out; every channel is weighted by its residual
     variance. The standard error adds the scores of one cycle before squaring, so that correlation within a cycle is
-    accounted for; it is never below that for independent samples.
+    accounted for; it is never below that for independent samples. Only harmonics whose squared amplitude is ten times
+    its noise, and the largest, take part in the slope, where noise would pass for information.
     """
     for _ in range(iterations):
         fit, slope, weights = _linearised(time, channels, frequency, harmonics)
@@ -89,7 +91,11 @@ def _linearised(
     time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int
 ) -> tuple[HarmonicFit, np.ndarray, np.ndarray]:
     fit = fit_harmonics(time, channels, frequency, harmonics)
-    rate = fourier.derivative(fit.amplitudes, 1.0)
+    noise = 4.0 * fit.variances[:, None] / time.size
+    power = np.abs(fit.amplitudes) ** 2
+    largest = power[:, 1:].max(axis=1, keepdims=True)
+    clear = np.where((power > CLEAR * noise) | (power == largest), fit.amplitudes, 0.0)
+    rate = fourier.derivative(clear, 1.0)
     slope = np.stack([fourier.at_times(c, frequency * time) for c in rate]) * (time - time.mean())
     slope = fit_harmonics(time, slope, frequency, harmonics).residuals
     floor = 1e-24 * np.var(channels, axis=1)
@@ -111,7 +117,7 @@ def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
         signal = (signal - signal.mean()) / signal.std()
         power = np.abs(np.fft.rfft(signal, 2 * samples)) ** 2
         correlation += np.fft.irfft(power)[:samples] / np.arange(samples, 0, -1)
-    correlation = correlation[: samples // 2]
+    correlation = correlation[: samples // 3 + 2]
     negative = np.flatnonzero(correlation < 0.5 * correlation[0])
     if negative.size == 0:
         return None

@@ -6,7 +6,7 @@ import numpy as np
 
 from bayesperiodic.inference.map_estimate import MapEstimate
 from bayesperiodic.inference.problem import Problem
-from bayesperiodic.periodic.newton import CONVERGED, STATUSES
+from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 
 
 class SamplingDensity:

@@ -13,7 +13,7 @@ from bayesperiodic.inference.priors import Prior
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.batch import Anchor, solve_batch
 from bayesperiodic.periodic.equations import PeriodicEquations
-from bayesperiodic.periodic.newton import CONVERGED
+from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import PeriodicSolution, describe, periodic_part
 

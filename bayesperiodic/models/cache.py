@@ -16,6 +16,7 @@ import sys
 import tempfile
 import types
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,6 @@ import llvmlite.binding
 import numba
 import platformdirs
 
-FUNCTIONS = ("residual_jacobian", "outputs", "derivatives")
 SOURCE, MANIFEST = "kernels.py", "manifest.json"
 
 
@@ -36,15 +36,18 @@ def cache_folder() -> Path:
     return Path(os.environ.get("BAYESPERIODIC_CACHE") or platformdirs.user_cache_dir("bayesperiodic")) / "kernels"
 
 
-def load(body: str) -> dict[str, Any]:
-    """Return the functions of a generated source, from the cache or freshly compiled (and then cached)."""
+def load(body: str, names: Sequence[str]) -> dict[str, Any]:
+    """Return named functions of a source text, from the cache or freshly compiled (and then cached).
+
+    The text's functions are compiled with the signatures that it states and the Numba option ``cache=CACHE``.
+    """
     source = _header() + body
     try:
         entry = _private_folder() / hashlib.sha256(source.encode()).hexdigest()[:32]
         if not entry.is_dir():
-            return _build(source, entry)
+            return _build(source, names, entry)
         _check(entry, source)
-        return _execute(source, entry / SOURCE, cache=True)
+        return _execute(source, names, entry / SOURCE, cache=True)
     except (CacheProblem, OSError) as problem:
         reason = str(problem)
     except Exception as problem:  # whatever a damaged compiled file provokes in the loader
@@ -54,14 +57,14 @@ def load(body: str) -> dict[str, Any]:
         "will repeat. Delete the folder or set BAYESPERIODIC_CACHE to one that you own.",
         RuntimeWarning, stacklevel=2,
     )
-    return _execute(source, Path("<kernels compiled in memory>"), cache=False)
+    return _execute(source, names, Path("<kernels compiled in memory>"), cache=False)
 
 
 def _header() -> str:
     python = ".".join(map(str, sys.version_info[:3]))
     machine = f"{platform.machine()} {llvmlite.binding.get_host_cpu_name()}"
     versions = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, python {python}, {machine}"
-    return f"# generated; {versions}\nimport math\n\nfrom numba import njit\n\n\n"
+    return f"# {versions}\n"
 
 
 def _private_folder() -> Path:
@@ -74,11 +77,11 @@ def _private_folder() -> Path:
     return folder
 
 
-def _build(source: str, entry: Path) -> dict[str, Any]:
+def _build(source: str, names: Sequence[str], entry: Path) -> dict[str, Any]:
     workshop = Path(tempfile.mkdtemp(prefix="building-", dir=entry.parent))
     try:
         (workshop / SOURCE).write_text(source, encoding="utf-8")
-        functions = _execute(source, workshop / SOURCE, cache=True)
+        functions = _execute(source, names, workshop / SOURCE, cache=True)
         (workshop / MANIFEST).write_text(json.dumps(_digests(workshop)), encoding="utf-8")
         try:
             workshop.rename(entry)
@@ -102,14 +105,12 @@ def _check(entry: Path, source: str) -> None:
 
 def _digests(entry: Path) -> dict[str, str]:
     files = sorted(p for p in (entry / "__pycache__").glob("*") if p.suffix in (".nbi", ".nbc"))
-    if len(files) < 2 * len(FUNCTIONS):
-        raise CacheProblem(f"the entry {entry.name} lacks compiled files")
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def _execute(source: str, path: Path, cache: bool) -> dict[str, Any]:
+def _execute(source: str, names: Sequence[str], path: Path, cache: bool) -> dict[str, Any]:
     module = types.ModuleType(f"bayesperiodic_kernels_{hashlib.sha256(source.encode()).hexdigest()[:32]}")
     module.__dict__.update(__file__=str(path), CACHE=cache)
     sys.modules[module.__name__] = module
     exec(compile(source, str(path), "exec"), module.__dict__)
-    return {name: getattr(module, name) for name in FUNCTIONS}
+    return {name: getattr(module, name) for name in names}

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from bayesperiodic.models.model import Model
 
 GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
+FUNCTIONS = ("residual_jacobian", "outputs", "derivatives")
+PREAMBLE = "import math\n\nfrom numba import njit\n\n\n"
 
 
 class GridFunction(types.WrapperAddressProtocol):
@@ -105,7 +107,7 @@ class Kernels:
 
 def compile_kernels(model: Model) -> Kernels:
     """Return the compiled functions of a model, from the disk cache where they are there and undamaged."""
-    functions = load(kernel_source(model))
+    functions = load(kernel_source(model), FUNCTIONS)
     return Kernels(
         **{name: GridFunction(compiled) for name, compiled in functions.items()},
         states=len(model.states), inputs=len(model.inputs),
@@ -134,7 +136,7 @@ def kernel_source(model: Model) -> str:
         model.time_symbols["tau"]: "tau[i]",
         model.time_symbols["frequency"]: "frequency",
     }
-    return "\n\n".join(_function(name, expressions, arguments) for name, expressions in needs.items())
+    return PREAMBLE + "\n\n".join(_function(name, expressions, arguments) for name, expressions in needs.items())
 
 
 def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str]) -> str:

@@ -6,14 +6,12 @@ from functools import cache
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 
 from bayesperiodic.parallel import available_cores
+from bayesperiodic.periodic.compiled import solve_many
 from bayesperiodic.periodic.equations import PeriodicEquations
-from bayesperiodic.periodic.newton import CONVERGED, FUNCTION, GRID, MATRIX, MAX_ITERATIONS, OPTIONS, VECTOR, newton
 
 SMALLEST_PART = 4
-CUBE = "float64[:,:,::1]"
 
 
 @dataclass(frozen=True)
@@ -30,42 +28,6 @@ class Anchor:
     parameters: np.ndarray
     z: np.ndarray
     sensitivities: np.ndarray
-
-
-@njit(
-    f"void({FUNCTION}, {FUNCTION}, {GRID}, int64, {MATRIX}, {MATRIX}, {VECTOR}, float64, {VECTOR}, {VECTOR}, {MATRIX}, "
-    f"{CUBE}, {CUBE}, int64[::1], int64[::1])",
-    **OPTIONS,
-)
-def _solve_many(
-    residual_jacobian, outputs, first, second, neighbours, shift, place, half_width, inputs, parameters, tau, frequency, drift,
-    anchor_parameters, anchor_z, anchor_sensitivities, y, status, iterations,
-):
-    points, count = anchor_z.shape
-    lower = half_width * count + count - 1
-    states, z = np.empty((points, 3 * count)), np.empty((points, count))
-    columns = np.empty((points, count * (1 + 3 * count)))
-    history = np.empty((MAX_ITERATIONS, 3))
-    band, pivots = np.empty((points * count, 3 * lower + 1)), np.empty(points * count, dtype=np.int64)
-    for b in range(parameters.shape[0]):
-        theta = parameters[b]
-        z[:] = anchor_z
-        for p in range(theta.size):
-            change = theta[p] - anchor_parameters[p]
-            if change != 0.0:
-                for i in range(points):
-                    for s in range(count):
-                        z[i, s] += anchor_sensitivities[p, i, s] * change
-        for attempt in range(2):
-            if attempt == 1:
-                z[:] = anchor_z
-            status[b], iterations[b] = newton(
-                residual_jacobian, first, second, neighbours, shift, place, half_width, inputs, theta, tau, frequency,
-                drift, z, states, columns, history, band, pivots,
-            )
-            if status[b] == CONVERGED:
-                break
-        outputs(states, inputs, theta, tau, frequency, y[b])
 
 
 def solve_batch(
@@ -87,7 +49,7 @@ def solve_batch(
     -------
     outputs : array (solves, points, channels)
     status : int array (solves,)
-        Index into `newton.STATUSES`.
+        Index into `compiled.STATUSES`.
     iterations : int array (solves,)
     """
     grid, kernels = equations.grid, equations.model.kernels
@@ -97,7 +59,7 @@ def solve_batch(
     status, iterations = np.empty(solves, dtype=np.int64), np.empty(solves, dtype=np.int64)
 
     def part(block: slice) -> None:
-        _solve_many(
+        solve_many(
             kernels.residual_jacobian, kernels.outputs, grid.first, grid.second, grid.neighbours, grid.shift,
             grid.place, grid.half_width, equations.inputs, parameters[block], grid.tau, equations.frequency, equations.drift,
             anchor.parameters, anchor.z, anchor.sensitivities, y[block], status[block], iterations[block],

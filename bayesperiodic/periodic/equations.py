@@ -9,8 +9,7 @@ import numpy as np
 from bayesperiodic import checks, fourier
 from bayesperiodic.models.compile import as_columns
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic import newton
-from bayesperiodic.periodic.cyclic import factor, solve
+from bayesperiodic.periodic import compiled
 from bayesperiodic.periodic.schemes import CyclicGrid, Scheme, find_scheme
 
 
@@ -76,7 +75,7 @@ class PeriodicEquations:
         inputs[0, len(self.model.inputs) :] = 0.0
         states, best = np.zeros((1, 3 * count)), np.inf
         solution = states[0, :count].copy()
-        for _ in range(newton.MAX_ITERATIONS):
+        for _ in range(compiled.MAX_ITERATIONS):
             row = kernels.evaluate("residual_jacobian", states, inputs, parameters, tau, self.frequency)[0]
             residual, stiffness = row[:count], row[count:].reshape(count, 3, count)[:, 0]
             size = float(np.linalg.norm(residual))
@@ -91,8 +90,8 @@ class PeriodicEquations:
         grid, z = self.grid, np.array(guess, dtype=float, order="C")
         points, count = z.shape
         lower = self._lower
-        history = np.zeros((newton.MAX_ITERATIONS, 3))
-        code, iterations = newton.newton(
+        history = np.zeros((compiled.MAX_ITERATIONS, 3))
+        code, iterations = compiled.newton(
             self.model.kernels.residual_jacobian, grid.first, grid.second, grid.neighbours, grid.shift,
             grid.place, grid.half_width, self.inputs, parameters, grid.tau, self.frequency, self.drift, z,
             np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count))), history,
@@ -104,7 +103,7 @@ class PeriodicEquations:
         """Return q, q̇, q̈ side by side, (points, 3·states), from the periodic part."""
         grid, out = self.grid, np.empty((z.shape[0], 3 * z.shape[1]))
         rate = self.drift if drift is None else drift
-        newton.differentiate(z, rate, grid.first, grid.second, grid.neighbours, grid.tau, self.frequency, out)
+        compiled.differentiate(z, rate, grid.first, grid.second, grid.neighbours, grid.tau, self.frequency, out)
         return out
 
     def outputs(self, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -116,12 +115,13 @@ class PeriodicEquations:
         columns, states = self._evaluate("residual_jacobian", self.states(z), parameters), self.states(z)
         count = z.shape[1]
         size, rounding = np.empty(count), np.empty(count)
-        newton.scales(
+        compiled.scales(
             columns, states, self.drift, self.grid.first, self.grid.second, np.abs(z).max(axis=0), self.frequency,
             size, rounding,
         )
         worst = np.abs(columns[:, :count]).max(axis=0)
-        return float(np.max(np.divide(worst, size, out=np.zeros(count), where=size > 0)))
+        with np.errstate(invalid="ignore"):
+            return float(np.max(np.divide(worst, size, out=np.zeros(count), where=size > 0)))
 
     def parameter_sensitivities(self, z: np.ndarray, parameters: np.ndarray) -> Sensitivities | None:
         """Return derivatives to every parameter by the implicit function theorem (eq. 4); None if singular."""
@@ -144,14 +144,14 @@ class PeriodicEquations:
         columns = self._evaluate("residual_jacobian", self.states(z), parameters)
         band = np.empty((points * count, 3 * self._lower + 1))
         pivots = np.empty(points * count, dtype=np.int64)
-        newton.assemble(
+        compiled.assemble(
             columns, grid.first, grid.second, grid.shift, grid.place, self.frequency, self._lower, band
         )
-        if not factor(band, self._lower, self._lower, pivots):
+        if not compiled.factor(band, self._lower, self._lower, pivots):
             return None
         order = np.argsort(grid.place)
         right = np.ascontiguousarray(-g[:, order].reshape(len(g), points * count))
-        solve(band, self._lower, self._lower, pivots, right)
+        compiled.solve(band, self._lower, self._lower, pivots, right)
         z_dot = np.ascontiguousarray(right.reshape(len(g), points, count)[:, grid.place])
         still = np.zeros(count)
         moved = np.stack([self.states(direction, still) for direction in z_dot]) if len(g) else np.empty((0, points, 3))

@@ -7,7 +7,7 @@ import numpy as np
 
 from bayesperiodic import checks
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic import newton
+from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved, winding_numbers
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.store import Result
@@ -67,7 +67,7 @@ class PeriodicSolution(Result):
     @property
     def converged(self) -> bool:
         """True if the status is "converged"."""
-        return self.status == newton.STATUSES[newton.CONVERGED]
+        return self.status == STATUSES[CONVERGED]
 
     def __repr__(self) -> str:
         return (
@@ -154,10 +154,10 @@ def describe(equations: PeriodicEquations, theta: np.ndarray, solved: Solved) ->
     turns = equations.drift * grid.periods / (2 * np.pi)
     sensitivities, state_sensitivities = {}, {}
     code = solved.code
-    if code == newton.CONVERGED:
+    if code == CONVERGED:
         derivative = equations.parameter_sensitivities(solved.z, theta)
         if derivative is None:
-            code = newton.SINGULAR
+            code = SINGULAR
         else:
             sensitivities = _by_name(derivative.outputs, model.outputs, model.parameters)
             state_sensitivities = _by_name(derivative.states, model.states, model.parameters)
@@ -165,7 +165,7 @@ def describe(equations: PeriodicEquations, theta: np.ndarray, solved: Solved) ->
     outputs = equations.outputs(solved.z, theta)
     return PeriodicSolution(
         model=model.name,
-        status=newton.STATUSES[code],
+        status=STATUSES[code],
         frequency=equations.frequency,
         samples=grid.samples,
         periods=grid.periods,

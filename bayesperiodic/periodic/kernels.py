@@ -1,21 +1,23 @@
-"""Damped Newton iteration with step halving on the discretised equations ([1]_, eq. 3).
+"""The compiled code of the periodic solver, generic in the model: banded algebra, discretisation, Newton, batches.
 
-A failed solve is a status, not an exception. Everything here is compiled, generic in the model, and takes the model's
-grid function as an argument.
+This text is compiled through the kernel cache as one module (see `compiled`), because code compiled from one file goes
+stale when a function of another file that it calls has changed. Import the functions from `compiled`.
 
-References
-----------
-.. [1] de Kraker, Verbeek & van de Wouw 1997.
+A cyclic band becomes an ordinary one in the folded order of `schemes.CyclicGrid`; pivoting then keeps the solution
+accurate however stable or unstable the orbit is, which one march through the period would not. Rows of the band are
+stored side by side: entry (i, j) of the matrix is ``band[i, j - i + lower]``, the width is 2·lower + upper + 1 and
+leaves room for the fill-in of row exchanges.
+
+The Newton iteration is that of de Kraker, Verbeek & van de Wouw (1997), eq. (3): damped, with step halving. A failed
+solve is a status, not an exception.
 """
 
 import numpy as np
 from numba import njit
 
 from bayesperiodic.models.compile import GRID_SIGNATURE
-from bayesperiodic.periodic.cyclic import factor, solve
 
-STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit")
-CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT = range(len(STATUSES))
+CONVERGED, STALLED, SINGULAR, NOT_FINITE = range(4)
 
 STEP_TOLERANCE = 1e-9
 MAX_ITERATIONS = 50
@@ -25,7 +27,70 @@ ROUNDING = 4.0 * np.finfo(float).eps
 MATRIX, VECTOR, INDICES = "float64[:,::1]", "float64[::1]", "int64[:,::1]"
 FUNCTION = f"FunctionType({GRID_SIGNATURE})"
 GRID = f"{VECTOR}, {VECTOR}, {INDICES}, {INDICES}, int64[::1]"
-OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+CUBE = "float64[:,:,::1]"
+OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
+
+
+@njit(f"boolean({MATRIX}, int64, int64, int64[::1])", **OPTIONS)
+def factor(band, lower, upper, pivots):
+    """Factor in place, P·A = L·U, the pivots kept as their inverses; return False for one that is zero or not finite.
+
+    Parameters
+    ----------
+    band : array (size, 2·lower + upper + 1)
+    lower, upper : int
+        Half-widths below and above the diagonal.
+    pivots : int array (size,)
+        Filled with the row exchanged with each row.
+    """
+    size = band.shape[0]
+    last = 0
+    for j in range(size):
+        end = min(j + lower, size - 1)
+        pivot, largest = j, abs(band[j, lower])
+        for i in range(j + 1, end + 1):
+            value = abs(band[i, j - i + lower])
+            if value > largest:
+                pivot, largest = i, value
+        if not (largest > 0.0 and largest < np.inf):
+            return False
+        pivots[j] = pivot
+        last = max(last, min(pivot + upper, size - 1))
+        if pivot != j:
+            for column in range(j, last + 1):
+                here, there = column - j + lower, column - pivot + lower
+                band[j, here], band[pivot, there] = band[pivot, there], band[j, here]
+        inverse = 1.0 / band[j, lower]
+        band[j, lower] = inverse
+        width = last - j
+        for i in range(j + 1, end + 1):
+            start = j - i + lower
+            multiplier = band[i, start] * inverse
+            band[i, start] = multiplier
+            if multiplier != 0.0:
+                for k in range(1, width + 1):
+                    band[i, start + k] -= multiplier * band[j, lower + k]
+    return True
+
+
+@njit(f"void({MATRIX}, int64, int64, int64[::1], {MATRIX})", **OPTIONS)
+def solve(band, lower, upper, pivots, right):
+    """Solve A·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
+    size = right.shape[1]
+    for c in range(right.shape[0]):
+        x = right[c]
+        for j in range(size):
+            pivot = pivots[j]
+            value = x[pivot]
+            x[pivot] = x[j]
+            x[j] = value
+            for i in range(j + 1, min(j + lower, size - 1) + 1):
+                x[i] -= band[i, j - i + lower] * value
+        for i in range(size - 1, -1, -1):
+            value = x[i]
+            for j in range(1, min(lower + upper, size - 1 - i) + 1):
+                value -= band[i, j + lower] * x[i + j]
+            x[i] = value * band[i, lower]
 
 
 @njit(f"void({MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, {INDICES}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
@@ -95,11 +160,14 @@ def scales(columns, states, drift, first, second, amplitude, frequency, size, ro
 
 @njit(f"float64({MATRIX}, {VECTOR})", **OPTIONS)
 def norm(columns, size):
-    """Return the root of the mean square of the residuals, each in units of its equation's size."""
+    """Return the root of the mean square of the residuals, each in units of its equation's size.
+
+    A residual that is not zero in an equation of size zero makes it infinite; one that is NaN makes it NaN.
+    """
     total = 0.0
     for i in range(columns.shape[0]):
         for e in range(size.size):
-            if size[e] > 0.0:
+            if columns[i, e] != 0.0:
                 total += (columns[i, e] / size[e]) ** 2
     return np.sqrt(total / (columns.shape[0] * size.size))
 
@@ -182,3 +250,40 @@ def newton(
         if full <= STEP_TOLERANCE or (damping == 1.0 and norm(columns, rounding) <= 1.0):
             return CONVERGED, iteration + 1
     return STALLED, MAX_ITERATIONS
+
+
+@njit(
+    f"void({FUNCTION}, {FUNCTION}, {GRID}, int64, {MATRIX}, {MATRIX}, {VECTOR}, float64, {VECTOR}, {VECTOR}, {MATRIX}, "
+    f"{CUBE}, {CUBE}, int64[::1], int64[::1])",
+    **OPTIONS,
+)
+def solve_many(
+    residual_jacobian, outputs, first, second, neighbours, shift, place, half_width, inputs, parameters, tau, frequency, drift,
+    anchor_parameters, anchor_z, anchor_sensitivities, y, status, iterations,
+):
+    """Solve for each row of `parameters`, from the anchor's linear prediction and, if that fails, from the anchor."""
+    points, count = anchor_z.shape
+    lower = half_width * count + count - 1
+    states, z = np.empty((points, 3 * count)), np.empty((points, count))
+    columns = np.empty((points, count * (1 + 3 * count)))
+    history = np.empty((MAX_ITERATIONS, 3))
+    band, pivots = np.empty((points * count, 3 * lower + 1)), np.empty(points * count, dtype=np.int64)
+    for b in range(parameters.shape[0]):
+        theta = parameters[b]
+        z[:] = anchor_z
+        for p in range(theta.size):
+            change = theta[p] - anchor_parameters[p]
+            if change != 0.0:
+                for i in range(points):
+                    for s in range(count):
+                        z[i, s] += anchor_sensitivities[p, i, s] * change
+        for attempt in range(2):
+            if attempt == 1:
+                z[:] = anchor_z
+            status[b], iterations[b] = newton(
+                residual_jacobian, first, second, neighbours, shift, place, half_width, inputs, theta, tau, frequency,
+                drift, z, states, columns, history, band, pivots,
+            )
+            if status[b] == CONVERGED:
+                break
+        outputs(states, inputs, theta, tau, frequency, y[b])

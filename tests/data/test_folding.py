@@ -1,0 +1,159 @@
+import numpy as np
+import pytest
+from scipy import stats
+
+import bayesperiodic as bp
+from tests.known import grid
+
+FREQUENCY = 2.317
+
+
+def recording(cycles=20.3, per_cycle=119.37, noise=0.05, seed=0, transient=0.0, channels=("x", "y"), offset=0.0):
+    time = offset + np.arange(int(cycles * per_cycle)) / (per_cycle * FREQUENCY)
+    generator = np.random.default_rng(seed)
+    angle = 2 * np.pi * FREQUENCY * time
+    x = np.sin(angle) + 0.2 * np.sin(3 * angle + 0.5)
+    y = mean_period(angle) + transient * np.exp(-(time - time[0]) * FREQUENCY)
+    noisy = [s + noise * generator.standard_normal(time.size) for s in (x, y)]
+    return bp.Recording.from_arrays(time, {"y": noisy[1]}, {"x": noisy[0]} if "x" in channels else {})
+
+
+def mean_period(angle):
+    return 0.7 + np.cos(angle + 0.3) + 0.3 * np.sin(2 * angle) + 0.1 * np.cos(5 * angle)
+
+
+def test_frequency_and_its_standard_error():
+    """400 recordings: z-scores of the frequency have unit variance, two-sided 1 % χ² band."""
+    scores = []
+    for seed in range(400):
+        e = recording(cycles=8.2, per_cycle=31.7, seed=seed, noise=0.1).fold(64)
+        scores.append((e.frequency - FREQUENCY) / e.frequency_se)
+    low, high = stats.chi2.ppf([0.005, 0.995], 400)
+    assert low * 0.8 < np.sum(np.square(scores)) < high
+    assert abs(np.mean(scores)) < 2.58 / np.sqrt(400)
+
+
+def test_mean_period_is_recovered_on_a_grid_that_the_sampling_does_not_share():
+    e = recording(noise=0.0).fold(800)
+    assert e.outputs["y"] == pytest.approx(mean_period(2 * np.pi * grid(800)), abs=1e-9)
+    assert e.frequency == pytest.approx(FREQUENCY, rel=1e-12)
+    assert e.cycles == 20
+
+
+def test_harmonics_kept_are_those_that_stand_out():
+    e = recording().fold(800)
+    assert e.harmonics == {"x": 3, "y": 5}
+    assert e.independent == {"y": 11}
+
+
+def test_no_more_harmonics_are_kept_by_chance_than_stated():
+    """1 % false alarms a channel: of 300 channels at most 9 keep one too many (binomial, 99.8 %)."""
+    kept = [recording(cycles=10.2, per_cycle=41.3, seed=s).fold(200).harmonics for s in range(150)]
+    wrong = sum((k["x"] != 3) + (k["y"] != 5) for k in kept)
+    assert wrong <= stats.binom.ppf(0.998, 300, 0.01)
+
+
+def test_transient_is_dropped():
+    clean = recording(transient=0.0, noise=0.02).fold(100)
+    disturbed = recording(transient=3.0, noise=0.02).fold(100)
+    assert clean.cycles == 20
+    assert 10 <= disturbed.cycles <= 17
+    assert disturbed.outputs["y"] == pytest.approx(clean.outputs["y"], abs=0.02)
+
+
+def test_rest_before_the_motion_is_dropped():
+    moving = recording(cycles=15.0, noise=0.01)
+    rest = 300
+    time = np.arange(moving.time.size + rest) / moving.sampling_rate
+    still = np.random.default_rng(1).normal(scale=0.01, size=rest)
+    e = bp.Recording.from_arrays(
+        time, {"y": np.concatenate([still, moving.outputs["y"]])}, {"x": np.concatenate([still, moving.inputs["x"]])}
+    ).fold(100)
+    assert e.frequency == pytest.approx(FREQUENCY, rel=1e-4)
+    assert 12 <= e.cycles <= 14
+
+
+def test_scatter_is_that_of_one_cycle_within_the_kept_harmonics():
+    """White noise of sd 0.05 on 119 samples a cycle: the kept harmonics hold the share (2H + 1)/119.37 of its variance."""
+    values = [recording(seed=s).fold(200).scatter["y"] for s in range(40)]
+    assert np.mean(values) == pytest.approx(0.05 * np.sqrt(11 / 119.37), rel=0.05)
+
+
+def test_variance_of_the_mean_amplitudes():
+    experiments = [recording(seed=s, cycles=12.1).fold(100, frequency=FREQUENCY, harmonics=5) for s in range(300)]
+    amplitudes = np.array([np.fft.rfft(e.outputs["y"])[1:6] * 2 / 100 for e in experiments])
+    stated = np.mean([e.amplitude_variance["y"][1:] for e in experiments], axis=0)
+    actual = np.mean(np.abs(amplitudes - amplitudes.mean(axis=0)) ** 2, axis=0)
+    assert stated.mean() == pytest.approx(actual.mean(), rel=0.12)
+
+
+def test_origin_shifts_the_phase():
+    e = recording(noise=0.0, offset=3.0).fold(100, origin=3.0 + 0.25 / FREQUENCY)
+    start = 2 * np.pi * FREQUENCY * 3.0
+    assert e.outputs["y"] == pytest.approx(mean_period(start + 2 * np.pi * (grid(100) + 0.25)), abs=1e-8)
+
+
+def test_response_of_two_forcing_periods():
+    time = np.arange(3000) / 100.3
+    x, y = np.cos(2 * np.pi * FREQUENCY * time), np.cos(np.pi * FREQUENCY * time) + np.sin(2 * np.pi * FREQUENCY * time)
+    e = bp.Recording.from_arrays(time, {"y": y}, {"x": x}).fold(50, periods=2)
+    assert e.frequency == pytest.approx(FREQUENCY, rel=1e-9)
+    assert e.outputs["y"].size == 100
+    assert e.outputs["y"] == pytest.approx(np.cos(np.pi * e.tau) + np.sin(2 * np.pi * e.tau), abs=1e-6)
+
+
+def test_unequal_steps_are_allowed():
+    generator = np.random.default_rng(2)
+    time = np.sort(generator.uniform(0, 10, 1500))
+    y = mean_period(2 * np.pi * FREQUENCY * time)
+    e = bp.Recording.from_arrays(time, {"y": y}).fold(100, harmonics=8)
+    assert e.outputs["y"] == pytest.approx(mean_period(2 * np.pi * grid(100)), abs=1e-6)
+
+
+def test_multisine_with_hundreds_of_harmonics_finds_its_fundamental():
+    samples = 1024
+    harmonic = np.arange(1, 400, 2)
+    period = np.cos(
+        2 * np.pi * np.arange(samples)[:, None] / samples * harmonic - np.pi * harmonic**2 / 400
+    ).sum(axis=1)
+    noise = np.random.default_rng(3).standard_normal(6 * samples)
+    time = np.arange(6 * samples) / 1000.0
+    e = bp.Recording.from_arrays(time, {"y": np.tile(period, 6) + 0.5 * noise}).fold(2048)
+    assert e.frequency == pytest.approx(1000.0 / 1024, rel=1e-5)
+    assert e.harmonics["y"] == 399
+
+
+def test_fewer_than_three_cycles_are_refused():
+    with pytest.raises(ValueError, match=r"it has 2\.\d\d cycles, and at least 3 cycles are needed"):
+        recording(cycles=2.6, noise=0.0).fold(frequency=FREQUENCY)
+    with pytest.raises(ValueError, match="at least 3 cycles are needed"):
+        recording(cycles=1.3, noise=0.0).fold()
+
+
+def test_constant_input_is_refused():
+    time = np.arange(500) / 100
+    with pytest.raises(ValueError, match=r"inputs\['x'\]: the constant 2 is not allowed; a channel must vary"):
+        bp.Recording.from_arrays(time, {"y": np.sin(9 * time)}, {"x": np.full(500, 2.0)}).fold()
+
+
+def test_signal_that_is_not_periodic_is_refused_with_its_measure():
+    noise = np.random.default_rng(4).standard_normal(4000)
+    with pytest.raises(ValueError, match=r"is not periodic; at .* Hz the mean period explains only \d+\.\d% .*periodicity"):
+        bp.Recording.from_arrays(np.arange(4000) / 100, {"y": noise}).fold()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"harmonics": 80}, r"harmonics\['x'\]: 80 is not allowed; samples and grid resolve at most 59 harmonics"),
+        ({"harmonics": {"z": 3}}, "harmonics: 'z' is not known; allowed: 'x', 'y'"),
+        ({"harmonics": 0}, "must be a whole number of at least 1"),
+        ({"samples": 2}, "samples: 2 is not allowed"),
+        ({"periods": 0}, "periods: 0 is not allowed"),
+        ({"frequency": -1.0}, "frequency: -1.0 is not allowed"),
+        ({"name": "a/b"}, "name: 'a/b' is not allowed"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        recording().fold(**({"samples": 800} | arguments))

@@ -1,0 +1,136 @@
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+import xarray as xr
+
+import bayesperiodic as bp
+
+TIME = np.arange(200) / 50
+FORCE, DISPLACEMENT = np.cos(TIME), 3.0 * np.sin(TIME)
+CHANNELS = {"outputs": {"force": "F [N]"}, "inputs": {"displacement": "x"}}
+
+
+@pytest.fixture
+def csv(tmp_path):
+    path = tmp_path / "run 7.csv"
+    pd.DataFrame({"t": TIME, "x": DISPLACEMENT, "F [N]": FORCE, "note": "text"}).to_csv(path, index=False)
+    return path
+
+
+def rewrite(path, row, column, text):
+    table = pd.read_csv(path, dtype=str)
+    table.loc[row, column] = text
+    table.to_csv(path, index=False)
+
+
+def test_csv_columns_by_name_and_units_by_pair_or_factor(csv):
+    recording = bp.Recording.from_csv(
+        csv, time="t", **CHANNELS, units={"displacement": ("mm", "m"), "force": 2.0, "time": ("ms", "s")}
+    )
+    assert recording.inputs["displacement"] == pytest.approx(1e-3 * DISPLACEMENT)
+    assert recording.outputs["force"] == pytest.approx(2.0 * FORCE)
+    assert recording.time == pytest.approx(1e-3 * TIME)
+    assert recording.name == "run 7"
+    assert not recording.synthetic
+
+
+def test_offset_units_are_converted_too(csv):
+    recording = bp.Recording.from_csv(csv, time="t", outputs={"T": "x"}, units={"T": ("degC", "kelvin")})
+    assert recording.outputs["T"] == pytest.approx(DISPLACEMENT + 273.15)
+
+
+def test_sampling_rate_stands_in_for_a_time_column(csv):
+    recording = bp.Recording.from_csv(csv, sampling_rate=50.0, **CHANNELS)
+    assert recording.time == pytest.approx(TIME)
+    assert recording.sampling_rate == pytest.approx(50.0)
+
+
+def test_npz_mat5_and_mat73_give_the_same_recording(tmp_path):
+    columns = {"t": TIME, "x": DISPLACEMENT, "F": FORCE}
+    np.savez(tmp_path / "run.npz", **columns)
+    scipy.io.savemat(tmp_path / "v5.mat", columns)
+    with h5py.File(tmp_path / "v73.mat", "w") as file:
+        for name, values in columns.items():
+            file[name] = values[None]
+    arguments = {"time": "t", "outputs": {"force": "F"}, "inputs": {"displacement": "x"}}
+    for recording in (
+        bp.Recording.from_npz(tmp_path / "run.npz", **arguments),
+        bp.Recording.from_mat(tmp_path / "v5.mat", **arguments),
+        bp.Recording.from_mat(tmp_path / "v73.mat", **arguments),
+    ):
+        assert np.array_equal(recording.outputs["force"], FORCE)
+        assert np.array_equal(recording.inputs["displacement"], DISPLACEMENT)
+
+
+def test_pickled_npz_is_refused(tmp_path):
+    np.savez(tmp_path / "run.npz", t=TIME, F=np.array([{}] * 200, dtype=object))
+    with pytest.raises(ValueError, match="pickled"):
+        bp.Recording.from_npz(tmp_path / "run.npz", time="t", outputs={"force": "F"})
+
+
+def test_arrays_may_be_pandas_or_xarray():
+    recording = bp.Recording.from_arrays(
+        pd.Series(TIME), {"force": xr.DataArray(FORCE, dims="time")}, {"displacement": pd.Series(DISPLACEMENT)}
+    )
+    assert np.array_equal(recording.outputs["force"], FORCE)
+
+
+def test_between_cuts_by_time():
+    recording = bp.Recording.from_arrays(TIME, {"force": FORCE}).between(1.0, 2.0)
+    assert (recording.time[0], recording.time[-1]) == (1.0, 2.0)
+    with pytest.raises(ValueError, match="start, stop: 7, 8 is not allowed; the recording runs from 1 to 2 s"):
+        recording.between(7, 8)
+
+
+def test_missing_column_is_answered_with_the_nearest(csv):
+    with pytest.raises(ValueError, match=r"column of run 7\.csv: 'F \[M\]' is not known; .*Did you mean 'F \[N\]'"):
+        bp.Recording.from_csv(csv, time="t", outputs={"force": "F [M]"})
+
+
+def test_non_numeric_cell_is_located(csv):
+    rewrite(csv, 3, "x", "broken")
+    with pytest.raises(ValueError, match=r"column 'x' of run 7\.csv: 'broken' in data row 4 is not allowed"):
+        bp.Recording.from_csv(csv, time="t", **CHANNELS)
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", ""])
+def test_samples_that_are_not_finite_are_located(csv, text):
+    rewrite(csv, 5, "x", text)
+    with pytest.raises(ValueError, match=r"displacement \(column 'x' of run 7.csv\): (nan|inf) at index 5 .*must be finite"):
+        bp.Recording.from_csv(csv, time="t", **CHANNELS)
+
+
+def test_time_that_does_not_increase_is_located(csv):
+    rewrite(csv, 10, "t", "0.1")
+    with pytest.raises(ValueError, match=r"time: 0\.1 s after 0\.18 s at index 10 is not allowed; time must increase"):
+        bp.Recording.from_csv(csv, time="t", **CHANNELS)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"path": "nowhere.csv"}, FileNotFoundError, "path: 'nowhere.csv' is not allowed; there is no such file"),
+        ({"time": None}, ValueError, "time: None with sampling_rate None is not allowed; give exactly one"),
+        ({"sampling_rate": 1.0}, ValueError, "give exactly one"),
+        ({"units": {"force": ("N", "m")}}, ValueError, r"units\['force'\]: \('N', 'm'\) is not allowed"),
+        ({"units": {"force": ("N", "newtown")}}, ValueError, r"units\['force'\]"),
+        ({"units": {"force": 0}}, ValueError, "a factor must differ from zero"),
+        ({"units": {"forc": 1}}, ValueError, "units: 'forc' is not known.*Did you mean 'force'"),
+        ({"outputs": {}}, ValueError, "at least one measured output"),
+    ],
+)
+def test_bad_arguments_are_named(csv, changes, error, message):
+    with pytest.raises(error, match=message):
+        bp.Recording.from_csv(**({"path": csv, "time": "t", **CHANNELS} | changes))
+
+
+def test_file_that_is_no_mat_file_is_refused(csv):
+    with pytest.raises(ValueError, match="cannot be read as MAT"):
+        bp.Recording.from_mat(csv, time="t", outputs={"force": "F"})
+
+
+def test_lengths_must_agree():
+    with pytest.raises(ValueError, match=r"outputs\['force'\]: 199 values are not allowed; there must be 200"):
+        bp.Recording.from_arrays(TIME, {"force": FORCE[1:]})

@@ -1,0 +1,108 @@
+"""Models and answers that are known from outside the package, shared by the tests."""
+
+import numpy as np
+import sympy as sp
+
+import bayesperiodic as bp
+
+# A dummy state w and outputs that are linear in the parameters: posterior and Laplace are known in closed form.
+LINEAR = bp.Model(
+    "linear",
+    states=["w"],
+    inputs=["x"],
+    parameters={"k": "N/m", "c": "N s/m", "coulomb": "N"},
+    units={"x": "m", "force": "N"},
+    equations=lambda s, p, u: [s.dw + s.w - u.x],
+    outputs=lambda s, p, u: {"force": p.k * u.x + p.c * u.dx + p.coulomb * sp.tanh(u.dx / 0.1)},
+)
+
+
+def grid(samples: int) -> np.ndarray:
+    """Return τ on a grid."""
+    return np.arange(samples) / samples
+
+
+def linear_regressors(x_amplitude: float, frequency: float, tau: np.ndarray) -> np.ndarray:
+    """Return the columns that multiply k, c and coulomb when x = amplitude · sin(2πτ)."""
+    rate = 2 * np.pi * frequency
+    x, v = x_amplitude * np.sin(2 * np.pi * tau), x_amplitude * rate * np.cos(2 * np.pi * tau)
+    return np.stack([x, v, np.tanh(v / 0.1)], axis=-1)
+
+
+def linear_experiment(
+    theta: np.ndarray, sd: float, seed: int, samples: int = 40, independent: int | None = None
+) -> bp.Experiment:
+    """Return an experiment of LINEAR with white noise on its samples."""
+    tau = grid(samples)
+    clean = linear_regressors(0.05, 2.0, tau) @ theta
+    noise = sd * np.random.default_rng(seed).standard_normal(samples)
+    return bp.Experiment(
+        "run", 2.0, {"force": clean + noise}, {"x": 0.05 * np.sin(2 * np.pi * tau)}, samples=samples,
+        independent=None if independent is None else {"force": independent},
+    )
+
+
+def complex_step_sensitivities(
+    model: bp.Model, parameters: dict[str, float], inputs: dict[str, np.ndarray], frequency: float, samples: int,
+    scheme: str,
+) -> dict[str, dict[str, np.ndarray]]:
+    """Return ∂output/∂parameter by complex steps through an independent dense solver of the same difference equations.
+
+    Nothing of the package's kernels is used: SymPy's own NumPy code, dense circulant matrices and numpy.linalg.
+    """
+    weights = {
+        "central2": ({-1: -0.5, 1: 0.5}, {-1: 1.0, 0: -2.0, 1: 1.0}),
+        "backward2": ({0: 1.5, -1: -2.0, -2: 0.5}, {0: 2.0, -1: -5.0, -2: 4.0, -3: -1.0}),
+    }[scheme]
+    step = 1.0 / (samples * frequency)
+    first, second = (
+        sum(w * np.roll(np.eye(samples), o, axis=1) for o, w in row.items()) / step**order
+        for order, row in zip((1, 2), weights, strict=True)
+    )
+    count = len(model.states)
+    symbols = [*model.state_symbols.values(), *model.input_symbols.values(), *model.parameter_symbols.values()]
+    symbols += list(model.time_symbols.values())
+    q = list(model.state_symbols.values())
+    residual = [sp.lambdify(symbols, e, "numpy") for e in model.equations]
+    slopes = [[sp.lambdify(symbols, sp.diff(e, s), "numpy") for s in q] for e in model.equations]
+    outputs = [sp.lambdify(symbols, e, "numpy") for e in model.output_expressions]
+    spectral = {}
+    harmonic = np.fft.fftfreq(samples, 1.0 / samples)
+    for name, values in inputs.items():
+        for order, prefix in enumerate(("", "d", "dd")):
+            wave = np.fft.fft(values) * (2j * np.pi * frequency * harmonic) ** order
+            spectral[prefix + name] = np.fft.ifft(wave).real
+    ordered = [spectral[n] for n in model.input_symbols]
+
+    def arguments(z: np.ndarray, theta: np.ndarray) -> list[np.ndarray]:
+        states = [z[:, s] for s in range(count)] + [first @ z[:, s] for s in range(count)]
+        states += [second @ z[:, s] for s in range(count)]
+        return [*states, *ordered, *theta, grid(samples), frequency]
+
+    def solve(theta: np.ndarray) -> np.ndarray:
+        z = np.zeros((samples, count), dtype=complex)
+        for _ in range(60):
+            a = arguments(z, theta)
+            g = np.concatenate([np.broadcast_to(f(*a), samples) for f in residual])
+            blocks = [
+                [
+                    sum(
+                        np.broadcast_to(slopes[e][order * count + s](*a), samples)[:, None] * d
+                        for order, d in enumerate((np.eye(samples), first, second))
+                    )
+                    for s in range(count)
+                ]
+                for e in range(count)
+            ]
+            z = z - np.linalg.solve(np.block(blocks), g).reshape(count, samples).T
+        return z
+
+    base = np.array([parameters[n] for n in model.parameters], dtype=complex)
+    result: dict[str, dict[str, np.ndarray]] = {name: {} for name in model.outputs}
+    for index, name in enumerate(model.parameters):
+        theta = base.copy()
+        theta[index] += 1e-30j
+        a = arguments(solve(theta), theta)
+        for channel, f in zip(model.outputs, outputs, strict=True):
+            result[channel][name] = np.broadcast_to(f(*a), samples).imag / 1e-30
+    return result

@@ -1,0 +1,117 @@
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+
+from bayesperiodic.models import cache
+from bayesperiodic.models.compile import FUNCTIONS, kernel_source
+from tests.known import LINEAR
+
+PROGRAM = """
+import numba
+from bayesperiodic.models.cache import load
+from bayesperiodic.models.compile import FUNCTIONS, kernel_source
+from tests.known import LINEAR
+functions = load(kernel_source(LINEAR), FUNCTIONS)
+print(sum(sum(f.stats.cache_hits.values()) for f in functions.values()))
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path))
+    return tmp_path / "kernels"
+
+
+def start() -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-W", "error::RuntimeWarning", "-c", PROGRAM], stdout=subprocess.PIPE, text=True,
+        cwd=Path(__file__).parents[2],
+    )
+
+
+def load_with_warning(match: str) -> None:
+    with pytest.warns(RuntimeWarning, match=match):
+        functions = cache.load(kernel_source(LINEAR), FUNCTIONS)
+    assert set(functions) == set(FUNCTIONS)
+
+
+def entry(folder: Path) -> Path:
+    (found,) = folder.iterdir()
+    return found
+
+
+def test_second_start_loads_all_functions_from_the_cache(folder):
+    first = start()
+    assert first.communicate()[0] == "0\n"
+    second = start()
+    assert second.communicate()[0] == "3\n"
+
+
+def test_two_processes_may_fill_the_cache_at_once(folder):
+    both = [start(), start()]
+    for process in both:
+        process.communicate()
+        assert process.returncode == 0
+    assert entry(folder).is_dir()
+    assert start().communicate()[0] == "3\n"
+
+
+def test_folder_is_private_to_the_user(folder):
+    cache.load(kernel_source(LINEAR), FUNCTIONS)
+    assert folder.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.parametrize("damage", ["truncate", "alter", "remove", "source", "manifest"])
+def test_damaged_entry_is_never_executed(folder, damage):
+    cache.load(kernel_source(LINEAR), FUNCTIONS)
+    compiled = sorted((entry(folder) / "__pycache__").glob("*.nbc"))[0]
+    if damage == "truncate":
+        compiled.write_bytes(compiled.read_bytes()[:100])
+    elif damage == "alter":
+        content = bytearray(compiled.read_bytes())
+        content[len(content) // 2] ^= 1
+        compiled.write_bytes(content)
+    elif damage == "remove":
+        compiled.unlink()
+    elif damage == "source":
+        source = entry(folder) / cache.SOURCE
+        source.write_text(source.read_text() + "\nraise SystemExit('executed')\n")
+    else:
+        (entry(folder) / cache.MANIFEST).write_text("{")
+    load_with_warning("compiling in memory")
+
+
+def test_folder_open_to_others_is_not_used(folder):
+    folder.mkdir(parents=True)
+    folder.chmod(0o777)
+    load_with_warning("not private")
+    assert not list(folder.iterdir())
+
+
+def test_unwritable_cache_falls_back_to_memory(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path / "file"))
+    load_with_warning("compiling in memory")
+
+
+def test_failed_build_leaves_nothing_behind(folder, monkeypatch):
+    def full(*_):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(cache, "_digests", full)
+    load_with_warning("no space left")
+    assert not list(folder.iterdir())
+
+
+def test_other_versions_get_an_entry_of_their_own(folder, monkeypatch):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cache.load(kernel_source(LINEAR), FUNCTIONS)
+        monkeypatch.setattr(cache.numba, "__version__", "0.0")
+        cache.load(kernel_source(LINEAR), FUNCTIONS)
+    assert len(list(folder.iterdir())) == 2
+    assert os.environ["BAYESPERIODIC_CACHE"]

@@ -1,0 +1,108 @@
+import pickle
+
+import numpy as np
+import pytest
+import sympy as sp
+
+import bayesperiodic as bp
+
+
+def spring(**changes):
+    arguments = {
+        "states": ["x"],
+        "inputs": ["force"],
+        "parameters": {"m": "kg", "k": "N/m"},
+        "equations": lambda s, p, u: [p.m * s.ddx + p.k * s.x - u.force],
+        "outputs": lambda s, p, u: {"displacement": s.x},
+    }
+    return bp.Model("spring", **(arguments | changes))
+
+
+def test_order_of_each_state_is_recognised_by_its_derivatives():
+    model = spring(
+        states=["x", "T"], equations=lambda s, p, u: [p.m * s.ddx + s.T - u.force, s.dT + p.k * s.x]
+    )
+    assert model.orders == {"x": 2, "T": 1}
+
+
+def test_input_derivatives_are_recognised():
+    model = spring(outputs=lambda s, p, u: {"displacement": s.x + u.ddforce})
+    assert model.input_derivatives() == {"force": 2}
+    assert spring().input_derivatives() == {"force": 0}
+
+
+def test_autonomous_means_neither_inputs_nor_time():
+    assert spring(inputs=[], equations=lambda s, p, u: [p.m * s.ddx + p.k * s.x]).autonomous
+    assert not spring().autonomous
+    assert not spring(inputs=[], equations=lambda s, p, u: [p.m * s.ddx + p.k * s.x * sp.cos(s.tau)]).autonomous
+
+
+def test_latex_writes_dots_and_greek():
+    text = bp.models.dahl.latex()
+    assert r"\dot{w}" in text and r"\rho" in text and r"\dot{\mathrm{displacement}}" in text
+
+
+def test_model_travels_to_other_processes():
+    copy = pickle.loads(pickle.dumps(spring()))
+    assert copy.equations == spring().equations
+
+
+def test_piecewise_min_and_sign_compile_and_agree_with_sympy():
+    model = bp.Model(
+        "kinks", states=["x"], inputs=["u"], parameters=["a"],
+        equations=lambda s, p, u: [s.dx + sp.sign(s.x) + sp.Max(s.x, p.a) + abs(s.x) * s.x - u.u],
+        outputs=lambda s, p, u: {"y": sp.Piecewise((s.x, s.x > 0), (p.a * s.x, True))},
+    )
+    states = np.array([[0.3, 0.1, 0.0], [-0.4, 0.2, 0.0]])
+    kernels = model.kernels
+    columns = kernels.evaluate("residual_jacobian", states, np.zeros((2, 3)), np.array([0.1]), np.zeros(2), 1.0)
+    assert columns[:, 0] == pytest.approx([0.1 + 1 + 0.3 + 0.09, 0.2 - 1 + 0.1 - 0.16])
+    assert columns[:, 1] == pytest.approx([1 + 0.6, 0.8])
+    y = kernels.evaluate("outputs", states, np.zeros((2, 3)), np.array([0.1]), np.zeros(2), 1.0)
+    assert y[:, 0] == pytest.approx([0.3, -0.04])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"states": ["tau"]}, "'tau' is reserved"),
+        ({"parameters": ["m", "m", "k"]}, "'m' is reserved or used twice"),
+        ({"inputs": ["x"]}, "'x' is reserved or used twice"),
+        ({"states": ["x", "dx"]}, "'dx' is reserved or used twice"),
+        ({"equations": lambda s, p, u: [p.k * s.x - u.force]}, "no derivative in any equation"),
+        ({"equations": lambda s, p, u: [s.ddx, s.dx]}, "there must be one a state, 1"),
+        ({"equations": lambda s, p, u: [s.ddx + sp.Symbol("stranger")]}, "unknown symbols stranger"),
+        ({"equations": lambda s, p, u: ["s.ddx"]}, "write SymPy expressions"),
+        ({"outputs": lambda s, p, u: {}}, "at least one output"),
+        ({"angles": ["phi"]}, "angles: 'phi' is not known; allowed: 'x', 'displacement'"),
+        ({"units": {"mass": "kg"}}, "units: 'mass' is not known"),
+    ],
+)
+def test_bad_models_are_refused_by_name(changes, message):
+    with pytest.raises(ValueError, match=message):
+        spring(**changes)
+
+
+def test_unknown_parameter_is_answered_with_the_nearest():
+    with pytest.raises(AttributeError, match=r"parameters: 'mm' is not known; allowed: 'm', 'k'\. Did you mean 'm'\?"):
+        spring(equations=lambda s, p, u: [p.mm * s.ddx])
+
+
+def test_unknown_input_is_answered_with_the_nearest():
+    with pytest.raises(AttributeError, match="inputs: 'forces' is not known.*Did you mean 'force'"):
+        spring(equations=lambda s, p, u: [s.ddx - u.forces])
+
+
+def test_function_that_cannot_be_compiled_is_named():
+    model = spring(equations=lambda s, p, u: [s.ddx + sp.Function("mystery")(s.x) - u.force])
+    with pytest.raises(ValueError, match=r"mystery\(s__x\).*cannot be compiled"):
+        model.kernels  # noqa: B018
+
+
+def test_smooth_sign_and_absolute_value_have_the_stated_width():
+    x = sp.Symbol("x")
+    assert float(bp.smooth_sign(x, 0.2).subs(x, 0.2)) == pytest.approx(np.tanh(1))
+    assert float(bp.smooth_abs(x, 0.2).subs(x, 20)) == pytest.approx(19.8, abs=2e-3)
+    assert float(sp.diff(bp.smooth_abs(x, 0.2), x, 2).subs(x, 0)) == pytest.approx(5)
+    with pytest.raises(ValueError, match="width: -1 is not allowed"):
+        bp.smooth_sign(x, -1)

@@ -1,0 +1,219 @@
+import numpy as np
+import pytest
+import sympy as sp
+
+import bayesperiodic as bp
+from tests.known import complex_step_sensitivities, grid
+
+DUFFING = {"m": 0.45, "c": 1.3, "k": 900.0, "k3": 4e5}
+FREQUENCY = 5.0
+SCHEMES = ["central2", "backward2"]
+
+COUPLED = bp.Model(
+    "coupled",
+    states=["x", "T"],
+    inputs=["force"],
+    parameters=["m", "c", "k", "h", "b"],
+    equations=lambda s, p, u: [
+        p.m * s.ddx + p.c * s.dx * sp.sqrt(1 + s.dx**2) + p.k * sp.sinh(s.x) - p.b * s.T - u.force,
+        s.dT + p.h * s.T * (1 + s.x**2) - s.dx * s.x - u.dforce / 10,
+    ],
+    outputs=lambda s, p, u: {"position": s.x * p.b, "temperature": s.T + p.c * s.dx, "force": p.m * s.ddx + u.ddforce},
+)
+COUPLED_AT = {"m": 1.2, "c": 0.4, "k": 30.0, "h": 2.0, "b": 0.7}
+
+
+def manufactured_force(x, v, a):
+    return DUFFING["m"] * a + DUFFING["c"] * v + DUFFING["k"] * x + DUFFING["k3"] * x**3
+
+
+def manufactured(samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return x(t) = 0.02 cos ωt + 0.006 sin(2ωt + 0.4) and the force that makes it an exact solution."""
+    angle, omega = 2 * np.pi * grid(samples), 2 * np.pi * FREQUENCY
+    x = 0.02 * np.cos(angle) + 0.006 * np.sin(2 * angle + 0.4)
+    v = omega * (-0.02 * np.sin(angle) + 0.012 * np.cos(2 * angle + 0.4))
+    a = omega**2 * (-0.02 * np.cos(angle) - 0.024 * np.sin(2 * angle + 0.4))
+    return x, manufactured_force(x, v, a)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_schemes_converge_at_second_order_on_a_manufactured_solution(scheme):
+    errors = []
+    for samples in (800, 1600, 3200):
+        exact, force = manufactured(samples)
+        solution = bp.solve_periodic(
+            bp.models.duffing, DUFFING, {"force": force}, frequency=FREQUENCY, samples=samples, scheme=scheme,
+            guess={"x": exact},
+        )
+        assert solution.converged
+        errors.append(np.max(np.abs(solution.states["x"] - exact)))
+    assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx(2.0, abs=0.05)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_first_order_states_converge_at_second_order(scheme):
+    model = bp.Model(
+        "relaxation", states=["w"], inputs=["u"], parameters=["a"],
+        equations=lambda s, p, u: [s.dw + p.a * s.w**3 - u.u], outputs=lambda s, p, u: {"w": s.w},
+    )
+    errors = []
+    for samples in (400, 800, 1600):
+        angle = 2 * np.pi * grid(samples)
+        exact = 1.0 + 0.5 * np.sin(angle)
+        forcing = np.pi * np.cos(angle) + 2.0 * exact**3
+        solution = bp.solve_periodic(
+            model, {"a": 2.0}, {"u": forcing}, frequency=1.0, samples=samples, scheme=scheme, guess={"w": exact}
+        )
+        errors.append(np.max(np.abs(solution.states["w"] - exact)))
+    assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx(2.0, abs=0.05)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_linear_oscillator_matches_the_transfer_function_to_the_scheme_error(scheme):
+    """Against the exact H(iω), and to rounding against H with the scheme's own symbols for d/dt and d²/dt²."""
+    samples, omega = 400, 2 * np.pi * FREQUENCY
+    force = np.cos(2 * np.pi * grid(samples))
+    parameters = DUFFING | {"k3": 0.0}
+    solution = bp.solve_periodic(
+        bp.models.duffing, parameters, {"force": force}, frequency=FREQUENCY, samples=samples, scheme=scheme
+    )
+    step = 1 / (samples * FREQUENCY)
+    shift = np.exp(-1j * omega * step)
+    one, two = {
+        "central2": ((1 / shift - shift) / 2 / step, (1 / shift - 2 + shift) / step**2),
+        "backward2": (
+            (1.5 - 2 * shift + 0.5 * shift**2) / step, (2 - 5 * shift + 4 * shift**2 - shift**3) / step**2
+        ),
+    }[scheme]
+    discrete = 1 / (parameters["m"] * two + parameters["c"] * one + parameters["k"])
+    exact = 1 / (-parameters["m"] * omega**2 + parameters["c"] * 1j * omega + parameters["k"])
+    amplitude = 2 * np.mean(solution.states["x"] * np.exp(-2j * np.pi * grid(samples)))
+    assert amplitude == pytest.approx(discrete, rel=1e-9)
+    assert abs(amplitude - exact) / abs(exact) < 1.01 * abs(discrete - exact) / abs(exact)
+    assert 0 < abs(discrete - exact) / abs(exact) < 2e-3
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_sensitivities_match_complex_steps_through_an_independent_solver(scheme):
+    samples = 48
+    force = 3.0 * np.cos(2 * np.pi * grid(samples)) + 0.5
+    solution = bp.solve_periodic(
+        COUPLED, COUPLED_AT, {"force": force}, frequency=0.6, samples=samples, scheme=scheme
+    )
+    assert solution.converged
+    expected = complex_step_sensitivities(COUPLED, COUPLED_AT, {"force": force}, 0.6, samples, scheme)
+    for channel, by_parameter in expected.items():
+        for name, values in by_parameter.items():
+            error = np.max(np.abs(solution.sensitivities[channel][name] - values))
+            assert error <= 1e-8 * np.max(np.abs(values)), (channel, name)
+
+
+def test_unstable_orbit_is_found():
+    """The upper equilibrium of a driven pendulum with a strong spring-like instability: a stable march would leave it."""
+    model = bp.Model(
+        "inverted", states=["x"], inputs=["u"], parameters=["a"],
+        equations=lambda s, p, u: [s.ddx - p.a * s.x + 0.1 * s.x**3 - u.u], outputs=lambda s, p, u: {"x": s.x},
+    )
+    solution = bp.solve_periodic(model, {"a": 400.0}, {"u": np.cos(2 * np.pi * grid(800))}, frequency=1.0)
+    assert solution.converged
+    exact = -1 / (400 + 4 * np.pi**2)
+    assert 2 * np.mean(solution.states["x"] * np.cos(2 * np.pi * grid(800))) == pytest.approx(exact, rel=1e-4)
+
+
+def test_period_two_orbit_has_samples_per_forcing_period():
+    model = bp.Model(
+        "slow", states=["x"], inputs=["u"], parameters=["a"],
+        equations=lambda s, p, u: [s.dx + p.a * s.x - u.u], outputs=lambda s, p, u: {"x": s.x},
+    )
+    tau = np.arange(400) / 200
+    solution = bp.solve_periodic(
+        model, {"a": 1.0}, {"u": np.cos(np.pi * tau)}, frequency=2.0, samples=200, periods=2
+    )
+    omega = 2 * np.pi * 1.0
+    exact = (np.exp(1j * np.pi * tau) / (1j * omega + 1)).real
+    assert solution.tau == pytest.approx(tau)
+    assert solution.states["x"] == pytest.approx(exact, abs=1e-3 * np.abs(exact).max())
+
+
+def test_rotation_keeps_its_turns():
+    """φ̈ + c φ̇ = torque: turning at torque/c rad/s, once a period when torque = 2π f c."""
+    model = bp.Model(
+        "rotor", states=["phi"], inputs=["torque"], parameters=["c", "k"], angles=["phi"],
+        equations=lambda s, p, u: [s.ddphi + p.c * s.dphi + p.k * sp.sin(s.phi) - u.torque],
+        outputs=lambda s, p, u: {"rate": s.dphi},
+    )
+    torque = np.full(200, 2 * np.pi * 0.5 * 3.0)
+    solution = bp.solve_periodic(
+        model, {"c": 3.0, "k": 0.4}, {"torque": torque + 0.5 * np.cos(2 * np.pi * grid(200))}, frequency=0.5,
+        samples=200, winding={"phi": 1}, guess={"phi": 2 * np.pi * grid(200) + 0.1},
+    )
+    assert solution.converged
+    assert solution.states["phi"][-1] - solution.states["phi"][0] == pytest.approx(2 * np.pi, rel=0.05)
+    assert np.mean(solution.outputs["rate"]) == pytest.approx(2 * np.pi * 0.5)
+
+
+def test_no_equilibrium_ends_in_a_status_and_not_in_an_exception():
+    model = bp.Model(
+        "runaway", states=["x"], inputs=["u"], parameters=["a"],
+        equations=lambda s, p, u: [s.dx - p.a * (1 + s.x**2) - u.u], outputs=lambda s, p, u: {"x": s.x},
+    )
+    solution = bp.solve_periodic(model, {"a": 1.0}, {"u": np.cos(2 * np.pi * grid(100))}, frequency=1.0, samples=100)
+    assert not solution.converged
+    assert solution.status in ("stalled", "singular")
+    assert solution.sensitivities == {}
+
+
+def test_overflow_is_told_as_not_finite():
+    model = bp.Model(
+        "overflow", states=["x"], inputs=["u"], parameters=["a"],
+        equations=lambda s, p, u: [s.dx + sp.exp(p.a * s.x) - u.u], outputs=lambda s, p, u: {"x": s.x},
+    )
+    solution = bp.solve_periodic(
+        model, {"a": 1e6}, {"u": np.cos(2 * np.pi * grid(50))}, frequency=1.0, samples=50, guess={"x": np.ones(50)}
+    )
+    assert solution.status == "not finite"
+
+
+def test_earlier_solution_as_guess_needs_no_iterations():
+    _, force = manufactured(400)
+    arguments = {"frequency": FREQUENCY, "samples": 400}
+    first = bp.solve_periodic(bp.models.duffing, DUFFING, {"force": force}, **arguments)
+    again = bp.solve_periodic(bp.models.duffing, DUFFING, {"force": force}, **arguments, guess=first)
+    assert again.iterations <= 1
+    assert again.states["x"] == pytest.approx(first.states["x"], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"samples": 3}, "samples: 3 is not allowed"),
+        ({"inputs": {"force": np.zeros(99)}}, r"inputs\['force'\]: 99 values are not allowed; there must be 100"),
+        ({"inputs": {"force": np.full(100, np.nan)}}, r"inputs\['force'\]: nan at index 0"),
+        ({"inputs": {"forse": np.zeros(100)}}, "inputs: 'forse' is not known.*Did you mean 'force'"),
+        ({"frequency": 0.0}, "frequency: 0.0 is not allowed; it must be > 0"),
+        ({"winding": 1}, "winding: 1 is not allowed; the model 'duffing' has the angles"),
+        ({"winding": {"x": 1}}, "winding: 'x' is not known"),
+        ({"scheme": "central3"}, "scheme: 'central3' is not known.*Did you mean 'central2'"),
+        ({"parameters": {"m": 1.0, "c": 1.0, "k": 1.0}}, "parameters: missing 'k3'"),
+        ({"parameters": DUFFING | {"k5": 1.0}}, "parameters: 'k5' is not known"),
+        ({"guess": {"x": np.zeros(3)}}, r"guess\['x'\]: 3 values are not allowed"),
+        ({"guess": "zero"}, "guess: 'zero' is not known"),
+        ({"periods": 0}, "periods: 0 is not allowed"),
+    ],
+)
+def test_bad_arguments_are_named(changes, message):
+    arguments = {
+        "model": bp.models.duffing, "parameters": DUFFING, "inputs": {"force": np.ones(100)}, "frequency": 1.0,
+        "samples": 100,
+    }
+    with pytest.raises(ValueError, match=message):
+        bp.solve_periodic(**(arguments | changes))
+
+
+def test_autonomous_model_is_refused():
+    model = bp.Model(
+        "free", states=["x"], parameters=["k"], equations=lambda s, p, u: [s.ddx + p.k * s.x],
+        outputs=lambda s, p, u: {"x": s.x},
+    )
+    with pytest.raises(ValueError, match="'free' is autonomous"):
+        bp.solve_periodic(model, {"k": 1.0}, frequency=1.0)
