@@ -143,9 +143,9 @@ def corner(posterior: Posterior, *, laplace: MapEstimate | None = None, figure: 
     handles = [plt.Line2D([], [], color=COLOURS["mcmc"], lw=4, label=f"MCMC, {_levels()}")]
     if laplace is not None:
         handles.append(plt.Line2D([], [], color=COLOURS["laplace"], lw=1.6, ls="--", label=f"Laplace, {_levels()}"))
-    title = None if posterior.converged else "NOT CONVERGED"
     figure.legend(handles=handles, loc="upper right", bbox_to_anchor=(0.97, 0.97), frameon=False, fontsize=14,
-                  title=title)
+                  title=_caveats(posterior) or None, title_fontsize=14)
+    figure.subplots_adjust(left=0.1, bottom=0.1)
     return figure
 
 
@@ -180,7 +180,7 @@ def _laplace_on_corner(axes: np.ndarray, names: tuple[str, ...], laplace: MapEst
                 )
 
 
-def traces(posterior: Posterior, *, walkers: int = 8, figure: Figure | None = None) -> Figure:
+def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = None) -> Figure:
     """Draw, for every parameter, the paths of a few walkers of each ensemble.
 
     Parameters
@@ -204,21 +204,27 @@ def traces(posterior: Posterior, *, walkers: int = 8, figure: Figure | None = No
     for axes, name in zip(rows, names, strict=True):
         paths = posterior.draws(name).reshape(chains, steps)
         for e in np.unique(ensemble):
-            shown = paths[ensemble == e][:walkers, :: max(1, steps // 400)]
-            across = np.arange(shown.shape[1]) * max(1, steps // 400)
+            shown = paths[ensemble == e][:walkers, :: max(1, steps // 300)]
+            across = np.arange(shown.shape[1]) * max(1, steps // 300)
             axes.plot(across, shown.T, color=ENSEMBLES[e % len(ENSEMBLES)], lw=0.4, alpha=0.6)
         axes.set_ylabel(_label(name, _unit(posterior, name)).replace(" [", "\n["), fontsize=8)
         axes.annotate(f"tau {posterior.tau[name]:.0f} steps, R-hat {posterior.rhat[name]:.3f}", (0.995, 0.97),
                       xycoords="axes fraction", ha="right", va="top", fontsize=7,
                       bbox={"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1.5})
-    rows[-1].set_xlabel("step after burn-in; a colour is an independent ensemble"
-                        + ("" if posterior.converged else " (NOT CONVERGED)"))
+    rows[-1].set_xlabel("step after burn-in; a colour is an independent ensemble")
+    if caveats := _caveats(posterior):
+        figure.suptitle(caveats)
     return figure
 
 
 def _measured(problem: Problem, cycles: int) -> str:
     synthetic = any(e.synthetic for e in problem.experiments)
     return f"{'synthetic' if synthetic else 'measured'}, mean of {cycles} cycles"
+
+
+def _caveats(posterior: Posterior) -> str:
+    said = ["synthetic data"] if posterior.data.attrs.get("synthetic") else []
+    return ", ".join(said + ([] if posterior.converged else ["NOT CONVERGED"]))
 
 
 def _closed(values: np.ndarray) -> np.ndarray:

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from PIL import Image
 
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "corner", "matplotlib", "xarray")
 DOTS_PER_INCH = 100
+COLOURS = 64
 
 
 def find_data(given: Path | None, relative: str) -> tuple[Path, str] | None:
@@ -77,12 +79,14 @@ def write_results(folder: Path, results: dict[str, Any]) -> Path:
 
 
 def save_figures(folder: Path, figures: dict[str, Figure]) -> list[Path]:
-    """Save figures as PNG, without time stamps, each whole or not at all; return their paths."""
+    """Save figures as small PNG files, without time stamps, each whole or not at all; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for name, figure in figures.items():
         target, draft = folder / f"{name}.png", folder / f".{name}.part.png"
-        figure.savefig(draft, dpi=DOTS_PER_INCH, metadata={"Software": None})
+        figure.savefig(draft, dpi=DOTS_PER_INCH)
+        with Image.open(draft) as picture:
+            picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(draft, optimize=True)
         draft.replace(target)
         paths.append(target)
     return paths

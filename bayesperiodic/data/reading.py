@@ -6,19 +6,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from bayesperiodic import checks
 
 
 def read_csv(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
     """Return named columns of a CSV file with a header line."""
+    import pandas as pd
+
     try:
         table = pd.read_csv(existing(path), skipinitialspace=True, low_memory=False)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise ValueError(f"path: {str(path)!r} cannot be read as CSV ({error}); it needs a header line.") from None
     table.columns = [str(name).strip() for name in table.columns]
-    return {column: _numbers(path, column, _pick(path, table, column)) for column in columns}
+    result = {}
+    for column in columns:
+        values = _pick(path, table, column)
+        if not pd.api.types.is_numeric_dtype(values):
+            row = int(np.flatnonzero(pd.to_numeric(values, errors="coerce").isna() & values.notna())[0])
+            raise ValueError(
+                f"column {column!r} of {Path(path).name}: {values.iloc[row]!r} in data row {row + 1} is not allowed; "
+                "every cell must be a number."
+            )
+        result[column] = _numbers(path, column, values.to_numpy())
+    return result
 
 
 def read_npz(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
@@ -65,12 +76,6 @@ def _pick(path: str | Path, source: Mapping[str, Any], column: str) -> Any:
 
 def _numbers(path: str | Path, column: str, values: Any) -> np.ndarray:
     argument = f"column {column!r} of {Path(path).name}"
-    if isinstance(values, pd.Series) and not pd.api.types.is_numeric_dtype(values):
-        numbers = pd.to_numeric(values, errors="coerce")
-        row = int(np.flatnonzero(numbers.isna() & values.notna())[0])
-        raise ValueError(
-            f"{argument}: {values.iloc[row]!r} in data row {row + 1} is not allowed; every cell must be a number."
-        )
     array = np.squeeze(np.asarray(values))
     if array.ndim != 1 or array.dtype.kind not in "fiub":
         raise ValueError(

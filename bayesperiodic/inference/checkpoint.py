@@ -1,6 +1,9 @@
 """Where a sampling run is kept while it goes on: emcee's HDF5 backend, one group an ensemble."""
 
 import hashlib
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import emcee
@@ -9,6 +12,18 @@ import numpy as np
 
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.models.compile import kernel_source
+
+
+class SharedBackend(emcee.backends.HDFBackend):
+    """emcee's HDF5 backend, one thread at a time in the file, because HDF5 opens no file twice in different modes."""
+
+    _lock = threading.RLock()
+
+    @contextmanager
+    def open(self, mode: str = "r") -> Iterator[h5py.File]:
+        """Open the file for this thread alone."""
+        with self._lock, super().open(mode) as file:
+            yield file
 
 
 def backends(checkpoint: str | Path | None, problem: Problem, settings: str, ensembles: int) -> list:
@@ -34,7 +49,7 @@ def backends(checkpoint: str | Path | None, problem: Problem, settings: str, ens
                 )
     except OSError as error:
         raise ValueError(f"checkpoint: {str(path)!r} cannot be used ({error}).") from None
-    return [emcee.backends.HDFBackend(str(path), name=f"ensemble {k}") for k in range(ensembles)]
+    return [SharedBackend(str(path), name=f"ensemble {k}") for k in range(ensembles)]
 
 
 def fingerprint(problem: Problem) -> str:

@@ -224,9 +224,10 @@ class Problem:
             equations, anchor = self.equations[experiment.name], self.anchors[experiment.name]
             y, codes, _ = solve_batch(equations, parameters, anchor, threads)
             status = np.maximum(status, codes)
-            for c, channel in enumerate(self.channels):
-                if channel in experiment.outputs:
-                    moments[:, c] += self._moment(experiment, channel, y[:, :, self.model.outputs.index(channel)])
+            with np.errstate(over="ignore", invalid="ignore"):
+                for c, channel in enumerate(self.channels):
+                    if channel in experiment.outputs:
+                        moments[:, c] += self._moment(experiment, channel, y[:, :, self.model.outputs.index(channel)])
         moments[(status != CONVERGED) | ~np.isfinite(moments).all(axis=1)] = np.inf
         return moments.reshape(*values.shape[:-1], -1), status.reshape(values.shape[:-1])
 

@@ -208,7 +208,10 @@ def _posterior(
         name: (("chain", "draw"), theta[..., i], {"units": units.get(name, "")})
         for i, name in enumerate(problem.names)
     }
-    squared = {f"units of {c}": f"({units[c]})²" for c in problem.channels if c in units}
+    squared = {
+        f"units of {c}": f"{units[c]}²" if units[c].isalpha() else f"({units[c]})²"
+        for c in problem.channels if c in units
+    }
     variables["variance"] = (("chain", "draw", "channel"), variances, squared)
     stats = {"lp": (("chain", "draw"), lp.transpose(0, 2, 1).reshape(ensembles * walkers, steps))}
     data = xr.DataTree.from_dict(
@@ -221,6 +224,7 @@ def _posterior(
     )
     data.attrs = {
         "seed": seed, "fingerprint": fingerprint(problem), "converged": int(converged), "reason": reason,
+        "synthetic": int(any(e.synthetic for e in problem.experiments)),
         "bayesperiodic": importlib.metadata.version("bayesperiodic"), "emcee": emcee.__version__,
     }
     draws = steps * walkers * ensembles

@@ -112,7 +112,7 @@ class Model:
                 f"equations: {len(self.equations)} are not allowed; there must be one a state, {len(self.states)}."
             )
         given = dict(outputs(*spaces))
-        self.outputs = checks.identifiers("outputs", given, RESERVED)
+        self.outputs = checks.identifiers("outputs", given, (*RESERVED, *self.inputs))
         self.output_expressions = tuple(self._expression("outputs", given[n]) for n in self.outputs)
         if not self.outputs:
             raise ValueError("outputs: {} is not allowed; a model needs at least one output.")

@@ -1,0 +1,24 @@
+import matplotlib
+import pytest
+
+import bayesperiodic as bp
+from tests.known import LINEAR, linear_experiment
+
+matplotlib.use("Agg")
+
+
+@pytest.fixture(scope="session")
+def solved():
+    """Return a problem, its MAP estimate and a short posterior, all plain and well determined."""
+    priors = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}
+    problem = bp.Problem(LINEAR, [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)], priors=priors)
+    fit = bp.map_estimate(problem)
+    return problem, fit, bp.sample(problem, fit, seed=1, progress=False)
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    import matplotlib.pyplot as plt
+
+    plt.close("all")

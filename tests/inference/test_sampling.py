@@ -1,0 +1,145 @@
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.inference import chains, sampling
+from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+
+TRUTH = np.array([900.0, 40.0, 25.0])
+PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
+QUIET = {"progress": False}
+
+
+@pytest.fixture(scope="module")
+def known_variance():
+    experiment = linear_experiment(TRUTH, 3.0, seed=1)
+    problem = bp.Problem(LINEAR, [experiment], priors=PRIORS, fixed={"variance[force]": 9.0})
+    return problem, bp.map_estimate(problem)
+
+
+@pytest.fixture(scope="module")
+def posterior(known_variance):
+    return bp.sample(*known_variance, seed=1, **QUIET)
+
+
+def test_emcee_matches_the_closed_form_within_monte_carlo_error(known_variance, posterior):
+    """Means, sds and covariances within 4 Monte Carlo errors: false-alarm rate below 0.1 % over the nine figures."""
+    problem, _ = known_variance
+    design = linear_regressors(0.05, 2.0, grid(40))
+    precision = np.diag([60.0**-2, 20.0**-2, 10.0**-2])
+    covariance = np.linalg.inv(design.T @ design / 9.0 + precision)
+    right = design.T @ problem.experiments[0].outputs["force"] / 9.0 + precision @ [800.0, 30.0, 20.0]
+    mean, sd = covariance @ right, np.sqrt(np.diag(covariance))
+    assert posterior.converged
+    draws = np.stack([posterior.draws(name) for name in problem.names], axis=-1)
+    error = 4 / np.sqrt(min(posterior.ess.values()))
+    assert (draws.mean(axis=0) - mean) / sd == pytest.approx(np.zeros(3), abs=error)
+    assert np.cov(draws.T) / np.outer(sd, sd) == pytest.approx(covariance / np.outer(sd, sd), abs=np.sqrt(2) * error)
+
+
+def test_unknown_variance_follows_its_closed_form():
+    """With flat priors on θ, Jeffreys' prior and n − l degrees of freedom, M/v is χ²: v's mean and the t-like sd of θ."""
+    flat = {"k": bp.Normal(900.0, 1e6), "coulomb": bp.Normal(25.0, 1e6)}
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=2)], priors=flat, fixed={"c": 40.0})
+    fit = bp.map_estimate(problem)
+    posterior = bp.sample(problem, fit, seed=2, **QUIET)
+    moment, degrees = fit.rms["force"] ** 2 * 40, 38
+    error = 4 / np.sqrt(min(posterior.ess.values()))
+    variance = posterior.draws("variance[force]")
+    expected = moment / (degrees - 2)
+    assert variance.mean() == pytest.approx(expected, rel=error * np.sqrt(2 / (degrees - 4)))
+    student = fit.sd["coulomb"] * np.sqrt(degrees / (degrees - 2))
+    assert posterior.draws("coulomb").std() == pytest.approx(student, rel=error)
+
+
+def test_positive_parameter_sampled_in_its_logarithm_keeps_its_natural_density():
+    """No data to speak of: the draws are the prior's."""
+    priors = PRIORS | {"c": bp.LogNormal(30.0, 0.5)}
+    experiment = linear_experiment(TRUTH, 3.0, seed=3)
+    problem = bp.Problem(LINEAR, [experiment], priors=priors, fixed={"variance[force]": 1e12})
+    posterior = bp.sample(problem, bp.map_estimate(problem), seed=3, **QUIET)
+    logarithm = np.log(posterior.draws("c") / 30.0) / 0.5
+    error = 4 / np.sqrt(posterior.ess["c"])
+    assert logarithm.mean() == pytest.approx(0.0, abs=error)
+    assert logarithm.std() == pytest.approx(1.0, abs=error)
+
+
+def test_same_seed_same_bits_and_another_seed_other_draws(known_variance):
+    first, again, other = (bp.sample(*known_variance, seed=s, max_steps=250, **QUIET) for s in (5, 5, 6))
+    assert np.array_equal(first.draws("k"), again.draws("k"))
+    assert not np.array_equal(first.draws("k"), other.draws("k"))
+
+
+def test_bits_do_not_depend_on_the_number_of_cores(known_variance, monkeypatch):
+    two = bp.sample(*known_variance, seed=5, max_steps=250, **QUIET)
+    monkeypatch.setattr(sampling, "available_cores", lambda: 1)
+    assert np.array_equal(two.draws("k"), bp.sample(*known_variance, seed=5, max_steps=250, **QUIET).draws("k"))
+
+
+def test_reaching_max_steps_is_reported(known_variance):
+    posterior = bp.sample(*known_variance, seed=1, max_steps=250, **QUIET)
+    assert not posterior.converged
+    assert "max_steps = 250 reached with length only" in posterior.reason
+    assert "NOT CONVERGED" in repr(posterior)
+
+
+def test_resumed_run_gives_the_same_chain(known_variance, tmp_path):
+    whole = bp.sample(*known_variance, seed=5, max_steps=500, **QUIET)
+    bp.sample(*known_variance, seed=5, max_steps=250, checkpoint=tmp_path / "run.h5", **QUIET)
+    resumed = bp.sample(*known_variance, seed=5, max_steps=500, checkpoint=tmp_path / "run.h5", **QUIET)
+    assert np.array_equal(whole.draws("k"), resumed.draws("k"))
+
+
+def test_checkpoint_of_another_run_is_refused(known_variance, tmp_path):
+    bp.sample(*known_variance, seed=5, max_steps=250, checkpoint=tmp_path / "run.h5", **QUIET)
+    with pytest.raises(ValueError, match="belongs to another run"):
+        bp.sample(*known_variance, seed=6, max_steps=250, checkpoint=tmp_path / "run.h5", **QUIET)
+    (tmp_path / "text.h5").write_text("no HDF5")
+    with pytest.raises(ValueError, match="checkpoint: .* cannot be used"):
+        bp.sample(*known_variance, seed=6, max_steps=250, checkpoint=tmp_path / "text.h5", **QUIET)
+
+
+def test_draws_pass_into_arviz_and_carry_units(posterior):
+    group = posterior.data["posterior"].to_dataset()
+    assert group["k"].dims == ("chain", "draw")
+    assert group["k"].attrs["units"] == "N/m"
+    assert group["variance"].dims == ("chain", "draw", "channel")
+    assert set(np.unique(group["ensemble"])) == {0, 1, 2, 3}
+    assert float(chains.arviz().ess(group[["k"]])["k"]) > 500
+
+
+def test_rhat_sees_ensembles_that_disagree():
+    generator = np.random.default_rng(4)
+    agreeing = generator.standard_normal((4, 100, 8, 1))
+    assert chains.rhat(agreeing)[0] < 1.01
+    assert chains.rhat(agreeing + np.arange(4)[:, None, None, None])[0] > 1.3
+
+
+def test_summary_names_its_interval(posterior):
+    table = posterior.summary()
+    assert list(table.columns) == ["mean", "sd", "q05", "q50", "q95", "mcse_mean", "ess", "tau", "rhat"]
+    assert table.attrs["interval"] == "90 % equal-tailed: q05 to q95"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"walkers": 4}, "walkers: 4 is not allowed; it must be even and at least twice the dimension, 6 for k, c, coulomb"),
+        ({"walkers": 9}, "walkers: 9 is not allowed"),
+        ({"ensembles": 1}, "ensembles: 1 is not allowed"),
+        ({"max_steps": 10}, "max_steps: 10 is not allowed"),
+        ({"seed": -1}, "seed: -1 is not allowed"),
+    ],
+)
+def test_bad_arguments_are_named(known_variance, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        bp.sample(*known_variance, **({"seed": 1, "progress": False} | arguments))
+
+
+def test_start_where_nothing_is_finite_fails_loudly(known_variance):
+    problem, fit = known_variance
+    other = bp.Problem(
+        LINEAR, problem.experiments, priors=PRIORS | {"k": bp.Uniform(0.0, 1.0)}, fixed={"variance[force]": 9.0}
+    )
+    with pytest.raises(ValueError, match=r"100\.0% have no finite log-posterior"):
+        bp.sample(other, fit, seed=1, **QUIET)

@@ -1,0 +1,82 @@
+import os
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import bayesperiodic as bp
+from tests.known import grid
+
+
+def same(a, b):
+    if isinstance(a, np.ndarray):
+        return np.array_equal(a, b, equal_nan=True)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, pd.DataFrame):
+        return a.equals(b)
+    if isinstance(a, xr.DataTree):
+        return a.identical(b)
+    if hasattr(a, "__dataclass_fields__"):
+        return type(a) is type(b) and all(same(getattr(a, f), getattr(b, f)) for f in a.__dataclass_fields__)
+    return a == b
+
+
+def results(solved):
+    problem, fit, posterior = solved
+    solution = bp.solve_periodic(
+        bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": np.cos(2 * np.pi * grid(64))},
+        frequency=0.2, samples=64,
+    )
+    recording = bp.Recording.from_arrays(np.arange(9.0), {"y": np.sin(np.arange(9.0))})
+    return [
+        recording, problem.experiments[0], solution, fit, posterior, bp.compare(problem, fit, posterior),
+        bp.predict(problem, posterior, draws=20),
+    ]
+
+
+def test_every_result_reads_back_as_it_was(solved, tmp_path):
+    for result in results(solved):
+        result.save(tmp_path / "result.h5")
+        assert same(result, bp.load(tmp_path / "result.h5")), type(result).__name__
+
+
+def test_saved_posterior_opens_in_xarray(solved, tmp_path):
+    posterior = solved[2]
+    posterior.save(tmp_path / "posterior.nc")
+    with xr.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as tree:
+        assert np.array_equal(tree["posterior"]["k"].values, posterior.data["posterior"]["k"].values)
+
+
+def test_a_failed_save_leaves_the_old_file(solved, tmp_path, monkeypatch):
+    fit = solved[1]
+    fit.save(tmp_path / "fit.h5")
+    before = (tmp_path / "fit.h5").read_bytes()
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        fit.save(tmp_path / "fit.h5")
+    assert (tmp_path / "fit.h5").read_bytes() == before
+    assert os.listdir(tmp_path) == ["fit.h5"]
+
+
+def test_other_files_are_refused(tmp_path):
+    (tmp_path / "text.h5").write_text("text")
+    with pytest.raises(ValueError, match="is not a saved result"):
+        bp.load(tmp_path / "text.h5")
+    with pytest.raises(FileNotFoundError, match="there is no such file"):
+        bp.load(tmp_path / "nothing.h5")
+
+
+def test_a_file_cannot_name_a_class_from_elsewhere(solved, tmp_path):
+    import h5py
+
+    solved[1].save(tmp_path / "fit.h5")
+    with h5py.File(tmp_path / "fit.h5", "a") as file:
+        file.attrs["bayesperiodic_result"] = '{"result": "subprocess:Popen", "fields": {"args": "true"}}'
+    with pytest.raises(ValueError, match="a saved 'subprocess:Popen' is not known"):
+        bp.load(tmp_path / "fit.h5")
