@@ -63,7 +63,11 @@ def fit(
 
 
 def loops(
-    problem: Problem, estimate: MapEstimate, *, output: str | None = None, input: str | None = None,
+    problem: Problem,
+    estimate: MapEstimate,
+    *,
+    output: str | None = None,
+    input: str | None = None,
     figure: Figure | None = None,
 ) -> Figure:
     """Draw an output against an input and against that input's rate, measured and fitted, for every experiment.
@@ -87,7 +91,7 @@ def loops(
     """
     output = problem.channels[0] if output is None else output
     checks.one_of("output", output, problem.channels)
-    input = input if input is not None or not problem.model.inputs else problem.model.inputs[0]
+    input = next(iter(problem.model.inputs), "") if input is None else input
     checks.one_of("input", input, problem.model.inputs)
     figure = figure or plt.figure(figsize=(9.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
@@ -98,10 +102,21 @@ def loops(
         rate = fourier.on_grid(fourier.derivative(amplitudes, e.frequency / e.periods), measured.size)
         for axes, across in ((left, e.inputs[input]), (right, rate)):
             first = number == 0
-            axes.plot(_closed(across), _closed(measured), color=COLOURS["measured"], lw=1.6,
-                      label=_measured(problem, e.cycles) if first else None)
-            axes.plot(_closed(across), _closed(predicted), color=COLOURS["map"], lw=1.2, ls="--",
-                      label="MAP" if first else None)
+            axes.plot(
+                _closed(across),
+                _closed(measured),
+                color=COLOURS["measured"],
+                lw=1.6,
+                label=_measured(problem, e.cycles) if first else None,
+            )
+            axes.plot(
+                _closed(across),
+                _closed(predicted),
+                color=COLOURS["map"],
+                lw=1.2,
+                ls="--",
+                label="MAP" if first else None,
+            )
     unit = problem.model.units.get(input, "")
     left.set_xlabel(_label(input, unit))
     right.set_xlabel(_label(f"rate of {input}", f"{unit}/s" if unit else ""))
@@ -133,9 +148,19 @@ def corner(posterior: Posterior, *, laplace: MapEstimate | None = None, figure: 
     span = [tuple(np.quantile(draws[:, i], [0.0005, 0.9995])) for i in range(len(names))]
     size = 1.75 * len(names) + 0.6
     figure = corner_package.corner(
-        draws, labels=[_label(n, _unit(posterior, n)) for n in names], levels=LEVELS, range=span, bins=35, smooth=1.0,
-        color=COLOURS["mcmc"], plot_datapoints=False, fill_contours=True, hist_kwargs={"density": True, "lw": 1.4},
-        contour_kwargs={"linewidths": 0.9, "colors": COLOURS["map"]}, max_n_ticks=3, labelpad=0.12,
+        draws,
+        labels=[_label(n, _unit(posterior, n)) for n in names],
+        levels=LEVELS,
+        range=span,
+        bins=35,
+        smooth=1.0,
+        color=COLOURS["mcmc"],
+        plot_datapoints=False,
+        fill_contours=True,
+        hist_kwargs={"density": True, "lw": 1.4},
+        contour_kwargs={"linewidths": 0.9, "colors": COLOURS["map"]},
+        max_n_ticks=3,
+        labelpad=0.12,
         fig=figure or plt.figure(figsize=(size, size)),
     )
     if laplace is not None:
@@ -143,8 +168,15 @@ def corner(posterior: Posterior, *, laplace: MapEstimate | None = None, figure: 
     handles = [plt.Line2D([], [], color=COLOURS["mcmc"], lw=4, label=f"MCMC, {_levels()}")]
     if laplace is not None:
         handles.append(plt.Line2D([], [], color=COLOURS["laplace"], lw=1.6, ls="--", label=f"Laplace, {_levels()}"))
-    figure.legend(handles=handles, loc="upper right", bbox_to_anchor=(0.97, 0.97), frameon=False, fontsize=14,
-                  title=_caveats(posterior) or None, title_fontsize=14)
+    figure.legend(
+        handles=handles,
+        loc="upper right",
+        bbox_to_anchor=(0.97, 0.97),
+        frameon=False,
+        fontsize=14,
+        title=_caveats(posterior) or None,
+        title_fontsize=14,
+    )
     figure.subplots_adjust(left=0.1, bottom=0.1)
     return figure
 
@@ -152,6 +184,8 @@ def corner(posterior: Posterior, *, laplace: MapEstimate | None = None, figure: 
 def _laplace_on_corner(axes: np.ndarray, names: tuple[str, ...], laplace: MapEstimate) -> None:
     count = len(names)
     mean, covariance = np.zeros(count), np.zeros((count, count))
+    parameters = [i for i, name in enumerate(names) if name in laplace.theta]
+    covariance[np.ix_(parameters, parameters)] = laplace.covariance.to_numpy()
     for i, name in enumerate(names):
         if name in laplace.theta:
             mean[i] = laplace.theta[name]
@@ -159,11 +193,9 @@ def _laplace_on_corner(axes: np.ndarray, names: tuple[str, ...], laplace: MapEst
             channel = name[len("variance[") : -1]
             mean[i] = laplace.variances[channel]
             covariance[i, i] = 2.0 / laplace.independent[channel] * mean[i] ** 2
-        for j, other in enumerate(names):
-            if name in laplace.theta and other in laplace.theta:
-                covariance[i, j] = laplace.covariance.loc[name, other]
     for i in range(count):
-        x = np.linspace(*axes[i, i].get_xlim(), 200)
+        left, right = axes[i, i].get_xlim()
+        x = np.linspace(left, right, 200)
         sd = np.sqrt(covariance[i, i])
         density = np.exp(-0.5 * ((x - mean[i]) / sd) ** 2) / (sd * np.sqrt(2 * np.pi))
         axes[i, i].plot(x, density, color=COLOURS["laplace"], lw=1.6, ls="--")
@@ -175,8 +207,17 @@ def _laplace_on_corner(axes: np.ndarray, names: tuple[str, ...], laplace: MapEst
             for level in LEVELS:
                 wide, narrow = (2.0 * np.sqrt(-2.0 * np.log(1.0 - level) * v) for v in (values[1], values[0]))
                 axes[i, j].add_patch(
-                    Ellipse((mean[j], mean[i]), wide, narrow, angle=angle, fill=False, color=COLOURS["laplace"],
-                            lw=1.4, ls="--", zorder=5)
+                    Ellipse(
+                        (mean[j], mean[i]),
+                        wide,
+                        narrow,
+                        angle=angle,
+                        fill=False,
+                        color=COLOURS["laplace"],
+                        lw=1.4,
+                        ls="--",
+                        zorder=5,
+                    )
                 )
 
 
@@ -208,9 +249,15 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
             across = np.arange(shown.shape[1]) * max(1, steps // 300)
             axes.plot(across, shown.T, color=ENSEMBLES[e % len(ENSEMBLES)], lw=0.4, alpha=0.6)
         axes.set_ylabel(_label(name, _unit(posterior, name)).replace(" [", "\n["), fontsize=8)
-        axes.annotate(f"tau {posterior.tau[name]:.0f} steps, R-hat {posterior.rhat[name]:.3f}", (0.995, 0.97),
-                      xycoords="axes fraction", ha="right", va="top", fontsize=7,
-                      bbox={"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1.5})
+        axes.annotate(
+            f"tau {posterior.tau[name]:.0f} steps, R-hat {posterior.rhat[name]:.3f}",
+            (0.995, 0.97),
+            xycoords="axes fraction",
+            ha="right",
+            va="top",
+            fontsize=7,
+            bbox={"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1.5},
+        )
     rows[-1].set_xlabel("step after burn-in; a colour is an independent ensemble")
     if caveats := _caveats(posterior):
         figure.suptitle(caveats)

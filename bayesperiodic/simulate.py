@@ -20,9 +20,16 @@ Signal = np.ndarray | Callable[[np.ndarray], np.ndarray]
 
 
 def simulate(
-    model: Model, parameters: Mapping[str, float], inputs: Mapping[str, Signal] | None = None, *, frequency: float,
-    duration: float, sampling_rate: float, start: Mapping[str, float] | None = None,
-    noise: Mapping[str, float] | None = None, seed: int | None = None,
+    model: Model,
+    parameters: Mapping[str, float],
+    inputs: Mapping[str, Signal] | None = None,
+    *,
+    frequency: float,
+    duration: float,
+    sampling_rate: float,
+    start: Mapping[str, float] | None = None,
+    noise: Mapping[str, float] | None = None,
+    seed: int | None = None,
 ) -> Recording:
     """Integrate a model in time and return what an instrument would record; the recording is marked synthetic.
 
@@ -111,7 +118,7 @@ class _FirstOrder:
         return np.ascontiguousarray(np.stack(columns, axis=-1)) if columns else np.empty((time.size, 0))
 
     def states(self, time: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return (points, 3·states) with the highest derivatives solved from the equations, in which they are linear."""
+        """Return (points, 3·states) with the highest derivatives solved from the equations, linear in them."""
         states = np.zeros((time.size, 3 * self.count))
         states[:, : self.count] = y[:, : self.count]
         for column, i in enumerate(self.second):
@@ -137,7 +144,13 @@ def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.n
     trial = solve_ivp(system, (span[0], min(span[1], 3.0 / system.frequency)), start, rtol=1e-3, max_step=step)
     size = np.max(np.abs(trial.y), axis=1) + np.finfo(float).tiny
     result = solve_ivp(
-        system, span, start, method="DOP853", t_eval=time, rtol=RELATIVE_TOLERANCE, atol=RELATIVE_TOLERANCE * size,
+        system,
+        span,
+        start,
+        method="DOP853",
+        t_eval=time,
+        rtol=RELATIVE_TOLERANCE,
+        atol=RELATIVE_TOLERANCE * size,
         max_step=step,
     )
     if not result.success or not np.isfinite(result.y).all():
@@ -150,11 +163,11 @@ def _with_derivatives(name: str, signal: Signal, frequency: float) -> Callable[[
         function, step = signal, DIFFERENCE_STEP / frequency
 
         def sampled(time: np.ndarray) -> list[np.ndarray]:
-            derivatives = [
-                sum(weight * function(time + offset * step) for offset, weight in SIXTH_ORDER[order]) / step**order
-                for order in (1, 2)
-            ]
-            return [function(time), *derivatives]
+            derivatives = [np.asarray(function(time), dtype=float)]
+            for order in (1, 2):
+                terms = [weight * function(time + offset * step) for offset, weight in SIXTH_ORDER[order]]
+                derivatives.append(np.sum(terms, axis=0) / step**order)
+            return derivatives
 
         return sampled
     amplitudes = fourier.coefficients(checks.finite_vector(f"inputs[{name!r}]", signal))

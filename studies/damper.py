@@ -19,7 +19,7 @@ FILE = "mr_damper/mr_damper_4.1.csv"
 ADDRESS = "github.com/labcontrol-data/mr-damper (commit e42439f0), mr_damper_4.1.csv"
 SHA256 = "86fde635ae4dc78174cdbd3bafafb415c8a05a89c6862004ebc4e7ff970a9d64"
 PUBLISHED = {"Kx": 768.0, "K": 0.0, "F0": 0.0, "Kw": 57.4, "rho": 27_500.0}
-PRIORS = {
+PRIORS: dict[str, Any] = {
     "Kx": bp.LogNormal(1e3, 1.0),
     "K": bp.Normal(0.0, 5e3),
     "F0": bp.Normal(0.0, 50.0),
@@ -89,8 +89,12 @@ def read_recording(given: Path | None, seed: int) -> tuple[bp.Recording, dict[st
         return generate(seed), {"path": "generated", "sha256": None, "synthetic": True}
     path, name = found
     recording = bp.Recording.from_csv(
-        path, time="time_s", inputs={"displacement": "displacement_mm"}, outputs={"force": "force_N"},
-        units={"displacement": ("mm", "m")}, name="magneto-rheological damper, 0 V",
+        path,
+        time="time_s",
+        inputs={"displacement": "displacement_mm"},
+        outputs={"force": "force_N"},
+        units={"displacement": ("mm", "m")},
+        name="magneto-rheological damper, 0 V",
     )
     return recording, {"path": name, "sha256": common.sha256(path), "synthetic": False}
 
@@ -102,8 +106,14 @@ def generate(seed: int) -> bp.Recording:
         amplitudes[harmonic] = amplitude
     phase = 2j * np.pi * np.arange(64)[:, None] / 64 * np.arange(amplitudes.size)
     return bp.simulate(
-        bp.models.dahl, PUBLISHED, {"displacement": (np.exp(phase) @ amplitudes).real}, frequency=SYNTHETIC_FREQUENCY,
-        duration=30.0, sampling_rate=100.0, noise=SYNTHETIC_NOISE, seed=seed,
+        bp.models.dahl,
+        PUBLISHED,
+        {"displacement": (np.exp(phase) @ amplitudes).real},
+        frequency=SYNTHETIC_FREQUENCY,
+        duration=30.0,
+        sampling_rate=100.0,
+        noise=SYNTHETIC_NOISE,
+        seed=seed,
     )
 
 
@@ -121,14 +131,23 @@ def fit_with(recording: bp.Recording, count: int) -> dict[str, Any]:
 def summary(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, Any]:
     """Return what one choice of harmonics leads to."""
     return {
-        "harmonics": experiment.harmonics["displacement"], "map": fit.theta, "laplace_sd": fit.sd,
-        "rms": fit.rms["force"], "fvu": fit.fvu["force"], "input_noise": fit.input_noise["force"],
+        "harmonics": experiment.harmonics["displacement"],
+        "map": fit.theta,
+        "laplace_sd": fit.sd,
+        "rms": fit.rms["force"],
+        "fvu": fit.fvu["force"],
+        "input_noise": fit.input_noise["force"],
     }
 
 
 def collect(
-    data: dict[str, Any], experiment: bp.Experiment, fit: bp.MapEstimate, posterior: bp.Posterior,
-    comparison: bp.Comparison, choices: list[dict[str, Any]], seed: int,
+    data: dict[str, Any],
+    experiment: bp.Experiment,
+    fit: bp.MapEstimate,
+    posterior: bp.Posterior,
+    comparison: bp.Comparison,
+    choices: list[dict[str, Any]],
+    seed: int,
 ) -> dict[str, Any]:
     """Return the content of results.json, times and versions excepted."""
     table = posterior.summary()
@@ -145,7 +164,8 @@ def collect(
         "map": fit.theta,
         "laplace_sd": fit.sd,
         "posterior": {
-            name: {key: float(row[key]) for key in ("mean", "sd", "q05", "q50", "q95")} for name, row in table.iterrows()
+            name: {key: float(row[key]) for key in ("mean", "sd", "q05", "q50", "q95")}
+            for name, row in table.iterrows()
         },
         "comparison": comparison.table["verdict"].to_dict(),
         "rms": fit.rms["force"],
@@ -164,8 +184,12 @@ def collect(
 
 
 def tables(
-    data: dict[str, Any], experiment: bp.Experiment, fit: bp.MapEstimate, posterior: bp.Posterior,
-    comparison: bp.Comparison, choices: list[dict[str, Any]],
+    data: dict[str, Any],
+    experiment: bp.Experiment,
+    fit: bp.MapEstimate,
+    posterior: bp.Posterior,
+    comparison: bp.Comparison,
+    choices: list[dict[str, Any]],
 ) -> str:
     """Return the tables that the study prints, with what must be said about them."""
     kind = "SYNTHETIC data" if data["synthetic"] else "measured data"
@@ -173,9 +197,15 @@ def tables(
     rows = pd.DataFrame(
         {
             "unit": [bp.models.dahl.units[name] for name in table.index],
-            "MAP": table["map"], "Laplace sd": table["laplace_sd"], "mean": table["mean"], "sd": table["sd"],
-            "5 %": table["q05"], "95 %": table["q95"], "skewness": table["skewness"],
-            "published": [PUBLISHED[name] or np.nan for name in table.index], "Laplace is": table["verdict"],
+            "MAP": table["map"],
+            "Laplace sd": table["laplace_sd"],
+            "mean": table["mean"],
+            "sd": table["sd"],
+            "5 %": table["q05"],
+            "95 %": table["q95"],
+            "skewness": table["skewness"],
+            "published": [PUBLISHED[name] or np.nan for name in table.index],
+            "Laplace is": table["verdict"],
         },
         index=table.index,
     )
@@ -197,7 +227,10 @@ def tables(
     lines.append(
         pd.DataFrame(
             [
-                {"harmonics": c["harmonics"], "default": "*" if c["harmonics"] == experiment.harmonics["displacement"] else ""}
+                {
+                    "harmonics": c["harmonics"],
+                    "default": "*" if c["harmonics"] == experiment.harmonics["displacement"] else "",
+                }
                 | {name: f"{c['map'][name]:.4g} ± {c['laplace_sd'][name]:.2g}" for name in c["map"]}
                 | {"fvu": f"{c['fvu']:.3%}"}
                 for c in choices

@@ -37,13 +37,21 @@ def linear_experiment(
     clean = linear_regressors(0.05, 2.0, tau) @ theta
     noise = sd * np.random.default_rng(seed).standard_normal(samples)
     return bp.Experiment(
-        "run", 2.0, {"force": clean + noise}, {"x": 0.05 * np.sin(2 * np.pi * tau)}, samples=samples,
+        "run",
+        2.0,
+        {"force": clean + noise},
+        {"x": 0.05 * np.sin(2 * np.pi * tau)},
+        samples=samples,
         independent=None if independent is None else {"force": independent},
     )
 
 
 def complex_step_sensitivities(
-    model: bp.Model, parameters: dict[str, float], inputs: dict[str, np.ndarray], frequency: float, samples: int,
+    model: bp.Model,
+    parameters: dict[str, float],
+    inputs: dict[str, np.ndarray],
+    frequency: float,
+    samples: int,
     scheme: str,
 ) -> dict[str, dict[str, np.ndarray]]:
     """Return ∂output/∂parameter by complex steps through an independent dense solver of the same difference equations.

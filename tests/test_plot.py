@@ -53,8 +53,10 @@ def test_traces_show_every_parameter_with_its_diagnostics(solved):
 def test_a_given_figure_is_used_and_returned(solved):
     problem, fit, posterior = solved
     for draw in (
-        lambda f: bp.plot.fit(problem, fit, figure=f), lambda f: bp.plot.loops(problem, fit, figure=f),
-        lambda f: bp.plot.corner(posterior, figure=f), lambda f: bp.plot.traces(posterior, figure=f),
+        lambda f: bp.plot.fit(problem, fit, figure=f),
+        lambda f: bp.plot.loops(problem, fit, figure=f),
+        lambda f: bp.plot.corner(posterior, figure=f),
+        lambda f: bp.plot.traces(posterior, figure=f),
     ):
         figure = plt.figure()
         assert draw(figure) is figure

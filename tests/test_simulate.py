@@ -10,7 +10,12 @@ OSCILLATOR = {"m": 1.3, "c": 0.4, "k": 20.0, "k3": 0.0}
 
 def test_free_decay_has_its_closed_form():
     run = bp.simulate(
-        bp.models.duffing, OSCILLATOR, {"force": np.zeros(8)}, frequency=1.0, duration=6.0, sampling_rate=37.0,
+        bp.models.duffing,
+        OSCILLATOR,
+        {"force": np.zeros(8)},
+        frequency=1.0,
+        duration=6.0,
+        sampling_rate=37.0,
         start={"x": 0.2, "dx": -0.1},
     )
     decay = 0.4 / 2.6
@@ -24,7 +29,11 @@ def test_free_decay_has_its_closed_form():
 @pytest.mark.parametrize("kind", ["array", "function"])
 def test_input_derivatives_reach_the_outputs(kind):
     model = bp.Model(
-        "direct", states=["w"], inputs=["x"], parameters=["a"], equations=lambda s, p, u: [s.dw + p.a * s.w - u.x],
+        "direct",
+        states=["w"],
+        inputs=["x"],
+        parameters=["a"],
+        equations=lambda s, p, u: [s.dw + p.a * s.w - u.x],
         outputs=lambda s, p, u: {"same": u.x, "rate": u.dx, "acceleration": u.ddx},
     )
     f = 3.0
@@ -38,11 +47,16 @@ def test_input_derivatives_reach_the_outputs(kind):
 
 def test_coupled_highest_derivatives_are_solved_for():
     model = bp.Model(
-        "masses", states=["x", "y"], inputs=["u"], parameters=["b"],
+        "masses",
+        states=["x", "y"],
+        inputs=["u"],
+        parameters=["b"],
         equations=lambda s, p, u: [2 * s.ddx + p.b * s.ddy + s.x - u.u, p.b * s.ddx + s.ddy + 3 * s.y],
         outputs=lambda s, p, u: {"balance": 2 * s.ddx + p.b * s.ddy + s.x - u.u},
     )
-    run = bp.simulate(model, {"b": 0.7}, {"u": np.cos(2 * np.pi * grid(8))}, frequency=0.3, duration=9.0, sampling_rate=11.0)
+    run = bp.simulate(
+        model, {"b": 0.7}, {"u": np.cos(2 * np.pi * grid(8))}, frequency=0.3, duration=9.0, sampling_rate=11.0
+    )
     assert run.outputs["balance"] == pytest.approx(np.zeros(run.time.size), abs=1e-12)
 
 
@@ -64,7 +78,12 @@ def test_periodic_solver_and_time_integration_agree_on_the_steady_state():
 
 
 def test_noise_has_its_standard_deviation_and_its_seed():
-    arguments = {"frequency": 1.0, "duration": 20.0, "sampling_rate": 100.0, "noise": {"displacement": 0.1, "force": 0.2}}
+    arguments = {
+        "frequency": 1.0,
+        "duration": 20.0,
+        "sampling_rate": 100.0,
+        "noise": {"displacement": 0.1, "force": 0.2},
+    }
     clean = bp.simulate(bp.models.duffing, OSCILLATOR, {"force": np.ones(8)}, **(arguments | {"noise": None}))
     one, again = (bp.simulate(bp.models.duffing, OSCILLATOR, {"force": np.ones(8)}, seed=3, **arguments) for _ in "12")
     assert np.array_equal(one.outputs["displacement"], again.outputs["displacement"])
@@ -74,11 +93,17 @@ def test_noise_has_its_standard_deviation_and_its_seed():
 
 def test_a_run_that_blows_up_is_an_error():
     model = bp.Model(
-        "blow", states=["x"], inputs=["u"], parameters=["a"], equations=lambda s, p, u: [s.dx - p.a * s.x**2 - 1 - u.u],
+        "blow",
+        states=["x"],
+        inputs=["u"],
+        parameters=["a"],
+        equations=lambda s, p, u: [s.dx - p.a * s.x**2 - 1 - u.u],
         outputs=lambda s, p, u: {"x": sp.sqrt(s.x**2)},
     )
     with pytest.raises(RuntimeError, match="The time integration of 'blow' failed"):
-        bp.simulate(model, {"a": 1.0}, {"u": np.cos(2 * np.pi * grid(8))}, frequency=1.0, duration=10.0, sampling_rate=10.0)
+        bp.simulate(
+            model, {"a": 1.0}, {"u": np.cos(2 * np.pi * grid(8))}, frequency=1.0, duration=10.0, sampling_rate=10.0
+        )
 
 
 @pytest.mark.parametrize(
@@ -92,8 +117,12 @@ def test_a_run_that_blows_up_is_an_error():
 )
 def test_bad_arguments_are_named(changes, message):
     arguments = {
-        "model": bp.models.duffing, "parameters": OSCILLATOR, "inputs": {"force": np.ones(8)}, "frequency": 1.0,
-        "duration": 1.0, "sampling_rate": 10.0,
+        "model": bp.models.duffing,
+        "parameters": OSCILLATOR,
+        "inputs": {"force": np.ones(8)},
+        "frequency": 1.0,
+        "duration": 1.0,
+        "sampling_rate": 10.0,
     }
     with pytest.raises(ValueError, match=message):
         bp.simulate(**(arguments | changes))

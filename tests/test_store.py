@@ -26,12 +26,20 @@ def same(a, b):
 def results(solved):
     problem, fit, posterior = solved
     solution = bp.solve_periodic(
-        bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": np.cos(2 * np.pi * grid(64))},
-        frequency=0.2, samples=64,
+        bp.models.duffing,
+        {"m": 1, "c": 0.2, "k": 1, "k3": 0.5},
+        {"force": np.cos(2 * np.pi * grid(64))},
+        frequency=0.2,
+        samples=64,
     )
     recording = bp.Recording.from_arrays(np.arange(9.0), {"y": np.sin(np.arange(9.0))})
     return [
-        recording, problem.experiments[0], solution, fit, posterior, bp.compare(problem, fit, posterior),
+        recording,
+        problem.experiments[0],
+        solution,
+        fit,
+        posterior,
+        bp.compare(problem, fit, posterior),
         bp.predict(problem, posterior, draws=20),
     ]
 

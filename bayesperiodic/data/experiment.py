@@ -60,11 +60,11 @@ class Experiment(Result):
     samples: int = field(kw_only=True)
     periods: int = field(default=1, kw_only=True)
     winding: int | Mapping[str, int] = field(default=0, kw_only=True)
-    scatter: Mapping[str, float] | None = field(default=None, kw_only=True)
+    scatter: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     cycles: int = field(default=1, kw_only=True)
-    independent: Mapping[str, int] | None = field(default=None, kw_only=True)
-    harmonics: Mapping[str, int] | None = field(default=None, kw_only=True)
-    amplitude_variance: Mapping[str, np.ndarray] | None = field(default=None, kw_only=True)
+    independent: Mapping[str, int] = field(default_factory=dict, kw_only=True)
+    harmonics: Mapping[str, int] = field(default_factory=dict, kw_only=True)
+    amplitude_variance: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
     frequency_se: float = field(default=0.0, kw_only=True)
     periodicity: float = field(default=1.0, kw_only=True)
     origin: float = field(default=0.0, kw_only=True)
@@ -82,12 +82,14 @@ class Experiment(Result):
             }
             checks.identifiers(kind, channels)
             object.__setattr__(self, kind, channels)
-        if self.independent is None:
-            object.__setattr__(self, "independent", dict.fromkeys(self.outputs, points))
-        checks.same_names("independent", self.independent or {}, self.outputs)
-        for argument in ("scatter", "harmonics", "amplitude_variance"):
-            for key in getattr(self, argument) or {}:
+        for argument in ("scatter", "independent", "harmonics", "amplitude_variance"):
+            given = dict(getattr(self, argument) or {})
+            object.__setattr__(self, argument, given)
+            for key in given:
                 checks.one_of(argument, key, (*self.inputs, *self.outputs))
+        counts = dict.fromkeys(self.outputs, points) | dict(self.independent)
+        checks.same_names("independent", counts, self.outputs)
+        object.__setattr__(self, "independent", counts)
 
     @property
     def tau(self) -> np.ndarray:
@@ -101,12 +103,12 @@ class Experiment(Result):
 
     def project(self, channel: str, values: np.ndarray) -> np.ndarray:
         """Return signals (…, points) with the harmonics removed that the measured channel did not keep."""
-        if not self.harmonics or channel not in self.harmonics:
+        if channel not in self.harmonics:
             return values
         return fourier.project(values, self.harmonics[channel])
 
     def __repr__(self) -> str:
-        counts = ", ".join(f"{k} ({n} independent values)" for k, n in (self.independent or {}).items())
+        counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
         return (
             f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples a "
             f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''})"

@@ -39,8 +39,14 @@ class CycleScatter:
 
 
 def fold(
-    recording: Recording, samples: int = 800, *, frequency: float | None = None, periods: int = 1,
-    harmonics: int | Mapping[str, int] | None = None, origin: float = 0.0, name: str | None = None,
+    recording: Recording,
+    samples: int = 800,
+    *,
+    frequency: float | None = None,
+    periods: int = 1,
+    harmonics: int | Mapping[str, int] | None = None,
+    origin: float = 0.0,
+    name: str | None = None,
 ) -> Experiment:
     """Fold the steady part of a recording into its mean period on an equidistant grid.
 

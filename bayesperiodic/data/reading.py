@@ -1,7 +1,7 @@
 """Columns of measured numbers from CSV, NPZ and MAT files."""
 
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,7 @@ def existing(path: str | Path) -> Path:
     return file
 
 
-def _pick(path: str | Path, source: Mapping[str, Any], column: str) -> Any:
+def _pick(path: str | Path, source: Any, column: str) -> Any:
     checks.one_of(f"column of {Path(path).name}", column, list(source.keys()))
     return source[column]
 

@@ -96,8 +96,15 @@ class Recording(Result):
 
     @classmethod
     def from_csv(
-        cls, path: str | Path, *, outputs: Mapping[str, str], inputs: Mapping[str, str] | None = None,
-        time: str | None = None, sampling_rate: float | None = None, units: Units | None = None, name: str | None = None,
+        cls,
+        path: str | Path,
+        *,
+        outputs: Mapping[str, str],
+        inputs: Mapping[str, str] | None = None,
+        time: str | None = None,
+        sampling_rate: float | None = None,
+        units: Units | None = None,
+        name: str | None = None,
     ) -> "Recording":
         """Read a recording from a CSV file with a header line.
 
@@ -127,31 +134,51 @@ class Recording(Result):
 
     @classmethod
     def from_npz(
-        cls, path: str | Path, *, outputs: Mapping[str, str], inputs: Mapping[str, str] | None = None,
-        time: str | None = None, sampling_rate: float | None = None, units: Units | None = None, name: str | None = None,
+        cls,
+        path: str | Path,
+        *,
+        outputs: Mapping[str, str],
+        inputs: Mapping[str, str] | None = None,
+        time: str | None = None,
+        sampling_rate: float | None = None,
+        units: Units | None = None,
+        name: str | None = None,
     ) -> "Recording":
         """Read a recording from the arrays of an NPZ file; the arguments are those of `from_csv`."""
         return cls._from_file(reading.read_npz, path, outputs, inputs, time, sampling_rate, units, name)
 
     @classmethod
     def from_mat(
-        cls, path: str | Path, *, outputs: Mapping[str, str], inputs: Mapping[str, str] | None = None,
-        time: str | None = None, sampling_rate: float | None = None, units: Units | None = None, name: str | None = None,
+        cls,
+        path: str | Path,
+        *,
+        outputs: Mapping[str, str],
+        inputs: Mapping[str, str] | None = None,
+        time: str | None = None,
+        sampling_rate: float | None = None,
+        units: Units | None = None,
+        name: str | None = None,
     ) -> "Recording":
         """Read a recording from a MAT file, version 5 or 7.3; the arguments are those of `from_csv`."""
         return cls._from_file(reading.read_mat, path, outputs, inputs, time, sampling_rate, units, name)
 
     @classmethod
     def _from_file(
-        cls, read: Callable[[str | Path, Iterable[str]], dict[str, np.ndarray]], path: str | Path,
-        outputs: Mapping[str, str], inputs: Mapping[str, str] | None, time: str | None, sampling_rate: float | None,
-        units: Units | None, name: str | None,
+        cls,
+        read: Callable[[str | Path, Iterable[str]], dict[str, np.ndarray]],
+        path: str | Path,
+        outputs: Mapping[str, str],
+        inputs: Mapping[str, str] | None,
+        time: str | None,
+        sampling_rate: float | None,
+        units: Units | None,
+        name: str | None,
     ) -> "Recording":
         inputs, units = inputs or {}, units or {}
         if (time is None) == (sampling_rate is None):
             raise ValueError(f"time: {time!r} with sampling_rate {sampling_rate!r} is not allowed; give exactly one.")
-        for channel in units:
-            checks.one_of("units", channel, ("time", *outputs, *inputs))
+        for key in units:
+            checks.one_of("units", key, ("time", *outputs, *inputs))
         wanted = dict.fromkeys([*([time] if time else []), *outputs.values(), *inputs.values()])
         columns = read(path, wanted)
 
@@ -166,7 +193,9 @@ class Recording(Result):
             samples = next(iter(signals.values())).size if signals else 0
             seconds = np.arange(samples) / checks.positive("sampling_rate", sampling_rate)
         return cls(
-            seconds, {key: signals[key] for key in outputs}, {key: signals[key] for key in inputs},
+            seconds,
+            {key: signals[key] for key in outputs},
+            {key: signals[key] for key in inputs},
             name or Path(path).stem,
         )
 
@@ -186,15 +215,19 @@ class Recording(Result):
         )
 
     def fold(
-        self, samples: int = 800, *, frequency: float | None = None, periods: int = 1,
-        harmonics: int | Mapping[str, int] | None = None, origin: float = 0.0, name: str | None = None,
+        self,
+        samples: int = 800,
+        *,
+        frequency: float | None = None,
+        periods: int = 1,
+        harmonics: int | Mapping[str, int] | None = None,
+        origin: float = 0.0,
+        name: str | None = None,
     ) -> "Experiment":
         """Fold the steady part of the recording into its mean period; see `folding.fold`."""
         from bayesperiodic.data.folding import fold
 
-        return fold(
-            self, samples, frequency=frequency, periods=periods, harmonics=harmonics, origin=origin, name=name
-        )
+        return fold(self, samples, frequency=frequency, periods=periods, harmonics=harmonics, origin=origin, name=name)
 
     def __repr__(self) -> str:
         kind = "synthetic recording" if self.synthetic else "recording"

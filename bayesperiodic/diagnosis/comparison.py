@@ -56,11 +56,17 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior) -> Compari
         draws, size = posterior.draws(name), posterior.ess[name]
         mean, sd = float(draws.mean()), float(draws.std(ddof=1))
         row = {
-            "map": fit.theta[name], "laplace_sd": fit.sd[name], "mean": mean, "sd": sd,
-            "shift": (mean - fit.theta[name]) / sd, "sd_ratio": fit.sd[name] / sd,
+            "map": fit.theta[name],
+            "laplace_sd": fit.sd[name],
+            "mean": mean,
+            "sd": sd,
+            "shift": (mean - fit.theta[name]) / sd,
+            "sd_ratio": fit.sd[name] / sd,
             "skewness": float(np.mean(((draws - mean) / sd) ** 3)),
-            "laplace_q05": fit.theta[name] - 1.6449 * fit.sd[name], "q05": float(np.quantile(draws, 0.05)),
-            "laplace_q95": fit.theta[name] + 1.6449 * fit.sd[name], "q95": float(np.quantile(draws, 0.95)),
+            "laplace_q05": fit.theta[name] - 1.6449 * fit.sd[name],
+            "q05": float(np.quantile(draws, 0.05)),
+            "laplace_q95": fit.theta[name] + 1.6449 * fit.sd[name],
+            "q95": float(np.quantile(draws, 0.95)),
         }
         rows[name] = {**row, "verdict": _verdict(row, size) if posterior.converged else "not converged"}
     return Comparison(pd.DataFrame.from_dict(rows, orient="index"))

@@ -56,8 +56,19 @@ def fingerprint(problem: Problem) -> str:
     """Return a digest of model, data, priors, fixed values and scheme."""
     digest = hashlib.sha256(kernel_source(problem.model).encode())
     for experiment in problem.experiments:
-        digest.update(repr((experiment.name, experiment.frequency, experiment.samples, experiment.periods,
-                            experiment.winding, experiment.independent, experiment.harmonics)).encode())
+        digest.update(
+            repr(
+                (
+                    experiment.name,
+                    experiment.frequency,
+                    experiment.samples,
+                    experiment.periods,
+                    experiment.winding,
+                    experiment.independent,
+                    experiment.harmonics,
+                )
+            ).encode()
+        )
         for signals in (experiment.outputs, experiment.inputs):
             for name, values in signals.items():
                 digest.update(name.encode() + np.ascontiguousarray(values).tobytes())

@@ -64,8 +64,10 @@ class SamplingDensity:
         count = len(problem.names)
         covariance[:count, :count] = fit.covariance.to_numpy() * np.outer(scale, scale)
         mean = np.concatenate(
-            [np.where(self.logarithmic, np.log(np.where(self.logarithmic, theta, 1.0)), theta),
-             [np.log(fit.variances[c]) for c in problem.free_variances]]
+            [
+                np.where(self.logarithmic, np.log(np.where(self.logarithmic, theta, 1.0)), theta),
+                [np.log(fit.variances[c]) for c in problem.free_variances],
+            ]
         )
         for i, channel in enumerate(problem.free_variances):
             covariance[count + i, count + i] = 2.0 / fit.independent[channel]

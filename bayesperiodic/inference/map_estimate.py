@@ -86,7 +86,9 @@ class MapEstimate(Result):
         if not 0.0 < checks.finite_number("probability", probability) < 1.0:
             raise ValueError(f"probability: {probability!r} is not allowed; it must be between 0 and 1.")
         width = float(stdtrit(min(self.degrees_of_freedom, 1e9), 0.5 + 0.5 * probability))
-        return {name: (value - width * self.sd[name], value + width * self.sd[name]) for name, value in self.theta.items()}
+        return {
+            name: (value - width * self.sd[name], value + width * self.sd[name]) for name, value in self.theta.items()
+        }
 
     def __repr__(self) -> str:
         lines = [f"MapEstimate ({self.status}), mean and Laplace sd:"]
@@ -165,7 +167,7 @@ def moments(problem: Problem, evaluation: Evaluation) -> np.ndarray:
     total = np.zeros(len(problem.channels))
     for e in problem.experiments:
         for channel, residual in evaluation.residuals[e.name].items():
-            total[problem.channels.index(channel)] += (e.independent or {})[channel] * np.mean(residual**2)
+            total[problem.channels.index(channel)] += e.independent[channel] * np.mean(residual**2)
     return total
 
 
@@ -207,7 +209,7 @@ def _hessian_and_gradient(
     for e in problem.experiments:
         for channel, sensitivity in evaluation.sensitivities[e.name].items():
             residual = evaluation.residuals[e.name][channel]
-            weight = (e.independent or {})[channel] / residual.size / v[problem.channels.index(channel)]
+            weight = e.independent[channel] / residual.size / v[problem.channels.index(channel)]
             hessian += weight * sensitivity @ sensitivity.T
             gradient += weight * sensitivity @ residual
     return hessian, gradient
@@ -251,7 +253,8 @@ def _describe(
                 f"The noise of the measured inputs, differentiated, brings {noise:.3g} to {channel!r}, "
                 f"{noise / rms[channel]:.0%} of the residual's {rms[channel]:.3g}; keep fewer input harmonics "
                 "(fold(harmonics=…)) or measure the derivative.",
-                UserWarning, stacklevel=3,
+                UserWarning,
+                stacklevel=3,
             )
     return result
 
@@ -263,8 +266,9 @@ def _pooled(channel: str, signals: Mapping[str, Mapping[str, np.ndarray]]) -> fl
 
 def _whiteness(problem: Problem, evaluation: Evaluation, channel: str) -> Whiteness:
     tests = [
-        whiteness(evaluation.residuals[e.name][channel], (e.harmonics or {}).get(channel))
-        for e in problem.experiments if channel in e.outputs
+        whiteness(evaluation.residuals[e.name][channel], e.harmonics.get(channel))
+        for e in problem.experiments
+        if channel in e.outputs
     ]
     return Whiteness(min(1.0, len(tests) * min(t.p for t in tests)), float(np.mean([t.lag1 for t in tests])))
 

@@ -66,9 +66,15 @@ class Posterior(Result):
             draws = self.draws(name)
             low, median, high = np.quantile(draws, [0.05, 0.5, 0.95])
             rows[name] = {
-                "mean": draws.mean(), "sd": draws.std(ddof=1), "q05": low, "q50": median, "q95": high,
+                "mean": draws.mean(),
+                "sd": draws.std(ddof=1),
+                "q05": low,
+                "q50": median,
+                "q95": high,
                 "mcse_mean": draws.std(ddof=1) / np.sqrt(self.ess[name]),
-                "ess": self.ess[name], "tau": self.tau[name], "rhat": self.rhat[name],
+                "ess": self.ess[name],
+                "tau": self.tau[name],
+                "rhat": self.rhat[name],
             }
         table = pd.DataFrame.from_dict(rows, orient="index")
         table.attrs["interval"] = "90 % equal-tailed: q05 to q95"

@@ -12,8 +12,8 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.inference.priors import Prior
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.batch import Anchor, solve_batch
-from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.compiled import CONVERGED
+from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import PeriodicSolution, describe, periodic_part
 
@@ -72,8 +72,13 @@ class Problem:
     """
 
     def __init__(
-        self, model: Model, experiments: Iterable[Experiment], *, priors: Mapping[str, Prior],
-        fixed: Mapping[str, float] | None = None, scheme: str | Scheme = "central2",
+        self,
+        model: Model,
+        experiments: Iterable[Experiment],
+        *,
+        priors: Mapping[str, Prior],
+        fixed: Mapping[str, float] | None = None,
+        scheme: str | Scheme = "central2",
     ):
         self.model = model
         self.experiments = _checked_experiments(model, experiments)
@@ -99,12 +104,13 @@ class Problem:
         self.fixed = {n: checks.finite_number(f"fixed[{n!r}]", fixed[n]) for n in model.parameters if n in fixed}
         self.fixed_variances = {
             channel: checks.positive(f"fixed[{name!r}]", fixed[name])
-            for name, channel in variance_names.items() if name in fixed
+            for name, channel in variance_names.items()
+            if name in fixed
         }
         self.free_variances = tuple(c for c in self.channels if c not in self.fixed_variances)
         self.scheme = scheme
         self.independent = np.array(
-            [sum((e.independent or {}).get(c, 0) for e in self.experiments) for c in self.channels], dtype=float
+            [sum(e.independent.get(c, 0) for e in self.experiments) for c in self.channels], dtype=float
         )
         self._check_counts()
         self._anchors: dict[str, Anchor] | None = None
@@ -123,8 +129,13 @@ class Problem:
         """The discretised equations of every experiment."""
         return {
             e.name: PeriodicEquations.build(
-                self.model, e.inputs, frequency=e.frequency, samples=e.samples, scheme=self.scheme,
-                periods=e.periods, winding=e.winding,
+                self.model,
+                e.inputs,
+                frequency=e.frequency,
+                samples=e.samples,
+                scheme=self.scheme,
+                periods=e.periods,
+                winding=e.winding,
             )
             for e in self.experiments
         }
@@ -233,7 +244,7 @@ class Problem:
 
     def _moment(self, experiment: Experiment, channel: str, predicted: np.ndarray) -> np.ndarray:
         """Return independent · (mean square of y − ŷ within the kept harmonics), one a row of `predicted`."""
-        count = (experiment.independent or {})[channel]
+        count = experiment.independent[channel]
         target = self._kept_amplitudes.get((experiment.name, channel))
         if target is None:
             return count * np.mean((experiment.outputs[channel] - predicted) ** 2, axis=-1)
@@ -245,12 +256,12 @@ class Problem:
     def _kept_amplitudes(self) -> dict[tuple[str, str], np.ndarray]:
         return {
             (e.name, channel): fourier.coefficients(e.outputs[channel], kept)
-            for e in self.experiments for channel, kept in (e.harmonics or {}).items() if channel in e.outputs
+            for e in self.experiments
+            for channel, kept in e.harmonics.items()
+            if channel in e.outputs
         }
 
-    def outputs(
-        self, theta: Mapping[str, float] | np.ndarray
-    ) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
+    def outputs(self, theta: Mapping[str, float] | np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
         """Return ŷ of many θ (draws, names), by experiment and channel (draws, points), and which solves converged."""
         parameters = self._parameters(self.vector(theta))
         converged = np.full(len(parameters), True)
@@ -344,7 +355,7 @@ def _input_noise(experiment: Experiment) -> np.ndarray:
     points = experiment.samples * experiment.periods
     count, directions = len(experiment.inputs), []
     for i, name in enumerate(experiment.inputs):
-        for h, variance in enumerate((experiment.amplitude_variance or {}).get(name, ())):
+        for h, variance in enumerate(experiment.amplitude_variance.get(name, ())):
             for part in (1.0,) if h == 0 else (1.0, 1j):
                 amplitude = np.zeros(h + 1, dtype=complex)
                 amplitude[h] = part * np.sqrt(variance if h == 0 else 0.5 * variance)

@@ -31,8 +31,15 @@ PASSES = 2
 
 
 def sample(
-    problem: Problem, fit: MapEstimate, *, seed: int, ensembles: int = 4, walkers: int | None = None,
-    max_steps: int = 20_000, checkpoint: str | Path | None = None, progress: bool = True,
+    problem: Problem,
+    fit: MapEstimate,
+    *,
+    seed: int,
+    ensembles: int = 4,
+    walkers: int | None = None,
+    max_steps: int = 20_000,
+    checkpoint: str | Path | None = None,
+    progress: bool = True,
 ) -> Posterior:
     """Sample the posterior of θ and the unknown channel variances with emcee's affine-invariant ensembles.
 
@@ -85,7 +92,8 @@ def sample(
     densities = [SamplingDensity(anchored, max(1, available_cores() // ensembles)) for _ in range(ensembles)]
     walkers = _checked_walkers(walkers, densities[0])
     samplers = _samplers(problem, fit, densities, seed, walkers, checkpoint)
-    converged, reason, passes, last = False, f"max_steps = {max_steps} reached", 0, np.inf
+    converged, reason, passes = False, f"max_steps = {max_steps} reached", 0
+    last = np.full(densities[0].dimension, np.inf)
     bar = tqdm(total=max_steps, unit="step", desc="sampling", disable=not progress)
     for steps in range(BLOCK, max_steps + 1, BLOCK):
         with ThreadPoolExecutor(available_cores()) as pool:
@@ -120,7 +128,11 @@ def _checked_walkers(walkers: int | None, density: SamplingDensity) -> int:
 
 
 def _samplers(
-    problem: Problem, fit: MapEstimate, densities: list[SamplingDensity], seed: int, walkers: int,
+    problem: Problem,
+    fit: MapEstimate,
+    densities: list[SamplingDensity],
+    seed: int,
+    walkers: int,
     checkpoint: str | Path | None,
 ) -> list[emcee.EnsembleSampler]:
     settings = f"seed {seed}, {len(densities)} ensembles of {walkers} walkers"
@@ -130,9 +142,7 @@ def _samplers(
         densities, np.random.SeedSequence(seed).spawn(len(densities)), stores, strict=True
     ):
         moves = [(emcee.moves.DEMove(), 0.6), (emcee.moves.DESnookerMove(), 0.1), (emcee.moves.StretchMove(), 0.3)]
-        sampler = emcee.EnsembleSampler(
-            walkers, density.dimension, density, moves=moves, vectorize=True, backend=store
-        )
+        sampler = emcee.EnsembleSampler(walkers, density.dimension, density, moves=moves, vectorize=True, backend=store)
         if sampler.iteration == 0:
             generator = np.random.default_rng(sequence)
             sampler.random_state = np.random.RandomState(generator.integers(2**32, size=4)).get_state()
@@ -175,7 +185,7 @@ def _acceptance(samplers: list[emcee.EnsembleSampler]) -> float:
     return float(np.mean([sampler.acceptance_fraction for sampler in samplers]))
 
 
-def _shortfall(kept: np.ndarray, tau: np.ndarray, last: Any) -> list[str]:
+def _shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray) -> list[str]:
     """Return what the stop rule misses, in words."""
     found = []
     if (lengths := kept.shape[1] / tau.max()) < LENGTHS:
@@ -200,17 +210,19 @@ def _posterior(
     theta, variances = density.to_natural(points)
     lp = np.stack([s.get_log_prob(discard=s.iteration // 5) for s in samplers])
     coords = {
-        "chain": np.arange(ensembles * walkers), "draw": np.arange(steps), "channel": list(problem.channels),
+        "chain": np.arange(ensembles * walkers),
+        "draw": np.arange(steps),
+        "channel": list(problem.channels),
         "ensemble": ("chain", np.repeat(np.arange(ensembles), walkers)),
     }
     units = problem.model.units
     variables: dict[str, Any] = {
-        name: (("chain", "draw"), theta[..., i], {"units": units.get(name, "")})
-        for i, name in enumerate(problem.names)
+        name: (("chain", "draw"), theta[..., i], {"units": units.get(name, "")}) for i, name in enumerate(problem.names)
     }
     squared = {
         f"units of {c}": f"{units[c]}²" if units[c].isalpha() else f"({units[c]})²"
-        for c in problem.channels if c in units
+        for c in problem.channels
+        if c in units
     }
     variables["variance"] = (("chain", "draw", "channel"), variances, squared)
     stats = {"lp": (("chain", "draw"), lp.transpose(0, 2, 1).reshape(ensembles * walkers, steps))}
@@ -223,20 +235,27 @@ def _posterior(
         }
     )
     data.attrs = {
-        "seed": seed, "fingerprint": fingerprint(problem), "converged": int(converged), "reason": reason,
+        "seed": seed,
+        "fingerprint": fingerprint(problem),
+        "converged": int(converged),
+        "reason": reason,
         "synthetic": int(any(e.synthetic for e in problem.experiments)),
-        "bayesperiodic": importlib.metadata.version("bayesperiodic"), "emcee": emcee.__version__,
+        "bayesperiodic": importlib.metadata.version("bayesperiodic"),
+        "emcee": emcee.__version__,
     }
     draws = steps * walkers * ensembles
     by_label = {label: float(t) for label, t in zip(density.labels, tau, strict=True)}
     return Posterior(
-        data=data, converged=converged, reason=reason,
+        data=data,
+        converged=converged,
+        reason=reason,
         tau=by_label,
         ess={label: draws / t for label, t in by_label.items()},
         rhat=dict(zip(density.labels, chains.rhat(kept).tolist(), strict=True)),
         acceptance=_acceptance(samplers),
         failures={s: n / calls for s, n in sum((d.failures for d in densities), Counter()).items()},
-        log_posterior_calls=calls, seed=seed,
+        log_posterior_calls=calls,
+        seed=seed,
     )
 
 
@@ -244,7 +263,8 @@ def _signals(problem: Problem, kind: str) -> xr.Dataset:
     return xr.Dataset(
         {
             f"{experiment.name} {channel}": ((f"{experiment.name} time",), values)
-            for experiment in problem.experiments for channel, values in getattr(experiment, kind).items()
+            for experiment in problem.experiments
+            for channel, values in getattr(experiment, kind).items()
         },
         coords={f"{experiment.name} time": experiment.time for experiment in problem.experiments},
     )

@@ -1,4 +1,4 @@
-"""Is a residual white within the harmonics that were kept?"""
+"""Whiteness of a residual within the harmonics that were kept."""
 
 from dataclasses import dataclass
 

@@ -55,7 +55,8 @@ def load(body: str, names: Sequence[str]) -> dict[str, Any]:
     warnings.warn(
         f"The kernel cache in {cache_folder()} cannot be used ({reason}); compiling in memory, which every start "
         "will repeat. Delete the folder or set BAYESPERIODIC_CACHE to one that you own.",
-        RuntimeWarning, stacklevel=2,
+        RuntimeWarning,
+        stacklevel=2,
     )
     return _execute(source, names, Path("<kernels compiled in memory>"), cache=False)
 

@@ -52,6 +52,7 @@ class GridFunction(types.WrapperAddressProtocol):
         return self._signature
 
     def __call__(self, *arguments: Any) -> None:
+        """Run the compiled function."""
         self._compiled(*arguments)
 
 
@@ -78,7 +79,12 @@ class Kernels:
     channels: int
 
     def evaluate(
-        self, name: str, states: np.ndarray, inputs: np.ndarray, parameters: np.ndarray, tau: np.ndarray,
+        self,
+        name: str,
+        states: np.ndarray,
+        inputs: np.ndarray,
+        parameters: np.ndarray,
+        tau: np.ndarray,
         frequency: float,
     ) -> np.ndarray:
         """Return one of the functions on a grid, (points, size)."""
@@ -110,8 +116,10 @@ def compile_kernels(model: Model) -> Kernels:
     functions = load(kernel_source(model), FUNCTIONS)
     return Kernels(
         **{name: GridFunction(compiled) for name, compiled in functions.items()},
-        states=len(model.states), inputs=len(model.inputs),
-        parameters=len(model.parameters), channels=len(model.outputs),
+        states=len(model.states),
+        inputs=len(model.inputs),
+        parameters=len(model.parameters),
+        channels=len(model.outputs),
     )
 
 
@@ -142,7 +150,9 @@ def kernel_source(model: Model) -> str:
 def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str]) -> str:
     common, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("common"), order="canonical")
     used = set().union(*(e.free_symbols for e in reduced), *(e.free_symbols for _, e in common))
-    lines = [f"    {s} = {place}" for s, place in arguments.items() if s in used and "[i" not in place and s.name != place]
+    lines = [
+        f"    {s} = {place}" for s, place in arguments.items() if s in used and "[i" not in place and s.name != place
+    ]
     lines += ["    for i in range(out.shape[0]):"]
     lines += [f"        {s} = {place}" for s, place in arguments.items() if s in used and "[i" in place]
     lines += [f"        {symbol} = {_code(expression)}" for symbol, expression in common]

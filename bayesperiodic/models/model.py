@@ -159,8 +159,11 @@ class Model:
         """Return for every input the highest time derivative of it that the model uses."""
         used = set().union(*(e.free_symbols for e in (*self.equations, *self.output_expressions)))
         return {
-            name: max(order for order, prefix in enumerate(("", "d", "dd"))
-                      if order == 0 or self.input_symbols[prefix + name] in used)
+            name: max(
+                order
+                for order, prefix in enumerate(("", "d", "dd"))
+                if order == 0 or self.input_symbols[prefix + name] in used
+            )
             for name in self.inputs
         }
 

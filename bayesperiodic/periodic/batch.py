@@ -60,9 +60,25 @@ def solve_batch(
 
     def part(block: slice) -> None:
         solve_many(
-            kernels.residual_jacobian, kernels.outputs, grid.first, grid.second, grid.neighbours, grid.shift,
-            grid.place, grid.half_width, equations.inputs, parameters[block], grid.tau, equations.frequency, equations.drift,
-            anchor.parameters, anchor.z, anchor.sensitivities, y[block], status[block], iterations[block],
+            kernels.residual_jacobian,
+            kernels.outputs,
+            grid.first,
+            grid.second,
+            grid.neighbours,
+            grid.shift,
+            grid.place,
+            grid.half_width,
+            equations.inputs,
+            parameters[block],
+            grid.tau,
+            equations.frequency,
+            equations.drift,
+            anchor.parameters,
+            anchor.z,
+            anchor.sensitivities,
+            y[block],
+            status[block],
+            iterations[block],
         )
 
     parts = max(1, min(threads or available_cores(), solves // SMALLEST_PART))

@@ -45,8 +45,15 @@ class PeriodicEquations:
 
     @classmethod
     def build(
-        cls, model: Model, inputs: Mapping[str, np.ndarray] | None, *, frequency: float, samples: int,
-        scheme: str | Scheme, periods: int, winding: int | Mapping[str, int],
+        cls,
+        model: Model,
+        inputs: Mapping[str, np.ndarray] | None,
+        *,
+        frequency: float,
+        samples: int,
+        scheme: str | Scheme,
+        periods: int,
+        winding: int | Mapping[str, int],
     ) -> "PeriodicEquations":
         """Check the arguments and differentiate the inputs spectrally; see `solution.solve_periodic`."""
         if model.autonomous:
@@ -92,10 +99,24 @@ class PeriodicEquations:
         lower = self._lower
         history = np.zeros((compiled.MAX_ITERATIONS, 3))
         code, iterations = compiled.newton(
-            self.model.kernels.residual_jacobian, grid.first, grid.second, grid.neighbours, grid.shift,
-            grid.place, grid.half_width, self.inputs, parameters, grid.tau, self.frequency, self.drift, z,
-            np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count))), history,
-            np.empty((points * count, 3 * lower + 1)), np.empty(points * count, dtype=np.int64),
+            self.model.kernels.residual_jacobian,
+            grid.first,
+            grid.second,
+            grid.neighbours,
+            grid.shift,
+            grid.place,
+            grid.half_width,
+            self.inputs,
+            parameters,
+            grid.tau,
+            self.frequency,
+            self.drift,
+            z,
+            np.empty((points, 3 * count)),
+            np.empty((points, count * (1 + 3 * count))),
+            history,
+            np.empty((points * count, 3 * lower + 1)),
+            np.empty(points * count, dtype=np.int64),
         )
         return Solved(z, code, history[:iterations])
 
@@ -116,8 +137,15 @@ class PeriodicEquations:
         count = z.shape[1]
         size, rounding = np.empty(count), np.empty(count)
         compiled.scales(
-            columns, states, self.drift, self.grid.first, self.grid.second, np.abs(z).max(axis=0), self.frequency,
-            size, rounding,
+            columns,
+            states,
+            self.drift,
+            self.grid.first,
+            self.grid.second,
+            np.abs(z).max(axis=0),
+            self.frequency,
+            size,
+            rounding,
         )
         worst = np.abs(columns[:, :count]).max(axis=0)
         with np.errstate(invalid="ignore"):
@@ -144,9 +172,7 @@ class PeriodicEquations:
         columns = self._evaluate("residual_jacobian", self.states(z), parameters)
         band = np.empty((points * count, 3 * self._lower + 1))
         pivots = np.empty(points * count, dtype=np.int64)
-        compiled.assemble(
-            columns, grid.first, grid.second, grid.shift, grid.place, self.frequency, self._lower, band
-        )
+        compiled.assemble(columns, grid.first, grid.second, grid.shift, grid.place, self.frequency, self._lower, band)
         if not compiled.factor(band, self._lower, self._lower, pivots):
             return None
         order = np.argsort(grid.place)

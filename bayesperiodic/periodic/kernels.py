@@ -178,8 +178,24 @@ def norm(columns, size):
     **OPTIONS,
 )
 def newton(
-    residual_jacobian, first, second, neighbours, shift, place, half_width, inputs, parameters, tau, frequency, drift,
-    z, states, columns, history, band, pivots,
+    residual_jacobian,
+    first,
+    second,
+    neighbours,
+    shift,
+    place,
+    half_width,
+    inputs,
+    parameters,
+    tau,
+    frequency,
+    drift,
+    z,
+    states,
+    columns,
+    history,
+    band,
+    pivots,
 ):
     """Solve g(z) = 0 in place and return (status, iterations).
 
@@ -258,8 +274,25 @@ def newton(
     **OPTIONS,
 )
 def solve_many(
-    residual_jacobian, outputs, first, second, neighbours, shift, place, half_width, inputs, parameters, tau, frequency, drift,
-    anchor_parameters, anchor_z, anchor_sensitivities, y, status, iterations,
+    residual_jacobian,
+    outputs,
+    first,
+    second,
+    neighbours,
+    shift,
+    place,
+    half_width,
+    inputs,
+    parameters,
+    tau,
+    frequency,
+    drift,
+    anchor_parameters,
+    anchor_z,
+    anchor_sensitivities,
+    y,
+    status,
+    iterations,
 ):
     """Solve for each row of `parameters`, from the anchor's linear prediction and, if that fails, from the anchor."""
     points, count = anchor_z.shape
@@ -281,8 +314,24 @@ def solve_many(
             if attempt == 1:
                 z[:] = anchor_z
             status[b], iterations[b] = newton(
-                residual_jacobian, first, second, neighbours, shift, place, half_width, inputs, theta, tau, frequency,
-                drift, z, states, columns, history, band, pivots,
+                residual_jacobian,
+                first,
+                second,
+                neighbours,
+                shift,
+                place,
+                half_width,
+                inputs,
+                theta,
+                tau,
+                frequency,
+                drift,
+                z,
+                states,
+                columns,
+                history,
+                band,
+                pivots,
             )
             if status[b] == CONVERGED:
                 break

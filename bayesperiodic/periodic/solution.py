@@ -208,6 +208,4 @@ def _guess(
 def _by_name(
     values: np.ndarray, rows: tuple[str, ...], directions: tuple[str, ...]
 ) -> dict[str, dict[str, np.ndarray]]:
-    return {
-        row: {name: values[d, :, r].copy() for d, name in enumerate(directions)} for r, row in enumerate(rows)
-    }
+    return {row: {name: values[d, :, r].copy() for d, name in enumerate(directions)} for r, row in enumerate(rows)}

@@ -74,7 +74,7 @@ def test_rest_before_the_motion_is_dropped():
 
 
 def test_scatter_is_that_of_one_cycle_within_the_kept_harmonics():
-    """White noise of sd 0.05 on 119 samples a cycle: the kept harmonics hold the share (2H + 1)/119.37 of its variance."""
+    """White noise of sd 0.05: the kept harmonics hold the share (2H + 1)/119.37 of its variance."""
     values = [recording(seed=s).fold(200).scatter["y"] for s in range(40)]
     assert np.mean(values) == pytest.approx(0.05 * np.sqrt(11 / 119.37), rel=0.05)
 
@@ -113,9 +113,9 @@ def test_unequal_steps_are_allowed():
 def test_multisine_with_hundreds_of_harmonics_finds_its_fundamental():
     samples = 1024
     harmonic = np.arange(1, 400, 2)
-    period = np.cos(
-        2 * np.pi * np.arange(samples)[:, None] / samples * harmonic - np.pi * harmonic**2 / 400
-    ).sum(axis=1)
+    period = np.cos(2 * np.pi * np.arange(samples)[:, None] / samples * harmonic - np.pi * harmonic**2 / 400).sum(
+        axis=1
+    )
     noise = np.random.default_rng(3).standard_normal(6 * samples)
     time = np.arange(6 * samples) / 1000.0
     e = bp.Recording.from_arrays(time, {"y": np.tile(period, 6) + 0.5 * noise}).fold(2048)
@@ -138,7 +138,9 @@ def test_constant_input_is_refused():
 
 def test_signal_that_is_not_periodic_is_refused_with_its_measure():
     noise = np.random.default_rng(4).standard_normal(4000)
-    with pytest.raises(ValueError, match=r"is not periodic; at .* Hz the mean period explains only \d+\.\d% .*periodicity"):
+    with pytest.raises(
+        ValueError, match=r"is not periodic; at .* Hz the mean period explains only \d+\.\d% .*periodicity"
+    ):
         bp.Recording.from_arrays(np.arange(4000) / 100, {"y": noise}).fold()
 
 

@@ -98,7 +98,9 @@ def test_non_numeric_cell_is_located(csv):
 @pytest.mark.parametrize("text", ["nan", "inf", ""])
 def test_samples_that_are_not_finite_are_located(csv, text):
     rewrite(csv, 5, "x", text)
-    with pytest.raises(ValueError, match=r"displacement \(column 'x' of run 7.csv\): (nan|inf) at index 5 .*must be finite"):
+    with pytest.raises(
+        ValueError, match=r"displacement \(column 'x' of run 7.csv\): (nan|inf) at index 5 .*must be finite"
+    ):
         bp.Recording.from_csv(csv, time="t", **CHANNELS)
 
 

@@ -1,4 +1,4 @@
-"""White noise on recordings of 119 samples a cycle, folded to n = 800: are 90 % intervals 90 % intervals?
+"""White noise on recordings of 119 samples a cycle, folded to n = 800: do 90 % intervals cover 90 %.
 
 500 recordings each; the count of covered truths must lie in the two-sided 99 % binomial band (a false-alarm rate of 1 %
 a number of harmonics).
@@ -50,7 +50,7 @@ def test_the_interval_of_a_friction_like_regressor_covers_its_truth(harmonics):
 
 
 def test_without_projection_the_interval_fails():
-    assert not BAND[0] <= covered([replace(e, harmonics=None) for e in folded(5)]) <= BAND[1]
+    assert not BAND[0] <= covered([replace(e, harmonics={}) for e in folded(5)]) <= BAND[1]
 
 
 def test_counting_every_sample_makes_the_interval_fail():

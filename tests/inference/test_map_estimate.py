@@ -40,7 +40,7 @@ def test_independent_values_weigh_the_samples():
 
 
 def test_unknown_variance_is_that_of_equation_7():
-    """v = s Σe² / (nNs − l) with s = 1 channel, N = 2 experiments, n = 40 samples, l = 3 parameters."""
+    """V = s Σe² / (nNs − l) with s = 1 channel, N = 2 experiments, n = 40 samples, l = 3 parameters."""
     experiments = [replace(linear_experiment(TRUTH, 3.0, seed=s), name=f"run {s}") for s in (3, 4)]
     fit = bp.map_estimate(bp.Problem(LINEAR, experiments, priors=PRIORS))
     design = linear_regressors(0.05, 2.0, grid(40))
@@ -53,7 +53,7 @@ def test_unknown_variance_is_that_of_equation_7():
 
 
 def test_estimate_maximises_equation_6_with_the_corrected_count():
-    """With eq. (7) the staged iteration ends at the maximum of −½ (nN − l/s) ln M + ln p(θ): checked by a grid of steps."""
+    """With eq. (7) the staged iteration ends at the maximum of −½ (nN − l/s) ln M + ln p(θ)."""
     problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=5)], priors=PRIORS)
     fit = bp.map_estimate(problem)
     best = np.array(list(fit.theta.values()))
@@ -87,7 +87,7 @@ def test_intervals_are_students():
 
 
 def test_white_residuals_pass_and_smooth_ones_do_not():
-    """Bartlett's test: uniform p for white noise (1000 series, KS at 0.1 %), tiny p and large lag1 for an AR process."""
+    """Uniform p for white noise (1000 series, KS at 0.1 %), tiny p and large lag1 for a random walk."""
     from scipy import stats
 
     generator = np.random.default_rng(8)
@@ -100,7 +100,11 @@ def test_white_residuals_pass_and_smooth_ones_do_not():
 def test_noise_of_differentiated_inputs_is_carried_to_the_output():
     """Force = c·ẋ with x of known amplitude noise: sd of the force from its closed form, and the warning."""
     model = bp.Model(
-        "dashpot", states=["w"], inputs=["x"], parameters=["c"], equations=lambda s, p, u: [s.dw + s.w - u.x],
+        "dashpot",
+        states=["w"],
+        inputs=["x"],
+        parameters=["c"],
+        equations=lambda s, p, u: [s.dw + s.w - u.x],
         outputs=lambda s, p, u: {"force": p.c * u.dx + s.w},
     )
     tau = grid(200)
@@ -109,7 +113,11 @@ def test_noise_of_differentiated_inputs_is_carried_to_the_output():
     rate = 2j * np.pi * 1.5 * np.arange(3)
     noise = np.random.default_rng(9).standard_normal(200) * 0.05
     experiment = bp.Experiment(
-        "run", 1.5, {"force": 2 * 2 * np.pi * 1.5 * np.cos(2 * np.pi * tau) + noise}, {"x": x}, samples=200,
+        "run",
+        1.5,
+        {"force": 2 * 2 * np.pi * 1.5 * np.cos(2 * np.pi * tau) + noise},
+        {"x": x},
+        samples=200,
         amplitude_variance={"x": variance},
     )
     with pytest.warns(UserWarning, match="noise of the measured inputs, differentiated, brings"):
@@ -131,9 +139,15 @@ def test_start_outside_the_support_is_refused():
 
 def test_start_without_periodic_solution_is_refused():
     model = bp.Model(
-        "runaway", states=["x"], inputs=["u"], parameters=["a"],
-        equations=lambda s, p, u: [s.dx - p.a * (1 + s.x**2) - u.u], outputs=lambda s, p, u: {"x": s.x},
+        "runaway",
+        states=["x"],
+        inputs=["u"],
+        parameters=["a"],
+        equations=lambda s, p, u: [s.dx - p.a * (1 + s.x**2) - u.u],
+        outputs=lambda s, p, u: {"x": s.x},
     )
-    experiment = bp.Experiment("run", 1.0, {"x": np.cos(2 * np.pi * grid(50))}, {"u": np.sin(2 * np.pi * grid(50))}, samples=50)
+    experiment = bp.Experiment(
+        "run", 1.0, {"x": np.cos(2 * np.pi * grid(50))}, {"u": np.sin(2 * np.pi * grid(50))}, samples=50
+    )
     with pytest.raises(ValueError, match="the log-posterior is not finite there, the periodic solve ended with"):
         bp.map_estimate(bp.Problem(model, [experiment], priors={"a": bp.LogNormal(1.0, 0.1)}))

@@ -54,7 +54,12 @@ def test_projection_removes_what_the_fold_did_not_keep():
     spectrum[4:] = 0
     kept = np.fft.irfft(spectrum, 200)
     experiment = bp.Experiment(
-        "run", 2.0, {"force": kept}, {"x": 0.05 * np.sin(2 * np.pi * tau)}, samples=200, harmonics={"force": 3},
+        "run",
+        2.0,
+        {"force": kept},
+        {"x": 0.05 * np.sin(2 * np.pi * tau)},
+        samples=200,
+        harmonics={"force": 3},
         independent={"force": 7},
     )
     problem = bp.Problem(LINEAR, [experiment], priors=PRIORS)
@@ -71,7 +76,10 @@ def test_prior_samples_have_the_names(problem):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"priors": {"k": PRIORS["k"], "c": PRIORS["c"]}}, "'coulomb' has neither a prior nor a value; a free parameter needs a prior"),
+        (
+            {"priors": {"k": PRIORS["k"], "c": PRIORS["c"]}},
+            "'coulomb' has neither a prior nor a value; a free parameter needs a prior",
+        ),
         ({"priors": PRIORS | {"coulom": PRIORS["k"]}}, "priors: 'coulom' is not known.*Did you mean 'coulomb'"),
         ({"fixed": {"k": 1.0}}, "fixed: 'k' has a prior too"),
         ({"fixed": {"variance[forc]": 1.0}}, r"fixed: 'variance\[forc\]' is not known"),
@@ -96,6 +104,8 @@ def test_experiments_must_fit_the_model(experiment):
 
 def test_fewer_independent_values_than_free_parameters_are_refused():
     few = linear_experiment(TRUTH, 3.0, seed=4, independent=3)
-    with pytest.raises(ValueError, match=r"3 free parameters \(k, c, coulomb\) are not allowed; the channel 'force' has only 3"):
+    with pytest.raises(
+        ValueError, match=r"3 free parameters \(k, c, coulomb\) are not allowed; the channel 'force' has only 3"
+    ):
         bp.Problem(LINEAR, [few], priors=PRIORS)
     bp.Problem(LINEAR, [few], priors=PRIORS, fixed={"variance[force]": 9.0})

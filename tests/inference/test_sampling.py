@@ -38,7 +38,7 @@ def test_emcee_matches_the_closed_form_within_monte_carlo_error(known_variance, 
 
 
 def test_unknown_variance_follows_its_closed_form():
-    """With flat priors on θ, Jeffreys' prior and n − l degrees of freedom, M/v is χ²: v's mean and the t-like sd of θ."""
+    """Flat priors on θ, Jeffreys' prior on v, n − l degrees of freedom: M/v is χ² and θ is Student's t."""
     flat = {"k": bp.Normal(900.0, 1e6), "coulomb": bp.Normal(25.0, 1e6)}
     problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=2)], priors=flat, fixed={"c": 40.0})
     fit = bp.map_estimate(problem)
@@ -124,7 +124,10 @@ def test_summary_names_its_interval(posterior):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"walkers": 4}, "walkers: 4 is not allowed; it must be even and at least twice the dimension, 6 for k, c, coulomb"),
+        (
+            {"walkers": 4},
+            "walkers: 4 is not allowed; it must be even and at least twice the dimension, 6 for k, c, coulomb",
+        ),
         ({"walkers": 9}, "walkers: 9 is not allowed"),
         ({"ensembles": 1}, "ensembles: 1 is not allowed"),
         ({"max_steps": 10}, "max_steps: 10 is not allowed"),

@@ -28,7 +28,9 @@ def folder(tmp_path, monkeypatch):
 
 def start() -> subprocess.Popen:
     return subprocess.Popen(
-        [sys.executable, "-W", "error::RuntimeWarning", "-c", PROGRAM], stdout=subprocess.PIPE, text=True,
+        [sys.executable, "-W", "error::RuntimeWarning", "-c", PROGRAM],
+        stdout=subprocess.PIPE,
+        text=True,
         cwd=Path(__file__).parents[2],
     )
 

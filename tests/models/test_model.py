@@ -19,9 +19,7 @@ def spring(**changes):
 
 
 def test_order_of_each_state_is_recognised_by_its_derivatives():
-    model = spring(
-        states=["x", "T"], equations=lambda s, p, u: [p.m * s.ddx + s.T - u.force, s.dT + p.k * s.x]
-    )
+    model = spring(states=["x", "T"], equations=lambda s, p, u: [p.m * s.ddx + s.T - u.force, s.dT + p.k * s.x])
     assert model.orders == {"x": 2, "T": 1}
 
 
@@ -49,7 +47,10 @@ def test_model_travels_to_other_processes():
 
 def test_piecewise_min_and_sign_compile_and_agree_with_sympy():
     model = bp.Model(
-        "kinks", states=["x"], inputs=["u"], parameters=["a"],
+        "kinks",
+        states=["x"],
+        inputs=["u"],
+        parameters=["a"],
         equations=lambda s, p, u: [s.dx + sp.sign(s.x) + sp.Max(s.x, p.a) + abs(s.x) * s.x - u.u],
         outputs=lambda s, p, u: {"y": sp.Piecewise((s.x, s.x > 0), (p.a * s.x, True))},
     )

@@ -33,8 +33,11 @@ def test_batch_equals_single_solves(equations, anchor):
     assert not status.any()
     for theta, y in zip(parameters, outputs, strict=True):
         alone = bp.solve_periodic(
-            bp.models.duffing, dict(zip(bp.models.duffing.parameters, theta, strict=True)),
-            {"force": equations.inputs[:, 0]}, frequency=5.0, samples=200,
+            bp.models.duffing,
+            dict(zip(bp.models.duffing.parameters, theta, strict=True)),
+            {"force": equations.inputs[:, 0]},
+            frequency=5.0,
+            samples=200,
         )
         assert y[:, 0] == pytest.approx(alone.outputs["displacement"], rel=1e-8, abs=1e-12)
 

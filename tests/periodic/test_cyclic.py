@@ -37,7 +37,7 @@ def test_singular_and_not_finite_matrices_are_told():
 
 @pytest.mark.parametrize("exponent", [-40.0, -20.0, 20.0, 40.0])
 def test_folded_band_is_accurate_however_unstable_the_orbit(exponent):
-    """w' = λ w + u on the cyclic grid of central2, multiplier e^λ over the period, against the discrete closed form."""
+    """W' = λ w + u on the cyclic grid of central2, multiplier e^λ over the period, against the discrete closed form."""
     grid = CyclicGrid(central2, 800)
     size, half = grid.points, grid.half_width
     tau = grid.tau

@@ -42,7 +42,12 @@ def test_schemes_converge_at_second_order_on_a_manufactured_solution(scheme):
     for samples in (800, 1600, 3200):
         exact, force = manufactured(samples)
         solution = bp.solve_periodic(
-            bp.models.duffing, DUFFING, {"force": force}, frequency=FREQUENCY, samples=samples, scheme=scheme,
+            bp.models.duffing,
+            DUFFING,
+            {"force": force},
+            frequency=FREQUENCY,
+            samples=samples,
+            scheme=scheme,
             guess={"x": exact},
         )
         assert solution.converged
@@ -53,8 +58,12 @@ def test_schemes_converge_at_second_order_on_a_manufactured_solution(scheme):
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_first_order_states_converge_at_second_order(scheme):
     model = bp.Model(
-        "relaxation", states=["w"], inputs=["u"], parameters=["a"],
-        equations=lambda s, p, u: [s.dw + p.a * s.w**3 - u.u], outputs=lambda s, p, u: {"w": s.w},
+        "relaxation",
+        states=["w"],
+        inputs=["u"],
+        parameters=["a"],
+        equations=lambda s, p, u: [s.dw + p.a * s.w**3 - u.u],
+        outputs=lambda s, p, u: {"w": s.w},
     )
     errors = []
     for samples in (400, 800, 1600):
@@ -81,9 +90,7 @@ def test_linear_oscillator_matches_the_transfer_function_to_the_scheme_error(sch
     shift = np.exp(-1j * omega * step)
     one, two = {
         "central2": ((1 / shift - shift) / 2 / step, (1 / shift - 2 + shift) / step**2),
-        "backward2": (
-            (1.5 - 2 * shift + 0.5 * shift**2) / step, (2 - 5 * shift + 4 * shift**2 - shift**3) / step**2
-        ),
+        "backward2": ((1.5 - 2 * shift + 0.5 * shift**2) / step, (2 - 5 * shift + 4 * shift**2 - shift**3) / step**2),
     }[scheme]
     discrete = 1 / (parameters["m"] * two + parameters["c"] * one + parameters["k"])
     exact = 1 / (-parameters["m"] * omega**2 + parameters["c"] * 1j * omega + parameters["k"])
@@ -97,9 +104,7 @@ def test_linear_oscillator_matches_the_transfer_function_to_the_scheme_error(sch
 def test_sensitivities_match_complex_steps_through_an_independent_solver(scheme):
     samples = 48
     force = 3.0 * np.cos(2 * np.pi * grid(samples)) + 0.5
-    solution = bp.solve_periodic(
-        COUPLED, COUPLED_AT, {"force": force}, frequency=0.6, samples=samples, scheme=scheme
-    )
+    solution = bp.solve_periodic(COUPLED, COUPLED_AT, {"force": force}, frequency=0.6, samples=samples, scheme=scheme)
     assert solution.converged
     expected = complex_step_sensitivities(COUPLED, COUPLED_AT, {"force": force}, 0.6, samples, scheme)
     for channel, by_parameter in expected.items():
@@ -109,10 +114,14 @@ def test_sensitivities_match_complex_steps_through_an_independent_solver(scheme)
 
 
 def test_unstable_orbit_is_found():
-    """The upper equilibrium of a driven pendulum with a strong spring-like instability: a stable march would leave it."""
+    """Around an unstable equilibrium with multipliers e^±20; a march in time would leave it."""
     model = bp.Model(
-        "inverted", states=["x"], inputs=["u"], parameters=["a"],
-        equations=lambda s, p, u: [s.ddx - p.a * s.x + 0.1 * s.x**3 - u.u], outputs=lambda s, p, u: {"x": s.x},
+        "inverted",
+        states=["x"],
+        inputs=["u"],
+        parameters=["a"],
+        equations=lambda s, p, u: [s.ddx - p.a * s.x + 0.1 * s.x**3 - u.u],
+        outputs=lambda s, p, u: {"x": s.x},
     )
     solution = bp.solve_periodic(model, {"a": 400.0}, {"u": np.cos(2 * np.pi * grid(800))}, frequency=1.0)
     assert solution.converged
@@ -122,13 +131,15 @@ def test_unstable_orbit_is_found():
 
 def test_period_two_orbit_has_samples_per_forcing_period():
     model = bp.Model(
-        "slow", states=["x"], inputs=["u"], parameters=["a"],
-        equations=lambda s, p, u: [s.dx + p.a * s.x - u.u], outputs=lambda s, p, u: {"x": s.x},
+        "slow",
+        states=["x"],
+        inputs=["u"],
+        parameters=["a"],
+        equations=lambda s, p, u: [s.dx + p.a * s.x - u.u],
+        outputs=lambda s, p, u: {"x": s.x},
     )
     tau = np.arange(400) / 200
-    solution = bp.solve_periodic(
-        model, {"a": 1.0}, {"u": np.cos(np.pi * tau)}, frequency=2.0, samples=200, periods=2
-    )
+    solution = bp.solve_periodic(model, {"a": 1.0}, {"u": np.cos(np.pi * tau)}, frequency=2.0, samples=200, periods=2)
     omega = 2 * np.pi * 1.0
     exact = (np.exp(1j * np.pi * tau) / (1j * omega + 1)).real
     assert solution.tau == pytest.approx(tau)
@@ -138,14 +149,23 @@ def test_period_two_orbit_has_samples_per_forcing_period():
 def test_rotation_keeps_its_turns():
     """φ̈ + c φ̇ = torque: turning at torque/c rad/s, once a period when torque = 2π f c."""
     model = bp.Model(
-        "rotor", states=["phi"], inputs=["torque"], parameters=["c", "k"], angles=["phi"],
+        "rotor",
+        states=["phi"],
+        inputs=["torque"],
+        parameters=["c", "k"],
+        angles=["phi"],
         equations=lambda s, p, u: [s.ddphi + p.c * s.dphi + p.k * sp.sin(s.phi) - u.torque],
         outputs=lambda s, p, u: {"rate": s.dphi},
     )
     torque = np.full(200, 2 * np.pi * 0.5 * 3.0)
     solution = bp.solve_periodic(
-        model, {"c": 3.0, "k": 0.4}, {"torque": torque + 0.5 * np.cos(2 * np.pi * grid(200))}, frequency=0.5,
-        samples=200, winding={"phi": 1}, guess={"phi": 2 * np.pi * grid(200) + 0.1},
+        model,
+        {"c": 3.0, "k": 0.4},
+        {"torque": torque + 0.5 * np.cos(2 * np.pi * grid(200))},
+        frequency=0.5,
+        samples=200,
+        winding={"phi": 1},
+        guess={"phi": 2 * np.pi * grid(200) + 0.1},
     )
     assert solution.converged
     assert solution.states["phi"][-1] - solution.states["phi"][0] == pytest.approx(2 * np.pi, rel=0.05)
@@ -154,8 +174,12 @@ def test_rotation_keeps_its_turns():
 
 def test_no_equilibrium_ends_in_a_status_and_not_in_an_exception():
     model = bp.Model(
-        "runaway", states=["x"], inputs=["u"], parameters=["a"],
-        equations=lambda s, p, u: [s.dx - p.a * (1 + s.x**2) - u.u], outputs=lambda s, p, u: {"x": s.x},
+        "runaway",
+        states=["x"],
+        inputs=["u"],
+        parameters=["a"],
+        equations=lambda s, p, u: [s.dx - p.a * (1 + s.x**2) - u.u],
+        outputs=lambda s, p, u: {"x": s.x},
     )
     solution = bp.solve_periodic(model, {"a": 1.0}, {"u": np.cos(2 * np.pi * grid(100))}, frequency=1.0, samples=100)
     assert not solution.converged
@@ -165,8 +189,12 @@ def test_no_equilibrium_ends_in_a_status_and_not_in_an_exception():
 
 def test_overflow_is_told_as_not_finite():
     model = bp.Model(
-        "overflow", states=["x"], inputs=["u"], parameters=["a"],
-        equations=lambda s, p, u: [s.dx + sp.exp(p.a * s.x) - u.u], outputs=lambda s, p, u: {"x": s.x},
+        "overflow",
+        states=["x"],
+        inputs=["u"],
+        parameters=["a"],
+        equations=lambda s, p, u: [s.dx + sp.exp(p.a * s.x) - u.u],
+        outputs=lambda s, p, u: {"x": s.x},
     )
     solution = bp.solve_periodic(
         model, {"a": 1e6}, {"u": np.cos(2 * np.pi * grid(50))}, frequency=1.0, samples=50, guess={"x": np.ones(50)}
@@ -203,7 +231,10 @@ def test_earlier_solution_as_guess_needs_no_iterations():
 )
 def test_bad_arguments_are_named(changes, message):
     arguments = {
-        "model": bp.models.duffing, "parameters": DUFFING, "inputs": {"force": np.ones(100)}, "frequency": 1.0,
+        "model": bp.models.duffing,
+        "parameters": DUFFING,
+        "inputs": {"force": np.ones(100)},
+        "frequency": 1.0,
         "samples": 100,
     }
     with pytest.raises(ValueError, match=message):
@@ -212,7 +243,10 @@ def test_bad_arguments_are_named(changes, message):
 
 def test_autonomous_model_is_refused():
     model = bp.Model(
-        "free", states=["x"], parameters=["k"], equations=lambda s, p, u: [s.ddx + p.k * s.x],
+        "free",
+        states=["x"],
+        parameters=["k"],
+        equations=lambda s, p, u: [s.ddx + p.k * s.x],
         outputs=lambda s, p, u: {"x": s.x},
     )
     with pytest.raises(ValueError, match="'free' is autonomous"):
