@@ -9,6 +9,7 @@ import pandas as pd
 from scipy.special import stdtrit
 
 from bayesperiodic import checks
+from bayesperiodic.inference.input_noise import input_noise
 from bayesperiodic.inference.problem import Evaluation, Problem
 from bayesperiodic.inference.whiteness import Whiteness, whiteness
 from bayesperiodic.periodic.solution import PeriodicSolution
@@ -244,7 +245,7 @@ def _describe(
         rms=rms,
         fvu={c: rms[c] ** 2 / _pooled(c, measured) ** 2 for c in problem.channels},
         whiteness={c: _whiteness(problem, evaluation, c) for c in problem.channels},
-        input_noise={c: 0.0 for c in problem.channels} | _input_noise(problem, theta),
+        input_noise=input_noise(problem, theta, evaluation.solutions),
         history=history,
     )
     for channel, noise in result.input_noise.items():
@@ -271,13 +272,6 @@ def _whiteness(problem: Problem, evaluation: Evaluation, channel: str) -> Whiten
         if channel in e.outputs
     ]
     return Whiteness(min(1.0, len(tests) * min(t.p for t in tests)), float(np.mean([t.lag1 for t in tests])))
-
-
-def _input_noise(problem: Problem, theta: np.ndarray) -> dict[str, float]:
-    by_experiment = problem.perturbed_inputs(theta).values()
-    return {
-        c: float(np.sqrt(np.mean([noise[c] ** 2 for noise in by_experiment if c in noise]))) for c in problem.channels
-    }
 
 
 def _not_finite(problem: Problem, theta: np.ndarray, evaluation: Evaluation | None) -> str:

@@ -15,7 +15,7 @@ from bayesperiodic.periodic.batch import Anchor, solve_batch
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme
-from bayesperiodic.periodic.solution import PeriodicSolution, describe, periodic_part
+from bayesperiodic.periodic.solution import PeriodicSolution, describe
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class Problem:
         return other
 
     def _anchors_at(self, theta: np.ndarray) -> dict[str, Anchor]:
-        parameters = self._parameters(theta[None])[0]
+        parameters = self.parameters(theta[None])[0]
         anchors = {}
         for name, equations in self.equations.items():
             guess = equations.static_guess(parameters)
@@ -228,7 +228,7 @@ class Problem:
         M is infinite where a periodic solve fails. The result does not depend on the number of threads.
         """
         values = self.vector(theta)
-        parameters = self._parameters(values.reshape(-1, len(self.names)))
+        parameters = self.parameters(values.reshape(-1, len(self.names)))
         moments = np.zeros((len(parameters), len(self.channels)))
         status = np.full(len(parameters), CONVERGED)
         for experiment in self.experiments:
@@ -263,7 +263,7 @@ class Problem:
 
     def outputs(self, theta: Mapping[str, float] | np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
         """Return ŷ of many θ (draws, names), by experiment and channel (draws, points), and which solves converged."""
-        parameters = self._parameters(self.vector(theta))
+        parameters = self.parameters(self.vector(theta))
         converged = np.full(len(parameters), True)
         result = {}
         for e in self.experiments:
@@ -274,7 +274,7 @@ class Problem:
 
     def solve(self, theta: Mapping[str, float] | np.ndarray) -> dict[str, PeriodicSolution]:
         """Return the periodic solution of every experiment at one θ."""
-        parameters = self._parameters(self.vector(theta)[None])[0]
+        parameters = self.parameters(self.vector(theta)[None])[0]
         solutions = {}
         for name, equations in self.equations.items():
             solved = equations.solve(parameters, self.anchors[name].z)
@@ -298,32 +298,13 @@ class Problem:
             }
         return Evaluation(solutions, residuals, sensitivities)
 
-    def perturbed_inputs(self, theta: Mapping[str, float] | np.ndarray) -> dict[str, dict[str, float]]:
-        """Return the sd that the inputs' measurement noise brings to every output, by experiment and channel.
-
-        The noise of each kept Fourier amplitude of an input, and of its derivatives, is carried through the linearised
-        periodic problem; the result is the root of the mean variance over the period, within the harmonics kept.
-        """
-        parameters = self._parameters(self.vector(theta)[None])[0]
-        result = {}
-        for e in self.experiments:
-            equations, total = self.equations[e.name], {channel: 0.0 for channel in e.outputs}
-            z = periodic_part(equations, self.solve(theta)[e.name].states)
-            directions = _input_noise(e)
-            derivative = equations.input_sensitivities(z, parameters, directions) if len(directions) else None
-            if derivative is not None:
-                for channel in total:
-                    moved = e.project(channel, derivative.outputs[:, :, self.model.outputs.index(channel)])
-                    total[channel] = float(np.sqrt(np.sum(np.mean(moved**2, axis=1))))
-            result[e.name] = total
-        return result
-
     def sample_prior(self, size: int, seed: int) -> dict[str, np.ndarray]:
         """Return independent draws of every free parameter from its prior, (size,) each."""
         generator = np.random.default_rng(seed)
         return {name: self.priors[name].sample(size, generator) for name in self.names}
 
-    def _parameters(self, theta: np.ndarray) -> np.ndarray:
+    def parameters(self, theta: np.ndarray) -> np.ndarray:
+        """Return every parameter of the model (points, parameters) from θ (points, names)."""
         parameters = np.empty((len(theta), len(self.model.parameters)))
         for column, name in enumerate(self.model.parameters):
             parameters[:, column] = theta[:, self.names.index(name)] if name in self.names else self.fixed[name]
@@ -348,20 +329,3 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
         for channel in experiment.outputs:
             checks.one_of(f"outputs of experiment {experiment.name!r}", channel, model.outputs)
     return result
-
-
-def _input_noise(experiment: Experiment) -> np.ndarray:
-    """Return one-sd perturbations (directions, points, 3·inputs) of (u, u̇, ü), two a noisy Fourier amplitude."""
-    points = experiment.samples * experiment.periods
-    count, directions = len(experiment.inputs), []
-    for i, name in enumerate(experiment.inputs):
-        for h, variance in enumerate(experiment.amplitude_variance.get(name, ())):
-            for part in (1.0,) if h == 0 else (1.0, 1j):
-                amplitude = np.zeros(h + 1, dtype=complex)
-                amplitude[h] = part * np.sqrt(variance if h == 0 else 0.5 * variance)
-                direction = np.zeros((points, 3 * count))
-                for order in range(3):
-                    rate = fourier.derivative(amplitude, experiment.frequency / experiment.periods, order)
-                    direction[:, order * count + i] = fourier.on_grid(rate, points)
-                directions.append(direction)
-    return np.array(directions)

@@ -1,21 +1,24 @@
-"""The functions of `kernels`, compiled, or loaded from the kernel cache."""
+"""What `kernels` defines, its functions compiled or loaded from the kernel cache."""
 
 from pathlib import Path
 
 from bayesperiodic.models.cache import load
 
-STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit")
-CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT = range(len(STATUSES))
-MAX_ITERATIONS = 50
+NAMES = (
+    "STATUSES", "CONVERGED", "SINGULAR", "MAX_ITERATIONS",
+    "factor", "solve", "differentiate", "assemble", "scales", "newton", "solve_many",
+)  # fmt: skip
+_kernels = load(Path(__file__).with_name("kernels.py").read_text(encoding="utf-8"), NAMES)
 
-_functions = load(
-    Path(__file__).with_name("kernels.py").read_text(encoding="utf-8"),
-    ("factor", "solve", "differentiate", "assemble", "scales", "norm", "newton", "solve_many"),
-)
-factor = _functions["factor"]
-solve = _functions["solve"]
-differentiate = _functions["differentiate"]
-assemble = _functions["assemble"]
-scales = _functions["scales"]
-newton = _functions["newton"]
-solve_many = _functions["solve_many"]
+STATUSES: tuple[str, ...] = _kernels["STATUSES"]
+CONVERGED: int = _kernels["CONVERGED"]
+SINGULAR: int = _kernels["SINGULAR"]
+MAX_ITERATIONS: int = _kernels["MAX_ITERATIONS"]
+
+factor = _kernels["factor"]
+solve = _kernels["solve"]
+differentiate = _kernels["differentiate"]
+assemble = _kernels["assemble"]
+scales = _kernels["scales"]
+newton = _kernels["newton"]
+solve_many = _kernels["solve_many"]

@@ -17,7 +17,8 @@ from numba import njit
 
 from bayesperiodic.models.compile import GRID_SIGNATURE
 
-CONVERGED, STALLED, SINGULAR, NOT_FINITE = range(4)
+STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit")
+CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT = range(len(STATUSES))
 
 STEP_TOLERANCE = 1e-9
 MAX_ITERATIONS = 50

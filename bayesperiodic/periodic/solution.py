@@ -135,7 +135,7 @@ def solve_periodic(
     >>> import numpy as np, bayesperiodic as bp
     >>> force = np.cos(2 * np.pi * np.arange(800) / 800)
     >>> solution = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
-    ...                              frequency=0.2)
+    ...                              frequency=0.1)
     >>> solution.status
     'converged'
     """

@@ -18,7 +18,11 @@ COUPLED = bp.Model(
         p.m * s.ddx + p.c * s.dx * sp.sqrt(1 + s.dx**2) + p.k * sp.sinh(s.x) - p.b * s.T - u.force,
         s.dT + p.h * s.T * (1 + s.x**2) - s.dx * s.x - u.dforce / 10,
     ],
-    outputs=lambda s, p, u: {"position": s.x * p.b, "temperature": s.T + p.c * s.dx, "force": p.m * s.ddx + u.ddforce},
+    outputs=lambda s, p, u: {
+        "position": s.x * p.b,
+        "temperature": s.T + p.c * s.dx,
+        "reaction": p.m * s.ddx + u.ddforce,
+    },
 )
 COUPLED_AT = {"m": 1.2, "c": 0.4, "k": 30.0, "h": 2.0, "b": 0.7}
 
