@@ -91,6 +91,7 @@ def test_noise_has_its_standard_deviation_and_its_seed():
     assert np.std(one.inputs["force"]) == pytest.approx(0.2, rel=0.08)
 
 
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning:scipy")
 def test_a_run_that_blows_up_is_an_error():
     model = bp.Model(
         "blow",

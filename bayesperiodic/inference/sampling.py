@@ -91,14 +91,14 @@ def sample(
     anchored = problem.anchored(fit.theta)
     densities = [SamplingDensity(anchored, max(1, available_cores() // ensembles)) for _ in range(ensembles)]
     walkers = _checked_walkers(walkers, densities[0])
-    samplers = _samplers(problem, fit, densities, seed, walkers, checkpoint)
+    samplers, starts = _samplers(problem, fit, densities, seed, walkers, checkpoint)
     converged, reason, passes = False, f"max_steps = {max_steps} reached", 0
     last = np.full(densities[0].dimension, np.inf)
     bar = tqdm(total=max_steps, unit="step", desc="sampling", disable=not progress)
     for steps in range(BLOCK, max_steps + 1, BLOCK):
         with ThreadPoolExecutor(available_cores()) as pool:
-            list(pool.map(_advance, samplers, [steps] * ensembles))
-        kept = _kept(samplers)
+            list(pool.map(_advance, samplers, starts, [steps] * ensembles))
+        kept = _kept(samplers, steps)
         tau = chains.autocorrelation_time(kept)
         shortfall = _shortfall(kept, tau, last)
         passes, last = (0 if shortfall else passes + 1), tau
@@ -112,7 +112,7 @@ def sample(
     else:
         reason += f" with {', '.join(shortfall) or 'the stop rule passed only once'}"
     bar.close()
-    return _posterior(densities, samplers, converged, reason, seed)
+    return _posterior(densities, samplers, steps, converged, reason, seed)
 
 
 def _checked_walkers(walkers: int | None, density: SamplingDensity) -> int:
@@ -134,21 +134,23 @@ def _samplers(
     seed: int,
     walkers: int,
     checkpoint: str | Path | None,
-) -> list[emcee.EnsembleSampler]:
+) -> tuple[list[emcee.EnsembleSampler], list[np.ndarray | None]]:
+    """Return the samplers and where they start; None where a checkpoint holds the last step."""
     settings = f"seed {seed}, {len(densities)} ensembles of {walkers} walkers"
     stores = backends(checkpoint, problem, settings, len(densities))
-    samplers = []
+    samplers: list[emcee.EnsembleSampler] = []
+    starts: list[np.ndarray | None] = []
     for density, sequence, store in zip(
         densities, np.random.SeedSequence(seed).spawn(len(densities)), stores, strict=True
     ):
         moves = [(emcee.moves.DEMove(), 0.6), (emcee.moves.DESnookerMove(), 0.1), (emcee.moves.StretchMove(), 0.3)]
         sampler = emcee.EnsembleSampler(walkers, density.dimension, density, moves=moves, vectorize=True, backend=store)
+        generator = np.random.default_rng(sequence)
         if sampler.iteration == 0:
-            generator = np.random.default_rng(sequence)
             sampler.random_state = np.random.RandomState(generator.integers(2**32, size=4)).get_state()
-            sampler._previous_state = emcee.State(_start(density, fit, walkers, generator))
+        starts.append(_start(density, fit, walkers, generator) if sampler.iteration == 0 else None)
         samplers.append(sampler)
-    return samplers
+    return samplers, starts
 
 
 def _start(density: SamplingDensity, fit: MapEstimate, walkers: int, generator: np.random.Generator) -> np.ndarray:
@@ -170,15 +172,15 @@ def _start(density: SamplingDensity, fit: MapEstimate, walkers: int, generator: 
     return points[:walkers]
 
 
-def _advance(sampler: emcee.EnsembleSampler, steps: int) -> None:
-    missing = steps - sampler.iteration
+def _advance(sampler: emcee.EnsembleSampler, start: np.ndarray | None, steps: int) -> None:
+    missing, here = steps - sampler.iteration, start if sampler.iteration == 0 else None
     if missing > 0:
-        sampler.run_mcmc(None, missing, skip_initial_state_check=True, progress=False)
+        sampler.run_mcmc(here, missing, skip_initial_state_check=True, progress=False)
 
 
-def _kept(samplers: list[emcee.EnsembleSampler]) -> np.ndarray:
-    """Return the chains (ensembles, steps, walkers, coordinates) without their first fifth."""
-    return np.stack([sampler.get_chain(discard=sampler.iteration // 5) for sampler in samplers])
+def _kept(samplers: list[emcee.EnsembleSampler], steps: int) -> np.ndarray:
+    """Return the chains (ensembles, steps, walkers, coordinates) up to a step, without their first fifth."""
+    return np.stack([sampler.get_chain()[steps // 5 : steps] for sampler in samplers])
 
 
 def _acceptance(samplers: list[emcee.EnsembleSampler]) -> float:
@@ -200,15 +202,20 @@ def _shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray) -> list[str]
 
 
 def _posterior(
-    densities: list[SamplingDensity], samplers: list[emcee.EnsembleSampler], converged: bool, reason: str, seed: int
+    densities: list[SamplingDensity],
+    samplers: list[emcee.EnsembleSampler],
+    last_step: int,
+    converged: bool,
+    reason: str,
+    seed: int,
 ) -> Posterior:
-    density, kept = densities[0], _kept(samplers)
+    density, kept = densities[0], _kept(samplers, last_step)
     problem, calls = density.problem, sum(d.calls for d in densities)
     ensembles, steps, walkers, _ = kept.shape
     tau = chains.autocorrelation_time(kept)
     points = kept.transpose(0, 2, 1, 3).reshape(ensembles * walkers, steps, -1)
     theta, variances = density.to_natural(points)
-    lp = np.stack([s.get_log_prob(discard=s.iteration // 5) for s in samplers])
+    lp = np.stack([s.get_log_prob()[last_step // 5 : last_step] for s in samplers])
     coords = {
         "chain": np.arange(ensembles * walkers),
         "draw": np.arange(steps),

@@ -90,6 +90,16 @@ def test_resumed_run_gives_the_same_chain(known_variance, tmp_path):
     assert np.array_equal(whole.draws("k"), resumed.draws("k"))
 
 
+def test_finished_run_comes_back_from_its_checkpoint(known_variance, tmp_path, monkeypatch):
+    monkeypatch.setattr(sampling, "LENGTHS", 5.0)
+    monkeypatch.setattr(sampling, "TAU_CHANGE", 1.0)
+    monkeypatch.setattr(sampling, "RHAT", 1.1)
+    first = bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **QUIET)
+    again = bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **QUIET)
+    assert first.converged and again.reason == first.reason
+    assert np.array_equal(first.draws("k"), again.draws("k"))
+
+
 def test_checkpoint_of_another_run_is_refused(known_variance, tmp_path):
     bp.sample(*known_variance, seed=5, max_steps=250, checkpoint=tmp_path / "run.h5", **QUIET)
     with pytest.raises(ValueError, match="belongs to another run"):

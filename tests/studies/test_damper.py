@@ -91,6 +91,7 @@ def test_the_measured_damper(tmp_path, capsys):
 
 
 @real_data
+@pytest.mark.filterwarnings("ignore:The noise of the measured inputs")
 def test_map_of_the_measured_damper_by_an_independent_route():
     """Folding by plain least squares, Dahl's equation by an integrating factor in scipy, and scipy's least squares."""
     from scipy.integrate import cumulative_trapezoid
