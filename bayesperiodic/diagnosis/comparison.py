@@ -10,10 +10,9 @@ from bayesperiodic.inference.posterior import Posterior
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.store import Result
 
-SHIFT = 0.25
-NARROW, WIDE = 0.85, 1.18
-SKEWNESS = 0.5
-SIGMAS = 3.0
+END_SHIFT = 0.25
+MONTE_CARLO_ERRORS = 3.0
+QUANTILE_ERROR = float(np.sqrt(0.05 * 0.95) / 0.1031)
 
 
 @dataclass(frozen=True)
@@ -37,9 +36,10 @@ class Comparison(Result):
 def compare(problem: Problem, fit: MapEstimate, posterior: Posterior) -> Comparison:
     """Compare the Laplace approximation of every parameter with its posterior draws.
 
-    A departure counts when it is large enough to matter and larger than three Monte Carlo errors: a shift of the mean
-    by 0.25 sd or a skewness of 0.5 is a wrong shape; Laplace's sd below 0.85 or above 1.18 of the posterior's is too
-    narrow or too wide.
+    What counts are the ends of the 90 % interval: Laplace is fine where both agree with those of the draws within a
+    quarter of the posterior sd and three Monte Carlo errors (of a normal quantile with the same ESS). Otherwise its
+    interval is too narrow or too wide where both ends are off in opposite directions, and of the wrong shape (shifted
+    or skewed) where they are not.
 
     Parameters
     ----------
@@ -73,13 +73,15 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior) -> Compari
 
 
 def _verdict(row: dict[str, float], size: float) -> str:
-    error = SIGMAS / np.sqrt(size)
     if not np.isfinite(row["laplace_sd"]):
         return "too wide"
-    if abs(row["shift"]) > SHIFT + error or abs(row["skewness"]) > SKEWNESS + np.sqrt(6.0) * error:
-        return "wrong shape"
-    if row["sd_ratio"] < NARROW * (1.0 - error):
+    tolerance = END_SHIFT + MONTE_CARLO_ERRORS * QUANTILE_ERROR / np.sqrt(size)
+    low = (row["q05"] - row["laplace_q05"]) / row["sd"]
+    high = (row["q95"] - row["laplace_q95"]) / row["sd"]
+    if max(abs(low), abs(high)) <= tolerance:
+        return "fine"
+    if low < -0.5 * tolerance and high > 0.5 * tolerance:
         return "too narrow"
-    if row["sd_ratio"] > WIDE * (1.0 + error):
+    if low > 0.5 * tolerance and high < -0.5 * tolerance:
         return "too wide"
-    return "fine"
+    return "wrong shape"

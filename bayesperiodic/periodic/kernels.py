@@ -6,7 +6,8 @@ stale when a function of another file that it calls has changed. Import the func
 A cyclic band becomes an ordinary one in the folded order of `schemes.CyclicGrid`; pivoting then keeps the solution
 accurate however stable or unstable the orbit is, which one march through the period would not. Rows of the band are
 stored side by side: entry (i, j) of the matrix is ``band[i, j - i + lower]``, the width is 2·lower + upper + 1 and
-leaves room for the fill-in of row exchanges.
+leaves room for the fill-in of row exchanges. It is read through flat, unsigned indices, which spares a test for
+negative ones at every access.
 
 The Newton iteration is that of de Kraker, Verbeek & van de Wouw (1997), eq. (3): damped, with step halving. A failed
 solve is a status, not an exception.
@@ -44,54 +45,62 @@ def factor(band, lower, upper, pivots):
     pivots : int array (size,)
         Filled with the row exchanged with each row.
     """
-    size = band.shape[0]
-    last = 0
+    flat = band.reshape(band.size)
+    size, one, below, above = np.uint64(band.shape[0]), np.uint64(1), np.uint64(lower), np.uint64(upper)
+    next_row = np.uint64(band.shape[1]) - one
+    last = np.uint64(0)
     for j in range(size):
-        end = min(j + lower, size - 1)
-        pivot, largest = j, abs(band[j, lower])
-        for i in range(j + 1, end + 1):
-            value = abs(band[i, j - i + lower])
+        end = min(j + below, size - one)
+        diagonal = j * (next_row + one) + below
+        pivot, largest = j, abs(flat[diagonal])
+        for m in range(one, end - j + one):
+            value = abs(flat[diagonal + m * next_row])
             if value > largest:
-                pivot, largest = i, value
+                pivot, largest = j + m, value
         if not (largest > 0.0 and largest < np.inf):
             return False
         pivots[j] = pivot
-        last = max(last, min(pivot + upper, size - 1))
-        if pivot != j:
-            for column in range(j, last + 1):
-                here, there = column - j + lower, column - pivot + lower
-                band[j, here], band[pivot, there] = band[pivot, there], band[j, here]
-        inverse = 1.0 / band[j, lower]
-        band[j, lower] = inverse
+        last = max(last, min(pivot + above, size - one))
         width = last - j
-        for i in range(j + 1, end + 1):
-            start = j - i + lower
-            multiplier = band[i, start] * inverse
-            band[i, start] = multiplier
+        if pivot != j:
+            other = diagonal + (pivot - j) * next_row
+            for k in range(width + one):
+                flat[diagonal + k], flat[other + k] = flat[other + k], flat[diagonal + k]
+        inverse = 1.0 / flat[diagonal]
+        flat[diagonal] = inverse
+        for m in range(one, end - j + one):
+            start = diagonal + m * next_row
+            multiplier = flat[start] * inverse
+            flat[start] = multiplier
             if multiplier != 0.0:
-                for k in range(1, width + 1):
-                    band[i, start + k] -= multiplier * band[j, lower + k]
+                for k in range(one, width + one):
+                    flat[start + k] -= multiplier * flat[diagonal + k]
     return True
 
 
 @njit(f"void({MATRIX}, int64, int64, int64[::1], {MATRIX})", **OPTIONS)
 def solve(band, lower, upper, pivots, right):
     """Solve A·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
-    size = right.shape[1]
+    flat = band.reshape(band.size)
+    size, one, below = np.uint64(right.shape[1]), np.uint64(1), np.uint64(lower)
+    reach, next_row = np.uint64(lower + upper), np.uint64(band.shape[1]) - np.uint64(1)
     for c in range(right.shape[0]):
         x = right[c]
         for j in range(size):
-            pivot = pivots[j]
+            pivot = np.uint64(pivots[j])
             value = x[pivot]
             x[pivot] = x[j]
             x[j] = value
-            for i in range(j + 1, min(j + lower, size - 1) + 1):
-                x[i] -= band[i, j - i + lower] * value
-        for i in range(size - 1, -1, -1):
+            diagonal = j * (next_row + one) + below
+            for m in range(one, min(below, size - one - j) + one):
+                x[j + m] -= flat[diagonal + m * next_row] * value
+        for back in range(size):
+            i = size - one - back
+            diagonal = i * (next_row + one) + below
             value = x[i]
-            for j in range(1, min(lower + upper, size - 1 - i) + 1):
-                value -= band[i, j + lower] * x[i + j]
-            x[i] = value * band[i, lower]
+            for k in range(one, min(reach, back) + one):
+                value -= flat[diagonal + k] * x[i + k]
+            x[i] = value * flat[diagonal]
 
 
 @njit(f"void({MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, {INDICES}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
