@@ -147,14 +147,18 @@ def _first_guess(
         fundamental = guess / periods if guess else None
     else:
         fundamental = guess_frequency(time, signals)
-    duration = float(np.ptp(time))
-    if fundamental is None or duration * fundamental < MINIMUM_CYCLES:
-        found = "no period was found" if fundamental is None else f"it has {duration * fundamental:.2f} cycles"
+    if fundamental is None or _cycles(time, fundamental) < MINIMUM_CYCLES:
+        found = "no period was found" if fundamental is None else f"it has {_cycles(time, fundamental):.2f} cycles"
         raise ValueError(
-            f"recording: {recording.name!r} of {duration:g} s is not allowed; {found}, and at least {MINIMUM_CYCLES} "
+            f"recording: {recording.name!r} of {np.ptp(time):g} s is not allowed; {found}, and at least {MINIMUM_CYCLES} "
             "cycles are needed. Record longer, or give the forcing frequency."
         )
     return fundamental
+
+
+def _cycles(time: np.ndarray, fundamental: float) -> float:
+    """Return the number of cycles, the last sample's step included."""
+    return float(np.ptp(time) * time.size / (time.size - 1) * fundamental * (1 + 1e-9))
 
 
 def _track(time: np.ndarray, signals: np.ndarray, fundamental: float) -> float:
@@ -183,8 +187,8 @@ def _resolved(time: np.ndarray, fundamental: float, points: int) -> int:
 def _steady_part(time: np.ndarray, signals: np.ndarray, fundamental: float) -> np.ndarray:
     """Return a mask of the last whole cycles, without the first ones that differ from the later half."""
     period = 1.0 / fundamental
-    total = int(np.ptp(time) * fundamental * (1 + 1e-9))
-    back = np.minimum(((time[-1] - time) / period).astype(int), total)
+    total = int(_cycles(time, fundamental))
+    back = np.minimum(((time[-1] - time) / period + 1e-9).astype(int), total)
     harmonics = min(5, _resolved(time, fundamental, time.size))
     scale = signals.std(axis=1)[:, None]
     shape = np.array(

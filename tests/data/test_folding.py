@@ -126,6 +126,15 @@ def test_multisine_with_hundreds_of_harmonics_finds_its_fundamental():
     assert e.harmonics["y"] == 399
 
 
+def test_exactly_three_cycles_are_enough():
+    time = np.arange(3 * 64) / 64
+    e = bp.Recording.from_arrays(time, {"y": mean_period(2 * np.pi * time)}).fold(64, harmonics=5)
+    assert e.cycles == 3
+    assert e.outputs["y"] == pytest.approx(mean_period(2 * np.pi * grid(64)), abs=1e-9)
+    with pytest.raises(ValueError, match=r"it has 2\.98 cycles"):
+        bp.Recording.from_arrays(time[1:], {"y": mean_period(2 * np.pi * time[1:])}).fold(64, frequency=1.0)
+
+
 def test_fewer_than_three_cycles_are_refused():
     with pytest.raises(ValueError, match=r"it has 2\.\d\d cycles, and at least 3 cycles are needed"):
         recording(cycles=2.6, noise=0.0).fold(frequency=FREQUENCY)
