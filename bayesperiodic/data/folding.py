@@ -150,8 +150,8 @@ def _first_guess(
     if fundamental is None or _cycles(time, fundamental) < MINIMUM_CYCLES:
         found = "no period was found" if fundamental is None else f"it has {_cycles(time, fundamental):.2f} cycles"
         raise ValueError(
-            f"recording: {recording.name!r} of {np.ptp(time):g} s is not allowed; {found}, and at least {MINIMUM_CYCLES} "
-            "cycles are needed. Record longer, or give the forcing frequency."
+            f"recording: {recording.name!r} of {np.ptp(time):g} s is not allowed; {found}, and at least "
+            f"{MINIMUM_CYCLES} cycles are needed. Record longer, or give the forcing frequency."
         )
     return fundamental
 

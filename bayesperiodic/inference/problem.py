@@ -148,7 +148,7 @@ class Problem:
         return self._anchors
 
     def anchored(self, theta: Mapping[str, float] | np.ndarray) -> "Problem":
-        """Return the same problem with its anchors at another θ."""
+        """Return the same problem with its anchors at another θ, solved from the present ones."""
         other = object.__new__(Problem)
         other.__dict__.update(self.__dict__)
         other._anchors = self._anchors_at(self.vector(theta))
@@ -158,13 +158,14 @@ class Problem:
         parameters = self.parameters(theta[None])[0]
         anchors = {}
         for name, equations in self.equations.items():
-            guess = equations.static_guess(parameters)
-            z = equations.solve(parameters, guess).z
-            derivative = equations.parameter_sensitivities(z, parameters) if np.isfinite(z).all() else None
-            if derivative is None or not np.isfinite(derivative.states).all():
-                anchors[name] = Anchor(parameters, guess, np.zeros((parameters.size, *guess.shape)))
-            else:
-                anchors[name] = Anchor(parameters, z, derivative.states)
+            static = equations.static_guess(parameters)
+            anchors[name] = Anchor(parameters, static, np.zeros((parameters.size, *static.shape)))
+            for guess in [self._anchors[name].z, static] if self._anchors else [static]:
+                z, code, _ = equations.solve(parameters, guess)
+                derivative = equations.parameter_sensitivities(z, parameters) if code == CONVERGED else None
+                if derivative is not None:
+                    anchors[name] = Anchor(parameters, z, derivative.states)
+                    break
         return anchors
 
     def median(self) -> np.ndarray:
@@ -215,7 +216,7 @@ class Problem:
 
     def likelihood_from_moments(self, moments: np.ndarray, variances: np.ndarray) -> np.ndarray:
         """Return −½ Σ_β [n_β ln v_β + M_β/v_β] of moments and variances (…, channels)."""
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             terms = self.independent * np.log(variances) + moments / variances
             value = -0.5 * terms.sum(axis=-1)
         return np.where(np.isfinite(value), value, -np.inf)
