@@ -113,5 +113,10 @@ def _execute(source: str, names: Sequence[str], path: Path, cache: bool) -> dict
     module = types.ModuleType(f"bayesperiodic_kernels_{hashlib.sha256(source.encode()).hexdigest()[:32]}")
     module.__dict__.update(__file__=str(path), CACHE=cache)
     sys.modules[module.__name__] = module
-    exec(compile(source, str(path), "exec"), module.__dict__)
+    settings: Any = numba.config
+    elsewhere, settings.CACHE_DIR = settings.CACHE_DIR, ""  # beside the source, where its digests are kept
+    try:
+        exec(compile(source, str(path), "exec"), module.__dict__)
+    finally:
+        settings.CACHE_DIR = elsewhere
     return {name: getattr(module, name) for name in names}

@@ -53,6 +53,13 @@ def test_second_start_loads_all_functions_from_the_cache(folder):
     assert second.communicate()[0] == "3\n"
 
 
+def test_numba_settings_of_the_user_do_not_move_the_files(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(cache.numba.config, "CACHE_DIR", str(tmp_path / "elsewhere"))
+    cache.load(kernel_source(LINEAR), FUNCTIONS)
+    assert len(list((entry(folder) / "__pycache__").glob("*.nbi"))) == len(FUNCTIONS)
+    assert cache.numba.config.CACHE_DIR == str(tmp_path / "elsewhere")
+
+
 def test_two_processes_may_fill_the_cache_at_once(folder):
     both = [start(), start()]
     for process in both:
