@@ -32,3 +32,9 @@ def test_solving_loads_neither_the_sampler_nor_the_plots():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
+
+
+def test_listing_the_studies_compiles_nothing():
+    program = "from studies.__main__ import main; main([]); import sys; print('numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.endswith("False\n")
