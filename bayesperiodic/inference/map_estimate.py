@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from scipy.special import stdtrit
+from tqdm import tqdm
 
 from bayesperiodic import checks
 from bayesperiodic.inference.input_noise import input_noise
@@ -92,13 +93,13 @@ class MapEstimate(Result):
         }
 
     def __repr__(self) -> str:
-        lines = [f"MapEstimate ({self.status}), mean and Laplace sd:"]
+        lines = [f"MapEstimate ({self.status}), estimate ± Laplace sd:"]
         lines += [f"  {name:12s} {value:12.6g} ± {self.sd[name]:.3g}" for name, value in self.theta.items()]
         lines += [f"  rms of {c}: {self.rms[c]:.4g}, unexplained variance {self.fvu[c]:.2%}" for c in self.rms]
         return "\n".join(lines)
 
 
-def map_estimate(problem: Problem, *, start: Mapping[str, float] | None = None) -> MapEstimate:
+def map_estimate(problem: Problem, *, start: Mapping[str, float] | None = None, progress: bool = True) -> MapEstimate:
     """Find the MAP point by staged Gauss-Newton and the Laplace covariance there ([1]_, eq. 7-8).
 
     Each iteration solves the channel variances from eq. (7) with its bias correction,
@@ -112,6 +113,8 @@ def map_estimate(problem: Problem, *, start: Mapping[str, float] | None = None) 
     problem : Problem
     start : mapping of str to float, optional
         A first guess of every free parameter; by default the medians of the priors.
+    progress : bool
+        Show the iterations, with the objective and the step in standard deviations.
 
     Returns
     -------
@@ -137,7 +140,8 @@ def map_estimate(problem: Problem, *, start: Mapping[str, float] | None = None) 
     if not np.isfinite(objective):
         raise ValueError(_not_finite(problem, theta, evaluation))
     history, status = [objective], "iterations"
-    for _ in range(MAX_ITERATIONS):
+    bar = tqdm(range(MAX_ITERATIONS), desc="MAP", unit="iteration", leave=False, disable=not progress)
+    for _ in bar:
         hessian, gradient = _hessian_and_gradient(problem, theta, evaluation)
         try:
             step = np.linalg.solve(hessian, gradient)
@@ -157,9 +161,11 @@ def map_estimate(problem: Problem, *, start: Mapping[str, float] | None = None) 
             break
         theta, evaluation, objective = theta + damping * step, candidate, value
         history.append(objective)
+        bar.set_postfix_str(f"objective {objective:.6g}, step {damping * size:.2g} sd")
         if damping == 1.0 and size < SCALED_STEP:
             status = "converged"
             break
+    bar.close()
     return _describe(problem, theta, evaluation, status, np.array(history))
 
 

@@ -38,7 +38,7 @@ def folded(harmonics: int) -> list[bp.Experiment]:
 def covered(experiments: list[bp.Experiment]) -> int:
     count = 0
     for experiment in experiments:
-        fit = bp.map_estimate(bp.Problem(LINEAR, [experiment], priors=FLAT, fixed={"c": TRUTH[1]}))
+        fit = bp.map_estimate(bp.Problem(LINEAR, [experiment], priors=FLAT, fixed={"c": TRUTH[1]}), progress=False)
         low, high = fit.interval(0.9)["coulomb"]
         count += low < TRUTH[2] < high
     return count

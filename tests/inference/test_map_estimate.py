@@ -31,6 +31,14 @@ def test_known_variance_gives_the_closed_form():
     assert fit.converged
 
 
+def test_progress_is_shown_unless_unwanted(capsys):
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS)
+    bp.map_estimate(problem, progress=False)
+    assert capsys.readouterr().err == ""
+    bp.map_estimate(problem)
+    assert "objective" in capsys.readouterr().err
+
+
 def test_independent_values_weigh_the_samples():
     experiment = linear_experiment(TRUTH, 3.0, seed=2, independent=11)
     fit = bp.map_estimate(bp.Problem(LINEAR, [experiment], priors=PRIORS, fixed={"variance[force]": 9.0}))
