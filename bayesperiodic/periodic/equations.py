@@ -133,13 +133,13 @@ class PeriodicEquations:
 
     def scaled_residual(self, z: np.ndarray, parameters: np.ndarray) -> float:
         """Return the largest residual in units of the size of its equation's terms."""
-        columns, states = self._evaluate("residual_jacobian", self.states(z), parameters), self.states(z)
+        states = self.states(z)
+        columns = self._evaluate("residual_jacobian", states, parameters)
         count = z.shape[1]
         size, rounding = np.empty(count), np.empty(count)
         compiled.scales(
             columns,
             states,
-            self.drift,
             self.grid.first,
             self.grid.second,
             np.abs(z).max(axis=0),

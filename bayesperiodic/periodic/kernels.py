@@ -143,8 +143,8 @@ def assemble(columns, first, second, shift, place, frequency, lower, band):
                     row[shift[i, o] * count + lower + s - e] += value
 
 
-@njit(f"void({MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR})", **OPTIONS)
-def scales(columns, states, drift, first, second, amplitude, frequency, size, rounding):
+@njit(f"void({MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR})", **OPTIONS)
+def scales(columns, states, first, second, amplitude, frequency, size, rounding):
     """Fill, for each equation, the size of its terms and the rounding error that its residual cannot fall below."""
     points, count = states.shape[0], amplitude.size
     one, two = 0.0, 0.0
@@ -232,7 +232,7 @@ def newton(
     for iteration in range(MAX_ITERATIONS):
         for s in range(count):
             amplitude[s] = np.max(np.abs(z[:, s]))
-        scales(columns, states, drift, first, second, amplitude, frequency, size, rounding)
+        scales(columns, states, first, second, amplitude, frequency, size, rounding)
         before = norm(columns, size)
         if not np.isfinite(before):
             return NOT_FINITE, iteration
