@@ -22,8 +22,11 @@ if TYPE_CHECKING:
     from bayesperiodic.inference.sampling import sample
     from bayesperiodic.models.model import Model
     from bayesperiodic.models.smooth import smooth_abs, smooth_sign
+    from bayesperiodic.periodic.continuation import Branch, continue_periodic, double_period, iterate_periodic
     from bayesperiodic.periodic.schemes import Scheme
-    from bayesperiodic.periodic.solution import PeriodicSolution, solve_periodic
+    from bayesperiodic.periodic.solution import PeriodicSolution
+    from bayesperiodic.periodic.solve import solve_periodic
+    from bayesperiodic.periodic.stability import multiplier_sensitivities
     from bayesperiodic.simulate import simulate
     from bayesperiodic.store import load
 
@@ -39,8 +42,11 @@ _HOMES = {
     "bayesperiodic.inference.sampling": ["sample"],
     "bayesperiodic.models.model": ["Model"],
     "bayesperiodic.models.smooth": ["smooth_abs", "smooth_sign"],
+    "bayesperiodic.periodic.continuation": ["Branch", "continue_periodic", "double_period", "iterate_periodic"],
     "bayesperiodic.periodic.schemes": ["Scheme"],
-    "bayesperiodic.periodic.solution": ["PeriodicSolution", "solve_periodic"],
+    "bayesperiodic.periodic.solution": ["PeriodicSolution"],
+    "bayesperiodic.periodic.solve": ["solve_periodic"],
+    "bayesperiodic.periodic.stability": ["multiplier_sensitivities"],
     "bayesperiodic.simulate": ["simulate"],
     "bayesperiodic.store": ["load"],
 }
@@ -48,8 +54,9 @@ _MODULES = ["models", "plot"]
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [  # noqa: PLE0604
-    "Comparison", "Experiment", "LogNormal", "MapEstimate", "Model", "Normal", "PeriodicSolution", "Posterior",
-    "Prediction", "Problem", "Recording", "Scheme", "Uniform", "compare", "load", "map_estimate", "models", "plot",
+    "Branch", "Comparison", "Experiment", "LogNormal", "MapEstimate", "Model", "Normal", "PeriodicSolution",
+    "Posterior", "Prediction", "Problem", "Recording", "Scheme", "Uniform", "compare", "continue_periodic",
+    "double_period", "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "plot",
     "predict", "sample", "simulate", "smooth_abs", "smooth_sign", "solve_periodic",
 ]  # fmt: skip
 

@@ -7,6 +7,7 @@ import numpy as np
 from bayesperiodic import fourier
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.inference.problem import Problem
+from bayesperiodic.periodic.sensitivity import input_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 
 
@@ -31,7 +32,7 @@ def input_noise(problem: Problem, theta: np.ndarray, solutions: Mapping[str, Per
             continue
         equations = problem.equations[e.name]
         z = periodic_part(equations, solutions[e.name].states)
-        derivative = equations.input_sensitivities(z, parameters, directions)
+        derivative = input_sensitivities(equations, z, parameters, directions)
         if derivative is None:
             continue
         for channel in e.outputs:

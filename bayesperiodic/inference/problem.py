@@ -11,11 +11,12 @@ from bayesperiodic import checks, fourier
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.inference.priors import Prior
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic.batch import Anchor, solve_batch
+from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.compiled import CONVERGED
-from bayesperiodic.periodic.equations import PeriodicEquations
+from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import PeriodicSolution, describe
+from bayesperiodic.periodic.solve import solve_from_rest
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Problem:
     ValueError
         For a parameter without prior or value, or with both, an unknown name, an experiment without the model's
         inputs or with outputs that the model lacks, no more independent values than free parameters in a channel whose
-        variance is unknown.
+        variance is unknown, an autonomous model.
 
     References
     ----------
@@ -80,6 +81,11 @@ class Problem:
         fixed: Mapping[str, float] | None = None,
         scheme: str | Scheme = "central2",
     ):
+        if model.autonomous:
+            raise ValueError(
+                f"model: {model.name!r} is not allowed; it is autonomous (neither inputs nor tau appear in its "
+                "equations), and problems take forced models."
+            )
         self.model = model
         self.experiments = _checked_experiments(model, experiments)
         measured = {channel for experiment in self.experiments for channel in experiment.outputs}
@@ -151,6 +157,7 @@ class Problem:
         """Return the same problem with its anchors at another θ, solved from the present ones."""
         other = object.__new__(Problem)
         other.__dict__.update(self.__dict__)
+        other.__dict__.pop("_batches", None)
         other._anchors = self._anchors_at(self.vector(theta))
         return other
 
@@ -158,15 +165,32 @@ class Problem:
         parameters = self.parameters(theta[None])[0]
         anchors = {}
         for name, equations in self.equations.items():
-            static = equations.static_guess(parameters)
-            anchors[name] = Anchor(parameters, static, np.zeros((parameters.size, *static.shape)))
-            for guess in [self._anchors[name].z, static] if self._anchors else [static]:
-                z, code, _ = equations.solve(parameters, guess)
-                derivative = equations.parameter_sensitivities(z, parameters) if code == CONVERGED else None
-                if derivative is not None:
-                    anchors[name] = Anchor(parameters, z, derivative.states)
-                    break
+            z, code, _ = self._solve_one(name, parameters, self._anchors)
+            anchors[name] = (
+                Anchor.at(equations, parameters, z)
+                if code == CONVERGED
+                else Anchor(parameters, equations.static_guess(parameters))
+            )
         return anchors
+
+    def _solve_one(self, name: str, parameters: np.ndarray, anchors: dict[str, Anchor] | None) -> Solved:
+        """Solve one experiment from its anchor, if there are any, or else from rest."""
+        if anchors:
+            solved = self.equations[name].solve(parameters, anchors[name].z)
+            if solved.code == CONVERGED:
+                return solved
+        return solve_from_rest(self.equations[name], parameters)[0]
+
+    @cached_property
+    def _batches(self) -> list[tuple[tuple[Experiment, ...], Batch]]:
+        """Experiments on the same grid, with what solves them together."""
+        groups: dict[tuple[int, int], list[Experiment]] = {}
+        for e in self.experiments:
+            groups.setdefault((e.samples, e.periods), []).append(e)
+        return [
+            (tuple(group), Batch([self.equations[e.name] for e in group], [self.anchors[e.name] for e in group]))
+            for group in groups.values()
+        ]
 
     def median(self) -> np.ndarray:
         """Return the medians of the priors, (names,)."""
@@ -232,14 +256,15 @@ class Problem:
         parameters = self.parameters(values.reshape(-1, len(self.names)))
         moments = np.zeros((len(parameters), len(self.channels)))
         status = np.full(len(parameters), CONVERGED)
-        for experiment in self.experiments:
-            equations, anchor = self.equations[experiment.name], self.anchors[experiment.name]
-            y, codes, _ = solve_batch(equations, parameters, anchor, threads)
-            status = np.maximum(status, codes)
+        for experiments, batch in self._batches:
+            y, codes, _ = batch.solve(parameters, threads)
+            status = np.maximum(status, codes.max(axis=0))
             with np.errstate(over="ignore", invalid="ignore"):
-                for c, channel in enumerate(self.channels):
-                    if channel in experiment.outputs:
-                        moments[:, c] += self._moment(experiment, channel, y[:, :, self.model.outputs.index(channel)])
+                for experiment, predicted in zip(experiments, y, strict=True):
+                    for c, channel in enumerate(self.channels):
+                        if channel in experiment.outputs:
+                            output = predicted[:, :, self.model.outputs.index(channel)]
+                            moments[:, c] += self._moment(experiment, channel, output)
         moments[(status != CONVERGED) | ~np.isfinite(moments).all(axis=1)] = np.inf
         return moments.reshape(*values.shape[:-1], -1), status.reshape(values.shape[:-1])
 
@@ -267,21 +292,19 @@ class Problem:
         parameters = self.parameters(self.vector(theta))
         converged = np.full(len(parameters), True)
         result = {}
-        for e in self.experiments:
-            y, codes, _ = solve_batch(self.equations[e.name], parameters, self.anchors[e.name])
-            converged &= codes == CONVERGED
-            result[e.name] = {channel: y[:, :, self.model.outputs.index(channel)] for channel in e.outputs}
-        return result, converged
+        for experiments, batch in self._batches:
+            y, codes, _ = batch.solve(parameters)
+            converged &= (codes == CONVERGED).all(axis=0)
+            for e, predicted in zip(experiments, y, strict=True):
+                result[e.name] = {channel: predicted[:, :, self.model.outputs.index(channel)] for channel in e.outputs}
+        return {e.name: result[e.name] for e in self.experiments}, converged
 
     def solve(self, theta: Mapping[str, float] | np.ndarray) -> dict[str, PeriodicSolution]:
         """Return the periodic solution of every experiment at one θ."""
         parameters = self.parameters(self.vector(theta)[None])[0]
         solutions = {}
         for name, equations in self.equations.items():
-            solved = equations.solve(parameters, self.anchors[name].z)
-            if solved.code != CONVERGED:
-                solved = equations.solve(parameters, equations.static_guess(parameters))
-            solutions[name] = describe(equations, parameters, solved)
+            solutions[name] = describe(equations, parameters, self._solve_one(name, parameters, self.anchors))
         return solutions
 
     def evaluate(self, theta: Mapping[str, float] | np.ndarray) -> Evaluation:

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from bayesperiodic.models.model import Model
 
 GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
-FUNCTIONS = ("residual_jacobian", "outputs", "derivatives")
+FUNCTIONS = ("residual_jacobian", "outputs", "derivatives", "transitions")
+SECOND_FUNCTIONS = ("jacobian_change",)
 PREAMBLE = "import math\n\nfrom numba import njit\n\n\n"
 
 
@@ -67,16 +68,21 @@ class Kernels:
     outputs : GridFunction
         Columns: ŷ (outputs).
     derivatives : GridFunction
-        Columns: ∂g/∂θ, ∂g/∂(u, u̇, ü), ∂f/∂(q, q̇, q̈), ∂f/∂θ, ∂f/∂(u, u̇, ü), each row by row; see `split_derivatives`.
+        Columns: ∂g/∂θ, ∂g/∂(u, u̇, ü), ∂g/∂f, ∂f/∂(q, q̇, q̈), ∂f/∂θ, ∂f/∂(u, u̇, ü), ∂f/∂f, each row by row; see
+        `split_derivatives`.
+    transitions : GridFunction
+        Columns: the arguments of the smooth signs in the equations, which change over within −1 … 1.
     """
 
     residual_jacobian: GridFunction
     outputs: GridFunction
     derivatives: GridFunction
+    transitions: GridFunction
     states: int
     inputs: int
     parameters: int
     channels: int
+    smooth_signs: int
 
     def evaluate(
         self,
@@ -91,6 +97,7 @@ class Kernels:
         size = {
             "residual_jacobian": self.states * (1 + 3 * self.states),
             "outputs": self.channels,
+            "transitions": self.smooth_signs,
             "derivatives": sum(rows * columns for rows, columns in self._derivative_shapes()),
         }[name]
         out = np.empty((tau.size, size))
@@ -98,17 +105,18 @@ class Kernels:
         return out
 
     def split_derivatives(self, columns: np.ndarray) -> list[np.ndarray]:
-        """Return g_θ, g_u, f_q, f_θ, f_u as arrays (points, rows, columns)."""
+        """Return g_θ, g_u, g_f, f_q, f_θ, f_u, f_f as arrays (points, rows, columns); g_f is to the frequency."""
         parts, start = [], 0
         for shape in self._derivative_shapes():
             stop = start + shape[0] * shape[1]
-            parts.append(columns[:, start:stop].reshape(-1, *shape))
+            parts.append(columns[:, start:stop].reshape(len(columns), *shape))
             start = stop
         return parts
 
     def _derivative_shapes(self) -> list[tuple[int, int]]:
         g, f = self.states, self.channels
-        return [(g, self.parameters), (g, 3 * self.inputs), (f, 3 * g), (f, self.parameters), (f, 3 * self.inputs)]
+        theta, u = self.parameters, 3 * self.inputs
+        return [(g, theta), (g, u), (g, 1), (f, 3 * g), (f, theta), (f, u), (f, 1)]
 
 
 def compile_kernels(model: Model) -> Kernels:
@@ -120,6 +128,7 @@ def compile_kernels(model: Model) -> Kernels:
         inputs=len(model.inputs),
         parameters=len(model.parameters),
         channels=len(model.outputs),
+        smooth_signs=len(model.smooth_signs),
     )
 
 
@@ -127,22 +136,60 @@ def kernel_source(model: Model) -> str:
     """Return the generated module as text; the same model always gives the same text."""
     g, f = sp.Matrix(model.equations), sp.Matrix(model.output_expressions)
     q, u = list(model.state_symbols.values()), list(model.input_symbols.values())
-    theta = list(model.parameter_symbols.values())
+    theta, frequency = list(model.parameter_symbols.values()), [model.time_symbols["frequency"]]
     needs = {
         "residual_jacobian": [*g, *g.jacobian(q)],
         "outputs": [*f],
+        "transitions": [sign.args[0] for sign in model.smooth_signs],
         "derivatives": [
             entry
-            for rows, columns in ((g, theta), (g, u), (f, q), (f, theta), (f, u))
+            for rows, columns in ((g, theta), (g, u), (g, frequency), (f, q), (f, theta), (f, u), (f, frequency))
             for entry in (rows.jacobian(columns) if columns else [])
         ],
     }
+    return _module(needs, q, u, theta, model.time_symbols)
+
+
+def compile_second(model: Model) -> GridFunction:
+    """Return the compiled `jacobian_change` of a model: the change of ∂g/∂(q, q̇, q̈) along a direction.
+
+    It is a grid function of states (q, q̇, q̈ and their changes), inputs (u, u̇, ü and their changes), parameters (θ, its
+    change and that of the frequency); columns row by row (states × 3·states).
+    """
+    return GridFunction(load(second_source(model), SECOND_FUNCTIONS)["jacobian_change"])
+
+
+def second_source(model: Model) -> str:
+    """Return the generated module with `jacobian_change` as text."""
+    q, u = list(model.state_symbols.values()), list(model.input_symbols.values())
+    theta, frequency = list(model.parameter_symbols.values()), model.time_symbols["frequency"]
+    change = {symbol: sp.Symbol(f"c_{symbol.name}", real=True) for symbol in (*q, *u, *theta, frequency)}
+    jacobian = sp.Matrix(model.equations).jacobian(q)
+    changes = [
+        sum((sp.diff(e, x) * dx for x, dx in change.items() if x in e.free_symbols), sp.S.Zero) for e in jacobian
+    ]
+    return _module(
+        {"jacobian_change": changes},
+        q + [change[x] for x in q],
+        u + [change[x] for x in u],
+        theta + [change[x] for x in (*theta, frequency)],
+        model.time_symbols,
+    )
+
+
+def _module(
+    needs: dict[str, list[sp.Expr]],
+    states: list[sp.Symbol],
+    inputs: list[sp.Symbol],
+    parameters: list[sp.Symbol],
+    time: dict[str, sp.Symbol],
+) -> str:
     arguments = {
-        **{symbol: f"states[i, {column}]" for column, symbol in enumerate(q)},
-        **{symbol: f"inputs[i, {column}]" for column, symbol in enumerate(u)},
-        **{symbol: f"parameters[{index}]" for index, symbol in enumerate(theta)},
-        model.time_symbols["tau"]: "tau[i]",
-        model.time_symbols["frequency"]: "frequency",
+        **{symbol: f"states[i, {column}]" for column, symbol in enumerate(states)},
+        **{symbol: f"inputs[i, {column}]" for column, symbol in enumerate(inputs)},
+        **{symbol: f"parameters[{index}]" for index, symbol in enumerate(parameters)},
+        time["tau"]: "tau[i]",
+        time["frequency"]: "frequency",
     }
     return PREAMBLE + "\n\n".join(_function(name, expressions, arguments) for name, expressions in needs.items())
 
@@ -157,6 +204,7 @@ def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, 
     lines += [f"        {s} = {place}" for s, place in arguments.items() if s in used and "[i" in place]
     lines += [f"        {symbol} = {_code(expression)}" for symbol, expression in common]
     lines += [f"        out[i, {column}] = {_code(expression)}" for column, expression in enumerate(reduced)]
+    lines += [] if reduced else ["        pass"]
     header = f'@njit("{GRID_SIGNATURE}", cache=CACHE, nogil=True, error_model="numpy")\n'
     return header + f"def {name}(states, inputs, parameters, tau, frequency, out):\n" + "\n".join(lines) + "\n"
 

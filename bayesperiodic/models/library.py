@@ -1,8 +1,15 @@
-"""Ready-made models."""
+"""Ready-made models. ``help(bayesperiodic.models.pendulum)`` tells where one comes from and what it is for."""
 
+from functools import cache
+from typing import Any
+
+import sympy as sp
+
+from bayesperiodic import checks
 from bayesperiodic.models.model import Model
+from bayesperiodic.models.smooth import smooth_sign
 
-__all__ = ["dahl", "duffing"]
+__all__ = ["chain", "dahl", "duffing", "landing_gear", "pendulum", "van_der_pol"]
 
 duffing = Model(
     "duffing",
@@ -12,6 +19,16 @@ duffing = Model(
     units={"x": "m", "force": "N", "displacement": "m"},
     equations=lambda s, p, u: [p.m * s.ddx + p.c * s.dx + p.k * s.x + p.k3 * s.x**3 - u.force],
     outputs=lambda s, p, u: {"displacement": s.x},
+    description="""A mass on a damper and a hardening or softening spring: m ẍ + c ẋ + k x + k3 x³ = force.
+
+    The cubic is the first term of any smooth symmetric restoring force after the linear one (G. Duffing, Erzwungene
+    Schwingungen bei veränderlicher Eigenfrequenz, Vieweg, 1918). For a first try, and for structures near a resonance,
+    whose bent peak has up to three periodic solutions at one frequency.
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": np.ones(8)},
+    ...                   frequency=0.2, duration=100, sampling_rate=10)
+    """,
 )
 
 dahl = Model(
@@ -22,4 +39,249 @@ dahl = Model(
     units={"displacement": "m", "force": "N", "w": "1"},
     equations=lambda s, p, u: [s.dw - p.rho * (u.ddisplacement - abs(u.ddisplacement) * s.w)],
     outputs=lambda s, p, u: {"force": p.Kx * u.ddisplacement + p.K * u.displacement + p.F0 + p.Kw * s.w},
+    description="""A damper with Dahl friction: force = Kx v + K x + F0 + Kw w, ẇ = rho (v − |v| w), x given and v = ẋ.
+
+    Before it slides, friction is a spring: dw/dx = rho (1 − w sgn v) takes the friction force Kw w from one sliding
+    value to the other, −Kw and Kw, within a few 1/rho of travel, at any speed (P. R. Dahl, Solid friction damping of
+    mechanical vibrations, AIAA Journal 14, 1976, 1675-1682; exponent 1). Viscous damping Kx, a stiffness K and an
+    offset F0 act beside it. For dampers and joints whose displacement is imposed.
+    """,
 )
+
+
+def _pendulum(s: Any, p: Any, u: Any) -> list[sp.Expr]:
+    inertia, omega = p.m * p.l**2, 2 * sp.pi * s.frequency
+    friction = p.k1 * smooth_sign(s.dphi, p.v0) + p.k2 * s.dphi + p.k3 * s.dphi * abs(s.dphi)
+    return [
+        s.ddphi + friction / inertia + (p.g + p.a * omega**2 * sp.cos(2 * sp.pi * s.tau)) / p.l * sp.sin(s.phi),
+    ]
+
+
+pendulum = Model(
+    "pendulum",
+    states=["phi"],
+    angles=["phi", "angle"],
+    parameters={
+        "m": "kg",
+        "l": "m",
+        "k1": "N m",
+        "k2": "N m s",
+        "k3": "N m s^2",
+        "a": "m",
+        "g": "m/s^2",
+        "v0": "rad/s",
+    },
+    units={"phi": "rad", "angle": "rad", "rate": "rad/s"},
+    equations=_pendulum,
+    outputs=lambda s, p, u: {"angle": s.phi, "rate": s.dphi},
+    description="""The parametrically driven pendulum of de Kraker, Verbeek & van de Wouw (1997), eq. (10).
+
+    A point mass m on an arm l, at the angle φ (state phi) from hanging down, whose pivot is at the height −a cos ωt,
+    ω = 2π·frequency. Seen from the pivot, gravity is g + a ω² cos ωt, and the torques divided by the inertia m l² are
+
+        φ̈ + [k1 tanh(φ̇/v0) + k2 φ̇ + k3 φ̇|φ̇|]/(m l²) + (g + a ω² cos ωt)/l · sin φ = 0
+
+    with Coulomb friction of the bearing (the paper's sgn φ̇, smoothed below the speed v0), viscous damping and air
+    resistance. Of m, only k1/m, k2/m and k3/m can be told. For stable and unstable periodic orbits, of rotating and
+    chaotic motion too: φ may wind. A set that behaves as the paper tells, locked at ω = 13 rad/s, chaotic at 9.09:
+
+    >>> import bayesperiodic as bp
+    >>> theta = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
+    >>> run = bp.simulate(bp.models.pendulum, theta, frequency=1.4467, duration=7, sampling_rate=100, start={"phi": 1})
+    """,
+)
+
+van_der_pol = Model(
+    "van_der_pol",
+    states=["x"],
+    parameters={"mu": "1", "omega": "rad/s"},
+    units={"x": "1", "displacement": "1"},
+    equations=lambda s, p, u: [s.ddx - p.mu * p.omega * (1 - s.x**2) * s.dx + p.omega**2 * s.x],
+    outputs=lambda s, p, u: {"displacement": s.x},
+    description="""A self-excited oscillator without any input: ẍ − mu omega (1 − x²) ẋ + omega² x = 0.
+
+    Van der Pol's equation (Philosophical Magazine 2, 1926, 978-992) with time scaled by omega. The damping is negative
+    for |x| < 1 and positive beyond, so that every motion but rest ends on one cycle, of amplitude about 2 and, for
+    small mu, of period (2π/omega)(1 + mu²/16 + …). The displacement is relative to the one where the damping vanishes.
+    For autonomous systems, where the frequency is part of the answer and the phase is free.
+
+    >>> import bayesperiodic as bp
+    >>> bp.models.van_der_pol.autonomous
+    True
+    """,
+)
+
+_GEAR_UNITS = {
+    "theta1": "kg",
+    "theta2": "m/s^2",
+    "theta3": "N s^2/m^2",
+    "theta4": "m^2",
+    "theta5": "Pa/K",
+    "theta6": "1/m",
+    "theta7": "1/K",
+    "theta8": "N",
+    "theta9": "m^2",
+    "theta10": "s/m",
+    "theta11": "N",
+    "theta12": "m",
+    "theta15": "J/K",
+    "theta16": "W/K",
+    "theta17": "K",
+}
+_GEAR_CHANNELS = {"displacement": "m", "force": "N", "pressure": "Pa", "q": "m", "T": "K"}
+
+
+def landing_gear(drive: str = "force") -> Model:
+    """Return the nose landing gear damper of [1]_, eq. (9), driven by a force or by a displacement.
+
+    q is the compression and T the absolute temperature of the gas. The force on the axle balances inertia, oil damping
+    with the velocity squared, the gas on the area theta4, Coulomb friction (partly growing with the pressure) smoothed
+    by an arctan, and a constant, which with theta11 = −theta4 · ambient pressure is the air outside::
+
+        theta1 (q̈ + theta2) + theta3 q̇|q̇| + theta4 p + (theta8 + theta9 p) arctan(theta10 q̇) + theta11 = force
+        theta15 Ṫ + theta16 (1 + theta6 q)(T + theta17) − (theta4 p + theta11) q̇ = 0
+        p = theta5 T / (1 + theta6 q + theta7 T),    displacement = q + theta12
+
+    The second row is the energy of the gas: its heat capacity theta15, conduction theta16 through the wall to the
+    surroundings at −theta17, and the work of compression. p is the absolute pressure of an ideal gas, whose volume
+    relative to that at q = 0 is 1 + theta6 q (theta6 < 0), corrected by theta7 T. There is no theta13 or theta14.
+
+    Parameters
+    ----------
+    drive : {"force", "displacement"}
+        "force": states q and T, input force, outputs displacement and pressure; for a gear under load, a drop or a
+        design. "displacement": state T, input displacement (q and its derivatives follow from it), outputs force and
+        pressure; for a test rig that imposes the motion, as the paper's does, and faster to solve.
+
+    Returns
+    -------
+    Model
+        The same object for the same drive. Where theta4 is free and theta11 stands for the ambient pressure, tie them.
+
+    Raises
+    ------
+    ValueError
+        For another drive.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, in: D. H. van Campen (Ed.), Interaction between Dynamics and Control in Advanced
+       Mechanical Systems, Kluwer, 1997, 191-198.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> bp.models.landing_gear("displacement").outputs
+    ('force', 'pressure')
+    """
+    checks.one_of("drive", drive, ("force", "displacement"))
+    return _landing_gear(str(drive))
+
+
+@cache
+def _landing_gear(drive: str) -> Model:
+    forced = drive == "force"
+
+    def motion(s: Any, p: Any, u: Any) -> tuple[sp.Expr, sp.Expr, sp.Expr]:
+        return (s.q, s.dq, s.ddq) if forced else (u.displacement - p.theta12, u.ddisplacement, u.dddisplacement)
+
+    def pressure(s: Any, p: Any, u: Any) -> sp.Expr:
+        q, _, _ = motion(s, p, u)
+        return p.theta5 * s.T / (1 + p.theta6 * q + p.theta7 * s.T)
+
+    def force(s: Any, p: Any, u: Any) -> sp.Expr:
+        _, v, a = motion(s, p, u)
+        gas = pressure(s, p, u)
+        friction = (p.theta8 + p.theta9 * gas) * sp.atan(p.theta10 * v)
+        return p.theta1 * (a + p.theta2) + p.theta3 * v * abs(v) + p.theta4 * gas + friction + p.theta11
+
+    def equations(s: Any, p: Any, u: Any) -> list[sp.Expr]:
+        q, v, _ = motion(s, p, u)
+        conduction = p.theta16 * (1 + p.theta6 * q) * (s.T + p.theta17)
+        energy = p.theta15 * s.dT + conduction - (p.theta4 * pressure(s, p, u) + p.theta11) * v
+        return [force(s, p, u) - u.force, energy] if forced else [energy]
+
+    def outputs(s: Any, p: Any, u: Any) -> dict[str, sp.Expr]:
+        measured = {"displacement": s.q + p.theta12} if forced else {"force": force(s, p, u)}
+        return measured | {"pressure": pressure(s, p, u)}
+
+    names = ["q", "T", "force", "displacement", "pressure"] if forced else ["T", "displacement", "force", "pressure"]
+    return Model(
+        f"landing_gear_{drive}",
+        states=["q", "T"] if forced else ["T"],
+        inputs=[drive],
+        parameters=_GEAR_UNITS,
+        units={name: _GEAR_CHANNELS[name] for name in names},
+        equations=equations,
+        outputs=outputs,
+        description=f"""A landing gear damper with a gas spring and oil damping, its {drive} prescribed.
+
+        De Kraker, Verbeek & van de Wouw (1997), eq. (9): a balance of forces and one of the energy of the gas; derived
+        in the docstring of `bayesperiodic.models.landing_gear`.
+        """,
+    )
+
+
+def chain(masses: int) -> Model:
+    """Return a row of equal masses on nonlinear springs, the first one tied to the ground, a force on the last one.
+
+    Newton's law for mass i between its springs, with the elongations e_i = x_i − x_(i−1) and x_0 = 0::
+
+        m ẍ_i + R(e_i, ė_i) − R(e_(i+1), ė_(i+1)) = 0,    R(e, ė) = c ė + k e + k3 e³
+
+    and the force in the place of R beyond the last mass. One mass is the Duffing oscillator. For several modes with
+    few parameters: internal resonances, what one measured channel can tell, how the effort grows with the states.
+
+    Parameters
+    ----------
+    masses : int
+        At least 1.
+
+    Returns
+    -------
+    Model
+        States x1, x2, …; input force; parameters m, c, k, k3; output displacement, that of the last mass. The same
+        object for the same number.
+
+    Raises
+    ------
+    ValueError
+        For a number of masses that is not whole or below 1.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> bp.models.chain(3).states
+    ('x1', 'x2', 'x3')
+    """
+    return _chain(checks.integer("masses", masses, 1))
+
+
+@cache
+def _chain(masses: int) -> Model:
+    states = [f"x{i}" for i in range(1, masses + 1)]
+
+    def equations(s: Any, p: Any, u: Any) -> list[sp.Expr]:
+        x = [sp.S.Zero, *(getattr(s, name) for name in states)]
+        v = [sp.S.Zero, *(getattr(s, f"d{name}") for name in states)]
+        pull = [
+            p.c * (v[i] - v[i - 1]) + p.k * (x[i] - x[i - 1]) + p.k3 * (x[i] - x[i - 1]) ** 3
+            for i in range(1, masses + 1)
+        ]
+        pull.append(u.force)
+        return [p.m * getattr(s, f"dd{name}") + pull[i] - pull[i + 1] for i, name in enumerate(states)]
+
+    return Model(
+        f"chain_{masses}",
+        states=states,
+        inputs=["force"],
+        parameters={"m": "kg", "c": "N s/m", "k": "N/m", "k3": "N/m^3"},
+        units={**dict.fromkeys(states, "m"), "force": "N", "displacement": "m"},
+        equations=equations,
+        outputs=lambda s, p, u: {"displacement": getattr(s, states[-1])},
+        description=f"""Equal masses ({masses}) in a row on dampers and cubic springs, the last one forced.
+
+        Newton's law for each mass; derived in the docstring of `bayesperiodic.models.chain`.
+        """,
+    )

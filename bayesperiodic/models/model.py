@@ -7,7 +7,7 @@ from typing import Any
 import sympy as sp
 
 from bayesperiodic import checks
-from bayesperiodic.models.compile import Kernels, compile_kernels
+from bayesperiodic.models.compile import GridFunction, Kernels, compile_kernels, compile_second
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
 
@@ -53,6 +53,8 @@ class Model:
         States that may wind (advance by a multiple of 2π a period) and outputs compared modulo 2π.
     units : mapping of str to str, optional
         Units of states, inputs and outputs, for tables and axes.
+    description : str, optional
+        What the model is and where it comes from; becomes the instance's docstring.
 
     Raises
     ------
@@ -87,7 +89,10 @@ class Model:
         inputs: Iterable[str] = (),
         angles: Iterable[str] = (),
         units: Mapping[str, str] | None = None,
+        description: str = "",
     ):
+        if description:
+            self.__doc__ = description
         (self.name,) = checks.identifiers("name", [name])
         self.states = checks.identifiers("states", states, RESERVED)
         self.inputs = checks.identifiers("inputs", inputs, (*RESERVED, *self.states))
@@ -151,6 +156,29 @@ class Model:
         return not any(e.free_symbols & forcing for e in self.equations)
 
     @cached_property
+    def smooth_signs(self) -> tuple[sp.Expr, ...]:
+        """The tanh and arctan in the equations whose arguments vary along an orbit."""
+        moving = {*self.state_symbols.values(), *self.input_symbols.values(), self.time_symbols["tau"]}
+        found = set().union(*(e.atoms(sp.tanh, sp.atan) for e in self.equations))
+        return tuple(sorted((sign for sign in found if sign.free_symbols & moving), key=sp.default_sort_key))
+
+    def softened(self) -> "Model":
+        """Return the model with a last parameter more, which multiplies the arguments of all smooth signs."""
+        sharpness = sp.Symbol("p_sharpness_of_signs", real=True)
+        softer = {sign: sign.func(sharpness * sign.args[0]) for sign in self.smooth_signs}
+        other = object.__new__(Model)
+        other.__dict__.update(self.__getstate__())
+        other.equations = tuple(e.xreplace(softer) for e in self.equations)
+        other.parameters = (*self.parameters, "sharpness_of_signs")
+        other.parameter_symbols = {**self.parameter_symbols, "sharpness_of_signs": sharpness}
+        return other
+
+    @cached_property
+    def jacobian_change(self) -> GridFunction:
+        """The compiled change of ∂g/∂(q, q̇, q̈) along a direction, see `compile.compile_second`."""
+        return compile_second(self)
+
+    @cached_property
     def kernels(self) -> Kernels:
         """The compiled grid functions; loaded from the user's cache folder or compiled at the first use."""
         return compile_kernels(self)
@@ -184,7 +212,8 @@ class Model:
         return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "kernels"}
+        compiled = ("kernels", "jacobian_change", "smooth_signs")
+        return {key: value for key, value in self.__dict__.items() if key not in compiled}
 
     def __repr__(self) -> str:
         return (

@@ -1,5 +1,6 @@
-"""Many parameter vectors in one compiled call, shared among the cores."""
+"""Many parameter vectors times many input sets, shared among the cores."""
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
@@ -8,87 +9,118 @@ from itertools import pairwise
 import numpy as np
 
 from bayesperiodic.parallel import available_cores
-from bayesperiodic.periodic.compiled import solve_many
-from bayesperiodic.periodic.equations import PeriodicEquations
+from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
+from bayesperiodic.periodic.sensitivity import parameter_sensitivities
 
 SMALLEST_PART = 4
+NO_FACTORS = -1
 
 
 @dataclass(frozen=True)
 class Anchor:
-    """A solved point from which others are predicted: z ≈ z₀ + z_θ (θ − θ₀).
+    """A solved point from which others are predicted: z ≈ z₀ + z_θ (θ − θ₀); or, without z_θ, a mere guess.
 
-    Parameters
+    Attributes
     ----------
     parameters : array (parameters,)
     z : array (points, states)
-    sensitivities : array (parameters, points, states)
+    sensitivities : array (parameters, points, states), or None
     """
 
     parameters: np.ndarray
     z: np.ndarray
-    sensitivities: np.ndarray
+    sensitivities: np.ndarray | None = None
+
+    @classmethod
+    def at(cls, equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> "Anchor":
+        """Return the anchor at a solution z; a mere guess where ∂g/∂z is singular."""
+        derivative = parameter_sensitivities(equations, z, parameters)
+        return cls(parameters, z, None if derivative is None else derivative.states[: parameters.size])
 
 
-def solve_batch(
-    equations: PeriodicEquations, parameters: np.ndarray, anchor: Anchor, threads: int | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Solve for many parameter vectors; the result does not depend on the number of threads.
-
-    Each solve starts from the anchor's linear prediction and, if that fails, from the anchor itself.
+class Batch:
+    """Input sets with their anchors, ready to be solved for many parameter vectors.
 
     Parameters
     ----------
-    equations : PeriodicEquations
-    parameters : array (solves, parameters)
-    anchor : Anchor
-    threads : int, optional
-        By default as many as there are cores.
-
-    Returns
-    -------
-    outputs : array (solves, points, channels)
-    status : int array (solves,)
-        Index into `compiled.STATUSES`.
-    iterations : int array (solves,)
+    sets : sequence of PeriodicEquations
+        Of one forced model on one grid; inputs, frequencies and winding numbers may differ.
+    anchors : sequence of Anchor
+        One a set.
     """
-    grid, kernels = equations.grid, equations.model.kernels
-    parameters = np.ascontiguousarray(parameters, dtype=float)
-    solves = len(parameters)
-    y = np.empty((solves, grid.points, kernels.channels))
-    status, iterations = np.empty(solves, dtype=np.int64), np.empty(solves, dtype=np.int64)
 
-    def part(block: slice) -> None:
-        solve_many(
-            kernels.residual_jacobian,
-            kernels.outputs,
-            grid.first,
-            grid.second,
-            grid.neighbours,
-            grid.shift,
-            grid.place,
-            grid.half_width,
-            equations.inputs,
-            parameters[block],
-            grid.tau,
-            equations.frequency,
-            equations.drift,
-            anchor.parameters,
-            anchor.z,
-            anchor.sensitivities,
-            y[block],
-            status[block],
-            iterations[block],
+    def __init__(self, sets: Sequence[PeriodicEquations], anchors: Sequence[Anchor]):
+        first = sets[0]
+        layout = first.grid.scheme, first.grid.samples, first.grid.periods
+        if any(e.model is not first.model or (e.grid.scheme, e.grid.samples, e.grid.periods) != layout for e in sets):
+            raise ValueError("sets: all must have the same model, scheme, samples and periods.")
+        self._first, self._size = first, len(sets)
+        self._factors = empty_factors(first.grid, first.count, (len(sets),))
+        sensitivities = np.zeros((len(sets), len(first.model.parameters), first.grid.points, first.count))
+        for e, (equations, anchor) in enumerate(zip(sets, anchors, strict=True)):
+            own = tuple(part[e] for part in self._factors)
+            own[5][0] = NO_FACTORS
+            if anchor.sensitivities is not None:
+                sensitivities[e] = anchor.sensitivities
+                columns = equations.residual_jacobian(anchor.z, anchor.parameters)
+                if not equations.factorise(columns, anchor.z, own):
+                    own[5][0] = NO_FACTORS
+        self._shared = (
+            first.grid.tau,
+            np.array([e.frequency for e in sets]),
+            np.stack([e.drift for e in sets]),
+            np.stack([a.parameters for a in anchors]),
+            np.stack([a.z for a in anchors]),
+            sensitivities,
+            self._factors,
         )
+        self._inputs = np.stack([e.inputs for e in sets])
 
-    parts = max(1, min(threads or available_cores(), solves // SMALLEST_PART))
-    edges = [solves * k // parts for k in range(parts + 1)]
-    first, *others = [slice(*pair) for pair in pairwise(edges)]
-    elsewhere = [_threads().submit(part, block) for block in others]
-    part(first)
-    for future in elsewhere:
-        future.result()
-    return y, status, iterations
+    def solve(self, parameters: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Solve every input set for every parameter vector; the result does not depend on the number of threads.
+
+        Parameters
+        ----------
+        parameters : array (solves, parameters)
+        threads : int, optional
+            By default as many as there are cores.
+
+        Returns
+        -------
+        outputs : array (sets, solves, points, channels)
+        status : int array (sets, solves)
+            Index into `compiled.STATUSES`.
+        iterations : int array (sets, solves)
+            Chord steps and Newton iterations.
+        """
+        model, grid = self._first.model, self._first.grid
+        parameters = np.ascontiguousarray(parameters, dtype=float)
+        total = self._size * len(parameters)
+        y = np.empty((self._size, len(parameters), grid.points, model.kernels.channels))
+        status, iterations = np.empty((2, self._size, len(parameters)), dtype=np.int64)
+
+        def part(start: int, stop: int) -> None:
+            self._first.kernels.solve_many(
+                model.kernels.residual_jacobian,
+                model.kernels.outputs,
+                grid.packed,
+                self._inputs,
+                parameters,
+                *self._shared,
+                start,
+                stop,
+                y,
+                status,
+                iterations,
+            )
+
+        parts = max(1, min(threads or available_cores(), total // SMALLEST_PART))
+        first, *others = pairwise([total * k // parts for k in range(parts + 1)])
+        elsewhere = [_threads().submit(part, *block) for block in others]
+        part(*first)
+        for future in elsewhere:
+            future.result()
+        return y, status, iterations
 
 
 @cache

@@ -1,7 +1,9 @@
-"""The discretised equations of one periodic problem: solved, linearised, and perturbed."""
+"""The discretised equations of one periodic problem: residuals, linearisation, Newton's iteration."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +12,10 @@ from bayesperiodic import checks, fourier
 from bayesperiodic.models.compile import as_columns
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic import compiled
+from bayesperiodic.periodic.factors import CyclicFactors
 from bayesperiodic.periodic.schemes import CyclicGrid, Scheme, find_scheme
+
+FREQUENCY = "frequency"
 
 
 class Solved(NamedTuple):
@@ -21,16 +26,30 @@ class Solved(NamedTuple):
     history: np.ndarray
 
 
-class Sensitivities(NamedTuple):
-    """Derivatives on the grid: z (directions, points, states) and outputs (directions, points, channels)."""
+class Derivatives(NamedTuple):
+    """Partial derivatives on the grid, each (points, rows, columns); g_f and f_f are to the frequency, z held."""
 
-    states: np.ndarray
-    outputs: np.ndarray
+    g_theta: np.ndarray
+    g_u: np.ndarray
+    g_frequency: np.ndarray
+    f_q: np.ndarray
+    f_theta: np.ndarray
+    f_u: np.ndarray
+    f_frequency: np.ndarray
 
 
 @dataclass(frozen=True)
 class PeriodicEquations:
     """g(z, θ) = 0 for one model, one set of inputs and one grid ([1]_, eq. 2-4).
+
+    Attributes
+    ----------
+    frequency : float
+        Forcing frequency [Hz]; for an autonomous model that of the solution, an unknown.
+    inputs : array (points, 3·inputs)
+        u, u̇, ü.
+    drift : array (states,)
+        What an angle advances per forcing period.
 
     References
     ----------
@@ -56,13 +75,13 @@ class PeriodicEquations:
         winding: int | Mapping[str, int],
     ) -> "PeriodicEquations":
         """Check the arguments and differentiate the inputs spectrally; see `solution.solve_periodic`."""
-        if model.autonomous:
-            raise ValueError(
-                f"model: {model.name!r} is autonomous (neither inputs nor tau appear in its equations), so its period "
-                "is unknown; solve_periodic takes forced models."
-            )
         frequency = checks.positive("frequency", frequency)
         grid = CyclicGrid(find_scheme(scheme), samples, periods)
+        if model.autonomous and grid.periods > 1:
+            raise ValueError(
+                f"periods: {periods!r} is not allowed; {model.name!r} is autonomous, there is no forcing period to "
+                "count."
+            )
         checks.same_names("inputs", inputs or {}, model.inputs)
         columns: list[list[np.ndarray]] = [[], [], []]
         for name in model.inputs:
@@ -75,14 +94,41 @@ class PeriodicEquations:
         stacked = as_columns([column for order in columns for column in order], grid.points)
         return cls(model, grid, frequency, stacked, _drift(model, winding, grid.periods))
 
+    @property
+    def count(self) -> int:
+        """Number of states."""
+        return len(self.model.states)
+
+    @cached_property
+    def kernels(self) -> SimpleNamespace:
+        """The compiled functions of the solver."""
+        return compiled.kernels(self.count, self.grid.reach)
+
+    @cached_property
+    def winding(self) -> dict[str, int]:
+        """Turns of each angle per response period."""
+        turns = np.rint(self.drift * self.grid.periods / (2 * np.pi)).astype(int).tolist()
+        named = dict(zip(self.model.states, turns, strict=True))
+        return {state: named[state] for state in self.model.states if state in self.model.angles}
+
+    def at_frequency(self, frequency: float) -> "PeriodicEquations":
+        """Return the same equations at another frequency, the inputs unchanged as functions of tau."""
+        ratio, width = frequency / self.frequency, len(self.model.inputs)
+        inputs = self.inputs * np.repeat([1.0, ratio, ratio**2], width)
+        return replace(self, frequency=frequency, inputs=inputs)
+
+    def with_inputs(self, inputs: np.ndarray) -> "PeriodicEquations":
+        """Return the same equations with other inputs, (points, 3·inputs)."""
+        return replace(self, inputs=np.ascontiguousarray(inputs))
+
     def static_guess(self, parameters: np.ndarray) -> np.ndarray:
         """Return the equilibrium under the mean inputs, (points, states); least squares where it is not unique."""
-        kernels, count = self.model.kernels, len(self.model.states)
+        kernels, count = self.model.kernels, self.count
         inputs, tau = np.ascontiguousarray(self.inputs.mean(axis=0)[None]), np.zeros(1)
         inputs[0, len(self.model.inputs) :] = 0.0
         states, best = np.zeros((1, 3 * count)), np.inf
         solution = states[0, :count].copy()
-        for _ in range(compiled.MAX_ITERATIONS):
+        for _ in range(self.kernels.MAX_ITERATIONS):
             row = kernels.evaluate("residual_jacobian", states, inputs, parameters, tau, self.frequency)[0]
             residual, stiffness = row[:count], row[count:].reshape(count, 3, count)[:, 0]
             size = float(np.linalg.norm(residual))
@@ -94,105 +140,103 @@ class PeriodicEquations:
 
     def solve(self, parameters: np.ndarray, guess: np.ndarray) -> Solved:
         """Run Newton's iteration from a guess (points, states) for the periodic part."""
-        grid, z = self.grid, np.array(guess, dtype=float, order="C")
+        z = np.array(guess, dtype=float, order="C")
         points, count = z.shape
-        lower = self._lower
-        history = np.zeros((compiled.MAX_ITERATIONS, 3))
-        code, iterations = compiled.newton(
+        history = np.zeros((self.kernels.MAX_ITERATIONS, 3))
+        code, iterations = self.kernels.newton(
             self.model.kernels.residual_jacobian,
-            grid.first,
-            grid.second,
-            grid.neighbours,
-            grid.shift,
-            grid.place,
-            grid.half_width,
+            self.grid.packed,
             self.inputs,
             parameters,
-            grid.tau,
+            self.grid.tau,
             self.frequency,
             self.drift,
             z,
+            history,
             np.empty((points, 3 * count)),
             np.empty((points, count * (1 + 3 * count))),
-            history,
-            np.empty((points * count, 3 * lower + 1)),
-            np.empty(points * count, dtype=np.int64),
+            empty_factors(self.grid, count),
         )
         return Solved(z, code, history[:iterations])
 
     def states(self, z: np.ndarray, drift: np.ndarray | None = None) -> np.ndarray:
         """Return q, q̇, q̈ side by side, (points, 3·states), from the periodic part."""
-        grid, out = self.grid, np.empty((z.shape[0], 3 * z.shape[1]))
+        out = np.empty((z.shape[0], 3 * z.shape[1]))
         rate = self.drift if drift is None else drift
-        compiled.differentiate(z, rate, grid.first, grid.second, grid.neighbours, grid.tau, self.frequency, out)
+        self.kernels.differentiate(z, rate, self.grid.packed, self.grid.tau, self.frequency, out)
         return out
+
+    def changes(self, z: np.ndarray) -> np.ndarray:
+        """Return the changes of q, q̇, q̈ (directions, points, 3·states) for those of z (directions, points, states)."""
+        still = np.zeros(z.shape[-1])
+        result = np.empty((*z.shape[:-1], 3 * z.shape[-1]))
+        for direction, change in enumerate(z):
+            result[direction] = self.states(np.ascontiguousarray(change), still)
+        return result
 
     def outputs(self, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return ŷ, (points, channels)."""
-        return self._evaluate("outputs", self.states(z), parameters)
+        return self.evaluate("outputs", z, parameters)
+
+    def residual_jacobian(self, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """Return g and ∂g/∂(q, q̇, q̈) side by side, (points, states·(1 + 3·states))."""
+        return self.evaluate("residual_jacobian", z, parameters)
+
+    def factors(self, columns: np.ndarray) -> CyclicFactors:
+        """Return the factors of ∂g/∂z for what `residual_jacobian` returned."""
+        return CyclicFactors(self.grid, columns, self.count, self.frequency)
+
+    def factorise(self, columns: np.ndarray, z: np.ndarray, factors: tuple[np.ndarray, ...]) -> bool:
+        """Fill the compiled functions' own factors of ∂g/∂z at z; return False if it is singular."""
+        amplitude = np.abs(z).max(axis=0)
+        amplitude[amplitude == 0.0] = 1.0
+        return self.kernels.factorise(columns, self.grid.packed, self.frequency, amplitude, factors)
+
+    def scales(self, z: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the size of each equation's terms, and the rounding error its residual cannot fall below."""
+        size, rounding = np.empty(self.count), np.empty(self.count)
+        amplitude = np.abs(z).max(axis=0)
+        self.kernels.scales(columns, self.states(z), self.grid.packed, amplitude, self.frequency, size, rounding)
+        return size, rounding
 
     def scaled_residual(self, z: np.ndarray, parameters: np.ndarray) -> float:
         """Return the largest residual in units of the size of its equation's terms."""
-        states = self.states(z)
-        columns = self._evaluate("residual_jacobian", states, parameters)
-        count = z.shape[1]
-        size, rounding = np.empty(count), np.empty(count)
-        compiled.scales(
-            columns,
-            states,
-            self.grid.first,
-            self.grid.second,
-            np.abs(z).max(axis=0),
-            self.frequency,
-            size,
-            rounding,
-        )
-        worst = np.abs(columns[:, :count]).max(axis=0)
+        columns = self.residual_jacobian(z, parameters)
+        size, _ = self.scales(z, columns)
+        worst = np.abs(columns[:, : self.count]).max(axis=0)
         with np.errstate(invalid="ignore"):
-            return float(np.max(np.divide(worst, size, out=np.zeros(count), where=size > 0)))
+            return float(np.max(np.divide(worst, size, out=np.zeros(self.count), where=size > 0)))
 
-    def parameter_sensitivities(self, z: np.ndarray, parameters: np.ndarray) -> Sensitivities | None:
-        """Return derivatives to every parameter by the implicit function theorem (eq. 4); None if singular."""
-        g_theta, _, f_q, f_theta, _ = self._derivatives(z, parameters)
-        return self._respond(z, parameters, np.moveaxis(g_theta, 2, 0), f_q, np.moveaxis(f_theta, 2, 0))
+    def derivatives(self, z: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        """Return the partial derivatives of g and f."""
+        return Derivatives(*self.model.kernels.split_derivatives(self.evaluate("derivatives", z, parameters)))
 
-    def input_sensitivities(
-        self, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
-    ) -> Sensitivities | None:
-        """Return derivatives along perturbations (directions, points, 3·inputs) of (u, u̇, ü); None if singular."""
-        _, g_u, f_q, _, f_u = self._derivatives(z, parameters)
-        g = np.einsum("neu,dnu->dne", g_u, directions)
-        f = np.einsum("ncu,dnu->dnc", f_u, directions)
-        return self._respond(z, parameters, g, f_q, f)
+    def frequency_changes(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return ∂(q, q̇, q̈)/∂frequency and ∂(u, u̇, ü)/∂frequency, z and the inputs held as functions of tau."""
+        order = np.repeat([0.0, 1.0, 2.0], self.count) / self.frequency
+        input_order = np.repeat([0.0, 1.0, 2.0], len(self.model.inputs)) / self.frequency
+        return self.states(z) * order, self.inputs * input_order
 
-    def _respond(
-        self, z: np.ndarray, parameters: np.ndarray, g: np.ndarray, f_q: np.ndarray, f: np.ndarray
-    ) -> Sensitivities | None:
-        grid, (points, count) = self.grid, z.shape
-        columns = self._evaluate("residual_jacobian", self.states(z), parameters)
-        band = np.empty((points * count, 3 * self._lower + 1))
-        pivots = np.empty(points * count, dtype=np.int64)
-        compiled.assemble(columns, grid.first, grid.second, grid.shift, grid.place, self.frequency, self._lower, band)
-        if not compiled.factor(band, self._lower, self._lower, pivots):
-            return None
-        order = np.argsort(grid.place)
-        right = np.ascontiguousarray(-g[:, order].reshape(len(g), points * count))
-        compiled.solve(band, self._lower, self._lower, pivots, right)
-        z_dot = np.ascontiguousarray(right.reshape(len(g), points, count)[:, grid.place])
-        still = np.zeros(count)
-        moved = np.stack([self.states(direction, still) for direction in z_dot]) if len(g) else np.empty((0, points, 3))
-        return Sensitivities(z_dot, f + np.einsum("ncq,dnq->dnc", f_q, moved) if len(g) else f)
+    def evaluate(self, name: str, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """Return one of the model's grid functions at the periodic part z."""
+        return self.model.kernels.evaluate(name, self.states(z), self.inputs, parameters, self.grid.tau, self.frequency)
 
-    def _derivatives(self, z: np.ndarray, parameters: np.ndarray) -> list[np.ndarray]:
-        return self.model.kernels.split_derivatives(self._evaluate("derivatives", self.states(z), parameters))
 
-    def _evaluate(self, name: str, states: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        return self.model.kernels.evaluate(name, states, self.inputs, parameters, self.grid.tau, self.frequency)
-
-    @property
-    def _lower(self) -> int:
-        count = len(self.model.states)
-        return self.grid.half_width * count + count - 1
+def empty_factors(grid: CyclicGrid, states: int, sets: tuple[int, ...] = ()) -> tuple[np.ndarray, ...]:
+    """Return room for the factors of the compiled functions, one for each of `sets`."""
+    points, reach = grid.points, max(grid.reach, 1)
+    lower = grid.half_width * states + states - 1
+    coupled = compiled.MAX_SEGMENTS * reach * states if grid.reach else 1
+    return (
+        np.empty((*sets, points * states, 3 * lower + 1)),
+        np.empty((*sets, points * states), dtype=np.int64),
+        np.empty((*sets, points, states, states)),
+        np.empty((*sets, points, reach, states, states)),
+        np.empty((*sets, points, states, reach * states)),
+        np.empty((*sets, 1 + compiled.MAX_SEGMENTS), dtype=np.int64),
+        np.empty((*sets, coupled * (3 * coupled - 2))),
+        np.empty((*sets, coupled), dtype=np.int64),
+    )
 
 
 def _drift(model: Model, winding: int | Mapping[str, int], periods: int) -> np.ndarray:

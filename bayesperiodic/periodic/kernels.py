@@ -1,13 +1,19 @@
-"""The compiled code of the periodic solver, generic in the model: banded algebra, discretisation, Newton, batches.
+"""The compiled code of the periodic solver, generic in the model: linear algebra, discretisation, Newton, batches.
 
 This text is compiled through the kernel cache as one module (see `compiled`), because code compiled from one file goes
-stale when a function of another file that it calls has changed. Import the functions from `compiled`.
+stale when a function of another file that it calls has changed. Import the functions from `compiled`, which puts in the
+numbers of states and of start points for which loops are unrolled.
 
-A cyclic band becomes an ordinary one in the folded order of `schemes.CyclicGrid`; pivoting then keeps the solution
-accurate however stable or unstable the orbit is, which one march through the period would not. Rows of the band are
-stored side by side: entry (i, j) of the matrix is ``band[i, j - i + lower]``, the width is 2·lower + upper + 1 and
-leaves room for the fill-in of row exchanges. It is read through flat, unsigned indices, which spares a test for
-negative ones at every access.
+**Linear systems** with the cyclic block band ∂g/∂z are factored in one of two ways, both right however stable or
+unstable the orbit is, which one march through the period would not be:
+
+- Segments: where the scheme allows it, the equations are solved for the newest point and marched from `reach` unknown
+  start points, until what they multiply has grown by `GROWTH`; there the next segment starts. The start points of all
+  segments are coupled by a small dense system, solved with pivoting.
+- Folded band: in the folded order of `schemes.CyclicGrid` a cyclic band is an ordinary one, factored with pivoting.
+  Rows of the band are stored side by side: entry (i, j) of the matrix is ``band[i, j - i + lower]``, the width is
+  2·lower + upper + 1 and leaves room for the fill-in of row exchanges. It is read through flat, unsigned indices,
+  which spares a test for negative ones at every access.
 
 The Newton iteration is that of de Kraker, Verbeek & van de Wouw (1997), eq. (3): damped, with step halving. A failed
 solve is a status, not an exception.
@@ -18,22 +24,33 @@ from numba import njit
 
 from bayesperiodic.models.compile import GRID_SIGNATURE
 
-STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit")
-CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT = range(len(STATUSES))
+STATES, REACH = 0, 0  # 0: any number, taken from the arrays
+
+CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT = range(5)
 
 STEP_TOLERANCE = 1e-9
 MAX_ITERATIONS = 50
 MAX_HALVINGS = 20
+MAX_CHORDS = 6
+CHORD_RATE = 0.2
 ROUNDING = 4.0 * np.finfo(float).eps
+SCALE_POINTS = 200
+FAR = 0.3
+PATH_STEPS = 16
 
-MATRIX, VECTOR, INDICES = "float64[:,::1]", "float64[::1]", "int64[:,::1]"
+GROWTH, TOO_MUCH_GROWTH = 1e4, 1e8
+MAX_SEGMENTS = 12
+CHECK_EVERY = 8
+
+MATRIX, VECTOR, INDICES, PLACES = "float64[:,::1]", "float64[::1]", "int64[:,::1]", "int64[::1]"
+CUBE, GAINS = "float64[:,:,::1]", "float64[:,:,:,::1]"
 FUNCTION = f"FunctionType({GRID_SIGNATURE})"
-GRID = f"{VECTOR}, {VECTOR}, {INDICES}, {INDICES}, int64[::1]"
-CUBE = "float64[:,:,::1]"
+GRID = f"Tuple(({VECTOR}, {VECTOR}, {INDICES}, {INDICES}, {PLACES}, int64, int64))"
+FACTORS = f"Tuple(({MATRIX}, {PLACES}, {CUBE}, {GAINS}, {CUBE}, {PLACES}, {VECTOR}, {PLACES}))"
 OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
 
 
-@njit(f"boolean({MATRIX}, int64, int64, int64[::1])", **OPTIONS)
+@njit(f"boolean({MATRIX}, int64, int64, {PLACES})", **OPTIONS)
 def factor(band, lower, upper, pivots):
     """Factor in place, P·A = L·U, the pivots kept as their inverses; return False for one that is zero or not finite.
 
@@ -57,9 +74,9 @@ def factor(band, lower, upper, pivots):
             value = abs(flat[diagonal + m * next_row])
             if value > largest:
                 pivot, largest = j + m, value
+        pivots[j] = pivot
         if not (largest > 0.0 and largest < np.inf):
             return False
-        pivots[j] = pivot
         last = max(last, min(pivot + above, size - one))
         width = last - j
         if pivot != j:
@@ -78,7 +95,7 @@ def factor(band, lower, upper, pivots):
     return True
 
 
-@njit(f"void({MATRIX}, int64, int64, int64[::1], {MATRIX})", **OPTIONS)
+@njit(f"void({MATRIX}, int64, int64, {PLACES}, {MATRIX})", **OPTIONS)
 def solve(band, lower, upper, pivots, right):
     """Solve A·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
     flat = band.reshape(band.size)
@@ -103,14 +120,41 @@ def solve(band, lower, upper, pivots, right):
             x[i] = value * flat[diagonal]
 
 
-@njit(f"void({MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, {INDICES}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
-def differentiate(z, drift, first, second, neighbours, tau, frequency, states):
+@njit(f"void({MATRIX}, int64, int64, {PLACES}, {MATRIX})", **OPTIONS)
+def solve_transposed(band, lower, upper, pivots, right):
+    """Solve Aᵀ·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
+    flat = band.reshape(band.size)
+    size, one, below = np.uint64(right.shape[1]), np.uint64(1), np.uint64(lower)
+    reach, next_row = np.uint64(lower + upper), np.uint64(band.shape[1]) - np.uint64(1)
+    for c in range(right.shape[0]):
+        x = right[c]
+        for i in range(size):
+            diagonal = i * (next_row + one) + below
+            value = x[i] * flat[diagonal]
+            x[i] = value
+            for k in range(one, min(reach, size - one - i) + one):
+                x[i + k] -= flat[diagonal + k] * value
+        for back in range(size):
+            j = size - one - back
+            diagonal = j * (next_row + one) + below
+            value = x[j]
+            for m in range(one, min(below, back) + one):
+                value -= flat[diagonal + m * next_row] * x[j + m]
+            pivot = np.uint64(pivots[j])
+            x[j] = x[pivot]
+            x[pivot] = value
+
+
+@njit(f"void({MATRIX}, {VECTOR}, {GRID}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
+def differentiate(z, drift, grid, tau, frequency, states):
     """Fill `states` (points, 3·states) with q = z + drift·tau and its time derivatives by the scheme."""
-    points, count = z.shape
+    first, second, neighbours, _, _, _, _ = grid
+    points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
+    width = REACH + 1 if REACH > 0 else first.size
     for i in range(points):
         for s in range(count):
             rate, acceleration = 0.0, 0.0
-            for o in range(first.size):
+            for o in range(width):
                 value = z[neighbours[i, o], s]
                 rate += first[o] * value
                 acceleration += second[o] * value
@@ -119,13 +163,12 @@ def differentiate(z, drift, first, second, neighbours, tau, frequency, states):
             states[i, 2 * count + s] = acceleration * frequency**2
 
 
-@njit(f"void({MATRIX}, {VECTOR}, {VECTOR}, {INDICES}, int64[::1], float64, int64, {MATRIX})", **OPTIONS)
-def assemble(columns, first, second, shift, place, frequency, lower, band):
+@njit(f"void({MATRIX}, {GRID}, int64, float64, {MATRIX})", **OPTIONS)
+def assemble(columns, grid, states, frequency, band):
     """Fill the folded band of ∂g/∂z from the columns g, ∂g/∂(q, q̇, q̈) of the model's grid function."""
-    points = columns.shape[0]
-    count = 0
-    while count * (1 + 3 * count) < columns.shape[1]:
-        count += 1
+    first, second, _, shift, place, half_width, _ = grid
+    points, count = columns.shape[0], STATES if STATES > 0 else states
+    lower = half_width * count + count - 1
     one, two = first * frequency, second * frequency**2
     for i in range(points):
         for e in range(count):
@@ -143,29 +186,234 @@ def assemble(columns, first, second, shift, place, frequency, lower, band):
                     row[shift[i, o] * count + lower + s - e] += value
 
 
-@njit(f"void({MATRIX}, {MATRIX}, {VECTOR}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR})", **OPTIONS)
-def scales(columns, states, first, second, amplitude, frequency, size, rounding):
-    """Fill, for each equation, the size of its terms and the rounding error that its residual cannot fall below."""
-    points, count = states.shape[0], amplitude.size
+@njit(f"boolean({MATRIX}, {MATRIX}, int64)", **OPTIONS)
+def invert(matrix, inverse, size):
+    """Invert by Gauss-Jordan elimination with row exchanges; `matrix` is destroyed. Return False if singular."""
+    count = STATES if STATES > 0 else size
+    for e in range(count):
+        for s in range(count):
+            inverse[e, s] = 1.0 if e == s else 0.0
+    for j in range(count):
+        pivot = j
+        for e in range(j + 1, count):
+            if abs(matrix[e, j]) > abs(matrix[pivot, j]):
+                pivot = e
+        if not (abs(matrix[pivot, j]) > 0.0 and abs(matrix[pivot, j]) < np.inf):
+            return False
+        if pivot != j:
+            for s in range(count):
+                matrix[pivot, s], matrix[j, s] = matrix[j, s], matrix[pivot, s]
+                inverse[pivot, s], inverse[j, s] = inverse[j, s], inverse[pivot, s]
+        scale = 1.0 / matrix[j, j]
+        for s in range(count):
+            matrix[j, s] *= scale
+            inverse[j, s] *= scale
+        for e in range(count):
+            multiplier = matrix[e, j]
+            if e != j and multiplier != 0.0:
+                for s in range(count):
+                    matrix[e, s] -= multiplier * matrix[j, s]
+                    inverse[e, s] -= multiplier * inverse[j, s]
+    return True
+
+
+@njit(f"boolean({MATRIX}, {GRID}, float64, {VECTOR}, {CUBE}, {GAINS}, {CUBE}, {PLACES})", **OPTIONS)
+def march(columns, grid, frequency, amplitude, inverses, gains, transfer, ends):
+    """Express every point by its segment's start points; return False where the scheme or the matrix forbids it.
+
+    Parameters
+    ----------
+    columns : array (points, states·(1 + 3·states))
+    amplitude : array (states,)
+        Units in which growth is judged.
+    inverses : array (points, states, states)
+        Filled: what multiplies the right-hand side at the newest point of each equation.
+    gains : array (points, reach, states, states)
+        Filled: what multiplies the points before it.
+    transfer : array (points, states, reach·states)
+        Filled: what multiplies the start points, the latest first.
+    ends : int array (1 + MAX_SEGMENTS,)
+        Filled: the number of segments, then the last point of each.
+    """
+    first, second, _, _, _, _, lead = grid
+    points, count = columns.shape[0], STATES if STATES > 0 else inverses.shape[1]
+    reach = REACH if REACH > 0 else gains.shape[1]
+    one, two, here = first * frequency, second * frequency**2, reach - lead
+    block, inverse = np.empty((count, count)), np.empty((count, count))
+    segments, start = 0, 0
+    for j in range(points):
+        row = columns[j - lead if j >= lead else j - lead + points]
+        for e in range(count):
+            for s in range(count):
+                column = count + e * 3 * count + s
+                value = row[column + count] * one[reach] + row[column + 2 * count] * two[reach]
+                block[e, s] = value + row[column] if here == reach else value
+        if not invert(block, inverse, count):
+            return False
+        for e in range(count):
+            for s in range(count):
+                inverses[j, e, s] = inverse[e, s]
+            for c in range(reach * count):
+                transfer[j, e, c] = 0.0
+        for d in range(reach):
+            o, back = reach - 1 - d, j - 1 - d
+            for e in range(count):
+                for s in range(count):
+                    column = count + e * 3 * count + s
+                    value = row[column + count] * one[o] + row[column + 2 * count] * two[o]
+                    block[e, s] = value + row[column] if here == o else value
+            for e in range(count):
+                for s in range(count):
+                    value = 0.0
+                    for t in range(count):
+                        value -= inverse[e, t] * block[t, s]
+                    gains[j, d, e, s] = value
+                    if back >= start:
+                        for c in range(reach * count):
+                            transfer[j, e, c] += value * transfer[back, s, c]
+                    else:
+                        transfer[j, e, (start - 1 - back) * count + s] += value
+        if j % CHECK_EVERY == CHECK_EVERY - 1 or j == points - 1:
+            growth = 0.0
+            for e in range(count):
+                for d in range(reach):
+                    for s in range(count):
+                        growth = max(growth, abs(transfer[j, e, d * count + s]) * amplitude[s] / amplitude[e])
+            if not growth < TOO_MUCH_GROWTH:
+                return False
+            if (growth > GROWTH or j == points - 1) and j - start >= reach - 1:
+                if segments == MAX_SEGMENTS:
+                    return False
+                segments, start = segments + 1, j + 1
+                ends[segments] = j
+    ends[0] = segments
+    return start == points
+
+
+@njit(f"boolean({CUBE}, {PLACES}, {VECTOR}, {PLACES})", **OPTIONS)
+def join(transfer, ends, reduced, pivots):
+    """Factor the cyclic system that couples the start points of the segments; return False if it is singular."""
+    count = STATES if STATES > 0 else transfer.shape[1]
+    reach, segments = transfer.shape[2] // count, ends[0]
+    block = reach * count
+    size = segments * block
+    matrix = reduced[: size * (3 * size - 2)].reshape((size, 3 * size - 2))
+    matrix[:] = 0.0
+    for q in range(segments):
+        after = (q + 1) % segments
+        for d in range(reach):
+            for e in range(count):
+                i = after * block + d * count + e
+                matrix[i, size - 1] += 1.0
+                for c in range(block):
+                    matrix[i, q * block + c - i + size - 1] -= transfer[ends[q + 1] - d, e, c]
+    return factor(matrix, size - 1, size - 1, pivots)
+
+
+@njit(f"boolean({MATRIX}, {GRID}, float64, {VECTOR}, {FACTORS})", **OPTIONS)
+def factorise(columns, grid, frequency, amplitude, factors):
+    """Factor ∂g/∂z by segments, or else in the folded order; return False if it is singular or not finite."""
+    band, pivots, inverses, gains, transfer, ends, reduced, reduced_pivots = factors
+    if grid[6] >= 0 and march(columns, grid, frequency, amplitude, inverses, gains, transfer, ends):
+        if join(transfer, ends, reduced, reduced_pivots):
+            return True
+    ends[0] = 0
+    count = inverses.shape[1]
+    lower = grid[5] * count + count - 1
+    assemble(columns, grid, count, frequency, band)
+    return factor(band, lower, lower, pivots)
+
+
+@njit(f"void({GRID}, {FACTORS}, {MATRIX})", **OPTIONS)
+def back_substitute(grid, factors, right):
+    """Solve ∂g/∂z·x = b in place, b (points, states), with the factors of `factorise`."""
+    band, pivots, inverses, gains, transfer, ends, reduced, reduced_pivots = factors
+    place, half_width, lead = grid[4], grid[5], grid[6]
+    points, count = right.shape[0], STATES if STATES > 0 else right.shape[1]
+    reach, segments = REACH if REACH > 0 else gains.shape[1], ends[0]
+    if segments == 0:
+        lower = half_width * count + count - 1
+        folded = np.empty((1, points * count))
+        for i in range(points):
+            for s in range(count):
+                folded[0, place[i] * count + s] = right[i, s]
+        solve(band, lower, lower, pivots, folded)
+        for i in range(points):
+            for s in range(count):
+                right[i, s] = folded[0, place[i] * count + s]
+        return
+    forced = np.empty((points, count))
+    start = 0
+    for q in range(segments):
+        for j in range(start, ends[q + 1] + 1):
+            i = j - lead if j >= lead else j - lead + points
+            for e in range(count):
+                value = 0.0
+                for s in range(count):
+                    value += inverses[j, e, s] * right[i, s]
+                for d in range(min(reach, j - start)):
+                    for s in range(count):
+                        value += gains[j, d, e, s] * forced[j - 1 - d, s]
+                forced[j, e] = value
+        start = ends[q + 1] + 1
+    block = reach * count
+    size = segments * block
+    x = np.empty((1, size))
+    for q in range(segments):
+        for d in range(reach):
+            for e in range(count):
+                x[0, (q + 1) % segments * block + d * count + e] = forced[ends[q + 1] - d, e]
+    matrix = reduced[: size * (3 * size - 2)].reshape((size, 3 * size - 2))
+    solve(matrix, size - 1, size - 1, reduced_pivots, x)
+    start = 0
+    for q in range(segments):
+        for j in range(start, ends[q + 1] + 1):
+            for e in range(count):
+                value = forced[j, e]
+                for c in range(block):
+                    value += transfer[j, e, c] * x[0, q * block + c]
+                right[j, e] = value
+        start = ends[q + 1] + 1
+
+
+@njit(f"void({MATRIX}, {MATRIX}, {GRID}, {VECTOR}, float64, {VECTOR}, {VECTOR})", **OPTIONS)
+def scales(columns, states, grid, amplitude, frequency, size, rounding):
+    """Fill, for each equation, the size of its terms and the rounding error that its residual cannot fall below.
+
+    About `SCALE_POINTS` points are looked at, all of them if an equation's terms vanish there.
+    """
+    first, second = grid[0], grid[1]
+    points, count = states.shape[0], STATES if STATES > 0 else amplitude.size
     one, two = 0.0, 0.0
     for o in range(first.size):
         one += abs(first[o]) * frequency
         two += abs(second[o]) * frequency**2
     for e in range(count):
         start = count + e * 3 * count
-        size[e], rounding[e] = 0.0, 0.0
-        for i in range(points):
-            terms, error = 0.0, 0.0
-            for s in range(count):
-                stiffness = abs(columns[i, start + s])
-                damping = abs(columns[i, start + count + s])
-                inertia = abs(columns[i, start + 2 * count + s])
-                terms += stiffness * abs(states[i, s]) + damping * abs(states[i, count + s])
-                terms += inertia * abs(states[i, 2 * count + s])
-                error += amplitude[s] * (stiffness + damping * one + inertia * two)
-            size[e] = max(size[e], terms, abs(columns[i, e]))
-            rounding[e] = max(rounding[e], error)
+        size[e], rounding[e], stride = 0.0, 0.0, max(1, points // SCALE_POINTS)
+        while stride > 0:
+            for i in range(0, points, stride):
+                terms, error = 0.0, 0.0
+                for s in range(count):
+                    stiffness = abs(columns[i, start + s])
+                    damping = abs(columns[i, start + count + s])
+                    inertia = abs(columns[i, start + 2 * count + s])
+                    terms += stiffness * abs(states[i, s]) + damping * abs(states[i, count + s])
+                    terms += inertia * abs(states[i, 2 * count + s])
+                    error += amplitude[s] * (stiffness + damping * one + inertia * two)
+                size[e] = max(size[e], terms, abs(columns[i, e]))
+                rounding[e] = max(rounding[e], error)
+            stride = 1 if stride > 1 and size[e] == 0.0 else 0
         rounding[e] *= ROUNDING
+
+
+@njit(f"void({MATRIX}, {VECTOR})", **OPTIONS)
+def largest(z, amplitude):
+    """Fill the largest absolute value of each state."""
+    for s in range(STATES if STATES > 0 else z.shape[1]):
+        amplitude[s] = 0.0
+        for i in range(z.shape[0]):
+            amplitude[s] = max(amplitude[s], abs(z[i, s]))
 
 
 @njit(f"float64({MATRIX}, {VECTOR})", **OPTIONS)
@@ -174,95 +422,94 @@ def norm(columns, size):
 
     A residual that is not zero in an equation of size zero makes it infinite; one that is NaN makes it NaN.
     """
-    total = 0.0
-    for i in range(columns.shape[0]):
-        for e in range(size.size):
-            if columns[i, e] != 0.0:
-                total += (columns[i, e] / size[e]) ** 2
-    return np.sqrt(total / (columns.shape[0] * size.size))
+    count, total = STATES if STATES > 0 else size.size, 0.0
+    for e in range(count):
+        square = 0.0
+        for i in range(columns.shape[0]):
+            square += columns[i, e] ** 2
+        if square != 0.0:
+            total += square / size[e] ** 2
+    return np.sqrt(total / (columns.shape[0] * count))
+
+
+@njit(f"float64({MATRIX}, {MATRIX})", **OPTIONS)
+def scaled_step(z, step):
+    """Return the largest step of any state in units of that state's largest value; infinite if not finite."""
+    result = 0.0
+    for s in range(STATES if STATES > 0 else z.shape[1]):
+        moved, reached = 0.0, 0.0
+        for i in range(z.shape[0]):
+            change = abs(step[i, s])
+            if not change < np.inf:
+                return np.inf
+            moved = max(moved, change)
+            reached = max(reached, abs(z[i, s]), abs(z[i, s] + step[i, s]))
+        if moved > 0.0:
+            result = max(result, moved / reached)
+    return result
 
 
 @njit(
-    f"Tuple((int64, int64))({FUNCTION}, {GRID}, int64, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, "
-    f"{MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, int64[::1])",
+    f"Tuple((int64, int64))({FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {MATRIX}, {MATRIX}, "
+    f"{MATRIX}, {MATRIX}, {FACTORS})",
     **OPTIONS,
 )
 def newton(
-    residual_jacobian,
-    first,
-    second,
-    neighbours,
-    shift,
-    place,
-    half_width,
-    inputs,
-    parameters,
-    tau,
-    frequency,
-    drift,
-    z,
-    states,
-    columns,
-    history,
-    band,
-    pivots,
-):
+    residual_jacobian, grid, inputs, parameters, tau, frequency, drift, z, history, states, columns, factors
+):  # fmt: skip
     """Solve g(z) = 0 in place and return (status, iterations).
+
+    An iteration ends the search when its step, or the one expected next at the rate seen, is below `STEP_TOLERANCE` of
+    the state, or when the residual is down to rounding.
 
     Parameters
     ----------
     residual_jacobian : compiled grid function of the model
-    first, second, neighbours, shift, place, half_width : see `schemes.CyclicGrid`
+    grid : see `schemes.CyclicGrid.packed`
     inputs : array (points, 3·inputs)
     parameters, tau, frequency : as the grid function takes them
     drift : array (states,)
         Secular rate of each state, per forcing period (a winding angle).
     z : array (points, states)
         The guess, overwritten by the periodic part of the solution.
-    states, columns, band, pivots : work arrays
     history : array (MAX_ITERATIONS, 3)
         Filled for each iteration with the scaled residual before it, the scaled full step, and the damping factor.
+    states, columns, factors : work arrays
+        Left as they are at the last iterate; the factors are those of the last but one.
     """
-    points, count = z.shape
-    lower = half_width * count + count - 1
+    points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
     size, rounding, amplitude = np.empty(count), np.empty(count), np.empty(count)
-    step, trial = np.empty((1, points * count)), np.empty((points, count))
-    differentiate(z, drift, first, second, neighbours, tau, frequency, states)
+    step, trial = np.empty((points, count)), np.empty((points, count))
+    differentiate(z, drift, grid, tau, frequency, states)
     residual_jacobian(states, inputs, parameters, tau, frequency, columns)
+    previous = np.inf
     for iteration in range(MAX_ITERATIONS):
-        for s in range(count):
-            amplitude[s] = np.max(np.abs(z[:, s]))
-        scales(columns, states, first, second, amplitude, frequency, size, rounding)
+        largest(z, amplitude)
+        scales(columns, states, grid, amplitude, frequency, size, rounding)
         before = norm(columns, size)
         if not np.isfinite(before):
             return NOT_FINITE, iteration
         if iteration == 0 and norm(columns, rounding) <= 1.0 and np.all(amplitude > 0.0):
             return CONVERGED, 0
-        assemble(columns, first, second, shift, place, frequency, lower, band)
-        if not factor(band, lower, lower, pivots):
+        for s in range(count):
+            if amplitude[s] == 0.0:
+                amplitude[s] = 1.0
+        if not factorise(columns, grid, frequency, amplitude, factors):
             return SINGULAR, iteration
         for i in range(points):
             for s in range(count):
-                step[0, place[i] * count + s] = -columns[i, s]
-        solve(band, lower, lower, pivots, step)
-        full = 0.0
-        for s in range(count):
-            moved, reached = 0.0, amplitude[s]
-            for i in range(points):
-                change = step[0, place[i] * count + s]
-                moved = max(moved, abs(change))
-                reached = max(reached, abs(z[i, s] + change))
-            if not np.isfinite(moved):
-                return SINGULAR, iteration
-            if moved > 0.0:
-                full = max(full, moved / reached)
+                step[i, s] = -columns[i, s]
+        back_substitute(grid, factors, step)
+        full = scaled_step(z, step)
+        if full == np.inf:
+            return SINGULAR, iteration
         history[iteration, 0], history[iteration, 1] = before, full
         damping, accepted = 1.0, False
         for _ in range(MAX_HALVINGS):
             for i in range(points):
                 for s in range(count):
-                    trial[i, s] = z[i, s] + damping * step[0, place[i] * count + s]
-            differentiate(trial, drift, first, second, neighbours, tau, frequency, states)
+                    trial[i, s] = z[i, s] + damping * step[i, s]
+            differentiate(trial, drift, grid, tau, frequency, states)
             residual_jacobian(states, inputs, parameters, tau, frequency, columns)
             after = norm(columns, size)
             if after <= (1.0 - 1e-4 * damping) * before or full <= STEP_TOLERANCE:
@@ -275,23 +522,80 @@ def newton(
         z[:] = trial
         if full <= STEP_TOLERANCE or (damping == 1.0 and norm(columns, rounding) <= 1.0):
             return CONVERGED, iteration + 1
+        if damping == 1.0 and full < CHORD_RATE * previous < np.inf and full**2 <= STEP_TOLERANCE * previous:
+            return CONVERGED, iteration + 1
+        previous = full if damping == 1.0 else np.inf
     return STALLED, MAX_ITERATIONS
 
 
 @njit(
-    f"void({FUNCTION}, {FUNCTION}, {GRID}, int64, {MATRIX}, {MATRIX}, {VECTOR}, float64, {VECTOR}, {VECTOR}, {MATRIX}, "
-    f"{CUBE}, {CUBE}, int64[::1], int64[::1])",
+    f"Tuple((boolean, int64))({FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {MATRIX}, {MATRIX}, "
+    f"{MATRIX}, {FACTORS})",
+    **OPTIONS,
+)
+def chord(residual_jacobian, grid, inputs, parameters, tau, frequency, drift, z, states, columns, factors):
+    """Improve z in place with the factors of a nearby solution; return whether that converged, and the steps.
+
+    `states` are left as they were before the last step. A step above `CHORD_RATE` times the one before ends it.
+    """
+    points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
+    step, previous = np.empty((points, count)), np.inf
+    for iteration in range(MAX_CHORDS):
+        differentiate(z, drift, grid, tau, frequency, states)
+        residual_jacobian(states, inputs, parameters, tau, frequency, columns)
+        for i in range(points):
+            for s in range(count):
+                step[i, s] = -columns[i, s]
+        back_substitute(grid, factors, step)
+        full = scaled_step(z, step)
+        if not full < min(FAR, CHORD_RATE * previous):
+            return False, iteration + 1
+        for i in range(points):
+            for s in range(count):
+                z[i, s] += step[i, s]
+        if full <= STEP_TOLERANCE or (iteration > 0 and full**2 <= STEP_TOLERANCE * previous):
+            return True, iteration + 1
+        previous = full
+    return False, MAX_CHORDS
+
+
+@njit(f"void({MATRIX}, {CUBE}, {VECTOR}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
+def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fraction, z):
+    """Fill z with the anchor's linear prediction, at a fraction of the way from the anchor's parameters."""
+    z[:] = anchor_z
+    count = STATES if STATES > 0 else z.shape[1]
+    for p in range(parameters.size):
+        change = fraction * (parameters[p] - anchor_parameters[p])
+        if change != 0.0:
+            for i in range(z.shape[0]):
+                for s in range(count):
+                    z[i, s] += anchor_sensitivities[p, i, s] * change
+
+
+@njit(f"boolean({MATRIX}, {MATRIX}, {MATRIX})", **OPTIONS)
+def is_far(z, predicted, anchor_z):
+    """Return whether z is further from the prediction than `FAR` of the anchor's range and of the predicted change."""
+    for s in range(STATES if STATES > 0 else z.shape[1]):
+        off, change, low, high = 0.0, 0.0, np.inf, -np.inf
+        for i in range(z.shape[0]):
+            off = max(off, abs(z[i, s] - predicted[i, s]))
+            change = max(change, abs(predicted[i, s] - anchor_z[i, s]))
+            low, high = min(low, anchor_z[i, s]), max(high, anchor_z[i, s])
+        if off > FAR * (high - low) and off > FAR * change:
+            return True
+    return False
+
+
+@njit(
+    f"void({FUNCTION}, {FUNCTION}, {GRID}, {CUBE}, {MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, {CUBE}, {GAINS}, "
+    f"Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
+    f"int64, int64, {GAINS}, {INDICES}, {INDICES})",
     **OPTIONS,
 )
 def solve_many(
     residual_jacobian,
     outputs,
-    first,
-    second,
-    neighbours,
-    shift,
-    place,
-    half_width,
+    grid,
     inputs,
     parameters,
     tau,
@@ -300,49 +604,74 @@ def solve_many(
     anchor_parameters,
     anchor_z,
     anchor_sensitivities,
+    anchor_factors,
+    start,
+    stop,
     y,
     status,
     iterations,
 ):
-    """Solve for each row of `parameters`, from the anchor's linear prediction and, if that fails, from the anchor."""
-    points, count = anchor_z.shape
-    lower = half_width * count + count - 1
-    states, z = np.empty((points, 3 * count)), np.empty((points, count))
-    columns = np.empty((points, count * (1 + 3 * count)))
-    history = np.empty((MAX_ITERATIONS, 3))
-    band, pivots = np.empty((points * count, 3 * lower + 1)), np.empty(points * count, dtype=np.int64)
-    for b in range(parameters.shape[0]):
-        theta = parameters[b]
-        z[:] = anchor_z
-        for p in range(theta.size):
-            change = theta[p] - anchor_parameters[p]
-            if change != 0.0:
-                for i in range(points):
-                    for s in range(count):
-                        z[i, s] += anchor_sensitivities[p, i, s] * change
-        for attempt in range(2):
-            if attempt == 1:
-                z[:] = anchor_z
-            status[b], iterations[b] = newton(
-                residual_jacobian,
-                first,
-                second,
-                neighbours,
-                shift,
-                place,
-                half_width,
-                inputs,
-                theta,
-                tau,
-                frequency,
-                drift,
-                z,
-                states,
-                columns,
-                history,
-                band,
-                pivots,
-            )
-            if status[b] == CONVERGED:
-                break
-        outputs(states, inputs, theta, tau, frequency, y[b])
+    """Solve for input sets times parameter vectors, those of the flat indices start … stop (vectors run fastest).
+
+    Each solve starts from the linear prediction of its set's anchor: chord steps with the anchor's factors, else
+    Newton's iteration, else that from the anchor itself. A result far from the prediction of a solved anchor is not
+    trusted: then small steps are taken along the way from the anchor's parameters, and where they lead is where the
+    orbit went; if one fails or leaps, the status is "other orbit". Nothing depends on the order of the solves.
+
+    Parameters
+    ----------
+    inputs : array (sets, points, 3·inputs)
+    parameters : array (solves, parameters)
+    frequency : array (sets,)
+    drift : array (sets, states)
+    anchor_parameters, anchor_z, anchor_sensitivities, anchor_factors : arrays (sets, …)
+    y : array (sets, solves, points, channels)
+    status, iterations : int arrays (sets, solves)
+    """
+    bands, pivots, inverses, gains, transfers, ends, reduced, reduced_pivots = anchor_factors
+    points, count, solves = anchor_z.shape[1], anchor_z.shape[2], parameters.shape[0]
+    states, z, predicted = np.empty((points, 3 * count)), np.empty((points, count)), np.empty((points, count))
+    columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MAX_ITERATIONS, 3))
+    own = (
+        np.empty_like(bands[0]), np.empty_like(pivots[0]), np.empty_like(inverses[0]), np.empty_like(gains[0]),
+        np.empty_like(transfers[0]), np.empty_like(ends[0]), np.empty_like(reduced[0]),
+        np.empty_like(reduced_pivots[0]),
+    )  # fmt: skip
+    for index in range(start, stop):
+        e, b = index // solves, index % solves
+        theta, at, turn, f = parameters[b], anchor_z[e], drift[e], frequency[e]
+        kept = (
+            bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], reduced[e], reduced_pivots[e]
+        )  # fmt: skip
+        predict(at, anchor_sensitivities[e], anchor_parameters[e], theta, 1.0, predicted)
+        z[:] = predicted
+        done, used, code = False, 0, CONVERGED
+        if ends[e, 0] >= 0:
+            done, used = chord(residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, states, columns, kept)
+        if not done:
+            z[:] = predicted
+            code, more = newton(
+                residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, history, states, columns, own
+            )  # fmt: skip
+            used += more
+            if code != CONVERGED:
+                z[:] = at
+                code, more = newton(
+                    residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, history, states, columns, own
+                )  # fmt: skip
+                used += more
+        if code == CONVERGED and ends[e, 0] >= 0 and is_far(z, predicted, at):
+            z[:] = at
+            for part in range(1, PATH_STEPS + 1):
+                predicted[:] = z
+                between = anchor_parameters[e] + (theta - anchor_parameters[e]) * (part / PATH_STEPS)
+                code, more = newton(
+                    residual_jacobian, grid, inputs[e], between, tau, f, turn, z, history, states, columns, own
+                )  # fmt: skip
+                used += more
+                if code != CONVERGED or is_far(z, predicted, predicted):
+                    code = OTHER_ORBIT
+                    break
+        differentiate(z, turn, grid, tau, f, states)
+        outputs(states, inputs[e], theta, tau, f, y[e, b])
+        status[e, b], iterations[e, b] = code, used

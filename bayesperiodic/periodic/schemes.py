@@ -1,5 +1,6 @@
 """Difference schemes on a cyclic grid."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,6 +22,11 @@ class Scheme:
     first, second : mapping of int to float
         Weight by offset for the first and the second derivative, for unit step.
 
+    Raises
+    ------
+    ValueError
+        For weights that do not differentiate 1, t and t² exactly (to rounding), or an order below 1.
+
     Examples
     --------
     >>> import bayesperiodic as bp
@@ -29,20 +35,70 @@ class Scheme:
     """
 
     name: str
-    order: int
+    order: float
     first: Mapping[int, float] = field(kw_only=True)
     second: Mapping[int, float] = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not self.order >= 1:
+            raise ValueError(f"order: {self.order!r} is not allowed; it must be at least 1.")
+        for argument, weights, derivative in (("first", self.first, 1), ("second", self.second, 2)):
+            for power in range(derivative + 1):
+                moment = sum(weight * offset**power for offset, weight in weights.items())
+                if weights and not abs(moment - (math.factorial(power) if power == derivative else 0.0)) < 1e-9:
+                    raise ValueError(
+                        f"{argument}: {dict(weights)!r} is not allowed; it gives {moment:.6g} for the derivative of "
+                        f"t**{power} at 0."
+                    )
 
     @property
     def reach(self) -> int:
         """The largest distance in steps between a point and one that its derivatives use."""
-        return max(abs(offset) for offset in (*self.first, *self.second))
+        return max((abs(offset) for offset in (*self.first, *self.second)), default=1)
+
+    def weights(self, points: int) -> tuple[Mapping[int, float], Mapping[int, float]]:
+        """Return the weights of the first and the second derivative on a cyclic grid of that many points."""
+        return self.first, self.second
+
+
+@dataclass(frozen=True)
+class FourierScheme(Scheme):
+    """Collocation with trigonometric polynomials: the derivatives are those of the interpolating polynomial ([1]_).
+
+    Every point uses all others, so the equations are those of harmonic balance with as many harmonics as the grid
+    carries, and the error of a smooth solution falls faster than any power of the step.
+
+    References
+    ----------
+    .. [1] L. N. Trefethen, Spectral Methods in MATLAB, SIAM, 2000, chapter 3.
+    """
+
+    def weights(self, points: int) -> tuple[Mapping[int, float], Mapping[int, float]]:
+        """Return the weights of the first and the second derivative on a cyclic grid of that many points."""
+        offsets = np.arange(points) - (points - 1) // 2
+        rate = 2j * np.pi * np.arange(points // 2 + 1) / points
+        second = np.fft.irfft(rate**2, n=points)
+        if points % 2 == 0:
+            rate[-1] = 0.0
+        first = np.fft.irfft(rate, n=points)
+        return _by_offset(offsets, first), _by_offset(offsets, second)
+
+
+def _by_offset(offsets: np.ndarray, impulse: np.ndarray) -> dict[int, float]:
+    return dict(zip(offsets.tolist(), impulse[-offsets % len(impulse)].tolist(), strict=True))
 
 
 backward2 = Scheme("backward2", 2, first={0: 1.5, -1: -2.0, -2: 0.5}, second={0: 2.0, -1: -5.0, -2: 4.0, -3: -1.0})
 central2 = Scheme("central2", 2, first={-1: -0.5, 1: 0.5}, second={-1: 1.0, 0: -2.0, 1: 1.0})
+central4 = Scheme(
+    "central4",
+    4,
+    first={-2: 1 / 12, -1: -2 / 3, 1: 2 / 3, 2: -1 / 12},
+    second={-2: -1 / 12, -1: 4 / 3, 0: -5 / 2, 1: 4 / 3, 2: -1 / 12},
+)
+fourier = FourierScheme("fourier", math.inf, first={}, second={})
 
-SCHEMES = {scheme.name: scheme for scheme in (backward2, central2)}
+SCHEMES = {scheme.name: scheme for scheme in (backward2, central2, central4, fourier)}
 
 
 def find_scheme(scheme: str | Scheme) -> Scheme:
@@ -87,23 +143,28 @@ class CyclicGrid:
         return np.arange(self.points) / self.samples
 
     @cached_property
-    def _offsets(self) -> list[int]:
-        return sorted({0, *self.scheme.first, *self.scheme.second})
+    def _weights(self) -> tuple[Mapping[int, float], Mapping[int, float]]:
+        return self.scheme.weights(self.points)
+
+    @cached_property
+    def offsets(self) -> np.ndarray:
+        """Offsets of the points that a point uses, ascending, (offsets,)."""
+        return np.array(sorted({0, *self._weights[0], *self._weights[1]}))
 
     @cached_property
     def first(self) -> np.ndarray:
         """Weights of the first derivative with respect to tau, one an offset."""
-        return np.array([self.scheme.first.get(o, 0.0) for o in self._offsets]) * self.samples
+        return np.array([self._weights[0].get(o, 0.0) for o in self.offsets.tolist()]) * self.samples
 
     @cached_property
     def second(self) -> np.ndarray:
         """Weights of the second derivative with respect to tau, one an offset."""
-        return np.array([self.scheme.second.get(o, 0.0) for o in self._offsets]) * self.samples**2
+        return np.array([self._weights[1].get(o, 0.0) for o in self.offsets.tolist()]) * self.samples**2
 
     @cached_property
     def neighbours(self) -> np.ndarray:
         """Index of the point at each offset, (points, offsets)."""
-        return (np.arange(self.points)[:, None] + np.array(self._offsets)) % self.points
+        return (np.arange(self.points)[:, None] + self.offsets) % self.points
 
     @cached_property
     def place(self) -> np.ndarray:
@@ -120,3 +181,26 @@ class CyclicGrid:
     def half_width(self) -> int:
         """Half-width, in points, of the folded band."""
         return int(np.max(np.abs(self.shift)))
+
+    @cached_property
+    def lead(self) -> int:
+        """The largest offset if the scheme can be marched forward from point to point without growing, else −1.
+
+        It can if the recurrences of both derivatives, solved for the value at that offset, have no root outside the
+        unit circle.
+        """
+        if len(self.offsets) > self.points // 2:
+            return -1
+        roots = np.concatenate([np.roots(self.first[::-1]), np.roots(self.second[::-1])])
+        consecutive = np.all(np.diff(self.offsets) == 1)
+        return int(self.offsets[-1]) if consecutive and self.offsets[-1] >= 0 and np.all(abs(roots) < 1.001) else -1
+
+    @cached_property
+    def reach(self) -> int:
+        """Number of start points of a march, 0 where the scheme cannot be marched."""
+        return len(self.offsets) - 1 if self.lead >= 0 else 0
+
+    @cached_property
+    def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, int, int]:
+        """The grid as the compiled functions take it."""
+        return self.first, self.second, self.neighbours, self.shift, self.place, self.half_width, self.lead

@@ -1,16 +1,22 @@
-"""Periodic equilibrium states: `solve_periodic` and what it returns."""
+"""Periodic equilibrium states: what a solve returns."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from bayesperiodic import checks
+from bayesperiodic import checks, fourier
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
-from bayesperiodic.periodic.equations import PeriodicEquations, Solved, winding_numbers
-from bayesperiodic.periodic.schemes import Scheme
+from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
+from bayesperiodic.periodic.factors import CyclicFactors
+from bayesperiodic.periodic.floquet import Floquet, first_order_matrix, floquet
+from bayesperiodic.periodic.schemes import CyclicGrid, Scheme
+from bayesperiodic.periodic.sensitivity import parameter_sensitivities
 from bayesperiodic.store import Result
+
+NEWTON = "newton"
 
 
 @dataclass(frozen=True)
@@ -21,25 +27,38 @@ class PeriodicSolution(Result):
     ----------
     model : str
         The model's name.
+    autonomous : bool
+        True if the frequency is part of the solution.
     status : str
-        "converged", "stalled", "singular", "not finite" or "other orbit".
+        "converged", "stalled", "singular", "not finite" or "other orbit" (an equilibrium instead of an autonomous
+        model's orbit, or an orbit whose period is a fraction of the guess's).
+    found_by : str
+        "newton", or what it took: "input amplitude", "time integration", "sharpness" (see `solve_periodic`).
     frequency : float
-        Forcing frequency [Hz].
+        Forcing frequency [Hz]; that of the orbit for an autonomous model.
     samples, periods : int
         Grid points per forcing period, forcing periods per response period.
     winding : dict of str to int
         Turns of each angle per response period.
-    scheme : str
+    scheme : Scheme
     parameters : dict of str to float
+    orders : dict of str to int
+        Order of each state, 1 or 2.
     tau : array (points,)
         Time in forcing periods, end point excluded; points = samples · periods.
     states, inputs, outputs : dict of str to array (points,)
     sensitivities : dict of str to dict of str to array (points,)
-        ∂output/∂parameter, ``sensitivities[output][parameter]`` (de Kraker et al. 1997, eq. 4); empty unless converged.
+        ∂output/∂parameter, ``sensitivities[output][parameter]`` (de Kraker et al. 1997, eq. 4), and for a forced model
+        ``sensitivities[output]["frequency"]`` [per Hz], inputs held as functions of tau; empty unless converged. For
+        an autonomous model the phase moves so that the change stays orthogonal to the flow.
     state_sensitivities : dict of str to dict of str to array (points,)
-        ∂state/∂parameter; empty unless converged.
+        The same of the states.
+    frequency_sensitivities : dict of str to float
+        ∂frequency/∂parameter of an autonomous model's orbit; zero for a forced model.
+    linearisation : array (points, states, 3·states)
+        ∂g/∂(q, q̇, q̈) on the orbit.
     iterations : int
-        Newton iterations.
+        Newton iterations of the last solve.
     residual : float
         Largest residual, in units of the size of its equation's terms.
     history : array (iterations, 3)
@@ -47,19 +66,24 @@ class PeriodicSolution(Result):
     """
 
     model: str
+    autonomous: bool
     status: str
+    found_by: str
     frequency: float
     samples: int
     periods: int
     winding: dict[str, int]
-    scheme: str
+    scheme: Scheme
     parameters: dict[str, float]
+    orders: dict[str, int]
     tau: np.ndarray
     states: dict[str, np.ndarray]
     inputs: dict[str, np.ndarray]
     outputs: dict[str, np.ndarray]
     sensitivities: dict[str, dict[str, np.ndarray]]
     state_sensitivities: dict[str, dict[str, np.ndarray]]
+    frequency_sensitivities: dict[str, float]
+    linearisation: np.ndarray
     iterations: int
     residual: float
     history: np.ndarray
@@ -69,6 +93,110 @@ class PeriodicSolution(Result):
         """True if the status is "converged"."""
         return self.status == STATUSES[CONVERGED]
 
+    @property
+    def period(self) -> float:
+        """The response period [s]."""
+        return self.periods / self.frequency
+
+    @cached_property
+    def floquet(self) -> Floquet | None:
+        """Exponents and eigenfunctions of the linearised equations; None unless converged."""
+        if not self.converged:
+            return None
+        orders = tuple(self.orders.values())
+        try:
+            matrix = first_order_matrix(self.linearisation, orders)
+        except np.linalg.LinAlgError:
+            return None
+        sizes = self._sizes()
+        return floquet(matrix * (sizes / sizes[:, None]), self.period)
+
+    def _sizes(self) -> np.ndarray:
+        """Return typical sizes of the states, then of the rates of the second-order ones, for scaling."""
+        sizes = {name: np.ptp(values - self._turns(name)) or 1.0 for name, values in self.states.items()}
+        rates = [2 * np.pi / self.period * sizes[name] for name, order in self.orders.items() if order == 2]
+        return np.array([*sizes.values(), *rates])
+
+    def _turns(self, state: str) -> np.ndarray:
+        return 2 * np.pi * self.winding.get(state, 0) / self.periods * self.tau
+
+    @property
+    def multipliers(self) -> np.ndarray:
+        """Floquet multipliers over the response period, complex, largest modulus first; empty unless converged.
+
+        They are those of the linearised differential equations. An autonomous model's trivial 1 is among them.
+        """
+        with np.errstate(over="ignore"):
+            return np.exp(self.floquet.exponents) if self.floquet is not None else np.empty(0, dtype=complex)
+
+    @property
+    def exponents(self) -> np.ndarray:
+        """Floquet exponents log(multiplier)/period [1/s], complex; finite where a multiplier would overflow."""
+        return self.floquet.exponents / self.period if self.floquet is not None else np.empty(0, dtype=complex)
+
+    @property
+    def stable(self) -> bool:
+        """True if all multipliers, but for an autonomous model's trivial one, are inside the unit circle."""
+        if self.floquet is None:
+            return False
+        exponents = self.floquet.exponents
+        if self.autonomous:
+            exponents = np.delete(exponents, np.argmin(abs(exponents)))
+        return bool(np.all(exponents.real < 0.0))
+
+    def error_estimate(self) -> dict[str, float]:
+        """Return the estimated discretisation error of each state, the largest on the grid.
+
+        Richardson's extrapolation of the scheme's derivatives, from steps h and 2h on the same grid, is carried to the
+        states by the linearised equations. For the fourier scheme it is the sum of the amplitudes in the upper quarter
+        of the spectrum. For an autonomous model the error of the frequency [Hz] is there too.
+        """
+        if not self.converged:
+            return dict.fromkeys(self.states, np.nan)
+        z = np.stack([self.states[name] - self._turns(name) for name in self.states], axis=-1)
+        if np.isinf(self.scheme.order):
+            amplitudes = np.abs(fourier.coefficients(z.T))
+            return dict(
+                zip(self.states, amplitudes[:, 3 * amplitudes.shape[1] // 4 :].sum(axis=1).tolist(), strict=True)
+            )
+        grid, count = CyclicGrid(self.scheme, self.samples, self.periods), z.shape[1]
+        coarse = {1: np.zeros_like(z), 2: np.zeros_like(z)}
+        fine = {1: np.zeros_like(z), 2: np.zeros_like(z)}
+        for order, weights in ((1, grid.first), (2, grid.second)):
+            for offset, weight in zip(grid.offsets.tolist(), weights.tolist(), strict=True):
+                fine[order] += weight * np.roll(z, -offset, axis=0)
+                coarse[order] += weight / 2**order * np.roll(z, -2 * offset, axis=0)
+        defect = np.zeros_like(z)
+        for order in (1, 2):
+            change = self.frequency**order * (fine[order] - coarse[order]) / (2.0**self.scheme.order - 1.0)
+            block = self.linearisation[:, :, order * count : (order + 1) * count]
+            defect -= np.einsum("nes,ns->ne", block, change)
+        return self._correct(grid, z, defect)
+
+    def _correct(self, grid: CyclicGrid, z: np.ndarray, defect: np.ndarray) -> dict[str, float]:
+        points, count = z.shape
+        columns = np.concatenate([np.zeros((points, count)), self.linearisation.reshape(points, -1)], axis=1)
+        factors = CyclicFactors(grid, np.ascontiguousarray(columns), count, self.frequency)
+        if not self.autonomous:
+            change, more = factors.solve(defect), {}
+        else:
+            rates = [np.gradient(z, grid.tau, axis=0) * self.frequency]
+            rates.append(np.gradient(rates[0], grid.tau, axis=0) * self.frequency)
+            slope = sum(
+                order
+                / self.frequency
+                * np.einsum("nes,ns->ne", self.linearisation[:, :, order * count :][:, :, :count], r)
+                for order, r in enumerate(rates, start=1)
+            )
+            flow = rates[0][None] / np.linalg.norm(rates[0])
+            solved = factors.solve_bordered(
+                np.asarray(slope)[None], flow, np.zeros((1, 1)), defect[None], np.zeros((1, 1))
+            )
+            if solved is None:
+                return dict.fromkeys([*self.states, FREQUENCY], np.nan)
+            change, more = solved[0][0], {FREQUENCY: abs(float(solved[1][0, 0]))}
+        return dict(zip(self.states, np.abs(change).max(axis=0).tolist(), strict=True)) | more
+
     def __repr__(self) -> str:
         return (
             f"PeriodicSolution({self.model!r}, {self.status!r}, frequency={self.frequency:.6g} Hz, "
@@ -77,113 +205,72 @@ class PeriodicSolution(Result):
         )
 
 
-def solve_periodic(
-    model: Model,
-    parameters: Mapping[str, float],
-    inputs: Mapping[str, np.ndarray] | None = None,
-    *,
-    frequency: float,
-    samples: int = 800,
-    scheme: str | Scheme = "central2",
-    periods: int = 1,
-    winding: int | Mapping[str, int] = 0,
-    guess: str | Mapping[str, np.ndarray] | PeriodicSolution = "static",
+def describe(
+    equations: PeriodicEquations, theta: np.ndarray, solved: Solved, found_by: str = NEWTON, sensitivities: bool = True
 ) -> PeriodicSolution:
-    """Find a periodic equilibrium state, stable or unstable, and its sensitivities to every parameter.
-
-    The equations are discretised with a cyclic difference scheme and solved by a damped Newton method with step
-    halving ([1]_, eq. 2-4).
-
-    Parameters
-    ----------
-    model : Model
-    parameters : mapping of str to float
-        A value for every parameter.
-    inputs : mapping of str to array (samples·periods,), optional
-        Every input over one response period, end point excluded; derivatives are taken spectrally.
-    frequency : float
-        Forcing frequency [Hz].
-    samples : int
-        Grid points per forcing period.
-    scheme : str or Scheme
-        "central2" (accurate for smooth responses) or "backward2" (calmer where the response has kinks).
-    periods : int
-        Forcing periods per response period.
-    winding : int or mapping of str to int
-        Turns that an angle advances per response period.
-    guess : "static", mapping of str to array (samples·periods,), or PeriodicSolution
-        The equilibrium under the mean inputs, every state (turns of angles included), or an earlier solution.
-
-    Returns
-    -------
-    PeriodicSolution
-        With a `status`; a solve that fails does not raise.
-
-    Raises
-    ------
-    ValueError
-        For unknown or missing names, inputs of a wrong length or not finite, a frequency ≤ 0, too few samples for the
-        scheme, a winding number for what is no angle, an autonomous model.
-
-    References
-    ----------
-    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
-       equilibrium states, 1997.
-
-    Examples
-    --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = np.cos(2 * np.pi * np.arange(800) / 800)
-    >>> solution = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
-    ...                              frequency=0.1)
-    >>> solution.status
-    'converged'
-    """
-    equations = PeriodicEquations.build(
-        model, inputs, frequency=frequency, samples=samples, scheme=scheme, periods=periods, winding=winding
-    )
-    checks.same_names("parameters", parameters, model.parameters)
-    theta = np.array([checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
-    solved = equations.solve(theta, _guess(equations, theta, guess))
-    return describe(equations, theta, solved)
-
-
-def describe(equations: PeriodicEquations, theta: np.ndarray, solved: Solved) -> PeriodicSolution:
-    """Return a solve as a PeriodicSolution, with sensitivities if it converged."""
-    model, grid = equations.model, equations.grid
-    turns = equations.drift * grid.periods / (2 * np.pi)
-    sensitivities, state_sensitivities = {}, {}
-    code = solved.code
-    if code == CONVERGED:
-        derivative = equations.parameter_sensitivities(solved.z, theta)
+    """Return a solve as a PeriodicSolution, with sensitivities, if wanted, where it converged."""
+    model, grid, code = equations.model, equations.grid, solved.code
+    by_output: dict[str, dict[str, np.ndarray]] = {}
+    by_state: dict[str, dict[str, np.ndarray]] = {}
+    by_parameter: dict[str, float] = {}
+    if code == CONVERGED and sensitivities:
+        derivative = parameter_sensitivities(equations, solved.z, theta)
         if derivative is None:
             code = SINGULAR
         else:
-            sensitivities = _by_name(derivative.outputs, model.outputs, model.parameters)
-            state_sensitivities = _by_name(derivative.states, model.states, model.parameters)
-    states = equations.states(solved.z)
-    outputs = equations.outputs(solved.z, theta)
+            names = (*model.parameters, FREQUENCY)[: len(derivative.frequency)]
+            by_output = _by_name(derivative.outputs, model.outputs, names)
+            by_state = _by_name(derivative.states, model.states, names)
+            by_parameter = dict(zip(model.parameters, derivative.frequency.tolist(), strict=False))
+    states, outputs = equations.states(solved.z), equations.outputs(solved.z, theta)
+    columns = equations.residual_jacobian(solved.z, theta)
     return PeriodicSolution(
         model=model.name,
+        autonomous=model.autonomous,
         status=STATUSES[code],
+        found_by=found_by,
         frequency=equations.frequency,
         samples=grid.samples,
         periods=grid.periods,
-        winding=winding_numbers(
-            model, {s: round(w) for s, w in zip(model.states, turns, strict=True) if s in model.angles}
-        ),
-        scheme=grid.scheme.name,
+        winding=equations.winding,
+        scheme=grid.scheme,
         parameters=dict(zip(model.parameters, theta.tolist(), strict=True)),
+        orders=model.orders,
         tau=grid.tau,
         states={name: states[:, i].copy() for i, name in enumerate(model.states)},
         inputs={name: equations.inputs[:, i].copy() for i, name in enumerate(model.inputs)},
         outputs={name: outputs[:, i].copy() for i, name in enumerate(model.outputs)},
-        sensitivities=sensitivities,
-        state_sensitivities=state_sensitivities,
+        sensitivities=by_output,
+        state_sensitivities=by_state,
+        frequency_sensitivities=by_parameter,
+        linearisation=columns[:, equations.count :].reshape(grid.points, equations.count, -1),
         iterations=len(solved.history),
         residual=equations.scaled_residual(solved.z, theta),
         history=solved.history,
     )
+
+
+def equations_of(model: Model, solution: PeriodicSolution) -> tuple[PeriodicEquations, np.ndarray, np.ndarray]:
+    """Return the equations, the parameters and z of a solution.
+
+    Raises
+    ------
+    ValueError
+        If the solution is of another model.
+    """
+    if solution.model != model.name:
+        raise ValueError(f"model: {model.name!r} is not allowed; the solution is one of {solution.model!r}.")
+    equations = PeriodicEquations.build(
+        model,
+        solution.inputs,
+        frequency=solution.frequency,
+        samples=solution.samples,
+        scheme=solution.scheme,
+        periods=solution.periods,
+        winding=solution.winding,
+    )
+    parameters = np.array([solution.parameters[name] for name in model.parameters])
+    return equations, parameters, periodic_part(equations, solution.states)
 
 
 def periodic_part(equations: PeriodicEquations, states: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -192,17 +279,6 @@ def periodic_part(equations: PeriodicEquations, states: Mapping[str, np.ndarray]
     checks.same_names("guess", states, model.states)
     z = np.stack([checks.finite_vector(f"guess[{n!r}]", states[n], grid.points) for n in model.states], axis=-1)
     return z - equations.drift * grid.tau[:, None]
-
-
-def _guess(
-    equations: PeriodicEquations, theta: np.ndarray, guess: str | Mapping[str, np.ndarray] | PeriodicSolution
-) -> np.ndarray:
-    if isinstance(guess, PeriodicSolution):
-        return periodic_part(equations, guess.states)
-    if isinstance(guess, Mapping):
-        return periodic_part(equations, guess)
-    checks.one_of("guess", guess, ["static"])
-    return equations.static_guess(theta)
 
 
 def _by_name(

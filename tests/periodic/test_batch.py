@@ -2,57 +2,135 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.periodic.batch import Anchor, solve_batch
+from bayesperiodic.periodic.batch import Anchor, Batch
+from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT
 from bayesperiodic.periodic.equations import PeriodicEquations
 from tests.known import grid
 
 DUFFING = np.array([0.45, 1.3, 900.0, 4e5])
 
 
-@pytest.fixture(scope="module")
-def equations():
-    force = 20.0 * np.cos(2 * np.pi * grid(200))
+def build(force: np.ndarray, frequency: float = 5.0) -> PeriodicEquations:
     return PeriodicEquations.build(
-        bp.models.duffing, {"force": force}, frequency=5.0, samples=200, scheme="central2", periods=1, winding=0
+        bp.models.duffing,
+        {"force": force},
+        frequency=frequency,
+        samples=force.size,
+        scheme="central2",
+        periods=1,
+        winding=0,
     )
 
 
+def anchored(equations: PeriodicEquations, guess: np.ndarray | None = None) -> Anchor:
+    solved = equations.solve(DUFFING, equations.static_guess(DUFFING) if guess is None else guess)
+    assert solved.code == CONVERGED
+    return Anchor.at(equations, DUFFING, solved.z)
+
+
 @pytest.fixture(scope="module")
-def anchor(equations):
-    z = equations.solve(DUFFING, equations.static_guess(DUFFING)).z
-    return Anchor(DUFFING, z, equations.parameter_sensitivities(z, DUFFING).states)
+def equations():
+    return build(20.0 * np.cos(2 * np.pi * grid(200)))
 
 
-def spread(count: int) -> np.ndarray:
-    return DUFFING * (1 + 0.02 * np.random.default_rng(1).standard_normal((count, 4)))
+@pytest.fixture(scope="module")
+def batch(equations):
+    return Batch([equations], [anchored(equations)])
 
 
-def test_batch_equals_single_solves(equations, anchor):
+def spread(count: int, sd: float = 0.02) -> np.ndarray:
+    return DUFFING * (1 + sd * np.random.default_rng(1).standard_normal((count, 4)))
+
+
+def alone(equations: PeriodicEquations, theta: np.ndarray) -> np.ndarray:
+    solution = bp.solve_periodic(
+        bp.models.duffing,
+        dict(zip(bp.models.duffing.parameters, theta, strict=True)),
+        {"force": equations.inputs[:, 0]},
+        frequency=equations.frequency,
+        samples=equations.grid.samples,
+    )
+    assert solution.converged
+    return solution.outputs["displacement"]
+
+
+def test_batch_equals_single_solves(equations, batch):
     parameters = spread(6)
-    outputs, status, _ = solve_batch(equations, parameters, anchor)
+    (outputs,), (status,), _ = batch.solve(parameters)
     assert not status.any()
     for theta, y in zip(parameters, outputs, strict=True):
-        alone = bp.solve_periodic(
-            bp.models.duffing,
-            dict(zip(bp.models.duffing.parameters, theta, strict=True)),
-            {"force": equations.inputs[:, 0]},
-            frequency=5.0,
-            samples=200,
-        )
-        assert y[:, 0] == pytest.approx(alone.outputs["displacement"], rel=1e-8, abs=1e-12)
+        assert y[:, 0] == pytest.approx(alone(equations, theta), abs=1e-9 * np.ptp(y))
 
 
-def test_bits_do_not_depend_on_the_number_of_threads(equations, anchor):
+def test_input_sets_times_parameter_vectors():
+    tau = grid(200)
+    sets = [build(f * np.cos(2 * np.pi * tau), nu) for f, nu in ((20.0, 5.0), (5.0, 3.0), (10.0, 12.0))]
+    parameters = spread(5)
+    outputs, status, _ = Batch(sets, [anchored(e) for e in sets]).solve(parameters)
+    assert outputs.shape == (3, 5, 200, 1) and not status.any()
+    for e, per_set in zip(sets, outputs, strict=True):
+        for theta, y in zip(parameters, per_set, strict=True):
+            assert y[:, 0] == pytest.approx(alone(e, theta), abs=1e-9 * np.ptp(y))
+
+
+def test_sets_on_different_grids_are_refused(equations):
+    other = build(np.ones(100))
+    with pytest.raises(ValueError, match="sets: all must have the same model, scheme, samples and periods"):
+        Batch([equations, other], [anchored(equations), anchored(other)])
+
+
+def test_small_changes_need_no_factorisation(equations):
+    """Chord steps with the anchor's factors count as iterations, too: two or three suffice after a small change."""
+    (outputs,), (status,), (iterations,) = Batch([equations], [anchored(equations)]).solve(spread(20, sd=1e-3))
+    assert not status.any() and np.all(iterations <= 3)
+    assert np.all(np.ptp(outputs, axis=1) > 0)
+
+
+def test_an_anchor_that_is_a_mere_guess_works(equations):
+    guess = Anchor(DUFFING, equations.static_guess(DUFFING))
+    (outputs,), (status,), _ = Batch([equations], [guess]).solve(DUFFING[None])
+    assert status[0] == 0
+    assert outputs[0, :, 0] == pytest.approx(alone(equations, DUFFING), abs=1e-9 * np.ptp(outputs))
+
+
+def test_bits_do_not_depend_on_the_number_of_threads_or_the_company(batch):
     parameters = spread(37)
-    one = solve_batch(equations, parameters, anchor, threads=1)
+    one = batch.solve(parameters, threads=1)
     for threads in (2, 3, 8):
-        many = solve_batch(equations, parameters, anchor, threads=threads)
+        many = batch.solve(parameters, threads=threads)
         assert all(np.array_equal(a, b) for a, b in zip(one, many, strict=True))
+    part = batch.solve(parameters[5:9])
+    assert np.array_equal(part[0][0], one[0][0, 5:9])
 
 
-def test_a_failed_solve_leaves_its_neighbours_alone(equations, anchor):
+def test_a_failed_solve_leaves_its_neighbours_alone(batch):
     parameters = spread(5)
     parameters[2] = np.nan
-    outputs, status, _ = solve_batch(equations, parameters, anchor)
+    (outputs,), (status,), _ = batch.solve(parameters)
     assert status[2] != 0 and not status[[0, 1, 3, 4]].any()
     assert np.isfinite(outputs[[0, 1, 3, 4]]).all()
+
+
+def test_no_solve_slips_to_another_branch():
+    """On the bistable Duffing curve, results either continue the anchor's upper branch or say "other orbit"."""
+    tau = grid(200)
+    equations = build(0.4 * np.cos(2 * np.pi * tau), 0.22)
+    theta = np.array([1.0, 0.1, 1.0, 0.5])
+    upper = equations.solve(theta, np.cos(2 * np.pi * tau)[:, None] * 2.0)
+    lower = equations.solve(theta, np.cos(2 * np.pi * (tau - 0.5))[:, None] * 0.4)
+    assert upper.code == lower.code == 0 and np.ptp(upper.z) > 2.5 * np.ptp(lower.z)
+    batch = Batch([equations], [Anchor.at(equations, theta, upper.z)])
+    damping = np.linspace(0.1, 0.4, 40)  # the upper branch ends on the way
+    parameters = np.tile(theta, (40, 1))
+    parameters[:, 1] = damping
+    (outputs,), (status,), _ = batch.solve(parameters)
+    followed, still = upper.z, True
+    for c, y, code in zip(damping, outputs[:, :, 0], status, strict=True):
+        step = equations.solve(np.array([1.0, c, 1.0, 0.5]), followed)
+        still &= step.code == 0 and np.ptp(step.z) > 0.7 * np.ptp(followed)
+        if not still:
+            assert code == OTHER_ORBIT or code != 0
+        else:
+            followed = step.z
+            assert code == 0 and y == pytest.approx(followed[:, 0], rel=1e-6, abs=1e-8)
+    assert not still

@@ -8,6 +8,12 @@ from tests.known import complex_step_sensitivities, grid
 DUFFING = {"m": 0.45, "c": 1.3, "k": 900.0, "k3": 4e5}
 FREQUENCY = 5.0
 SCHEMES = ["central2", "backward2"]
+FORWARD3 = bp.Scheme(
+    "forward3",
+    3,
+    first={-1: -1 / 3, 0: -1 / 2, 1: 1.0, 2: -1 / 6},
+    second={-1: 11 / 12, 0: -5 / 3, 1: 1 / 2, 2: 1 / 3, 3: -1 / 12},
+)
 
 COUPLED = bp.Model(
     "coupled",
@@ -40,23 +46,53 @@ def manufactured(samples: int) -> tuple[np.ndarray, np.ndarray]:
     return x, manufactured_force(x, v, a)
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_schemes_converge_at_second_order_on_a_manufactured_solution(scheme):
-    errors = []
-    for samples in (800, 1600, 3200):
-        exact, force = manufactured(samples)
-        solution = bp.solve_periodic(
-            bp.models.duffing,
-            DUFFING,
-            {"force": force},
-            frequency=FREQUENCY,
-            samples=samples,
-            scheme=scheme,
-            guess={"x": exact},
-        )
-        assert solution.converged
-        errors.append(np.max(np.abs(solution.states["x"] - exact)))
-    assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx(2.0, abs=0.05)
+def solve_manufactured(scheme, samples: int) -> tuple[bp.PeriodicSolution, float]:
+    exact, force = manufactured(samples)
+    solution = bp.solve_periodic(
+        bp.models.duffing,
+        DUFFING,
+        {"force": force},
+        frequency=FREQUENCY,
+        samples=samples,
+        scheme=scheme,
+        guess={"x": exact},
+    )
+    assert solution.converged
+    return solution, np.max(np.abs(solution.states["x"] - exact))
+
+
+@pytest.mark.parametrize(
+    ("scheme", "order", "tolerance", "sizes"),
+    [
+        ("central2", 2.0, 0.05, (800, 1600, 3200)),
+        ("backward2", 2.0, 0.05, (800, 1600, 3200)),
+        ("central4", 4.0, 0.1, (100, 200, 400)),
+        (FORWARD3, 3.0, 0.1, (400, 800, 1600)),
+    ],
+)
+def test_schemes_have_their_order_on_a_manufactured_solution(scheme, order, tolerance, sizes):
+    errors = np.array([solve_manufactured(scheme, samples)[1] for samples in sizes])
+    assert np.log2(errors[:-1] / errors[1:]) == pytest.approx(order, abs=tolerance)
+
+
+@pytest.mark.parametrize("samples", [63, 64])
+def test_fourier_collocation_is_exact_to_rounding_on_a_smooth_solution(samples):
+    solution, error = solve_manufactured("fourier", samples)
+    assert error < 1e-12 and solution.error_estimate()["x"] < 1e-10
+
+
+@pytest.mark.parametrize(("scheme", "samples"), [("central2", 200), ("backward2", 400), ("central4", 100)])
+def test_error_estimate_is_the_error(scheme, samples):
+    solution, error = solve_manufactured(scheme, samples)
+    assert solution.error_estimate()["x"] == pytest.approx(error, rel=0.1)
+
+
+def test_error_estimate_of_a_failed_solve_is_not_a_number():
+    solution = bp.solve_periodic(
+        bp.models.duffing, DUFFING, {"force": np.full(50, 1e300)}, frequency=FREQUENCY, samples=50
+    )
+    assert not solution.converged and np.isnan(solution.error_estimate()["x"])
+    assert solution.multipliers.size == 0 and not solution.stable
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -225,7 +261,7 @@ def test_earlier_solution_as_guess_needs_no_iterations():
         ({"frequency": 0.0}, "frequency: 0.0 is not allowed; it must be > 0"),
         ({"winding": 1}, "winding: 1 is not allowed; the model 'duffing' has the angles"),
         ({"winding": {"x": 1}}, "winding: 'x' is not known"),
-        ({"scheme": "central3"}, "scheme: 'central3' is not known.*Did you mean 'central2'"),
+        ({"scheme": "central3"}, "scheme: 'central3' is not known.*Did you mean 'central4'"),
         ({"parameters": {"m": 1.0, "c": 1.0, "k": 1.0}}, "parameters: missing 'k3'"),
         ({"parameters": DUFFING | {"k5": 1.0}}, "parameters: 'k5' is not known"),
         ({"guess": {"x": np.zeros(3)}}, r"guess\['x'\]: 3 values are not allowed"),
@@ -245,13 +281,15 @@ def test_bad_arguments_are_named(changes, message):
         bp.solve_periodic(**(arguments | changes))
 
 
-def test_autonomous_model_is_refused():
-    model = bp.Model(
-        "free",
-        states=["x"],
-        parameters=["k"],
-        equations=lambda s, p, u: [s.ddx + p.k * s.x],
-        outputs=lambda s, p, u: {"x": s.x},
-    )
-    with pytest.raises(ValueError, match="'free' is autonomous"):
-        bp.solve_periodic(model, {"k": 1.0}, frequency=1.0)
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"first": {-1: -1.0, 1: 1.0}}, "first: .* it gives 2 for the derivative of t"),
+        ({"second": {0: 1.0, 1: -2.0}}, "second: .* it gives -1 for the derivative of t"),
+        ({"order": 0}, "order: 0 is not allowed"),
+    ],
+)
+def test_schemes_that_do_not_differentiate_are_refused(changes, message):
+    good = {"order": 2, "first": {-1: -0.5, 1: 0.5}, "second": {-1: 1.0, 0: -2.0, 1: 1.0}}
+    with pytest.raises(ValueError, match=message):
+        bp.Scheme("mine", **(good | changes))

@@ -1,0 +1,343 @@
+"""Branches of periodic solutions: followed in one quantity, with folds and period doublings; branch switching."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, overload
+
+import numpy as np
+from scipy.optimize import brentq
+from tqdm import tqdm
+
+from bayesperiodic import checks
+from bayesperiodic.models.model import Model
+from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR
+from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
+from bayesperiodic.periodic.family import INPUTS, Family
+from bayesperiodic.periodic.solution import PeriodicSolution, describe, equations_of
+from bayesperiodic.periodic.trace import Point, Tracer, trace
+from bayesperiodic.store import Result
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+FOLD, PERIOD_DOUBLING = "fold", "period doubling"
+STEPS = 50
+LOCATED = 1e-9
+FOUND_BY = "continuation"
+DOUBLED = 0.02
+
+
+@dataclass(frozen=True)
+class Branch(Result, Sequence):
+    """A branch of periodic solutions: a sequence of PeriodicSolution, in the order in which they were found.
+
+    Attributes
+    ----------
+    vary : str
+        What was varied: "frequency" [Hz], a parameter, or an input (its scale, 1 at the start).
+    unit : str
+        That of `vary`, if known.
+    values : array (points,)
+        Of what was varied.
+    solutions : tuple of PeriodicSolution
+        Without sensitivities.
+    kinds : tuple of str
+        "fold", "period doubling" or "" for each.
+    complete : bool
+        True if the branch got to the end wanted, or back to its start value, and did not get stuck.
+    """
+
+    vary: str
+    unit: str
+    values: np.ndarray
+    solutions: tuple[PeriodicSolution, ...]
+    kinds: tuple[str, ...]
+    complete: bool
+
+    def __len__(self) -> int:
+        return len(self.solutions)
+
+    @overload
+    def __getitem__(self, index: int) -> PeriodicSolution: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[PeriodicSolution, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> PeriodicSolution | tuple[PeriodicSolution, ...]:
+        return self.solutions[index]
+
+    def _of_kind(self, kind: str) -> tuple[PeriodicSolution, ...]:
+        return tuple(s for s, k in zip(self.solutions, self.kinds, strict=True) if k == kind)
+
+    @property
+    def folds(self) -> tuple[PeriodicSolution, ...]:
+        """The solutions where the branch turns back."""
+        return self._of_kind(FOLD)
+
+    @property
+    def period_doublings(self) -> tuple[PeriodicSolution, ...]:
+        """The solutions where a multiplier passes −1."""
+        return self._of_kind(PERIOD_DOUBLING)
+
+    @property
+    def data(self) -> xr.Dataset:
+        """The branch as an xarray Dataset: dims point, tau, state, output, multiplier."""
+        import xarray as xr
+
+        first = self.solutions[0]
+        multipliers = np.array([s.multipliers for s in self.solutions])
+        states = np.array([[s.states[n] for n in first.states] for s in self.solutions])
+        outputs = np.array([[s.outputs[n] for n in first.outputs] for s in self.solutions])
+        return xr.Dataset(
+            {
+                "states": (("point", "state", "tau"), states),
+                "outputs": (("point", "output", "tau"), outputs),
+                "frequency": ("point", [s.frequency for s in self.solutions], {"units": "Hz"}),
+                "multiplier_real": (("point", "multiplier"), multipliers.real),
+                "multiplier_imaginary": (("point", "multiplier"), multipliers.imag),
+                "stable": ("point", [s.stable for s in self.solutions]),
+                "kind": ("point", list(self.kinds)),
+            },
+            coords={
+                "value": ("point", self.values, {"units": self.unit, "long_name": self.vary}),
+                "tau": first.tau,
+                "state": list(first.states),
+                "output": list(first.outputs),
+            },
+            attrs={"model": first.model, "vary": self.vary},
+        )
+
+    def __repr__(self) -> str:
+        return (
+            f"Branch({self.solutions[0].model!r}, {self.vary} {self.values[0]:.6g} … {self.values[-1]:.6g}"
+            f"{' ' + self.unit if self.unit else ''}, {len(self)} points, {len(self.folds)} folds, "
+            f"{len(self.period_doublings)} period doublings{'' if self.complete else ', stuck'})"
+        )
+
+
+def continue_periodic(
+    model: Model,
+    solution: PeriodicSolution,
+    vary: str,
+    *,
+    until: float,
+    step: float | None = None,
+    progress: bool = True,
+) -> Branch:
+    """Follow a periodic solution, stable or unstable, along a parameter, the frequency or an input's scale.
+
+    Pseudo-arclength continuation with steps adapted to the curvature passes folds; folds and period doublings are
+    located to 1e-9 of a step. It ends where the quantity gets to `until`, or back to its start value, or where the
+    steps get too small (then the branch is not `complete`).
+
+    Parameters
+    ----------
+    model : Model
+    solution : PeriodicSolution
+        A converged one.
+    vary : str
+        "frequency", a parameter's name, or an input's name (its scale, 1 at the start).
+    until : float
+    step : float, optional
+        The largest step in what is varied; by default a fiftieth of the way. Changes of the orbit by its own size
+        count as much as the way to `until`.
+    progress : bool
+        Show a progress bar.
+
+    Returns
+    -------
+    Branch
+
+    Raises
+    ------
+    ValueError
+        If the solution has not converged or is of another model, for an unknown `vary`, the frequency of an autonomous
+        model, `until` equal to the start value, a step ≤ 0.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = np.cos(2 * np.pi * np.arange(100) / 100)
+    >>> start = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
+    ...                           frequency=0.1, samples=100)
+    >>> branch = bp.continue_periodic(bp.models.duffing, start, "frequency", until=0.4, progress=False)
+    >>> len(branch.folds)
+    2
+    """
+    points = iterate_periodic(model, solution, vary, until=until, step=step)
+    values, solutions, kinds = [], [], []
+    with tqdm(desc=f"{model.name}: {vary} to {until:g}", unit=" points", disable=not progress, leave=False) as bar:
+        for value, found, kind in points:
+            values.append(value)
+            solutions.append(found)
+            kinds.append(kind)
+            bar.set_postfix_str(f"{vary} = {value:.6g}")
+            bar.update()
+    unit = "Hz" if vary == FREQUENCY else "" if vary in model.inputs else model.units.get(vary, "")
+    complete = values[-1] == until or (len(values) > 1 and values[-1] == values[0])
+    return Branch(vary, unit, np.array(values), tuple(solutions), tuple(kinds), complete)
+
+
+def iterate_periodic(
+    model: Model, solution: PeriodicSolution, vary: str, *, until: float, step: float | None = None
+) -> Iterator[tuple[float, PeriodicSolution, str]]:
+    """Yield the points of `continue_periodic` one by one: the value of what is varied, the solution, the kind.
+
+    Parameters
+    ----------
+    model, solution, vary, until, step : see `continue_periodic`
+
+    Yields
+    ------
+    value : float
+    solution : PeriodicSolution
+    kind : str
+        "fold", "period doubling" or "".
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> orbit = bp.solve_periodic(bp.models.van_der_pol, {"mu": 0.5, "omega": 1}, frequency=0.15, samples=200)
+    >>> for mu, orbit, kind in bp.iterate_periodic(bp.models.van_der_pol, orbit, "mu", until=2.0):
+    ...     if orbit.period > 7:
+    ...         break
+    >>> 1.0 < mu < 2.0
+    True
+    """
+    equations, parameters, z = equations_of(model, solution)
+    if not solution.converged:
+        raise ValueError(f"solution: status {solution.status!r} is not allowed; it must have converged.")
+    family, values = _family(equations, parameters, vary)
+    until = checks.finite_number("until", until)
+    if vary == FREQUENCY:
+        checks.positive("until", until)
+    if until == values[0]:
+        raise ValueError(f"until: {until!r} is not allowed; {vary} has that value at the start.")
+    step = abs(until - values[0]) / STEPS if step is None else checks.positive("step", step)
+    located: dict[int, str] = {}
+
+    def refine(tracer: Tracer, before: Point, after: Point) -> list[Point]:
+        found = _between(tracer, family, before, after)
+        located.update({id(point): kind for kind, point in found})
+        return [point for _, point in found]
+
+    for point in trace(family, z, values, until=until, step=step, refine=refine):
+        yield float(point.values[0]), _solution(family, point), located.get(id(point), "")
+
+
+def double_period(model: Model, solution: PeriodicSolution, vary: str) -> PeriodicSolution:
+    """Step from a period doubling onto the branch of solutions of twice the period.
+
+    Parameters
+    ----------
+    model : Model
+    solution : PeriodicSolution
+        One of ``branch.period_doublings``.
+    vary : str
+        What the branch was followed in; it is free in this step, too.
+
+    Returns
+    -------
+    PeriodicSolution
+        Of twice the periods (for an autonomous model, twice the samples at half the frequency), 2 % of the orbit's size
+        away from the old one; or with the status "singular" where the step fails.
+
+    Raises
+    ------
+    ValueError
+        If the solution has not converged, has no multiplier near −1, or for an unknown `vary`.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> help(bp.double_period)    # doctest: +ELLIPSIS
+    Help on function double_period in module bayesperiodic.periodic.continuation:
+    ...
+    """
+    equations, parameters, z = equations_of(model, solution)
+    if not solution.converged or np.min(abs(solution.multipliers + 1.0)) > 0.1:
+        raise ValueError(f"solution: multipliers {solution.multipliers} are not allowed; one must be near -1.")
+    twice = PeriodicEquations.build(
+        model,
+        {name: np.tile(values, 2) for name, values in solution.inputs.items()},
+        frequency=solution.frequency / 2 if model.autonomous else solution.frequency,
+        samples=2 * solution.samples if model.autonomous else solution.samples,
+        scheme=solution.scheme,
+        periods=solution.periods if model.autonomous else 2 * solution.periods,
+        winding={name: 2 * turns for name, turns in solution.winding.items()},
+    )
+    family, values = _family(twice, parameters, vary)
+    start = np.tile(z, (2, 1))
+    columns = twice.residual_jacobian(start, parameters)
+    across = twice.factors(columns).null_vector()
+    across = 0.5 * (across - np.roll(across, len(z), axis=0))
+    tracer = Tracer(family, np.ptp(start, axis=0), values, 2.0 * values[0] + 1.0)
+    tangent = (across, np.zeros_like(values))
+    length = tracer.length(tangent)
+    point = Point(start, values, (across / length, tangent[1]), 0.0)
+    corrected = tracer.correct(point, DOUBLED)
+    if corrected is None:
+        return describe(twice, parameters, Solved(start, SINGULAR, np.empty((0, 3))), FOUND_BY)
+    return _solution(family, corrected[0], sensitivities=True)
+
+
+def _family(equations: PeriodicEquations, parameters: np.ndarray, vary: str) -> tuple[Family, np.ndarray]:
+    """Return the family in what is varied (and, for an autonomous model, the frequency) and the present values."""
+    model = equations.model
+    allowed = [*model.parameters, *model.inputs, *([] if model.autonomous else [FREQUENCY])]
+    checks.one_of("vary", vary, allowed)
+    own, own_values = ((FREQUENCY,), [equations.frequency]) if model.autonomous else ((), [])
+    if vary in model.inputs:
+        column, width = model.inputs.index(vary), len(model.inputs)
+        change = np.zeros_like(equations.inputs)
+        change[:, column::width] = equations.inputs[:, column::width]
+        family = Family(equations.with_inputs(equations.inputs - change), parameters, (INPUTS, *own), change)
+        return family, np.array([1.0, *own_values])
+    value = equations.frequency if vary == FREQUENCY else parameters[model.parameters.index(vary)]
+    return Family(equations, parameters, (vary, *own)), np.array([value, *own_values])
+
+
+def _solution(family: Family, point: Point, sensitivities: bool = False) -> PeriodicSolution:
+    equations, parameters = family.at(point.values)
+    solved = Solved(point.z, CONVERGED, np.empty((0, 3)))
+    return describe(equations, parameters, solved, FOUND_BY, sensitivities)
+
+
+def _between(tracer: Tracer, family: Family, before: Point, after: Point) -> list[tuple[str, Point]]:
+    """Return the folds and period doublings between two neighbouring points, in order."""
+    tests: dict[str, Callable[[Point], float]] = {
+        FOLD: lambda point: float(point.tangent[1][0]),
+        PERIOD_DOUBLING: lambda point: _doubling_test(_solution(family, point)),
+    }
+    found = []
+    for kind, test in tests.items():
+        low, high = test(before), test(after)
+        if not low * high < 0.0:
+            continue
+        span = after.distance - before.distance
+        corrected: dict[float, Point] = {0.0: before, span: after}
+
+        def at(distance: float, corrected: dict[float, Point] = corrected) -> Point:
+            if distance not in corrected:
+                result = tracer.correct(before, distance)
+                if result is None:
+                    raise RuntimeError("lost")
+                corrected[distance] = result[0]
+            return corrected[distance]
+
+        try:
+            root = brentq(lambda d, test=test, at=at: test(at(d)), 0.0, span, xtol=LOCATED * span, rtol=1e-14)
+            found.append((kind, at(root)))
+        except RuntimeError:
+            continue
+    return sorted(found, key=lambda item: item[1].distance)
+
+
+def _doubling_test(solution: PeriodicSolution) -> float:
+    """Return a number that changes sign where a multiplier passes −1."""
+    exponents = solution.floquet.exponents if solution.floquet is not None else np.array([np.nan])
+    growth = np.abs(exponents.real)
+    parts = np.exp(-growth) + np.exp(exponents - growth)
+    return float(np.prod(parts).real)

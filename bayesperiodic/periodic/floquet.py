@@ -1,0 +1,273 @@
+"""Floquet multipliers and eigenfunctions of linear periodic equations, however stable or unstable.
+
+The multipliers are those of the equations linearised on the orbit, ẏ = A(t) y, not of a difference scheme's recurrence,
+which has parasitic ones. Between neighbouring grid points A is interpolated and the equations are integrated by
+collocation at three Gauss points (order 6, [1]_, table II.7.4). The transfer matrices are multiplied only while that is
+harmless; through the remaining factors an orthogonal basis is swept round the period until it turns into itself. This
+finds the invariant subspaces of each modulus, and every multiplier comes from the equations restricted to its own.
+
+References
+----------
+.. [1] Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, Springer, 1993.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+STENCIL = 8
+GAUSS_NODES = np.array([0.5 - np.sqrt(15) / 10, 0.5, 0.5 + np.sqrt(15) / 10])
+GAUSS_WEIGHTS = np.array([5, 8, 5]) / 18
+GAUSS_MATRIX = np.array(
+    [
+        [5 / 36, 2 / 9 - np.sqrt(15) / 15, 5 / 36 - np.sqrt(15) / 30],
+        [5 / 36 + np.sqrt(15) / 24, 2 / 9, 5 / 36 - np.sqrt(15) / 24],
+        [5 / 36 + np.sqrt(15) / 30, 2 / 9 + np.sqrt(15) / 15, 5 / 36],
+    ]
+)
+HARMLESS = 1e5
+SWEEPS = 8
+DECOUPLED = 1e-11
+CHUNK = 4_000_000
+
+
+@dataclass(frozen=True)
+class Floquet:
+    """Multipliers and eigenfunctions.
+
+    Attributes
+    ----------
+    exponents : complex array (size,)
+        log μ of the whole period, largest real part first; the imaginary part is in (−π, π].
+    """
+
+    exponents: np.ndarray
+    _steps: np.ndarray
+    _every: int
+    _along: np.ndarray
+    _across: np.ndarray
+
+    @cached_property
+    def eigenfunctions(self) -> tuple[np.ndarray, np.ndarray]:
+        """For each multiplier v of ẏ = A y and w of the adjoint ẇ = −Aᵀ w, complex arrays (size, points, size).
+
+        They are given without their growth, each of unit length at each grid point.
+        """
+        right = [_between(self._steps, v, self._every) for v in self._along]
+        left = [_between_adjoint(self._steps, w, self._every) for w in self._across]
+        return np.array(right), np.array(left)
+
+
+def first_order_matrix(linearisation: np.ndarray, orders: tuple[int, ...]) -> np.ndarray:
+    """Return A (points, size, size) [1/s] of ẏ = A y, y = δq and the rates of the second-order states.
+
+    Parameters
+    ----------
+    linearisation : array (points, states, 3·states)
+        ∂g/∂(q, q̇, q̈).
+    orders : tuple of int
+        Of each state.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the equations cannot be solved for the highest derivatives.
+    """
+    points, count, _ = linearisation.shape
+    highest, lower = _split(linearisation, orders)
+    second = [i for i, order in enumerate(orders) if order == 2]
+    solved = -np.linalg.solve(highest, lower)
+    matrix = np.zeros((points, count + len(second), count + len(second)))
+    matrix[:, :count] = solved
+    for row, state in enumerate(second):
+        matrix[:, count + row] = solved[:, state]
+        matrix[:, state] = 0.0
+        matrix[:, state, count + row] = 1.0
+    return matrix
+
+
+def matrix_change(linearisation: np.ndarray, change: np.ndarray, orders: tuple[int, ...]) -> np.ndarray:
+    """Return the change of `first_order_matrix` for a change of the linearisation, of the same shape."""
+    count = linearisation.shape[1]
+    highest, lower = _split(linearisation, orders)
+    highest_change, lower_change = _split(change, orders)
+    solved = -np.linalg.solve(highest, lower)
+    solved_change = -np.linalg.solve(highest, lower_change + highest_change @ solved)
+    second = [i for i, order in enumerate(orders) if order == 2]
+    matrix = np.zeros((len(change), count + len(second), count + len(second)))
+    matrix[:, :count] = solved_change
+    for row, state in enumerate(second):
+        matrix[:, count + row] = solved_change[:, state]
+        matrix[:, state] = 0.0
+    return matrix
+
+
+def _split(linearisation: np.ndarray, orders: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    count = linearisation.shape[1]
+    highest = linearisation[:, :, [order * count + i for i, order in enumerate(orders)]]
+    rates = [count + i for i, order in enumerate(orders) if order == 2]
+    return highest, np.concatenate([linearisation[:, :, :count], linearisation[:, :, rates]], axis=2)
+
+
+def floquet(matrix: np.ndarray, period: float) -> Floquet:
+    """Return multipliers and eigenfunctions of ẏ = A(t) y.
+
+    Parameters
+    ----------
+    matrix : array (points, size, size)
+        A [1/s] on an equidistant grid of one period, end point excluded.
+    period : float
+        [s].
+    """
+    points, size, _ = matrix.shape
+    steps = _transfer_matrices(matrix, period / points)
+    groups, length = _harmless_products(steps)
+    splits, right = _invariant_bases(groups)
+    _, left = _invariant_bases(np.swapaxes(groups[::-1], 1, 2), splits)
+    left = np.roll(left[::-1], 1, axis=0)
+    exponents: list[complex] = []
+    v: list[np.ndarray] = []
+    w: list[np.ndarray] = []
+    for start, stop in zip([0, *splits], [*splits, size], strict=True):
+        x, y = _eigenspaces(right, left, start, stop)
+        for exponent, along, across in _block(groups, x, y):
+            exponents.append(exponent)
+            v.append(along)
+            w.append(across)
+    order = np.argsort([-e.real for e in exponents], kind="stable")
+    return Floquet(np.array(exponents)[order], steps, length, np.array(v)[order], np.array(w)[order])
+
+
+def _transfer_matrices(matrix: np.ndarray, step: float) -> np.ndarray:
+    """Return (points, size, size): from each grid point to the next."""
+    points, size, _ = matrix.shape
+    width = min(STENCIL, points)
+    offsets = np.arange(width) - (width // 2 - 1)
+    nearby = [np.roll(matrix, -o, axis=0) for o in offsets]
+    stages = np.stack(
+        [sum(w * a for w, a in zip(_lagrange(offsets, node), nearby, strict=True)) for node in GAUSS_NODES], axis=1
+    )
+    result = np.empty_like(matrix)
+    chunk = max(1, CHUNK // (3 * size) ** 2)
+    for start in range(0, points, chunk):
+        a = stages[start : start + chunk]
+        coupled = -step * np.einsum("ij,nipq->nipjq", GAUSS_MATRIX, a).reshape(-1, 3 * size, 3 * size)
+        coupled += np.eye(3 * size)
+        slopes = np.linalg.solve(coupled, a.reshape(-1, 3 * size, size)).reshape(-1, 3, size, size)
+        result[start : start + chunk] = np.eye(size) + step * np.einsum("i,nipq->npq", GAUSS_WEIGHTS, slopes)
+    return result
+
+
+def _lagrange(nodes: np.ndarray, at: float) -> np.ndarray:
+    return np.array([np.prod([(at - m) / (k - m) for m in nodes if m != k]) for k in nodes])
+
+
+def _harmless_products(steps: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return products of neighbouring transfer matrices and how many steps each spans (the last may span fewer)."""
+    products, length = steps, 1
+    while len(products) > 1:
+        padded = products if len(products) % 2 == 0 else np.concatenate([products, np.eye(steps.shape[1])[None]])
+        longer = padded[1::2] @ padded[0::2]
+        if not np.max(_spread(longer)) < HARMLESS:
+            break
+        products, length = longer, 2 * length
+    return products, length
+
+
+def _spread(matrices: np.ndarray) -> np.ndarray:
+    """Return the ratio of the largest to the smallest stretching; infinite where it cannot be had."""
+    with np.errstate(all="ignore"):
+        if not np.isfinite(matrices).all():
+            return np.full(len(matrices), np.inf)
+        values = np.linalg.svd(matrices, compute_uv=False)
+        return np.where(values[:, -1] > 0, values[:, 0] / values[:, -1], np.inf)
+
+
+def _invariant_bases(groups: np.ndarray, splits: list[int] | None = None) -> tuple[list[int], np.ndarray]:
+    """Sweep an orthogonal basis through the factors until it turns into itself.
+
+    Returns the sizes j for which its first j vectors span the subspace of the j largest multipliers (to rounding), and
+    the basis before each factor, (factors, size, size).
+    """
+    size = groups.shape[1]
+    basis = np.linalg.qr(np.random.default_rng(0).standard_normal((size, size)))[0]
+    before = np.empty_like(groups)
+    for _ in range(SWEEPS if len(groups) > 1 else 0):
+        start = basis
+        for g, group in enumerate(groups):
+            before[g] = basis
+            basis = np.linalg.qr(group @ basis)[0]
+        turned = start.T @ basis
+    if len(groups) == 1:
+        before[0], turned = basis, np.ones((size, size))
+    if splits is None:
+        splits = [j for j in range(1, size) if np.linalg.norm(turned[j:, :j]) < DECOUPLED]
+    return splits, before
+
+
+def _eigenspaces(right: np.ndarray, left: np.ndarray, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return bases (factors, size, stop − start) of a block's invariant subspace, of A's and of the adjoint's."""
+    x, y = right[:, :, start:stop], left[:, :, start:stop]
+    if start:
+        q, p = right[:, :, :start], left[:, :, :start]
+        overlap, back = np.swapaxes(p, 1, 2) @ q, np.swapaxes(p, 1, 2)
+        x = x - q @ np.linalg.solve(overlap, back @ x)
+        y = y - p @ np.linalg.solve(np.swapaxes(overlap, 1, 2), np.swapaxes(q, 1, 2) @ y)
+    return x, y
+
+
+def _block(groups: np.ndarray, x: np.ndarray, y: np.ndarray) -> list[tuple[complex, np.ndarray, np.ndarray]]:
+    """Return for each multiplier of a block its logarithm and the eigenfunctions (factors, size) before the factors."""
+    after, width = np.roll(y, -1, axis=0), x.shape[2]
+    small = np.linalg.solve(np.swapaxes(after, 1, 2) @ np.roll(x, -1, axis=0), np.swapaxes(after, 1, 2) @ groups @ x)
+    product, growth = np.eye(width), 0.0
+    for matrix in small:
+        product = matrix @ product
+        scale = np.linalg.norm(product)
+        product, growth = product / scale, growth + np.log(scale)
+    values, vectors = np.linalg.eig(product)
+    adjoint = np.linalg.inv(vectors)
+    gram = np.linalg.inv(np.swapaxes(y, 1, 2) @ x)
+    found = []
+    for value, c, d in zip(values, vectors.T, adjoint, strict=True):
+        with np.errstate(divide="ignore"):
+            exponent = complex(np.log(complex(value)) + growth)
+        along, across = np.empty((2, len(groups), groups.shape[1]), dtype=complex)
+        for g, matrix in enumerate(small):
+            along[g] = x[g] @ c
+            c = matrix @ c
+            c = c / np.linalg.norm(c)
+        for g in range(len(groups) - 1, -1, -1):
+            d = small[g].T @ d
+            d = d / np.linalg.norm(d)
+            across[g] = y[g] @ (gram[g].T @ d)
+        found.append((exponent, along, across))
+    return found
+
+
+def _between(steps: np.ndarray, at: np.ndarray, length: int) -> np.ndarray:
+    """Return an eigenfunction at every grid point from its values at every `length`-th."""
+    result = np.empty((len(steps), at.shape[1]), dtype=complex)
+    result[::length] = _unit(at)
+    for k in range(1, length):
+        part = result[k::length]
+        part[:] = _unit(
+            np.einsum("npq,nq->np", steps[k - 1 :: length][: len(part)], result[k - 1 :: length][: len(part)])
+        )
+    return result
+
+
+def _between_adjoint(steps: np.ndarray, at: np.ndarray, length: int) -> np.ndarray:
+    points = len(steps)
+    result = np.empty((points + 1, at.shape[1]), dtype=complex)
+    result[:points:length] = _unit(at)
+    result[points] = result[0]
+    for k in range(length - 1, 0, -1):
+        index = np.arange(k, points, length)
+        result[index] = _unit(np.einsum("nqp,nq->np", steps[index], result[index + 1]))
+    return result[:points]
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

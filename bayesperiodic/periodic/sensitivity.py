@@ -1,0 +1,85 @@
+"""Derivatives of a periodic state by the implicit function theorem (de Kraker et al. 1997, eq. 4)."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bayesperiodic.periodic.equations import PeriodicEquations
+
+
+class Sensitivities(NamedTuple):
+    """Derivatives along several directions, on the grid.
+
+    Attributes
+    ----------
+    states : array (directions, points, states)
+    outputs : array (directions, points, channels)
+    frequency : array (directions,)
+        That of the solution's frequency [Hz per unit]; zero for a forced model.
+    """
+
+    states: np.ndarray
+    outputs: np.ndarray
+    frequency: np.ndarray
+
+
+def parameter_sensitivities(
+    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray
+) -> Sensitivities | None:
+    """Return derivatives to every parameter and, for a forced model, last to the frequency; None if singular.
+
+    For an autonomous model the phase moves so that the change of the orbit stays orthogonal to the flow.
+    """
+    d = equations.derivatives(z, parameters)
+    g, f = np.moveaxis(d.g_theta, 2, 0), np.moveaxis(d.f_theta, 2, 0)
+    if not equations.model.autonomous:
+        columns = equations.residual_jacobian(z, parameters)
+        g_frequency, f_frequency = frequency_derivatives(equations, z, columns, d)
+        g, f = np.concatenate([g, g_frequency[None]]), np.concatenate([f, f_frequency[None]])
+    return respond(equations, z, parameters, g, f)
+
+
+def input_sensitivities(
+    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
+) -> Sensitivities | None:
+    """Return derivatives along perturbations (directions, points, 3·inputs) of (u, u̇, ü); None if singular."""
+    d = equations.derivatives(z, parameters)
+    g = np.einsum("neu,dnu->dne", d.g_u, directions)
+    f = np.einsum("ncu,dnu->dnc", d.f_u, directions)
+    return respond(equations, z, parameters, g, f)
+
+
+def frequency_derivatives(
+    equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray, d: tuple[np.ndarray, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return dg/dfrequency (points, states) and df/dfrequency (points, channels), z and inputs held in tau."""
+    states, inputs = equations.frequency_changes(z)
+    _, g_u, g_frequency, f_q, _, f_u, f_frequency = d
+    g_q = columns[:, equations.count :].reshape(len(z), equations.count, -1)
+    g = g_frequency[:, :, 0] + np.einsum("neq,nq->ne", g_q, states) + np.einsum("neu,nu->ne", g_u, inputs)
+    f = f_frequency[:, :, 0] + np.einsum("ncq,nq->nc", f_q, states) + np.einsum("ncu,nu->nc", f_u, inputs)
+    return g, f
+
+
+def respond(
+    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray, g: np.ndarray, f: np.ndarray
+) -> Sensitivities | None:
+    """Return the response to changes of g (directions, points, states) and f (directions, points, channels)."""
+    columns = equations.residual_jacobian(z, parameters)
+    d = equations.derivatives(z, parameters)
+    factors = equations.factors(columns)
+    if equations.model.autonomous:
+        g_frequency, f_frequency = frequency_derivatives(equations, z, columns, d)
+        flow = equations.states(z)[None, :, equations.count : 2 * equations.count]
+        flow = flow / np.linalg.norm(flow)
+        nothing = np.zeros((len(g), 1))
+        solved = factors.solve_bordered(g_frequency[None], flow, np.zeros((1, 1)), -g, nothing)
+        if solved is None:
+            return None
+        z_change, frequency = solved[0], solved[1][:, 0]
+        f = f + frequency[:, None, None] * f_frequency
+    elif factors.regular:
+        z_change, frequency = factors.solve(-g), np.zeros(len(g))
+    else:
+        return None
+    return Sensitivities(z_change, f + np.einsum("ncq,dnq->dnc", d.f_q, equations.changes(z_change)), frequency)

@@ -1,0 +1,242 @@
+"""`solve_periodic`: from arguments to a periodic equilibrium state, with what is tried before giving up."""
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from bayesperiodic import checks
+from bayesperiodic.models.model import Model
+from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT
+from bayesperiodic.periodic.equations import PeriodicEquations, Solved
+from bayesperiodic.periodic.family import Family, solve_autonomous
+from bayesperiodic.periodic.homotopy import raise_amplitude, sharpen
+from bayesperiodic.periodic.schemes import Scheme
+from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, describe, periodic_part
+from bayesperiodic.periodic.transient import measured_cycle, settled_period
+
+GUESSES = ("static", "integration")
+FEW_STEPS = 4
+EQUILIBRIUM = 1e-6
+SAME = 1e-6
+
+
+def solve_periodic(
+    model: Model,
+    parameters: Mapping[str, float],
+    inputs: Mapping[str, np.ndarray] | None = None,
+    *,
+    frequency: float,
+    samples: int = 800,
+    scheme: str | Scheme = "central2",
+    periods: int = 1,
+    winding: int | Mapping[str, int] = 0,
+    guess: str | Mapping[str, np.ndarray] | PeriodicSolution = "static",
+) -> PeriodicSolution:
+    """Find a periodic equilibrium state, stable or unstable, and its sensitivities to every parameter.
+
+    The equations are discretised with a cyclic difference scheme and solved by a damped Newton method with step
+    halving ([1]_, eq. 2-4). If that fails from the static guess, the input's variation is raised from zero along the
+    branch of solutions, then a short time integration is tried; if smooth signs are too sharp for Newton's method, they
+    are sharpened step by step.
+
+    Parameters
+    ----------
+    model : Model
+    parameters : mapping of str to float
+        A value for every parameter.
+    inputs : mapping of str to array (samples·periods,), optional
+        Every input over one response period, end point excluded; derivatives are taken spectrally.
+    frequency : float
+        Forcing frequency [Hz]; for an autonomous model the first guess of the orbit's frequency.
+    samples : int
+        Grid points per forcing period.
+    scheme : str or Scheme
+        "central2" (accurate for smooth responses), "backward2" (calmer where the response has kinks), "central4" or
+        "fourier" (collocation as in harmonic balance, the most accurate for smooth responses; few points suffice).
+    periods : int
+        Forcing periods per response period.
+    winding : int or mapping of str to int
+        Turns that an angle advances per response period.
+    guess : "static", "integration", mapping of str to array (samples·periods,), or PeriodicSolution
+        The equilibrium under the mean inputs, the end of a short time integration from there, every state (turns of
+        angles included), or an earlier solution. An autonomous model has no use for its equilibrium, so "static" means
+        an integration from near it. The phase of its orbit is the one closest to the guess.
+
+    Returns
+    -------
+    PeriodicSolution
+        With a `status`; a solve that fails does not raise.
+
+    Raises
+    ------
+    ValueError
+        For unknown or missing names, inputs of a wrong length or not finite, a frequency ≤ 0, too few samples for the
+        scheme, a winding number for what is no angle, an autonomous model whose guess is constant in time, so that no
+        phase can be fixed.
+
+    Warns
+    -----
+    UserWarning
+        If a smooth sign changes over within fewer than four steps of the grid.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = np.cos(2 * np.pi * np.arange(800) / 800)
+    >>> solution = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
+    ...                              frequency=0.1)
+    >>> solution.status
+    'converged'
+    >>> solution.stable
+    True
+    >>> orbit = bp.solve_periodic(bp.models.van_der_pol, {"mu": 0.5, "omega": 1}, frequency=0.15, scheme="central4")
+    >>> round(orbit.period, 4)
+    6.3807
+    """
+    equations = PeriodicEquations.build(
+        model, inputs, frequency=frequency, samples=samples, scheme=scheme, periods=periods, winding=winding
+    )
+    checks.same_names("parameters", parameters, model.parameters)
+    theta = np.array([checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
+    if model.autonomous:
+        equations, solved, found_by = _solve_autonomous(equations, theta, guess)
+    else:
+        solved, found_by = _solve_forced(equations, theta, guess)
+    solution = describe(equations, theta, solved, found_by)
+    if solution.converged and (steps := _steps_of_transitions(equations, theta, solved.z)) < FEW_STEPS:
+        warnings.warn(
+            f"A smooth sign of {model.name!r} changes over within {steps:.2g} steps of the grid; "
+            f"{int(np.ceil(samples * FEW_STEPS / steps))} samples would resolve it (see error_estimate).",
+            UserWarning,
+            stacklevel=2,
+        )
+    return solution
+
+
+def _solve_forced(
+    equations: PeriodicEquations, theta: np.ndarray, guess: str | Mapping[str, np.ndarray] | PeriodicSolution
+) -> tuple[Solved, str]:
+    if not isinstance(guess, str):
+        start = periodic_part(equations, guess.states if isinstance(guess, PeriodicSolution) else guess)
+        solved, found_by = solve_from(equations, theta, start)
+        return _same_orbit(equations, solved, start), found_by
+    checks.one_of("guess", guess, GUESSES)
+    if guess == "integration":
+        settled = settled_period(equations, theta, equations.static_guess(theta))
+        if settled is not None:
+            return solve_from(equations, theta, settled)
+    return solve_from_rest(equations, theta)
+
+
+def solve_from(equations: PeriodicEquations, theta: np.ndarray, start: np.ndarray) -> tuple[Solved, str]:
+    """Solve a forced problem from a guess; return the solve and how it was found (`PeriodicSolution.found_by`)."""
+    return _first_success(
+        (NEWTON, lambda: equations.solve(theta, start)), ("sharpness", lambda: sharpen(equations, theta, start))
+    )
+
+
+def solve_from_rest(equations: PeriodicEquations, theta: np.ndarray) -> tuple[Solved, str]:
+    """Solve a forced problem from its static equilibrium, by all means; return the solve and how it was found."""
+    static = equations.static_guess(theta)
+
+    def integrated() -> Solved | None:
+        settled = settled_period(equations, theta, static)
+        return None if settled is None else equations.solve(theta, settled)
+
+    return _first_success(
+        (NEWTON, lambda: equations.solve(theta, static)),
+        ("input amplitude", lambda: raise_amplitude(equations, theta, static)),
+        ("time integration", integrated),
+        ("sharpness", lambda: sharpen(equations, theta, static)),
+    )
+
+
+def _first_success(*routes: tuple[str, Callable[[], Solved | None]]) -> tuple[Solved, str]:
+    """Return the first solve that converges and its route's name; the first one of all if none does."""
+    first: Solved | None = None
+    for name, route in routes:
+        solved = route()
+        if solved is not None and solved.code == CONVERGED:
+            return solved, name
+        first = first or solved
+    assert first is not None
+    return first, routes[0][0]
+
+
+def _same_orbit(equations: PeriodicEquations, solved: Solved, guess: np.ndarray) -> Solved:
+    """Return the solve, marked "other orbit" if it repeats within the response period and its guess did not."""
+    if solved.code == CONVERGED and _repeats(equations, solved.z) > 1 == _repeats(equations, guess):
+        return solved._replace(code=OTHER_ORBIT)
+    return solved
+
+
+def _repeats(equations: PeriodicEquations, z: np.ndarray) -> int:
+    """Return how many times the orbit repeats itself within the response period (angles modulo their turns)."""
+    grid = equations.grid
+    turns = np.array([equations.winding.get(state, 0) for state in equations.model.states])
+    size = np.maximum(np.ptp(z, axis=0), 1e-300)
+    for times in range(grid.periods, 1, -1):
+        shift = grid.samples * grid.periods // times
+        whole = grid.periods % times == 0 and np.all(turns % times == 0)
+        if whole and np.all(np.abs(np.roll(z, shift, axis=0) - z).max(axis=0) <= SAME * size):
+            return times
+    return 1
+
+
+def _solve_autonomous(
+    equations: PeriodicEquations, theta: np.ndarray, guess: str | Mapping[str, np.ndarray] | PeriodicSolution
+) -> tuple[PeriodicEquations, Solved, str]:
+    frequency, found_by = equations.frequency, NEWTON
+    if isinstance(guess, str):
+        checks.one_of("guess", guess, GUESSES)
+        cycle = measured_cycle(equations, theta)
+        if cycle is None:
+            z = equations.static_guess(theta)
+            return equations, Solved(z, OTHER_ORBIT, np.empty((0, 3))), "time integration"
+        z, frequency = cycle
+        found_by = "time integration"
+    else:
+        if isinstance(guess, PeriodicSolution):
+            frequency = guess.frequency
+        z = periodic_part(equations, guess.states if isinstance(guess, PeriodicSolution) else guess)
+        if np.all(np.ptp(z, axis=0) == 0.0):
+            raise ValueError(
+                f"guess: states constant in time are not allowed; {equations.model.name!r} is autonomous, and only a "
+                "guess that moves fixes the phase."
+            )
+    equations = replace(equations, frequency=frequency)
+    found = solve_autonomous(Family(equations, theta, ("frequency",)), z, frequency)
+    equations = equations.at_frequency(float(found.values[0]))
+    code = found.code
+    if code == CONVERGED and (_collapsed(found.z, z) or _has_shorter_period(found.z) and not _has_shorter_period(z)):
+        code = OTHER_ORBIT
+    return equations, Solved(found.z, code, found.history), found_by
+
+
+def _collapsed(z: np.ndarray, guess: np.ndarray) -> bool:
+    return bool(np.all(np.ptp(z, axis=0) <= EQUILIBRIUM * np.ptp(guess, axis=0)))
+
+
+def _has_shorter_period(z: np.ndarray) -> bool:
+    """Return whether only every k-th harmonic is there, for a k of 2 or more."""
+    power = np.sum(np.abs(np.fft.rfft(z, axis=0)) ** 2, axis=1)[1:]
+    present = np.flatnonzero(power > SAME**2 * power.max()) + 1
+    return bool(power.max() > 0 and np.gcd.reduce(present) > 1)
+
+
+def _steps_of_transitions(equations: PeriodicEquations, theta: np.ndarray, z: np.ndarray) -> float:
+    """Return in how few steps of the grid a smooth sign goes from −0.76 to 0.76 (its argument from −1 to 1)."""
+    if not equations.model.smooth_signs:
+        return np.inf
+    arguments = equations.evaluate("transitions", z, theta)
+    after = np.roll(arguments, -1, axis=0)
+    crossing = (np.minimum(abs(arguments), abs(after)) < 1.0) | (arguments * after < 0.0)
+    steepest = np.max(np.abs(after - arguments), where=crossing, initial=0.0)
+    return 2.0 / steepest if steepest > 0 else np.inf

@@ -1,0 +1,150 @@
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.periodic import compiled
+from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
+from tests.known import grid
+
+SCHEMES = ["backward2", "central2", "central4", "fourier"]
+
+
+def growing(states: int) -> bp.Model:
+    """Return ẇ = λ w + u with as many copies as wanted, the others decaying or turning: multipliers e^λ, e^−3, e^±i."""
+    names = ["w", "x", "y"][:states]
+    rows = {
+        "w": lambda s, p, u: s.dw - p.rate * s.w - u.u,
+        "x": lambda s, p, u: s.dx + 3 * s.x - s.w / 10 - u.u,
+        "y": lambda s, p, u: s.ddy + 2 * s.y + s.dx / 50 - u.u,
+    }
+    return bp.Model(
+        f"growing{states}",
+        states=names,
+        inputs=["u"],
+        parameters=["rate"],
+        equations=lambda s, p, u: [rows[name](s, p, u) for name in names],
+        outputs=lambda s, p, u: {"out": s.w},
+    )
+
+
+def equations_of(model: bp.Model, scheme: str, samples: int) -> PeriodicEquations:
+    wave = np.cos(2 * np.pi * grid(samples))
+    return PeriodicEquations.build(
+        model, {"u": wave}, frequency=1.0, samples=samples, scheme=scheme, periods=1, winding=0
+    )
+
+
+def dense(equations: PeriodicEquations, columns: np.ndarray) -> np.ndarray:
+    """Return ∂g/∂z as a dense matrix, assembled from circulant differentiation matrices."""
+    samples, count = equations.grid.points, equations.count
+    first, second = np.zeros((2, samples, samples))
+    weights = equations.grid.scheme.weights(samples)
+    for matrix, row, order in ((first, weights[0], 1), (second, weights[1], 2)):
+        for offset, weight in row.items():
+            matrix += weight * np.roll(np.eye(samples), offset, axis=1) * (samples * equations.frequency) ** order
+    blocks = columns[:, count:].reshape(samples, count, 3, count)
+    result = np.zeros((samples, count, samples, count))
+    for derivative, matrix in enumerate((np.eye(samples), first, second)):
+        result += np.einsum("nes,nm->nems", blocks[:, :, derivative], matrix)
+    return result.reshape(samples * count, samples * count)
+
+
+@pytest.mark.parametrize("exponent", [-40.0, -20.0, 0.7, 20.0, 40.0])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_linear_solves_are_right_however_stable_or_unstable_the_orbit(scheme, exponent):
+    """Against the transfer function with the scheme's own symbol for d/dt; multiplier e^λ over the period."""
+    samples = 800 if scheme != "fourier" else 100
+    equations = equations_of(growing(1), scheme, samples)
+    solution = equations.solve(np.array([exponent]), np.zeros((samples, 1)))
+    weights = equations.grid.scheme.weights(samples)[0]
+    symbol = sum(w * np.exp(2j * np.pi * o / samples) for o, w in weights.items()) * samples
+    exact = (np.exp(2j * np.pi * grid(samples)) / (symbol - exponent)).real
+    assert solution.code == compiled.CONVERGED
+    assert np.max(np.abs(solution.z[:, 0] - exact)) <= 1e-10 * np.max(np.abs(exact))
+
+
+@pytest.mark.parametrize("exponent", [-40.0, 40.0])
+@pytest.mark.parametrize("states", [1, 2, 3])
+@pytest.mark.parametrize("scheme", ["backward2", "central2"])
+def test_segments_agree_with_the_folded_band_and_are_used(scheme, states, exponent):
+    equations = equations_of(growing(states), scheme, 800)
+    theta = np.array([exponent])
+    z = np.random.default_rng(1).standard_normal((800, states))
+    columns = equations.residual_jacobian(z, theta)
+    factors = empty_factors(equations.grid, states)
+    assert equations.factorise(columns, z, factors)
+    segments = factors[5][0]
+    assert 1 < segments <= compiled.MAX_SEGMENTS or exponent < 0 and segments >= 1
+    right = np.random.default_rng(2).standard_normal((800, states))
+    solved = right.copy()
+    equations.kernels.back_substitute(equations.grid.packed, factors, solved)
+    expected = equations.factors(columns).solve(right)
+    assert np.max(np.abs(solved - expected) / np.abs(expected).max(axis=0)) < 1e-8  # some 10 roundings of 1/h²
+
+
+def test_a_march_that_grows_too_fast_is_left_for_the_folded_band():
+    equations = equations_of(growing(1), "central2", 200)
+    theta = np.array([-2000.0])  # the leapfrog's parasitic solution grows by e^2000 in a period
+    z = np.ones((200, 1))
+    factors = empty_factors(equations.grid, 1)
+    columns = equations.residual_jacobian(z, theta)
+    assert equations.factorise(columns, z, factors)
+    assert factors[5][0] == 0
+    right = np.random.default_rng(3).standard_normal((200, 1))
+    solved = right.copy()
+    equations.kernels.back_substitute(equations.grid.packed, factors, solved)
+    assert solved.ravel() == pytest.approx(np.linalg.solve(dense(equations, columns), right.ravel()), rel=1e-9)
+
+
+@pytest.mark.parametrize("states", [1, 2, 3])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_many_sides_and_the_transpose_match_dense_algebra(scheme, states):
+    equations = equations_of(growing(states), scheme, 30)
+    z = np.ones((30, states))
+    columns = equations.residual_jacobian(z, np.array([1.5]))
+    matrix, factors = dense(equations, columns), equations.factors(columns)
+    right = np.random.default_rng(4).standard_normal((5, 30, states))
+    flat = right.reshape(5, -1)
+    assert factors.regular
+    assert factors.solve(right).reshape(5, -1) == pytest.approx(np.linalg.solve(matrix, flat.T).T, rel=1e-8, abs=1e-10)
+    transposed = np.linalg.solve(matrix.T, flat.T).T
+    assert factors.solve_transposed(right).reshape(5, -1) == pytest.approx(transposed, rel=1e-8, abs=1e-8)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("rate", [0.0, 1e-13, 1.5])
+def test_bordered_systems_are_solved_where_the_block_is_singular(scheme, rate):
+    """ẇ = u has a constant as null vector; a border fixes the mean and frees a constant force."""
+    equations = equations_of(growing(2), scheme, 41)
+    columns = equations.residual_jacobian(np.ones((41, 2)), np.array([rate]))
+    matrix, factors = dense(equations, columns), equations.factors(columns)
+    generator = np.random.default_rng(5)
+    rows, borders = generator.standard_normal((2, 2, 41, 2))
+    rows[0, :, 0] += 1.0
+    borders[0, :, 0] += 1.0
+    corner, right, below = generator.standard_normal((2, 2)), generator.standard_normal((3, 41, 2)), np.ones((3, 2))
+    solved = factors.solve_bordered(borders, rows, corner, right, below)
+    whole = np.block([[matrix, borders.reshape(2, -1).T], [rows.reshape(2, -1), corner]])
+    expected = np.linalg.solve(whole, np.concatenate([right.reshape(3, -1), below], axis=1).T).T
+    assert solved is not None
+    assert np.concatenate([solved[0].reshape(3, -1), solved[1]], axis=1) == pytest.approx(expected, rel=1e-7, abs=1e-7)
+    if rate < 1e-10:
+        null = factors.null_vector()
+        assert np.abs(matrix @ null.ravel()).max() < 1e-9
+
+
+def test_plain_solves_are_not_changed_by_bordered_ones():
+    equations = equations_of(growing(2), "central2", 40)
+    columns = equations.residual_jacobian(np.ones((40, 2)), np.array([1.5]))
+    factors = equations.factors(columns)
+    right = np.random.default_rng(6).standard_normal((1, 40, 2))
+    before = factors.solve(right)
+    factors.null_vector()
+    assert np.array_equal(factors.solve(right), before)
+
+
+def test_status_codes_of_the_compiled_code_are_those_of_the_package():
+    names = ("CONVERGED", "STALLED", "SINGULAR", "NOT_FINITE", "OTHER_ORBIT", "MAX_SEGMENTS")
+    kernels = compiled.kernels(1, 2)
+    assert [getattr(kernels, name) for name in names] == [getattr(compiled, name) for name in names]
+    assert len(compiled.STATUSES) == 5
