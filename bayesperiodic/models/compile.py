@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
 FUNCTIONS = ("residual_jacobian", "outputs", "derivatives", "transitions")
 SECOND_FUNCTIONS = ("jacobian_change",)
+MANY_ZEROS = 30
 PREAMBLE = "import math\n\nfrom numba import njit\n\n\n"
 
 
@@ -134,17 +135,17 @@ def compile_kernels(model: Model) -> Kernels:
 
 def kernel_source(model: Model) -> str:
     """Return the generated module as text; the same model always gives the same text."""
-    g, f = sp.Matrix(model.equations), sp.Matrix(model.output_expressions)
+    g, f = list(model.equations), list(model.output_expressions)
     q, u = list(model.state_symbols.values()), list(model.input_symbols.values())
     theta, frequency = list(model.parameter_symbols.values()), [model.time_symbols["frequency"]]
     needs = {
-        "residual_jacobian": [*g, *g.jacobian(q)],
+        "residual_jacobian": [*g, *_jacobian(g, q)],
         "outputs": [*f],
         "transitions": [sign.args[0] for sign in model.smooth_signs],
         "derivatives": [
             entry
             for rows, columns in ((g, theta), (g, u), (g, frequency), (f, q), (f, theta), (f, u), (f, frequency))
-            for entry in (rows.jacobian(columns) if columns else [])
+            for entry in _jacobian(rows, columns)
         ],
     }
     return _module(needs, q, u, theta, model.time_symbols)
@@ -164,7 +165,7 @@ def second_source(model: Model) -> str:
     q, u = list(model.state_symbols.values()), list(model.input_symbols.values())
     theta, frequency = list(model.parameter_symbols.values()), model.time_symbols["frequency"]
     change = {symbol: sp.Symbol(f"c_{symbol.name}", real=True) for symbol in (*q, *u, *theta, frequency)}
-    jacobian = sp.Matrix(model.equations).jacobian(q)
+    jacobian = _jacobian(list(model.equations), q)
     changes = [
         sum((sp.diff(e, x) * dx for x, dx in change.items() if x in e.free_symbols), sp.S.Zero) for e in jacobian
     ]
@@ -175,6 +176,11 @@ def second_source(model: Model) -> str:
         theta + [change[x] for x in (*theta, frequency)],
         model.time_symbols,
     )
+
+
+def _jacobian(rows: list[sp.Expr], columns: list[sp.Symbol]) -> list[sp.Expr]:
+    """Return ∂rows/∂columns row by row."""
+    return [sp.diff(row, x) if x in row.free_symbols else sp.S.Zero for row in rows for x in columns]
 
 
 def _module(
@@ -203,7 +209,14 @@ def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, 
     lines += ["    for i in range(out.shape[0]):"]
     lines += [f"        {s} = {place}" for s, place in arguments.items() if s in used and "[i" in place]
     lines += [f"        {symbol} = {_code(expression)}" for symbol, expression in common]
-    lines += [f"        out[i, {column}] = {_code(expression)}" for column, expression in enumerate(reduced)]
+    zeros = sum(expression == 0 for expression in reduced)
+    if zeros > MANY_ZEROS:
+        lines += ["        for column in range(out.shape[1]):", "            out[i, column] = 0.0"]
+    lines += [
+        f"        out[i, {column}] = {_code(expression)}"
+        for column, expression in enumerate(reduced)
+        if zeros <= MANY_ZEROS or expression != 0
+    ]
     lines += [] if reduced else ["        pass"]
     header = f'@njit("{GRID_SIGNATURE}", cache=CACHE, nogil=True, error_model="numpy")\n'
     return header + f"def {name}(states, inputs, parameters, tau, frequency, out):\n" + "\n".join(lines) + "\n"

@@ -281,6 +281,29 @@ def periodic_part(equations: PeriodicEquations, states: Mapping[str, np.ndarray]
     return z - equations.drift * grid.tau[:, None]
 
 
+def as_guess(equations: PeriodicEquations, guess: Mapping[str, np.ndarray] | PeriodicSolution) -> np.ndarray:
+    """Return z (points, states) from named states, or from a solution, brought to the grid and repeated as needed.
+
+    Raises
+    ------
+    ValueError
+        For unknown or missing states, arrays of a wrong length, a solution whose periods do not divide those wanted.
+    """
+    if not isinstance(guess, PeriodicSolution):
+        return periodic_part(equations, guess)
+    checks.same_names("guess", guess.states, equations.model.states)
+    if equations.grid.periods % guess.periods:
+        raise ValueError(
+            f"guess: a solution of {guess.periods} periods is not allowed; its periods must divide "
+            f"{equations.grid.periods}."
+        )
+    z = np.stack([guess.states[name] - guess._turns(name) for name in equations.model.states])
+    times = equations.grid.periods // guess.periods
+    if guess.samples != equations.grid.samples:
+        z = fourier.on_grid(fourier.coefficients(z), equations.grid.samples * guess.periods)
+    return np.ascontiguousarray(np.tile(z, times).T)
+
+
 def _by_name(
     values: np.ndarray, rows: tuple[str, ...], directions: tuple[str, ...]
 ) -> dict[str, dict[str, np.ndarray]]:

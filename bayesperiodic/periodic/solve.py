@@ -13,7 +13,7 @@ from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.family import Family, solve_autonomous
 from bayesperiodic.periodic.homotopy import raise_amplitude, sharpen
 from bayesperiodic.periodic.schemes import Scheme
-from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, describe, periodic_part
+from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, as_guess, describe
 from bayesperiodic.periodic.transient import measured_cycle, settled_period
 
 GUESSES = ("static", "integration")
@@ -61,8 +61,9 @@ def solve_periodic(
         Turns that an angle advances per response period.
     guess : "static", "integration", mapping of str to array (samples·periods,), or PeriodicSolution
         The equilibrium under the mean inputs, the end of a short time integration from there, every state (turns of
-        angles included), or an earlier solution. An autonomous model has no use for its equilibrium, so "static" means
-        an integration from near it. The phase of its orbit is the one closest to the guess.
+        angles included), or an earlier solution, on any grid, of as many periods or a fraction of them. An autonomous
+        model has no use for its equilibrium, so "static" means an integration from near it; the phase of its orbit is
+        the one closest to the guess.
 
     Returns
     -------
@@ -124,7 +125,7 @@ def _solve_forced(
     equations: PeriodicEquations, theta: np.ndarray, guess: str | Mapping[str, np.ndarray] | PeriodicSolution
 ) -> tuple[Solved, str]:
     if not isinstance(guess, str):
-        start = periodic_part(equations, guess.states if isinstance(guess, PeriodicSolution) else guess)
+        start = as_guess(equations, guess)
         solved, found_by = solve_from(equations, theta, start)
         return _same_orbit(equations, solved, start), found_by
     checks.one_of("guess", guess, GUESSES)
@@ -205,7 +206,7 @@ def _solve_autonomous(
     else:
         if isinstance(guess, PeriodicSolution):
             frequency = guess.frequency
-        z = periodic_part(equations, guess.states if isinstance(guess, PeriodicSolution) else guess)
+        z = as_guess(equations, guess)
         if np.all(np.ptp(z, axis=0) == 0.0):
             raise ValueError(
                 f"guess: states constant in time are not allowed; {equations.model.name!r} is autonomous, and only a "

@@ -32,6 +32,15 @@ COUPLED = bp.Model(
 )
 COUPLED_AT = {"m": 1.2, "c": 0.4, "k": 30.0, "h": 2.0, "b": 0.7}
 
+RUNAWAY = bp.Model(
+    "runaway",
+    states=["x"],
+    inputs=["u"],
+    parameters=["a"],
+    equations=lambda s, p, u: [s.dx - p.a * (1 + s.x**2) - u.u],
+    outputs=lambda s, p, u: {"x": s.x},
+)
+
 
 def manufactured_force(x, v, a):
     return DUFFING["m"] * a + DUFFING["c"] * v + DUFFING["k"] * x + DUFFING["k3"] * x**3
@@ -88,9 +97,7 @@ def test_error_estimate_is_the_error(scheme, samples):
 
 
 def test_error_estimate_of_a_failed_solve_is_not_a_number():
-    solution = bp.solve_periodic(
-        bp.models.duffing, DUFFING, {"force": np.full(50, 1e300)}, frequency=FREQUENCY, samples=50
-    )
+    solution = bp.solve_periodic(RUNAWAY, {"a": 1.0}, {"u": np.cos(2 * np.pi * grid(100))}, frequency=1.0, samples=100)
     assert not solution.converged and np.isnan(solution.error_estimate()["x"])
     assert solution.multipliers.size == 0 and not solution.stable
 
@@ -213,15 +220,7 @@ def test_rotation_keeps_its_turns():
 
 
 def test_no_equilibrium_ends_in_a_status_and_not_in_an_exception():
-    model = bp.Model(
-        "runaway",
-        states=["x"],
-        inputs=["u"],
-        parameters=["a"],
-        equations=lambda s, p, u: [s.dx - p.a * (1 + s.x**2) - u.u],
-        outputs=lambda s, p, u: {"x": s.x},
-    )
-    solution = bp.solve_periodic(model, {"a": 1.0}, {"u": np.cos(2 * np.pi * grid(100))}, frequency=1.0, samples=100)
+    solution = bp.solve_periodic(RUNAWAY, {"a": 1.0}, {"u": np.cos(2 * np.pi * grid(100))}, frequency=1.0, samples=100)
     assert not solution.converged
     assert solution.status in ("stalled", "singular")
     assert solution.sensitivities == {}
@@ -249,6 +248,22 @@ def test_earlier_solution_as_guess_needs_no_iterations():
     again = bp.solve_periodic(bp.models.duffing, DUFFING, {"force": force}, **arguments, guess=first)
     assert again.iterations <= 1
     assert again.states["x"] == pytest.approx(first.states["x"], rel=1e-9)
+
+
+def test_a_solution_on_another_grid_or_of_fewer_periods_is_a_guess():
+    _, force = manufactured(400)
+    arguments = {"frequency": FREQUENCY, "samples": 400}
+    coarse, _ = solve_manufactured("central2", 100)
+    fine = bp.solve_periodic(bp.models.duffing, DUFFING, {"force": force}, **arguments, guess=coarse)
+    assert fine.converged and fine.history[0, 1] < 2e-3
+    twice = {"force": np.tile(force, 2)}
+    doubled = bp.solve_periodic(bp.models.duffing, DUFFING, twice, **arguments, periods=2, guess=fine)
+    assert doubled.iterations <= 1
+    assert doubled.states["x"] == pytest.approx(np.tile(fine.states["x"], 2), rel=1e-9)
+    with pytest.raises(ValueError, match="guess: a solution of 2 periods is not allowed; its periods must divide 3"):
+        bp.solve_periodic(
+            bp.models.duffing, DUFFING, {"force": np.tile(force, 3)}, **arguments, periods=3, guess=doubled
+        )
 
 
 @pytest.mark.parametrize(
