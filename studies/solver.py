@@ -209,7 +209,7 @@ def measure_periods(values: tuple[float, ...]) -> dict[str, Any]:
                     frequency=start.frequency,
                     samples=n,
                     scheme=scheme,
-                    guess={"x": resampled(start.states["x"], n)},
+                    guess=start,
                 )
                 if solution.converged:
                     found[n] = solution
@@ -329,15 +329,13 @@ def measure_rotations(rotations: dict[str, bp.PeriodicSolution]) -> dict[str, An
         table[name] = {}
         for scheme in SCHEMES:
             samples = 100 if scheme == "fourier" else 800
-            tau = np.arange(samples) / samples
-            phi = resampled(known.states["phi"] - TURN * known.tau, samples) + TURN * tau
-            solution = solve_pendulum({"phi": phi}, samples, scheme, winding=1)
+            solution = solve_pendulum(known, samples, scheme, winding=1)
             table[name][scheme] = {"samples": samples} | compared(solution, ROTATIONS[name])
     return table
 
 
 def solve_pendulum(
-    guess: dict[str, np.ndarray], samples: int, scheme: str, winding: int, periods: int = 1
+    guess: dict[str, np.ndarray] | bp.PeriodicSolution, samples: int, scheme: str, winding: int, periods: int = 1
 ) -> bp.PeriodicSolution:
     """Return an orbit at 9.09 rad/s."""
     return bp.solve_periodic(

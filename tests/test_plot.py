@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -48,6 +50,98 @@ def test_traces_show_every_parameter_with_its_diagnostics(solved):
     figure = bp.plot.traces(posterior)
     assert len(figure.axes) == 4
     assert "R-hat" in figure.axes[0].texts[0].get_text()
+
+
+@pytest.fixture(scope="module")
+def response():
+    """Return a Duffing frequency response with two folds."""
+    force = np.cos(2 * np.pi * np.arange(40) / 40)
+    parameters = {"m": 1.0, "c": 0.2, "k": 1.0, "k3": 0.5}
+    start = bp.solve_periodic(
+        bp.models.duffing, parameters, {"force": force}, frequency=0.1, samples=40, scheme="central4"
+    )
+    return bp.continue_periodic(bp.models.duffing, start, "frequency", until=0.4, step=0.03, progress=False)
+
+
+def lines(axes, style):
+    return [line for line in axes.lines if line.get_linestyle() == style]
+
+
+def test_branch_is_solid_where_stable_dashed_between_its_folds_and_says_so(response):
+    figure = bp.plot.branch(response, unit="m")
+    (axes,) = figure.axes
+    assert labels(figure) == {"frequency [Hz]", "amplitude of displacement [m]"}
+    (dashed,) = lines(axes, "--")
+    folds = [fold.frequency for fold in response.folds]
+    assert sorted(dashed.get_xdata()[[0, -1]]) == sorted(folds)
+    drawn = {*dashed.get_xdata(), *np.concatenate([line.get_xdata() for line in lines(axes, "-")])}
+    assert drawn == set(response.values)
+    (marked,) = [line for line in lines(axes, "None") if line.get_marker() == "o" and len(line.get_xdata())]
+    assert list(marked.get_xdata()) == folds
+    upper = response.folds[0].outputs["displacement"]
+    assert marked.get_ydata()[0] == pytest.approx(np.ptp(upper) / 2)
+    assert [t.get_text() for t in axes.get_legend().get_texts()] == ["stable", "unstable", "fold"]
+
+
+def test_branches_have_their_own_colours_labels_and_marks(response):
+    doubled = replace(response, kinds=("period doubling", *response.kinds[1:]))
+    figure = bp.plot.branch(response, doubled, labels=["one", "other"], measure="period")
+    (axes,) = figure.axes
+    assert [t.get_text() for t in axes.get_legend().get_texts()] == [
+        "one",
+        "other",
+        "stable",
+        "unstable",
+        "fold",
+        "period doubling",
+    ]
+    assert len({line.get_color() for line in axes.lines}) == 2
+    assert axes.lines[0].get_ydata()[0] == pytest.approx(1 / response.values[0])
+    assert axes.get_ylabel() == "period [s]"
+
+
+def test_rotations_are_drawn_by_their_section_points_without_their_turns():
+    parameters = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
+    phi = 2 * np.pi * (np.arange(80) / 80 + 3) - 0.4
+    start = bp.solve_periodic(
+        bp.models.pendulum,
+        parameters,
+        frequency=13 / (2 * np.pi),
+        samples=80,
+        scheme="central4",
+        winding=1,
+        guess={"phi": phi},
+    )
+    branch = bp.continue_periodic(bp.models.pendulum, start, "frequency", until=2.0, progress=False)
+    section = bp.plot.branch(branch, measure="section", angular=True).axes[0]
+    assert section.get_xlabel() == "angular frequency [rad/s]"
+    assert section.lines[0].get_xdata()[0] == pytest.approx(13.0)
+    assert section.lines[0].get_ydata()[0] == pytest.approx(-0.386461826143287, abs=1e-5)
+    amplitude = bp.plot.branch(branch).axes[0].lines[0].get_ydata()
+    assert 0.1 < amplitude[0] < 1.0
+    own = bp.plot.branch(branch, measure=lambda s: [s.outputs["rate"].min(), s.outputs["rate"].max()]).axes[0]
+    low, high = (line.get_ydata() for line in own.lines[:2])
+    assert np.all(low < high)
+    assert len(low) == len(branch)
+
+
+def test_what_cannot_be_drawn_of_branches_is_told(response):
+    with pytest.raises(ValueError, match="output: 'force' is not known"):
+        bp.plot.branch(response, output="force")
+    with pytest.raises(ValueError, match="measure: 'size' is not known"):
+        bp.plot.branch(response, measure="size")
+    with pytest.raises(ValueError, match="labels: 2 are not allowed; there must be 1"):
+        bp.plot.branch(response, labels=["a", "b"])
+    with pytest.raises(ValueError, match="more: .'k3'. is not allowed; all must vary 'frequency'"):
+        bp.plot.branch(response, replace(response, vary="k3"))
+
+
+def test_branch_draws_into_given_axes(response):
+    figure, (left, right) = plt.subplots(1, 2)
+    assert bp.plot.branch(response, ax=right) is figure
+    assert not left.lines and right.lines
+    other = plt.figure()
+    assert bp.plot.branch(response, figure=other) is other
 
 
 def test_a_given_figure_is_used_and_returned(solved):

@@ -216,15 +216,8 @@ def iterate_periodic(
     if until == values[0]:
         raise ValueError(f"until: {until!r} is not allowed; {vary} has that value at the start.")
     step = abs(until - values[0]) / STEPS if step is None else checks.positive("step", step)
-    located: dict[int, str] = {}
-
-    def refine(tracer: Tracer, before: Point, after: Point) -> list[Point]:
-        found = _between(tracer, family, before, after)
-        located.update({id(point): kind for kind, point in found})
-        return [point for _, point in found]
-
-    for point in trace(family, z, values, until=until, step=step, refine=refine):
-        yield float(point.values[0]), _solution(family, point), located.get(id(point), "")
+    for point in trace(family, z, values, until=until, step=step, refine=_special_points):
+        yield float(point.values[0]), _solution(family, point), point.kind
 
 
 def double_period(model: Model, solution: PeriodicSolution, vary: str) -> PeriodicSolution:
@@ -305,38 +298,50 @@ def _solution(family: Family, point: Point, sensitivities: bool = False) -> Peri
     return describe(equations, parameters, solved, FOUND_BY, sensitivities)
 
 
-def _between(tracer: Tracer, family: Family, before: Point, after: Point) -> list[tuple[str, Point]]:
+def _special_points(tracer: Tracer, before: Point, after: Point) -> list[Point]:
     """Return the folds and period doublings between two neighbouring points, in order."""
-    tests: dict[str, Callable[[Point], float]] = {
-        FOLD: lambda point: float(point.tangent[1][0]),
-        PERIOD_DOUBLING: lambda point: _doubling_test(_solution(family, point)),
-    }
     found = []
-    for kind, test in tests.items():
-        low, high = test(before), test(after)
-        if not low * high < 0.0:
-            continue
-        span = after.distance - before.distance
-        corrected: dict[float, Point] = {0.0: before, span: after}
-
-        def at(distance: float, corrected: dict[float, Point] = corrected) -> Point:
-            if distance not in corrected:
-                result = tracer.correct(before, distance)
-                if result is None:
-                    raise RuntimeError("lost")
-                corrected[distance] = result[0]
-            return corrected[distance]
-
-        try:
-            root = brentq(lambda d, test=test, at=at: test(at(d)), 0.0, span, xtol=LOCATED * span, rtol=1e-14)
-            found.append((kind, at(root)))
-        except RuntimeError:
-            continue
-    return sorted(found, key=lambda item: item[1].distance)
+    for kind, test in ((FOLD, _fold_test), (PERIOD_DOUBLING, _doubling_test)):
+        if test(tracer, before) * test(tracer, after) < 0.0:
+            found += _locate(tracer, before, after, kind, test)
+    return sorted(found, key=lambda point: point.distance)
 
 
-def _doubling_test(solution: PeriodicSolution) -> float:
+def _locate(
+    tracer: Tracer, before: Point, after: Point, kind: str, test: Callable[[Tracer, Point], float]
+) -> list[Point]:
+    """Return the point where a test changes sign, in a list that is empty if the branch is lost on the way."""
+    span = after.distance - before.distance
+    known: dict[float, Point] = {0.0: before, span: after}
+
+    def at(distance: float) -> float:
+        if distance not in known:
+            corrected = tracer.correct(before, distance)
+            if corrected is None:
+                raise _Lost
+            known[distance] = corrected[0]
+        return test(tracer, known[distance])
+
+    try:
+        root = brentq(at, 0.0, span, xtol=LOCATED * span, rtol=1e-14)
+        at(root)
+    except _Lost:
+        return []
+    return [known[root]._replace(kind=kind)]
+
+
+class _Lost(Exception):
+    """A correction failed."""
+
+
+def _fold_test(tracer: Tracer, point: Point) -> float:
+    """Return how fast the quantity varied changes along the branch."""
+    return float(point.tangent[1][0])
+
+
+def _doubling_test(tracer: Tracer, point: Point) -> float:
     """Return a number that changes sign where a multiplier passes −1."""
+    solution = _solution(tracer.family, point)
     exponents = solution.floquet.exponents if solution.floquet is not None else np.array([np.nan])
     growth = np.abs(exponents.real)
     parts = np.exp(-growth) + np.exp(exponents - growth)

@@ -131,7 +131,10 @@ def solve_family(
         z, values = trial, trial_values
         if full <= kernels.STEP_TOLERANCE or (
             damping == 1.0
-            and (rounded or (full < 0.2 * previous < np.inf and full**2 <= kernels.STEP_TOLERANCE * previous))
+            and (
+                rounded
+                or (full < kernels.CHORD_RATE * previous < np.inf and full**2 <= kernels.STEP_TOLERANCE * previous)
+            )
         ):
             return Found(z, values, CONVERGED, np.array(history))
         previous = full if damping == 1.0 else np.inf

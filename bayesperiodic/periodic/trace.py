@@ -16,12 +16,13 @@ GROWTH = 1.5
 
 
 class Point(NamedTuple):
-    """A point of a branch: z (points, states), the free scalars, the unit tangent, and how far along the branch."""
+    """A point of a branch: z (points, states), the free scalars, the unit tangent, how far along, what is special."""
 
     z: np.ndarray
     values: np.ndarray
     tangent: tuple[np.ndarray, np.ndarray]
     distance: float
+    kind: str = ""
 
 
 class Tracer:
