@@ -277,7 +277,7 @@ def branch(
     *more: Branch,
     measure: str | Callable[[PeriodicSolution], float | np.ndarray] = "amplitude",
     output: str | None = None,
-    unit: str = "",
+    unit: str | None = None,
     labels: Sequence[str] | None = None,
     angular: bool = False,
     figure: Figure | None = None,
@@ -296,8 +296,8 @@ def branch(
         count.
     output : str, optional
         By default the first one.
-    unit : str
-        That of what is drawn; for the period it is s.
+    unit : str, optional
+        That of what is drawn; by default the output's, or s for the period.
     labels : sequence of str, optional
         One for each branch, for the legend.
     angular : bool
@@ -323,7 +323,7 @@ def branch(
     >>> start = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
     ...                           frequency=0.1, samples=50, scheme="central4")
     >>> response = bp.continue_periodic(bp.models.duffing, start, "frequency", until=0.4, step=0.05, progress=False)
-    >>> figure = bp.plot.branch(response, unit="m")
+    >>> figure = bp.plot.branch(response)
     >>> figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()
     ('frequency [Hz]', 'amplitude of displacement [m]')
     """
@@ -348,8 +348,10 @@ def branch(
             at = np.array([k == kind for k in b.kinds])
             every = np.repeat(across[at], up.shape[1])
             ax.plot(every, up[at].ravel(), marker, color=colour, mfc="white", ms=6, mew=1.4, ls="none", zorder=4)
-    ax.set_xlabel("angular frequency [rad/s]" if factor != 1.0 else _label(branch.vary, branch.unit))
-    ax.set_ylabel(_measure_label(measure, output, unit))
+    ax.set_xlabel(
+        "angular frequency [rad/s]" if factor != 1.0 else _label(branch.vary, branch.units.get(branch.vary, ""))
+    )
+    ax.set_ylabel(_measure_label(measure, output, branch.units.get(output, "") if unit is None else unit))
     ax.legend(handles=_branch_handles(branches, labels), frameon=False)
     return cast(Figure, ax.figure)
 

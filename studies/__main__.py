@@ -20,7 +20,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1, help="of everything random (default 1)")
     parser.add_argument("--quick", action="store_true", help="short chains, into figures/quick/NAME; not for quoting")
     options = parser.parse_args(arguments)
-    known = {m.name: m for m in pkgutil.iter_modules(studies.__path__) if m.name not in ("__main__", "common")}
+    names = (m.name for m in pkgutil.iter_modules(studies.__path__))
+    known = [name for name in names if name != "common" and "_" not in name]  # an underscore: a part of a study
     if options.name is None:
         for name in sorted(known):
             print(f"{name:12s} {_first_line(name)}")

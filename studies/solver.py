@@ -16,7 +16,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from studies import common
+from studies import common, solver_cost
 
 SCHEMES = {"backward2": "#D55E00", "central2": "#E69F00", "central4": "#009E73", "fourier": "#0072B2"}
 TURN = 2 * np.pi
@@ -43,7 +43,7 @@ SHOWN = {1.0: "o", 5.0: "s"}
 
 PENDULUM = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
 LOCKED, CHAOTIC, LOWEST = 13.0, 9.09, 4.5
-INTEGRATED = (12.6, 12.2, 11.2, 10.4, 9.8, 9.7, 9.57, 9.5, 9.434, 9.4)
+INTEGRATED = (12.6, 12.2, 11.2, 10.4, 9.8, 9.7, 9.57, 9.5, 9.434, 9.39)
 # Angular frequencies [rad/s] where a multiplier passes −1 on the branches of periods 1, 2 and 4, and on that of
 # period 1 far below, where it then turns in a fold; multiple shooting.
 DOUBLINGS = {1: 11.777800948492088, 2: 9.626472743642093, 4: 9.452278937446584}
@@ -102,6 +102,8 @@ def run(options: argparse.Namespace) -> None:
         route, results["pendulum"] = follow_pendulum(quick)
     with watch.part("orbits", f"unstable orbits of periods 3 and 5 at {CHAOTIC:g} rad/s"):
         results["orbits"] = measure_orbits(ORBITS[1::4] if quick else ORBITS)
+    with watch.part("cost", "what a solve costs, side by side with LAPACK"):
+        results["cost"] = solver_cost.run_cost(quick)
     with watch.part("time_integration", "the pendulum integrated in time, for the figure"):
         attractor = integrate_down(INTEGRATED[2:3] if quick else INTEGRATED)
     with watch.part("figures", "drawing"):
@@ -112,6 +114,7 @@ def run(options: argparse.Namespace) -> None:
         }
         paths = common.save_figures(options.out, figures)
     results["checks"] = checks(results)
+    results["cost"]["checks"] = [verdict(*row) for row in solver_cost.checks(results["cost"])]
     print("\n" + tables(results) + "\n")
     path = common.write_results(options.out, results | {"seconds": watch.total(), "versions": common.versions()})
     print(f"figures: {', '.join(map(str, paths))}\nresults: {path}")
@@ -266,7 +269,7 @@ def follow_pendulum(quick: bool) -> tuple[dict[int, bp.Branch], dict[str, Any]]:
     )
     branches = {1: bp.continue_periodic(model, start, "frequency", until=CHAOTIC / TURN, step=step, progress=False)}
     for periods in (2, 4) if quick else (2, 4, 8):
-        doubling = branches[periods // 2].period_doublings[0]
+        doubling = first(branches[periods // 2].period_doublings, f"period {periods // 2}")
         doubled = bp.double_period(model, doubling, "frequency")
         back, ahead = (
             bp.continue_periodic(model, doubled, "frequency", until=until, step=step, progress=False)
@@ -274,6 +277,7 @@ def follow_pendulum(quick: bool) -> tuple[dict[int, bp.Branch], dict[str, Any]]:
         )
         branches[periods] = joined(back, ahead)
     down = bp.continue_periodic(model, branches[1][-1], "frequency", until=LOWEST / TURN, step=step, progress=False)
+    doubling, fold = first(down.period_doublings, "far below"), first(down.folds, "far below")
     found = {p: [s.frequency * TURN for s in b.period_doublings] for p, b in branches.items()}
     table = {
         "scheme": "central4",
@@ -288,15 +292,22 @@ def follow_pendulum(quick: bool) -> tuple[dict[int, bp.Branch], dict[str, Any]]:
         | {str(p): {"found": found[p]} for p in branches if p not in DOUBLINGS},
         "multipliers": {str(p): compared(branches[p][-1], BRANCHES[p]) for p in BRANCHES},
         "below": {
-            "doubling": down.period_doublings[0].frequency * TURN,
-            "doubling_difference": abs(down.period_doublings[0].frequency * TURN - LOW_DOUBLING),
-            "fold": down.folds[0].frequency * TURN,
-            "fold_difference": abs(down.folds[0].frequency * TURN - LOW_FOLD),
+            "doubling": doubling.frequency * TURN,
+            "doubling_difference": abs(doubling.frequency * TURN - LOW_DOUBLING),
+            "fold": fold.frequency * TURN,
+            "fold_difference": abs(fold.frequency * TURN - LOW_FOLD),
             "back_at": down[-1].frequency * TURN,
         },
         "rotations": measure_rotations({"first": branches[1][-1], "second": down[-1]}),
     }
     return branches, table
+
+
+def first(points: tuple[bp.PeriodicSolution, ...], where: str) -> bp.PeriodicSolution:
+    """Return the first of the special points of a branch."""
+    if not points:
+        raise RuntimeError(f"pendulum, {where}: the fold or period doubling that must be there was not found.")
+    return points[0]
 
 
 def joined(back: bp.Branch, ahead: bp.Branch) -> bp.Branch:
@@ -315,7 +326,7 @@ def compared(solution: bp.PeriodicSolution, reference: tuple[float, float]) -> d
     return {
         "multipliers": found.real.tolist(),
         "reference": list(reference),
-        "relative_difference": float(np.max(np.abs(found / np.array(reference) - 1.0))),
+        "relative_difference": float(np.max(np.abs(found / np.array(reference) - 1.0))) if found.size else np.inf,
         "status": solution.status,
         "iterations": solution.iterations,
         "section": [solution.states["phi"][0], solution.outputs["rate"][0]],
@@ -389,7 +400,7 @@ def integrate_down(frequencies: tuple[float, ...], settling: int = 48, kept: int
 
 def draw_duffing(branches: dict[float, bp.Branch]) -> Figure:
     """Draw the frequency responses and shade where the strongest force has two stable states."""
-    figure = bp.plot.branch(*branches.values(), labels=[f"force {level:g} N" for level in branches], unit="m")
+    figure = bp.plot.branch(*branches.values(), labels=[f"force {level:g} N" for level in branches])
     axes = figure.axes[0]
     low, high = sorted(fold.frequency for fold in branches[LEVELS[-1]].folds)
     axes.axvspan(low, high, color="0.92", lw=0, zorder=0)
@@ -417,7 +428,6 @@ def draw_pendulum(branches: dict[int, bp.Branch], attractor: dict[float, np.ndar
             *shown.values(),
             measure="section",
             output="rate",
-            unit="rad/s",
             labels=[f"period {p}" for p in shown],
             angular=True,
             ax=axes,
@@ -429,9 +439,11 @@ def draw_pendulum(branches: dict[int, bp.Branch], attractor: dict[float, np.ndar
         assert legend is not None
         handles = legend.legend_handles if axes is whole else legend.legend_handles[1 : len(shown)]
         axes.legend(handles=[*handles, *([dots] if axes is whole else [])], frameon=False, loc="lower right")
-    whole.set(xlim=(9.0, 13.1), ylim=(7.0, 17.5), title=f"from {LOCKED:g} to {CHAOTIC:g} rad/s")
-    enlarged.set(xlim=(9.38, 9.72), ylim=(9.4, 12.6), title="the boxed part enlarged")
-    whole.indicate_inset(bounds=(9.38, 9.4, 0.34, 3.2), edgecolor="0.4")
+    whole.set(xlim=(9.0, 13.1), ylim=(7.0, 17.5), title=f"pendulum, from {LOCKED:g} to {CHAOTIC:g} rad/s")
+    enlarged.set(xlim=(9.37, 9.71), ylim=(9.4, 12.6), title="the boxed part enlarged")
+    if INTEGRATED[-1] in attractor:
+        enlarged.text(INTEGRATED[-1] + 0.006, 11.1, "chaotic beyond\nthe cascade", fontsize=9, va="center")
+    whole.indicate_inset(bounds=(9.37, 9.4, 0.34, 3.2), edgecolor="0.4")
     return figure
 
 
@@ -440,7 +452,7 @@ def draw_orders(forced: dict[str, Any], periods: dict[str, Any]) -> Figure:
     from matplotlib import pyplot as plt
 
     figure = plt.figure(figsize=(10.0, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     for scheme, colour in SCHEMES.items():
         entry = forced[scheme]
         order = "" if entry["order"] is None else f", fitted order {entry['order']:.2f}"
@@ -462,7 +474,8 @@ def draw_orders(forced: dict[str, Any], periods: dict[str, Any]) -> Figure:
         axes.legend(frameon=False, fontsize=9)
     left.set_ylabel("largest error / largest displacement")
     left.set_title("Duffing, smooth forcing: displacement")
-    right.set_ylabel("error / period")
+    right.set_ylabel("relative error of the period")
+    right.set_ylim(top=1.0)
     right.set_title("van der Pol: period of the free oscillation")
     return figure
 
@@ -481,9 +494,9 @@ def checks(results: dict[str, Any]) -> list[dict[str, Any]]:
     for scheme, limit in (("backward2", 1e-3), ("central2", 1e-5), ("central4", 1e-8), ("fourier", 1e-8)):
         worst = max(by_scheme[scheme]["relative_difference"] for by_scheme in pendulum["rotations"].values())
         rows.append((f"multipliers of the period-1 rotations, {scheme}, relative", worst, 0.0, limit))
-    for periods_, entry in pendulum["doublings"].items():
+    for p, entry in pendulum["doublings"].items():
         if "difference" in entry:
-            rows.append((f"doubling of period {periods_} [rad/s]", entry["difference"], 0.0, 1e-4))
+            rows.append((f"doubling of period {p} [rad/s]", entry["difference"], 0.0, 1e-4))
     for what in ("doubling", "fold"):
         rows.append((f"{what} far below [rad/s]", pendulum["below"][f"{what}_difference"], 0.0, 1e-4))
     for scheme, limit in (("central2", 1e-4), ("central4", 1e-5)):
@@ -493,10 +506,12 @@ def checks(results: dict[str, Any]) -> list[dict[str, Any]]:
         if entry["folds"]:
             worst = float(np.max(np.abs(np.subtract(entry["folds"], entry["folds_fourier"]))))
             rows.append((f"Duffing's folds at {entry['force']:g} N, central4 against fourier [Hz]", worst, 0.0, 1e-5))
-    return [
-        {"what": what, "found": found, "low": low, "high": high, "met": bool(low <= found <= high)}
-        for what, found, low, high in rows
-    ]
+    return [verdict(*row) for row in rows]
+
+
+def verdict(what: str, found: float, low: float, high: float) -> dict[str, Any]:
+    """Return a check as results.json holds it."""
+    return {"what": what, "found": found, "low": low, "high": high, "met": bool(low <= found <= high)}
 
 
 def at(entry: dict[str, Any], samples: int, what: str = "errors") -> float:
@@ -550,14 +565,15 @@ def tables(results: dict[str, Any]) -> str:
     for e in results["duffing"]:
         folds = " and ".join(f"{f:.6f} Hz" for f in sorted(e["folds"])) or "none"
         lines.append(f"  force {e['force']:g} N: {folds}")
-    lines += ["", "What must show"]
-    verdicts = [
-        {
-            "": "yes" if c["met"] else "NO",
-            "what": c["what"],
-            "found": f"{c['found']:.4g}",
-            "allowed": f"≤ {c['high']:g}" if c["low"] == 0.0 else f"{c['low']:g} … {c['high']:g}",
-        }
-        for c in results["checks"]
-    ]
-    return "\n".join([*lines, pd.DataFrame(verdicts).to_string(index=False)])
+    for title, rows in (("What must show", results["checks"]), ("What it costs", results["cost"]["checks"])):
+        verdicts = [
+            {
+                "": "yes" if c["met"] else "NO",
+                "what": c["what"],
+                "found": f"{c['found']:.4g}",
+                "allowed": f"≤ {c['high']:g}" if c["low"] == 0.0 else f"{c['low']:g} … {c['high']:g}",
+            }
+            for c in rows
+        ]
+        lines += ["", title, pd.DataFrame(verdicts).to_string(index=False)]
+    return "\n".join(lines)

@@ -68,7 +68,7 @@ def lines(axes, style):
 
 
 def test_branch_is_solid_where_stable_dashed_between_its_folds_and_says_so(response):
-    figure = bp.plot.branch(response, unit="m")
+    figure = bp.plot.branch(response)
     (axes,) = figure.axes
     assert labels(figure) == {"frequency [Hz]", "amplitude of displacement [m]"}
     (dashed,) = lines(axes, "--")

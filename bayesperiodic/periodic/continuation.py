@@ -26,7 +26,7 @@ FOLD, PERIOD_DOUBLING = "fold", "period doubling"
 STEPS = 50
 LOCATED = 1e-9
 FOUND_BY = "continuation"
-DOUBLED = 0.02
+DOUBLED = 0.005
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class Branch(Result, Sequence):
     ----------
     vary : str
         What was varied: "frequency" [Hz], a parameter, or an input (its scale, 1 at the start).
-    unit : str
-        That of `vary`, if known.
+    units : dict of str to str
+        Of what was varied (under its own name), and of the model's parameters, states, inputs and outputs, if known.
     values : array (points,)
         Of what was varied.
     solutions : tuple of PeriodicSolution
@@ -50,7 +50,7 @@ class Branch(Result, Sequence):
     """
 
     vary: str
-    unit: str
+    units: dict[str, str]
     values: np.ndarray
     solutions: tuple[PeriodicSolution, ...]
     kinds: tuple[str, ...]
@@ -101,7 +101,7 @@ class Branch(Result, Sequence):
                 "kind": ("point", list(self.kinds)),
             },
             coords={
-                "value": ("point", self.values, {"units": self.unit, "long_name": self.vary}),
+                "value": ("point", self.values, {"units": self.units.get(self.vary, ""), "long_name": self.vary}),
                 "tau": first.tau,
                 "state": list(first.states),
                 "output": list(first.outputs),
@@ -110,9 +110,9 @@ class Branch(Result, Sequence):
         )
 
     def __repr__(self) -> str:
+        span = f"{self.values[0]:.6g} … {self.values[-1]:.6g} {self.units.get(self.vary, '')}".rstrip()
         return (
-            f"Branch({self.solutions[0].model!r}, {self.vary} {self.values[0]:.6g} … {self.values[-1]:.6g}"
-            f"{' ' + self.unit if self.unit else ''}, {len(self)} points, {len(self.folds)} folds, "
+            f"Branch({self.solutions[0].model!r}, {self.vary} {span}, {len(self)} points, {len(self.folds)} folds, "
             f"{len(self.period_doublings)} period doublings{'' if self.complete else ', stuck'})"
         )
 
@@ -175,9 +175,9 @@ def continue_periodic(
             kinds.append(kind)
             bar.set_postfix_str(f"{vary} = {value:.6g}")
             bar.update()
-    unit = "Hz" if vary == FREQUENCY else "" if vary in model.inputs else model.units.get(vary, "")
+    units = model.units | ({FREQUENCY: "Hz"} if vary == FREQUENCY else {vary: ""} if vary in model.inputs else {})
     complete = values[-1] == until or (len(values) > 1 and values[-1] == values[0])
-    return Branch(vary, unit, np.array(values), tuple(solutions), tuple(kinds), complete)
+    return Branch(vary, units, np.array(values), tuple(solutions), tuple(kinds), complete)
 
 
 def iterate_periodic(
@@ -234,8 +234,8 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
     Returns
     -------
     PeriodicSolution
-        Of twice the periods (for an autonomous model, twice the samples at half the frequency), 2 % of the orbit's size
-        away from the old one; or with the status "singular" where the step fails.
+        Of twice the periods (for an autonomous model, twice the samples at half the frequency), half a per cent of the
+        orbit's size away from the old one; or with the status "singular" where the step fails.
 
     Raises
     ------

@@ -1,0 +1,312 @@
+"""What a solve costs: against LAPACK on the same matrices, after a small change, with size, and on several cores.
+
+This is the one module of the studies that looks inside the package: it times single Newton iterations.
+"""
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+import numba
+import numpy as np
+from scipy.linalg import lapack
+
+import bayesperiodic as bp
+from bayesperiodic.parallel import available_cores
+from bayesperiodic.periodic.batch import Anchor, Batch
+from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
+
+GEAR = {
+    "theta1": 80.0, "theta2": 0.0, "theta3": 8e3, "theta4": 5e-3, "theta5": 1e6 / 293, "theta6": -2.5, "theta7": 0.0,
+    "theta8": 150.0, "theta9": 1e-4, "theta10": 300.0, "theta11": -500.0, "theta12": 0.0, "theta15": 17.0,
+    "theta16": 2.0, "theta17": -293.0,
+}  # fmt: skip
+# Frequency [Hz], force amplitude about 4.5 kN [N], displacement amplitude about 0.12 m [m].
+RIG = (
+    (0.05, 1500, 0.080), (0.1, 1400, 0.070), (0.15, 1300, 0.060), (0.2, 1200, 0.055), (0.3, 1100, 0.048),
+    (0.4, 1000, 0.041), (0.5, 900, 0.035), (0.7, 800, 0.028), (1.0, 700, 0.021), (1.4, 650, 0.015), (2.0, 600, 0.0097),
+    (3.0, 600, 0.0060), (4.0, 600, 0.0040), (6.0, 600, 0.0021),
+)  # fmt: skip
+SAMPLES = 800
+CHANGE = 0.01
+OFF = 1e-3
+REPEATS = 15
+LOOP = 5_000_000
+CALLS = 20
+LINEAR_SIZES = (200, 400, 800, 1600, 3200, 6400, 12800, 25600, 51200)
+MASSES = (1, 2, 5, 10, 20, 30, 40, 50)
+
+
+def run_cost(quick: bool = False) -> dict[str, Any]:
+    """Return everything measured, as plain data; times in microseconds are medians of interleaved repeats."""
+    repeats = 5 if quick else REPEATS
+    return {
+        "newton_iteration": [newton_iteration(drive, scheme, repeats) for drive, scheme in _variants()],
+        "warm_solve": [warm_solve(drive, scheme, repeats) for drive, scheme in _variants()],
+        "with_samples": with_samples(LINEAR_SIZES[:5] if quick else LINEAR_SIZES, repeats),
+        "with_systems": with_systems(repeats),
+        "with_masses": with_masses(MASSES[:4] if quick else MASSES),
+    }
+
+
+def checks(cost: dict[str, Any]) -> list[tuple[str, float, float, float]]:
+    """Return what the measurements should show: what, the value found, and the limits allowed."""
+    rows = []
+    for entry in cost["newton_iteration"]:
+        what = f"Newton iteration / (sweep + gbtrf + gbtrs), {entry['drive']}, {entry['scheme']}"
+        rows.append((what, entry["ratio_median"], 0.0, entry["target"]))
+    for entry in cost["warm_solve"]:
+        what = f"solve after a 1 % change in Newton iterations, {entry['drive']}, {entry['scheme']}"
+        rows.append((what, entry["newton_iterations_median"], 0.0, entry["target"]))
+    for scheme, entry in cost["with_samples"].items():
+        rows.append((f"slope of the cost with n, {scheme}", entry["slope"], 0.9, 1.1))
+    rows.append(("slope of the cost with the number of systems", cost["with_systems"]["slope"], 0.9, 1.1))
+    rows.append(("gain of all cores / that of a plain loop", cost["with_systems"]["ratio"], 0.9, np.inf))
+    rows.append(("slope of the cost with masses", cost["with_masses"]["slope"], 2.0, 3.2))
+    return rows
+
+
+def _variants() -> list[tuple[str, str]]:
+    return [(drive, scheme) for drive in ("force", "displacement") for scheme in ("backward2", "central2")]
+
+
+def gear_equations(drive: str, scheme: str) -> list[PeriodicEquations]:
+    """Return the equations of the 14 experiments (synthetic inputs, pure sines)."""
+    wave = np.cos(2 * np.pi * np.arange(SAMPLES) / SAMPLES)
+    return [
+        PeriodicEquations.build(
+            bp.models.landing_gear(drive),
+            {drive: 4500.0 + force * wave if drive == "force" else 0.12 + stroke * wave},
+            frequency=frequency,
+            samples=SAMPLES,
+            scheme=scheme,
+            periods=1,
+            winding=0,
+        )
+        for frequency, force, stroke in RIG
+    ]
+
+
+def newton_iteration(drive: str, scheme: str, repeats: int) -> dict[str, Any]:
+    """Compare one Newton iteration with one sweep plus LAPACK's gbtrf and gbtrs on the same folded band.
+
+    The iteration is the time of a solve from a guess 0.1 % off over its iterations, so it carries its share of what a
+    solve does once. The copy that gbtrf needs, because it overwrites the band, is timed alone and taken off.
+    """
+    theta = np.array(list(GEAR.values()))
+    measured = []
+    for equations in gear_equations(drive, scheme):
+        z = equations.solve(theta, equations.static_guess(theta)).z
+        newton, iterations = _prepared(equations, theta, z * (1.0 + OFF))
+        band, lower = _lapack_band(equations, equations.residual_jacobian(z, theta))
+        working = band.copy(order="F")
+        right = np.random.default_rng(1).standard_normal(band.shape[1])
+        factored, pivots, _ = lapack.dgbtrf(band, lower, lower)
+        columns = equations.residual_jacobian(z, theta)
+        sweep = (
+            equations.states(z), equations.inputs, theta, equations.grid.tau, equations.frequency, columns
+        )  # fmt: skip
+
+        def copy(working: np.ndarray = working, band: np.ndarray = band) -> None:
+            working[:] = band
+
+        def factor(working: np.ndarray = working, band: np.ndarray = band, lower: int = lower) -> None:
+            working[:] = band
+            lapack.dgbtrf(working, lower, lower, overwrite_ab=True)
+
+        times = _interleaved(
+            repeats,
+            newton=newton,
+            sweep=partial(equations.model.kernels.residual_jacobian, *sweep),
+            copy=copy,
+            factor=factor,
+            gbtrs=partial(lapack.dgbtrs, factored, lower, lower, right, pivots),
+        )
+        measured.append(
+            {
+                "newton": times["newton"] / iterations,
+                "sweep": times["sweep"],
+                "gbtrf": times["factor"] - times["copy"],
+                "gbtrs": times["gbtrs"],
+            }
+        )
+    floors = [m["sweep"] + m["gbtrf"] + m["gbtrs"] for m in measured]
+    ratios = [m["newton"] / floor for m, floor in zip(measured, floors, strict=True)]
+    return {
+        "drive": drive,
+        "scheme": scheme,
+        "sweep_gbtrf_gbtrs_us": float(np.median(floors)),
+        **{f"{part}_us": float(np.median([m[part] for m in measured])) for part in measured[0]},
+        "ratio_median": float(np.median(ratios)),
+        "ratio_worst": max(ratios),
+        "target": 0.6 if (drive, scheme) == ("force", "backward2") else 1.0,
+    }
+
+
+def _prepared(equations: PeriodicEquations, theta: np.ndarray, guess: np.ndarray) -> tuple[Callable[[], Any], int]:
+    """Return a solve from a guess with its work arrays at hand, and how many Newton iterations it takes."""
+    z, grid = guess.copy(), equations.grid
+    states, columns = equations.states(z), equations.residual_jacobian(z, theta)
+    history, factors = np.empty((equations.kernels.MAX_ITERATIONS, 3)), empty_factors(grid, equations.count)
+
+    def solve() -> tuple[int, int]:
+        z[:] = guess
+        return equations.kernels.newton(
+            equations.model.kernels.residual_jacobian, grid.packed, equations.inputs, theta, grid.tau,
+            equations.frequency, equations.drift, z, history, states, columns, factors,
+        )  # fmt: skip
+
+    return solve, solve()[1]
+
+
+def warm_solve(drive: str, scheme: str, repeats: int, changes: int = 20) -> dict[str, Any]:
+    """Time solves after every parameter has changed by 1 % up or down, from an anchor, in Newton iterations.
+
+    They end when the next step expected is below 1e-9 of the state.
+    """
+    theta = np.array(list(GEAR.values()))
+    changed = theta * (1.0 + CHANGE * np.random.default_rng(2).choice([-1.0, 1.0], (changes, theta.size)))
+    costs, steps = [], []
+    for equations in gear_equations(drive, scheme):
+        z = equations.solve(theta, equations.static_guess(theta)).z
+        batch = Batch([equations], [Anchor.at(equations, theta, z)])
+        _, status, used = batch.solve(changed, threads=1)
+        if status.any():
+            raise RuntimeError(f"A warm solve failed at {equations.frequency} Hz.")
+        newton, iterations = _prepared(equations, theta, z * (1.0 + OFF))
+        times = _interleaved(repeats, calls=3, warm=partial(batch.solve, changed, threads=1), newton=newton)
+        costs.append(times["warm"] / changes / (times["newton"] / iterations))
+        steps.append(float(used.mean()))
+    return {
+        "drive": drive,
+        "scheme": scheme,
+        "change": CHANGE,
+        "newton_iterations_median": float(np.median(costs)),
+        "newton_iterations_worst": max(costs),
+        "worst_at_hz": RIG[int(np.argmax(costs))][0],
+        "steps_mean": steps,
+        "target": 2.0,
+    }
+
+
+def with_samples(sizes: tuple[int, ...], repeats: int) -> dict[str, Any]:
+    """Time a Newton iteration of the force-driven gear at 1 Hz for growing n; fit the log-log slope from n = 800."""
+    theta, result = np.array(list(GEAR.values())), {}
+    for scheme in ("backward2", "central2"):
+        times = []
+        for samples in sizes:
+            wave = np.cos(2 * np.pi * np.arange(samples) / samples)
+            equations = PeriodicEquations.build(
+                bp.models.landing_gear(), {"force": 4500.0 + 700.0 * wave}, frequency=1.0, samples=samples,
+                scheme=scheme, periods=1, winding=0,
+            )  # fmt: skip
+            z = equations.solve(theta, equations.static_guess(theta)).z
+            newton, iterations = _prepared(equations, theta, z * (1.0 + OFF))
+            times.append(_interleaved(repeats, calls=3, newton=newton)["newton"] / iterations)
+        result[scheme] = {
+            "samples": list(sizes),
+            "us": times,
+            "slope": _slope(sizes[2:], times[2:]),
+        }
+    return result
+
+
+def with_systems(repeats: int, systems: int = 512) -> dict[str, Any]:
+    """Compare what both cores gain on a batch of solves with what they gain on a plain compute loop in the same run."""
+    theta = np.array(list(GEAR.values()))
+    (equations,) = gear_equations("force", "backward2")[8:9]
+    z = equations.solve(theta, equations.static_guess(theta)).z
+    batch = Batch([equations], [Anchor.at(equations, theta, z)])
+    changed = theta * (1.0 + CHANGE * np.random.default_rng(3).standard_normal((systems, theta.size)))
+    cores = available_cores()
+    counts = (64, 128, 256, systems)
+    times = [
+        _interleaved(repeats, calls=1, solves=partial(batch.solve, changed[:c], threads=1))["solves"] for c in counts
+    ]
+    with ThreadPoolExecutor(cores) as pool:
+        list(pool.map(_loop, [10] * cores))
+        both = _interleaved(
+            repeats,
+            calls=1,
+            one=lambda: batch.solve(changed, threads=1),
+            many=lambda: batch.solve(changed, threads=cores),
+            loop_one=lambda: [_loop(LOOP) for _ in range(cores)],
+            loop_many=lambda: list(pool.map(_loop, [LOOP] * cores)),
+        )
+    gain, plain = both["one"] / both["many"], both["loop_one"] / both["loop_many"]
+    return {
+        "systems": list(counts),
+        "us": times,
+        "slope": _slope(counts, times),
+        "cores": cores,
+        "gain": gain,
+        "gain_of_plain_loop": plain,
+        "ratio": gain / plain,
+        "target_ratio": 0.9,
+    }
+
+
+def with_masses(masses: tuple[int, ...], samples: int = 100) -> dict[str, Any]:
+    """Time a Newton iteration of chains of masses; both ways of factoring cost masses³ where the blocks are large.
+
+    The slope is fitted from 10 masses on, where the blocks begin to outweigh the sweep over them.
+    """
+    times = []
+    for count in masses:
+        model = bp.models.chain(count)
+        wave = np.cos(2 * np.pi * np.arange(samples) / samples)
+        equations = PeriodicEquations.build(
+            model, {"force": wave}, frequency=0.3, samples=samples, scheme="central2", periods=1, winding=0
+        )
+        theta = np.array([{"m": 1.0, "c": 0.2, "k": 50.0, "k3": 10.0}[name] for name in model.parameters])
+        z = equations.solve(theta, equations.static_guess(theta)).z
+        newton, iterations = _prepared(equations, theta, z * (1.0 + OFF))
+        times.append(_interleaved(5, calls=1, newton=newton)["newton"] / iterations)
+    large = [m for m in masses if m >= 10] or list(masses[-2:])
+    return {
+        "masses": list(masses),
+        "us": times,
+        "slope": _slope(large, times[-len(large) :]),
+        "slope_from": large[0],
+        "predicted_slope": 3.0,
+    }
+
+
+@numba.njit(nogil=True)
+def _loop(count: int) -> float:
+    total = 0.0
+    for k in range(count):
+        total += 1.0 / (1.0 + k * total)
+    return total
+
+
+def _interleaved(repeats: int, calls: int = CALLS, **actions: Callable[[], Any]) -> dict[str, float]:
+    """Return the median of microseconds a call of each action, all timed in turn within every repeat."""
+    times: dict[str, list[float]] = {name: [] for name in actions}
+    for _ in range(repeats):
+        for name, action in actions.items():
+            start = time.perf_counter()
+            for _ in range(calls):
+                action()
+            times[name].append((time.perf_counter() - start) / calls * 1e6)
+    return {name: float(np.median(values)) for name, values in times.items()}
+
+
+def _slope(sizes: Any, times: Any) -> float:
+    return float(np.polyfit(np.log(sizes), np.log(times), 1)[0])
+
+
+def _lapack_band(equations: PeriodicEquations, columns: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the folded band of ∂g/∂z in LAPACK's storage, with room for pivoting, and its half-width."""
+    grid, count = equations.grid, equations.count
+    lower = grid.half_width * count + count - 1
+    size = grid.points * count
+    rows = np.empty((size, 3 * lower + 1))
+    equations.kernels.assemble(columns, grid.packed, count, equations.frequency, rows)
+    band = np.zeros((3 * lower + 1, size), order="F")
+    for i in range(size):
+        for j in range(max(0, i - lower), min(size, i + lower + 1)):
+            band[2 * lower + i - j, j] = rows[i, j - i + lower]
+    return band, lower
