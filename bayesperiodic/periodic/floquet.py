@@ -26,7 +26,7 @@ GAUSS_MATRIX = np.array(
         [5 / 36 + np.sqrt(15) / 30, 2 / 9 + np.sqrt(15) / 15, 5 / 36],
     ]
 )
-HARMLESS = 1e5
+HARMLESS, IN_RANGE = 1e3, 1e60
 SWEEPS = 8
 DECOUPLED = 1e-11
 CHUNK = 4_000_000
@@ -176,12 +176,13 @@ def _harmless_products(steps: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _spread(matrices: np.ndarray) -> np.ndarray:
-    """Return the ratio of the largest to the smallest stretching; infinite where it cannot be had."""
+    """Return the ratio of the largest to the smallest stretching; infinite where they are far from 1."""
     with np.errstate(all="ignore"):
         if not np.isfinite(matrices).all():
             return np.full(len(matrices), np.inf)
         values = np.linalg.svd(matrices, compute_uv=False)
-        return np.where(values[:, -1] > 0, values[:, 0] / values[:, -1], np.inf)
+        in_range = (values[:, -1] > 1.0 / IN_RANGE) & (values[:, 0] < IN_RANGE)
+        return np.where(in_range, values[:, 0] / values[:, -1], np.inf)
 
 
 def _invariant_bases(groups: np.ndarray, splits: list[int] | None = None) -> tuple[list[int], np.ndarray]:

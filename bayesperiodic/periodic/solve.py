@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesperiodic import checks
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT
+from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, OTHER_ORBIT
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.family import Family, solve_autonomous
 from bayesperiodic.periodic.homotopy import raise_amplitude, sharpen
@@ -172,8 +172,8 @@ def _first_success(*routes: tuple[str, Callable[[], Solved | None]]) -> tuple[So
 
 
 def _same_orbit(equations: PeriodicEquations, solved: Solved, guess: np.ndarray) -> Solved:
-    """Return the solve, marked "other orbit" if it repeats within the response period and its guess did not."""
-    if solved.code == CONVERGED and _repeats(equations, solved.z) > 1 == _repeats(equations, guess):
+    """Return the solve, marked "other orbit" if it repeats more often within the response period than its guess."""
+    if solved.code == CONVERGED and _repeats(equations, solved.z) > _repeats(equations, guess):
         return solved._replace(code=OTHER_ORBIT)
     return solved
 
@@ -216,7 +216,8 @@ def _solve_autonomous(
     found = solve_autonomous(Family(equations, theta, ("frequency",)), z, frequency)
     equations = equations.at_frequency(float(found.values[0]))
     code = found.code
-    if code == CONVERGED and (_collapsed(found.z, z) or _has_shorter_period(found.z) and not _has_shorter_period(z)):
+    shorter = code == CONVERGED and _has_shorter_period(found.z) and not _has_shorter_period(z)
+    if shorter or (code != NOT_FINITE and _collapsed(found.z, z)):
         code = OTHER_ORBIT
     return equations, Solved(found.z, code, found.history), found_by
 

@@ -73,6 +73,12 @@ def test_cycle_with_the_fourier_scheme(mu, known):
     assert solution.multipliers[1] == pytest.approx(multiplier, rel=1e-7 if mu < 5 else 1e-4)
 
 
+def test_stability_does_not_depend_on_which_side_of_one_the_trivial_multiplier_is_computed():
+    above, below = cycle(0.1, 200, "backward2"), cycle(0.1, 200, "central2")
+    assert above.multipliers[0].real > 1.0 > below.multipliers[0].real
+    assert above.stable and below.stable
+
+
 def test_tabulated_cycle_is_again_that_of_shooting():
     assert shooting.van_der_pol_cycle(0.5, parts=6) == pytest.approx(shooting.VAN_DER_POL[0.5], rel=1e-11)
 

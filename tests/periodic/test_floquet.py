@@ -67,9 +67,25 @@ def test_multipliers_come_with_their_sign():
     assert np.exp(found.exponents) == pytest.approx([-np.e, -np.exp(-2.0)], rel=1e-9)
 
 
+@pytest.mark.parametrize("points", [200, 201])
+def test_multipliers_of_equal_modulus_and_opposite_sign(points):
+    """A frame of two axes that makes half a turn a period beside a third axis, all mixed by a periodic matrix."""
+    half, zero, one = np.pi * grid(points), np.zeros(points), np.ones(points)
+    turn = np.array([[np.cos(half), -np.sin(half), zero], [np.sin(half), np.cos(half), zero], [zero, zero, one]])
+    turn = turn.transpose(2, 0, 1)
+    rate = np.zeros((3, 3))
+    rate[0, 1], rate[1, 0] = -np.pi, np.pi
+    inner = turn @ np.diag([0.8, -2.0, 0.8]) @ turn.transpose(0, 2, 1) + rate
+    p, still = manufactured(points, np.zeros((3, 3)))
+    found = floquet(still + p @ inner @ np.linalg.inv(p) / PERIOD, PERIOD)
+    expected = [-np.exp(0.8), np.exp(0.8), -np.exp(-2.0)]
+    assert np.sort(np.exp(found.exponents).real) == pytest.approx(np.sort(expected), rel=1e-8)
+    assert np.exp(found.exponents).imag == pytest.approx(np.zeros(3), abs=1e-9)
+
+
 @pytest.mark.parametrize("points", [400, 401])
 def test_eigenfunctions_are_those_of_the_manufactured_system(points):
-    """v = P(t) c and w = P(t)⁻ᵀ d with B c = λ c, Bᵀ d = λ d, each up to a factor."""
+    """They are v = P(t) c and w = P(t)⁻ᵀ d with B c = λ c, Bᵀ d = λ d, each up to a factor."""
     b, exact = wide_range()
     p, matrix = manufactured(points, b)
     v, w = floquet(matrix, PERIOD).eigenfunctions
@@ -147,7 +163,7 @@ def test_strong_friction_is_told_as_stable():
 
 
 def test_first_order_matrix_of_mixed_orders_is_the_hand_written_one():
-    """Coupled in the highest derivatives: m ẍ + b Ṫ + c ẋ + k x = 0, r Ṫ + s ẍ + h T + e ẋ = 0, x second, T first order."""
+    """For m ẍ + b Ṫ + c ẋ + k x = 0 and r Ṫ + s ẍ + h T + e ẋ = 0: x of second, T of first order."""
     m, b, c, k, r, s, h, e = 2.0, 0.5, 0.3, 7.0, 1.5, 0.4, 0.8, 0.6
     linearisation = np.array([[[k, 0.0, c, b, m, 0.0], [0.0, h, e, r, s, 0.0]]])
     highest = np.array([[m, b], [s, r]])

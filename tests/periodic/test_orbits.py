@@ -5,7 +5,8 @@ import bayesperiodic as bp
 from tests import shooting
 from tests.known import grid
 
-# shooting.PENDULUM as torques, for m = 0.1 kg: k = c m l².
+TURN = 2 * np.pi
+# The torques of shooting.PENDULUM for m = 0.1 kg: k = c m l².
 PENDULUM = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
 ROTATIONS = [k for k in shooting.UNSTABLE if len(k.section) == 1]
 LONG = [k for k in shooting.UNSTABLE if len(k.section) in (3, 5) and abs(k.multipliers[0]) > 100]
@@ -24,7 +25,7 @@ def pendulum_solution(
     """Return the solver's orbit near a tabulated one, or near another angle."""
     angle = rates_and_angles(known, samples)[:, 0] if angle is None else angle
     arguments = {
-        "frequency": known.omega / (2 * np.pi),
+        "frequency": known.omega / TURN,
         "samples": samples,
         "scheme": scheme,
         "periods": len(known.section),
@@ -128,7 +129,7 @@ def test_period_two_guess_that_ends_on_the_period_one_orbit_is_told():
     once = pendulum_solution(shooting.DOUBLINGS[0]._replace(omega=11.9), 200, "central4")
     assert once.converged
     tau = np.arange(400) / 200
-    tiled = np.concatenate([once.states["phi"], once.states["phi"] + 2 * np.pi])
+    tiled = np.concatenate([once.states["phi"], once.states["phi"] + TURN])
     twice = {"frequency": once.frequency, "samples": 200, "scheme": "central4", "periods": 2, "winding": 2}
     guess = {"phi": tiled + 0.05 * np.cos(np.pi * tau)}
     ended = bp.solve_periodic(bp.models.pendulum, PENDULUM, **twice, guess=guess)
@@ -141,11 +142,29 @@ def test_period_two_guess_that_ends_on_the_period_one_orbit_is_told():
     assert np.sort_complex(asked.multipliers) == pytest.approx(np.sort_complex(once.multipliers**2), rel=1e-6)
 
 
+def test_period_four_guess_of_two_equal_halves_that_ends_on_the_period_one_orbit_is_told():
+    once = pendulum_solution(shooting.DOUBLINGS[0]._replace(omega=11.9), 200, "central4")
+    tau = np.arange(800) / 200
+    tiled = np.tile(once.states["phi"] - TURN * once.tau, 4) + TURN * tau
+    ended = bp.solve_periodic(
+        bp.models.pendulum,
+        PENDULUM,
+        frequency=once.frequency,
+        samples=200,
+        scheme="central4",
+        periods=4,
+        winding=4,
+        guess={"phi": tiled + 0.05 * np.cos(np.pi * tau)},
+    )
+    assert ended.states["phi"] == pytest.approx(tiled, abs=1e-8)
+    assert ended.status == "other orbit"
+
+
 def test_period_two_orbit_is_not_mistaken_for_a_repetition():
     known = shooting.STABLE[1]
     solution = pendulum_solution(known, 200, "central4", disturbed(known, rates_and_angles(known, 200)[:, 0]))
     assert solution.converged
-    half = solution.states["phi"][200:] - solution.states["phi"][:200] - 2 * np.pi
+    half = solution.states["phi"][200:] - solution.states["phi"][:200] - TURN
     assert np.abs(half).max() > 0.1
 
 

@@ -24,7 +24,9 @@ def test_all_that_must_show_does(done):
     _, results, printed = done
     assert len(results["checks"]) >= 20
     assert [check["what"] for check in results["checks"] if not check["met"]] == []
-    assert "What must show" in printed and "NO " not in printed
+    account, cost = printed.split("What it costs")
+    assert "What must show" in account and "NO " not in account
+    assert len(results["cost"]["checks"]) >= 10 and cost.count("\n") > 10  # what is timed has no verdict here
     assert results["quick"] is True and "computed" in results["data"]
     assert set(results["seconds"]) > {"orders", "pendulum", "total"} and "numba" in results["versions"]
 
