@@ -173,7 +173,7 @@ def continue_periodic(
             values.append(value)
             solutions.append(found)
             kinds.append(kind)
-            bar.set_postfix_str(f"{vary} = {value:.6g}")
+            bar.set_postfix_str(f"{vary} = {value:.6g}", refresh=False)
             bar.update()
     units = model.units | ({FREQUENCY: "Hz"} if vary == FREQUENCY else {vary: ""} if vary in model.inputs else {})
     complete = values[-1] == until or (len(values) > 1 and values[-1] == values[0])
@@ -244,10 +244,15 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
 
     Examples
     --------
-    >>> import bayesperiodic as bp
-    >>> help(bp.double_period)    # doctest: +ELLIPSIS
-    Help on function double_period in module bayesperiodic.periodic.continuation:
-    ...
+    >>> import numpy as np, bayesperiodic as bp
+    >>> values = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
+    >>> turning = {"phi": 2 * np.pi * np.arange(100) / 100 - 0.4}
+    >>> start = bp.solve_periodic(bp.models.pendulum, values, frequency=2.07, samples=100, scheme="central4",
+    ...                           winding=1, guess=turning)
+    >>> route = bp.continue_periodic(bp.models.pendulum, start, "frequency", until=1.8, progress=False)
+    >>> doubled = bp.double_period(bp.models.pendulum, route.period_doublings[0], "frequency")
+    >>> doubled.periods, doubled.winding, doubled.stable
+    (2, {'phi': 2}, True)
     """
     equations, parameters, z = equations_of(model, solution)
     if not solution.converged or np.min(abs(solution.multipliers + 1.0)) > 0.1:
