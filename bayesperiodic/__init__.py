@@ -16,8 +16,18 @@ if TYPE_CHECKING:
     from bayesperiodic.diagnosis.comparison import Comparison, compare
     from bayesperiodic.diagnosis.predictive import Prediction, predict
     from bayesperiodic.inference.map_estimate import MapEstimate, map_estimate
+    from bayesperiodic.inference.multivariate import MultivariateNormal
     from bayesperiodic.inference.posterior import Posterior
-    from bayesperiodic.inference.priors import LogNormal, Normal, Uniform
+    from bayesperiodic.inference.priors import (
+        HalfNormal,
+        InverseGamma,
+        LogNormal,
+        LogUniform,
+        Normal,
+        StudentT,
+        TruncatedNormal,
+        Uniform,
+    )
     from bayesperiodic.inference.problem import Problem
     from bayesperiodic.inference.sampling import sample
     from bayesperiodic.models.model import Model
@@ -37,7 +47,17 @@ _HOMES = {
     "bayesperiodic.diagnosis.predictive": ["Prediction", "predict"],
     "bayesperiodic.inference.map_estimate": ["MapEstimate", "map_estimate"],
     "bayesperiodic.inference.posterior": ["Posterior"],
-    "bayesperiodic.inference.priors": ["LogNormal", "Normal", "Uniform"],
+    "bayesperiodic.inference.multivariate": ["MultivariateNormal"],
+    "bayesperiodic.inference.priors": [
+        "HalfNormal",
+        "InverseGamma",
+        "LogNormal",
+        "LogUniform",
+        "Normal",
+        "StudentT",
+        "TruncatedNormal",
+        "Uniform",
+    ],
     "bayesperiodic.inference.problem": ["Problem"],
     "bayesperiodic.inference.sampling": ["sample"],
     "bayesperiodic.models.model": ["Model"],
@@ -54,10 +74,11 @@ _MODULES = ["models", "plot"]
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [  # noqa: PLE0604
-    "Branch", "Comparison", "Experiment", "LogNormal", "MapEstimate", "Model", "Normal", "PeriodicSolution",
-    "Posterior", "Prediction", "Problem", "Recording", "Scheme", "Uniform", "compare", "continue_periodic",
-    "double_period", "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "plot",
-    "predict", "sample", "simulate", "smooth_abs", "smooth_sign", "solve_periodic",
+    "Branch", "Comparison", "Experiment", "HalfNormal", "InverseGamma", "LogNormal", "LogUniform", "MapEstimate",
+    "Model", "MultivariateNormal", "Normal", "PeriodicSolution", "Posterior", "Prediction", "Problem", "Recording",
+    "Scheme", "StudentT", "TruncatedNormal", "Uniform", "compare", "continue_periodic", "double_period",
+    "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "plot", "predict", "sample",
+    "simulate", "smooth_abs", "smooth_sign", "solve_periodic",
 ]  # fmt: skip
 
 

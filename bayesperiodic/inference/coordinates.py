@@ -33,7 +33,7 @@ class SamplingDensity:
     def __init__(self, problem: Problem, threads: int = 1):
         self.problem = problem
         self.threads = threads
-        self.logarithmic = np.array([p.support == (0.0, np.inf) for p in problem.priors.values()])
+        self.logarithmic = np.array([s == (0.0, np.inf) for s in problem.joint_prior.supports.values()])
         self.labels = (*problem.names, *(f"variance[{c}]" for c in problem.free_variances))
         self._free = [problem.channels.index(c) for c in problem.free_variances]
         self._fixed = np.array([problem.fixed_variances.get(c, np.nan) for c in problem.channels])

@@ -105,8 +105,9 @@ def map_estimate(problem: Problem, *, start: Mapping[str, float] | None = None, 
     Each iteration solves the channel variances from eq. (7) with its bias correction,
     v_β = M_β / [n_β (1 − l/Σn)], which is s·Σe²/(nNs − l) for equal counts, and then updates θ by eq. (8). Printed
     there, the right-hand side lacks the prior's gradient (θ̄ − θ)/σ², without which the iteration would not end at a
-    maximum of eq. (6); it is added. Steps are halved until the objective, −½ Σ n_β (1 − l/Σn) ln M_β + Σ ln p(θ),
-    rises.
+    maximum of eq. (6); it is added. Where convex log-priors outweigh the data, H is not positive definite, and steps
+    (not the covariance) take their curvature with the opposite sign. Steps are halved until the objective,
+    −½ Σ n_β (1 − l/Σn) ln M_β + Σ ln p(θ), rises.
 
     Parameters
     ----------
@@ -143,6 +144,7 @@ def map_estimate(problem: Problem, *, start: Mapping[str, float] | None = None, 
     bar = tqdm(range(MAX_ITERATIONS), desc="MAP", unit="iteration", leave=False, disable=not progress)
     for _ in bar:
         hessian, gradient = _hessian_and_gradient(problem, theta, evaluation)
+        hessian = _uphill(problem, theta, hessian)
         try:
             step = np.linalg.solve(hessian, gradient)
             size = float(np.max(np.abs(step) / np.sqrt(np.abs(np.diag(np.linalg.inv(hessian))))))
@@ -211,8 +213,7 @@ def _hessian_and_gradient(
     """Return H of eq. (8) and the gradient of the objective, the prior's part included in both."""
     assert evaluation is not None
     v = variances(problem, moments(problem, evaluation))
-    hessian = np.diag([float(p.curvature(theta[i])) for i, p in enumerate(problem.priors.values())])
-    gradient = np.array([float(p.gradient(theta[i])) for i, p in enumerate(problem.priors.values())])
+    hessian, gradient = problem.joint_prior.curvature(theta), problem.joint_prior.gradient(theta)
     for e in problem.experiments:
         for channel, sensitivity in evaluation.sensitivities[e.name].items():
             residual = evaluation.residuals[e.name][channel]
@@ -220,6 +221,16 @@ def _hessian_and_gradient(
             hessian += weight * sensitivity @ sensitivity.T
             gradient += weight * sensitivity @ residual
     return hessian, gradient
+
+
+def _uphill(problem: Problem, theta: np.ndarray, hessian: np.ndarray) -> np.ndarray:
+    """Return H such that a step goes up: where convex log-priors outweigh the data their curvature changes sign."""
+    try:
+        np.linalg.cholesky(hessian)
+    except np.linalg.LinAlgError:
+        curvature = np.diag(problem.joint_prior.curvature(theta))
+        return hessian + np.diag(2.0 * np.maximum(-curvature, 0.0))
+    return hessian
 
 
 def _describe(
@@ -281,14 +292,15 @@ def _whiteness(problem: Problem, evaluation: Evaluation, channel: str) -> Whiten
 
 
 def _not_finite(problem: Problem, theta: np.ndarray, evaluation: Evaluation | None) -> str:
-    values = ", ".join(f"{name} = {value:.6g}" for name, value in zip(problem.names, theta, strict=True))
-    for name, value in zip(problem.names, theta, strict=True):
-        if not np.isfinite(problem.priors[name].log_prob(value)):
-            low, high = problem.priors[name].support
-            return (
-                f"start: {name} = {value:.6g} is not allowed; the log-posterior is not finite there, the prior's "
-                f"support is ({low:g}, {high:g})."
-            )
+    given = dict(zip(problem.names, theta, strict=True))
+    values = ", ".join(f"{name} = {value:.6g}" for name, value in given.items())
+    if names := problem.joint_prior.excluding(theta):
+        low, high = problem.joint_prior.supports[names[0]]
+        excluded = ", ".join(f"{name} = {given[name]:.6g}" for name in names)
+        return (
+            f"start: {excluded} is not allowed; the log-posterior is not finite there, the prior's support is "
+            f"({low:g}, {high:g})."
+        )
     statuses = {} if evaluation is None else {n: s.status for n, s in evaluation.solutions.items() if not s.converged}
     return (
         f"start: {values} is not allowed; the log-posterior is not finite there, the periodic solve ended with "

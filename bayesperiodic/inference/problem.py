@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesperiodic import checks, fourier
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.inference.priors import Prior
+from bayesperiodic.inference.joint_prior import JointPrior
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.compiled import CONVERGED
@@ -52,8 +52,9 @@ class Problem:
     ----------
     model : Model
     experiments : sequence of Experiment
-    priors : mapping of str to prior
-        Makes a parameter free.
+    priors : mapping of str or tuple of str to prior
+        Makes a parameter free; a tuple of names takes a `MultivariateNormal`. A frozen continuous distribution of
+        scipy.stats is a prior too.
     fixed : mapping of str to float, optional
         Values of the other parameters; ``"variance[force]"`` fixes the variance of a channel.
     scheme : str or Scheme
@@ -62,9 +63,10 @@ class Problem:
     Raises
     ------
     ValueError
-        For a parameter without prior or value, or with both, an unknown name, an experiment without the model's
-        inputs or with outputs that the model lacks, no more independent values than free parameters in a channel whose
-        variance is unknown, an autonomous model.
+        For a parameter without prior or value, with both or with two priors, a value that is no prior or does not fit
+        its tuple of names, an unknown name, an experiment without the model's inputs or with outputs that the model
+        lacks, no more independent values than free parameters in a channel whose variance is unknown, an autonomous
+        model.
 
     References
     ----------
@@ -77,7 +79,7 @@ class Problem:
         model: Model,
         experiments: Iterable[Experiment],
         *,
-        priors: Mapping[str, Prior],
+        priors: Mapping[Any, Any],
         fixed: Mapping[str, float] | None = None,
         scheme: str | Scheme = "central2",
     ):
@@ -92,21 +94,20 @@ class Problem:
         self.channels = tuple(channel for channel in model.outputs if channel in measured)
         fixed = dict(fixed or {})
         variance_names = {f"variance[{channel}]": channel for channel in self.channels}
-        for name in priors:
-            checks.one_of("priors", name, model.parameters)
+        self.joint_prior = JointPrior.of(priors, model.parameters)
+        self.names = self.joint_prior.names
+        for name in self.names:
             if name in fixed:
                 raise ValueError(f"fixed: {name!r} has a prior too; give a prior or a value.")
         for name in fixed:
             checks.one_of("fixed", name, (*model.parameters, *variance_names))
-        if without := [n for n in model.parameters if n not in priors and n not in fixed]:
+        if without := [n for n in model.parameters if n not in self.names and n not in fixed]:
             raise ValueError(
                 f"priors: {', '.join(map(repr, without))} has neither a prior nor a value; a free parameter needs a "
                 "prior, any other a value in `fixed`."
             )
-        self.names = tuple(name for name in model.parameters if name in priors)
         if not self.names:
             raise ValueError("priors: {} is not allowed; at least one parameter must be free.")
-        self.priors = {name: priors[name] for name in self.names}
         self.fixed = {n: checks.finite_number(f"fixed[{n!r}]", fixed[n]) for n in model.parameters if n in fixed}
         self.fixed_variances = {
             channel: checks.positive(f"fixed[{name!r}]", fixed[name])
@@ -192,9 +193,14 @@ class Problem:
             for group in groups.values()
         ]
 
+    @property
+    def priors(self) -> dict[str | tuple[str, ...], Any]:
+        """The priors by the keys they were given with, in the order of the model's parameters."""
+        return self.joint_prior.blocks
+
     def median(self) -> np.ndarray:
         """Return the medians of the priors, (names,)."""
-        return np.array([float(self.priors[name].quantile(np.array(0.5))) for name in self.names])
+        return self.joint_prior.median()
 
     def vector(self, theta: Mapping[str, float] | np.ndarray | Sequence[float]) -> np.ndarray:
         """Return θ as an array (…, names) from a mapping or an array."""
@@ -220,8 +226,7 @@ class Problem:
 
     def log_prior(self, theta: Mapping[str, float] | np.ndarray) -> np.ndarray:
         """Return Σ ln p(θ_α), shape (…); −inf outside the support."""
-        values = self.vector(theta)
-        return np.sum([p.log_prob(values[..., i]) for i, p in enumerate(self.priors.values())], axis=0)
+        return self.joint_prior.log_prob(self.vector(theta))
 
     def log_likelihood(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> np.ndarray:
         """Return −½ Σ_β [n_β ln v_β + M_β/v_β], shape (…); −inf where a periodic solve fails."""
@@ -324,8 +329,8 @@ class Problem:
 
     def sample_prior(self, size: int, seed: int) -> dict[str, np.ndarray]:
         """Return independent draws of every free parameter from its prior, (size,) each."""
-        generator = np.random.default_rng(seed)
-        return {name: self.priors[name].sample(size, generator) for name in self.names}
+        draws = self.joint_prior.sample(size, np.random.default_rng(seed))
+        return dict(zip(self.names, draws.T.copy(), strict=True))
 
     def parameters(self, theta: np.ndarray) -> np.ndarray:
         """Return every parameter of the model (points, parameters) from θ (points, names)."""

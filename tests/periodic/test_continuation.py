@@ -341,6 +341,11 @@ def test_solution_without_a_multiplier_near_minus_one_is_not_doubled(resonance):
         bp.double_period(bp.models.duffing, resonance[0], "frequency")
 
 
+def test_unknown_quantity_is_not_varied_in_a_doubling(rotation):
+    with pytest.raises(ValueError, match="vary: 'k4' is not known; allowed: 'm', 'l', .*Did you mean 'k"):
+        bp.double_period(bp.models.pendulum, rotation.period_doublings[0], "k4")
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
