@@ -130,7 +130,8 @@ def continue_periodic(
 
     Pseudo-arclength continuation with steps adapted to the curvature passes folds; folds and period doublings are
     located to 1e-9 of a step. It ends where the quantity gets to `until`, or back to its start value, or where the
-    steps get too small (then the branch is not `complete`).
+    steps get too small (then the branch is not `complete`; nor is it if the start is a fold that turns away from
+    `until`).
 
     Parameters
     ----------
@@ -305,7 +306,7 @@ def _solution(family: Family, point: Point, sensitivities: bool = False) -> Peri
 
 def _special_points(tracer: Tracer, before: Point, after: Point) -> list[Point]:
     """Return the folds and period doublings between two neighbouring points, in order."""
-    found = []
+    found: list[Point] = []
     for kind, test in ((FOLD, _fold_test), (PERIOD_DOUBLING, _doubling_test)):
         if test(tracer, before) * test(tracer, after) < 0.0:
             found += _locate(tracer, before, after, kind, test)

@@ -217,6 +217,14 @@ class PeriodicEquations:
         input_order = np.repeat([0.0, 1.0, 2.0], len(self.model.inputs)) / self.frequency
         return self.states(z) * order, self.inputs * input_order
 
+    def phase_row(self, z: np.ndarray) -> np.ndarray:
+        """Return the row (points, states) of the phase condition against z, states in units of their range."""
+        flow = self.changes(z[None])[0, :, self.count : 2 * self.count]
+        spread = np.ptp(z, axis=0)
+        flow = flow / np.where(spread > 0, spread, 1.0) ** 2
+        length = np.linalg.norm(flow)
+        return flow / length if length > 0 else flow
+
     def evaluate(self, name: str, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return one of the model's grid functions at the periodic part z."""
         return self.model.kernels.evaluate(name, self.states(z), self.inputs, parameters, self.grid.tau, self.frequency)

@@ -146,16 +146,7 @@ def solve_autonomous(family: Family, z: np.ndarray, frequency: float) -> Found:
 
     The phase condition is ∫ q_guess'·(q − q_guess) dτ = 0.
     """
-    row = phase_row(family.equations, z)
+    row = family.equations.phase_row(z)
     target = np.array([np.sum(row * z)])
     start = np.array([frequency])
     return solve_family(family, z, start, row[None], np.zeros((1, 1)), target, start)
-
-
-def phase_row(equations: PeriodicEquations, z: np.ndarray) -> np.ndarray:
-    """Return the row (points, states) of the phase condition against z, states in units of their range."""
-    flow = equations.changes(z[None])[0, :, z.shape[1] : 2 * z.shape[1]]
-    spread = np.ptp(z, axis=0)
-    flow = flow / np.where(spread > 0, spread, 1.0) ** 2
-    length = np.linalg.norm(flow)
-    return flow / length if length > 0 else flow

@@ -28,7 +28,8 @@ def parameter_sensitivities(
 ) -> Sensitivities | None:
     """Return derivatives to every parameter and, for a forced model, last to the frequency; None if singular.
 
-    For an autonomous model the phase moves so that the change of the orbit stays orthogonal to the flow.
+    For an autonomous model the phase moves so that the change of the orbit stays orthogonal to the flow, states in
+    units of their range.
     """
     d = equations.derivatives(z, parameters)
     g, f = np.moveaxis(d.g_theta, 2, 0), np.moveaxis(d.f_theta, 2, 0)
@@ -70,10 +71,9 @@ def respond(
     factors = equations.factors(columns)
     if equations.model.autonomous:
         g_frequency, f_frequency = frequency_derivatives(equations, z, columns, d)
-        flow = equations.states(z)[None, :, equations.count : 2 * equations.count]
-        flow = flow / np.linalg.norm(flow)
         nothing = np.zeros((len(g), 1))
-        solved = factors.solve_bordered(g_frequency[None], flow, np.zeros((1, 1)), -g, nothing)
+        row = equations.phase_row(z)[None]
+        solved = factors.solve_bordered(g_frequency[None], row, np.zeros((1, 1)), -g, nothing)
         if solved is None:
             return None
         z_change, frequency = solved[0], solved[1][:, 0]

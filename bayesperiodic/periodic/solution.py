@@ -10,9 +10,9 @@ from bayesperiodic import checks, fourier
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
-from bayesperiodic.periodic.factors import CyclicFactors
+from bayesperiodic.periodic.error import estimate_error
 from bayesperiodic.periodic.floquet import Floquet, first_order_matrix, floquet
-from bayesperiodic.periodic.schemes import CyclicGrid, Scheme
+from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.sensitivity import parameter_sensitivities
 from bayesperiodic.store import Result
 
@@ -50,7 +50,8 @@ class PeriodicSolution(Result):
     sensitivities : dict of str to dict of str to array (points,)
         ∂output/∂parameter, ``sensitivities[output][parameter]`` (de Kraker et al. 1997, eq. 4), and for a forced model
         ``sensitivities[output]["frequency"]`` [per Hz], inputs held as functions of tau; empty unless converged. For
-        an autonomous model the phase moves so that the change stays orthogonal to the flow.
+        an autonomous model the phase moves so that the change stays orthogonal to the flow, states in units of their
+        range.
     state_sensitivities : dict of str to dict of str to array (points,)
         The same of the states.
     frequency_sensitivities : dict of str to float
@@ -149,53 +150,13 @@ class PeriodicSolution(Result):
 
         Richardson's extrapolation of the scheme's derivatives, from steps h and 2h on the same grid, is carried to the
         states by the linearised equations. For the fourier scheme it is the sum of the amplitudes in the upper quarter
-        of the spectrum. For an autonomous model the error of the frequency [Hz] is there too.
+        of the spectrum. For an autonomous model the error of the frequency [Hz] is there too. Where smooth signs change
+        over within a step or two the grid does not see the error, and the estimate is far too small.
         """
         if not self.converged:
             return dict.fromkeys(self.states, np.nan)
         z = np.stack([self.states[name] - self._turns(name) for name in self.states], axis=-1)
-        if np.isinf(self.scheme.order):
-            amplitudes = np.abs(fourier.coefficients(z.T))
-            return dict(
-                zip(self.states, amplitudes[:, 3 * amplitudes.shape[1] // 4 :].sum(axis=1).tolist(), strict=True)
-            )
-        grid, count = CyclicGrid(self.scheme, self.samples, self.periods), z.shape[1]
-        coarse = {1: np.zeros_like(z), 2: np.zeros_like(z)}
-        fine = {1: np.zeros_like(z), 2: np.zeros_like(z)}
-        for order, weights in ((1, grid.first), (2, grid.second)):
-            for offset, weight in zip(grid.offsets.tolist(), weights.tolist(), strict=True):
-                fine[order] += weight * np.roll(z, -offset, axis=0)
-                coarse[order] += weight / 2**order * np.roll(z, -2 * offset, axis=0)
-        defect = np.zeros_like(z)
-        for order in (1, 2):
-            change = self.frequency**order * (fine[order] - coarse[order]) / (2.0**self.scheme.order - 1.0)
-            block = self.linearisation[:, :, order * count : (order + 1) * count]
-            defect -= np.einsum("nes,ns->ne", block, change)
-        return self._correct(grid, z, defect)
-
-    def _correct(self, grid: CyclicGrid, z: np.ndarray, defect: np.ndarray) -> dict[str, float]:
-        points, count = z.shape
-        columns = np.concatenate([np.zeros((points, count)), self.linearisation.reshape(points, -1)], axis=1)
-        factors = CyclicFactors(grid, np.ascontiguousarray(columns), count, self.frequency)
-        if not self.autonomous:
-            change, more = factors.solve(defect), {}
-        else:
-            rates = [np.gradient(z, grid.tau, axis=0) * self.frequency]
-            rates.append(np.gradient(rates[0], grid.tau, axis=0) * self.frequency)
-            slope = sum(
-                order
-                / self.frequency
-                * np.einsum("nes,ns->ne", self.linearisation[:, :, order * count :][:, :, :count], r)
-                for order, r in enumerate(rates, start=1)
-            )
-            flow = rates[0][None] / np.linalg.norm(rates[0])
-            solved = factors.solve_bordered(
-                np.asarray(slope)[None], flow, np.zeros((1, 1)), defect[None], np.zeros((1, 1))
-            )
-            if solved is None:
-                return dict.fromkeys([*self.states, FREQUENCY], np.nan)
-            change, more = solved[0][0], {FREQUENCY: abs(float(solved[1][0, 0]))}
-        return dict(zip(self.states, np.abs(change).max(axis=0).tolist(), strict=True)) | more
+        return estimate_error(self, z)
 
     def __repr__(self) -> str:
         return (

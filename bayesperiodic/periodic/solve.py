@@ -37,9 +37,9 @@ def solve_periodic(
     """Find a periodic equilibrium state, stable or unstable, and its sensitivities to every parameter.
 
     The equations are discretised with a cyclic difference scheme and solved by a damped Newton method with step
-    halving ([1]_, eq. 2-4). If that fails from the static guess, the input's variation is raised from zero along the
-    branch of solutions, then a short time integration is tried; if smooth signs are too sharp for Newton's method, they
-    are sharpened step by step.
+    halving ([1]_, eq. 2-4). If that fails, smooth signs are softened and sharpened again step by step; then, from the
+    static guess, the inputs' variation is raised from zero along the branch of solutions, and at last a short time
+    integration is tried.
 
     Parameters
     ----------
@@ -61,9 +61,10 @@ def solve_periodic(
         Turns that an angle advances per response period.
     guess : "static", "integration", mapping of str to array (samples·periods,), or PeriodicSolution
         The equilibrium under the mean inputs, the end of a short time integration from there, every state (turns of
-        angles included), or an earlier solution, on any grid, of as many periods or a fraction of them. An autonomous
-        model has no use for its equilibrium, so "static" means an integration from near it; the phase of its orbit is
-        the one closest to the guess.
+        angles included), or an earlier solution, on any grid, of as many periods or a fraction of them. An integration
+        that fails or does not lock to the winding is no guess, and the static one is taken. An autonomous model has no
+        use for its equilibrium, so "static" means an integration from near it; the phase of its orbit is the one
+        closest to the guess.
 
     Returns
     -------
@@ -114,7 +115,8 @@ def solve_periodic(
     if solution.converged and (steps := _steps_of_transitions(equations, theta, solved.z)) < FEW_STEPS:
         warnings.warn(
             f"A smooth sign of {model.name!r} changes over within {steps:.2g} steps of the grid; "
-            f"{int(np.ceil(samples * FEW_STEPS / steps))} samples would resolve it (see error_estimate).",
+            f"{int(np.ceil(samples * FEW_STEPS / steps))} samples would resolve it. Until then the error may be far "
+            "larger than error_estimate says.",
             UserWarning,
             stacklevel=2,
         )
@@ -153,9 +155,9 @@ def solve_from_rest(equations: PeriodicEquations, theta: np.ndarray) -> tuple[So
 
     return _first_success(
         (NEWTON, lambda: equations.solve(theta, static)),
+        ("sharpness", lambda: sharpen(equations, theta, static)),
         ("input amplitude", lambda: raise_amplitude(equations, theta, static)),
         ("time integration", integrated),
-        ("sharpness", lambda: sharpen(equations, theta, static)),
     )
 
 
@@ -216,7 +218,7 @@ def _solve_autonomous(
     found = solve_autonomous(Family(equations, theta, ("frequency",)), z, frequency)
     equations = equations.at_frequency(float(found.values[0]))
     code = found.code
-    shorter = code == CONVERGED and _has_shorter_period(found.z) and not _has_shorter_period(z)
+    shorter = code == CONVERGED and _has_shorter_period(found.z)
     if shorter or (code != NOT_FINITE and _collapsed(found.z, z)):
         code = OTHER_ORBIT
     return equations, Solved(found.z, code, found.history), found_by

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesperiodic.periodic.compiled import CONVERGED
-from bayesperiodic.periodic.family import Family, phase_row, solve_family
+from bayesperiodic.periodic.family import Family, solve_family
 
 MAX_POINTS = 2000
 SMALLEST_STEP = 1e-6
@@ -112,7 +112,7 @@ class Tracer:
         rows, corner = np.zeros((scalars, *z.shape)), np.zeros((scalars, scalars))
         rows[0], corner[0] = tangent[0] * self._weights, tangent[1] / self._value_scales**2
         if scalars > 1:
-            rows[1] = phase_row(self.family.equations, z)
+            rows[1] = self.family.equations.phase_row(z)
         return rows, corner
 
     def _product(self, a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> float:
@@ -139,6 +139,8 @@ def trace(
 ) -> Iterator[Point]:
     """Yield the points of a branch from a solution until the first scalar gets to a value or leaves on the other side.
 
+    The solution alone is yielded where the branch has no unique tangent, or turns back there (at a fold).
+
     Parameters
     ----------
     family : Family
@@ -157,10 +159,10 @@ def trace(
     origin = float(values[0])
     direction = 1.0 if until > origin else -1.0
     tangent = tracer.first_tangent(z, values, direction)
+    here = Point(z, values, tangent or (np.zeros_like(z), np.zeros_like(values)), 0.0)
+    yield here
     if tangent is None:
         return
-    here = Point(z, values, tangent, 0.0)
-    yield here
     largest = step / abs(until - origin)
     length = largest / 4
     for _ in range(MAX_POINTS):
@@ -169,6 +171,8 @@ def trace(
         if corrected is not None and _follows(tracer, here, corrected[0], length):
             after, iterations = corrected
             limit = _passed(after.values[0], origin, until)
+            if limit == origin and here.distance == 0.0:
+                return
             if limit is not None:
                 after = tracer.stop_at(here, after, limit)
         if after is None:

@@ -140,6 +140,19 @@ def test_several_cycles_in_a_guess_that_is_none_of_them_end_in_another_orbit(cyc
     assert cycles * solution.frequency == pytest.approx(1 / shooting.VAN_DER_POL[0.5][0], rel=1e-5)
 
 
+def test_one_cycle_counted_twice_is_another_orbit():
+    once = cycle(0.5)
+    solution = cycle(0.5, frequency=once.frequency / 2, guess={"x": np.tile(once.states["x"][::2], 2)})
+    assert solution.status == "other orbit"
+
+
+def test_fourier_estimates_the_error_of_the_frequency_too():
+    coarse, fine = cycle(2.0, 48, "fourier"), cycle(2.0, 256, "fourier")
+    true = abs(coarse.frequency - fine.frequency)
+    assert true < coarse.error_estimate()["frequency"] < 1e-2 * coarse.frequency
+    assert fine.error_estimate()["frequency"] < 1e-9 * fine.frequency
+
+
 @pytest.mark.parametrize("damping", [0.1, -0.1])
 @pytest.mark.parametrize("guess", ["static", "integration", circle(200)], ids=["static", "integration", "array"])
 def test_linear_oscillator_with_damping_has_no_cycle(damping, guess):

@@ -392,3 +392,15 @@ def test_parameters_of_a_forced_model_can_be_varied_too(rotation):
     )
     assert branch.units["a"] == "m" and branch[-1].parameters["a"] == 0.12
     assert again.iterations <= 1 and again.states["phi"] == pytest.approx(branch[-1].states["phi"], abs=1e-9)
+
+
+def test_a_fold_that_turns_away_from_the_end_wanted_is_told():
+    force = {"force": 0.4 * np.cos(2 * np.pi * grid(100))}
+    start = bp.solve_periodic(
+        bp.models.duffing, {"m": 1, "c": 0.1, "k": 1, "k3": 0.5}, force, frequency=0.08, samples=100, scheme="central4"
+    )
+    fold = bp.continue_periodic(bp.models.duffing, start, "frequency", until=0.4, progress=False).folds[0]
+    away = bp.continue_periodic(bp.models.duffing, fold, "frequency", until=0.4, progress=False)
+    assert len(away) == 1 and not away.complete and "stuck" in repr(away)
+    back = bp.continue_periodic(bp.models.duffing, fold, "frequency", until=0.25, progress=False)
+    assert back.complete and back[-1].frequency == pytest.approx(0.25)

@@ -188,3 +188,19 @@ def test_equations_that_do_not_determine_the_highest_derivatives_are_refused():
     linearisation = np.array([[[1.0, 0.0, 1.0, 1.0, 0.0, 0.0], [0.0, 1.0, 2.0, 2.0, 0.0, 0.0]]])
     with pytest.raises(np.linalg.LinAlgError):
         first_order_matrix(linearisation, (1, 1))
+
+
+@pytest.mark.parametrize("points", [200, 201])
+@pytest.mark.parametrize(("rate", "tolerance"), [(2e3, 5e-3), (1e4, 0.02)])
+def test_stiff_equations_forget_as_fast_as_they_do(points, rate, tolerance):
+    """For ẇ = −rate (w − u) with up to fifty time constants a step of the grid."""
+    matrix = np.full((points, 1, 1), -rate)
+    exponent = floquet(matrix, 1.0).exponents[0]
+    assert exponent.real == pytest.approx(-rate, rel=tolerance) and exponent.imag == 0.0
+
+
+def test_multipliers_of_overly_stiff_equations_are_stable_and_positive():
+    """Beyond what the integration resolves; a false −1 would pass for a period doubling."""
+    for points in (200, 201):
+        multiplier = np.exp(floquet(np.full((points, 1, 1), -1e8), 1.0).exponents[0])
+        assert 0.0 <= multiplier.real < 1.0 and multiplier.imag == 0.0
