@@ -10,6 +10,7 @@ from scipy.special import stdtrit
 from tqdm import tqdm
 
 from bayesperiodic import checks
+from bayesperiodic.expressions import parse_all
 from bayesperiodic.inference.input_noise import input_noise
 from bayesperiodic.inference.problem import Evaluation, Problem
 from bayesperiodic.inference.whiteness import Whiteness, whiteness
@@ -90,6 +91,71 @@ class MapEstimate(Result):
         width = float(stdtrit(min(self.degrees_of_freedom, 1e9), 0.5 + 0.5 * probability))
         return {
             name: (value - width * self.sd[name], value + width * self.sd[name]) for name, value in self.theta.items()
+        }
+
+    def derive(self, expressions: Mapping[str, str]) -> pd.DataFrame:
+        """Return quantities derived from the parameters, with standard deviations by the delta method.
+
+        The standard deviation is √(gᵀ C g) with the exact gradient g by the free parameters and the `covariance` C:
+        exact for linear combinations, otherwise good as far as the expression is straight within the uncertainty.
+
+        Parameters
+        ----------
+        expressions : mapping of str to str
+            By new name: numbers, names of parameters (free or fixed), pi, + - * / ** and sqrt, exp, log, sin, cos, tan,
+            atan, sinh, cosh, tanh, abs.
+
+        Returns
+        -------
+        DataFrame
+            Columns value and sd, a row a quantity; ``attrs["covariance"]`` holds the covariances between the quantities
+            as a dict of dict of floats.
+
+        Raises
+        ------
+        ValueError
+            For an expression that is not allowed or has no finite value at the estimate, a new name that is no
+            identifier or that a parameter has.
+
+        Examples
+        --------
+        >>> import numpy as np, bayesperiodic as bp
+        >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
+        >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
+        ...                          frequency=0.1, samples=50)
+        >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
+        >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)},
+        ...                      fixed={"m": 1, "k3": 0.5, "variance[displacement]": 1e-4})
+        >>> fit = bp.map_estimate(problem, progress=False)
+        >>> fit.derive({"damping_ratio": "c/(2*sqrt(k*m))"}).round(4)
+                       value      sd
+        damping_ratio    0.1  0.0016
+        """
+        values = self._fixed() | self.theta
+        quantities = parse_all("expressions", expressions, values)
+        at = {name: float(quantity.value(values)) for name, quantity in quantities.items()}
+        for name, value in at.items():
+            if not np.isfinite(value):
+                raise ValueError(
+                    f"expressions[{name!r}]: {quantities[name].text!r} is not allowed; it is {value} at the estimate "
+                    "and must be finite."
+                )
+        covariance = _carried(self.covariance, [q.gradient(values, self.theta) for q in quantities.values()])
+        with np.errstate(invalid="ignore"):
+            sd = np.sqrt(np.diag(covariance))
+        table = pd.DataFrame({"value": list(at.values()), "sd": sd}, index=list(at))
+        table.attrs["covariance"] = {
+            name: dict(zip(at, row, strict=True)) for name, row in zip(at, covariance.tolist(), strict=True)
+        }
+        return table
+
+    def _fixed(self) -> dict[str, float]:
+        """Return the parameters that have the same value in all solutions and are not free."""
+        first, *others = (solution.parameters for solution in self.solutions.values())
+        return {
+            name: value
+            for name, value in first.items()
+            if name not in self.theta and all(other.get(name) == value for other in others)
         }
 
     def __repr__(self) -> str:
@@ -274,6 +340,18 @@ def _describe(
                 UserWarning,
                 stacklevel=3,
             )
+    return result
+
+
+def _carried(covariance: pd.DataFrame, gradients: list[dict[str, np.ndarray]]) -> np.ndarray:
+    """Return the covariance of quantities with these gradients; what a quantity does not depend on has no say."""
+    matrix = covariance.to_numpy()
+    rows = [np.array([float(gradient[name]) for name in covariance.columns]) for gradient in gradients]
+    result = np.zeros((len(rows), len(rows)))
+    with np.errstate(invalid="ignore", over="ignore"):
+        for i, a in enumerate(rows):
+            for j, b in enumerate(rows):
+                result[i, j] = a[a != 0.0] @ matrix[np.ix_(a != 0.0, b != 0.0)] @ b[b != 0.0]
     return result
 
 
