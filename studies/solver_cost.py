@@ -227,23 +227,24 @@ def with_systems(repeats: int, systems: int = 512) -> dict[str, Any]:
     ]
     with ThreadPoolExecutor(cores) as pool:
         list(pool.map(_loop, [10] * cores))
-        both = _interleaved(
-            repeats,
+        raw = _timed(
+            2 * repeats + 1,
             calls=1,
             one=lambda: batch.solve(changed, threads=1),
             many=lambda: batch.solve(changed, threads=cores),
             loop_one=lambda: [_loop(LOOP) for _ in range(cores)],
             loop_many=lambda: list(pool.map(_loop, [LOOP] * cores)),
         )
-    gain, plain = both["one"] / both["many"], both["loop_one"] / both["loop_many"]
+    gains, plain_gains = raw["one"] / raw["many"], raw["loop_one"] / raw["loop_many"]
     return {
         "systems": list(counts),
         "us": times,
         "slope": _slope(counts, times),
         "cores": cores,
-        "gain": gain,
-        "gain_of_plain_loop": plain,
-        "ratio": gain / plain,
+        "gain": float(np.median(gains)),
+        "gain_of_plain_loop": float(np.median(plain_gains)),
+        "ratio": float(np.median(gains / plain_gains)),
+        "ratio_quartiles": np.quantile(gains / plain_gains, [0.25, 0.75]).tolist(),
         "target_ratio": 0.9,
     }
 
@@ -284,6 +285,11 @@ def _loop(count: int) -> float:
 
 def _interleaved(repeats: int, calls: int = CALLS, **actions: Callable[[], Any]) -> dict[str, float]:
     """Return the median of microseconds a call of each action, all timed in turn within every repeat."""
+    return {name: float(np.median(times)) for name, times in _timed(repeats, calls, **actions).items()}
+
+
+def _timed(repeats: int, calls: int, **actions: Callable[[], Any]) -> dict[str, np.ndarray]:
+    """Return microseconds a call of each action, (repeats,)."""
     times: dict[str, list[float]] = {name: [] for name in actions}
     for _ in range(repeats):
         for name, action in actions.items():
@@ -291,7 +297,7 @@ def _interleaved(repeats: int, calls: int = CALLS, **actions: Callable[[], Any])
             for _ in range(calls):
                 action()
             times[name].append((time.perf_counter() - start) / calls * 1e6)
-    return {name: float(np.median(values)) for name, values in times.items()}
+    return {name: np.array(values) for name, values in times.items()}
 
 
 def _slope(sizes: Any, times: Any) -> float:

@@ -12,7 +12,7 @@ from bayesperiodic.parallel import available_cores
 from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
 from bayesperiodic.periodic.sensitivity import parameter_sensitivities
 
-SMALLEST_PART = 4
+SMALLEST_PART, PARTS_EACH = 4, 4
 NO_FACTORS = -1
 
 
@@ -114,10 +114,16 @@ class Batch:
                 iterations,
             )
 
-        parts = max(1, min(threads or available_cores(), total // SMALLEST_PART))
-        first, *others = pairwise([total * k // parts for k in range(parts + 1)])
-        elsewhere = [_threads().submit(part, *block) for block in others]
-        part(*first)
+        workers = max(1, min(threads or available_cores(), total // SMALLEST_PART))
+        parts = 1 if workers == 1 else max(workers, min(workers * PARTS_EACH, total // SMALLEST_PART))
+        waiting = iter(list(pairwise([total * k // parts for k in range(parts + 1)])))
+
+        def work() -> None:
+            for block in waiting:
+                part(*block)
+
+        elsewhere = [_threads().submit(work) for _ in range(workers - 1)]
+        work()
         for future in elsewhere:
             future.result()
         return y, status, iterations
