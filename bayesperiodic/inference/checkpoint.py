@@ -53,7 +53,7 @@ def backends(checkpoint: str | Path | None, problem: Problem, settings: str, ens
 
 
 def fingerprint(problem: Problem) -> str:
-    """Return a digest of model, data, priors, fixed values and scheme."""
+    """Return a digest of model, data, priors, fixed values, ties and scheme."""
     digest = hashlib.sha256(kernel_source(problem.model).encode())
     for experiment in problem.experiments:
         digest.update(
@@ -72,5 +72,5 @@ def fingerprint(problem: Problem) -> str:
         for signals in (experiment.outputs, experiment.inputs):
             for name, values in signals.items():
                 digest.update(name.encode() + np.ascontiguousarray(values).tobytes())
-    digest.update(repr((problem.priors, problem.fixed, problem.fixed_variances, problem.scheme)).encode())
+    digest.update(repr((problem.priors, problem.fixed, problem.tied, problem.fixed_variances, problem.scheme)).encode())
     return f"problem {digest.hexdigest()[:16]}"

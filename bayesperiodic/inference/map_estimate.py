@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 from tqdm import tqdm
 
 from bayesperiodic import checks
-from bayesperiodic.expressions import parse_all
+from bayesperiodic.expressions import Expression, parse_all
 from bayesperiodic.inference.input_noise import input_noise
 from bayesperiodic.inference.problem import Evaluation, Problem
 from bayesperiodic.inference.whiteness import Whiteness, whiteness
@@ -54,6 +54,8 @@ class MapEstimate(Result):
         Standard deviation that the noise of the measured inputs brings to each channel.
     history : array (iterations,)
         The objective before each step and at the end.
+    tied : dict of str to dict of str to float
+        Derivatives of the tied parameters by the free ones at the estimate.
     """
 
     status: str
@@ -70,6 +72,7 @@ class MapEstimate(Result):
     whiteness: dict[str, Whiteness]
     input_noise: dict[str, float]
     history: np.ndarray
+    tied: dict[str, dict[str, float]]
 
     @property
     def converged(self) -> bool:
@@ -102,8 +105,8 @@ class MapEstimate(Result):
         Parameters
         ----------
         expressions : mapping of str to str
-            By new name: numbers, names of parameters (free or fixed), pi, + - * / ** and sqrt, exp, log, sin, cos, tan,
-            atan, sinh, cosh, tanh, abs.
+            By new name: numbers, names of parameters (free, fixed or tied), pi, + - * / ** and sqrt, exp, log, sin,
+            cos, tan, atan, sinh, cosh, tanh, abs.
 
         Returns
         -------
@@ -140,7 +143,7 @@ class MapEstimate(Result):
                     f"expressions[{name!r}]: {quantities[name].text!r} is not allowed; it is {value} at the estimate "
                     "and must be finite."
                 )
-        covariance = _carried(self.covariance, [q.gradient(values, self.theta) for q in quantities.values()])
+        covariance = _carried(self.covariance, [self._gradient(q, values) for q in quantities.values()])
         with np.errstate(invalid="ignore"):
             sd = np.sqrt(np.diag(covariance))
         table = pd.DataFrame({"value": list(at.values()), "sd": sd}, index=list(at))
@@ -149,8 +152,16 @@ class MapEstimate(Result):
         }
         return table
 
+    def _gradient(self, quantity: Expression, values: dict[str, float]) -> dict[str, np.ndarray]:
+        """Return the derivatives by the free parameters, those through tied ones included."""
+        partial = quantity.gradient(values, [*self.theta, *self.tied])
+        return {
+            name: partial[name] + sum((partial[t] * slopes[name] for t, slopes in self.tied.items()), np.array(0.0))
+            for name in self.theta
+        }
+
     def _fixed(self) -> dict[str, float]:
-        """Return the parameters that have the same value in all solutions and are not free."""
+        """Return the parameters that have the same value in all solutions and are not free, tied ones among them."""
         first, *others = (solution.parameters for solution in self.solutions.values())
         return {
             name: value
@@ -299,6 +310,11 @@ def _uphill(problem: Problem, theta: np.ndarray, hessian: np.ndarray) -> np.ndar
     return hessian
 
 
+def _tied_slopes(problem: Problem, theta: np.ndarray) -> dict[str, dict[str, float]]:
+    slopes = dict(zip(problem.model.parameters, problem.parameter_map.slopes(theta).tolist(), strict=True))
+    return {name: dict(zip(problem.names, slopes[name], strict=True)) for name in problem.tied}
+
+
 def _describe(
     problem: Problem, theta: np.ndarray, evaluation: Evaluation | None, status: str, history: np.ndarray
 ) -> MapEstimate:
@@ -330,6 +346,7 @@ def _describe(
         whiteness={c: _whiteness(problem, evaluation, c) for c in problem.channels},
         input_noise=input_noise(problem, theta, evaluation.solutions),
         history=history,
+        tied=_tied_slopes(problem, theta),
     )
     for channel, noise in result.input_noise.items():
         if noise > NOISE_SHARE * rms[channel]:

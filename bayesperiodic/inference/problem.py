@@ -10,6 +10,7 @@ import numpy as np
 from bayesperiodic import checks, fourier
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.inference.joint_prior import JointPrior
+from bayesperiodic.inference.parameters import ParameterMap
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.compiled import CONVERGED
@@ -56,17 +57,20 @@ class Problem:
         Makes a parameter free; a tuple of names takes a `MultivariateNormal`. A frozen continuous distribution of
         scipy.stats is a prior too.
     fixed : mapping of str to float, optional
-        Values of the other parameters; ``"variance[force]"`` fixes the variance of a channel.
+        Values of other parameters; ``"variance[force]"`` fixes the variance of a channel.
+    tied : mapping of str to str, optional
+        The remaining parameters as expressions of others, such as ``{"theta11": "-1e5*theta4"}``: numbers, names, pi,
+        + - * / ** and sqrt, exp, log, sin, cos, tan, atan, sinh, cosh, tanh, abs.
     scheme : str or Scheme
         See `solve_periodic`.
 
     Raises
     ------
     ValueError
-        For a parameter without prior or value, with both or with two priors, a value that is no prior or does not fit
-        its tuple of names, an unknown name, an experiment without the model's inputs or with outputs that the model
-        lacks, no more independent values than free parameters in a channel whose variance is unknown, an autonomous
-        model.
+        For a parameter that is not just one of free, fixed and tied, or is in two priors, an expression that is not
+        allowed or circular, a value that is no prior or does not fit its tuple of names, an unknown name, an experiment
+        without the model's inputs or with outputs that the model lacks, no more independent values than free parameters
+        in a channel whose variance is unknown, an autonomous model.
 
     References
     ----------
@@ -81,6 +85,7 @@ class Problem:
         *,
         priors: Mapping[Any, Any],
         fixed: Mapping[str, float] | None = None,
+        tied: Mapping[str, str] | None = None,
         scheme: str | Scheme = "central2",
     ):
         if model.autonomous:
@@ -101,14 +106,10 @@ class Problem:
                 raise ValueError(f"fixed: {name!r} has a prior too; give a prior or a value.")
         for name in fixed:
             checks.one_of("fixed", name, (*model.parameters, *variance_names))
-        if without := [n for n in model.parameters if n not in self.names and n not in fixed]:
-            raise ValueError(
-                f"priors: {', '.join(map(repr, without))} has neither a prior nor a value; a free parameter needs a "
-                "prior, any other a value in `fixed`."
-            )
         if not self.names:
             raise ValueError("priors: {} is not allowed; at least one parameter must be free.")
         self.fixed = {n: checks.finite_number(f"fixed[{n!r}]", fixed[n]) for n in model.parameters if n in fixed}
+        self.parameter_map = ParameterMap.of(model.parameters, self.names, self.fixed, tied or {})
         self.fixed_variances = {
             channel: checks.positive(f"fixed[{name!r}]", fixed[name])
             for name, channel in variance_names.items()
@@ -192,6 +193,11 @@ class Problem:
             (tuple(group), Batch([self.equations[e.name] for e in group], [self.anchors[e.name] for e in group]))
             for group in groups.values()
         ]
+
+    @property
+    def tied(self) -> dict[str, str]:
+        """The expressions of the tied parameters."""
+        return {name: expression.text for name, expression in self.parameter_map.tied.items()}
 
     @property
     def priors(self) -> dict[str | tuple[str, ...], Any]:
@@ -314,7 +320,8 @@ class Problem:
 
     def evaluate(self, theta: Mapping[str, float] | np.ndarray) -> Evaluation:
         """Solve at one θ and compare with the data (eq. 4-5)."""
-        solutions = self.solve(theta)
+        values = self.vector(theta)
+        solutions = self.solve(values)
         residuals: dict[str, dict[str, np.ndarray]] = {}
         sensitivities: dict[str, dict[str, np.ndarray]] = {}
         for e in self.experiments:
@@ -322,8 +329,10 @@ class Problem:
             if not solution.converged:
                 continue
             residuals[e.name] = {c: y - e.project(c, solution.outputs[c]) for c, y in e.outputs.items()}
+            slopes = self.parameter_map.slopes(values).T
             sensitivities[e.name] = {
-                c: e.project(c, np.stack([solution.sensitivities[c][name] for name in self.names])) for c in e.outputs
+                c: e.project(c, slopes @ np.stack([solution.sensitivities[c][p] for p in self.model.parameters]))
+                for c in e.outputs
             }
         return Evaluation(solutions, residuals, sensitivities)
 
@@ -334,10 +343,7 @@ class Problem:
 
     def parameters(self, theta: np.ndarray) -> np.ndarray:
         """Return every parameter of the model (points, parameters) from θ (points, names)."""
-        parameters = np.empty((len(theta), len(self.model.parameters)))
-        for column, name in enumerate(self.model.parameters):
-            parameters[:, column] = theta[:, self.names.index(name)] if name in self.names else self.fixed[name]
-        return parameters
+        return self.parameter_map.values(theta)
 
     def __repr__(self) -> str:
         return (
