@@ -30,14 +30,14 @@ def linear_regressors(x_amplitude: float, frequency: float, tau: np.ndarray) -> 
 
 
 def linear_experiment(
-    theta: np.ndarray, sd: float, seed: int, samples: int = 40, independent: int | None = None
+    theta: np.ndarray, sd: float, seed: int, samples: int = 40, independent: int | None = None, name: str = "run"
 ) -> bp.Experiment:
     """Return an experiment of LINEAR with white noise on its samples."""
     tau = grid(samples)
     clean = linear_regressors(0.05, 2.0, tau) @ theta
     noise = sd * np.random.default_rng(seed).standard_normal(samples)
     return bp.Experiment(
-        "run",
+        name,
         2.0,
         {"force": clean + noise},
         {"x": 0.05 * np.sin(2 * np.pi * tau)},

@@ -24,14 +24,13 @@ def input_noise(problem: Problem, theta: np.ndarray, solutions: Mapping[str, Per
     solutions : mapping of str to PeriodicSolution
         At θ, by experiment.
     """
-    parameters = problem.parameters(theta[None])[0]
     variances: dict[str, list[float]] = {channel: [0.0] for channel in problem.channels}
     for e in problem.experiments:
         directions = _perturbations(e)
         if not len(directions):
             continue
         equations = problem.equations[e.name]
-        z = periodic_part(equations, solutions[e.name].states)
+        z, parameters = periodic_part(equations, solutions[e.name].states), problem.parameters(theta[None], e.name)[0]
         derivative = input_sensitivities(equations, z, parameters, directions)
         if derivative is None:
             continue

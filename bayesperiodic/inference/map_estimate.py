@@ -55,7 +55,7 @@ class MapEstimate(Result):
     history : array (iterations,)
         The objective before each step and at the end.
     tied : dict of str to dict of str to float
-        Derivatives of the tied parameters by the free ones at the estimate.
+        Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
     """
 
     status: str
@@ -311,7 +311,9 @@ def _uphill(problem: Problem, theta: np.ndarray, hessian: np.ndarray) -> np.ndar
 
 
 def _tied_slopes(problem: Problem, theta: np.ndarray) -> dict[str, dict[str, float]]:
-    slopes = dict(zip(problem.model.parameters, problem.parameter_map.slopes(theta).tolist(), strict=True))
+    each = np.array([parameter_map.slopes(theta) for parameter_map in problem.parameter_maps.values()])
+    common = np.where(np.ptp(each, axis=0) == 0.0, each[0], np.nan)
+    slopes = dict(zip(problem.model.parameters, common.tolist(), strict=True))
     return {name: dict(zip(problem.names, slopes[name], strict=True)) for name in problem.tied}
 
 

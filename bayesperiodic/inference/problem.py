@@ -56,8 +56,9 @@ class Problem:
     priors : mapping of str or tuple of str to prior
         Makes a parameter free; a tuple of names takes a `MultivariateNormal`. A frozen continuous distribution of
         scipy.stats is a prior too.
-    fixed : mapping of str to float, optional
-        Values of other parameters; ``"variance[force]"`` fixes the variance of a channel.
+    fixed : mapping of str to float or to mapping of str to float, optional
+        Values of other parameters, for all experiments or by experiment; ``"variance[force]"`` fixes the variance of a
+        channel.
     tied : mapping of str to str, optional
         The remaining parameters as expressions of others, such as ``{"theta11": "-1e5*theta4"}``: numbers, names, pi,
         + - * / ** and sqrt, exp, log, sin, cos, tan, atan, sinh, cosh, tanh, abs.
@@ -84,7 +85,7 @@ class Problem:
         experiments: Iterable[Experiment],
         *,
         priors: Mapping[Any, Any],
-        fixed: Mapping[str, float] | None = None,
+        fixed: Mapping[str, float | Mapping[str, float]] | None = None,
         tied: Mapping[str, str] | None = None,
         scheme: str | Scheme = "central2",
     ):
@@ -108,8 +109,13 @@ class Problem:
             checks.one_of("fixed", name, (*model.parameters, *variance_names))
         if not self.names:
             raise ValueError("priors: {} is not allowed; at least one parameter must be free.")
-        self.fixed = {n: checks.finite_number(f"fixed[{n!r}]", fixed[n]) for n in model.parameters if n in fixed}
-        self.parameter_map = ParameterMap.of(model.parameters, self.names, self.fixed, tied or {})
+        self.fixed = {n: _constant(n, fixed[n], self.experiments) for n in model.parameters if n in fixed}
+        self.parameter_maps = {
+            e.name: ParameterMap.of(
+                model.parameters, self.names, {n: v[e.name] for n, v in self.fixed.items()}, tied or {}
+            )
+            for e in self.experiments
+        }
         self.fixed_variances = {
             channel: checks.positive(f"fixed[{name!r}]", fixed[name])
             for name, channel in variance_names.items()
@@ -164,9 +170,9 @@ class Problem:
         return other
 
     def _anchors_at(self, theta: np.ndarray) -> dict[str, Anchor]:
-        parameters = self.parameters(theta[None])[0]
         anchors = {}
         for name, equations in self.equations.items():
+            parameters = self.parameters(theta[None], name)[0]
             z, code, _ = self._solve_one(name, parameters, self._anchors)
             anchors[name] = (
                 Anchor.at(equations, parameters, z)
@@ -185,10 +191,11 @@ class Problem:
 
     @cached_property
     def _batches(self) -> list[tuple[tuple[Experiment, ...], Batch]]:
-        """Experiments on the same grid, with what solves them together."""
-        groups: dict[tuple[int, int], list[Experiment]] = {}
+        """Experiments on the same grid and with the same constants, with what solves them together."""
+        groups: dict[tuple[Any, ...], list[Experiment]] = {}
         for e in self.experiments:
-            groups.setdefault((e.samples, e.periods), []).append(e)
+            constants = tuple(values[e.name] for values in self.fixed.values())
+            groups.setdefault((e.samples, e.periods, constants), []).append(e)
         return [
             (tuple(group), Batch([self.equations[e.name] for e in group], [self.anchors[e.name] for e in group]))
             for group in groups.values()
@@ -197,7 +204,8 @@ class Problem:
     @property
     def tied(self) -> dict[str, str]:
         """The expressions of the tied parameters."""
-        return {name: expression.text for name, expression in self.parameter_map.tied.items()}
+        any_map = next(iter(self.parameter_maps.values()))
+        return {name: expression.text for name, expression in any_map.tied.items()}
 
     @property
     def priors(self) -> dict[str | tuple[str, ...], Any]:
@@ -264,11 +272,11 @@ class Problem:
         M is infinite where a periodic solve fails. The result does not depend on the number of threads.
         """
         values = self.vector(theta)
-        parameters = self.parameters(values.reshape(-1, len(self.names)))
-        moments = np.zeros((len(parameters), len(self.channels)))
-        status = np.full(len(parameters), CONVERGED)
+        flat = values.reshape(-1, len(self.names))
+        moments = np.zeros((len(flat), len(self.channels)))
+        status = np.full(len(flat), CONVERGED)
         for experiments, batch in self._batches:
-            y, codes, _ = batch.solve(parameters, threads)
+            y, codes, _ = batch.solve(self.parameters(flat, experiments[0].name), threads)
             status = np.maximum(status, codes.max(axis=0))
             with np.errstate(over="ignore", invalid="ignore"):
                 for experiment, predicted in zip(experiments, y, strict=True):
@@ -300,11 +308,11 @@ class Problem:
 
     def outputs(self, theta: Mapping[str, float] | np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
         """Return ŷ of many θ (draws, names), by experiment and channel (draws, points), and which solves converged."""
-        parameters = self.parameters(self.vector(theta))
-        converged = np.full(len(parameters), True)
+        values = self.vector(theta)
+        converged = np.full(len(values), True)
         result = {}
         for experiments, batch in self._batches:
-            y, codes, _ = batch.solve(parameters)
+            y, codes, _ = batch.solve(self.parameters(values, experiments[0].name))
             converged &= (codes == CONVERGED).all(axis=0)
             for e, predicted in zip(experiments, y, strict=True):
                 result[e.name] = {channel: predicted[:, :, self.model.outputs.index(channel)] for channel in e.outputs}
@@ -312,9 +320,9 @@ class Problem:
 
     def solve(self, theta: Mapping[str, float] | np.ndarray) -> dict[str, PeriodicSolution]:
         """Return the periodic solution of every experiment at one θ."""
-        parameters = self.parameters(self.vector(theta)[None])[0]
-        solutions = {}
+        values, solutions = self.vector(theta), {}
         for name, equations in self.equations.items():
+            parameters = self.parameters(values[None], name)[0]
             solutions[name] = describe(equations, parameters, self._solve_one(name, parameters, self.anchors))
         return solutions
 
@@ -329,7 +337,7 @@ class Problem:
             if not solution.converged:
                 continue
             residuals[e.name] = {c: y - e.project(c, solution.outputs[c]) for c, y in e.outputs.items()}
-            slopes = self.parameter_map.slopes(values).T
+            slopes = self.parameter_maps[e.name].slopes(values).T
             sensitivities[e.name] = {
                 c: e.project(c, slopes @ np.stack([solution.sensitivities[c][p] for p in self.model.parameters]))
                 for c in e.outputs
@@ -341,15 +349,23 @@ class Problem:
         draws = self.joint_prior.sample(size, np.random.default_rng(seed))
         return dict(zip(self.names, draws.T.copy(), strict=True))
 
-    def parameters(self, theta: np.ndarray) -> np.ndarray:
-        """Return every parameter of the model (points, parameters) from θ (points, names)."""
-        return self.parameter_map.values(theta)
+    def parameters(self, theta: np.ndarray, experiment: str) -> np.ndarray:
+        """Return every parameter of the model (points, parameters) in an experiment from θ (points, names)."""
+        return self.parameter_maps[experiment].values(theta)
 
     def __repr__(self) -> str:
         return (
             f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
             f"channels: {', '.join(self.channels)} with {self.independent.sum():.0f} independent values)"
         )
+
+
+def _constant(name: str, given: Any, experiments: tuple[Experiment, ...]) -> dict[str, float]:
+    """Return the value of a fixed parameter in each experiment."""
+    if not isinstance(given, Mapping):
+        return dict.fromkeys((e.name for e in experiments), checks.finite_number(f"fixed[{name!r}]", given))
+    checks.same_names(f"fixed[{name!r}]", given, [e.name for e in experiments])
+    return {e.name: checks.finite_number(f"fixed[{name!r}][{e.name!r}]", given[e.name]) for e in experiments}
 
 
 def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tuple[Experiment, ...]:

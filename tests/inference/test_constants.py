@@ -1,0 +1,83 @@
+"""Fixed parameters that differ between experiments."""
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+
+COULOMB = {"light": 10.0, "heavy": 40.0}
+PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(40.0, 20.0)}
+
+
+def experiments() -> list[bp.Experiment]:
+    return [
+        linear_experiment([900.0, 45.0, coulomb], 3.0, seed=seed, name=name)
+        for seed, (name, coulomb) in enumerate(COULOMB.items())
+    ]
+
+
+def problem(coulomb, **changes) -> bp.Problem:
+    fixed = {"variance[force]": 9.0, "coulomb": coulomb}
+    return bp.Problem(LINEAR, experiments(), **({"priors": PRIORS, "fixed": fixed} | changes))
+
+
+def test_each_experiment_has_its_own_constant():
+    """The closed posterior of k and c, each run's own friction taken off its force."""
+    fit = bp.map_estimate(problem(COULOMB), progress=False)
+    x = linear_regressors(0.05, 2.0, grid(40))
+    precision = 2 * x[:, :2].T @ x[:, :2] / 9.0 + np.diag([60.0**-2, 20.0**-2])
+    right = np.array([800 / 60.0**2, 40 / 20.0**2])
+    for e in experiments():
+        right += x[:, :2].T @ (e.outputs["force"] - COULOMB[e.name] * x[:, 2]) / 9.0
+    assert list(fit.theta.values()) == pytest.approx(np.linalg.solve(precision, right), rel=1e-9)
+    assert fit.covariance.to_numpy() == pytest.approx(np.linalg.inv(precision), rel=1e-8)
+    assert {name: s.parameters["coulomb"] for name, s in fit.solutions.items()} == COULOMB
+    with pytest.raises(ValueError, match="'coulomb' is not known"):
+        fit.derive({"share": "coulomb/k"})
+
+
+def test_density_agrees_with_one_problem_an_experiment():
+    theta = {"k": np.array([850.0, 910.0]), "c": np.array([30.0, 52.0])}
+    together = problem(COULOMB).log_likelihood(theta, {})
+    apart = [
+        bp.Problem(LINEAR, [e], priors=PRIORS, fixed={"variance[force]": 9.0, "coulomb": COULOMB[e.name]})
+        for e in experiments()
+    ]
+    assert together == pytest.approx(sum(p.log_likelihood(theta, {}) for p in apart), rel=1e-12)
+
+
+def test_a_tie_may_name_what_differs():
+    """Damping = coulomb · k/900, k the only free parameter: closed, and no common slope to derive anything from c."""
+    tied = problem(COULOMB, tied={"c": "coulomb*k/900"}, priors={"k": PRIORS["k"]})
+    assert tied.parameters(np.array([[450.0]]), "heavy")[0] == pytest.approx([450.0, 20.0, 40.0])
+    fit = bp.map_estimate(tied, progress=False)
+    x = linear_regressors(0.05, 2.0, grid(40))
+    precision, right = 60.0**-2, 800 / 60.0**2
+    for e in experiments():
+        regressor = x[:, 0] + x[:, 1] * COULOMB[e.name] / 900
+        precision += regressor @ regressor / 9.0
+        right += regressor @ (e.outputs["force"] - COULOMB[e.name] * x[:, 2]) / 9.0
+    assert fit.theta["k"] == pytest.approx(right / precision, rel=1e-9)
+    assert fit.sd["k"] == pytest.approx(precision**-0.5, rel=1e-8)
+    assert np.isnan(fit.tied["c"]["k"])
+
+
+def test_one_value_for_all_is_as_before():
+    both = {"k": 900.0, "c": 45.0}
+    one, each = problem(25.0), problem(dict.fromkeys(COULOMB, 25.0))
+    assert one.log_likelihood(both, {}) == each.log_likelihood(both, {})
+
+
+@pytest.mark.parametrize(
+    ("coulomb", "message"),
+    [
+        ({"light": 1.0}, r"fixed\['coulomb'\]: missing 'heavy'"),
+        ({"light": 1.0, "heavi": 2.0}, r"fixed\['coulomb'\]: 'heavi' is not known.*Did you mean 'heavy'"),
+        ({"light": 1.0, "heavy": np.nan}, r"fixed\['coulomb'\]\['heavy'\]: nan is not allowed"),
+        ("25 N", r"fixed\['coulomb'\]: '25 N' is not allowed"),
+    ],
+)
+def test_bad_constants_are_named(coulomb, message):
+    with pytest.raises(ValueError, match=message):
+        problem(coulomb)
