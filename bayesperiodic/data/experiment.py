@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from bayesperiodic import checks, fourier
 from bayesperiodic.store import Result
@@ -91,6 +92,65 @@ class Experiment(Result):
         checks.same_names("independent", counts, self.outputs)
         object.__setattr__(self, "independent", counts)
 
+    @classmethod
+    def from_harmonics(
+        cls,
+        name: str,
+        frequency: float,
+        outputs: Mapping[str, ArrayLike],
+        inputs: Mapping[str, ArrayLike] | None = None,
+        *,
+        samples: int = 800,
+    ) -> "Experiment":
+        """Return the experiment that was measured as harmonic amplitudes instead of time histories.
+
+        Parameters
+        ----------
+        name : str
+        frequency : float
+            Of harmonic 1, the forcing frequency [Hz].
+        outputs, inputs : mapping of str to complex array (harmonics + 1,)
+            Amplitudes c of harmonics 0, 1, 2, …: the signal is Re Σ c[h] exp(2πi h τ), so that c[0] is the mean (real),
+            |c[h]| the amplitude and a cosine has a real, positive one.
+        samples : int
+            Grid points per period; more than twice the highest harmonic.
+
+        Returns
+        -------
+        Experiment
+            The outputs are compared in these harmonics only; each channel has 2·harmonics + 1 independent values.
+
+        Raises
+        ------
+        ValueError
+            For amplitudes that are not finite or no vector, a mean that is not real, too few samples for the highest
+            harmonic, and as `Experiment` does.
+
+        Examples
+        --------
+        >>> import bayesperiodic as bp
+        >>> run = bp.Experiment.from_harmonics("run", 2.0, {"x": [0.1, 0.02 - 0.01j]}, {"force": [0, 5]}, samples=8)
+        >>> run.independent, run.inputs["force"].round(3)[:3].tolist()
+        ({'x': 3}, [5.0, 3.536, 0.0])
+        """
+        samples = checks.integer("samples", samples, 4)
+        signals: dict[str, dict[str, np.ndarray]] = {"outputs": {}, "inputs": {}}
+        highest: dict[str, int] = {}
+        for kind, channels in (("outputs", outputs), ("inputs", inputs or {})):
+            for channel, values in channels.items():
+                amplitudes = _amplitudes(f"{kind}[{channel!r}]", values, samples)
+                signals[kind][channel] = fourier.on_grid(amplitudes, samples)
+                highest[channel] = amplitudes.size - 1
+        return cls(
+            name,
+            frequency,
+            signals["outputs"],
+            signals["inputs"],
+            samples=samples,
+            harmonics={channel: highest[channel] for channel in outputs},
+            independent={channel: 2 * highest[channel] + 1 for channel in outputs},
+        )
+
     @property
     def tau(self) -> np.ndarray:
         """Time in forcing periods, (samples·periods,)."""
@@ -113,3 +173,24 @@ class Experiment(Result):
             f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples a "
             f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''})"
         )
+
+
+def _amplitudes(argument: str, values: ArrayLike, samples: int) -> np.ndarray:
+    """Return checked complex amplitudes of harmonics from 0 on."""
+    try:
+        amplitudes = np.array(values, dtype=complex)
+    except (TypeError, ValueError):
+        raise ValueError(f"{argument}: {values!r} is not allowed; it must be an array of complex numbers.") from None
+    if amplitudes.ndim != 1 or not amplitudes.size or not np.isfinite(amplitudes).all():
+        raise ValueError(
+            f"{argument}: {amplitudes.tolist()} is not allowed; it must be a vector of finite amplitudes of harmonics "
+            "0, 1, 2, …"
+        )
+    if amplitudes[0].imag != 0.0:
+        raise ValueError(f"{argument}: {amplitudes[0]} is not allowed as harmonic 0; the mean must be real.")
+    if amplitudes.size - 1 > fourier.highest_harmonic(samples):
+        raise ValueError(
+            f"samples: {samples} is not allowed; harmonic {amplitudes.size - 1} of {argument} needs at least "
+            f"{2 * amplitudes.size - 1}."
+        )
+    return amplitudes

@@ -49,13 +49,13 @@ class PeriodicSolution(Result):
     states, inputs, outputs : dict of str to array (points,)
     sensitivities : dict of str to dict of str to array (points,)
         ∂output/∂parameter, ``sensitivities[output][parameter]`` (de Kraker et al. 1997, eq. 4), and for a forced model
-        ``sensitivities[output]["frequency"]`` [per Hz], inputs held as functions of tau; empty unless converged. For
-        an autonomous model the phase moves so that the change stays orthogonal to the flow, states in units of their
-        range.
+        ``sensitivities[output]["frequency"]`` [per Hz; −frequency² times that is per second of period], inputs held as
+        functions of tau; empty unless converged. For an autonomous model the phase moves so that the change stays
+        orthogonal to the flow, states in units of their range.
     state_sensitivities : dict of str to dict of str to array (points,)
         The same of the states.
     frequency_sensitivities : dict of str to float
-        ∂frequency/∂parameter of an autonomous model's orbit; zero for a forced model.
+        ∂frequency/∂parameter of an autonomous model's orbit (−period² times that: ∂period); zero for a forced one.
     linearisation : array (points, states, 3·states)
         ∂g/∂(q, q̇, q̈) on the orbit.
     iterations : int
