@@ -16,6 +16,16 @@ LINEAR = bp.Model(
     outputs=lambda s, p, u: {"force": p.k * u.x + p.c * u.dx + p.coulomb * sp.tanh(u.dx / 0.1)},
 )
 
+# It has no equilibrium and no periodic solution.
+RUNAWAY = bp.Model(
+    "runaway",
+    states=["x"],
+    inputs=["u"],
+    parameters=["a"],
+    equations=lambda s, p, u: [s.dx - p.a * (1 + s.x**2) - u.u],
+    outputs=lambda s, p, u: {"x": s.x},
+)
+
 
 def grid(samples: int) -> np.ndarray:
     """Return τ on a grid."""

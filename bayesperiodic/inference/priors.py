@@ -6,6 +6,7 @@ are open intervals; outside, `log_prob` is −∞, `gradient` and `curvature` ar
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -46,7 +47,7 @@ class Prior(Protocol):
         """Return independent draws, (size,)."""
 
 
-class Univariate:
+class Univariate(ABC):
     """What the priors of one parameter share: only points inside the support reach their formulas."""
 
     @property
@@ -93,17 +94,17 @@ class Univariate:
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
-    def _log_density(self, x: np.ndarray) -> Any:
-        raise NotImplementedError
+    @abstractmethod
+    def _log_density(self, x: np.ndarray) -> Any: ...
 
-    def _gradient(self, x: np.ndarray) -> Any:
-        raise NotImplementedError
+    @abstractmethod
+    def _gradient(self, x: np.ndarray) -> Any: ...
 
-    def _curvature(self, x: np.ndarray) -> Any:
-        raise NotImplementedError
+    @abstractmethod
+    def _curvature(self, x: np.ndarray) -> Any: ...
 
-    def _quantile(self, p: np.ndarray) -> np.ndarray:
-        raise NotImplementedError
+    @abstractmethod
+    def _quantile(self, p: np.ndarray) -> np.ndarray: ...
 
 
 class _Positive(Univariate):

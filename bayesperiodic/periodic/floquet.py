@@ -76,32 +76,28 @@ def first_order_matrix(linearisation: np.ndarray, orders: tuple[int, ...]) -> np
     numpy.linalg.LinAlgError
         If the equations cannot be solved for the highest derivatives.
     """
-    points, count, _ = linearisation.shape
     highest, lower = _split(linearisation, orders)
-    second = [i for i, order in enumerate(orders) if order == 2]
-    solved = -np.linalg.solve(highest, lower)
-    matrix = np.zeros((points, count + len(second), count + len(second)))
-    matrix[:, :count] = solved
-    for row, state in enumerate(second):
-        matrix[:, count + row] = solved[:, state]
-        matrix[:, state] = 0.0
-        matrix[:, state, count + row] = 1.0
-    return matrix
+    return _companion(-np.linalg.solve(highest, lower), orders, 1.0)
 
 
 def matrix_change(linearisation: np.ndarray, change: np.ndarray, orders: tuple[int, ...]) -> np.ndarray:
     """Return the change of `first_order_matrix` for a change of the linearisation, of the same shape."""
-    count = linearisation.shape[1]
     highest, lower = _split(linearisation, orders)
     highest_change, lower_change = _split(change, orders)
     solved = -np.linalg.solve(highest, lower)
-    solved_change = -np.linalg.solve(highest, lower_change + highest_change @ solved)
+    return _companion(-np.linalg.solve(highest, lower_change + highest_change @ solved), orders, 0.0)
+
+
+def _companion(solved: np.ndarray, orders: tuple[int, ...], one: float) -> np.ndarray:
+    """Return the matrix whose rows for the highest derivatives are given, (points, states, size); q̇ = `one` · q̇."""
+    points, count, size = solved.shape
     second = [i for i, order in enumerate(orders) if order == 2]
-    matrix = np.zeros((len(change), count + len(second), count + len(second)))
-    matrix[:, :count] = solved_change
+    matrix = np.zeros((points, size, size))
+    matrix[:, :count] = solved
     for row, state in enumerate(second):
-        matrix[:, count + row] = solved_change[:, state]
+        matrix[:, count + row] = solved[:, state]
         matrix[:, state] = 0.0
+        matrix[:, state, count + row] = one
     return matrix
 
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesperiodic.periodic.equations import PeriodicEquations
+from bayesperiodic.periodic.equations import Derivatives, PeriodicEquations
 
 
 class Sensitivities(NamedTuple):
@@ -31,27 +31,26 @@ def parameter_sensitivities(
     For an autonomous model the phase moves so that the change of the orbit stays orthogonal to the flow, states in
     units of their range.
     """
-    d = equations.derivatives(z, parameters)
+    d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
     g, f = np.moveaxis(d.g_theta, 2, 0), np.moveaxis(d.f_theta, 2, 0)
     if not equations.model.autonomous:
-        columns = equations.residual_jacobian(z, parameters)
         g_frequency, f_frequency = frequency_derivatives(equations, z, columns, d)
         g, f = np.concatenate([g, g_frequency[None]]), np.concatenate([f, f_frequency[None]])
-    return respond(equations, z, parameters, g, f)
+    return respond(equations, z, columns, d, g, f)
 
 
 def input_sensitivities(
     equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
 ) -> Sensitivities | None:
     """Return derivatives along perturbations (directions, points, 3·inputs) of (u, u̇, ü); None if singular."""
-    d = equations.derivatives(z, parameters)
+    d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
     g = np.einsum("neu,dnu->dne", d.g_u, directions)
     f = np.einsum("ncu,dnu->dnc", d.f_u, directions)
-    return respond(equations, z, parameters, g, f)
+    return respond(equations, z, columns, d, g, f)
 
 
 def frequency_derivatives(
-    equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray, d: tuple[np.ndarray, ...]
+    equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray, d: Derivatives
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return dg/dfrequency (points, states) and df/dfrequency (points, channels), z and inputs held in tau."""
     states, inputs = equations.frequency_changes(z)
@@ -63,11 +62,9 @@ def frequency_derivatives(
 
 
 def respond(
-    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray, g: np.ndarray, f: np.ndarray
+    equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray, d: Derivatives, g: np.ndarray, f: np.ndarray
 ) -> Sensitivities | None:
     """Return the response to changes of g (directions, points, states) and f (directions, points, channels)."""
-    columns = equations.residual_jacobian(z, parameters)
-    d = equations.derivatives(z, parameters)
     factors = equations.factors(columns)
     if equations.model.autonomous:
         g_frequency, f_frequency = frequency_derivatives(equations, z, columns, d)

@@ -43,7 +43,7 @@ def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tupl
     """Return z (points, states) and frequency [Hz] of the cycle that an autonomous model settles on; None without one.
 
     The integration starts near the equilibrium; the cycle is what lies between the last two upward passages of the
-    widest moving state through its mean.
+    widest moving state through the middle of its range.
     """
     grid, count, model = equations.grid, equations.count, equations.model
     equilibrium = equations.static_guess(parameters)[0]

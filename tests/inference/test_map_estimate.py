@@ -5,7 +5,7 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.inference.whiteness import whiteness
-from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+from tests.known import LINEAR, RUNAWAY, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
@@ -146,16 +146,8 @@ def test_start_outside_the_support_is_refused():
 
 
 def test_start_without_periodic_solution_is_refused():
-    model = bp.Model(
-        "runaway",
-        states=["x"],
-        inputs=["u"],
-        parameters=["a"],
-        equations=lambda s, p, u: [s.dx - p.a * (1 + s.x**2) - u.u],
-        outputs=lambda s, p, u: {"x": s.x},
-    )
     experiment = bp.Experiment(
         "run", 1.0, {"x": np.cos(2 * np.pi * grid(50))}, {"u": np.sin(2 * np.pi * grid(50))}, samples=50
     )
     with pytest.raises(ValueError, match="the log-posterior is not finite there, the periodic solve ended with"):
-        bp.map_estimate(bp.Problem(model, [experiment], priors={"a": bp.LogNormal(1.0, 0.1)}))
+        bp.map_estimate(bp.Problem(RUNAWAY, [experiment], priors={"a": bp.LogNormal(1.0, 0.1)}))

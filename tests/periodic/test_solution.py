@@ -3,7 +3,7 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
-from tests.known import complex_step_sensitivities, grid
+from tests.known import RUNAWAY, complex_step_sensitivities, grid
 
 DUFFING = {"m": 0.45, "c": 1.3, "k": 900.0, "k3": 4e5}
 FREQUENCY = 5.0
@@ -31,15 +31,6 @@ COUPLED = bp.Model(
     },
 )
 COUPLED_AT = {"m": 1.2, "c": 0.4, "k": 30.0, "h": 2.0, "b": 0.7}
-
-RUNAWAY = bp.Model(
-    "runaway",
-    states=["x"],
-    inputs=["u"],
-    parameters=["a"],
-    equations=lambda s, p, u: [s.dx - p.a * (1 + s.x**2) - u.u],
-    outputs=lambda s, p, u: {"x": s.x},
-)
 
 
 def manufactured_force(x, v, a):
