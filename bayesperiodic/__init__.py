@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from bayesperiodic.data.recording import Recording
     from bayesperiodic.diagnosis.comparison import Comparison, compare
     from bayesperiodic.diagnosis.predictive import Prediction, predict
-    from bayesperiodic.inference.map_estimate import MapEstimate, map_estimate
+    from bayesperiodic.inference import noise
+    from bayesperiodic.inference.estimate import MapEstimate
+    from bayesperiodic.inference.map_estimate import map_estimate
     from bayesperiodic.inference.multivariate import MultivariateNormal
     from bayesperiodic.inference.posterior import Posterior
     from bayesperiodic.inference.priors import (
@@ -45,7 +47,8 @@ _HOMES = {
     "bayesperiodic.data.recording": ["Recording"],
     "bayesperiodic.diagnosis.comparison": ["Comparison", "compare"],
     "bayesperiodic.diagnosis.predictive": ["Prediction", "predict"],
-    "bayesperiodic.inference.map_estimate": ["MapEstimate", "map_estimate"],
+    "bayesperiodic.inference.estimate": ["MapEstimate"],
+    "bayesperiodic.inference.map_estimate": ["map_estimate"],
     "bayesperiodic.inference.posterior": ["Posterior"],
     "bayesperiodic.inference.multivariate": ["MultivariateNormal"],
     "bayesperiodic.inference.priors": [
@@ -70,14 +73,18 @@ _HOMES = {
     "bayesperiodic.simulate": ["simulate"],
     "bayesperiodic.store": ["load"],
 }
-_MODULES = ["models", "plot"]
+_MODULES = {
+    "models": "bayesperiodic.models",
+    "noise": "bayesperiodic.inference.noise",
+    "plot": "bayesperiodic.plot",
+}
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [  # noqa: PLE0604
     "Branch", "Comparison", "Experiment", "HalfNormal", "InverseGamma", "LogNormal", "LogUniform", "MapEstimate",
     "Model", "MultivariateNormal", "Normal", "PeriodicSolution", "Posterior", "Prediction", "Problem", "Recording",
     "Scheme", "StudentT", "TruncatedNormal", "Uniform", "compare", "continue_periodic", "double_period",
-    "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "plot", "predict", "sample",
+    "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "noise", "plot", "predict", "sample",
     "simulate", "smooth_abs", "smooth_sign", "solve_periodic",
 ]  # fmt: skip
 
@@ -88,7 +95,7 @@ def __getattr__(name: str) -> Any:
         globals()[name] = value
         return value
     if name in _MODULES:
-        return import_module(f"bayesperiodic.{name}")
+        return import_module(_MODULES[name])
     raise AttributeError(f"module 'bayesperiodic' has no attribute {name!r}")
 
 

@@ -14,7 +14,7 @@ from matplotlib.patches import Ellipse
 
 from bayesperiodic import checks, fourier
 from bayesperiodic.diagnosis.predictive import Prediction
-from bayesperiodic.inference.map_estimate import MapEstimate
+from bayesperiodic.inference.estimate import MapEstimate
 from bayesperiodic.inference.posterior import Posterior
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.periodic.continuation import FOLD, PERIOD_DOUBLING, Branch

@@ -172,13 +172,13 @@ def warm_solve(drive: str, scheme: str, repeats: int, changes: int = 20) -> dict
     for equations in gear_equations(drive, scheme):
         z = equations.solve(theta, equations.static_guess(theta)).z
         batch = Batch([equations], [Anchor.at(equations, theta, z)])
-        _, status, used = batch.solve(changed, threads=1)
-        if status.any():
+        solved = batch.solve(changed, threads=1)
+        if solved.status.any():
             raise RuntimeError(f"A warm solve failed at {equations.frequency} Hz.")
         newton, iterations = _prepared(equations, theta, z * (1.0 + OFF))
         times = _interleaved(repeats, calls=3, warm=partial(batch.solve, changed, threads=1), newton=newton)
         costs.append(times["warm"] / changes / (times["newton"] / iterations))
-        steps.append(float(used.mean()))
+        steps.append(float(solved.iterations.mean()))
     return {
         "drive": drive,
         "scheme": scheme,

@@ -47,11 +47,26 @@ class Experiment(Result):
         Time [s] of the recording at which τ = 0.
     synthetic : bool
         True if the data were simulated.
+    mask : bool array (samples·periods,), optional
+        True at the points where the outputs were measured, such as the points of a Poincaré section; what stands
+        elsewhere is not looked at.
+    covariance : array (values, values) or (values + multipliers, values + multipliers), optional
+        Covariance of the outputs at the points of the mask, point by point, within a point in the order of `outputs`,
+        up to one unknown factor ("scale"); then that of the logarithms of `multipliers`, if it has rows for them.
+    multipliers : array (multipliers,), optional
+        Measured Floquet multipliers, real and signed, largest modulus first; they are compared as log|μ|.
+    multiplier_sd : array (multipliers,), optional
+        Standard deviations of log|μ|, where `covariance` has no rows for them.
+    guess : mapping of str to array (samples·periods,), optional
+        States of the model, turns of angles included, from which the first periodic solve starts; without it that is
+        the equilibrium. An unstable orbit needs one.
 
     Raises
     ------
     ValueError
-        For arrays of a wrong length, NaN, a frequency ≤ 0, an unknown channel, a name with ``/``, ``[`` or ``]``.
+        For arrays of a wrong length, NaN where something was measured, a frequency ≤ 0, an unknown channel, a name with
+        ``/``, ``[`` or ``]``, a mask without points, a covariance that is not symmetric and positive definite,
+        multipliers that are zero or without an error.
     """
 
     name: str
@@ -70,27 +85,86 @@ class Experiment(Result):
     periodicity: float = field(default=1.0, kw_only=True)
     origin: float = field(default=0.0, kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
+    mask: np.ndarray | None = field(default=None, kw_only=True)
+    covariance: np.ndarray | None = field(default=None, kw_only=True)
+    multipliers: np.ndarray | None = field(default=None, kw_only=True)
+    multiplier_sd: np.ndarray | None = field(default=None, kw_only=True)
+    guess: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
 
     def __post_init__(self) -> None:
         if not self.name or any(c in self.name for c in "/[]"):
             raise ValueError(f"name: {self.name!r} is not allowed; any text without '/', '[' and ']' is.")
         checks.positive("frequency", self.frequency)
         points = checks.integer("samples", self.samples, 4) * checks.integer("periods", self.periods, 1)
+        if self.mask is not None:
+            object.__setattr__(self, "mask", _checked_mask(self.mask, points))
         for kind in ("outputs", "inputs"):
             channels = {
-                key: checks.finite_vector(f"{kind}[{key!r}]", values, points)
+                key: checks.finite_vector(f"{kind}[{key!r}]", self._measured(kind, values), points)
                 for key, values in getattr(self, kind).items()
             }
             checks.identifiers(kind, channels)
             object.__setattr__(self, kind, channels)
+        guess = {key: checks.finite_vector(f"guess[{key!r}]", v, points) for key, v in (self.guess or {}).items()}
+        object.__setattr__(self, "guess", guess)
         for argument in ("scatter", "independent", "harmonics", "amplitude_variance"):
             given = dict(getattr(self, argument) or {})
             object.__setattr__(self, argument, given)
             for key in given:
                 checks.one_of(argument, key, (*self.inputs, *self.outputs))
-        counts = dict.fromkeys(self.outputs, points) | dict(self.independent)
-        checks.same_names("independent", counts, self.outputs)
-        object.__setattr__(self, "independent", counts)
+        measured = points if self.mask is None else int(self.mask.sum())
+        counts = {key: min(measured, 2 * self.harmonics.get(key, points) + 1) for key in self.outputs}
+        checks.same_names("independent", counts | dict(self.independent), self.outputs)
+        object.__setattr__(self, "independent", counts | dict(self.independent))
+        self._check_multipliers()
+        self._check_covariance(measured * len(self.outputs))
+
+    def _measured(self, kind: str, values: ArrayLike) -> ArrayLike:
+        """Return the values of a channel with zeros where an output was not measured."""
+        array = np.asarray(values)
+        if self.mask is None or kind == "inputs" or array.shape != self.mask.shape or array.dtype.kind not in "fiu":
+            return values
+        return np.where(self.mask, array, 0.0)
+
+    def _check_multipliers(self) -> None:
+        if self.multipliers is None:
+            if self.multiplier_sd is not None:
+                raise ValueError("multiplier_sd: it is not allowed without `multipliers`.")
+            return
+        values = checks.finite_vector("multipliers", self.multipliers)
+        if not values.size or np.any(values == 0.0) or np.any(np.diff(np.abs(values)) > 0.0):
+            raise ValueError(
+                f"multipliers: {values.tolist()} is not allowed; they must be real, not zero, and ordered by modulus, "
+                "largest first."
+            )
+        object.__setattr__(self, "multipliers", values)
+        if self.multiplier_sd is not None:
+            sd = checks.finite_vector("multiplier_sd", self.multiplier_sd, values.size)
+            if np.any(sd <= 0.0):
+                raise ValueError(f"multiplier_sd: {sd.tolist()} is not allowed; they must be > 0.")
+            object.__setattr__(self, "multiplier_sd", sd)
+
+    def _check_covariance(self, values: int) -> None:
+        logarithms = 0 if self.multipliers is None else self.multipliers.size
+        if self.covariance is None:
+            if logarithms and self.multiplier_sd is None:
+                raise ValueError("multipliers: without an error they are not allowed; give multiplier_sd.")
+            return
+        matrix = np.asarray(self.covariance, dtype=float)
+        size = values if self.multiplier_sd is not None else values + logarithms
+        if matrix.shape != (size, size):
+            raise ValueError(
+                f"covariance: shape {matrix.shape} is not allowed; it must be {(size, size)}, for {values} "
+                f"measured values{f' and {logarithms} multipliers' if size > values else ''}."
+            )
+        if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-8):
+            raise ValueError("covariance: it must be finite and symmetric.")
+        scale = np.sqrt(np.abs(np.diag(matrix)))
+        try:
+            np.linalg.cholesky(matrix / np.outer(scale, scale))
+        except np.linalg.LinAlgError:
+            raise ValueError("covariance: it must be positive definite.") from None
+        object.__setattr__(self, "covariance", matrix)
 
     @classmethod
     def from_harmonics(
@@ -173,6 +247,16 @@ class Experiment(Result):
             f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples a "
             f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''})"
         )
+
+
+def _checked_mask(given: ArrayLike, points: int) -> np.ndarray:
+    mask = np.asarray(given)
+    if mask.dtype != bool or mask.shape != (points,) or not mask.any():
+        raise ValueError(
+            f"mask: {mask.dtype} of shape {mask.shape} with {np.count_nonzero(mask)} points is not allowed; it must be "
+            f"a bool array of shape {(points,)}, True at one point at least."
+        )
+    return mask
 
 
 def _amplitudes(argument: str, values: ArrayLike, samples: int) -> np.ndarray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from bayesperiodic.inference.map_estimate import MapEstimate
+from bayesperiodic.inference.estimate import MapEstimate
 from bayesperiodic.inference.posterior import Posterior
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.store import Result

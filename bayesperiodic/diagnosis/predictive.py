@@ -22,7 +22,8 @@ class Prediction(Result):
     ----------
     median, low, high : dict of str to dict of str to array (points,)
         By experiment and channel: the median and the central 90 % band of the mean period, residual variance included
-        and taken as normal at each point, within the harmonics kept.
+        and taken as normal at each point, within the harmonics kept. Section values with a covariance of their own have
+        the band of the model alone.
     probability : float
         Of the band.
     draws : int
@@ -57,6 +58,10 @@ def predict(problem: Problem, posterior: Posterior, *, draws: int = 200) -> Pred
     count = checks.integer("draws", draws, 20)
     columns = {name: posterior.draws(name) for name in posterior.names}
     chosen = np.linspace(0, next(iter(columns.values())).size - 1, count).astype(int)
+    free = (
+        np.stack([columns[n][chosen] for n in problem.free_noise], -1) if problem.free_noise else np.empty((count, 0))
+    )
+    variances = problem.likelihood.value_variances(problem.likelihood.complete(free))
     theta = {name: float(np.median(columns[name])) for name in problem.names}
     anchored = problem.anchored(theta)
     points = np.stack([columns[name][chosen] for name in problem.names], axis=-1)
@@ -68,8 +73,7 @@ def predict(problem: Problem, posterior: Posterior, *, draws: int = 200) -> Pred
     bands: list[dict[str, dict[str, np.ndarray]]] = [{}, {}, {}]
     for e in problem.experiments:
         for channel in e.outputs:
-            label = f"variance[{channel}]"
-            variance = columns[label][chosen] if label in columns else np.full(count, problem.fixed_variances[channel])
+            variance = variances.get((e.name, channel), np.zeros(count))
             expected = e.project(channel, outputs[e.name][channel])
             noise = np.sqrt(variance)[:, None, None] * scores[:, None]
             values = (expected[:, None] + noise)[converged].reshape(-1, expected.shape[1])

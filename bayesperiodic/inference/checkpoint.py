@@ -53,7 +53,7 @@ def backends(checkpoint: str | Path | None, problem: Problem, settings: str, ens
 
 
 def fingerprint(problem: Problem) -> str:
-    """Return a digest of model, data, priors, fixed values, ties and scheme."""
+    """Return a digest of model, data, priors, fixed values, ties, noise model and scheme."""
     digest = hashlib.sha256(kernel_source(problem.model).encode())
     for experiment in problem.experiments:
         digest.update(
@@ -66,11 +66,17 @@ def fingerprint(problem: Problem) -> str:
                     experiment.winding,
                     experiment.independent,
                     experiment.harmonics,
+                    experiment.frequency_se,
+                    [(b.channel, b.kind, b.count, b.measured) for b in problem.observations[experiment.name].blocks],
                 )
             ).encode()
         )
         for signals in (experiment.outputs, experiment.inputs):
             for name, values in signals.items():
                 digest.update(name.encode() + np.ascontiguousarray(values).tobytes())
-    digest.update(repr((problem.priors, problem.fixed, problem.tied, problem.fixed_variances, problem.scheme)).encode())
+        for name in ("mask", "covariance", "multipliers", "multiplier_sd"):
+            values = getattr(experiment, name)
+            digest.update(name.encode() + (b"" if values is None else np.ascontiguousarray(values).tobytes()))
+    settings = (problem.priors, problem.fixed, problem.tied, problem.noise, problem.likelihood.fixed, problem.scheme)
+    digest.update(repr(settings).encode())
     return f"problem {digest.hexdigest()[:16]}"

@@ -29,8 +29,11 @@ def input_noise(problem: Problem, theta: np.ndarray, solutions: Mapping[str, Per
         directions = _perturbations(e)
         if not len(directions):
             continue
-        equations = problem.equations[e.name]
-        z, parameters = periodic_part(equations, solutions[e.name].states), problem.parameters(theta[None], e.name)[0]
+        equations = problem.responses.equations[e.name].at_frequency(solutions[e.name].frequency)
+        z, parameters = (
+            periodic_part(equations, solutions[e.name].states),
+            problem.responses.parameters(theta[None], e.name)[0],
+        )
         derivative = input_sensitivities(equations, z, parameters, directions)
         if derivative is None:
             continue

@@ -42,8 +42,6 @@ class JointPrior:
             For an unknown name, a name in two keys, an empty key, a value that is no prior or does not fit its key.
         """
         known = list(known)
-        if not isinstance(priors, Mapping):
-            raise ValueError(f"priors: {priors!r} is not allowed; it must be a mapping of names to priors.")
         keys: dict[str, str | tuple[str, ...]] = {}
         blocks = {}
         for key, value in priors.items():

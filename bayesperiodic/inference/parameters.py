@@ -1,6 +1,6 @@
 """Which parameters of a model are free, fixed or tied, and how all of them follow from the free ones."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,32 +9,75 @@ import numpy as np
 from bayesperiodic import checks
 from bayesperiodic.expressions import Expression, parse
 
+SHIFT = "shift"
+
+
+def local_name(name: str, experiment: str) -> str:
+    """Return what a parameter local to an experiment is called, such as ``theta16[run 7]``."""
+    return f"{name}[{experiment}]"
+
+
+def expand_priors(
+    priors: Mapping[Any, Any],
+    local: Sequence[str],
+    experiments: Sequence[str],
+    fixed: Mapping[str, Mapping[str, float]],
+) -> dict[Any, Any]:
+    """Return the priors with every local parameter's given once for each experiment that has no fixed value of it."""
+    result: dict[Any, Any] = {}
+    for key, prior in priors.items():
+        if key in local:
+            names = [local_name(key, e) for e in experiments if e not in fixed.get(key, {})]
+            result |= {name: prior for name in names if name not in priors}
+        else:
+            result[key] = prior
+    return result
+
+
+def free_names(parameters: Iterable[str], local: Iterable[str], experiments: Iterable[str]) -> list[str]:
+    """Return every name that a free parameter may have, in order."""
+    result: list[str] = []
+    for name in (*parameters, SHIFT):
+        if name in local:
+            result += [local_name(name, experiment) for experiment in experiments]
+        elif name != SHIFT:
+            result.append(name)
+    return result
+
 
 @dataclass(frozen=True)
 class ParameterMap:
-    """From θ, the free parameters, to all parameters of a model.
+    """From θ, the free parameters of all experiments, to all parameters of one experiment.
 
     Attributes
     ----------
     parameters : tuple of str
-        All of the model's.
-    names : tuple of str
-        The free ones, in the order of θ.
+        All of the model's, and last "shift", the delay of the measured outputs [s].
+    columns : dict of str to int
+        Where the free ones of this experiment are in θ.
+    size : int
+        Length of θ.
     fixed : dict of str to float
     tied : dict of str to Expression
         Each only of parameters that are free, fixed or tied before it.
     """
 
     parameters: tuple[str, ...]
-    names: tuple[str, ...]
+    columns: dict[str, int]
+    size: int
     fixed: dict[str, float]
     tied: dict[str, Expression]
 
     @classmethod
     def of(
-        cls, parameters: tuple[str, ...], names: tuple[str, ...], fixed: Mapping[str, float], tied: Mapping[str, Any]
+        cls,
+        parameters: tuple[str, ...],
+        names: tuple[str, ...],
+        experiment: str,
+        fixed: Mapping[str, float],
+        tied: Mapping[str, Any],
     ) -> "ParameterMap":
-        """Return the checked map.
+        """Return the checked map of an experiment; `names` are those of θ.
 
         Raises
         ------
@@ -42,37 +85,48 @@ class ParameterMap:
             For a parameter that is none of the three or two of them, an unknown name, an expression that is not allowed
             or that comes back to itself.
         """
+        every = (*parameters, SHIFT)
+        columns = {}
+        for name in every:
+            for candidate in (name, local_name(name, experiment)):
+                if candidate in names:
+                    columns[name] = names.index(candidate)
         for name in tied:
-            checks.one_of("tied", name, parameters)
-            for argument, others in (("priors", names), ("fixed", fixed)):
+            checks.one_of("tied", name, every)
+            for argument, others in (("priors", columns), ("fixed", fixed)):
                 if name in others:
                     raise ValueError(f"tied: {name!r} is in {argument} too; a parameter is free, fixed or tied.")
-        if without := [n for n in parameters if n not in names and n not in fixed and n not in tied]:
+        known = {SHIFT: 0.0} if SHIFT not in columns and SHIFT not in tied else {}
+        known |= fixed
+        if without := [n for n in every if n not in columns and n not in known and n not in tied]:
             raise ValueError(
                 f"priors: {', '.join(map(repr, without))} has neither a prior nor a value; a free parameter needs a "
                 "prior, any other a value in `fixed` or an expression in `tied`."
             )
-        expressions = {name: parse(f"tied[{name!r}]", text, parameters) for name, text in tied.items()}
-        return cls(parameters, names, dict(fixed), _ordered(expressions))
+        expressions = {name: parse(f"tied[{name!r}]", text, every) for name, text in tied.items()}
+        return cls(every, columns, len(names), known, _ordered(expressions))
+
+    @property
+    def delayed(self) -> bool:
+        """Whether the outputs may be late."""
+        return SHIFT in self.columns or SHIFT in self.tied or self.fixed[SHIFT] != 0.0
 
     def values(self, theta: np.ndarray) -> np.ndarray:
-        """Return all parameters (points, parameters) of θ (points, names)."""
-        known: dict[str, Any] = {**self.fixed, **{name: theta[:, i] for i, name in enumerate(self.names)}}
+        """Return all parameters (points, parameters + 1), the delay last, of θ (points, names)."""
+        known: dict[str, Any] = {**self.fixed, **{name: theta[:, i] for name, i in self.columns.items()}}
         for name, expression in self.tied.items():
             known[name] = expression.value(known)
         return np.stack([np.broadcast_to(known[name], len(theta)) for name in self.parameters], axis=-1)
 
     def slopes(self, theta: np.ndarray) -> np.ndarray:
-        """Return ∂(all parameters)/∂θ at one θ (names,), (parameters, names)."""
-        by_name = {name: row for name, row in zip(self.names, np.eye(len(self.names)), strict=True)}
-        known: dict[str, Any] = {**self.fixed, **dict(zip(self.names, theta.tolist(), strict=True))}
+        """Return ∂(all parameters)/∂θ at one θ (names,), (parameters + 1, names)."""
+        nothing = np.zeros(self.size)
+        by_name = {name: np.eye(1, self.size, i)[0] for name, i in self.columns.items()}
+        known: dict[str, Any] = {**self.fixed, **{name: float(theta[i]) for name, i in self.columns.items()}}
         for name, expression in self.tied.items():
             gradient = expression.gradient(known)
-            by_name[name] = sum(
-                (float(slope) * by_name[n] for n, slope in gradient.items() if n in by_name), np.zeros(len(self.names))
-            )
+            by_name[name] = sum((float(slope) * by_name[n] for n, slope in gradient.items() if n in by_name), nothing)
             known[name] = float(expression.value(known))
-        nothing = np.zeros(len(self.names))
         return np.stack([by_name.get(name, nothing) for name in self.parameters])
 
 

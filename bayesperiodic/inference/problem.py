@@ -1,67 +1,60 @@
 """Problem: a model, experiments and priors, and the posterior density they define."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from bayesperiodic import checks, fourier
+from bayesperiodic import checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.inference.joint_prior import JointPrior
-from bayesperiodic.inference.parameters import ParameterMap
+from bayesperiodic.inference.likelihood import Likelihood
+from bayesperiodic.inference.linearisation import Linearisation
+from bayesperiodic.inference.noise import Noise, as_noise
+from bayesperiodic.inference.observation import Observation
+from bayesperiodic.inference.parameters import SHIFT, ParameterMap, expand_priors, free_names
+from bayesperiodic.inference.priors import Uniform
+from bayesperiodic.inference.responses import Responses
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.compiled import CONVERGED
-from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.schemes import Scheme
-from bayesperiodic.periodic.solution import PeriodicSolution, describe
-from bayesperiodic.periodic.solve import solve_from_rest
+from bayesperiodic.periodic.solution import PeriodicSolution
 
-
-@dataclass(frozen=True)
-class Evaluation:
-    """The model against the data at one θ: residuals e = y − ŷ and ∂ŷ/∂θ, both within the harmonics kept.
-
-    Attributes
-    ----------
-    solutions : dict of str to PeriodicSolution
-    residuals : dict of str to dict of str to array (points,)
-        By experiment and channel.
-    sensitivities : dict of str to dict of str to array (names, points)
-    """
-
-    solutions: dict[str, PeriodicSolution]
-    residuals: dict[str, dict[str, np.ndarray]]
-    sensitivities: dict[str, dict[str, np.ndarray]]
+METHODS = ("adjoint", "forward")
 
 
 class Problem:
     """What the estimator and the samplers work on ([1]_, eq. 5-6).
 
-    Errors are taken as independent and normal with an unknown variance per channel, Jeffreys' prior 1/v unless the
-    variance is fixed. The density is over (θ, log v),
+    The density is over (θ, log φ), φ the noise parameters. With independent errors, the paper's model, φ is the
+    variance of each channel with Jeffreys' prior 1/v, and the density is
 
         −½ Σ_β [ n_β ln v_β + M_β / v_β ] + Σ_α ln p(θ_α),
 
     where n_β counts the independent values behind the samples of channel β, and M_β weighs each squared residual by
     independent values per sample. It is eq. (6) where every sample is independent. Outputs are projected onto the
-    harmonics that the experiment keeps before they are compared.
+    harmonics that the experiment keeps before they are compared, angles are compared modulo 2π.
 
     Parameters
     ----------
     model : Model
+        For an autonomous model the measured frequency, with its standard error, is data too.
     experiments : sequence of Experiment
     priors : mapping of str or tuple of str to prior
         Makes a parameter free; a tuple of names takes a `MultivariateNormal`. A frozen continuous distribution of
-        scipy.stats is a prior too.
+        scipy.stats is a prior too. The name "shift" makes the delay [s] of the measured outputs a parameter of each
+        experiment; an autonomous model, whose phase is free, always has it.
     fixed : mapping of str to float or to mapping of str to float, optional
-        Values of other parameters, for all experiments or by experiment; ``"variance[force]"`` fixes the variance of a
-        channel.
+        Values of other parameters, for all experiments or by experiment; a name such as ``"variance[force]"`` fixes a
+        noise parameter.
     tied : mapping of str to str, optional
         The remaining parameters as expressions of others, such as ``{"theta11": "-1e5*theta4"}``: numbers, names, pi,
         + - * / ** and sqrt, exp, log, sin, cos, tan, atan, sinh, cosh, tanh, abs.
+    local : sequence of str
+        Free parameters that each experiment has its own of, called ``theta16[run 7]``. Their prior goes by the plain
+        name, or by that of one experiment; an experiment may have a fixed value instead.
+    noise : str or noise model
+        "independent", "measured" or "circulant", or a model of `bayesperiodic.noise`.
     scheme : str or Scheme
         See `solve_periodic`.
 
@@ -70,8 +63,9 @@ class Problem:
     ValueError
         For a parameter that is not just one of free, fixed and tied, or is in two priors, an expression that is not
         allowed or circular, a value that is no prior or does not fit its tuple of names, an unknown name, an experiment
-        without the model's inputs or with outputs that the model lacks, no more independent values than free parameters
-        in a channel whose variance is unknown, an autonomous model.
+        without the model's inputs or with outputs that the model lacks or that are constant, no more independent values
+        than free parameters behind a variance whose prior is improper, an autonomous model whose measured frequency has
+        no standard error.
 
     References
     ----------
@@ -87,119 +81,113 @@ class Problem:
         priors: Mapping[Any, Any],
         fixed: Mapping[str, float | Mapping[str, float]] | None = None,
         tied: Mapping[str, str] | None = None,
+        local: Iterable[str] = (),
+        noise: str | Noise = "independent",
         scheme: str | Scheme = "central2",
     ):
-        if model.autonomous:
-            raise ValueError(
-                f"model: {model.name!r} is not allowed; it is autonomous (neither inputs nor tau appear in its "
-                "equations), and problems take forced models."
-            )
-        self.model = model
+        self.model, self.scheme, self.noise = model, scheme, as_noise(noise)
         self.experiments = _checked_experiments(model, experiments)
         measured = {channel for experiment in self.experiments for channel in experiment.outputs}
         self.channels = tuple(channel for channel in model.outputs if channel in measured)
-        fixed = dict(fixed or {})
-        variance_names = {f"variance[{channel}]": channel for channel in self.channels}
-        self.joint_prior = JointPrior.of(priors, model.parameters)
+        runs = [e.name for e in self.experiments]
+        if not isinstance(priors, Mapping):
+            raise ValueError(f"priors: {priors!r} is not allowed; it must be a mapping of names to priors.")
+        fixed, tied, every = dict(fixed or {}), dict(tied or {}), (*model.parameters, SHIFT)
+        self.local = _checked_local(local, every, priors, tied)
+        self.fixed = {n: _constant(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
+        given = expand_priors(priors, self.local, runs, self.fixed) | self._free_phases(priors, fixed, tied)
+        self.joint_prior = JointPrior.of(given, free_names(model.parameters, self.local, runs))
         self.names = self.joint_prior.names
+        self._check_free(fixed)
+        self.parameter_maps = {
+            run: ParameterMap.of(
+                model.parameters, self.names, run, {n: v[run] for n, v in self.fixed.items() if run in v}, tied
+            )
+            for run in runs
+        }
+        self.observations = {
+            e.name: Observation(e, model, self.parameter_maps[e.name].delayed) for e in self.experiments
+        }
+        self.likelihood = self._likelihood(fixed)
+        self._check_counts()
+        self._responses = Responses(model, self.experiments, self.parameter_maps, scheme)
+
+    def _free_phases(self, priors: Any, fixed: Mapping[str, Any], tied: Mapping[str, Any]) -> dict[str, Uniform]:
+        """Return the priors of the delays that an autonomous model needs and that were not given."""
+        if not self.model.autonomous or SHIFT in fixed or SHIFT in tied or SHIFT in priors:
+            return {}
+        return {
+            f"{SHIFT}[{e.name}]": Uniform(-0.5 / e.frequency, 0.5 / e.frequency)
+            for e in self.experiments
+            if f"{SHIFT}[{e.name}]" not in priors
+        }
+
+    def _likelihood(self, fixed: Mapping[str, Any]) -> Likelihood:
+        blocks = [block for observation in self.observations.values() for block in observation.blocks]
+        known = {name: value for name, value in fixed.items() if name not in self.fixed}
+        names = tuple(dict.fromkeys(n for block in blocks for n in self.noise.parameter_names(block)))
+        for name, value in known.items():
+            checks.one_of("fixed", name, (*self.model.parameters, SHIFT, *names))
+            checks.positive(f"fixed[{name!r}]", value)
+        return Likelihood(self.noise, blocks, known)
+
+    def _check_free(self, fixed: Mapping[str, Any]) -> None:
         for name in self.names:
             if name in fixed:
                 raise ValueError(f"fixed: {name!r} has a prior too; give a prior or a value.")
-        for name in fixed:
-            checks.one_of("fixed", name, (*model.parameters, *variance_names))
         if not self.names:
             raise ValueError("priors: {} is not allowed; at least one parameter must be free.")
-        self.fixed = {n: _constant(n, fixed[n], self.experiments) for n in model.parameters if n in fixed}
-        self.parameter_maps = {
-            e.name: ParameterMap.of(
-                model.parameters, self.names, {n: v[e.name] for n, v in self.fixed.items()}, tied or {}
-            )
-            for e in self.experiments
-        }
-        self.fixed_variances = {
-            channel: checks.positive(f"fixed[{name!r}]", fixed[name])
-            for name, channel in variance_names.items()
-            if name in fixed
-        }
-        self.free_variances = tuple(c for c in self.channels if c not in self.fixed_variances)
-        self.scheme = scheme
-        self.independent = np.array(
-            [sum(e.independent.get(c, 0) for e in self.experiments) for c in self.channels], dtype=float
-        )
-        self._check_counts()
-        self._anchors: dict[str, Anchor] | None = None
 
     def _check_counts(self) -> None:
-        for channel, count in zip(self.channels, self.independent, strict=True):
-            if channel in self.free_variances and count <= len(self.names):
+        """Refuse an improper prior of a variance where as many parameters can fit the data exactly."""
+        if self.noise.proper:
+            return
+        for group, members in self.likelihood.groups():
+            count = self.likelihood.counts[group[0]]
+            runs = {self.likelihood.blocks[b].experiment for b in members}
+            acting = sorted({i for run in runs for i in self.parameter_maps[run].columns.values()})
+            needed = len(acting) + self.noise.spare
+            if group[0] in self.likelihood.free and count <= needed:
+                names = ", ".join(self.names[i] for i in acting)
                 raise ValueError(
-                    f"priors: {len(self.names)} free parameters ({', '.join(self.names)}) are not allowed; the channel "
-                    f"{channel!r} has only {count:.0f} independent values and its variance is unknown. Fix parameters "
-                    f"or 'variance[{channel}]', keep more harmonics, or add experiments."
+                    f"priors: {len(acting)} free parameters ({names}) are not allowed; {group[0]!r} is unknown, has the "
+                    f"{self.noise.prior_text}, and only {count:.0f} independent values, where more than {needed} are "
+                    f"needed. Fix parameters or {group[0]!r}, give it a proper prior (noise.Independent(prior=…)), keep "
+                    "more harmonics, or add experiments."
                 )
 
-    @cached_property
-    def equations(self) -> dict[str, PeriodicEquations]:
-        """The discretised equations of every experiment."""
-        return {
-            e.name: PeriodicEquations.build(
-                self.model,
-                e.inputs,
-                frequency=e.frequency,
-                samples=e.samples,
-                scheme=self.scheme,
-                periods=e.periods,
-                winding=e.winding,
-            )
-            for e in self.experiments
-        }
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """All noise parameters, the last axis of `variances` in what follows."""
+        return self.likelihood.names
 
     @property
-    def anchors(self) -> dict[str, Anchor]:
-        """Solved points from which `log_posterior` predicts all others; at the medians of the priors unless set."""
-        if self._anchors is None:
-            self._anchors = self._anchors_at(self.median())
-        return self._anchors
+    def free_noise(self) -> tuple[str, ...]:
+        """Noise parameters without a known value."""
+        return self.likelihood.free
+
+    @property
+    def counted(self) -> float:
+        """Σn, the independent values behind all unknown and known variances."""
+        return sum(self.likelihood.counts.values())
+
+    @property
+    def responses(self) -> Responses:
+        """The periodic solves, anchored at the medians of the priors unless set."""
+        if self._responses._anchors is None:
+            self._responses = self._responses.anchored(self.median())
+        return self._responses
 
     def anchored(self, theta: Mapping[str, float] | np.ndarray) -> "Problem":
         """Return the same problem with its anchors at another θ, solved from the present ones."""
+        return self.with_responses(self.responses.anchored(self.vector(theta)))
+
+    def with_responses(self, responses: Responses) -> "Problem":
+        """Return the same problem with other anchors."""
         other = object.__new__(Problem)
         other.__dict__.update(self.__dict__)
-        other.__dict__.pop("_batches", None)
-        other._anchors = self._anchors_at(self.vector(theta))
+        other._responses = responses
         return other
-
-    def _anchors_at(self, theta: np.ndarray) -> dict[str, Anchor]:
-        anchors = {}
-        for name, equations in self.equations.items():
-            parameters = self.parameters(theta[None], name)[0]
-            z, code, _ = self._solve_one(name, parameters, self._anchors)
-            anchors[name] = (
-                Anchor.at(equations, parameters, z)
-                if code == CONVERGED
-                else Anchor(parameters, equations.static_guess(parameters))
-            )
-        return anchors
-
-    def _solve_one(self, name: str, parameters: np.ndarray, anchors: dict[str, Anchor] | None) -> Solved:
-        """Solve one experiment from its anchor, if there are any, or else from rest."""
-        if anchors:
-            solved = self.equations[name].solve(parameters, anchors[name].z)
-            if solved.code == CONVERGED:
-                return solved
-        return solve_from_rest(self.equations[name], parameters)[0]
-
-    @cached_property
-    def _batches(self) -> list[tuple[tuple[Experiment, ...], Batch]]:
-        """Experiments on the same grid and with the same constants, with what solves them together."""
-        groups: dict[tuple[Any, ...], list[Experiment]] = {}
-        for e in self.experiments:
-            constants = tuple(values[e.name] for values in self.fixed.values())
-            groups.setdefault((e.samples, e.periods, constants), []).append(e)
-        return [
-            (tuple(group), Batch([self.equations[e.name] for e in group], [self.anchors[e.name] for e in group]))
-            for group in groups.values()
-        ]
 
     @property
     def tied(self) -> dict[str, str]:
@@ -209,7 +197,7 @@ class Problem:
 
     @property
     def priors(self) -> dict[str | tuple[str, ...], Any]:
-        """The priors by the keys they were given with, in the order of the model's parameters."""
+        """The priors by name, in the order of the model's parameters."""
         return self.joint_prior.blocks
 
     def median(self) -> np.ndarray:
@@ -226,146 +214,165 @@ class Problem:
             raise ValueError(f"theta: shape {values.shape} is not allowed; the last axis must be {list(self.names)}.")
         return values
 
-    def _variances(self, variances: Mapping[str, Any] | np.ndarray) -> np.ndarray:
+    def noise_values(self, variances: Mapping[str, Any] | np.ndarray) -> np.ndarray:
+        """Return the noise parameters as an array (…, noise_names) from a mapping or an array.
+
+        In a mapping a channel's name stands for its variance, and those with a known value may be left out.
+        """
+        names = self.noise_names
         if isinstance(variances, Mapping):
-            given = {**self.fixed_variances, **variances}
-            checks.same_names("variances", given, self.channels)
-            variances = np.stack(np.broadcast_arrays(*(np.asarray(given[c], dtype=float) for c in self.channels)), -1)
+            longer = {f"variance[{name}]": name for name in variances}
+            renamed = {long if long in names else short: variances[short] for long, short in longer.items()}
+            given: dict[str, Any] = {**self.likelihood.fixed, **renamed}
+            checks.same_names("variances", given, names)
+            variances = np.stack(np.broadcast_arrays(*(np.asarray(given[n], dtype=float) for n in names)), -1)
         values = np.asarray(variances, dtype=float)
-        if values.shape[-1:] != (len(self.channels),):
-            raise ValueError(
-                f"variances: shape {values.shape} is not allowed; the last axis must be {list(self.channels)}."
-            )
+        if values.shape[-1:] != (len(names),):
+            raise ValueError(f"variances: shape {values.shape} is not allowed; the last axis must be {list(names)}.")
         return values
 
     def log_prior(self, theta: Mapping[str, float] | np.ndarray) -> np.ndarray:
         """Return Σ ln p(θ_α), shape (…); −inf outside the support."""
         return self.joint_prior.log_prob(self.vector(theta))
 
-    def log_likelihood(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> np.ndarray:
-        """Return −½ Σ_β [n_β ln v_β + M_β/v_β], shape (…); −inf where a periodic solve fails."""
-        return self.likelihood_from_moments(self.moments(theta)[0], self._variances(variances))
+    def log_likelihood(
+        self, theta: Mapping[str, float] | np.ndarray, variances: Any, threads: int | None = None
+    ) -> np.ndarray:
+        """Return the log-likelihood, shape (…); −inf where a periodic solve fails.
+
+        Its value does not depend on the number of threads.
+        """
+        values = self.vector(theta)
+        noise = np.broadcast_to(self.noise_values(variances), (*values.shape[:-1], len(self.noise_names)))
+        return self.likelihood_and_status(values, noise, threads)[0]
+
+    def likelihood_and_status(
+        self, theta: np.ndarray, noise: np.ndarray, threads: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log-likelihood and the worst status code of the solves, both (…,)."""
+        flat = theta.reshape(-1, len(self.names))
+        solved = self.responses.solve(flat, threads)
+        status = np.max([s.status for s in solved.values()], axis=0)
+        good = status == CONVERGED
+        result = np.full(len(flat), -np.inf)
+        if good.any():
+            residuals: list[np.ndarray] = []
+            with np.errstate(over="ignore", invalid="ignore"):
+                for name, observation in self.observations.items():
+                    part = type(solved[name].response)(*(field[good] for field in solved[name].response))
+                    residuals += observation.residuals(part)
+            result[good] = self.likelihood(residuals, noise.reshape(len(flat), -1)[good])
+        return result.reshape(theta.shape[:-1]), status.reshape(theta.shape[:-1])
 
     def log_posterior(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> np.ndarray:
-        """Return log-prior plus log-likelihood, shape (…), a density over (θ, log v)."""
+        """Return log-prior plus log-likelihood, shape (…), a density over (θ, log φ)."""
         values = self.vector(theta)
-        prior = np.asarray(self.log_prior(values))
+        noise = np.broadcast_to(self.noise_values(variances), (*values.shape[:-1], len(self.noise_names)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            prior = np.asarray(self.log_prior(values) + self.likelihood.log_prior(noise))
         result = np.full(prior.shape, -np.inf)
         inside = np.isfinite(prior)
         if inside.any():
-            v = np.broadcast_to(self._variances(variances), (*prior.shape, len(self.channels)))
-            result[inside] = prior[inside] + self.log_likelihood(values[inside], v[inside])
+            result[inside] = prior[inside] + self.likelihood_and_status(values[inside], noise[inside])[0]
         return result
 
-    def likelihood_from_moments(self, moments: np.ndarray, variances: np.ndarray) -> np.ndarray:
-        """Return −½ Σ_β [n_β ln v_β + M_β/v_β] of moments and variances (…, channels)."""
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            terms = self.independent * np.log(variances) + moments / variances
-            value = -0.5 * terms.sum(axis=-1)
-        return np.where(np.isfinite(value), value, -np.inf)
+    def gradient(
+        self, theta: Mapping[str, float] | np.ndarray, variances: Any, *, method: str = "adjoint"
+    ) -> np.ndarray:
+        """Return the gradient of `log_posterior` by θ and by the logarithms of the free noise parameters.
 
-    def moments(
-        self, theta: Mapping[str, float] | np.ndarray, threads: int | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return M (…, channels), the diagonal of the moment matrix (eq. 6), and the worst status code, shape (…).
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (names,)
+        variances : mapping of str to float, or array (noise_names,)
+        method : "adjoint" or "forward"
+            One transposed solve an experiment, whatever the number of parameters, or one solve a parameter ([1]_, eq.
+            4). An autonomous model always takes the second.
 
-        M is infinite where a periodic solve fails. The result does not depend on the number of threads.
+        Returns
+        -------
+        array (names + free_noise,)
+
+        Raises
+        ------
+        ValueError
+            Where the log-posterior is not finite.
         """
+        checks.one_of("method", method, METHODS)
+        values, noise = self.vector(theta), self.noise_values(variances)
+        here = self.linearised(values)
+        if not np.isfinite(self.log_prior(values)) or not here.converged:
+            raise ValueError(
+                f"theta: {dict(zip(self.names, values.tolist(), strict=True))} has no finite log-posterior."
+            )
+        by_residual, by_noise = self.likelihood.gradients(here.residuals, noise)
+        forward = method == "forward" or self.model.autonomous
+        by_theta = here.forward(by_residual) if forward else here.adjoint(by_residual)
+        free = [self.noise_names.index(name) for name in self.free_noise]
+        return np.concatenate([by_theta + self.joint_prior.gradient(values), by_noise[free]])
+
+    def linearised(self, theta: Mapping[str, float] | np.ndarray) -> Linearisation:
+        """Solve at one θ from the present anchors, and compare with the data (eq. 4-5)."""
         values = self.vector(theta)
-        flat = values.reshape(-1, len(self.names))
-        moments = np.zeros((len(flat), len(self.channels)))
-        status = np.full(len(flat), CONVERGED)
-        for experiments, batch in self._batches:
-            y, codes, _ = batch.solve(self.parameters(flat, experiments[0].name), threads)
-            status = np.maximum(status, codes.max(axis=0))
-            with np.errstate(over="ignore", invalid="ignore"):
-                for experiment, predicted in zip(experiments, y, strict=True):
-                    for c, channel in enumerate(self.channels):
-                        if channel in experiment.outputs:
-                            output = predicted[:, :, self.model.outputs.index(channel)]
-                            moments[:, c] += self._moment(experiment, channel, output)
-        moments[(status != CONVERGED) | ~np.isfinite(moments).all(axis=1)] = np.inf
-        return moments.reshape(*values.shape[:-1], -1), status.reshape(values.shape[:-1])
-
-    def _moment(self, experiment: Experiment, channel: str, predicted: np.ndarray) -> np.ndarray:
-        """Return independent · (mean square of y − ŷ within the kept harmonics), one a row of `predicted`."""
-        count = experiment.independent[channel]
-        target = self._kept_amplitudes.get((experiment.name, channel))
-        if target is None:
-            return count * np.mean((experiment.outputs[channel] - predicted) ** 2, axis=-1)
-        amplitudes = fourier.coefficients(predicted, target.size - 1) - target
-        power = amplitudes.real**2 + amplitudes.imag**2
-        return count * (power[..., 0] + 0.5 * power[..., 1:].sum(axis=-1))
-
-    @cached_property
-    def _kept_amplitudes(self) -> dict[tuple[str, str], np.ndarray]:
-        return {
-            (e.name, channel): fourier.coefficients(e.outputs[channel], kept)
-            for e in self.experiments
-            for channel, kept in e.harmonics.items()
-            if channel in e.outputs
-        }
+        return Linearisation(values, self.responses.anchored(values), self.observations)
 
     def outputs(self, theta: Mapping[str, float] | np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
         """Return ŷ of many θ (draws, names), by experiment and channel (draws, points), and which solves converged."""
         values = self.vector(theta)
-        converged = np.full(len(values), True)
-        result = {}
-        for experiments, batch in self._batches:
-            y, codes, _ = batch.solve(self.parameters(values, experiments[0].name))
-            converged &= (codes == CONVERGED).all(axis=0)
-            for e, predicted in zip(experiments, y, strict=True):
-                result[e.name] = {channel: predicted[:, :, self.model.outputs.index(channel)] for channel in e.outputs}
-        return {e.name: result[e.name] for e in self.experiments}, converged
+        solved = self.responses.solve(values)
+        converged = np.all([s.status == CONVERGED for s in solved.values()], axis=0)
+        return {name: o.predicted(solved[name].response) for name, o in self.observations.items()}, converged
 
     def solve(self, theta: Mapping[str, float] | np.ndarray) -> dict[str, PeriodicSolution]:
         """Return the periodic solution of every experiment at one θ."""
-        values, solutions = self.vector(theta), {}
-        for name, equations in self.equations.items():
-            parameters = self.parameters(values[None], name)[0]
-            solutions[name] = describe(equations, parameters, self._solve_one(name, parameters, self.anchors))
-        return solutions
+        return self.responses.solutions(self.vector(theta))
 
-    def evaluate(self, theta: Mapping[str, float] | np.ndarray) -> Evaluation:
-        """Solve at one θ and compare with the data (eq. 4-5)."""
-        values = self.vector(theta)
-        solutions = self.solve(values)
-        residuals: dict[str, dict[str, np.ndarray]] = {}
-        sensitivities: dict[str, dict[str, np.ndarray]] = {}
-        for e in self.experiments:
-            solution = solutions[e.name]
-            if not solution.converged:
-                continue
-            residuals[e.name] = {c: y - e.project(c, solution.outputs[c]) for c, y in e.outputs.items()}
-            slopes = self.parameter_maps[e.name].slopes(values).T
-            sensitivities[e.name] = {
-                c: e.project(c, slopes @ np.stack([solution.sensitivities[c][p] for p in self.model.parameters]))
-                for c in e.outputs
-            }
-        return Evaluation(solutions, residuals, sensitivities)
+    def parameters(self, theta: np.ndarray, experiment: str) -> np.ndarray:
+        """Return every parameter of the model (points, parameters) in an experiment from θ (points, names)."""
+        return self._responses.parameters(theta, experiment)
 
     def sample_prior(self, size: int, seed: int) -> dict[str, np.ndarray]:
         """Return independent draws of every free parameter from its prior, (size,) each."""
         draws = self.joint_prior.sample(size, np.random.default_rng(seed))
         return dict(zip(self.names, draws.T.copy(), strict=True))
 
-    def parameters(self, theta: np.ndarray, experiment: str) -> np.ndarray:
-        """Return every parameter of the model (points, parameters) in an experiment from θ (points, names)."""
-        return self.parameter_maps[experiment].values(theta)
-
     def __repr__(self) -> str:
         return (
             f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
-            f"channels: {', '.join(self.channels)} with {self.independent.sum():.0f} independent values)"
+            f"channels: {', '.join(self.channels)} with {self.counted:.0f} independent values, {self.noise.name} noise)"
         )
 
 
-def _constant(name: str, given: Any, experiments: tuple[Experiment, ...]) -> dict[str, float]:
-    """Return the value of a fixed parameter in each experiment."""
+def _checked_local(
+    local: Iterable[str], every: tuple[str, ...], priors: Any, tied: Mapping[str, str]
+) -> tuple[str, ...]:
+    if isinstance(local, str):
+        raise ValueError(f"local: {local!r} is not allowed; it must be a sequence of names, such as [{local!r}].")
+    names = tuple(local)
+    for name in names:
+        checks.one_of("local", name, every)
+        if name in tied:
+            raise ValueError(f"local: {name!r} is tied; it follows what it is tied to, so leave it out.")
+    if isinstance(priors, Mapping):
+        for key in priors:
+            for name in key if isinstance(key, tuple) else ():
+                if name in names:
+                    raise ValueError(
+                        f"priors[{key!r}]: {name!r} is local; a joint prior needs the names of single experiments, such "
+                        f"as '{name}[run]'."
+                    )
+    return names if SHIFT in names else (*names, SHIFT)
+
+
+def _constant(name: str, given: Any, runs: list[str], local: bool) -> dict[str, float]:
+    """Return the value of a fixed parameter in each experiment; a local one may be fixed in some of them."""
     if not isinstance(given, Mapping):
-        return dict.fromkeys((e.name for e in experiments), checks.finite_number(f"fixed[{name!r}]", given))
-    checks.same_names(f"fixed[{name!r}]", given, [e.name for e in experiments])
-    return {e.name: checks.finite_number(f"fixed[{name!r}][{e.name!r}]", given[e.name]) for e in experiments}
+        return dict.fromkeys(runs, checks.finite_number(f"fixed[{name!r}]", given))
+    for run in given:
+        checks.one_of(f"fixed[{name!r}]", run, runs)
+    if not local:
+        checks.same_names(f"fixed[{name!r}]", given, runs)
+    return {run: checks.finite_number(f"fixed[{name!r}][{run!r}]", given[run]) for run in runs if run in given}
 
 
 def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tuple[Experiment, ...]:
@@ -375,8 +382,20 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
     names = [experiment.name for experiment in result]
     if len(set(names)) < len(names):
         raise ValueError(f"experiments: the names {names} are not allowed; they must differ, see fold(name=…).")
-    for experiment in result:
-        checks.same_names(f"inputs of experiment {experiment.name!r}", experiment.inputs, model.inputs)
-        for channel in experiment.outputs:
-            checks.one_of(f"outputs of experiment {experiment.name!r}", channel, model.outputs)
+    for e in result:
+        checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
+        if not e.outputs:
+            raise ValueError(f"outputs of experiment {e.name!r}: {{}} is not allowed; at least one must be measured.")
+        for channel, values in e.outputs.items():
+            checks.one_of(f"outputs of experiment {e.name!r}", channel, model.outputs)
+            if e.mask is None and e.covariance is None and np.ptp(values) == 0.0:
+                raise ValueError(
+                    f"outputs of experiment {e.name!r}: {channel!r} is constant ({values[0]:g}); a channel must vary "
+                    "over the period, or tells nothing about its variance."
+                )
+        if model.autonomous and not e.frequency_se > 0.0:
+            raise ValueError(
+                f"experiment {e.name!r}: frequency_se = {e.frequency_se:g} is not allowed; {model.name!r} is "
+                "autonomous, its measured frequency is data and needs a standard error > 0."
+            )
     return result

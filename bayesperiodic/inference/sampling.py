@@ -15,7 +15,7 @@ from bayesperiodic import checks
 from bayesperiodic.inference import chains
 from bayesperiodic.inference.checkpoint import backends, fingerprint
 from bayesperiodic.inference.coordinates import SamplingDensity
-from bayesperiodic.inference.map_estimate import MapEstimate
+from bayesperiodic.inference.estimate import MapEstimate
 from bayesperiodic.inference.posterior import Posterior
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.parallel import available_cores

@@ -15,7 +15,7 @@ class Whiteness:
     ----------
     p : float
         Probability, for white residuals, of a cumulative periodogram at least as far from a straight line; the
-        Kolmogorov-Smirnov distance of the kept harmonics, exact for independent normal values.
+        Kolmogorov-Smirnov distance of the kept harmonics, exact for independent normal values. NaN if not tested.
     lag1 : float
         Circular autocorrelation at the distance of two independent values, one period / (2·harmonics + 1).
     """
@@ -25,7 +25,19 @@ class Whiteness:
 
 
 def whiteness(residual: np.ndarray, harmonics: int | None = None) -> Whiteness:
-    """Test one residual period (points,) for whiteness; by default over all harmonics of the grid.
+    """Test one residual period (points,) for whiteness; by default over all harmonics of the grid."""
+    return of_periodogram(np.abs(fourier.coefficients(residual, harmonics)[1:]) ** 2)
+
+
+def of_components(components: np.ndarray, harmonic: np.ndarray) -> Whiteness:
+    """Test real Fourier components (size,) that belong to given harmonics (size,)."""
+    power = np.bincount(harmonic, components**2)
+    complete = np.bincount(harmonic) == 2
+    return of_periodogram(power[complete])
+
+
+def of_periodogram(power: np.ndarray) -> Whiteness:
+    """Test the squared amplitudes of harmonics 1, 2, … for being those of white noise.
 
     References
     ----------
@@ -33,7 +45,6 @@ def whiteness(residual: np.ndarray, harmonics: int | None = None) -> Whiteness:
     """
     from scipy.stats import kstest
 
-    power = np.abs(fourier.coefficients(residual, harmonics)[1:]) ** 2
     if power.size < 2 or power.sum() == 0.0:
         return Whiteness(1.0, 0.0)
     harmonic = np.arange(1, power.size + 1)

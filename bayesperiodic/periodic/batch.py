@@ -1,19 +1,43 @@
-"""Many parameter vectors times many input sets, shared among the cores."""
+"""Many parameter vectors times many input sets of a forced model, shared among the cores."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from bayesperiodic.parallel import available_cores
 from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
-from bayesperiodic.periodic.sensitivity import parameter_sensitivities
+from bayesperiodic.periodic.sensitivity import Sensitivities, parameter_sensitivities
 
 SMALLEST_PART, PARTS_EACH = 4, 4
 NO_FACTORS = -1
+
+
+class BatchSolution(NamedTuple):
+    """What a batch of solves ended with.
+
+    Attributes
+    ----------
+    z : array (sets, solves, points, states)
+        The periodic parts.
+    outputs : array (sets, solves, points, channels)
+    frequency : array (sets, solves)
+        [Hz].
+    status : int array (sets, solves)
+        Index into `compiled.STATUSES`.
+    iterations : int array (sets, solves)
+        Chord steps and Newton iterations.
+    """
+
+    z: np.ndarray
+    outputs: np.ndarray
+    frequency: np.ndarray
+    status: np.ndarray
+    iterations: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -24,18 +48,40 @@ class Anchor:
     ----------
     parameters : array (parameters,)
     z : array (points, states)
+    frequency : float
+        [Hz].
     sensitivities : array (parameters, points, states), or None
+    frequency_sensitivities : array (parameters,), or None
+        Zero for a forced model.
     """
 
     parameters: np.ndarray
     z: np.ndarray
+    frequency: float
     sensitivities: np.ndarray | None = None
+    frequency_sensitivities: np.ndarray | None = None
 
     @classmethod
     def at(cls, equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> "Anchor":
         """Return the anchor at a solution z; a mere guess where ∂g/∂z is singular."""
         derivative = parameter_sensitivities(equations, z, parameters)
-        return cls(parameters, z, None if derivative is None else derivative.states[: parameters.size])
+        return cls.of(equations, parameters, z, derivative, np.arange(parameters.size))
+
+    @classmethod
+    def of(
+        cls,
+        equations: PeriodicEquations,
+        parameters: np.ndarray,
+        z: np.ndarray,
+        derivative: Sensitivities | None,
+        moving: np.ndarray,
+    ) -> "Anchor":
+        """Return the anchor at a solution z with derivatives by the parameters `moving` (indices), zero by others."""
+        if derivative is None:
+            return cls(parameters, z, equations.frequency)
+        states, frequency = np.zeros((parameters.size, *z.shape)), np.zeros(parameters.size)
+        states[moving], frequency[moving] = derivative.states[: moving.size], derivative.frequency[: moving.size]
+        return cls(parameters, z, equations.frequency, states, frequency)
 
 
 class Batch:
@@ -76,7 +122,7 @@ class Batch:
         )
         self._inputs = np.stack([e.inputs for e in sets])
 
-    def solve(self, parameters: np.ndarray, threads: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def solve(self, parameters: np.ndarray, threads: int | None = None) -> BatchSolution:
         """Solve every input set for every parameter vector; the result does not depend on the number of threads.
 
         Parameters
@@ -84,18 +130,11 @@ class Batch:
         parameters : array (solves, parameters)
         threads : int, optional
             By default as many as there are cores.
-
-        Returns
-        -------
-        outputs : array (sets, solves, points, channels)
-        status : int array (sets, solves)
-            Index into `compiled.STATUSES`.
-        iterations : int array (sets, solves)
-            Chord steps and Newton iterations.
         """
         model, grid = self._first.model, self._first.grid
         parameters = np.ascontiguousarray(parameters, dtype=float)
         total = self._size * len(parameters)
+        z = np.empty((self._size, len(parameters), grid.points, self._first.count))
         y = np.empty((self._size, len(parameters), grid.points, model.kernels.channels))
         status, iterations = np.empty((2, self._size, len(parameters)), dtype=np.int64)
 
@@ -109,6 +148,7 @@ class Batch:
                 *self._shared,
                 start,
                 stop,
+                z,
                 y,
                 status,
                 iterations,
@@ -126,7 +166,8 @@ class Batch:
         work()
         for future in elsewhere:
             future.result()
-        return y, status, iterations
+        frequency = np.repeat(self._shared[1][:, None], len(parameters), axis=1)
+        return BatchSolution(z, y, frequency, status, iterations)
 
 
 @cache

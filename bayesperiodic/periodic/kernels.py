@@ -589,7 +589,7 @@ def is_far(z, predicted, anchor_z):
 @njit(
     f"void({FUNCTION}, {FUNCTION}, {GRID}, {CUBE}, {MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, {CUBE}, {GAINS}, "
     f"Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
-    f"int64, int64, {GAINS}, {INDICES}, {INDICES})",
+    f"int64, int64, {GAINS}, {GAINS}, {INDICES}, {INDICES})",
     **OPTIONS,
 )
 def solve_many(
@@ -607,6 +607,7 @@ def solve_many(
     anchor_factors,
     start,
     stop,
+    kept_z,
     y,
     status,
     iterations,
@@ -625,6 +626,7 @@ def solve_many(
     frequency : array (sets,)
     drift : array (sets, states)
     anchor_parameters, anchor_z, anchor_sensitivities, anchor_factors : arrays (sets, …)
+    kept_z : array (sets, solves, points, states)
     y : array (sets, solves, points, channels)
     status, iterations : int arrays (sets, solves)
     """
@@ -674,4 +676,5 @@ def solve_many(
                     break
         differentiate(z, turn, grid, tau, f, states)
         outputs(states, inputs[e], theta, tau, f, y[e, b])
+        kept_z[e, b] = z
         status[e, b], iterations[e, b] = code, used

@@ -108,9 +108,9 @@ def solve_periodic(
     checks.same_names("parameters", parameters, model.parameters)
     theta = np.array([checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
     if model.autonomous:
-        equations, solved, found_by = _solve_autonomous(equations, theta, guess)
+        equations, solved, found_by = solve_free(equations, theta, guess)
     else:
-        solved, found_by = _solve_forced(equations, theta, guess)
+        solved, found_by = solve_forced(equations, theta, guess)
     solution = describe(equations, theta, solved, found_by)
     if solution.converged and (steps := _steps_of_transitions(equations, theta, solved.z)) < FEW_STEPS:
         warnings.warn(
@@ -123,9 +123,10 @@ def solve_periodic(
     return solution
 
 
-def _solve_forced(
+def solve_forced(
     equations: PeriodicEquations, theta: np.ndarray, guess: str | Mapping[str, np.ndarray] | PeriodicSolution
 ) -> tuple[Solved, str]:
+    """Solve a forced problem from any guess; return the solve and how it was found (`PeriodicSolution.found_by`)."""
     if not isinstance(guess, str):
         start = as_guess(equations, guess)
         solved, found_by = solve_from(equations, theta, start)
@@ -193,9 +194,10 @@ def _repeats(equations: PeriodicEquations, z: np.ndarray) -> int:
     return 1
 
 
-def _solve_autonomous(
+def solve_free(
     equations: PeriodicEquations, theta: np.ndarray, guess: str | Mapping[str, np.ndarray] | PeriodicSolution
 ) -> tuple[PeriodicEquations, Solved, str]:
+    """Solve for the orbit of an autonomous model; return the equations at its frequency, the solve, and how found."""
     frequency, found_by = equations.frequency, NEWTON
     if isinstance(guess, str):
         checks.one_of("guess", guess, GUESSES)
@@ -218,17 +220,18 @@ def _solve_autonomous(
     found = solve_autonomous(Family(equations, theta, ("frequency",)), z, frequency)
     equations = equations.at_frequency(float(found.values[0]))
     code = found.code
-    shorter = code == CONVERGED and _has_shorter_period(found.z)
-    if shorter or (code != NOT_FINITE and _collapsed(found.z, z)):
+    shorter = code == CONVERGED and has_shorter_period(found.z)
+    if shorter or (code != NOT_FINITE and collapsed(found.z, z)):
         code = OTHER_ORBIT
     return equations, Solved(found.z, code, found.history), found_by
 
 
-def _collapsed(z: np.ndarray, guess: np.ndarray) -> bool:
+def collapsed(z: np.ndarray, guess: np.ndarray) -> bool:
+    """Return whether an orbit has shrunk to an equilibrium."""
     return bool(np.all(np.ptp(z, axis=0) <= EQUILIBRIUM * np.ptp(guess, axis=0)))
 
 
-def _has_shorter_period(z: np.ndarray) -> bool:
+def has_shorter_period(z: np.ndarray) -> bool:
     """Return whether only every k-th harmonic is there, for a k of 2 or more."""
     power = np.sum(np.abs(np.fft.rfft(z, axis=0)) ** 2, axis=1)[1:]
     present = np.flatnonzero(power > SAME**2 * power.max()) + 1

@@ -62,13 +62,14 @@ def test_unknown_variance_is_that_of_equation_7():
 
 def test_estimate_maximises_equation_6_with_the_corrected_count():
     """With eq. (7) the staged iteration ends at the maximum of −½ (nN − l/s) ln M + ln p(θ)."""
-    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=5)], priors=PRIORS)
+    experiment = linear_experiment(TRUTH, 3.0, seed=5)
+    problem = bp.Problem(LINEAR, [experiment], priors=PRIORS)
     fit = bp.map_estimate(problem)
     best = np.array(list(fit.theta.values()))
 
     def objective(theta):
-        moment = problem.moments(theta)[0][..., 0]
-        return -0.5 * (40 - 3) * np.log(moment) + problem.log_prior(theta)
+        residual = experiment.outputs["force"] - linear_regressors(0.05, 2.0, grid(40)) @ theta
+        return -0.5 * (40 - 3) * np.log(np.sum(residual**2)) + problem.log_prior(theta)
 
     for direction in np.eye(3) * np.array(list(fit.sd.values())):
         for step in (-0.05, 0.05):

@@ -43,7 +43,7 @@ def test_chains_of_ties_and_nonlinear_ones_have_exact_slopes():
     at = chained.parameters(np.array([[800.0]]), "run")[0]
     assert at == pytest.approx([800.0, 2 * np.sqrt(6.4), 6.4])
     slopes = chained.parameter_maps["run"].slopes(np.array([800.0]))
-    assert slopes[:, 0] == pytest.approx([1.0, 0.016 / np.sqrt(6.4), 0.016], rel=1e-12)
+    assert slopes[:, 0] == pytest.approx([1.0, 0.016 / np.sqrt(6.4), 0.016, 0.0], rel=1e-12)
     fit = bp.map_estimate(chained, progress=False)
     assert fit.converged and fit.tied["coulomb"]["k"] == pytest.approx(2 * fit.theta["k"] / 1e5)
 

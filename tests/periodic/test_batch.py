@@ -56,7 +56,7 @@ def alone(equations: PeriodicEquations, theta: np.ndarray) -> np.ndarray:
 
 def test_batch_equals_single_solves(equations, batch):
     parameters = spread(6)
-    (outputs,), (status,), _ = batch.solve(parameters)
+    _, (outputs,), _, (status,), _ = batch.solve(parameters)
     assert not status.any()
     for theta, y in zip(parameters, outputs, strict=True):
         assert y[:, 0] == pytest.approx(alone(equations, theta), abs=1e-9 * np.ptp(y))
@@ -66,7 +66,7 @@ def test_input_sets_times_parameter_vectors():
     tau = grid(200)
     sets = [build(f * np.cos(2 * np.pi * tau), nu) for f, nu in ((20.0, 5.0), (5.0, 3.0), (10.0, 12.0))]
     parameters = spread(5)
-    outputs, status, _ = Batch(sets, [anchored(e) for e in sets]).solve(parameters)
+    _, outputs, _, status, _ = Batch(sets, [anchored(e) for e in sets]).solve(parameters)
     assert outputs.shape == (3, 5, 200, 1) and not status.any()
     for e, per_set in zip(sets, outputs, strict=True):
         for theta, y in zip(parameters, per_set, strict=True):
@@ -81,14 +81,14 @@ def test_sets_on_different_grids_are_refused(equations):
 
 def test_small_changes_need_no_factorisation(equations):
     """Chord steps with the anchor's factors count as iterations, too: two or three suffice after a small change."""
-    (outputs,), (status,), (iterations,) = Batch([equations], [anchored(equations)]).solve(spread(20, sd=1e-3))
+    _, (outputs,), _, (status,), (iterations,) = Batch([equations], [anchored(equations)]).solve(spread(20, sd=1e-3))
     assert not status.any() and np.all(iterations <= 3)
     assert np.all(np.ptp(outputs, axis=1) > 0)
 
 
 def test_an_anchor_that_is_a_mere_guess_works(equations):
-    guess = Anchor(DUFFING, equations.static_guess(DUFFING))
-    (outputs,), (status,), _ = Batch([equations], [guess]).solve(DUFFING[None])
+    guess = Anchor(DUFFING, equations.static_guess(DUFFING), equations.frequency)
+    _, (outputs,), _, (status,), _ = Batch([equations], [guess]).solve(DUFFING[None])
     assert status[0] == 0
     assert outputs[0, :, 0] == pytest.approx(alone(equations, DUFFING), abs=1e-9 * np.ptp(outputs))
 
@@ -106,7 +106,7 @@ def test_bits_do_not_depend_on_the_number_of_threads_or_the_company(batch):
 def test_a_failed_solve_leaves_its_neighbours_alone(batch):
     parameters = spread(5)
     parameters[2] = np.nan
-    (outputs,), (status,), _ = batch.solve(parameters)
+    _, (outputs,), _, (status,), _ = batch.solve(parameters)
     assert status[2] != 0 and not status[[0, 1, 3, 4]].any()
     assert np.isfinite(outputs[[0, 1, 3, 4]]).all()
 
@@ -123,7 +123,7 @@ def test_no_solve_slips_to_another_branch():
     damping = np.linspace(0.1, 0.4, 40)  # the upper branch ends on the way
     parameters = np.tile(theta, (40, 1))
     parameters[:, 1] = damping
-    (outputs,), (status,), _ = batch.solve(parameters)
+    _, (outputs,), _, (status,), _ = batch.solve(parameters)
     followed, still = upper.z, True
     for c, y, code in zip(damping, outputs[:, :, 0], status, strict=True):
         step = equations.solve(np.array([1.0, c, 1.0, 0.5]), followed)

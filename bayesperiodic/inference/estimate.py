@@ -1,0 +1,235 @@
+"""MapEstimate: the MAP point, its Laplace approximations, and an account of the residual."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.special import stdtrit
+
+from bayesperiodic import checks
+from bayesperiodic.expressions import Expression, parse_all
+from bayesperiodic.inference.residual_split import NoiseSplit
+from bayesperiodic.inference.whiteness import Whiteness
+from bayesperiodic.periodic.solution import PeriodicSolution
+from bayesperiodic.store import Result
+
+
+@dataclass(frozen=True)
+class MapEstimate(Result):
+    """The maximum of the posterior density and the normal approximation around it.
+
+    Attributes
+    ----------
+    status : str
+        "converged", "stalled" (no step raised the objective), "iterations" (their limit was reached) or "singular".
+    theta, sd : dict of str to float
+        Estimates and their standard deviations, in natural values and the parameters' units.
+    robust_sd : dict of str to float
+        Standard deviations that hold although the residuals are not as the noise model says (sandwich with the
+        residual's smoothed spectrum); far from `sd`, the noise model is too sure of itself or not sure enough.
+    variances : dict of str to float
+        Variance of the mean period of each channel (or "channel, experiment"), and "scale", eq. (7) or as fixed.
+    noise : dict of str to float
+        All noise parameters by their full names.
+    noise_prior : str
+        The prior of the variances, in words.
+    covariance : DataFrame (names × names)
+        Inverse of H of eq. (8) at these variances.
+    joint_mode : dict of str to float
+        Mode of the density in sampling coordinates: natural values of parameters and free noise parameters.
+    joint_covariance : DataFrame
+        Inverse of the exact Hessian there, over the sampling coordinates: logarithms of the parameters whose prior's
+        support is (0, ∞) and of the noise parameters, other parameters as they are. NaN where there is no maximum.
+    degrees_of_freedom : float
+        Independent values less free parameters; infinite where all variances are fixed.
+    independent : dict of str to float
+        Independent values behind each variance.
+    solutions : dict of str to PeriodicSolution
+        By experiment.
+    residuals : dict of str to dict of str to array (points,)
+        y − ŷ within the kept harmonics, by experiment and channel.
+    rms, fvu : dict of str to float
+        Root mean square of the residuals of each channel, and their mean square over the variance of the measured
+        channel (the fraction of variance unexplained).
+    whiteness : dict of str to Whiteness
+        Of the residuals in units of the noise model, by channel; with several experiments p is the smallest, corrected
+        for their number, lag1 the mean.
+    noise_split : dict of str to NoiseSplit
+        Measurement noise and model error of each channel.
+    input_noise : dict of str to float
+        Standard deviation that the noise of the measured inputs brings to each channel.
+    doubling_shift : dict of str to float
+        By how many standard deviations each estimate would move on twice as many points; NaN if those solves fail.
+    undetermined : tuple of str
+        Parameters or combinations of them that change no output at all, in words; what is said of them is the prior's.
+    history : array (iterations,)
+        The objective before each step and at the end.
+    starts : tuple of dict of str to float
+        Of every start, the objective it led to (−inf: none) under "objective", and the estimates.
+    tied : dict of str to dict of str to float
+        Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
+    """
+
+    status: str
+    theta: dict[str, float]
+    sd: dict[str, float]
+    robust_sd: dict[str, float]
+    variances: dict[str, float]
+    noise: dict[str, float]
+    noise_prior: str
+    covariance: pd.DataFrame
+    joint_mode: dict[str, float]
+    joint_covariance: pd.DataFrame
+    degrees_of_freedom: float
+    independent: dict[str, float]
+    solutions: dict[str, PeriodicSolution]
+    residuals: dict[str, dict[str, np.ndarray]]
+    rms: dict[str, float]
+    fvu: dict[str, float]
+    whiteness: dict[str, Whiteness]
+    noise_split: dict[str, NoiseSplit]
+    input_noise: dict[str, float]
+    doubling_shift: dict[str, float]
+    undetermined: tuple[str, ...]
+    history: np.ndarray
+    starts: tuple[dict[str, float], ...]
+    tied: dict[str, dict[str, float]]
+
+    @property
+    def converged(self) -> bool:
+        """True if the status is "converged"."""
+        return self.status == "converged"
+
+    @property
+    def correlations(self) -> pd.DataFrame:
+        """Correlations of the parameters, from `covariance`."""
+        sd = np.sqrt(np.diag(self.covariance))
+        return pd.DataFrame(self.covariance / np.outer(sd, sd))
+
+    def interval(self, probability: float = 0.9, *, robust: bool = False) -> dict[str, tuple[float, float]]:
+        """Return the equal-tailed interval of each parameter, Student's t with `degrees_of_freedom`.
+
+        With few independent values a normal interval is too short, because the variance is estimated too.
+
+        Parameters
+        ----------
+        probability : float
+            Between 0 and 1.
+        robust : bool
+            Take `robust_sd` instead of `sd`.
+
+        Raises
+        ------
+        ValueError
+            If the probability is not between 0 and 1.
+        """
+        if not 0.0 < checks.finite_number("probability", probability) < 1.0:
+            raise ValueError(f"probability: {probability!r} is not allowed; it must be between 0 and 1.")
+        width = float(stdtrit(min(self.degrees_of_freedom, 1e9), 0.5 + 0.5 * probability))
+        sd = self.robust_sd if robust else self.sd
+        return {name: (value - width * sd[name], value + width * sd[name]) for name, value in self.theta.items()}
+
+    def derive(self, expressions: Mapping[str, str]) -> pd.DataFrame:
+        """Return quantities derived from the parameters, with standard deviations by the delta method.
+
+        The standard deviation is √(gᵀ C g) with the exact gradient g by the free parameters and the `covariance` C:
+        exact for linear combinations, otherwise good as far as the expression is straight within the uncertainty.
+
+        Parameters
+        ----------
+        expressions : mapping of str to str
+            By new name: numbers, names of parameters (free, fixed or tied), pi, + - * / ** and sqrt, exp, log, sin,
+            cos, tan, atan, sinh, cosh, tanh, abs.
+
+        Returns
+        -------
+        DataFrame
+            Columns value and sd, a row a quantity; ``attrs["covariance"]`` holds the covariances between the quantities
+            as a dict of dict of floats.
+
+        Raises
+        ------
+        ValueError
+            For an expression that is not allowed or has no finite value at the estimate, a new name that is no
+            identifier or that a parameter has.
+
+        Examples
+        --------
+        >>> import numpy as np, bayesperiodic as bp
+        >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
+        >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
+        ...                          frequency=0.1, samples=50)
+        >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
+        >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)},
+        ...                      fixed={"m": 1, "k3": 0.5, "variance[displacement]": 1e-4})
+        >>> fit = bp.map_estimate(problem, progress=False)
+        >>> fit.derive({"damping_ratio": "c/(2*sqrt(k*m))"}).round(4)
+                       value      sd
+        damping_ratio    0.1  0.0016
+        """
+        values = self._fixed() | self.theta
+        quantities = parse_all("expressions", expressions, values)
+        at = {name: float(quantity.value(values)) for name, quantity in quantities.items()}
+        for name, value in at.items():
+            if not np.isfinite(value):
+                raise ValueError(
+                    f"expressions[{name!r}]: {quantities[name].text!r} is not allowed; it is {value} at the estimate "
+                    "and must be finite."
+                )
+        covariance = _carried(self.covariance, [self._gradient(q, values) for q in quantities.values()])
+        with np.errstate(invalid="ignore"):
+            sd = np.sqrt(np.diag(covariance))
+        table = pd.DataFrame({"value": list(at.values()), "sd": sd}, index=list(at))
+        table.attrs["covariance"] = {
+            name: dict(zip(at, row, strict=True)) for name, row in zip(at, covariance.tolist(), strict=True)
+        }
+        return table
+
+    def _gradient(self, quantity: Expression, values: dict[str, float]) -> dict[str, np.ndarray]:
+        """Return the derivatives by the free parameters, those through tied ones included."""
+        partial = quantity.gradient(values, [*self.theta, *self.tied])
+        return {
+            name: partial[name] + sum((partial[t] * slopes[name] for t, slopes in self.tied.items()), np.array(0.0))
+            for name in self.theta
+        }
+
+    def _fixed(self) -> dict[str, float]:
+        """Return the parameters that have the same value in all solutions and are not free, tied ones among them."""
+        first, *others = (solution.parameters for solution in self.solutions.values())
+        return {
+            name: value
+            for name, value in first.items()
+            if name not in self.theta and all(other.get(name) == value for other in others)
+        }
+
+    def __repr__(self) -> str:
+        lines = [f"MapEstimate ({self.status}), estimate ± Laplace sd (robust sd):"]
+        lines += [
+            f"  {name:12s} {value:12.6g} ± {self.sd[name]:.3g} ({self.robust_sd[name]:.3g})"
+            for name, value in self.theta.items()
+        ]
+        lines += [f"  {name} = {value:.4g}" for name, value in self.noise.items()]
+        lines[-1] += f" ({self.noise_prior})" if self.noise else ""
+        for channel, rms in self.rms.items():
+            line = f"  rms of {channel}: {rms:.4g}, unexplained variance {self.fvu[channel]:.2%}"
+            if channel in self.noise_split and np.isfinite(self.noise_split[channel].measurement):
+                split = self.noise_split[channel]
+                line += f", measurement noise {split.measurement:.3g}, model error {split.model:.3g}"
+            if np.isfinite(self.whiteness[channel].p):
+                line += f", whiteness p = {self.whiteness[channel].p:.2g}"
+            lines.append(line)
+        lines += [f"  not determined by the data: {text}" for text in self.undetermined]
+        return "\n".join(lines)
+
+
+def _carried(covariance: pd.DataFrame, gradients: list[dict[str, np.ndarray]]) -> np.ndarray:
+    """Return the covariance of quantities with these gradients; what a quantity does not depend on has no say."""
+    matrix = covariance.to_numpy()
+    rows = [np.array([float(gradient[name]) for name in covariance.columns]) for gradient in gradients]
+    result = np.zeros((len(rows), len(rows)))
+    with np.errstate(invalid="ignore", over="ignore"):
+        for i, a in enumerate(rows):
+            for j, b in enumerate(rows):
+                result[i, j] = a[a != 0.0] @ matrix[np.ix_(a != 0.0, b != 0.0)] @ b[b != 0.0]
+    return result

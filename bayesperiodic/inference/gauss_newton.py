@@ -1,0 +1,172 @@
+"""The staged Gauss-Newton iteration: noise parameters from the residuals, then a step in θ (eq. 7-8)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesperiodic.inference.linearisation import Linearisation
+from bayesperiodic.inference.noise_estimate import estimate_noise
+from bayesperiodic.inference.problem import Problem
+
+MAX_ITERATIONS = 100
+MAX_HALVINGS = 30
+SCALED_STEP = 1e-8
+SMALL_STEP = 1e-4
+SINGULAR = 1e-13
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """Where the iteration stands.
+
+    Attributes
+    ----------
+    theta : array (names,)
+    here : Linearisation
+        At θ, which anchors the next solves.
+    noise : array (noise_names,)
+        The noise parameters that suit the residuals there.
+    objective : float
+    """
+
+    theta: np.ndarray
+    here: Linearisation
+    noise: np.ndarray
+    objective: float
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What the iteration maximises over θ, the noise parameters having been replaced by the best ones.
+
+    Attributes
+    ----------
+    problem : Problem
+    share : float
+        What multiplies the logarithms of the variances: 1 − l/Σn makes their best values those of eq. (7), 1 those of
+        the maximum of eq. (6).
+    logarithmic : bool array (names,)
+        Parameters whose density is taken over their logarithm.
+    """
+
+    problem: Problem
+    share: float
+    logarithmic: np.ndarray
+
+    def at(self, theta: np.ndarray, near: Linearisation | None, noise: np.ndarray) -> Iterate | None:
+        """Return the iterate at θ, solved from a near one; None where the log-posterior is not finite."""
+        prior = float(self.problem.log_prior(theta))
+        if not np.isfinite(prior):
+            return None
+        problem = self.problem if near is None else self.problem.with_responses(near.responses)
+        trial = Linearisation(theta, problem.responses, problem.observations)
+        if not trial.converged or not all(np.isfinite(r).all() for r in trial.residuals):
+            return None
+        likelihood = problem.likelihood
+        noise = estimate_noise(likelihood, trial.residuals, noise, self.share)
+        value = float(likelihood(trial.residuals, noise, self.share) + likelihood.log_prior(noise))
+        value += prior + float(np.sum(np.log(theta[self.logarithmic])))
+        return Iterate(theta, trial, noise, value) if np.isfinite(value) else None
+
+    def anchored(self, iterate: Iterate) -> Iterate:
+        """Return the iterate with the solves anchored at it."""
+        here = self.problem.with_responses(iterate.here.responses).linearised(iterate.theta)
+        return Iterate(iterate.theta, here, iterate.noise, iterate.objective)
+
+    def hessian_and_gradient(self, iterate: Iterate) -> tuple[np.ndarray, np.ndarray]:
+        """Return H of eq. (8) and the gradient of the objective, the prior's part included in both."""
+        hessian, gradient = information(self.problem, iterate)
+        prior, theta, logarithmic = self.problem.joint_prior, iterate.theta, self.logarithmic
+        hessian = hessian + prior.curvature(theta)
+        hessian[logarithmic, logarithmic] += theta[logarithmic] ** -2
+        gradient = gradient + prior.gradient(theta)
+        gradient[logarithmic] += 1.0 / theta[logarithmic]
+        return hessian, gradient
+
+
+def information(problem: Problem, iterate: Iterate) -> tuple[np.ndarray, np.ndarray]:
+    """Return the data's part of H of eq. (8), (names, names), and of its gradient, (names,)."""
+    changes = np.concatenate(problem.likelihood.whitened(iterate.here.changes, iterate.noise), axis=1)
+    residuals = np.concatenate(problem.likelihood.whitened(iterate.here.residuals, iterate.noise))
+    return changes @ changes.T, changes @ residuals
+
+
+def bias_correction(problem: Problem) -> float:
+    """Return 1 − l/Σn, for which the variances of the first stage are those of eq. (7); 1 if that is not positive."""
+    share = 1.0 - len(problem.names) / problem.counted if problem.counted else 1.0
+    return share if share > 0.0 else 1.0
+
+
+def climb(
+    objective: Objective,
+    start: Iterate,
+    held: np.ndarray | None = None,
+    report: Callable[[Iterate, float], None] | None = None,
+) -> tuple[Iterate, str, np.ndarray]:
+    """Raise the objective from a start until the steps are small, and never lower it.
+
+    Where H is not positive definite (convex log-priors that outweigh the data) steps take its negative curvature with
+    the opposite sign; directions without curvature are left alone. Each solve starts from the iterate before and is
+    checked to lie on the same branch, so that a step cannot slip to another periodic solution; steps whose solve fails
+    are halved.
+
+    Parameters
+    ----------
+    objective : Objective
+    start : Iterate
+        Anchored.
+    held : bool array (names,), optional
+        Parameters that stay.
+    report : callable, optional
+        Called with every new iterate and the length of its step in standard deviations.
+
+    Returns
+    -------
+    iterate : Iterate
+    status : str
+        "converged", "stalled" (no step raised the objective), "iterations" (their limit was reached) or "singular".
+    history : array (iterations,)
+        The objective at each iterate.
+    """
+    now, history = start, [start.objective]
+    for _ in range(MAX_ITERATIONS):
+        hessian, gradient = objective.hessian_and_gradient(now)
+        if not np.isfinite(hessian).all() or not np.isfinite(gradient).all():
+            return now, "singular", np.array(history)
+        step, size = _step(hessian, gradient, held)
+        if size < SCALED_STEP:
+            return now, "converged", np.array(history)
+        damping = 1.0
+        for _ in range(MAX_HALVINGS):
+            trial = objective.at(now.theta + damping * step, now.here, now.noise)
+            if trial is not None and trial.objective > now.objective:
+                break
+            damping, trial = 0.5 * damping, None
+            if size < SMALL_STEP:
+                return now, "converged", np.array(history)
+        if trial is None:
+            return now, "stalled", np.array(history)
+        now = objective.anchored(trial)
+        history.append(now.objective)
+        if report is not None:
+            report(now, damping * size)
+    return now, "iterations", np.array(history)
+
+
+def _step(hessian: np.ndarray, gradient: np.ndarray, held: np.ndarray | None) -> tuple[np.ndarray, float]:
+    """Return the step uphill and its largest component in standard deviations."""
+    moving = np.arange(gradient.size) if held is None else np.flatnonzero(~held)
+    step = np.zeros_like(gradient)
+    if not moving.size:
+        return step, 0.0
+    part = hessian[np.ix_(moving, moving)]
+    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(part)), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(part * np.outer(scale, scale))
+    values = np.abs(values)
+    along = vectors.T @ (scale * gradient[moving])
+    along = np.where(values > SINGULAR * values.max(), along / np.maximum(values, np.finfo(float).tiny), 0.0)
+    sd = np.sqrt(np.sum(vectors**2 / np.maximum(values, SINGULAR * values.max()), axis=1))
+    scaled = vectors @ along
+    step[moving] = scale * scaled
+    return step, float(np.max(np.abs(scaled) / sd))

@@ -1,0 +1,195 @@
+"""The log-likelihood of residuals under a noise model, and its derivatives."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from bayesperiodic import checks
+from bayesperiodic.inference.blocks import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
+from bayesperiodic.inference.noise import VARIANCE, Noise
+
+
+class Likelihood:
+    """A noise model on the blocks of a problem: the log-likelihood of their residuals and its derivatives.
+
+    Parameters
+    ----------
+    model : Noise
+    blocks : sequence of Block
+    fixed : mapping of str to float
+        Noise parameters with known values.
+
+    Attributes
+    ----------
+    names : tuple of str
+        All noise parameters.
+    free : tuple of str
+        Those without a known value.
+    """
+
+    def __init__(self, model: Noise, blocks: Sequence[Block], fixed: Mapping[str, float]):
+        self.model, self.blocks = model, tuple(blocks)
+        model.check([b for b in blocks if not set(model.parameter_names(b)) <= set(fixed)])
+        self.names = tuple(dict.fromkeys(name for block in blocks for name in model.parameter_names(block)))
+        for name, value in fixed.items():
+            checks.one_of("fixed", name, self.names)
+            checks.positive(f"fixed[{name!r}]", value)
+        self.fixed = {name: float(fixed[name]) for name in self.names if name in fixed}
+        self.free = tuple(name for name in self.names if name not in fixed)
+        self._columns = [[self.names.index(name) for name in model.parameter_names(block)] for block in blocks]
+        self._free = [self.names.index(name) for name in self.free]
+
+    def groups(self) -> list[tuple[tuple[str, ...], list[int]]]:
+        """Return the noise parameters that belong together, by name, and the indices of their blocks."""
+        together = dict.fromkeys(tuple(columns) for columns in self._columns if columns)
+        return [
+            (tuple(self.names[i] for i in group), [b for b, own in enumerate(self._columns) if tuple(own) == group])
+            for group in together
+        ]
+
+    @cached_property
+    def counts(self) -> dict[str, float]:
+        """Independent values behind each variance (and "scale"), by its name."""
+        result: dict[str, float] = {}
+        for block, columns in zip(self.blocks, self._columns, strict=True):
+            if block.counted:
+                name = self.names[columns[0]]
+                result[name] = result.get(name, 0.0) + block.count
+        return result
+
+    @cached_property
+    def measured(self) -> dict[str, float]:
+        """Measured variance behind each variance, the mean over its values; NaN where it is not known."""
+        total: dict[str, float] = {}
+        for block, columns in zip(self.blocks, self._columns, strict=True):
+            if block.counted:
+                name = self.names[columns[0]]
+                total[name] = total.get(name, 0.0) + block.count * block.measured
+        return {name: value / self.counts[name] for name, value in total.items()}
+
+    def value_variances(self, values: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
+        """Return the variance (…,) of one value of each channel, by (experiment, channel), where it has its own."""
+        result = {}
+        for block, columns in zip(self.blocks, self._columns, strict=True):
+            if block.kind in (SPECTRAL, POINTS):
+                own, count = values[..., columns], max(block.points, 1)
+                harmonic = np.minimum(np.arange(count), count - np.arange(count))
+                whole = block if block.kind == SPECTRAL else replace(block, harmonic=harmonic, size=count)
+                result[block.experiment, block.channel] = self.model.spectrum(whole, own)[0].mean(axis=-1)
+        return result
+
+    def complete(self, free: np.ndarray) -> np.ndarray:
+        """Return the values of all noise parameters (…, names) from those of the free ones (…, free)."""
+        values = np.empty((*free.shape[:-1], len(self.names)))
+        for i, name in enumerate(self.names):
+            values[..., i] = self.fixed[name] if name in self.fixed else free[..., self.free.index(name)]
+        return values
+
+    def log_prior(self, values: np.ndarray) -> np.ndarray:
+        """Return the log-density of the free noise parameters over their logarithms, (…,)."""
+        return self._log_prior(values)[0]
+
+    def _log_prior(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        total, slopes = np.zeros(values.shape[:-1]), np.zeros(values.shape)
+        for i in self._free:
+            name = self.names[i]
+            kind = VARIANCE if name.startswith(SCALE) else name.partition("[")[0]
+            measured = self.measured.get(name, np.nan)
+            value, slopes[..., i] = self.model.log_prior(kind, values[..., i], measured)
+            total = total + value
+        return total, slopes
+
+    def __call__(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float = 1.0) -> np.ndarray:
+        """Return the log-likelihood (…,) of residuals, one (…, size) a block, at values (…, names).
+
+        The logarithms of the variances are multiplied by `share`: 1 − l/Σn for the bias correction of eq. (7).
+        """
+        total = np.zeros(values.shape[:-1])
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            for block, columns, r in zip(self.blocks, self._columns, residuals, strict=True):
+                total = total + self._block(block, r, values[..., columns], share)
+        return np.where(np.isfinite(total), total, -np.inf)
+
+    def _block(self, block: Block, r: np.ndarray, values: np.ndarray, share: float) -> np.ndarray:
+        """Return the log-likelihood (…,) of one block, the logarithms of the variances multiplied by `share`."""
+        if block.kind == KNOWN:
+            return -0.5 * np.sum(r**2, axis=-1)
+        if block.kind == POINTS and self.model.covariance(block, np.ones(values.shape[-1])) is not None:
+            flat, rows = values.reshape(-1, values.shape[-1]), r.reshape(-1, r.shape[-1])
+            each = [self._dense(block, row, v, share)[0] for row, v in zip(rows, flat, strict=True)]
+            return np.array(each).reshape(values.shape[:-1])
+        variances = self._variances(block, values)[0]
+        if block.kind == CORRELATED or self.model.flat:
+            v = variances[..., 0]
+            return -0.5 * block.weight * (share * block.size * np.log(v) + np.sum(r**2, axis=-1) / v)
+        return -0.5 * block.weight * np.sum(share * np.log(variances) + r**2 / variances, axis=-1)
+
+    def _variances(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if block.kind == CORRELATED:
+            shape = (*values.shape[:-1], block.size)
+            return np.broadcast_to(values[..., :1], shape), np.ones((*shape, 1))
+        return self.model.spectrum(block, values)
+
+    def _dense(
+        self, block: Block, r: np.ndarray, values: np.ndarray, share: float
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the log-likelihood of one residual with a dense covariance, and its gradients by r and ln φ."""
+        covariance, slopes = self.model.covariance(block, values)  # type: ignore[misc]
+        try:
+            factor = np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            return -np.inf, np.zeros_like(r), np.zeros(len(slopes))
+        half = solve_triangular(factor, r, lower=True)
+        solved = solve_triangular(factor, half, lower=True, trans=1)
+        inverse = solve_triangular(factor, np.eye(block.size), lower=True)
+        traces = np.einsum("ki,kj,pij->p", inverse, inverse, slopes)
+        value = -0.5 * block.weight * (2 * share * np.sum(np.log(np.diag(factor))) + half @ half)
+        return value, -block.weight * solved, 0.5 * block.weight * (solved @ slopes @ solved - share * traces)
+
+    def gradients(
+        self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float = 1.0
+    ) -> tuple[list[np.ndarray], np.ndarray]:
+        """Return the gradients of log-likelihood plus log-prior of φ, by each block's residual and by ln φ (names,)."""
+        slopes = self._log_prior(values)[1]
+        by_residual = []
+        for block, columns, r in zip(self.blocks, self._columns, residuals, strict=True):
+            if block.kind == KNOWN:
+                by_residual.append(-r)
+                continue
+            if block.kind == POINTS and self.model.covariance(block, values[columns]) is not None:
+                _, by_r, by_phi = self._dense(block, r, values[columns], share)
+            else:
+                variances, change = self._variances(block, values[columns])
+                by_r = -block.weight * r / variances
+                by_phi = 0.5 * block.weight * (r**2 / variances - share) @ change
+            by_residual.append(by_r)
+            slopes[columns] += by_phi
+        return by_residual, slopes
+
+    def whitened(self, vectors: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
+        """Return vectors (…, size), one a block, in units of the noise: their squares sum to −2 log-likelihood."""
+        result = []
+        for block, columns, r in zip(self.blocks, self._columns, vectors, strict=True):
+            if block.kind == KNOWN:
+                result.append(r)
+                continue
+            dense = self.model.covariance(block, values[columns]) if block.kind == POINTS else None
+            if dense is not None:
+                white = solve_triangular(np.linalg.cholesky(dense[0]), r.reshape(-1, block.size).T, lower=True)
+                result.append(np.sqrt(block.weight) * white.T.reshape(r.shape))
+            else:
+                result.append(r * np.sqrt(block.weight / self._variances(block, values[columns])[0]))
+        return result
+
+    def guess(self) -> np.ndarray:
+        """Return where the noise parameters start, (names,): variances 1, shapes at the medians of their priors."""
+        values = np.ones(len(self.names))
+        for i, name in enumerate(self.names):
+            kind = name.partition("[")[0]
+            if kind in self.model.shape_priors:
+                values[i] = float(self.model.shape_priors[kind].quantile(np.array(0.5)))
+            values[i] = self.fixed.get(name, values[i])
+        return values

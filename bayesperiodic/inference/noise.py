@@ -1,0 +1,277 @@
+"""Noise models: what is assumed of the residuals, by name.
+
+Every model gives each residual component its own variance V_j(φ), in a basis in which the components are independent:
+Fourier components for whole periods. The log-likelihood is −½ Σ_j w_j [ln V_j + r_j²/V_j] with w_j independent values
+per component. The noise parameters φ are positive, and densities are over their logarithms.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bayesperiodic import checks
+from bayesperiodic.inference.blocks import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
+from bayesperiodic.inference.joint_prior import as_prior
+from bayesperiodic.inference.priors import LogNormal, Prior
+
+CHANNEL, EXPERIMENT = "channel", "experiment"
+JEFFREYS, FLAT = "jeffreys", "flat"
+VARIANCE = "variance"
+
+# A residual correlated over a few per cent of a period is what smooth model errors leave.
+LENGTHSCALE = LogNormal(0.03, 1.5)
+FLOOR = LogNormal(0.01, 2.0)
+
+
+@dataclass(frozen=True)
+class Noise(ABC):
+    """What the noise models share.
+
+    Parameters
+    ----------
+    per : "channel" or "experiment"
+        Whether a channel has the same noise parameters in all experiments, or its own in each.
+    prior : "jeffreys", "flat", a prior with positive support, or a frozen scipy.stats distribution
+        Of each variance: Jeffreys' 1/v, a constant density of v, or a proper one.
+    """
+
+    per: str = field(default=CHANNEL, kw_only=True)
+    prior: Any = field(default=JEFFREYS, kw_only=True)
+
+    name: ClassVar[str]
+    flat: ClassVar[bool] = True
+    needs_scatter: ClassVar[bool] = False
+
+    @property
+    def shape_priors(self) -> dict[str, Prior]:
+        """The priors of the spectrum's parameters beyond the variance."""
+        return {}
+
+    def __post_init__(self) -> None:
+        checks.one_of("per", self.per, (CHANNEL, EXPERIMENT))
+        if isinstance(self.prior, str):
+            checks.one_of("prior", self.prior, (JEFFREYS, FLAT))
+            return
+        prior = as_prior("prior", self.prior)
+        if prior.support[0] < 0.0:
+            raise ValueError(f"prior: {self.prior!r} is not allowed; a variance is positive, and its support is not.")
+
+    @property
+    def proper(self) -> bool:
+        """Whether the prior of a variance can be normalised."""
+        return not isinstance(self.prior, str)
+
+    @property
+    def spare(self) -> int:
+        """How many more values than free parameters the prior of a variance needs: the flat one diverges with two."""
+        return 2 if self.prior == FLAT else 0
+
+    @property
+    def prior_text(self) -> str:
+        """The prior of a variance in words."""
+        return {JEFFREYS: "Jeffreys prior 1/v", FLAT: "flat prior"}.get(self.prior, f"prior {self.prior!r}")
+
+    def check(self, blocks: Sequence[Block]) -> None:
+        """Raise a ValueError for channels whose scatter is needed and not known."""
+        for block in blocks:
+            if self.needs_scatter and block.kind in (SPECTRAL, POINTS) and not block.measured > 0.0:
+                raise ValueError(
+                    f"noise: {self.name!r} is not allowed; experiment {block.experiment!r} has no scatter of "
+                    f"{block.channel!r}. Give scatter and cycles, or take 'independent'."
+                )
+
+    def label(self, block: Block) -> str:
+        """Return what stands in the brackets of a block's noise parameters."""
+        return block.channel if self.per == CHANNEL else f"{block.channel}, {block.experiment}"
+
+    def parameter_names(self, block: Block) -> tuple[str, ...]:
+        """Return the names of the noise parameters of a block, the variance first."""
+        if block.kind == KNOWN:
+            return ()
+        if block.kind == CORRELATED:
+            return (SCALE if self.per == CHANNEL else f"{SCALE}[{block.experiment}]",)
+        return tuple(f"{kind}[{self.label(block)}]" for kind in (VARIANCE, *self.shape_priors))
+
+    @abstractmethod
+    def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return V (…, size) and ∂ ln V/∂ ln φ (…, size, parameters) of a spectral block at values (…, parameters)."""
+
+    def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the covariance of a block of points (size, size) and its derivatives by ln φ; None if diagonal."""
+        return None
+
+    def log_prior(self, kind: str, value: np.ndarray, measured: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log-density over ln φ of a noise parameter (…,), and its derivative by ln φ."""
+        if kind in self.shape_priors:
+            return _over_logarithm(self.shape_priors[kind], value)
+        if self.prior == JEFFREYS:
+            return np.zeros_like(value), np.zeros_like(value)
+        if self.prior == FLAT:
+            return np.log(value), np.ones_like(value)
+        return _over_logarithm(as_prior("prior", self.prior), value)
+
+
+@dataclass(frozen=True)
+class Independent(Noise):
+    """Independent, identically distributed errors of unknown variance, the paper's model (eq. 6-7).
+
+    Each channel has one unknown variance v, that of one independent value of the mean period. With whole periods the
+    independent values are 2·harmonics + 1, not the grid points.
+
+    Parameters
+    ----------
+    per : "channel" or "experiment"
+    prior : "jeffreys", "flat" or a prior
+        See `Noise`.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> bp.noise.Independent(per="experiment").prior_text
+    'Jeffreys prior 1/v'
+    """
+
+    name: ClassVar[str] = "independent"
+
+    def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return V = v."""
+        shape = (*values.shape[:-1], block.size)
+        return np.broadcast_to(values[..., :1], shape), np.ones((*shape, 1))
+
+
+@dataclass(frozen=True)
+class Measured(Noise):
+    """Measurement noise known from the scatter of the cycles, plus an independent model error of unknown variance.
+
+    V = scatter²/cycles + v, with the variance of the mean period that the fold found where there is one (corrected for
+    correlation between cycles). Jeffreys' prior means 1/(V) here, which is 1/v for large model errors and proper
+    towards v = 0.
+
+    Parameters
+    ----------
+    per : "channel" or "experiment"
+    prior : "jeffreys" or a prior
+        Of the model error's variance. A flat prior is not allowed.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> bp.noise.Measured().name
+    'measured'
+    """
+
+    name: ClassVar[str] = "measured"
+    needs_scatter: ClassVar[bool] = True
+
+    def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return V = scatter²/cycles + v."""
+        shape = (*values.shape[:-1], block.size)
+        total = np.broadcast_to(values[..., :1] + block.measured, shape)
+        return total, (values[..., :1] / total)[..., None]
+
+    def log_prior(self, kind: str, value: np.ndarray, measured: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log-density over ln v; Jeffreys' is that of 1/(measured + v)."""
+        if self.prior != JEFFREYS or not measured > 0.0:
+            return super().log_prior(kind, value, measured)
+        return np.log(value / (measured + value)), measured / (measured + value)
+
+
+@dataclass(frozen=True)
+class Circulant(Noise):
+    """Errors that are correlated along the period and stationary on the circle.
+
+    Their covariance depends on the distance of two points alone, so that Fourier components are independent, with
+    V_h = v·S_h: v is the variance of one value, S the spectrum of the kernel with mean 1. Both kernels become white
+    noise as the correlation length goes to zero. This is exact for noise that repeats with the period, and to O(1/K)
+    for the mean of K cycles of a stationary process. Values at the points of a mask take the dense covariance.
+
+    Parameters
+    ----------
+    kernel : "matern" or "exponential"
+        "matern": once differentiable errors (Matérn, ν = 3/2) over a white floor, S ∝ (3 + (2πhℓ)²)⁻² + floor; for
+        smooth model errors under measurement noise. "exponential": a first-order autoregressive process in continuous
+        time, S ∝ 1/(1 + (2πhℓ)²).
+    per : "channel" or "experiment"
+    prior : "jeffreys", "flat" or a prior
+        Of the variance. The correlation length ℓ, as a fraction of the response period, has the prior
+        LogNormal(0.03, 1.5); the floor, as a multiple of the correlated part's variance, LogNormal(0.01, 2).
+
+    References
+    ----------
+    C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press, 2006, section 4.2.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> bp.noise.Circulant(kernel="exponential").shape_priors
+    {'lengthscale': LogNormal(median=0.03, spread=1.5)}
+    """
+
+    kernel: str = field(default="matern", kw_only=True)
+
+    name: ClassVar[str] = "circulant"
+    flat: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.one_of("kernel", self.kernel, ("matern", "exponential"))
+
+    @property
+    def shape_priors(self) -> dict[str, Prior]:
+        """The priors of the spectrum's shape."""
+        shape: dict[str, Prior] = {"lengthscale": LENGTHSCALE}
+        return shape | ({"floor": FLOOR} if self.kernel == "matern" else {})
+
+    def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return V = v·S_h, S with mean 1 over the components."""
+        return self._spectrum(block.harmonic, values)
+
+    def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return v·Σ_h S_h cos(2πh(t_i − t_j))/n at the points of a mask."""
+        harmonic = np.minimum(np.arange(block.points), block.points - np.arange(block.points))
+        variances, slopes = self._spectrum(harmonic, values)
+        distance = block.position[:, None] - block.position[None, :]
+        waves = np.cos(2 * np.pi * np.multiply.outer(distance, np.arange(block.points))) / block.points
+        return waves @ variances, np.moveaxis(waves @ (variances[:, None] * slopes), -1, 0)
+
+    def _spectrum(self, harmonic: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = 2 * np.pi * harmonic * values[..., 1:2]
+        if self.kernel == "exponential":
+            power, slope = 1.0 / (1.0 + x**2), -2.0 * x**2 / (1.0 + x**2)
+        else:
+            power, slope = (3.0 + x**2) ** -2, -4.0 * x**2 / (3.0 + x**2)
+        mean = power.mean(axis=-1, keepdims=True)
+        power, slope = power / mean, slope - np.mean(power * slope, axis=-1, keepdims=True) / mean
+        if self.kernel == "exponential":
+            return values[..., :1] * power, np.stack([np.ones_like(slope), slope], axis=-1)
+        floor = values[..., 2:3]
+        total = power + floor
+        slopes = [np.ones_like(slope), slope * power / total, floor / total - floor / (1.0 + floor)]
+        return values[..., :1] * total / (1.0 + floor), np.stack(slopes, axis=-1)
+
+
+NAMED: dict[str, type[Noise]] = {model.name: model for model in (Independent, Measured, Circulant)}
+
+
+def as_noise(given: str | Noise) -> Noise:
+    """Return a noise model from its name or itself.
+
+    Raises
+    ------
+    ValueError
+        If it is neither.
+    """
+    if isinstance(given, Noise):
+        return given
+    if not isinstance(given, str):
+        raise ValueError(f"noise: {given!r} is not allowed; it must be a name or a model such as noise.Independent().")
+    checks.one_of("noise", given, NAMED)
+    return NAMED[given]()
+
+
+def _over_logarithm(prior: Prior, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a prior's log-density over ln x, and its derivative by ln x."""
+    return prior.log_prob(value) + np.log(value), prior.gradient(value) * value + 1.0

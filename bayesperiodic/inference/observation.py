@@ -1,0 +1,297 @@
+"""From a periodic response to what is compared with one experiment, and the derivatives of that."""
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from bayesperiodic import fourier
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.inference.blocks import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
+from bayesperiodic.models.model import Model
+
+
+class Response(NamedTuple):
+    """What a model answers in one experiment, or the derivatives of that along directions on the leading axis.
+
+    Attributes
+    ----------
+    outputs : array (…, points, channels)
+        In the order of the model's outputs.
+    frequency : array (…,)
+        [Hz].
+    log_multipliers : array (…, multipliers)
+        log|μ|, largest first, as many as were measured.
+    delay : array (…,)
+        By how much the measured outputs are late against the model's [s].
+    """
+
+    outputs: np.ndarray
+    frequency: np.ndarray
+    log_multipliers: np.ndarray
+    delay: np.ndarray
+
+
+class Observation:
+    """The comparison of a response with one experiment.
+
+    Outputs are delayed, compared with the data (angles modulo 2π), and taken at the points of the mask or as Fourier
+    components within the harmonics kept. The orbit of an autonomous model, whose phase is free, is first turned until
+    the first harmonic of its first measured output has the phase of the data.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    model : Model
+    delayed : bool
+        Whether the delay is a parameter; without it outputs are not shifted at all, unless the phase is free.
+    """
+
+    def __init__(self, experiment: Experiment, model: Model, delayed: bool):
+        self.experiment = experiment
+        self.channels = tuple(channel for channel in model.outputs if channel in experiment.outputs)
+        self._columns = [model.outputs.index(channel) for channel in self.channels]
+        self._angles = [channel in model.angles for channel in self.channels]
+        self._free_phase = model.autonomous
+        self._shifted = delayed or model.autonomous
+        self._data = np.stack([experiment.outputs[channel] for channel in self.channels], axis=-1)
+        self._points = len(self._data)
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """What the noise model must know, one entry a vector of components."""
+        e, found = self.experiment, []
+        if e.covariance is not None:
+            found.append(self._block(SCALE, CORRELATED, float(self._values), self._values))
+        else:
+            for channel in self.channels:
+                kind = SPECTRAL if e.mask is None else POINTS
+                size = len(self._harmonic(channel)) if e.mask is None else int(e.mask.sum())
+                found.append(self._block(channel, kind, float(e.independent[channel]), size))
+        if e.multipliers is not None:
+            found.append(self._block("multipliers", KNOWN, 0.0, e.multipliers.size))
+        if self._free_phase:
+            found.append(self._block("frequency", KNOWN, 0.0, 1))
+        return tuple(found)
+
+    def _block(self, channel: str, kind: str, count: float, size: int) -> Block:
+        mask = self.experiment.mask
+        return Block(
+            self.experiment.name,
+            channel,
+            kind,
+            count,
+            size,
+            self._harmonic(channel) if kind == SPECTRAL else np.empty(0),
+            np.flatnonzero(mask) / self._points if kind == POINTS and mask is not None else np.empty(0),
+            self._points,
+            _measured_variance(self.experiment, channel),
+        )
+
+    @property
+    def _values(self) -> int:
+        mask = self.experiment.mask
+        return (self._points if mask is None else int(mask.sum())) * len(self.channels)
+
+    def _harmonic(self, channel: str) -> np.ndarray:
+        kept = self.experiment.harmonics.get(channel)
+        highest = fourier.highest_harmonic(self._points)
+        harmonics = np.arange(1, 1 + min(highest if kept is None else kept, highest))
+        nyquist = [self._points // 2] if kept is None and self._points % 2 == 0 else []
+        return np.array([0, *harmonics, *harmonics, *nyquist])
+
+    @cached_property
+    def _joint(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the factor of the values' covariance, the regression of log|μ| on them, and its factor."""
+        e, size = self.experiment, self._values
+        count = 0 if e.multipliers is None else e.multipliers.size
+        if e.covariance is None:
+            assert e.multiplier_sd is not None
+            return np.empty((0, 0)), np.zeros((count, 0)), np.diag(e.multiplier_sd)
+        factor = np.linalg.cholesky(e.covariance[:size, :size])
+        if e.multiplier_sd is not None or not count:
+            return factor, np.zeros((count, size)), np.diag(e.multiplier_sd if count else np.empty(0))  # type: ignore[arg-type]
+        cross = e.covariance[size:, :size]
+        slopes = np.linalg.solve(e.covariance[:size, :size], cross.T).T
+        return factor, slopes, np.linalg.cholesky(e.covariance[size:, size:] - slopes @ cross.T)
+
+    def residuals(self, response: Response) -> list[np.ndarray]:
+        """Return the residual components, one array (…, size) a block."""
+        e = self.experiment
+        difference = self._data - self._predicted(response)
+        for c, angle in enumerate(self._angles):
+            if angle:
+                difference[..., c] = np.mod(difference[..., c] + np.pi, 2 * np.pi) - np.pi
+        known = [] if e.multipliers is None else [np.log(np.abs(e.multipliers)) - response.log_multipliers]
+        frequency = [e.frequency - response.frequency] if self._free_phase else []
+        return self._components(difference, known, frequency)
+
+    def changes(self, response: Response, directions: Response) -> list[np.ndarray]:
+        """Return the derivatives of the predicted components along directions, one array (directions, size) a block."""
+        e = self.experiment
+        moved = directions.outputs[..., self._columns]
+        if self._shifted:
+            moved = self._shift(moved, self._fraction(response))
+            moved = moved - self._rate(response) * self._fraction_changes(response, directions)[:, None, None]
+        known = [] if e.multipliers is None else [directions.log_multipliers]
+        return self._components(moved, known, [directions.frequency] if self._free_phase else [])
+
+    def pulled(self, response: Response, weights: list[np.ndarray]) -> Response:
+        """Return the derivatives of Σ weights · predicted components by everything in the response."""
+        e, total = self.experiment, np.zeros_like(self._data)
+        joint = np.zeros(0)
+        if e.multipliers is not None:
+            joint = solve_triangular(self._joint[2], weights[-2 if self._free_phase else -1], lower=True, trans=1)
+        if e.covariance is not None:
+            factor, slopes, _ = self._joint
+            by_value = solve_triangular(factor, weights[0], lower=True, trans=1) - slopes.T @ joint
+            at = slice(None) if e.mask is None else e.mask
+            total[at] = by_value.reshape(-1, len(self.channels))
+        else:
+            for c, channel in enumerate(self.channels):
+                if e.mask is not None:
+                    total[e.mask, c] = weights[c]
+                else:
+                    total[:, c] = self._spread(weights[c], self._harmonic(channel))
+        by_frequency = weights[-1][0] / e.frequency_se if self._free_phase else 0.0
+        by_delay = 0.0
+        if self._shifted:
+            by_fraction = -float(np.sum(total * self._rate(response)))
+            total = self._shift(total, -self._fraction(response))
+            by_delay = by_fraction * float(response.frequency) / e.periods
+            by_frequency += by_fraction * float(response.delay) / e.periods
+            if self._free_phase:
+                total[:, 0] += by_fraction * self._phase_gradient(response)
+        outputs = np.zeros_like(response.outputs)
+        outputs[:, self._columns] = total
+        return Response(outputs, np.array(by_frequency), joint, np.array(by_delay))
+
+    def predicted(self, response: Response) -> dict[str, np.ndarray]:
+        """Return ŷ (…, points) of each measured channel, turned and delayed."""
+        return dict(zip(self.channels, np.moveaxis(self._predicted(response), -1, 0), strict=True))
+
+    def compared(self, response: Response) -> dict[str, np.ndarray]:
+        """Return y − ŷ (points,) of each channel, within the harmonics kept and zero where nothing was measured."""
+        difference = self._data - self._predicted(response)
+        result = {}
+        for c, channel in enumerate(self.channels):
+            e = difference[:, c]
+            e = np.mod(e + np.pi, 2 * np.pi) - np.pi if self._angles[c] else e
+            mask = self.experiment.mask
+            result[channel] = self.experiment.project(channel, e) if mask is None else np.where(mask, e, 0.0)
+        return result
+
+    def _components(
+        self, values: np.ndarray, multipliers: list[np.ndarray], frequency: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        """Return the components of differences (…, points, channels), and of those of log|μ| and the frequency."""
+        e, found = self.experiment, []
+        picked = values if e.mask is None else values[..., e.mask, :]
+        flat = picked.reshape(*picked.shape[:-2], -1)
+        if e.covariance is not None:
+            found.append(_solved(self._joint[0], flat))
+        else:
+            for c, channel in enumerate(self.channels):
+                column = picked[..., c]
+                found.append(column if e.mask is not None else self._spectral(column, self._harmonic(channel)))
+        for logarithms in multipliers:
+            _, slopes, factor = self._joint
+            explained = flat @ slopes.T if slopes.shape[1] else 0.0
+            found.append(_solved(factor, logarithms - explained))
+        found += [np.asarray(difference)[..., None] / e.frequency_se for difference in frequency]
+        return found
+
+    def _spectral(self, signal: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
+        """Return real Fourier components whose mean square is that of the signal within the harmonics."""
+        highest = (harmonic.size - 1) // 2
+        amplitudes = fourier.coefficients(signal, highest) * np.sqrt(0.5 * harmonic.size)
+        amplitudes[..., 0] *= np.sqrt(2.0)
+        parts = [amplitudes.real, amplitudes.imag[..., 1:]]
+        if harmonic.size % 2 == 0:
+            alternating = np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0) / self._points
+            parts.append((signal @ alternating)[..., None] * np.sqrt(harmonic.size))
+        return np.concatenate(parts, axis=-1)
+
+    def _spread(self, weights: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
+        """Return the transpose of `_spectral` applied to weights (size,)."""
+        highest = (harmonic.size - 1) // 2
+        amplitudes = weights[: highest + 1].astype(complex)
+        amplitudes[1:] += 1j * weights[highest + 1 : 2 * highest + 1]
+        amplitudes *= np.sqrt(2.0 * harmonic.size) / self._points
+        amplitudes[0] *= np.sqrt(0.5)
+        signal = fourier.on_grid(amplitudes, self._points)
+        if harmonic.size % 2 == 0:
+            alternating = np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0)
+            signal += weights[-1] * np.sqrt(harmonic.size) / self._points * alternating
+        return signal
+
+    def _predicted(self, response: Response) -> np.ndarray:
+        """Return the model's outputs (…, points, channels), turned and delayed."""
+        outputs = response.outputs[..., self._columns]
+        return self._shift(outputs, self._fraction(response), turning=True) if self._shifted else outputs
+
+    def _fraction(self, response: Response) -> np.ndarray:
+        """Return by what fraction of the response period the outputs are shifted, (…,)."""
+        fraction = np.asarray(response.delay) * response.frequency / self.experiment.periods
+        if self._free_phase:
+            model = fourier.coefficients(response.outputs[..., self._columns[0]], 1)[..., 1]
+            data = fourier.coefficients(self._data[:, 0], 1)[1]
+            fraction = fraction + np.angle(model / data) / (2 * np.pi)
+        return fraction
+
+    def _fraction_changes(self, response: Response, directions: Response) -> np.ndarray:
+        delays = directions.delay * response.frequency + response.delay * directions.frequency
+        changes = delays / self.experiment.periods
+        if self._free_phase:
+            changes = changes + directions.outputs[..., self._columns[0]] @ self._phase_gradient(response)
+        return changes
+
+    def _phase_gradient(self, response: Response) -> np.ndarray:
+        """Return the derivative (points,) of the first output's phase [turns] by its values."""
+        amplitude = fourier.coefficients(response.outputs[:, self._columns[0]], 1)[1]
+        wave = np.exp(-2j * np.pi * np.arange(self._points) / self._points) * 2.0 / self._points
+        return np.imag(wave / amplitude) / (2 * np.pi)
+
+    def _shift(self, signals: np.ndarray, fraction: np.ndarray, turning: bool = False) -> np.ndarray:
+        """Return signals (…, points, channels) that come a fraction of the response period later."""
+        phase = np.asarray(fraction)[..., None, None]
+        trend = self._trend(signals) if turning else 0.0
+        spectrum = np.fft.rfft(signals - trend * np.arange(self._points)[:, None] / self._points, axis=-2)
+        harmonic = np.arange(spectrum.shape[-2])[:, None]
+        turn = np.exp(-2j * np.pi * harmonic * phase)
+        if self._points % 2 == 0:
+            turn[..., -1, :] = turn[..., -1, :].real
+        shifted = np.fft.irfft(spectrum * turn, n=self._points, axis=-2)
+        return shifted + trend * (np.arange(self._points)[:, None] / self._points - phase)
+
+    def _trend(self, signals: np.ndarray) -> np.ndarray:
+        """Return what angles advance in a response period, (…, 1, channels), whole turns; zero for other channels."""
+        ahead = 2.0 * signals[..., -1:, :] - signals[..., -2:-1, :]
+        turns = np.rint((ahead - signals[..., :1, :]) / (2 * np.pi))
+        return 2 * np.pi * np.where(self._angles, turns, 0.0)
+
+    def _rate(self, response: Response) -> np.ndarray:
+        """Return the derivative (points, channels) of the predicted outputs by their phase [per response period]."""
+        predicted = self._predicted(response)
+        trend = self._trend(predicted)
+        spectrum = np.fft.rfft(predicted - trend * np.arange(self._points)[:, None] / self._points, axis=0)
+        spectrum *= 2j * np.pi * np.arange(len(spectrum))[:, None]
+        if self._points % 2 == 0:
+            spectrum[-1] = 0.0
+        return np.fft.irfft(spectrum, n=self._points, axis=0) + trend
+
+
+def _solved(factor: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return L⁻¹ of vectors (…, size)."""
+    return solve_triangular(factor, values.reshape(-1, len(factor)).T, lower=True).T.reshape(values.shape)
+
+
+def _measured_variance(experiment: Experiment, channel: str) -> float:
+    """Return the variance of one value of the mean period that the scatter of the cycles explains; NaN if unknown."""
+    if channel in experiment.amplitude_variance:
+        variance = experiment.amplitude_variance[channel]
+        return float(variance[0] + 0.5 * np.sum(variance[1:]))
+    if channel in experiment.scatter:
+        return float(experiment.scatter[channel] ** 2 / experiment.cycles)
+    return float("nan")

@@ -1,0 +1,243 @@
+"""The periodic solves behind a problem: every experiment, for many parameter vectors, from anchors."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.inference.observation import Response
+from bayesperiodic.inference.parameters import ParameterMap
+from bayesperiodic.models.model import Model
+from bayesperiodic.periodic.autonomous_batch import AutonomousBatch
+from bayesperiodic.periodic.batch import Anchor, Batch
+from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
+from bayesperiodic.periodic.equations import PeriodicEquations, Solved
+from bayesperiodic.periodic.schemes import Scheme
+from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities, output_gradient
+from bayesperiodic.periodic.solution import PeriodicSolution, describe
+from bayesperiodic.periodic.solve import solve_forced, solve_free
+from bayesperiodic.periodic.stability import multiplier_sensitivities
+
+
+class SolvedResponse(NamedTuple):
+    """Responses of one experiment to several θ.
+
+    Attributes
+    ----------
+    response : Response
+        Its leading axis runs over the θ.
+    z : array (solves, points, states)
+    status : int array (solves,)
+        Index into `compiled.STATUSES`.
+    """
+
+    response: Response
+    z: np.ndarray
+    status: np.ndarray
+
+    def one(self, index: int) -> tuple[Response, np.ndarray]:
+        """Return the response to a single θ, and its z."""
+        return Response(*(part[index] for part in self.response)), self.z[index]
+
+
+class Responses:
+    """Solves the experiments of a problem for any θ.
+
+    Parameters
+    ----------
+    model : Model
+    experiments : tuple of Experiment
+    maps : mapping of str to ParameterMap
+        By experiment.
+    scheme : str or Scheme
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        experiments: tuple[Experiment, ...],
+        maps: Mapping[str, ParameterMap],
+        scheme: str | Scheme,
+    ):
+        self.model, self.experiments, self.maps, self.scheme = model, experiments, maps, scheme
+        self._anchors: dict[str, Anchor] | None = None
+        self._derivatives: dict[str, Sensitivities | None] = {}
+
+    @cached_property
+    def equations(self) -> dict[str, PeriodicEquations]:
+        """The discretised equations of every experiment."""
+        return {
+            e.name: PeriodicEquations.build(
+                self.model,
+                e.inputs,
+                frequency=e.frequency,
+                samples=e.samples,
+                scheme=self.scheme,
+                periods=e.periods,
+                winding=e.winding,
+            )
+            for e in self.experiments
+        }
+
+    def parameters(self, theta: np.ndarray, experiment: str) -> np.ndarray:
+        """Return every parameter of the model (points, parameters) in an experiment from θ (points, names)."""
+        return np.ascontiguousarray(self.maps[experiment].values(theta)[:, :-1])
+
+    def anchored(self, theta: np.ndarray) -> "Responses":
+        """Return the same with its anchors at a θ (names,), solved from the present ones or else from the start."""
+        other = Responses(self.model, self.experiments, self.maps, self.scheme)
+        other.__dict__["equations"] = self.equations
+        found = self.solve(theta[None]) if self._anchors is not None else {}
+        other._anchors = {}
+        for name, equations in self.equations.items():
+            parameters = self.parameters(theta[None], name)[0]
+            if name in found and found[name].status[0] == CONVERGED:
+                here, z = equations.at_frequency(float(found[name].response.frequency[0])), found[name].z[0]
+            else:
+                here, (z, code, _) = self._from_start(name, parameters)
+                if code != CONVERGED:
+                    other._anchors[name] = Anchor(parameters, z, equations.frequency)
+                    other._derivatives[name] = None
+                    continue
+            moving = np.flatnonzero(self.maps[name].slopes(theta)[:-1].any(axis=1))
+            directions = np.eye(parameters.size)[moving]
+            derivative = directional_sensitivities(here, z, parameters, directions)
+            other._anchors[name] = Anchor.of(here, parameters, z, derivative, moving)
+            other._derivatives[name] = derivative and derivative._replace(
+                outputs=np.tensordot(directions, derivative.outputs, (0, 0)),
+                frequency=directions.T @ derivative.frequency,
+            )
+        return other
+
+    def _from_start(self, experiment: str, parameters: np.ndarray) -> tuple[PeriodicEquations, Solved]:
+        """Solve from the experiment's own guess, or from the equilibrium by all means."""
+        equations = self.equations[experiment]
+        guess = next(e.guess for e in self.experiments if e.name == experiment) or "static"
+        if self.model.autonomous:
+            return solve_free(equations, parameters, guess)[:2]
+        return equations, solve_forced(equations, parameters, guess)[0]
+
+    @cached_property
+    def _batches(self) -> list[tuple[tuple[Experiment, ...], Batch | AutonomousBatch]]:
+        """Experiments on the same grid and with the same parameters, with what solves them together."""
+        assert self._anchors is not None
+        groups: dict[tuple[Any, ...], list[Experiment]] = {}
+        for e in self.experiments:
+            own = self.maps[e.name]
+            constants = tuple(value for name, value in own.fixed.items() if name in self.model.parameters)
+            groups.setdefault((e.samples, e.periods, tuple(own.columns.items()), constants), []).append(e)
+        kind = AutonomousBatch if self.model.autonomous else Batch
+        return [
+            (tuple(group), kind([self.equations[e.name] for e in group], [self._anchors[e.name] for e in group]))
+            for group in groups.values()
+        ]
+
+    def solve(self, theta: np.ndarray, threads: int | None = None) -> dict[str, SolvedResponse]:
+        """Solve every experiment for θ (solves, names); the result does not depend on the number of threads."""
+        result = {}
+        for experiments, batch in self._batches:
+            parameters = self.parameters(theta, experiments[0].name)
+            solved = batch.solve(parameters, threads)
+            for i, e in enumerate(experiments):
+                status = solved.status[i].copy()
+                logarithms = self._log_multipliers(e, solved.z[i], solved.frequency[i], parameters, status)
+                delay = self.maps[e.name].values(theta)[:, -1]
+                response = Response(solved.outputs[i], solved.frequency[i], logarithms, delay)
+                result[e.name] = SolvedResponse(response, solved.z[i], status)
+        return {e.name: result[e.name] for e in self.experiments}
+
+    def _log_multipliers(
+        self, experiment: Experiment, z: np.ndarray, frequency: np.ndarray, parameters: np.ndarray, status: np.ndarray
+    ) -> np.ndarray:
+        """Return log|μ| (solves, multipliers) of those that were measured; "other orbit" where a sign differs."""
+        if experiment.multipliers is None:
+            return np.zeros((len(z), 0))
+        measured = experiment.multipliers
+        result = np.full((len(z), measured.size), np.nan)
+        for i in np.flatnonzero(status == CONVERGED):
+            equations = self.equations[experiment.name].at_frequency(float(frequency[i]))
+            found = leading_multipliers(equations, parameters[i], z[i], measured.size)
+            if found.size < measured.size:
+                status[i] = SINGULAR
+            elif np.any(np.sign(found.real) != np.sign(measured)):
+                status[i] = OTHER_ORBIT
+            else:
+                result[i] = np.log(np.abs(found))
+        return result
+
+    def solutions(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
+        """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""
+        solutions = {}
+        for name, solved in self.solve(theta[None]).items():
+            equations = self.equations[name].at_frequency(float(solved.response.frequency[0]))
+            parameters = self.parameters(theta[None], name)[0]
+            code = int(solved.status[0])
+            solutions[name] = describe(equations, parameters, Solved(solved.z[0], code, np.empty((0, 3))))
+        return solutions
+
+    def changes(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:
+        """Return the derivatives of the response at the anchor by θ, (names, …); None where they do not exist.
+
+        Parameters
+        ----------
+        theta : array (names,)
+            Where the anchors are.
+        experiment : str
+        response, z
+            There.
+        """
+        slopes, derivative = self.maps[experiment].slopes(theta), self._derivatives[experiment]
+        if derivative is None:
+            return None
+        outputs = np.tensordot(slopes[:-1], derivative.outputs, (0, 0))
+        multipliers = np.zeros((theta.size, 0))
+        if response.log_multipliers.size:
+            equations = self.equations[experiment].at_frequency(float(response.frequency))
+            parameters = self.parameters(theta[None], experiment)[0]
+            multipliers = slopes[:-1].T @ self._multiplier_changes(equations, parameters, z, response)
+        return Response(outputs, slopes[:-1].T @ derivative.frequency, multipliers, slopes[-1])
+
+    def _multiplier_changes(
+        self, equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, response: Response
+    ) -> np.ndarray:
+        """Return ∂ log|μ|/∂parameter, (parameters, multipliers)."""
+        solution = _described(equations, parameters, z)
+        by_parameter = multiplier_sensitivities(self.model, solution)
+        every = np.array([by_parameter[name] / solution.multipliers for name in self.model.parameters]).real
+        kept = [_without_trivial(solution, row)[: response.log_multipliers.size] for row in every]
+        return np.array(kept)
+
+    def pulled(
+        self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray, weights: Response
+    ) -> np.ndarray | None:
+        """Return Σ weights · derivatives of the response by θ (names,), the outputs' part by one transposed solve."""
+        equations, slopes = self.equations[experiment], self.maps[experiment].slopes(theta)
+        parameters = self.parameters(theta[None], experiment)[0]
+        by_parameter = output_gradient(equations, z, parameters, weights.outputs)
+        if by_parameter is None:
+            return None
+        if response.log_multipliers.size:
+            changes = self._multiplier_changes(equations, parameters, z, response)
+            by_parameter = by_parameter + changes @ weights.log_multipliers
+        return slopes[:-1].T @ by_parameter + slopes[-1] * weights.delay
+
+
+def leading_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int) -> np.ndarray:
+    """Return the `count` largest multipliers of a solution z, or fewer, without an autonomous orbit's trivial 1."""
+    if not count:
+        return np.empty(0)
+    solution = _described(equations, parameters, z)
+    return _without_trivial(solution, solution.multipliers)[:count]
+
+
+def _described(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> PeriodicSolution:
+    return describe(equations, parameters, Solved(z, CONVERGED, np.empty((0, 3))), sensitivities=False)
+
+
+def _without_trivial(solution: PeriodicSolution, values: np.ndarray) -> np.ndarray:
+    """Return values, one a multiplier, without that of an autonomous orbit's trivial multiplier 1."""
+    if not solution.autonomous or not values.size:
+        return values
+    return np.delete(values, np.argmin(np.abs(solution.exponents)))
