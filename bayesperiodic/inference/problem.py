@@ -12,7 +12,7 @@ from bayesperiodic.inference.likelihood import Likelihood
 from bayesperiodic.inference.linearisation import Linearisation
 from bayesperiodic.inference.noise import Noise, as_noise
 from bayesperiodic.inference.observation import Observation
-from bayesperiodic.inference.parameters import SHIFT, ParameterMap, expand_priors, free_names
+from bayesperiodic.inference.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
 from bayesperiodic.inference.priors import Uniform
 from bayesperiodic.inference.responses import Responses
 from bayesperiodic.models.model import Model
@@ -132,8 +132,9 @@ class Problem:
         return Likelihood(self.noise, blocks, known)
 
     def _check_free(self, fixed: Mapping[str, Any]) -> None:
+        known = {*fixed, *(local_name(name, run) for name, by_run in self.fixed.items() for run in by_run)}
         for name in self.names:
-            if name in fixed:
+            if name in known:
                 raise ValueError(f"fixed: {name!r} has a prior too; give a prior or a value.")
         if not self.names:
             raise ValueError("priors: {} is not allowed; at least one parameter must be free.")
@@ -302,9 +303,8 @@ class Problem:
         values, noise = self.vector(theta), self.noise_values(variances)
         here = self.linearised(values)
         if not np.isfinite(self.log_prior(values)) or not here.converged:
-            raise ValueError(
-                f"theta: {dict(zip(self.names, values.tolist(), strict=True))} has no finite log-posterior."
-            )
+            given = dict(zip(self.names, values.tolist(), strict=True))
+            raise ValueError(f"theta: {given} is not allowed; the log-posterior is not finite there.")
         by_residual, by_noise = self.likelihood.gradients(here.residuals, noise)
         forward = method == "forward" or self.model.autonomous
         by_theta = here.forward(by_residual) if forward else here.adjoint(by_residual)

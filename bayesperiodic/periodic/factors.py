@@ -123,5 +123,5 @@ class CyclicFactors:
             self._band[-1, self._lower] = self._last_pivots[deflated]
         flat = np.empty((right.size // self._band.shape[0], *right.shape[-2:]))
         flat[:, self._grid.place] = right.reshape(flat.shape)
-        routine(self._band, self._lower, self._lower, self._pivots, flat.reshape(len(flat), -1))
+        routine(self._band, self._lower, self._lower, self._pivots, flat.reshape(len(flat), len(self._band)))
         return np.ascontiguousarray(flat[:, self._grid.place]).reshape(right.shape)
