@@ -42,7 +42,8 @@ def doubling_shift(
     changes = problem.likelihood.whitened(estimate.here.changes, estimate.noise)
     white = problem.likelihood.whitened(moved, estimate.noise)
     right = np.sum([s @ r for s, r in zip(changes, white, strict=True)], axis=0)
-    return covariance @ right / np.sqrt(np.diag(covariance))
+    with np.errstate(invalid="ignore"):
+        return covariance @ right / np.sqrt(np.diag(covariance))
 
 
 def _on_twice_the_points(

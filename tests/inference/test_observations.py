@@ -37,7 +37,7 @@ def linear_runs(*coulomb: float) -> list[bp.Experiment]:
 
 
 def test_local_parameters_give_the_closed_form_of_the_enlarged_problem():
-    """Stiffness and damping are shared, Coulomb friction of each run its own: a normal posterior with a design of 2 + 3 columns."""
+    """Stiffness and damping shared, Coulomb friction of each run its own: a design of 2 + 3 columns."""
     runs = linear_runs(10.0, 25.0, 40.0)
     problem = bp.Problem(LINEAR, runs, priors=PRIORS, fixed=KNOWN, local=["coulomb"])
     names = ("k", "c", "coulomb[run 1]", "coulomb[run 2]", "coulomb[run 3]")
@@ -182,6 +182,7 @@ def test_a_multiplier_of_the_other_sign_is_another_orbit():
         bp.map_estimate(problem, start=UNSTABLE, progress=False)
 
 
+@pytest.mark.filterwarnings("ignore:Twice as many points")
 def test_a_delay_of_the_outputs_is_found():
     """Outputs 0.37 s late are found to be 0.37 s late, within 4 standard deviations (false-alarm rate 0.006 %)."""
     run = duffing_run()
