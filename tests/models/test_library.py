@@ -12,6 +12,7 @@ LIBRARY = {
     "duffing": lambda: bp.models.duffing,
     "dahl": lambda: bp.models.dahl,
     "pendulum": lambda: bp.models.pendulum,
+    "silverbox": lambda: bp.models.silverbox,
     "van_der_pol": lambda: bp.models.van_der_pol,
     "landing_gear_force": lambda: bp.models.landing_gear("force"),
     "landing_gear_displacement": lambda: bp.models.landing_gear("displacement"),
@@ -23,11 +24,13 @@ GEAR = {
     "theta7": 2e-4, "theta8": 150.0, "theta9": 1e-4, "theta10": 300.0, "theta11": -500.0, "theta12": 0.03,
     "theta15": 17.0, "theta16": 2.0, "theta17": -293.0,
 }  # fmt: skip
+SILVERBOX = {"w0": 6.0, "c": 0.2, "k1": 1.1, "k2": 0.3, "k3": 4.0, "g": 1.3, "u0": 0.1}
 CHAIN = {"m": 0.7, "c": 0.3, "k": 40.0, "k3": 900.0}
 TYPICAL = {
     "duffing": ({"m": 1.0, "c": 0.2, "k": 3.0, "k3": 2.0}, {"x": 1.0, "force": 1.0}),
     "dahl": ({"Kx": 768.0, "K": 10.0, "F0": 3.0, "Kw": 57.4, "rho": 2e3}, {"w": 1.0, "displacement": 0.01}),
     "pendulum": (PENDULUM, {"phi": 1.0}),
+    "silverbox": (SILVERBOX, {"y": 0.5, "drive": 1.0}),
     "van_der_pol": ({"mu": 1.3, "omega": 4.0}, {"x": 1.5}),
     "landing_gear_force": (GEAR, {"q": 0.05, "T": 300.0, "force": 5e3}),
     "landing_gear_displacement": (GEAR, {"displacement": 0.05, "T": 300.0}),
@@ -62,6 +65,12 @@ def by_hand_pendulum(q, u, p, tau):
     return [a + friction / inertia + drive / p["l"] * np.sin(phi)], [phi, v]
 
 
+def by_hand_silverbox(q, u, p, tau):
+    y, v, a = q
+    spring = p["k1"] * y + p["k2"] * y**2 + p["k3"] * y**3
+    return [a / p["w0"] ** 2 + p["c"] * v / p["w0"] + spring - p["g"] * u[0] - p["u0"]], [y]
+
+
 def by_hand_van_der_pol(q, u, p, tau):
     x, v, a = q
     return [a - p["mu"] * p["omega"] * (1 - x**2) * v + p["omega"] ** 2 * x], [x]
@@ -90,6 +99,7 @@ def by_hand_chain_3(q, u, p, tau):
 
 BY_HAND = {
     "pendulum": by_hand_pendulum,
+    "silverbox": by_hand_silverbox,
     "van_der_pol": by_hand_van_der_pol,
     "landing_gear_force": by_hand_landing_gear_force,
     "landing_gear_displacement": by_hand_landing_gear_displacement,
@@ -143,10 +153,10 @@ def test_jacobian_is_the_complex_step_of_the_formulas_written_by_hand(name):
 
 @pytest.mark.parametrize("name", LIBRARY)
 def test_equations_hold_in_any_system_of_units(name):
-    """With other metres, kilograms, seconds and kelvins a residual changes by one factor, an output by its unit's."""
+    """With other base units a residual changes by one factor, an output by that of its unit."""
     model, states, inputs, theta, tau = random_points(name)
     registry = pint.UnitRegistry()
-    base = {"[length]": 1.7, "[mass]": 0.6, "[time]": 1.3, "[temperature]": 0.8}
+    base = {"[length]": 1.7, "[mass]": 0.6, "[time]": 1.3, "[temperature]": 0.8, "[current]": 1.2}
 
     def factors(names, orders=1):
         dimensions = [registry.Quantity(1.0, model.units[n]).dimensionality for n in names]
@@ -237,6 +247,23 @@ def test_pendulum_locks_to_one_turn_a_period():
         bp.models.pendulum, PENDULUM, frequency=f, duration=50.001 / f, sampling_rate=f, start={"dphi": 13.0}
     )
     assert np.diff(run.outputs["angle"])[-5:] == pytest.approx(np.full(5, 2 * np.pi), abs=1e-5)
+
+
+def test_scale_of_time_and_offset_of_the_silverbox_are_redundant():
+    """Twice w0 with half c and a quarter of the rest; a shifted response with other k1, k2 and u0."""
+    model, states, inputs, theta, tau = random_points("silverbox")
+    p = dict(zip(model.parameters, theta, strict=True))
+    quartered = {n: p[n] / 4 for n in ("k1", "k2", "k3", "g", "u0")} | {"w0": 2 * p["w0"], "c": p["c"] / 2}
+    b, k1, k2, k3 = 0.2, p["k1"], p["k2"], p["k3"]
+    springs = {"k1": k1 + 2 * k2 * b + 3 * k3 * b**2, "k2": k2 + 3 * k3 * b}
+    shifted = p | springs | {"u0": p["u0"] - k1 * b - k2 * b**2 - k3 * b**3}
+
+    def residual(parameters, y):
+        values = np.array([parameters[n] for n in model.parameters])
+        return model.kernels.evaluate("residual_jacobian", y, inputs, values, tau, FREQUENCY)[:, 0]
+
+    assert 4 * residual(quartered, states) == pytest.approx(residual(p, states), rel=1e-10)
+    assert residual(shifted, states - [b, 0, 0]) == pytest.approx(residual(p, states), rel=1e-10)
 
 
 def test_van_der_pol_has_its_known_cycle():

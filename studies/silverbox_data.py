@@ -1,0 +1,91 @@
+"""The steady parts of the Silverbox's multisine record, or two generated in their image."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import bayesperiodic as bp
+from studies import common
+
+FILE = "silverbox/Schroeder80mV.csv"
+ADDRESS = "nonlinearbenchmark.org (Silverbox), copy in github.com/biaslab/nsi-silverbox (commit 728f07e4)"
+SHA256 = "b22cbcba9c59d9b4b1b379967b669dc32959e515b24784da3254505f8563e36c"
+SAMPLING_RATE = 1e7 / 2**14
+PERIOD, PERIODS = 1024, 9
+FREQUENCY = SAMPLING_RATE / PERIOD
+# The second one is steady from row 119,548 on; this row has the phase of the first one's beginning.
+FIRST_ROWS = (10_824, 119_608)
+W0 = 2 * np.pi * 65.0
+TRUE = {"c": 0.104, "k1": 1.105, "k2": -0.037, "k3": 4.37, "g": 1.115, "u0": -0.006}
+SYNTHETIC_LINES, SYNTHETIC_AMPLITUDE, SYNTHETIC_OFFSET = range(1, 336, 2), 3e-3, 6.1e-3
+SYNTHETIC_NOISE = {"drive": 3e-5, "response": 3e-4}
+
+
+def read_steady_parts(given: Path | None, seed: int) -> tuple[tuple[bp.Recording, bp.Recording], dict[str, Any]]:
+    """Return both measured steady parts, or generated ones of the same kind, and what to report about them."""
+    found = common.find_data(given, FILE)
+    if found is None:
+        data = {"path": "generated", "sha256": None, "synthetic": True}
+        return generate(seed), data
+    path, name = found
+    whole = bp.Recording.from_csv(
+        path,
+        sampling_rate=SAMPLING_RATE,
+        inputs={"drive": "V1"},
+        outputs={"response": "V2"},
+        name="Silverbox, Schroeder multisine",
+    )
+    first, second = (
+        whole.between((row - 0.5) / SAMPLING_RATE, (row + PERIODS * PERIOD - 0.5) / SAMPLING_RATE) for row in FIRST_ROWS
+    )
+    return (first, second), {
+        "path": name,
+        "sha256": common.sha256(path),
+        "synthetic": False,
+        "first_rows": FIRST_ROWS,
+        "rows_each": PERIODS * PERIOD,
+    }
+
+
+def generate(seed: int) -> tuple[bp.Recording, bp.Recording]:
+    """Return synthetic steady parts of the same kind: one period, integrated in time, repeated, with noise."""
+    period = dict(zip(("drive", "response"), steady_period(), strict=True))
+    generator = np.random.default_rng(seed)
+
+    def part() -> bp.Recording:
+        noisy = {
+            name: np.tile(values, PERIODS) + SYNTHETIC_NOISE[name] * generator.standard_normal(PERIODS * PERIOD)
+            for name, values in period.items()
+        }
+        return bp.Recording(
+            np.arange(PERIODS * PERIOD) / SAMPLING_RATE,
+            {"response": noisy["response"]},
+            {"drive": noisy["drive"]},
+            name="synthetic Silverbox, Schroeder multisine",
+            synthetic=True,
+        )
+
+    return part(), part()
+
+
+def steady_period() -> tuple[np.ndarray, np.ndarray]:
+    """Return a period of the drive and of the response; after one period the transient is below 1e-14.
+
+    Schroeder's phases with this sign let the frequency fall with time, as in the measured drive.
+    """
+    lines = np.array(SYNTHETIC_LINES)
+    phase = np.pi * np.arange(lines.size) * (np.arange(lines.size) + 1) / lines.size
+    tau = np.arange(PERIOD)[:, None] / PERIOD
+    drive = SYNTHETIC_OFFSET + SYNTHETIC_AMPLITUDE * np.cos(2 * np.pi * tau * lines + phase).sum(axis=1)
+    run = bp.simulate(
+        bp.models.silverbox,
+        {"w0": W0, **TRUE},
+        {"drive": drive},
+        frequency=FREQUENCY,
+        duration=2.0 / FREQUENCY,
+        sampling_rate=SAMPLING_RATE,
+    )
+    return drive, run.outputs["response"][PERIOD : 2 * PERIOD]
