@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         Uniform,
     )
     from bayesperiodic.inference.problem import Problem
+    from bayesperiodic.inference.profile import Profile, profile
     from bayesperiodic.inference.sampling import sample
     from bayesperiodic.models.model import Model
     from bayesperiodic.models.smooth import smooth_abs, smooth_sign
@@ -62,6 +63,7 @@ _HOMES = {
         "Uniform",
     ],
     "bayesperiodic.inference.problem": ["Problem"],
+    "bayesperiodic.inference.profile": ["Profile", "profile"],
     "bayesperiodic.inference.sampling": ["sample"],
     "bayesperiodic.models.model": ["Model"],
     "bayesperiodic.models.smooth": ["smooth_abs", "smooth_sign"],
@@ -82,10 +84,10 @@ _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [  # noqa: PLE0604
     "Branch", "Comparison", "Experiment", "HalfNormal", "InverseGamma", "LogNormal", "LogUniform", "MapEstimate",
-    "Model", "MultivariateNormal", "Normal", "PeriodicSolution", "Posterior", "Prediction", "Problem", "Recording",
-    "Scheme", "StudentT", "TruncatedNormal", "Uniform", "compare", "continue_periodic", "double_period",
-    "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "noise", "plot", "predict", "sample",
-    "simulate", "smooth_abs", "smooth_sign", "solve_periodic",
+    "Model", "MultivariateNormal", "Normal", "PeriodicSolution", "Posterior", "Prediction", "Problem", "Profile",
+    "Recording", "Scheme", "StudentT", "TruncatedNormal", "Uniform", "compare", "continue_periodic", "double_period",
+    "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "noise", "plot", "predict",
+    "profile", "sample", "simulate", "smooth_abs", "smooth_sign", "solve_periodic",
 ]  # fmt: skip
 
 

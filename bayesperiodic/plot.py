@@ -3,27 +3,34 @@
 One colour means one thing everywhere: measured, MAP, Laplace, MCMC.
 """
 
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import cast
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 
 from bayesperiodic import checks, fourier
 from bayesperiodic.diagnosis.predictive import Prediction
 from bayesperiodic.inference.estimate import MapEstimate
+from bayesperiodic.inference.labels import unit as unit_of
 from bayesperiodic.inference.posterior import Posterior
 from bayesperiodic.inference.problem import Problem
+from bayesperiodic.inference.profile import CLOSED, Profile
 from bayesperiodic.periodic.continuation import FOLD, PERIOD_DOUBLING, Branch
 from bayesperiodic.periodic.solution import PeriodicSolution
 
 COLOURS = {"measured": "#000000", "map": "#0072B2", "laplace": "#D55E00", "mcmc": "#56B4E9"}
 ENSEMBLES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 LEVELS = (0.5, 0.9)
+LABEL_LENGTH = 24
 MEASURES = ("amplitude", "maximum", "section", "period")
+PROFILES_ACROSS = 3
+PROFILE_LEGEND = ("profile", "MAP", "Laplace", "solve failed")
+AT_90, DEEPEST = -0.5 * 1.6449**2, -4.2
 MARKERS = {FOLD: "o", PERIOD_DOUBLING: "D"}
 
 
@@ -133,31 +140,47 @@ def loops(
     return figure
 
 
-def corner(posterior: Posterior, *, laplace: MapEstimate | None = None, figure: Figure | None = None) -> Figure:
+def corner(
+    posterior: Posterior,
+    *,
+    laplace: MapEstimate | None = None,
+    names: Sequence[str] | None = None,
+    figure: Figure | None = None,
+) -> Figure:
     """Draw all pairs of parameters, with the Laplace approximation's ellipses on top.
 
-    Contours of draws and ellipses hold 50 and 90 % of the probability. The variances' Laplace approximation is
-    v ± v·sqrt(2/n), independent of the parameters.
+    Contours of draws and ellipses hold 50 and 90 % of the probability. The ellipses of parameters are those of
+    `MapEstimate.covariance`. Noise parameters are drawn as v ± v·sd(ln v) around the mode in sampling coordinates,
+    independent of the parameters; what has no Laplace approximation has no ellipse.
 
     Parameters
     ----------
     posterior : Posterior
     laplace : MapEstimate, optional
+    names : sequence of str, optional
+        Full names such as "k", "theta16[run 7]" and "variance[force]", in the order of the rows; by default all.
     figure : Figure, optional
 
     Returns
     -------
     Figure
+
+    Raises
+    ------
+    ValueError
+        For an unknown name, or an estimate of another problem.
     """
     import corner as corner_package
 
-    names = posterior.names
+    names = _chosen(names, posterior.names)
     draws = np.stack([posterior.draws(name) for name in names], axis=-1)
     span = [tuple(np.quantile(draws[:, i], [0.0005, 0.9995])) for i in range(len(names))]
-    size = 1.75 * len(names) + 0.6
+    titles = [_wrapped(name, _unit(posterior, name)) for name in names]
+    margin = 0.9 + 0.17 * max(title.count("\n") for title in titles)
+    size = 1.75 * len(names) + margin + 0.2
     figure = corner_package.corner(
         draws,
-        labels=[_label(n, _unit(posterior, n)) for n in names],
+        labels=titles,
         levels=LEVELS,
         range=span,
         bins=35,
@@ -172,61 +195,80 @@ def corner(posterior: Posterior, *, laplace: MapEstimate | None = None, figure: 
         fig=figure or plt.figure(figsize=(size, size)),
     )
     if laplace is not None:
-        _laplace_on_corner(np.array(figure.axes).reshape(len(names), len(names)), names, laplace)
+        mean, covariance = _laplace(names, laplace)
+        _laplace_on_corner(np.array(figure.axes).reshape(len(names), len(names)), mean, covariance)
+    _corner_legend(figure, posterior, laplace is not None, min(14, 4 * max(len(names), 2)))
+    width, height = figure.get_size_inches()
+    top = 0.98 if len(names) > 1 else 0.75
+    figure.subplots_adjust(left=margin / width, bottom=margin / height, right=0.98, top=top)
+    return figure
+
+
+def _corner_legend(figure: Figure, posterior: Posterior, laplace: bool, fontsize: int) -> None:
     handles = [plt.Line2D([], [], color=COLOURS["mcmc"], lw=4, label=f"MCMC, {_levels()}")]
-    if laplace is not None:
+    if laplace:
         handles.append(plt.Line2D([], [], color=COLOURS["laplace"], lw=1.6, ls="--", label=f"Laplace, {_levels()}"))
     figure.legend(
         handles=handles,
         loc="upper right",
         bbox_to_anchor=(0.97, 0.97),
         frameon=False,
-        fontsize=14,
+        fontsize=fontsize,
         title=_caveats(posterior) or None,
-        title_fontsize=14,
+        title_fontsize=fontsize,
     )
-    figure.subplots_adjust(left=0.1, bottom=0.1)
-    return figure
 
 
-def _laplace_on_corner(axes: np.ndarray, names: tuple[str, ...], laplace: MapEstimate) -> None:
-    count = len(names)
-    mean, covariance = np.zeros(count), np.zeros((count, count))
-    parameters = [i for i, name in enumerate(names) if name in laplace.theta]
-    covariance[np.ix_(parameters, parameters)] = laplace.covariance.to_numpy()
-    for i, name in enumerate(names):
-        if name in laplace.theta:
-            mean[i] = laplace.theta[name]
-        else:
-            channel = name[len("variance[") : -1]
-            mean[i] = laplace.variances[channel]
-            covariance[i, i] = 2.0 / laplace.independent[channel] * mean[i] ** 2
-    for i in range(count):
+def _chosen(names: Sequence[str] | None, every: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names to draw, checked."""
+    if names is None:
+        return every
+    if isinstance(names, str) or not len(names):
+        raise ValueError(f"names: {names!r} is not allowed; it must be a sequence of names, such as [{every[0]!r}].")
+    for name in names:
+        checks.one_of("names", name, every)
+    if len(set(names)) < len(names):
+        raise ValueError(f"names: {list(names)} is not allowed; a name is in it twice.")
+    return tuple(names)
+
+
+def _laplace(names: tuple[str, ...], fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean (names,) and covariance (names, names) in natural values; NaN where there are none."""
+    for name in names:
+        checks.one_of("laplace", name, [*fit.theta, *fit.noise])
+    theta, noise = [n for n in names if n in fit.theta], [n for n in names if n not in fit.theta]
+    mean = np.array([fit.theta[n] if n in fit.theta else fit.joint_mode.get(n, np.nan) for n in names])
+    covariance = pd.DataFrame(0.0, index=[*names], columns=[*names])
+    covariance.loc[theta, theta] = fit.covariance.loc[theta, theta]
+    modes = [fit.joint_mode.get(n, np.nan) for n in noise]
+    covariance.loc[noise, noise] = fit.joint_covariance.reindex(noise, columns=noise) * np.outer(modes, modes)
+    return mean, covariance.to_numpy()
+
+
+def _laplace_on_corner(axes: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
+    variances = np.diag(covariance)
+    drawn = np.flatnonzero(np.isfinite(mean) & np.isfinite(variances) & (variances > 0.0))
+    for i in drawn:
         left, right = axes[i, i].get_xlim()
         x = np.linspace(left, right, 200)
-        sd = np.sqrt(covariance[i, i])
+        sd = np.sqrt(variances[i])
         density = np.exp(-0.5 * ((x - mean[i]) / sd) ** 2) / (sd * np.sqrt(2 * np.pi))
         axes[i, i].plot(x, density, color=COLOURS["laplace"], lw=1.6, ls="--")
         axes[i, i].set_ylim(0.0, 1.1 * max(density.max(), axes[i, i].get_ylim()[1] / 1.1))
-        for j in range(i):
-            pair = covariance[np.ix_([j, i], [j, i])]
-            values, vectors = np.linalg.eigh(pair)
-            angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
-            for level in LEVELS:
-                wide, narrow = (2.0 * np.sqrt(-2.0 * np.log(1.0 - level) * v) for v in (values[1], values[0]))
-                axes[i, j].add_patch(
-                    Ellipse(
-                        (mean[j], mean[i]),
-                        wide,
-                        narrow,
-                        angle=angle,
-                        fill=False,
-                        color=COLOURS["laplace"],
-                        lw=1.4,
-                        ls="--",
-                        zorder=5,
-                    )
-                )
+        for j in drawn[drawn < i]:
+            sds = np.sqrt(variances[[j, i]])
+            _ellipses(axes[i, j], mean[[j, i]], sds, covariance[i, j] / np.prod(sds))
+
+
+def _ellipses(axes: Axes, centre: np.ndarray, sds: np.ndarray, correlation: float) -> None:
+    """Draw the ellipses that hold the levels of a normal distribution of two quantities."""
+    turn = np.linspace(0.0, 2 * np.pi, 200)
+    across = np.cos(turn)
+    up = correlation * across + np.sqrt(max(1.0 - correlation**2, 0.0)) * np.sin(turn)
+    for level in LEVELS:
+        radius = np.sqrt(-2.0 * np.log(1.0 - level))
+        x, y = (c + radius * sd * wave for c, sd, wave in zip(centre, sds, (across, up), strict=True))
+        axes.plot(x, y, color=COLOURS["laplace"], lw=1.4, ls="--", zorder=5)
 
 
 def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = None) -> Figure:
@@ -256,7 +298,7 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
             shown = paths[ensemble == e][:walkers, :: max(1, steps // 300)]
             across = np.arange(shown.shape[1]) * max(1, steps // 300)
             axes.plot(across, shown.T, color=ENSEMBLES[e % len(ENSEMBLES)], lw=0.4, alpha=0.6)
-        axes.set_ylabel(_label(name, _unit(posterior, name)).replace(" [", "\n["), fontsize=8)
+        axes.set_ylabel(_wrapped(name, _unit(posterior, name)), fontsize=8)
         axes.annotate(
             f"tau {posterior.tau[name]:.0f} steps, R-hat {posterior.rhat[name]:.3f}",
             (0.995, 0.97),
@@ -270,6 +312,102 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
     if caveats := _caveats(posterior):
         figure.suptitle(caveats)
     return figure
+
+
+def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Figure | None = None) -> Figure:
+    """Draw each profile over the Laplace approximation's parabola, with the level that a 90 % interval reaches down to.
+
+    Where the parabola leaves the profile, the standard deviation misleads; a profile that does not come down is named.
+    Values over more than two decades have a logarithmic axis. A parabola without a finite standard deviation is left
+    out.
+
+    Parameters
+    ----------
+    profile : Profile
+    names : sequence of str, optional
+        Those to draw; by default all.
+    figure : Figure, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ValueError
+        For a name without a profile.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
+    >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
+    ...                          frequency=0.1, samples=50)
+    >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5, "variance[displacement]": 0.01})
+    >>> followed = bp.profile(problem, bp.map_estimate(problem, progress=False), ["k"])
+    >>> figure = bp.plot.profile(followed)
+    >>> figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()
+    ('k [N/m]', 'relative log-density')
+    """
+    shown = profile.names if names is None else tuple(names)
+    for name in shown:
+        checks.one_of("names", name, profile.names)
+    columns = min(len(shown), PROFILES_ACROSS)
+    rows = -(-len(shown) // columns)
+    figure = figure or plt.figure(figsize=(3.0 * columns + 0.8, 2.7 * rows + 0.6), layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
+    for axes, name in zip(panels, shown, strict=False):
+        _profile_panel(axes, profile, name)
+    for axes in panels[len(shown) :]:
+        axes.remove()
+    for axes in panels[: len(shown) : columns]:
+        axes.set_ylabel("relative log-density")
+    drawn = {label: line for axes in figure.axes for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    legend = {label: drawn[label] for label in PROFILE_LEGEND if label in drawn}
+    figure.legend(legend.values(), legend.keys(), loc="outside upper center", ncols=len(legend), frameon=False)
+    return figure
+
+
+def _profile_panel(axes: Axes, profile: Profile, name: str) -> None:
+    values, density = profile.values[name], profile.log_density[name]
+    at, sd, found, bottom = profile.map[name], profile.sd[name], np.isfinite(density), DEEPEST - profile.improvement
+    wide = values[0] > 0.0 and values[-1] > 100.0 * values[0]
+    curve, peak, laplace, failed = PROFILE_LEGEND
+    axes.plot(values[found], density[found], ".-", color=COLOURS["map"], lw=1.6, ms=5, label=curve)
+    axes.plot(at, -profile.improvement, "o", color=COLOURS["map"], ms=6, label=peak)
+    if np.isfinite(sd):
+        x = np.geomspace(values[0], values[-1], 400) if wide else _laplace_range(profile, name)
+        parabola = -profile.improvement - 0.5 * ((x - at) / sd) ** 2
+        axes.plot(x, parabola, color=COLOURS["laplace"], lw=1.6, ls="--", zorder=1.5, label=laplace)
+    if not found.all():
+        low = np.full(np.sum(~found), 0.97 * bottom)
+        axes.plot(values[~found], low, "x", color=COLOURS["measured"], ms=5, label=failed)
+    axes.axhline(AT_90, color="grey", lw=0.8, ls=":", zorder=1)
+    axes.annotate(
+        "90%", (1, AT_90), (-3, 1), ("axes fraction", "data"), "offset points", color="grey", ha="right", va="bottom"
+    )
+    if profile.shape[name] != CLOSED:
+        axes.annotate(profile.shape[name], (0.5, 0.03), xycoords="axes fraction", ha="center", va="bottom")
+    if wide:
+        axes.set_xscale("log")
+    else:
+        axes.locator_params(axis="x", nbins=3)
+    axes.set_ylim(bottom, 0.35)
+    axes.set_xlabel(_label(name, profile.units[name]))
+
+
+def _laplace_range(profile: Profile, name: str) -> np.ndarray:
+    """Return values as far as three standard deviations, where that is within the support and not far beyond."""
+    values, reach, (low, high) = profile.values[name], 3.0 * profile.sd[name], profile.limits[name]
+    margin = 0.5 * np.ptp(values)
+    return np.linspace(
+        min(values[0], max(low, values[0] - margin, profile.map[name] - reach)),
+        max(values[-1], min(high, values[-1] + margin, profile.map[name] + reach)),
+        400,
+    )
 
 
 def branch(
@@ -439,11 +577,14 @@ def _levels() -> str:
 
 
 def _unit(posterior: Posterior, name: str) -> str:
-    group = posterior.data["posterior"]
-    if name.startswith("variance["):
-        return str(group["variance"].attrs.get(f"units of {name[len('variance[') : -1]}", ""))
-    return str(group[name].attrs.get("units", ""))
+    return unit_of(posterior.data["posterior"].to_dataset(), name)
+
+
+def _wrapped(name: str, unit: str) -> str:
+    """Return a label of short lines, the unit on its own."""
+    return _label(textwrap.fill(name, LABEL_LENGTH), unit).replace(" [", "\n[")
 
 
 def _label(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name
+    text = name.replace("$", r"\$")
+    return f"{text} [{unit}]" if unit else text

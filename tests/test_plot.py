@@ -3,6 +3,7 @@ from dataclasses import replace
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.path import Path
 
 import bayesperiodic as bp
 from bayesperiodic.plot import COLOURS
@@ -36,13 +37,41 @@ def test_corner_draws_laplace_ellipses_where_the_draws_are(solved):
     _, fit, posterior = solved
     figure = bp.plot.corner(posterior, laplace=fit)
     axes = np.array(figure.axes).reshape(4, 4)
-    (ellipse, wide) = axes[1, 0].patches[-2:]
-    assert ellipse.center == (fit.theta["k"], fit.theta["c"])
     draws = np.stack([posterior.draws("k"), posterior.draws("c")], axis=-1)
-    for patch, level in ((ellipse, 0.5), (wide, 0.9)):
-        path = patch.get_patch_transform().transform_path(patch.get_path())
-        assert path.contains_points(draws).mean() == pytest.approx(level, abs=0.04)
-    assert axes[3, 0].get_xlabel() == "k [N/m]"
+    for line, level in zip(axes[1, 0].lines[-2:], (0.5, 0.9), strict=True):
+        inside = Path(line.get_xydata()).contains_points(draws)
+        assert inside.mean() == pytest.approx(level, abs=0.04)
+        assert line.get_xydata()[:-1].mean(axis=0) == pytest.approx([fit.theta["k"], fit.theta["c"]])
+    assert axes[3, 0].get_xlabel() == "k\n[N/m]"
+
+
+def test_corner_takes_the_noise_from_the_joint_laplace_approximation(solved):
+    """In natural values v ± v·sd(ln v), whatever the prior, and whether variances belong to experiments or not."""
+    _, fit, posterior = solved
+    name = "variance[force]"
+    joint = fit.joint_covariance * 9.0
+    axes = bp.plot.corner(posterior, laplace=replace(fit, joint_covariance=joint), names=[name, "k"]).axes
+    values = axes[2].lines[-1].get_xydata()
+    top = fit.joint_mode[name] * (1.0 + 3.0 * np.sqrt(fit.joint_covariance.loc[name, name] * -2.0 * np.log(0.1)))
+    assert values[:, 0].max() == pytest.approx(top, rel=1e-3)
+    assert np.ptp(values[:, 1]) == pytest.approx(2 * fit.sd["k"] * np.sqrt(-2.0 * np.log(0.1)), rel=1e-3)
+
+
+def test_corner_draws_the_names_asked_for_and_no_ellipse_where_there_is_no_approximation(solved):
+    _, fit, posterior = solved
+    figure = bp.plot.corner(posterior, laplace=fit, names=("coulomb", "k"))
+    assert labels(figure) == {"k\n[N/m]", "coulomb\n[N]"}
+    without = replace(fit, joint_mode={}, joint_covariance=fit.joint_covariance * np.nan)
+    axes = np.array(bp.plot.corner(posterior, laplace=without).axes).reshape(4, 4)
+    assert len(axes[1, 0].lines) == 2 and not axes[3, 0].lines
+    assert not bp.plot.corner(posterior, names=["k"]).axes[0].lines
+    with pytest.raises(ValueError, match="names: 'kk' is not known; allowed: 'k', 'c'"):
+        bp.plot.corner(posterior, names=["kk"])
+    for names in ("k", [], ["k", "k"]):
+        with pytest.raises(ValueError, match="names: .* is not allowed"):
+            bp.plot.corner(posterior, names=names)
+    with pytest.raises(ValueError, match="laplace: 'k' is not known"):
+        bp.plot.corner(posterior, laplace=replace(fit, theta={"m": 1.0}))
 
 
 def test_traces_show_every_parameter_with_its_diagnostics(solved):
@@ -158,3 +187,49 @@ def test_a_given_figure_is_used_and_returned(solved):
 
 def test_one_colour_means_one_thing():
     assert len(set(COLOURS.values())) == len(COLOURS)
+
+
+def test_profiles_are_drawn_over_their_parabolas_with_the_level_of_the_interval(solved):
+    problem, fit, _ = solved
+    profile = bp.profile(problem, fit)
+    figure = bp.plot.profile(profile)
+    assert labels(figure) == {"k [N/m]", "c [N s/m]", "coulomb [N]", "relative log-density"}
+    for axes, name in zip(figure.axes, profile.names, strict=True):
+        curve, peak, parabola, level = axes.lines
+        assert (curve.get_color(), parabola.get_color()) == (COLOURS["map"], COLOURS["laplace"])
+        assert parabola.get_linestyle() == "--"
+        assert np.array_equal(curve.get_xydata(), np.stack([profile.values[name], profile.log_density[name]], axis=-1))
+        assert peak.get_xydata().tolist() == [[fit.theta[name], 0.0]]
+        low, high = fit.theta[name] + np.array([-1.0, 1.0]) * 1.6449 * fit.sd[name]
+        assert np.interp([low, high], *parabola.get_data()) == pytest.approx(level.get_ydata(), abs=1e-3)
+        assert [text.get_text() for text in axes.texts] == ["90%"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["profile", "MAP", "Laplace"]
+    assert len(bp.plot.profile(profile, names=["c"]).axes) == 1
+    other = plt.figure()
+    assert bp.plot.profile(profile, figure=other) is other
+    with pytest.raises(ValueError, match="names: 'kk' is not known"):
+        bp.plot.profile(profile, names=["kk"])
+
+
+def test_profiles_that_do_not_come_down_fail_or_lie_above_the_estimate_are_told_apart(solved):
+    problem, fit, _ = solved
+    plain = bp.profile(problem, fit, ["c", "coulomb"])
+    c, coulomb = plain.values["c"] ** 12, plain.values["coulomb"]
+    profile = replace(
+        plain,
+        map=plain.map | {"c": c[6]},
+        sd=plain.sd | {"c": np.inf},
+        values={"c": c, "coulomb": coulomb},
+        log_density={"c": np.zeros(c.size), "coulomb": np.where(coulomb > coulomb[-3], np.nan, -1.0)},
+        limits=plain.limits | {"c": (c[0], c[-1])},
+        improvement=1.0,
+    )
+    left, right = bp.plot.profile(profile).axes
+    assert (left.get_xscale(), right.get_xscale()) == ("log", "linear")
+    assert [text.get_text() for text in left.texts] == ["90%", "flat"]
+    assert len(left.lines) == 3
+    marks = next(line for line in right.lines if line.get_marker() == "x")
+    assert list(marks.get_xdata()) == list(coulomb[-2:])
+    peak = next(line for line in right.lines if line.get_marker() == "o")
+    assert list(peak.get_ydata()) == [-1.0]
+    assert right.get_ylim()[0] < -5.0

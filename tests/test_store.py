@@ -20,7 +20,7 @@ def same(a, b):
         return a.identical(b)
     if hasattr(a, "__dataclass_fields__"):
         return type(a) is type(b) and all(same(getattr(a, f), getattr(b, f)) for f in a.__dataclass_fields__)
-    return a == b
+    return a == b or (isinstance(a, float) and np.isnan(a) and np.isnan(b))
 
 
 def results(solved):

@@ -1,5 +1,6 @@
 """MapEstimate: the MAP point, its Laplace approximations, and an account of the residual."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -9,6 +10,8 @@ from scipy.special import stdtrit
 
 from bayesperiodic import checks
 from bayesperiodic.expressions import Expression, parse_all
+from bayesperiodic.inference import labels
+from bayesperiodic.inference.multivariate import MultivariateNormal
 from bayesperiodic.inference.residual_split import NoiseSplit
 from bayesperiodic.inference.whiteness import Whiteness
 from bayesperiodic.periodic.solution import PeriodicSolution
@@ -130,7 +133,7 @@ class MapEstimate(Result):
         sd = self.robust_sd if robust else self.sd
         return {name: (value - width * sd[name], value + width * sd[name]) for name, value in self.theta.items()}
 
-    def derive(self, expressions: Mapping[str, str]) -> pd.DataFrame:
+    def derive(self, expressions: Mapping[str, str], *, experiment: str | None = None) -> pd.DataFrame:
         """Return quantities derived from the parameters, with standard deviations by the delta method.
 
         The standard deviation is √(gᵀ C g) with the exact gradient g by the free parameters and the `covariance` C:
@@ -141,35 +144,42 @@ class MapEstimate(Result):
         expressions : mapping of str to str
             By new name: numbers, names of parameters (free, fixed or tied), pi, + - * / ** and sqrt, exp, log, sin,
             cos, tan, atan, sinh, cosh, tanh, abs.
+        experiment : str, optional
+            Whose local parameters, and fixed values, the expressions mean, by their plain names: with "run 7"
+            ``theta16`` is ``theta16[run 7]``. Without it they can name only what all experiments share.
 
         Returns
         -------
         DataFrame
             Columns value and sd, a row a quantity; ``attrs["covariance"]`` holds the covariances between the quantities
-            as a dict of dict of floats.
+            as a dict of dict of floats. The sd is NaN where a tied parameter enters that follows a local one.
 
         Raises
         ------
         ValueError
             For an expression that is not allowed or has no finite value at the estimate, a new name that is no
-            identifier or that a parameter has.
+            identifier or that a parameter has, an unknown experiment.
 
         Examples
         --------
         >>> import numpy as np, bayesperiodic as bp
         >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
         >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
-        ...                          frequency=0.1, samples=50)
+        ...                          frequency=0.1, samples=50, scheme="central4")
         >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
         >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)},
-        ...                      fixed={"m": 1, "k3": 0.5, "variance[displacement]": 1e-4})
+        ...                      fixed={"m": 1, "k3": 0.5, "variance[displacement]": 1e-4}, scheme="central4")
         >>> fit = bp.map_estimate(problem, progress=False)
         >>> fit.derive({"damping_ratio": "c/(2*sqrt(k*m))"}).round(4)
                        value      sd
         damping_ratio    0.1  0.0016
         """
-        values = self._fixed() | self.theta
-        quantities = parse_all("expressions", expressions, values)
+        if experiment is not None:
+            checks.one_of("experiment", experiment, self.solutions)
+        named = labels.in_experiment(self.theta, experiment)
+        values = self._fixed(experiment) | {plain: self.theta[name] for plain, name in named.items()}
+        hint = labels.local_hint(self.theta, experiment)
+        quantities = parse_all("expressions", expressions, values, labels.local_names(self.theta), hint)
         at = {name: float(quantity.value(values)) for name, quantity in quantities.items()}
         for name, value in at.items():
             if not np.isfinite(value):
@@ -177,7 +187,7 @@ class MapEstimate(Result):
                     f"expressions[{name!r}]: {quantities[name].text!r} is not allowed; it is {value} at the estimate "
                     "and must be finite."
                 )
-        covariance = _carried(self.covariance, [self._gradient(q, values) for q in quantities.values()])
+        covariance = _carried(self.covariance, [self._gradient(q, values, named) for q in quantities.values()])
         with np.errstate(invalid="ignore"):
             sd = np.sqrt(np.diag(covariance))
         table = pd.DataFrame({"value": list(at.values()), "sd": sd}, index=list(at))
@@ -186,21 +196,51 @@ class MapEstimate(Result):
         }
         return table
 
-    def _gradient(self, quantity: Expression, values: dict[str, float]) -> dict[str, np.ndarray]:
-        """Return the derivatives by the free parameters, those through tied ones included."""
-        partial = quantity.gradient(values, [*self.theta, *self.tied])
-        return {
-            name: partial[name] + sum((partial[t] * slopes[name] for t, slopes in self.tied.items()), np.array(0.0))
-            for name in self.theta
-        }
+    def as_prior(self, names: tuple[str, ...]) -> MultivariateNormal:
+        """Return the normal approximation of these parameters, as the prior of the next problem.
 
-    def _fixed(self) -> dict[str, float]:
-        """Return the parameters that have the same value in all solutions and are not free, tied ones among them."""
-        first, *others = (solution.parameters for solution in self.solutions.values())
+        See `Posterior.as_prior`; the mean is the maximum, and the covariance is taken from `covariance`.
+
+        Examples
+        --------
+        >>> import numpy as np, bayesperiodic as bp
+        >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
+        >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
+        ...                          frequency=0.1, samples=50, scheme="central4")
+        >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
+        >>> known = {"m": 1, "k3": 0.5, "variance[displacement]": 1e-4}
+        >>> problem = bp.Problem(bp.models.duffing, [run], fixed=known, scheme="central4",
+        ...                      priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)})
+        >>> names = ("c", "k")
+        >>> prior = bp.map_estimate(problem, progress=False).as_prior(names)
+        >>> bp.Problem(bp.models.duffing, [run], fixed=known, priors={names: prior}).median().round(3).tolist()
+        [0.2, 1.0]
+        """
+        key = labels.checked_key(names, self.theta, self.noise)
+        if not self.converged:
+            warnings.warn(f"The estimate has not converged ({self.status}), nor has this prior.", stacklevel=2)
+        mean = np.array([self.theta[name] for name in key])
+        return MultivariateNormal(mean, self.covariance.loc[[*key], [*key]].to_numpy())
+
+    def _gradient(self, quantity: Expression, values: dict[str, float], named: dict[str, str]) -> dict[str, np.ndarray]:
+        """Return the derivatives by the free parameters, those through tied ones included; `named` by plain name."""
+        partial = quantity.gradient(values)
+        total = {name: np.array(0.0) for name in self.theta}
+        for plain, slope in partial.items():
+            if plain in named:
+                total[named[plain]] = total[named[plain]] + slope
+            for name, through in self.tied.get(plain, {}).items():
+                total[name] = total[name] + slope * through
+        return total
+
+    def _fixed(self, experiment: str | None) -> dict[str, float]:
+        """Return the parameters that are not free, tied ones among them: of one experiment, or common to all."""
+        free = {*self.theta, *(labels.local_names(self.theta) if experiment is None else ())}
+        first, *others = (solution.parameters for run, solution in self.solutions.items() if experiment in (None, run))
         return {
             name: value
             for name, value in first.items()
-            if name not in self.theta and all(other.get(name) == value for other in others)
+            if name not in free and all(other.get(name) == value for other in others)
         }
 
     def __repr__(self) -> str:

@@ -70,6 +70,15 @@ class Likelihood:
                 total[name] = total.get(name, 0.0) + block.count * block.measured
         return {name: value / self.counts[name] for name, value in total.items()}
 
+    def moments(self, residuals: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+        """Return Σ weight·r² (…,) behind each variance (and "scale"), the M of eq. (6), by its name."""
+        result: dict[str, np.ndarray] = {}
+        for block, columns, r in zip(self.blocks, self._columns, residuals, strict=True):
+            if block.counted:
+                name = self.names[columns[0]]
+                result[name] = result.get(name, 0.0) + block.weight * np.sum(r**2, axis=-1)
+        return result
+
     def value_variances(self, values: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
         """Return the variance (…,) of one value of each channel, by (experiment, channel), where it has its own."""
         result = {}

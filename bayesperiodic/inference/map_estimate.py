@@ -20,6 +20,7 @@ from bayesperiodic.inference.undetermined import undetermined
 
 NOISE_SHARE = 0.1
 LARGEST_SHIFT = 0.1
+SHOWN = 3
 
 
 def map_estimate(
@@ -185,9 +186,11 @@ def _warn(problem: Problem, fit: MapEstimate) -> None:
             f"samples than {max(e.samples for e in problem.experiments)}, or a scheme of higher order."
         )
     if fit.undetermined:
+        more = len(fit.undetermined) - SHOWN
+        shown = "; or under ".join(fit.undetermined[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
         _say(
-            f"The data do not change under {'; or under '.join(fit.undetermined)}. What is said of these is the "
-            "prior's; fix one of them, or report the combination that stays."
+            f"The data do not change under {shown}. What is said of these is the prior's; fix one of them, or report "
+            "the combination that stays."
         )
 
 

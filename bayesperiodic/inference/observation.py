@@ -103,18 +103,19 @@ class Observation:
 
     @cached_property
     def _joint(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the factor of the values' covariance, the regression of log|μ| on them, and its factor."""
+        """Return what whitens the values, the regression of log|μ| on them, and what whitens the rest of log|μ|."""
         e, size = self.experiment, self._values
         count = 0 if e.multipliers is None else e.multipliers.size
-        if e.covariance is None:
-            assert e.multiplier_sd is not None
-            return np.empty((0, 0)), np.zeros((count, 0)), np.diag(e.multiplier_sd)
-        factor = np.linalg.cholesky(e.covariance[:size, :size])
-        if e.multiplier_sd is not None or not count:
-            return factor, np.zeros((count, size)), np.diag(e.multiplier_sd if count else np.empty(0))  # type: ignore[arg-type]
+        values, slopes = np.empty((0, 0)), np.zeros((count, 0))
+        if e.covariance is not None:
+            values, slopes = _whitening(e.covariance[:size, :size]), np.zeros((count, size))
+        if e.multiplier_sd is not None:
+            return values, slopes, np.diag(1.0 / e.multiplier_sd)
+        if not count or e.covariance is None:
+            return values, slopes, np.empty((0, 0))
         cross = e.covariance[size:, :size]
         slopes = np.linalg.solve(e.covariance[:size, :size], cross.T).T
-        return factor, slopes, np.linalg.cholesky(e.covariance[size:, size:] - slopes @ cross.T)
+        return values, slopes, _whitening(e.covariance[size:, size:] - slopes @ cross.T)
 
     def residuals(self, response: Response) -> list[np.ndarray]:
         """Return the residual components, one array (…, size) a block."""
@@ -142,10 +143,10 @@ class Observation:
         e, total = self.experiment, np.zeros_like(self._data)
         joint = np.zeros(0)
         if e.multipliers is not None:
-            joint = solve_triangular(self._joint[2], weights[-2 if self._free_phase else -1], lower=True, trans=1)
+            joint = weights[-2 if self._free_phase else -1] @ self._joint[2]
         if e.covariance is not None:
-            factor, slopes, _ = self._joint
-            by_value = solve_triangular(factor, weights[0], lower=True, trans=1) - slopes.T @ joint
+            whitening, slopes, _ = self._joint
+            by_value = weights[0] @ whitening - slopes.T @ joint
             at = slice(None) if e.mask is None else e.mask
             total[at] = by_value.reshape(-1, len(self.channels))
         else:
@@ -188,17 +189,17 @@ class Observation:
         """Return the components of differences (…, points, channels), and of those of log|μ| and the frequency."""
         e, found = self.experiment, []
         picked = values if e.mask is None else values[..., e.mask, :]
-        flat = picked.reshape(*picked.shape[:-2], -1)
+        flat = picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
         if e.covariance is not None:
-            found.append(_solved(self._joint[0], flat))
+            found.append(flat @ self._joint[0].T)
         else:
             for c, channel in enumerate(self.channels):
                 column = picked[..., c]
                 found.append(column if e.mask is not None else self._spectral(column, self._harmonic(channel)))
         for logarithms in multipliers:
-            _, slopes, factor = self._joint
+            _, slopes, whitening = self._joint
             explained = flat @ slopes.T if slopes.shape[1] else 0.0
-            found.append(_solved(factor, logarithms - explained))
+            found.append((logarithms - explained) @ whitening.T)
         found += [np.asarray(difference)[..., None] / e.frequency_se for difference in frequency]
         return found
 
@@ -282,9 +283,9 @@ class Observation:
         return np.fft.irfft(spectrum, n=self._points, axis=0) + trend
 
 
-def _solved(factor: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return L⁻¹ of vectors (…, size)."""
-    return solve_triangular(factor, values.reshape(-1, len(factor)).T, lower=True).T.reshape(values.shape)
+def _whitening(covariance: np.ndarray) -> np.ndarray:
+    """Return the inverse of the lower Cholesky factor."""
+    return solve_triangular(np.linalg.cholesky(covariance), np.eye(len(covariance)), lower=True)
 
 
 def _measured_variance(experiment: Experiment, channel: str) -> float:

@@ -1,5 +1,6 @@
 """Posterior: draws, and how far they can be trusted."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -7,8 +8,10 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from bayesperiodic import checks
 from bayesperiodic.expressions import parse_all
-from bayesperiodic.inference import chains
+from bayesperiodic.inference import chains, labels
+from bayesperiodic.inference.multivariate import MultivariateNormal
 from bayesperiodic.store import Result
 
 SAMPLED_ONLY = "Only sampled parameters are kept with the draws; write the value of a fixed one as a number."
@@ -16,21 +19,29 @@ SAMPLED_ONLY = "Only sampled parameters are kept with the draws; write the value
 
 @dataclass(frozen=True)
 class Posterior(Result):
-    """Draws from the posterior of θ and the channel variances.
+    """Draws from the posterior of θ and the noise parameters.
+
+    Every quantity has a full name, as in the problem: ``k``, ``theta16[run 7]``, ``variance[force]``, or
+    ``variance[force, run 7]`` where the noise model has its own parameters for each experiment.
 
     Attributes
     ----------
     data : DataTree
-        Group ``posterior``: every parameter with dims (chain, draw), ``variance`` with dims (chain, draw, channel); a
-        chain is a walker, the coordinate ``ensemble`` tells to which ensemble it belongs. Group ``sample_stats``: lp,
-        the log-density in sampling coordinates. Groups ``observed_data`` and ``constant_data``.
+        Group ``posterior``: variables with dims (chain, draw) first; a chain is a walker, the coordinate ``ensemble``
+        tells to which ensemble it belongs. A parameter that experiments have their own of is one variable with the dim
+        ``experiment``, which holds its fixed value where it is not free. ``variance``, ``lengthscale`` and ``floor``
+        have the dim ``channel``, then ``experiment`` where each has its own; ``scale`` has at most the latter. Known
+        noise parameters are kept with the others, with their values; NaN stands where there is none, such as the
+        variance of a channel in an experiment that lacks it. Attributes: ``units``, or ``units of <channel>`` of
+        ``variance``; ``noise``, the noise model's name, on its parameters alone. Group ``sample_stats``: lp, the
+        log-density in sampling coordinates. Groups ``observed_data`` and ``constant_data``: outputs and inputs.
     converged : bool
         True if the stop rule was passed.
     reason : str
         Why sampling stopped.
     tau, ess, rhat : dict of str to float
         Integrated autocorrelation time [steps], effective sample size (draws / tau), R-hat between ensembles; in
-        sampling coordinates, by parameter and ``variance[channel]``.
+        sampling coordinates, by full name.
     acceptance : float
         Mean fraction of accepted proposals.
     failures : dict of str to float
@@ -52,17 +63,27 @@ class Posterior(Result):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameters and ``variance[channel]``, in the order of the summary."""
+        """Full names of all that was sampled, parameters first, in the order of the summary."""
         return tuple(self.tau)
 
     def draws(self, name: str) -> np.ndarray:
-        """Return all draws of a parameter or ``variance[channel]``, chains one after the other."""
-        posterior = self.data["posterior"]
-        if name.startswith("variance["):
-            values = posterior["variance"].sel(channel=name[len("variance[") : -1])
-        else:
-            values = posterior[name]
-        return values.transpose("chain", "draw").to_numpy().ravel()
+        """Return all draws of what has this full name, (chains·draws,), chains one after the other.
+
+        Raises
+        ------
+        ValueError
+            For an unknown name.
+        """
+        return labels.column(self._group, name).ravel()
+
+    @property
+    def _group(self) -> xr.Dataset:
+        return self.data["posterior"].to_dataset()
+
+    @property
+    def _noise(self) -> list[str]:
+        """Full names of the noise parameters."""
+        return [n for n, (variable, _) in labels.places(self._group).items() if labels.is_noise(self._group, variable)]
 
     def summary(self) -> pd.DataFrame:
         """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, a row a parameter."""
@@ -73,7 +94,7 @@ class Posterior(Result):
             }
         )
 
-    def derive(self, expressions: Mapping[str, str]) -> pd.DataFrame:
+    def derive(self, expressions: Mapping[str, str], *, experiment: str | None = None) -> pd.DataFrame:
         """Return quantities derived from the sampled parameters, evaluated at every draw.
 
         Parameters
@@ -82,6 +103,9 @@ class Posterior(Result):
             By new name, such as ``{"damping_ratio": "c/(2*sqrt(k*1.5))"}``: numbers, names of sampled parameters, pi,
             + - * / ** and sqrt, exp, log, sin, cos, tan, atan, sinh, cosh, tanh, abs. Fixed parameters are not kept
             with the draws; their values are written as numbers.
+        experiment : str, optional
+            Whose local parameters the expressions mean, by their plain names: with "run 7" ``theta16`` is
+            ``theta16[run 7]``. Without it they can name shared parameters only.
 
         Returns
         -------
@@ -93,15 +117,19 @@ class Posterior(Result):
         ------
         ValueError
             For an expression that is not allowed or not finite at some draw, a new name that is no identifier or that a
-            parameter has.
+            parameter has, an unknown experiment.
         """
-        names = [name for name in self.names if not name.startswith("variance[")]
-        posterior = self.data["posterior"]
-        values = {name: posterior[name].transpose("chain", "draw").to_numpy() for name in names}
-        shape = posterior.sizes["chain"], posterior.sizes["draw"]
+        group, noise = self._group, self._noise
+        if experiment is not None:
+            checks.one_of("experiment", experiment, group[labels.EXPERIMENT].values.tolist())
+        kept = [name for name in labels.places(group) if name not in noise]
+        named = labels.in_experiment(kept, experiment)
+        note = f"{SAMPLED_ONLY} {labels.local_hint(kept, experiment)}".strip()
+        quantities = parse_all("expressions", expressions, named, ["variance", *map(str, group.data_vars)], note)
+        values = {plain: labels.column(group, name) for plain, name in named.items()}
         rows = {}
-        for name, quantity in parse_all("expressions", expressions, names, ["variance"], SAMPLED_ONLY).items():
-            draws = np.broadcast_to(quantity.value(values), shape)
+        for name, quantity in quantities.items():
+            draws = np.broadcast_to(quantity.value(values), (group.sizes["chain"], group.sizes["draw"]))
             if bad := int(np.sum(~np.isfinite(draws))):
                 raise ValueError(
                     f"expressions[{name!r}]: {quantity.text!r} is not allowed; it is NaN or infinite at {bad} of "
@@ -110,11 +138,40 @@ class Posterior(Result):
             rows[name] = _described(draws.ravel(), self._effective_size(draws))
         return _table(rows)
 
+    def as_prior(self, names: tuple[str, ...]) -> MultivariateNormal:
+        """Return the normal distribution with the mean and covariance of the draws: the prior of the next problem.
+
+        It is given for the same names, ``priors={names: posterior.as_prior(names)}``. It is over natural values, so
+        that a parameter that was positive is no longer kept positive, and noise parameters are left out. A tail or a
+        second mode of the draws does not survive; see `compare`.
+
+        Parameters
+        ----------
+        names : tuple of str
+            Free parameters, local ones as ``theta16[run 7]``, in the order of the prior's.
+
+        Raises
+        ------
+        ValueError
+            For anything else than a tuple of different free parameters.
+
+        Warns
+        -----
+        UserWarning
+            If the draws have not converged.
+        """
+        noise = self._noise
+        key = labels.checked_key(names, [name for name in self.names if name not in noise], noise)
+        if not self.converged:
+            warnings.warn(f"The draws have not converged ({self.reason}), nor has this prior.", stacklevel=2)
+        draws = np.stack([self.draws(name) for name in key])
+        return MultivariateNormal(draws.mean(axis=1), np.cov(draws).reshape(len(key), len(key)))
+
     def _effective_size(self, draws: np.ndarray) -> float:
         """Return the effective sample size of values (chains, draws); NaN if they do not vary."""
         if np.ptp(draws) == 0.0:
             return np.nan
-        ensemble = self.data["posterior"]["ensemble"].to_numpy()
+        ensemble = self._group["ensemble"].to_numpy()
         ensembles = np.stack([draws[ensemble == e].T[:, :, None] for e in np.unique(ensemble)])
         return draws.size / float(chains.autocorrelation_time(ensembles)[0])
 

@@ -11,7 +11,7 @@ from bayesperiodic.inference.joint_prior import JointPrior
 from bayesperiodic.inference.likelihood import Likelihood
 from bayesperiodic.inference.linearisation import Linearisation
 from bayesperiodic.inference.noise import Noise, as_noise
-from bayesperiodic.inference.observation import Observation
+from bayesperiodic.inference.observation import Observation, Response
 from bayesperiodic.inference.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
 from bayesperiodic.inference.priors import Uniform
 from bayesperiodic.inference.responses import Responses
@@ -126,6 +126,12 @@ class Problem:
         blocks = [block for observation in self.observations.values() for block in observation.blocks]
         known = {name: value for name, value in fixed.items() if name not in self.fixed}
         names = tuple(dict.fromkeys(n for block in blocks for n in self.noise.parameter_names(block)))
+        for plain in (name.partition("[")[0] for name in names):
+            if plain in self.model.parameters:
+                raise ValueError(
+                    f"model: the parameter name {plain!r} is not allowed; the noise model {self.noise.name!r} has a "
+                    "parameter of that name. Call the model's otherwise."
+                )
         for name, value in known.items():
             checks.one_of("fixed", name, (*self.model.parameters, SHIFT, *names))
             checks.positive(f"fixed[{name!r}]", value)
@@ -151,10 +157,10 @@ class Problem:
             if group[0] in self.likelihood.free and count <= needed:
                 names = ", ".join(self.names[i] for i in acting)
                 raise ValueError(
-                    f"priors: {len(acting)} free parameters ({names}) are not allowed; {group[0]!r} is unknown, has the "
-                    f"{self.noise.prior_text}, and only {count:.0f} independent values, where more than {needed} are "
-                    f"needed. Fix parameters or {group[0]!r}, give it a proper prior (noise.Independent(prior=…)), keep "
-                    "more harmonics, or add experiments."
+                    f"priors: {len(acting)} free parameters ({names}) are not allowed; {group[0]!r} is unknown, has "
+                    f"the {self.noise.prior_text}, and only {count:.0f} independent values, where more than {needed} "
+                    f"are needed. Fix parameters or {group[0]!r}, give it a proper prior "
+                    "(noise.Independent(prior=…)), keep more harmonics, or add experiments."
                 )
 
     @property
@@ -252,18 +258,29 @@ class Problem:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the log-likelihood and the worst status code of the solves, both (…,)."""
         flat = theta.reshape(-1, len(self.names))
-        solved = self.responses.solve(flat, threads)
-        status = np.max([s.status for s in solved.values()], axis=0)
-        good = status == CONVERGED
-        result = np.full(len(flat), -np.inf)
+        residuals, status = self.residuals(flat, threads)
+        good, result = status == CONVERGED, np.full(len(flat), -np.inf)
         if good.any():
-            residuals: list[np.ndarray] = []
-            with np.errstate(over="ignore", invalid="ignore"):
-                for name, observation in self.observations.items():
-                    part = type(solved[name].response)(*(field[good] for field in solved[name].response))
-                    residuals += observation.residuals(part)
             result[good] = self.likelihood(residuals, noise.reshape(len(flat), -1)[good])
         return result.reshape(theta.shape[:-1]), status.reshape(theta.shape[:-1])
+
+    def residuals(self, theta: np.ndarray, threads: int | None = None) -> tuple[list[np.ndarray], np.ndarray]:
+        """Return the residual components at those of many θ (solves, names) whose solves converge, and status codes.
+
+        Returns
+        -------
+        residuals : list of array (converged, size)
+            One a block.
+        status : int array (solves,)
+            The worst of all experiments.
+        """
+        solved = self.responses.solve(theta, threads)
+        status = np.max([s.status for s in solved.values()], axis=0)
+        good, residuals = status == CONVERGED, []
+        with np.errstate(over="ignore", invalid="ignore"):
+            for name, observation in self.observations.items():
+                residuals += observation.residuals(Response(*(part[good] for part in solved[name].response)))
+        return residuals, status
 
     def log_posterior(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> np.ndarray:
         """Return log-prior plus log-likelihood, shape (…), a density over (θ, log φ)."""
@@ -358,8 +375,8 @@ def _checked_local(
             for name in key if isinstance(key, tuple) else ():
                 if name in names:
                     raise ValueError(
-                        f"priors[{key!r}]: {name!r} is local; a joint prior needs the names of single experiments, such "
-                        f"as '{name}[run]'."
+                        f"priors[{key!r}]: {name!r} is local; a joint prior needs the names of single experiments, "
+                        f"such as '{name}[run]'."
                     )
     return names if SHIFT in names else (*names, SHIFT)
 

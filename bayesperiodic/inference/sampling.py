@@ -1,33 +1,31 @@
-"""Sampling of θ and the channel variances with emcee."""
+"""Sampling of θ and the noise parameters with emcee."""
 
-import importlib.metadata
+import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import emcee
 import numpy as np
-import xarray as xr
 from tqdm import tqdm
 
 from bayesperiodic import checks
 from bayesperiodic.inference import chains
-from bayesperiodic.inference.checkpoint import backends, fingerprint
-from bayesperiodic.inference.coordinates import SamplingDensity
+from bayesperiodic.inference.checkpoint import Checkpoint, Saved
+from bayesperiodic.inference.coordinates import COLLAPSED, NATURAL, RIDGE, SAMPLED, RidgeMap, SamplingDensity
+from bayesperiodic.inference.draws import gather
 from bayesperiodic.inference.estimate import MapEstimate
 from bayesperiodic.inference.posterior import Posterior
 from bayesperiodic.inference.problem import Problem
+from bayesperiodic.inference.starts import LAPLACE, PRIOR, STARTS, start_points
+from bayesperiodic.inference.stopping import shortfall
 from bayesperiodic.parallel import available_cores
 
-BLOCK = 250
-OVERDISPERSION = 2.0
-REDRAWS = 100
-LENGTHS = 50.0
-TAU_CHANGE = 0.05
-RHAT = 1.005
-QUANTILE_SPREAD = 0.25
+BLOCK, PIECE = 250, 25
 PASSES = 2
+FEWEST_STEPS = 50
 
 
 def sample(
@@ -38,20 +36,24 @@ def sample(
     ensembles: int = 4,
     walkers: int | None = None,
     max_steps: int = 20_000,
+    start: str = LAPLACE,
+    coordinates: str = RIDGE,
+    variances: str = SAMPLED,
     checkpoint: str | Path | None = None,
     progress: bool = True,
 ) -> Posterior:
-    """Sample the posterior of θ and the unknown channel variances with emcee's affine-invariant ensembles.
+    """Sample the posterior of θ and the free noise parameters with emcee's affine-invariant ensembles.
 
     Several independent ensembles start from draws of the Laplace approximation with doubled standard deviations.
-    Parameters with positive support and the variances are sampled in their logarithms, where products become
-    straight ridges; Jeffreys' prior 1/v is flat there. Seven steps in ten are differential-evolution moves, which mix
-    three times faster than stretch moves on a normal target of six dimensions (tau 21 against 67), two are stretch
-    moves, and one is a differential-evolution move of full length, which can jump between modes.
+    Parameters with positive support and the noise parameters are sampled in their logarithms, where products become
+    straight ridges; Jeffreys' prior 1/v is flat there. The eigenvectors of the Laplace approximation in these
+    coordinates are the axes of the walk. Seven steps in ten are differential-evolution moves, which mix three times
+    faster than stretch moves on a normal target of six dimensions (tau 21 against 67), two are stretch moves, and one
+    is a differential-evolution move of full length, which can jump between modes.
 
     Sampling stops when the chain is 50 autocorrelation times long after a fifth of it was dropped, that time has
     changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and 95 % quantiles agree
-    within a quarter of a standard deviation, twice in succession.
+    within a quarter of a standard deviation, twice in succession. Ctrl-C ends it with what is there, not converged.
 
     Parameters
     ----------
@@ -63,11 +65,21 @@ def sample(
     ensembles : int
         At least 2.
     walkers : int, optional
-        Of each ensemble, even and at least twice the number of parameters and unknown variances.
+        Of each ensemble, even and at least twice the number of coordinates.
     max_steps : int
         Reaching it is reported as not converged.
+    start : "laplace", "prior" or "overdispersed"
+        Draws of the Laplace approximation with twice its standard deviations, of the priors, or of the Laplace
+        approximation with five times its standard deviations.
+    coordinates : "ridge" or "natural"
+        "natural" takes no logarithms of parameters.
+    variances : "sampled" or "collapsed"
+        "collapsed" integrates the unknown variances out and draws them exactly afterwards: the same posterior in fewer
+        dimensions. Only for independent errors with the prior 1/v or a flat one.
     checkpoint : path, optional
-        An HDF5 file; the same call resumes what it holds.
+        An HDF5 file that holds the run so far, whenever the process may be killed; the same call resumes it. A finished
+        one returns at once. emcee's HDFBackend reads it, in coordinates in which the Laplace approximation is a unit
+        sphere.
     progress : bool
         Show a progress bar with acceptance, tau and length in units of tau.
 
@@ -78,7 +90,8 @@ def sample(
     Raises
     ------
     ValueError
-        For too few or an odd number of walkers, a start with no finite log-posterior, a checkpoint of another problem.
+        For too few or an odd number of walkers, a start with no finite log-posterior, variances that cannot be
+        integrated out, a checkpoint of another problem, damaged or in use.
 
     References
     ----------
@@ -89,31 +102,22 @@ def sample(
     checks.integer("ensembles", ensembles, 2)
     checks.integer("max_steps", max_steps, BLOCK)
     checks.integer("seed", seed, 0)
-    anchored = problem.anchored(fit.theta)
-    densities = [SamplingDensity(anchored, max(1, available_cores() // ensembles)) for _ in range(ensembles)]
-    walkers = _checked_walkers(walkers, densities[0])
-    samplers, starts = _samplers(problem, fit, densities, seed, walkers, checkpoint)
-    converged, reason, passes = False, f"max_steps = {max_steps} reached", 0
-    last = np.full(densities[0].dimension, np.inf)
-    bar = tqdm(total=max_steps, unit="step", desc="sampling", disable=not progress)
-    for steps in range(BLOCK, max_steps + 1, BLOCK):
-        with ThreadPoolExecutor(available_cores()) as pool:
-            list(pool.map(_advance, samplers, starts, [steps] * ensembles))
-        kept = _kept(samplers, steps)
-        tau = chains.autocorrelation_time(kept)
-        shortfall = _shortfall(kept, tau, last)
-        passes, last = (0 if shortfall else passes + 1), tau
-        bar.update(steps - bar.n)
-        bar.set_postfix_str(
-            f"acceptance {_acceptance(samplers):.2f}, tau {tau.max():.0f}, length {kept.shape[1] / tau.max():.0f} tau"
+    checks.one_of("start", start, STARTS)
+    checks.one_of("coordinates", coordinates, (RIDGE, NATURAL))
+    checks.one_of("variances", variances, (SAMPLED, COLLAPSED))
+    plain = SamplingDensity(problem, coordinates=coordinates, variances=variances)
+    if variances == COLLAPSED and not plain.collapsed:
+        raise ValueError(
+            "variances: 'collapsed' is not allowed; there is no unknown variance of independent errors with the prior "
+            "1/v or a flat one."
         )
-        if passes == PASSES:
-            converged, reason = True, f"stop rule passed after {steps} steps of {ensembles} × {walkers} walkers"
-            break
-    else:
-        reason += f" with {', '.join(shortfall) or 'the stop rule passed only once'}"
-    bar.close()
-    return _posterior(densities, samplers, steps, converged, reason, seed)
+    walkers = _checked_walkers(walkers, plain)
+    settings = f"seed {seed}, {ensembles} ensembles of {walkers} walkers, {start}, {coordinates}, {variances}"
+    with nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings) as store:
+        saved = None if store is None else store.load()
+        run = _Run(problem, fit, plain, seed, start, walkers, ensembles, saved)
+        run.go(max_steps, store, progress)
+        return run.posterior()
 
 
 def _checked_walkers(walkers: int | None, density: SamplingDensity) -> int:
@@ -128,155 +132,185 @@ def _checked_walkers(walkers: int | None, density: SamplingDensity) -> int:
     return walkers
 
 
-def _samplers(
-    problem: Problem,
-    fit: MapEstimate,
-    densities: list[SamplingDensity],
-    seed: int,
-    walkers: int,
-    checkpoint: str | Path | None,
-) -> tuple[list[emcee.EnsembleSampler], list[np.ndarray | None]]:
-    """Return the samplers and where they start; None where a checkpoint holds the last step."""
-    settings = f"seed {seed}, {len(densities)} ensembles of {walkers} walkers"
-    stores = backends(checkpoint, problem, settings, len(densities))
-    samplers: list[emcee.EnsembleSampler] = []
-    starts: list[np.ndarray | None] = []
-    for density, sequence, store in zip(
-        densities, np.random.SeedSequence(seed).spawn(len(densities)), stores, strict=True
+@dataclass
+class _Ensemble:
+    """One emcee ensemble, its density, and where it starts (None if it goes on)."""
+
+    density: SamplingDensity
+    sampler: emcee.EnsembleSampler
+    start: np.ndarray | None
+
+    def advance(self, steps: int, stop: threading.Event) -> None:
+        """Walk until so many steps are done in all, or `stop` is set."""
+        while (missing := steps - self.sampler.iteration) > 0 and not stop.is_set():
+            here, self.start = self.start, None
+            self.sampler.run_mcmc(here, min(missing, PIECE), skip_initial_state_check=True, progress=False)
+
+
+class _Run:
+    """A sampling run: its ensembles, how far they are and what the stop rule says."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        fit: MapEstimate,
+        plain: SamplingDensity,
+        seed: int,
+        start: str,
+        walkers: int,
+        ensembles: int,
+        saved: Saved | None,
     ):
+        self.seed, self.plain = seed, plain
+        sequences = np.random.SeedSequence(seed).spawn(ensembles + 2)
+        self.redraws = np.random.default_rng(sequences[ensembles])
+        state = saved.state if saved else {}
+        anchor = np.array(state["anchor"]) if saved else problem.vector(fit.theta)
+        anchored = problem.anchored(anchor)
+        densities = [self._density(anchored, ensembles) for _ in range(ensembles)]
+        self.map = (
+            RidgeMap(np.array(state["origin"]), np.array(state["axes"]))
+            if saved
+            else _axes(densities[0], fit, start, np.random.default_rng(sequences[ensembles + 1]))
+        )
+        self.state = state or {
+            "anchor": anchor.tolist(), "origin": self.map.origin.tolist(), "axes": self.map.axes.tolist(),
+            "steps": 0, "passes": 0, "tau": [np.inf] * plain.dimension, "converged": False, "reason": "",
+        }  # fmt: skip
+        self.ensembles = [
+            self._ensemble(density, fit, start, walkers, np.random.default_rng(sequences[i]), saved, i)
+            for i, density in enumerate(densities)
+        ]
+
+    def _density(self, problem: Problem, ensembles: int) -> SamplingDensity:
+        variances = COLLAPSED if self.plain.collapsed else SAMPLED
+        return SamplingDensity(problem, max(1, available_cores() // ensembles), self.plain.coordinates, variances)
+
+    def _ensemble(
+        self,
+        density: SamplingDensity,
+        fit: MapEstimate,
+        start: str,
+        walkers: int,
+        generator: np.random.Generator,
+        saved: Saved | None,
+        number: int,
+    ) -> _Ensemble:
         moves = [
             (emcee.moves.DEMove(), 0.7),
             (emcee.moves.DEMove(gamma0=1.0), 0.1),
             (emcee.moves.StretchMove(), 0.2),
         ]
-        sampler = emcee.EnsembleSampler(walkers, density.dimension, density, moves=moves, vectorize=True, backend=store)
-        generator = np.random.default_rng(sequence)
-        if sampler.iteration == 0:
-            sampler.random_state = np.random.RandomState(generator.integers(2**32, size=4)).get_state()
-        starts.append(_start(density, fit, walkers, generator) if sampler.iteration == 0 else None)
-        samplers.append(sampler)
-    return samplers, starts
-
-
-def _start(density: SamplingDensity, fit: MapEstimate, walkers: int, generator: np.random.Generator) -> np.ndarray:
-    mean, covariance = density.laplace(fit)
-    if not np.isfinite(covariance).all():
-        raise ValueError("fit: its covariance is not finite, so there is no Laplace approximation to start from.")
-    factor = OVERDISPERSION * np.linalg.cholesky(covariance)
-    points = np.empty((0, mean.size))
-    drawn = 0
-    while len(points) < walkers and drawn < REDRAWS * walkers:
-        candidates = mean + generator.standard_normal((walkers, mean.size)) @ factor.T
-        drawn += walkers
-        points = np.concatenate([points, candidates[np.isfinite(density(candidates))]])
-    if len(points) < walkers:
-        raise ValueError(
-            f"fit: of {drawn} start points drawn around it {1 - len(points) / drawn:.1%} have no finite log-posterior, "
-            "so the walkers cannot start; check the priors' support and the fit's status."
+        backend = saved.backends[number] if saved else emcee.backends.Backend()
+        sampler = emcee.EnsembleSampler(
+            walkers,
+            density.dimension,
+            lambda u: density(self.map.outwards(u)),
+            moves=moves,
+            vectorize=True,
+            backend=backend,
         )
-    return points[:walkers]
+        if saved:
+            density.calls = self.state["calls"][number]
+            density.failures = Counter(self.state["failures"][number])
+            return _Ensemble(density, sampler, None)
+        sampler.random_state = np.random.RandomState(generator.integers(2**32, size=4)).get_state()
+        return _Ensemble(density, sampler, self.map.inwards(start_points(density, fit, start, walkers, generator)))
+
+    def go(self, max_steps: int, store: Checkpoint | None, progress: bool) -> None:
+        """Walk block by block until the stop rule is passed twice in succession, or `max_steps` are reached."""
+        state, missing = self.state, ["nothing was checked"]
+        with tqdm(total=max_steps, unit="step", desc="sampling", disable=not progress) as bar:
+            for steps in range(state["steps"] + BLOCK, max_steps + 1, BLOCK):
+                if state["converged"]:
+                    return
+                if not self._advance(steps):
+                    done = min(e.sampler.iteration for e in self.ensembles)
+                    if done < FEWEST_STEPS:
+                        raise KeyboardInterrupt
+                    state["steps"], state["reason"] = done, f"interrupted after {done} steps"
+                    self._save(store, now=True)
+                    return
+                kept = self._kept(steps)
+                tau = chains.autocorrelation_time(kept)
+                missing = shortfall(kept, tau, np.array(state["tau"]))
+                state["steps"], state["tau"] = steps, tau.tolist()
+                state["passes"] = 0 if missing else state["passes"] + 1
+                state["converged"] = state["passes"] >= PASSES
+                bar.update(steps - bar.n)
+                bar.set_postfix_str(self._account(kept, tau))
+                if state["converged"]:
+                    shape = f"{len(self.ensembles)} × {self.ensembles[0].sampler.nwalkers} walkers"
+                    state["reason"] = f"stop rule passed after {steps} steps of {shape}"
+                self._save(store, now=state["converged"] or steps + BLOCK > max_steps)
+        if not state["converged"]:
+            left = ", ".join(missing) or "the stop rule passed only once"
+            state["reason"] = f"max_steps = {max_steps} reached with {left}"
+
+    def _advance(self, steps: int) -> bool:
+        """Walk all ensembles to a number of steps; return False if Ctrl-C came."""
+        stop = threading.Event()
+        with ThreadPoolExecutor(available_cores()) as pool:
+            waiting = [pool.submit(ensemble.advance, steps, stop) for ensemble in self.ensembles]
+            try:
+                for future in waiting:
+                    future.result()
+            except KeyboardInterrupt:
+                return False
+            finally:
+                stop.set()
+        return True
+
+    def _account(self, kept: np.ndarray, tau: np.ndarray) -> str:
+        text = f"acceptance {self._acceptance():.2f}, tau {tau.max():.0f}, length {kept.shape[1] / tau.max():.0f} tau"
+        calls = sum(e.density.calls for e in self.ensembles)
+        failed = sum(sum(e.density.failures.values()) for e in self.ensembles)
+        return text + (f", failed solves {failed / calls:.1%}" if failed else "")
+
+    def _save(self, store: Checkpoint | None, *, now: bool) -> None:
+        if store is not None:
+            calls = [e.density.calls for e in self.ensembles]
+            failures = [dict(e.density.failures) for e in self.ensembles]
+            backends = [e.sampler.backend for e in self.ensembles]
+            store.save(backends, self.state | {"calls": calls, "failures": failures}, now=now)
+
+    def _kept(self, steps: int) -> np.ndarray:
+        """Return the chains (ensembles, steps, walkers, coordinates) up to a step, without their first fifth."""
+        walked = np.stack([e.sampler.get_chain()[steps // 5 : steps] for e in self.ensembles])
+        return self.map.outwards(walked)
+
+    def _acceptance(self) -> float:
+        return float(np.mean([e.sampler.acceptance_fraction for e in self.ensembles]))
+
+    def posterior(self) -> Posterior:
+        """Return the draws, with the variances that were integrated out drawn again."""
+        steps = self.state["steps"]
+        kept, part = self._kept(steps), slice(steps // 5, steps)
+        log_density = np.stack([e.sampler.get_log_prob()[part] for e in self.ensembles])
+        if self.plain.collapsed:
+            moments = np.stack([e.sampler.get_blobs()[part] for e in self.ensembles])
+            moments = moments.reshape(*kept.shape[:-1], -1)
+            kept, log_density = self.ensembles[0].density.expanded(kept, log_density, moments, self.redraws)
+        whole = SamplingDensity(self.plain.problem, coordinates=self.plain.coordinates)
+        whole.calls = sum(e.density.calls for e in self.ensembles)
+        whole.failures = sum((e.density.failures for e in self.ensembles), Counter())
+        return gather(
+            whole,
+            kept,
+            log_density,
+            converged=self.state["converged"],
+            reason=self.state["reason"],
+            acceptance=self._acceptance(),
+            seed=self.seed,
+        )
 
 
-def _advance(sampler: emcee.EnsembleSampler, start: np.ndarray | None, steps: int) -> None:
-    missing, here = steps - sampler.iteration, start if sampler.iteration == 0 else None
-    if missing > 0:
-        sampler.run_mcmc(here, missing, skip_initial_state_check=True, progress=False)
-
-
-def _kept(samplers: list[emcee.EnsembleSampler], steps: int) -> np.ndarray:
-    """Return the chains (ensembles, steps, walkers, coordinates) up to a step, without their first fifth."""
-    return np.stack([sampler.get_chain()[steps // 5 : steps] for sampler in samplers])
-
-
-def _acceptance(samplers: list[emcee.EnsembleSampler]) -> float:
-    return float(np.mean([sampler.acceptance_fraction for sampler in samplers]))
-
-
-def _shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray) -> list[str]:
-    """Return what the stop rule misses, in words."""
-    found = []
-    if (lengths := kept.shape[1] / tau.max()) < LENGTHS:
-        found.append(f"length only {lengths:.0f} tau")
-    if (change := np.max(np.abs(tau - last) / tau)) > TAU_CHANGE:
-        found.append(f"tau changed by {change:.0%}")
-    if (spread := chains.quantile_spread(kept).max()) > QUANTILE_SPREAD:
-        found.append(f"quantiles of the ensembles {spread:.2f} sd apart")
-    if not found and (worst := chains.rhat(kept).max()) > RHAT:
-        found.append(f"R-hat {worst:.3f}")
-    return found
-
-
-def _posterior(
-    densities: list[SamplingDensity],
-    samplers: list[emcee.EnsembleSampler],
-    last_step: int,
-    converged: bool,
-    reason: str,
-    seed: int,
-) -> Posterior:
-    density, kept = densities[0], _kept(samplers, last_step)
-    problem, calls = density.problem, sum(d.calls for d in densities)
-    ensembles, steps, walkers, _ = kept.shape
-    tau = chains.autocorrelation_time(kept)
-    points = kept.transpose(0, 2, 1, 3).reshape(ensembles * walkers, steps, -1)
-    theta, variances = density.to_natural(points)
-    lp = np.stack([s.get_log_prob()[last_step // 5 : last_step] for s in samplers])
-    coords = {
-        "chain": np.arange(ensembles * walkers),
-        "draw": np.arange(steps),
-        "channel": list(problem.channels),
-        "ensemble": ("chain", np.repeat(np.arange(ensembles), walkers)),
-    }
-    units = problem.model.units
-    variables: dict[str, Any] = {
-        name: (("chain", "draw"), theta[..., i], {"units": units.get(name, "")}) for i, name in enumerate(problem.names)
-    }
-    squared = {
-        f"units of {c}": f"{units[c]}²" if units[c].isalpha() else f"({units[c]})²"
-        for c in problem.channels
-        if c in units
-    }
-    variables["variance"] = (("chain", "draw", "channel"), variances, squared)
-    stats = {"lp": (("chain", "draw"), lp.transpose(0, 2, 1).reshape(ensembles * walkers, steps))}
-    data = xr.DataTree.from_dict(
-        {
-            "posterior": xr.Dataset(variables, coords=coords),
-            "sample_stats": xr.Dataset(stats, coords={k: coords[k] for k in ("chain", "draw", "ensemble")}),
-            "observed_data": _signals(problem, "outputs"),
-            "constant_data": _signals(problem, "inputs"),
-        }
-    )
-    data.attrs = {
-        "seed": seed,
-        "fingerprint": fingerprint(problem),
-        "converged": int(converged),
-        "reason": reason,
-        "synthetic": int(any(e.synthetic for e in problem.experiments)),
-        "bayesperiodic": importlib.metadata.version("bayesperiodic"),
-        "emcee": emcee.__version__,
-    }
-    draws = steps * walkers * ensembles
-    by_label = {label: float(t) for label, t in zip(density.labels, tau, strict=True)}
-    return Posterior(
-        data=data,
-        converged=converged,
-        reason=reason,
-        tau=by_label,
-        ess={label: draws / t for label, t in by_label.items()},
-        rhat=dict(zip(density.labels, chains.rhat(kept).tolist(), strict=True)),
-        acceptance=_acceptance(samplers),
-        failures={s: n / calls for s, n in sum((d.failures for d in densities), Counter()).items()},
-        log_posterior_calls=calls,
-        seed=seed,
-    )
-
-
-def _signals(problem: Problem, kind: str) -> xr.Dataset:
-    return xr.Dataset(
-        {
-            f"{experiment.name} {channel}": ((f"{experiment.name} time",), values)
-            for experiment in problem.experiments
-            for channel, values in getattr(experiment, kind).items()
-        },
-        coords={f"{experiment.name} time": experiment.time for experiment in problem.experiments},
-    )
+def _axes(density: SamplingDensity, fit: MapEstimate, start: str, generator: np.random.Generator) -> RidgeMap:
+    """Return the axes of the walk: those of the Laplace approximation, or the spread of the start where it has none."""
+    try:
+        return RidgeMap.of(*density.laplace(fit))
+    except ValueError:
+        if start != PRIOR:
+            raise
+    points = start_points(density, fit, start, 10 * density.dimension, generator)
+    return RidgeMap(points.mean(axis=0), np.diag(points.std(axis=0)))

@@ -25,8 +25,7 @@ def undetermined(
     Returns
     -------
     tuple of str
-        Such as "a: no output depends on it" or "m·k": one combination a direction, which can change without any change
-        of the outputs.
+        Such as "a: no output depends on it" or "a → a·t, b → b·t^-1": changes of the parameters that change no output.
 
     Examples
     --------
@@ -45,12 +44,21 @@ def undetermined(
         return tuple(silent)
     part = scaled[np.ix_(acting, acting)] / np.outer(size[acting], size[acting])
     values, vectors = np.linalg.eigh(part)
-    found = []
-    for value, vector in zip(values, vectors.T, strict=True):
-        if value < NEARLY_SINGULAR:
-            direction = vector / size[acting]
-            found.append(_in_words(direction, acting, names, logarithmic))
-    return tuple(silent + found)
+    directions = _reduced(vectors[:, values < NEARLY_SINGULAR].T / size[acting])
+    return tuple(silent + [_in_words(direction, acting, names, logarithmic) for direction in directions])
+
+
+def _reduced(directions: np.ndarray) -> np.ndarray:
+    """Return vectors that span the same (directions, acting), each without what the others begin with."""
+    rows = directions.copy()
+    for i in range(len(rows)):
+        relative = np.abs(rows) / np.abs(rows).max(axis=1, keepdims=True)
+        column = int(np.argmax(relative[i] > SHOWN))
+        rows[i] /= rows[i, column]
+        for j in range(len(rows)):
+            if j != i:
+                rows[j] -= rows[j, column] * rows[i]
+    return rows
 
 
 def _in_words(direction: np.ndarray, acting: np.ndarray, names: Sequence[str], logarithmic: np.ndarray) -> str:

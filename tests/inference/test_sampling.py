@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.inference import chains, sampling
+from bayesperiodic.inference import chains, sampling, stopping
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])
@@ -91,9 +91,9 @@ def test_resumed_run_gives_the_same_chain(known_variance, tmp_path):
 
 
 def test_finished_run_comes_back_from_its_checkpoint(known_variance, tmp_path, monkeypatch):
-    monkeypatch.setattr(sampling, "LENGTHS", 5.0)
-    monkeypatch.setattr(sampling, "TAU_CHANGE", 1.0)
-    monkeypatch.setattr(sampling, "RHAT", 1.1)
+    monkeypatch.setattr(stopping, "LENGTHS", 5.0)
+    monkeypatch.setattr(stopping, "TAU_CHANGE", 1.0)
+    monkeypatch.setattr(stopping, "RHAT", 1.1)
     first = bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **QUIET)
     again = bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **QUIET)
     assert first.converged and again.reason == first.reason

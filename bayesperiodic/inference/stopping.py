@@ -1,0 +1,33 @@
+"""When a sampling run is long enough."""
+
+import numpy as np
+
+from bayesperiodic.inference import chains
+
+LENGTHS = 50.0
+TAU_CHANGE = 0.05
+RHAT = 1.005
+QUANTILE_SPREAD = 0.25
+
+
+def shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray) -> list[str]:
+    """Return what the stop rule misses, in words; nothing if it is passed.
+
+    Parameters
+    ----------
+    kept : array (ensembles, steps, walkers, coordinates)
+    tau, last : array (coordinates,)
+        Autocorrelation time [steps], now and at the check before.
+    """
+    found = []
+    if not np.isfinite(tau).all():
+        return ["a coordinate that does not move"]
+    if (lengths := kept.shape[1] / tau.max()) < LENGTHS:
+        found.append(f"length only {lengths:.0f} tau")
+    if (change := np.max(np.abs(tau - last) / tau)) > TAU_CHANGE:
+        found.append(f"tau changed by {change:.0%}")
+    if (spread := chains.quantile_spread(kept).max()) > QUANTILE_SPREAD:
+        found.append(f"quantiles of the ensembles {spread:.2f} sd apart")
+    if not found and (worst := chains.rhat(kept).max()) > RHAT:
+        found.append(f"R-hat {worst:.3f}")
+    return found
