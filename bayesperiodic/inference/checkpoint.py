@@ -103,7 +103,7 @@ class Checkpoint:
         if not self._path.exists():
             return None
         with h5py.File(self._path, "r") as file:
-            state = json.loads(file.attrs[RUN])
+            state = json.loads(file[RUN][()])
             names = sorted((name for name in file if name.startswith("ensemble ")), key=lambda name: int(name[9:]))
         stored = [emcee.backends.HDFBackend(str(self._path), name=name, read_only=True) for name in names]
         return Saved([_in_memory(backend) for backend in stored], state)
@@ -117,7 +117,8 @@ class Checkpoint:
         os.close(handle)
         try:
             with h5py.File(draft, "w") as file:
-                file.attrs[MARK], file.attrs[RUN] = self._mark, json.dumps(state)
+                file.attrs[MARK] = self._mark
+                file.create_dataset(RUN, data=json.dumps(state))
                 for number, backend in enumerate(backends):
                     _write(file.create_group(f"ensemble {number}"), backend)
             os.replace(draft, self._path)

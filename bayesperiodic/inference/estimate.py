@@ -64,6 +64,8 @@ class MapEstimate(Result):
         Standard deviation that the noise of the measured inputs brings to each channel.
     doubling_shift : dict of str to float
         By how many standard deviations each estimate would move on twice as many points; NaN if those solves fail.
+    at_ends : tuple of str
+        Parameters whose estimate lies at the end of their prior's support.
     undetermined : tuple of str
         Parameters or combinations of them that change no output at all, in words; what is said of them is the prior's.
     history : array (iterations,)
@@ -94,6 +96,7 @@ class MapEstimate(Result):
     noise_split: dict[str, NoiseSplit]
     input_noise: dict[str, float]
     doubling_shift: dict[str, float]
+    at_ends: tuple[str, ...]
     undetermined: tuple[str, ...]
     history: np.ndarray
     starts: tuple[dict[str, float], ...]

@@ -14,6 +14,7 @@ MAX_HALVINGS = 30
 SCALED_STEP = 1e-8
 SMALL_STEP = 1e-4
 SINGULAR = 1e-13
+MAX_ROUNDS, PRESSED = 10, 1e-3
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def climb(
     Where H is not positive definite (convex log-priors that outweigh the data) steps take its negative curvature with
     the opposite sign; directions without curvature are left alone. Each solve starts from the iterate before and is
     checked to lie on the same branch, so that a step cannot slip to another periodic solution; steps whose solve fails
-    are halved.
+    are halved. A parameter at the end of its prior's support is held while the gradient presses it outwards.
 
     Parameters
     ----------
@@ -129,14 +130,41 @@ def climb(
     history : array (iterations,)
         The objective at each iterate.
     """
-    now, history = start, [start.objective]
+    always = np.zeros(start.theta.size, dtype=bool) if held is None else held
+    now, resting, history = start, always, [start.objective]
+    for _ in range(MAX_ROUNDS):
+        now, status, objectives = _ascend(objective, now, resting, report)
+        history += objectives
+        ends = at_ends(objective, now)
+        inwards = ends * objective.hessian_and_gradient(now)[1] < 0.0
+        wanted = always | (ends != 0.0 if status == "stalled" else resting & ~inwards)
+        if np.array_equal(wanted, resting):
+            break
+        resting = wanted
+    return now, status, np.array(history)
+
+
+def at_ends(objective: Objective, iterate: Iterate) -> np.ndarray:
+    """Return −1 or 1 for parameters next to the lower or upper end of their support, 0 for others, (names,)."""
+    hessian, _ = objective.hessian_and_gradient(iterate)
+    low, high = np.transpose(list(objective.problem.joint_prior.supports.values()))
+    near = PRESSED / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
+    return 1.0 * (high - iterate.theta < near) - (iterate.theta - low < near)
+
+
+def _ascend(
+    objective: Objective, start: Iterate, held: np.ndarray, report: Callable[[Iterate, float], None] | None
+) -> tuple[Iterate, str, list[float]]:
+    """Climb with the same parameters held throughout; return the end, the status, and the objectives on the way."""
+    now = start
+    history: list[float] = []
     for _ in range(MAX_ITERATIONS):
         hessian, gradient = objective.hessian_and_gradient(now)
         if not np.isfinite(hessian).all() or not np.isfinite(gradient).all():
-            return now, "singular", np.array(history)
+            return now, "singular", history
         step, size = _step(hessian, gradient, held)
         if size < SCALED_STEP:
-            return now, "converged", np.array(history)
+            return now, "converged", history
         damping = 1.0
         for _ in range(MAX_HALVINGS):
             trial = objective.at(now.theta + damping * step, now.here, now.noise)
@@ -144,19 +172,19 @@ def climb(
                 break
             damping, trial = 0.5 * damping, None
             if size < SMALL_STEP:
-                return now, "converged", np.array(history)
+                return now, "converged", history
         if trial is None:
-            return now, "stalled", np.array(history)
+            return now, "stalled", history
         now = objective.anchored(trial)
         history.append(now.objective)
         if report is not None:
             report(now, damping * size)
-    return now, "iterations", np.array(history)
+    return now, "iterations", history
 
 
-def _step(hessian: np.ndarray, gradient: np.ndarray, held: np.ndarray | None) -> tuple[np.ndarray, float]:
-    """Return the step uphill and its largest component in standard deviations."""
-    moving = np.arange(gradient.size) if held is None else np.flatnonzero(~held)
+def _step(hessian: np.ndarray, gradient: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the step uphill and its length in standard deviations, √(step·H·step), all directions together."""
+    moving = np.flatnonzero(~held)
     step = np.zeros_like(gradient)
     if not moving.size:
         return step, 0.0
@@ -164,9 +192,7 @@ def _step(hessian: np.ndarray, gradient: np.ndarray, held: np.ndarray | None) ->
     scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(part)), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(part * np.outer(scale, scale))
     values = np.abs(values)
-    along = vectors.T @ (scale * gradient[moving])
-    along = np.where(values > SINGULAR * values.max(), along / np.maximum(values, np.finfo(float).tiny), 0.0)
-    sd = np.sqrt(np.sum(vectors**2 / np.maximum(values, SINGULAR * values.max()), axis=1))
-    scaled = vectors @ along
-    step[moving] = scale * scaled
-    return step, float(np.max(np.abs(scaled) / sd))
+    along, curved = vectors.T @ (scale * gradient[moving]), values > SINGULAR * values.max()
+    along = np.where(curved, along / np.where(curved, values, 1.0), 0.0)
+    step[moving] = scale * (vectors @ along)
+    return step, float(np.sqrt(np.sum(values * along**2)))

@@ -10,7 +10,15 @@ from tqdm import tqdm
 from bayesperiodic import checks
 from bayesperiodic.inference.doubling import doubling_shift
 from bayesperiodic.inference.estimate import MapEstimate
-from bayesperiodic.inference.gauss_newton import Iterate, Objective, bias_correction, climb, information
+from bayesperiodic.inference.gauss_newton import (
+    SINGULAR,
+    Iterate,
+    Objective,
+    at_ends,
+    bias_correction,
+    climb,
+    information,
+)
 from bayesperiodic.inference.input_noise import input_noise
 from bayesperiodic.inference.joint_laplace import joint_laplace, logarithmic
 from bayesperiodic.inference.problem import Problem
@@ -21,6 +29,7 @@ from bayesperiodic.inference.undetermined import undetermined
 NOISE_SHARE = 0.1
 LARGEST_SHIFT = 0.1
 SHOWN = 3
+LOST = 1e-6
 
 
 def map_estimate(
@@ -65,8 +74,8 @@ def map_estimate(
     -----
     UserWarning
         If the noise of the measured inputs brings more than a tenth of the residual to an output, if twice as many
-        points would move an estimate by more than a tenth of its standard deviation, and if the data do not determine
-        a parameter or a combination of them.
+        points would move an estimate by more than a tenth of its standard deviation, if an estimate lies at the end of
+        its prior's support, and if the data do not determine a parameter or a combination of them.
 
     References
     ----------
@@ -90,7 +99,7 @@ def map_estimate(
         found.append(_outcome(problem, end))
         if end.objective > best.objective:
             best, status, history = end, other_status, other_history
-    result = _describe(problem, best, status, history, tuple(found))
+    result = _describe(objective, best, status, history, tuple(found))
     _warn(problem, result)
     return result
 
@@ -119,16 +128,22 @@ def _outcome(problem: Problem, iterate: Iterate) -> dict[str, float]:
 
 
 def _describe(
-    problem: Problem, best: Iterate, status: str, history: np.ndarray, starts: tuple[dict[str, float], ...]
+    objective: Objective, best: Iterate, status: str, history: np.ndarray, starts: tuple[dict[str, float], ...]
 ) -> MapEstimate:
-    names, likelihood, share = problem.names, problem.likelihood, bias_correction(problem)
+    problem, share = objective.problem, objective.share
+    names, likelihood = problem.names, problem.likelihood
     data, _ = information(problem, best)
-    covariance = _inverse(data + problem.joint_prior.curvature(best.theta))
+    solutions = problem.with_responses(best.here.responses).solve(best.theta)
+    covariance, lost = _inverse(data + problem.joint_prior.curvature(best.theta))
+    robust = robust_covariance(problem, best, covariance)
+    shift = doubling_shift(problem, best, solutions, covariance)
+    shift[lost] = np.nan
+    for matrix in (covariance, robust):
+        matrix[lost], matrix[:, lost] = np.nan, np.nan
+        matrix[lost, lost] = np.inf
     with np.errstate(invalid="ignore"):
-        sd = np.sqrt(np.diag(covariance))
-        robust = np.sqrt(np.diag(robust_covariance(problem, best, covariance)))
-    here = problem.with_responses(best.here.responses)
-    solutions, residuals = here.solve(best.theta), best.here.compared()
+        sd, robust_sd = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
+    residuals = best.here.compared()
     joint = joint_laplace(problem, best)
     noise = dict(zip(problem.noise_names, best.noise.tolist(), strict=True))
     rms = {c: _pooled(problem, c, residuals) for c in problem.channels}
@@ -137,7 +152,7 @@ def _describe(
         status=status,
         theta=dict(zip(names, best.theta.tolist(), strict=True)),
         sd=dict(zip(names, sd.tolist(), strict=True)),
-        robust_sd=dict(zip(names, robust.tolist(), strict=True)),
+        robust_sd=dict(zip(names, robust_sd.tolist(), strict=True)),
         variances={_short(name): noise[name] for name in likelihood.counts},
         noise=noise,
         noise_prior=problem.noise.prior_text,
@@ -153,7 +168,8 @@ def _describe(
         whiteness=channel_whiteness(problem, best),
         noise_split=noise_split(problem, best, share),
         input_noise=input_noise(problem, best.theta, solutions),
-        doubling_shift=dict(zip(names, doubling_shift(problem, best, solutions, covariance).tolist(), strict=True)),
+        doubling_shift=dict(zip(names, shift.tolist(), strict=True)),
+        at_ends=tuple(name for name, end in zip(names, at_ends(objective, best), strict=True) if end),
         undetermined=undetermined(data, best.theta, names, logarithmic(problem)),
         history=history,
         starts=starts,
@@ -161,13 +177,16 @@ def _describe(
     )
 
 
-def _inverse(hessian: np.ndarray) -> np.ndarray:
-    """Return the inverse of a symmetric matrix, scaled to a unit diagonal first; infinite where it is singular."""
+def _inverse(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inverse of a symmetric matrix, and which parameters are in directions without curvature.
+
+    These directions are left out of the inverse.
+    """
     scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
-    try:
-        return np.linalg.inv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
-    except np.linalg.LinAlgError:
-        return np.full_like(hessian, np.inf)
+    values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+    curved = np.abs(values) > SINGULAR * np.abs(values).max()
+    inverse = (vectors[:, curved] / values[curved]) @ vectors[:, curved].T * np.outer(scale, scale)
+    return inverse, np.any(np.abs(vectors[:, ~curved]) > LOST, axis=1)
 
 
 def _warn(problem: Problem, fit: MapEstimate) -> None:
@@ -184,6 +203,12 @@ def _warn(problem: Problem, fit: MapEstimate) -> None:
         _say(
             f"Twice as many points would move {worst!r} by {shifts[worst]:.2g} of its standard deviation; take more "
             f"samples than {max(e.samples for e in problem.experiments)}, or a scheme of higher order."
+        )
+    for name in fit.at_ends:
+        low, high = problem.joint_prior.supports[name]
+        _say(
+            f"The estimate of {name!r}, {fit.theta[name]:.6g}, lies at the end of its prior's support ({low:g}, "
+            f"{high:g}); standard deviations do not describe the posterior there. Sample it, or widen the prior."
         )
     if fit.undetermined:
         more = len(fit.undetermined) - SHOWN

@@ -60,17 +60,19 @@ class MultivariateNormal:
         return sd[:, None] * np.linalg.cholesky(self.covariance / np.outer(sd, sd))
 
     @cached_property
+    def _whitening(self) -> np.ndarray:
+        return solve_triangular(self._cholesky, np.eye(self.dimension), lower=True)
+
+    @cached_property
     def _precision(self) -> np.ndarray:
-        whitening = solve_triangular(self._cholesky, np.eye(self.dimension), lower=True)
-        return whitening.T @ whitening
+        return self._whitening.T @ self._whitening
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
         """Return the normalised log-density of points (…, n), shape (…)."""
         x = self._points(x)
         finite = np.isfinite(x).all(axis=-1)
         offset = np.where(finite[..., None], x, self.mean) - self.mean
-        flat = offset.reshape(-1, self.dimension)
-        score = solve_triangular(self._cholesky, flat.T, lower=True).T.reshape(offset.shape)
+        score = offset @ self._whitening.T
         constant = np.log(np.diag(self._cholesky)).sum() + self.dimension * LOG_ROOT_TWO_PI
         return np.where(finite, -0.5 * np.sum(score**2, axis=-1) - constant, -np.inf)[()]
 

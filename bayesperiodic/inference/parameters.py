@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -113,10 +114,21 @@ class ParameterMap:
 
     def values(self, theta: np.ndarray) -> np.ndarray:
         """Return all parameters (points, parameters + 1), the delay last, of θ (points, names)."""
-        known: dict[str, Any] = {**self.fixed, **{name: theta[:, i] for name, i in self.columns.items()}}
-        for name, expression in self.tied.items():
-            known[name] = expression.value(known)
-        return np.stack([np.broadcast_to(known[name], len(theta)) for name in self.parameters], axis=-1)
+        template, places = self._layout
+        result = np.tile(template, (len(theta), 1))
+        result[:, places] = theta[:, [*self.columns.values()]]
+        if self.tied:
+            known: dict[str, Any] = dict(zip(self.parameters, result.T, strict=True))
+            for name, expression in self.tied.items():
+                known[name] = expression.value(known)
+                result[:, self.parameters.index(name)] = known[name]
+        return result
+
+    @cached_property
+    def _layout(self) -> tuple[np.ndarray, list[int]]:
+        """Return the fixed values in their places, NaN elsewhere, and the places of the free ones."""
+        template = np.array([self.fixed.get(name, np.nan) for name in self.parameters])
+        return template, [self.parameters.index(name) for name in self.columns]
 
     def slopes(self, theta: np.ndarray) -> np.ndarray:
         """Return ∂(all parameters)/∂θ at one θ (names,), (parameters + 1, names)."""

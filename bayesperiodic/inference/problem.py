@@ -1,6 +1,7 @@
 """Problem: a model, experiments and priors, and the posterior density they define."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -185,9 +186,23 @@ class Problem:
             self._responses = self._responses.anchored(self.median())
         return self._responses
 
-    def anchored(self, theta: Mapping[str, float] | np.ndarray) -> "Problem":
-        """Return the same problem with its anchors at another θ, solved from the present ones."""
-        return self.with_responses(self.responses.anchored(self.vector(theta)))
+    def anchored(
+        self, theta: Mapping[str, float] | np.ndarray, guesses: Mapping[str, Mapping[str, np.ndarray]] | None = None
+    ) -> "Problem":
+        """Return the same problem with its anchors at another θ.
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (names,)
+        guesses : mapping of str to mapping of str to array (points,), optional
+            States of every experiment, turns included, from which to solve; by default the present anchors.
+        """
+        if guesses is None:
+            return self.with_responses(self.responses.anchored(self.vector(theta)))
+        checks.same_names("guesses", guesses, [e.name for e in self.experiments])
+        experiments = tuple(replace(e, guess=guesses[e.name]) for e in self.experiments)
+        responses = Responses(self.model, experiments, self.parameter_maps, self.scheme)
+        return self.with_responses(responses.anchored(self.vector(theta)))
 
     def with_responses(self, responses: Responses) -> "Problem":
         """Return the same problem with other anchors."""

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -16,7 +16,6 @@ from bayesperiodic.inference.gauss_newton import Iterate, Objective, bias_correc
 from bayesperiodic.inference.linearisation import Linearisation
 from bayesperiodic.inference.parameters import SHIFT
 from bayesperiodic.inference.problem import Problem
-from bayesperiodic.inference.responses import Responses
 from bayesperiodic.inference.ridge import Point, Ridge
 from bayesperiodic.store import Result
 
@@ -247,8 +246,7 @@ def _at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate
     checks.same_names("fit.noise", fit.noise, problem.noise_names)
     checks.same_names("fit.solutions", fit.solutions, [e.name for e in problem.experiments])
     theta = problem.vector(fit.theta)
-    experiments = tuple(replace(e, guess=fit.solutions[e.name].states) for e in problem.experiments)
-    responses = Responses(problem.model, experiments, problem.parameter_maps, problem.scheme).anchored(theta)
+    responses = problem.anchored(theta, {name: s.states for name, s in fit.solutions.items()}).responses
     objective = Objective(problem, bias_correction(problem), np.zeros(theta.size, dtype=bool))
     near = Linearisation(theta, responses, problem.observations)
     peak = objective.at(theta, near, np.array([fit.noise[name] for name in problem.noise_names]))

@@ -126,8 +126,7 @@ class Responses:
         groups: dict[tuple[Any, ...], list[Experiment]] = {}
         for e in self.experiments:
             own = self.maps[e.name]
-            constants = tuple(value for name, value in own.fixed.items() if name in self.model.parameters)
-            groups.setdefault((e.samples, e.periods, tuple(own.columns.items()), constants), []).append(e)
+            groups.setdefault((e.samples, e.periods, *own.columns.items(), *own.fixed.items()), []).append(e)
         kind = AutonomousBatch if self.model.autonomous else Batch
         return [
             (tuple(group), kind([self.equations[e.name] for e in group], [self._anchors[e.name] for e in group]))
@@ -138,13 +137,13 @@ class Responses:
         """Solve every experiment for θ (solves, names); the result does not depend on the number of threads."""
         result = {}
         for experiments, batch in self._batches:
-            parameters = self.parameters(theta, experiments[0].name)
+            values = self.maps[experiments[0].name].values(theta)
+            parameters = np.ascontiguousarray(values[:, :-1])
             solved = batch.solve(parameters, threads)
             for i, e in enumerate(experiments):
                 status = solved.status[i].copy()
                 logarithms = self._log_multipliers(e, solved.z[i], solved.frequency[i], parameters, status)
-                delay = self.maps[e.name].values(theta)[:, -1]
-                response = Response(solved.outputs[i], solved.frequency[i], logarithms, delay)
+                response = Response(solved.outputs[i], solved.frequency[i], logarithms, values[:, -1])
                 result[e.name] = SolvedResponse(response, solved.z[i], status)
         return {e.name: result[e.name] for e in self.experiments}
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesperiodic.inference.gauss_newton import Iterate, Objective, climb
+from bayesperiodic.inference.gauss_newton import PRESSED, Iterate, Objective, climb
 from bayesperiodic.inference.priors import Prior
 
 # How far apart points lie, as changes of the root of the drop; how steps grow, are cut, and when they are short.
@@ -15,9 +15,8 @@ FURTHEST = 2.8
 # A step leaves a tenth of the distance to the support's end; the last point leaves a millionth of the peak's, so that
 # priors that vanish at the end are seen to, or lies at the outermost thousandth of the prior if that is closer.
 NEARER, NEAREST, TAIL = 0.1, 1e-6, 1e-3
-MOST_POINTS, MOST_FAILURES, MOST_CLIMBS, MOST_ROUNDS = 60, 5, 10, 5
-GAIN, CUT, PRESSED = 1e-6, 1e-12, 1e-3
-STALLED = "stalled"
+MOST_POINTS, MOST_FAILURES, MOST_ROUNDS = 60, 5, 5
+GAIN, CUT = 1e-6, 1e-12
 
 
 class Point(NamedTuple):
@@ -147,31 +146,7 @@ class Ridge:
         if not finite:
             return None
         first = max(finite, key=lambda iterate: iterate.objective)
-        return self._settled(self.objective.anchored(first))
-
-    def _settled(self, iterate: Iterate) -> Iterate:
-        """Return where the climb over the other parameters ends.
-
-        One next to the end of its prior's support can cut every step short, and leave the others where they are; it is
-        held too, and let go again where the gradient draws it back.
-        """
-        held = self._held
-        for _ in range(MOST_CLIMBS):
-            iterate, status, _ = climb(self.objective, iterate, held)
-            ends = self._at_ends(iterate)
-            inwards = ends * self.objective.hessian_and_gradient(iterate)[1] < 0.0
-            wanted = self._held | (ends != 0.0 if status == STALLED else held & ~inwards)
-            if np.array_equal(wanted, held):
-                break
-            held = wanted
-        return iterate
-
-    def _at_ends(self, iterate: Iterate) -> np.ndarray:
-        """Return −1 or 1 for parameters next to the lower or upper end of their support, 0 for others, (names,)."""
-        hessian, _ = self.objective.hessian_and_gradient(iterate)
-        low, high = np.transpose(list(self.objective.problem.joint_prior.supports.values()))
-        near = PRESSED / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
-        return 1.0 * (high - iterate.theta < near) - (iterate.theta - low < near)
+        return climb(self.objective, self.objective.anchored(first), held)[0]
 
     @property
     def _held(self) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import threading
 from collections import Counter
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -166,7 +167,8 @@ class _Run:
         self.redraws = np.random.default_rng(sequences[ensembles])
         state = saved.state if saved else {}
         anchor = np.array(state["anchor"]) if saved else problem.vector(fit.theta)
-        anchored = problem.anchored(anchor)
+        guesses = state["guesses"] if saved else {name: s.states for name, s in fit.solutions.items()}
+        anchored = problem.anchored(anchor, guesses)
         densities = [self._density(anchored, ensembles) for _ in range(ensembles)]
         self.map = (
             RidgeMap(np.array(state["origin"]), np.array(state["axes"]))
@@ -174,7 +176,8 @@ class _Run:
             else _axes(densities[0], fit, start, np.random.default_rng(sequences[ensembles + 1]))
         )
         self.state = state or {
-            "anchor": anchor.tolist(), "origin": self.map.origin.tolist(), "axes": self.map.axes.tolist(),
+            "anchor": anchor.tolist(), "guesses": _as_lists(guesses),
+            "origin": self.map.origin.tolist(), "axes": self.map.axes.tolist(),
             "steps": 0, "passes": 0, "tau": [np.inf] * plain.dimension, "converged": False, "reason": "",
         }  # fmt: skip
         self.ensembles = [
@@ -303,6 +306,10 @@ class _Run:
             acceptance=self._acceptance(),
             seed=self.seed,
         )
+
+
+def _as_lists(guesses: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, list[float]]]:
+    return {run: {state: values.tolist() for state, values in states.items()} for run, states in guesses.items()}
 
 
 def _axes(density: SamplingDensity, fit: MapEstimate, start: str, generator: np.random.Generator) -> RidgeMap:

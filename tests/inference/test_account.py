@@ -148,6 +148,49 @@ def test_without_a_prior_that_decides_the_fit_ends_all_the_same():
     assert len(fit.undetermined) == 1
 
 
+def test_what_is_determined_keeps_its_sd_beside_what_is_not():
+    """With uniform priors only a·b² is known, and the sum beside it as if it were alone."""
+    run = sine_run(lambda x, rate: 12.0 * x + 0.5 * rate)
+    priors = {"a": bp.Uniform(0.0, 50.0), "b": bp.Uniform(0.0, 50.0), "shift_a": bp.Uniform(-5.0, 5.0)}
+    fixed = {"shift_b": 0.0, "idle": 0.0, "variance[force]": 0.25}
+    with pytest.warns(UserWarning, match="The data do not change under"):
+        fit = bp.map_estimate(bp.Problem(PRODUCT, [run], priors=priors, fixed=fixed), progress=False)
+    rate = 2 * np.pi * np.cos(2 * np.pi * grid(60))
+    assert fit.sd["shift_a"] == pytest.approx(np.sqrt(0.25 / np.sum(rate**2)), rel=1e-6)
+    assert fit.sd["a"] == fit.sd["b"] == np.inf
+
+
+def test_an_estimate_at_the_end_of_a_support_is_the_best_one_inside():
+    """Bounded least squares in closed form: the parameter pressed against the end is fixed there."""
+    run = linear_experiment(TRUTH, 3.0, seed=1)
+    wide = {"k": bp.Normal(800.0, 1e6), "c": bp.Normal(30.0, 1e6), "coulomb": bp.Uniform(0.0, 20.0)}
+    with pytest.warns(UserWarning, match=r"'coulomb', 20, lies at the end of its prior's support \(0, 20\)"):
+        fit = bp.map_estimate(
+            bp.Problem(LINEAR, [run], priors=wide, fixed={"variance[force]": 9.0}),
+            start={"k": 100.0, "c": 400.0, "coulomb": 1.0},
+            progress=False,
+        )
+    x = linear_regressors(0.05, 2.0, grid(40))
+    best = np.linalg.lstsq(x[:, :2], run.outputs["force"] - 20.0 * x[:, 2], rcond=None)[0]
+    assert fit.converged and fit.at_ends == ("coulomb",)
+    assert [fit.theta["k"], fit.theta["c"]] == pytest.approx(best, rel=1e-4)
+    assert fit.theta["coulomb"] == pytest.approx(20.0, abs=0.01)
+
+
+def test_directions_without_information_do_not_end_the_climb():
+    """Three collinear columns: from far away the sum is found all the same, to 1e-6 of its standard deviation."""
+    run = sine_run(lambda x, rate: 12.0 * x + 0.5 * rate)
+    priors = {"shift_a": bp.Normal(400.0, 1e9), "shift_b": bp.Normal(900.0, 1e9)}
+    fixed = {"a": 12.0, "b": 1.0, "idle": 0.0, "variance[force]": 0.25}
+    with pytest.warns(UserWarning, match="The data do not change under"):
+        fit = bp.map_estimate(bp.Problem(PRODUCT, [run], priors=priors, fixed=fixed), progress=False)
+    x, rate = np.sin(2 * np.pi * grid(60)), 2 * np.pi * np.cos(2 * np.pi * grid(60))
+    best = rate @ (run.outputs["force"] - 12.0 * x) / (rate @ rate)
+    found = fit.theta["shift_a"] + 2 * fit.theta["shift_b"]
+    assert fit.converged
+    assert found == pytest.approx(best, abs=1e-5 * np.sqrt(0.25 / (rate @ rate)))
+
+
 def test_determined_problems_say_nothing():
     fit = bp.map_estimate(bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS), progress=False)
     assert fit.undetermined == ()

@@ -1,0 +1,145 @@
+"""Sampling of posteriors that are known: means, spreads, distances of distributions, and independence of the walkers.
+
+Every figure is compared within five of its own Monte Carlo errors: false-alarm rate below 1e-4 a test.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import bayesperiodic as bp
+from tests.known import grid
+
+QUIET = {"progress": False}
+TWO = {"ensembles": 2, "seed": 1, "progress": False}
+ERRORS = 5.0
+
+
+def model(name: str, parameters: Sequence[str], force: Callable) -> bp.Model:
+    """Return a model with a dummy state and the outputs that `force` makes of its parameters, times x."""
+    return bp.Model(
+        name,
+        states=["w"],
+        inputs=["x"],
+        parameters=list(parameters),
+        equations=lambda s, p, u: [s.dw + s.w - u.x],
+        outputs=lambda s, p, u: {channel: value * u.x for channel, value in force(p).items()},
+    )
+
+
+def run(**sizes: float) -> bp.Experiment:
+    """Return an experiment whose outputs are sizes times x, the mean square of x over its 20 values being 1.
+
+    A second harmonic of the outputs, which no model here has, makes the residual finite.
+    """
+    x, second = np.sqrt(2.0) * np.sin(2 * np.pi * grid(20)), 1e-3 * np.sin(4 * np.pi * grid(20))
+    return bp.Experiment("run", 1.0, {name: size * x + second for name, size in sizes.items()}, {"x": x}, samples=20)
+
+
+def known(**sds: float) -> dict[str, float]:
+    """Return the variances of one value for which the sizes have these standard deviations."""
+    return {f"variance[{name}]": 20 * sd**2 for name, sd in sds.items()}
+
+
+def check(
+    posterior: bp.Posterior, moments: dict[str, tuple[float, float]], cdf: dict[str, Callable] | None = None
+) -> None:
+    """Compare means, sds and distributions of the draws with the truth, and walkers with each other."""
+    assert posterior.converged, posterior.reason
+    for name, (mean, sd) in moments.items():
+        draws, error = posterior.draws(name), ERRORS / np.sqrt(posterior.ess[name])
+        kurtosis = np.mean((draws - draws.mean()) ** 4) / draws.var() ** 2
+        assert abs(draws.mean() - mean) < error * sd
+        assert abs(draws.std() / sd - 1.0) < error * np.sqrt((kurtosis - 1.0) / 4.0)
+        if cdf and name in cdf:
+            assert stats.kstest(draws, cdf[name]).statistic < 0.5 * error
+    group = posterior.data["posterior"]
+    for name in moments:
+        values = group[name].transpose("draw", "chain").to_numpy()
+        between = np.corrcoef(values[:: max(1, int(2 * posterior.tau[name]))].T)
+        pairs = between[np.triu_indices_from(between, 1)]
+        assert abs(pairs.mean()) < ERRORS / np.sqrt(values.size / (2 * posterior.tau[name])) + 1 / len(values)
+
+
+@pytest.mark.filterwarnings("ignore:The data do not change under")
+@pytest.mark.parametrize("dimension", [2, 10, 20])
+def test_correlated_normal(dimension):
+    """A joint prior that the data do not change, correlations of 0.9 between neighbours, scales from 1e-6 to 1."""
+    names = [f"p{i}" for i in range(dimension)]
+    quiet = model(f"normal_{dimension}", names, lambda p: {"force": 1 + 1e-12 * sum(getattr(p, n) for n in names)})
+    scale = np.geomspace(1e-6, 1.0, dimension)
+    correlation = 0.9 ** np.abs(np.subtract.outer(np.arange(dimension), np.arange(dimension)))
+    mean = np.linspace(-1.0, 1.0, dimension)
+    prior = bp.MultivariateNormal(mean, correlation * np.outer(scale, scale))
+    problem = bp.Problem(quiet, [run(force=1.0)], priors={tuple(names): prior}, fixed=known(force=1e3))
+    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), **TWO)
+    moments = dict(zip(names, zip(mean, scale, strict=True), strict=True))
+    check(posterior, moments, {n: stats.norm(*moments[n]).cdf for n in names})
+    draws = np.stack([posterior.draws(n) for n in names[:2]])
+    assert np.corrcoef(draws)[0, 1] == pytest.approx(0.9, abs=ERRORS * 0.19 / np.sqrt(min(posterior.ess.values())))
+
+
+def test_banana():
+    """Rosenbrock's: a ~ N(1, 0.5), b = a² + N(0, 0.1)."""
+    banana = model("banana", ["a", "b"], lambda p: {"first": p.a, "second": p.b - p.a**2})
+    wide = {"a": bp.Normal(0.0, 1e3), "b": bp.Normal(0.0, 1e4)}
+    problem = bp.Problem(banana, [run(first=1.0, second=1e-9)], priors=wide, fixed=known(first=0.5, second=0.1))
+    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), **TWO)
+    of_b = 1.0 + 0.5**2, np.sqrt(4 * 0.5**2 + 2 * 0.5**4 + 0.1**2)
+    check(posterior, {"a": (1.0, 0.5), "b": of_b}, {"a": stats.norm(1.0, 0.5).cdf})
+
+
+def test_two_modes_of_opposite_sign():
+    """Only a² is measured: half the draws on each side, or "not converged" said."""
+    signed = model("square", ["a"], lambda p: {"force": p.a**2})
+    problem = bp.Problem(signed, [run(force=1.0)], priors={"a": bp.Normal(0.0, 2.0)}, fixed=known(force=0.1))
+    fit = bp.map_estimate(problem, start={"a": 0.8}, **QUIET)
+    posterior = bp.sample(problem, fit, seed=1, start="prior", max_steps=5000, **QUIET)
+    negative = float(np.mean(posterior.draws("a") < 0.0))
+    assert not posterior.converged or abs(negative - 0.5) < ERRORS * 0.5 / np.sqrt(posterior.ess["a"])
+
+
+@pytest.mark.filterwarnings("ignore:The estimate of 'a', 0.9.*, lies at the end")
+def test_edge_of_a_uniform_prior():
+    """The data pull beyond the prior's end: a normal cut off one standard deviation below its mean."""
+    edged = model("edged", ["a"], lambda p: {"force": p.a})
+    problem = bp.Problem(edged, [run(force=1.0)], priors={"a": bp.Uniform(0.0, 0.9)}, fixed=known(force=0.1))
+    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), seed=1, **QUIET)
+    cut = stats.truncnorm(-10.0, -1.0, loc=1.0, scale=0.1)
+    check(posterior, {"a": (cut.mean(), cut.std())}, {"a": cut.cdf})
+
+
+def ridge(priors: dict) -> tuple[bp.Problem, bp.MapEstimate]:
+    """Return a·b = 1 ± 2 %."""
+    product = model("ridge", ["a", "b"], lambda p: {"force": p.a * p.b})
+    problem = bp.Problem(product, [run(force=1.0)], priors=priors, fixed=known(force=0.02))
+    return problem, bp.map_estimate(problem, **QUIET)
+
+
+@pytest.mark.filterwarnings("ignore:The data do not change under")
+def test_ridge_of_a_product():
+    """Priors N(1, 1) cut at zero: sd(a) = 0.595 by quadrature; the stop rule sees through a short natural chain."""
+    cut = bp.TruncatedNormal(1.0, 1.0, 0.0, np.inf)
+    problem, fit = ridge({"a": cut, "b": cut})
+    a = np.geomspace(1e-3, 20.0, 200_001)
+    weight = cut.log_prob(a) + cut.log_prob(1 / a) - np.log(a)
+    density = np.exp(weight - weight.max()) / np.trapezoid(np.exp(weight - weight.max()), a)
+    mean = np.trapezoid(a * density, a)
+    sd = np.sqrt(np.trapezoid((a - mean) ** 2 * density, a))
+    assert sd == pytest.approx(0.595, abs=0.002)
+    posterior = bp.sample(problem, fit, seed=1, **QUIET)
+    assert posterior.converged and max(posterior.tau.values()) <= 40
+    assert posterior.draws("a").std() == pytest.approx(sd, rel=0.03)
+    natural = bp.sample(problem, fit, seed=1, coordinates="natural", max_steps=1500, **QUIET)
+    assert not natural.converged and "max_steps = 1500 reached with" in natural.reason
+
+
+@pytest.mark.filterwarnings("ignore:The data do not change under")
+def test_ridge_with_a_far_second_branch_is_not_called_converged_without_it():
+    """Uncut priors leave 1.2 % of the mass with both signs negative: found, or not converged."""
+    problem, fit = ridge({"a": bp.Normal(1.0, 1.0), "b": bp.Normal(1.0, 1.0)})
+    posterior = bp.sample(problem, fit, seed=1, max_steps=3000, **QUIET)
+    negative = float(np.mean(posterior.draws("a") < 0.0))
+    assert not posterior.converged or abs(negative - 0.012) < 0.006
