@@ -165,6 +165,8 @@ def collect(
         "whiteness": {"p": fit.whiteness["force"].p, "lag1": fit.whiteness["force"].lag1},
         "map": fit.theta,
         "laplace_sd": fit.sd,
+        "robust_sd": fit.robust_sd,
+        "noise_split": {key: getattr(fit.noise_split["force"], key) for key in ("measurement", "model", "total")},
         "posterior": {
             name: {key: float(row[key]) for key in ("mean", "sd", "q05", "q50", "q95")}
             for name, row in table.iterrows()
@@ -201,6 +203,7 @@ def tables(
             "unit": [bp.models.dahl.units[name] for name in table.index],
             "MAP": table["map"],
             "Laplace sd": table["laplace_sd"],
+            "robust sd": pd.Series(fit.robust_sd),
             "mean": table["mean"],
             "sd": table["sd"],
             "5 %": table["q05"],
@@ -218,12 +221,14 @@ def tables(
         f"{posterior.draws('variance[force]').mean():.3g} N²",
         f"residual {fit.rms['force']:.2f} N rms, {fit.fvu['force']:.2%} of the force's variance",
     ]
-    white = fit.whiteness["force"]
+    white, split = fit.whiteness["force"], fit.noise_split["force"]
     if white.p < 0.01:
         lines.append(
             f"The residual is not white (p = {white.p:.1g}, autocorrelation {white.lag1:.2f} from one independent "
             "value to the next):\nit is model error, not noise, and neighbouring values repeat it. All standard "
-            "deviations above are therefore too small."
+            "deviations above are therefore too small, but for the\nrobust ones, which take the residual's spectrum as "
+            f"it is. Of {split.total:.2f} N, {split.measurement:.2f} N are measurement noise and {split.model:.2f} N "
+            "model error."
         )
     lines += ["", f"The same with other numbers of displacement harmonics; the rule: {RULE}."]
     lines.append(

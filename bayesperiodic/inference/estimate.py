@@ -38,7 +38,8 @@ class MapEstimate(Result):
     noise_prior : str
         The prior of the variances, in words.
     covariance : DataFrame (names × names)
-        Inverse of H of eq. (8) at these variances.
+        Inverse of H of eq. (8) at these variances; where the correlation of the noise is estimated too (`Circulant`),
+        with that uncertainty integrated in.
     joint_mode : dict of str to float
         Mode of the density in sampling coordinates: natural values of parameters and free noise parameters.
     joint_covariance : DataFrame

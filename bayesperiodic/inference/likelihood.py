@@ -126,7 +126,7 @@ class Likelihood:
         """Return the log-likelihood (…,) of one block, the logarithms of the variances multiplied by `share`."""
         if block.kind == KNOWN:
             return -0.5 * np.sum(r**2, axis=-1)
-        if block.kind == POINTS and self.model.covariance(block, np.ones(values.shape[-1])) is not None:
+        if self._is_dense(block):
             flat, rows = values.reshape(-1, values.shape[-1]), r.reshape(-1, r.shape[-1])
             each = [self._dense(block, row, v, share)[0] for row, v in zip(rows, flat, strict=True)]
             return np.array(each).reshape(values.shape[:-1])
@@ -135,6 +135,10 @@ class Likelihood:
             v = variances[..., 0]
             return -0.5 * block.weight * (share * block.size * np.log(v) + np.sum(r**2, axis=-1) / v)
         return -0.5 * block.weight * np.sum(share * np.log(variances) + r**2 / variances, axis=-1)
+
+    def _is_dense(self, block: Block) -> bool:
+        """Return whether the components of a block are correlated: points under noise that is not white."""
+        return block.kind == POINTS and not self.model.flat
 
     def _variances(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if block.kind == CORRELATED:
@@ -168,7 +172,7 @@ class Likelihood:
             if block.kind == KNOWN:
                 by_residual.append(-r)
                 continue
-            if block.kind == POINTS and self.model.covariance(block, values[columns]) is not None:
+            if self._is_dense(block):
                 _, by_r, by_phi = self._dense(block, r, values[columns], share)
             else:
                 variances, change = self._variances(block, values[columns])
@@ -185,9 +189,9 @@ class Likelihood:
             if block.kind == KNOWN:
                 result.append(r)
                 continue
-            dense = self.model.covariance(block, values[columns]) if block.kind == POINTS else None
-            if dense is not None:
-                white = solve_triangular(np.linalg.cholesky(dense[0]), r.reshape(-1, block.size).T, lower=True)
+            if self._is_dense(block):
+                covariance, _ = self.model.covariance(block, values[columns])  # type: ignore[misc]
+                white = solve_triangular(np.linalg.cholesky(covariance), r.reshape(-1, block.size).T, lower=True)
                 result.append(np.sqrt(block.weight) * white.T.reshape(r.shape))
             else:
                 result.append(r * np.sqrt(block.weight / self._variances(block, values[columns])[0]))

@@ -21,6 +21,7 @@ from bayesperiodic.inference.gauss_newton import (
 )
 from bayesperiodic.inference.input_noise import input_noise
 from bayesperiodic.inference.joint_laplace import joint_laplace, logarithmic
+from bayesperiodic.inference.noise_uncertainty import with_uncertain_noise
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.inference.residual_split import channel_whiteness, noise_split
 from bayesperiodic.inference.robust import robust_covariance
@@ -136,6 +137,7 @@ def _describe(
     solutions = problem.with_responses(best.here.responses).solve(best.theta)
     covariance, lost = _inverse(data + problem.joint_prior.curvature(best.theta))
     robust = robust_covariance(problem, best, covariance)
+    covariance = with_uncertain_noise(problem, best, covariance)
     shift = doubling_shift(problem, best, solutions, covariance)
     shift[lost] = np.nan
     for matrix in (covariance, robust):

@@ -100,7 +100,7 @@ class Noise(ABC):
         """Return V (…, size) and ∂ ln V/∂ ln φ (…, size, parameters) of a spectral block at values (…, parameters)."""
 
     def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the covariance of a block of points (size, size) and its derivatives by ln φ; None if diagonal."""
+        """Return the covariance of a block of points (size, size) and its derivatives by ln φ; None if it is `flat`."""
         return None
 
     def log_prior(self, kind: str, value: np.ndarray, measured: float) -> tuple[np.ndarray, np.ndarray]:
@@ -153,8 +153,8 @@ class Measured(Noise):
     Parameters
     ----------
     per : "channel" or "experiment"
-    prior : "jeffreys" or a prior
-        Of the model error's variance. A flat prior is not allowed.
+    prior : "jeffreys", "flat" or a prior
+        Of the model error's variance.
 
     Examples
     --------
@@ -233,9 +233,10 @@ class Circulant(Noise):
         """Return v·Σ_h S_h cos(2πh(t_i − t_j))/n at the points of a mask."""
         harmonic = np.minimum(np.arange(block.points), block.points - np.arange(block.points))
         variances, slopes = self._spectrum(harmonic, values)
-        distance = block.position[:, None] - block.position[None, :]
-        waves = np.cos(2 * np.pi * np.multiply.outer(distance, np.arange(block.points))) / block.points
-        return waves @ variances, np.moveaxis(waves @ (variances[:, None] * slopes), -1, 0)
+        point = np.rint(block.position * block.points).astype(int)
+        by_lag = np.fft.ifft(np.vstack([variances, slopes.T * variances])).real
+        found = by_lag[:, np.abs(point[:, None] - point[None, :])]
+        return found[0], found[1:]
 
     def _spectrum(self, harmonic: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x = 2 * np.pi * harmonic * values[..., 1:2]
