@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from bayesperiodic.data.recording import Recording
     from bayesperiodic.diagnosis.comparison import Comparison, compare
     from bayesperiodic.diagnosis.predictive import Prediction, predict
-    from bayesperiodic.inference import noise
-    from bayesperiodic.inference.estimate import MapEstimate
-    from bayesperiodic.inference.map_estimate import map_estimate
-    from bayesperiodic.inference.multivariate import MultivariateNormal
-    from bayesperiodic.inference.posterior import Posterior
-    from bayesperiodic.inference.priors import (
+    from bayesperiodic.inference.estimation.estimate import MapEstimate
+    from bayesperiodic.inference.estimation.map_estimate import map_estimate
+    from bayesperiodic.inference.estimation.profile import Profile, profile
+    from bayesperiodic.inference.noise import models as noise
+    from bayesperiodic.inference.priors.multivariate import MultivariateNormal
+    from bayesperiodic.inference.priors.univariate import (
         HalfNormal,
         InverseGamma,
         LogNormal,
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
         Uniform,
     )
     from bayesperiodic.inference.problem import Problem
-    from bayesperiodic.inference.profile import Profile, profile
-    from bayesperiodic.inference.sampling import sample
+    from bayesperiodic.inference.sampling.posterior import Posterior
+    from bayesperiodic.inference.sampling.sampling import sample
     from bayesperiodic.models.model import Model
     from bayesperiodic.models.smooth import smooth_abs, smooth_sign
     from bayesperiodic.periodic.continuation import Branch, continue_periodic, double_period, iterate_periodic
@@ -48,11 +48,11 @@ _HOMES = {
     "bayesperiodic.data.recording": ["Recording"],
     "bayesperiodic.diagnosis.comparison": ["Comparison", "compare"],
     "bayesperiodic.diagnosis.predictive": ["Prediction", "predict"],
-    "bayesperiodic.inference.estimate": ["MapEstimate"],
-    "bayesperiodic.inference.map_estimate": ["map_estimate"],
-    "bayesperiodic.inference.posterior": ["Posterior"],
-    "bayesperiodic.inference.multivariate": ["MultivariateNormal"],
-    "bayesperiodic.inference.priors": [
+    "bayesperiodic.inference.estimation.estimate": ["MapEstimate"],
+    "bayesperiodic.inference.estimation.map_estimate": ["map_estimate"],
+    "bayesperiodic.inference.sampling.posterior": ["Posterior"],
+    "bayesperiodic.inference.priors.multivariate": ["MultivariateNormal"],
+    "bayesperiodic.inference.priors.univariate": [
         "HalfNormal",
         "InverseGamma",
         "LogNormal",
@@ -63,8 +63,8 @@ _HOMES = {
         "Uniform",
     ],
     "bayesperiodic.inference.problem": ["Problem"],
-    "bayesperiodic.inference.profile": ["Profile", "profile"],
-    "bayesperiodic.inference.sampling": ["sample"],
+    "bayesperiodic.inference.estimation.profile": ["Profile", "profile"],
+    "bayesperiodic.inference.sampling.sampling": ["sample"],
     "bayesperiodic.models.model": ["Model"],
     "bayesperiodic.models.smooth": ["smooth_abs", "smooth_sign"],
     "bayesperiodic.periodic.continuation": ["Branch", "continue_periodic", "double_period", "iterate_periodic"],
@@ -77,7 +77,7 @@ _HOMES = {
 }
 _MODULES = {
     "models": "bayesperiodic.models",
-    "noise": "bayesperiodic.inference.noise",
+    "noise": "bayesperiodic.inference.noise.models",
     "plot": "bayesperiodic.plot",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}

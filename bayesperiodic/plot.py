@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 
 from bayesperiodic import checks, fourier
 from bayesperiodic.diagnosis.predictive import Prediction
-from bayesperiodic.inference.estimate import MapEstimate
+from bayesperiodic.inference.estimation.estimate import MapEstimate
+from bayesperiodic.inference.estimation.profile import CLOSED, Profile
 from bayesperiodic.inference.labels import unit as unit_of
-from bayesperiodic.inference.posterior import Posterior
 from bayesperiodic.inference.problem import Problem
-from bayesperiodic.inference.profile import CLOSED, Profile
+from bayesperiodic.inference.sampling.posterior import Posterior
 from bayesperiodic.periodic.continuation import FOLD, PERIOD_DOUBLING, Branch
 from bayesperiodic.periodic.solution import PeriodicSolution
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from bayesperiodic.inference.estimate import MapEstimate
-from bayesperiodic.inference.posterior import Posterior
+from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.problem import Problem
+from bayesperiodic.inference.sampling.posterior import Posterior
 from bayesperiodic.store import Result
 
 END_SHIFT = 0.25

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.special import ndtri
 
 from bayesperiodic import checks
-from bayesperiodic.inference.posterior import Posterior
 from bayesperiodic.inference.problem import Problem
+from bayesperiodic.inference.sampling.posterior import Posterior
 from bayesperiodic.store import Result
 
 PROBABILITY = 0.9

@@ -8,7 +8,7 @@ from scipy.linalg import solve_triangular
 
 from bayesperiodic import fourier
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.inference.blocks import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
+from bayesperiodic.inference.noise.blocks import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
 from bayesperiodic.models.model import Model
 
 

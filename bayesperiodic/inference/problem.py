@@ -8,13 +8,13 @@ import numpy as np
 
 from bayesperiodic import checks
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.inference.joint_prior import JointPrior
-from bayesperiodic.inference.likelihood import Likelihood
 from bayesperiodic.inference.linearisation import Linearisation
-from bayesperiodic.inference.noise import Noise, as_noise
+from bayesperiodic.inference.noise.likelihood import Likelihood
+from bayesperiodic.inference.noise.models import Noise, as_noise
 from bayesperiodic.inference.observation import Observation, Response
 from bayesperiodic.inference.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
-from bayesperiodic.inference.priors import Uniform
+from bayesperiodic.inference.priors.joint import JointPrior
+from bayesperiodic.inference.priors.univariate import Uniform
 from bayesperiodic.inference.responses import Responses
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.compiled import CONVERGED

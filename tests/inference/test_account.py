@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.inference.coordinates import SamplingDensity
+from bayesperiodic.inference.sampling.coordinates import SamplingDensity
 from tests.inference.observed import DUFFING, DUFFING_PRIORS, duffing_run
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 

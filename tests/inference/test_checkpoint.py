@@ -13,7 +13,7 @@ import pytest
 from filelock import FileLock
 
 import bayesperiodic as bp
-from bayesperiodic.inference import checkpoint, sampling
+from bayesperiodic.inference.sampling import checkpoint, sampling
 from tests.known import LINEAR, linear_experiment
 
 TRUTH = np.array([900.0, 40.0, 25.0])

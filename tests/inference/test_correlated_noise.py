@@ -14,8 +14,8 @@ from scipy import signal, stats
 
 import bayesperiodic as bp
 from bayesperiodic import noise
-from bayesperiodic.inference.residual_split import NoiseSplit
-from bayesperiodic.inference.whiteness import whiteness
+from bayesperiodic.inference.estimation.residual_split import NoiseSplit
+from bayesperiodic.inference.estimation.whiteness import whiteness
 from tests.known import LINEAR, grid, linear_regressors
 
 RECORDINGS, HARMONICS = 500, 20

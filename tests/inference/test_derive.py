@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.inference import chains
+from bayesperiodic.inference.sampling import chains
 from tests.known import LINEAR, linear_experiment
 
 TRUTH = np.array([900.0, 40.0, 25.0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.inference.whiteness import whiteness
+from bayesperiodic.inference.estimation.whiteness import whiteness
 from tests.known import LINEAR, RUNAWAY, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])

@@ -8,10 +8,10 @@ from scipy import integrate, linalg, optimize, stats
 
 import bayesperiodic as bp
 from bayesperiodic import noise
-from bayesperiodic.inference.blocks import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
-from bayesperiodic.inference.gauss_newton import Iterate, Objective, climb
-from bayesperiodic.inference.likelihood import Likelihood
-from bayesperiodic.inference.noise_estimate import estimate_noise
+from bayesperiodic.inference.estimation.gauss_newton import Iterate, Objective, climb
+from bayesperiodic.inference.noise.blocks import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
+from bayesperiodic.inference.noise.estimate import estimate_noise
+from bayesperiodic.inference.noise.likelihood import Likelihood
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])

@@ -276,6 +276,14 @@ def test_what_does_not_fit_is_refused_by_name(changes, message):
         bp.Problem(LINEAR, linear_runs(10.0, 25.0), **({"priors": PRIORS} | changes))
 
 
+def test_grids_that_one_correlation_cannot_span_are_refused():
+    runs = [linear_experiment(TRUTH, 3.0, seed=1), linear_experiment(TRUTH, 3.0, seed=2, samples=60, name="fine")]
+    with pytest.raises(ValueError, match="noise: 'circulant' is not allowed; experiments have 40 and 60 points"):
+        bp.Problem(LINEAR, runs, priors=PRIORS, noise="circulant")
+    bp.Problem(LINEAR, runs, priors=PRIORS, noise=bp.noise.Circulant(per="experiment"))
+    bp.Problem(LINEAR, runs, priors=PRIORS)
+
+
 def test_data_that_cannot_tell_are_refused():
     run = linear_experiment(TRUTH, 3.0, seed=5)
     with pytest.raises(ValueError, match=r"outputs of experiment 'run': 'force' is constant \(1\)"):

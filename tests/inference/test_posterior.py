@@ -8,9 +8,9 @@ from scipy import integrate, stats
 from scipy.special import digamma, polygamma
 
 import bayesperiodic as bp
-from bayesperiodic.inference import chains
-from bayesperiodic.inference.coordinates import SamplingDensity
-from bayesperiodic.inference.draws import gather
+from bayesperiodic.inference.sampling import chains
+from bayesperiodic.inference.sampling.coordinates import SamplingDensity
+from bayesperiodic.inference.sampling.draws import gather
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 
 FIRST, SECOND = "run 7", "run 8, 14.5 Hz"

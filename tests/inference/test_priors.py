@@ -7,8 +7,8 @@ import pytest
 from scipy import integrate, stats
 
 import bayesperiodic as bp
-from bayesperiodic.inference.joint_prior import JointPrior, as_prior
-from bayesperiodic.inference.scipy_priors import FromScipy
+from bayesperiodic.inference.priors.from_scipy import FromScipy
+from bayesperiodic.inference.priors.joint import JointPrior, as_prior
 
 INFINITY = math.inf
 CASES = {

@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
-from bayesperiodic.inference.checkpoint import fingerprint
-from bayesperiodic.inference.coordinates import SamplingDensity
+from bayesperiodic.inference.sampling.checkpoint import fingerprint
+from bayesperiodic.inference.sampling.coordinates import SamplingDensity
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])

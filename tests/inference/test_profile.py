@@ -6,7 +6,7 @@ from scipy.optimize import lsq_linear
 from scipy.special import ndtri
 
 import bayesperiodic as bp
-from bayesperiodic.inference.ridge import Ridge
+from bayesperiodic.inference.estimation.ridge import Ridge
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])

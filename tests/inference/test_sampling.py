@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.inference import chains, sampling, stopping
+from bayesperiodic.inference.sampling import chains, sampling, stopping
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])

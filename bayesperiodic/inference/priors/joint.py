@@ -10,9 +10,9 @@ from scipy import stats
 from scipy.stats.distributions import rv_frozen
 
 from bayesperiodic import checks
-from bayesperiodic.inference.multivariate import MultivariateNormal
-from bayesperiodic.inference.priors import Prior
-from bayesperiodic.inference.scipy_priors import FromScipy, as_written
+from bayesperiodic.inference.priors.from_scipy import FromScipy, as_written
+from bayesperiodic.inference.priors.multivariate import MultivariateNormal
+from bayesperiodic.inference.priors.univariate import Prior
 
 ALLOWED = "a prior such as Normal(mean, sd), or a frozen continuous distribution of scipy.stats"
 
@@ -143,7 +143,7 @@ def as_prior(argument: str, value: Any) -> Prior:
     Examples
     --------
     >>> from scipy import stats
-    >>> from bayesperiodic.inference.joint_prior import as_prior
+    >>> from bayesperiodic.inference.priors.joint import as_prior
     >>> as_prior("priors['k']", stats.norm(1.0, 2.0)).support
     (-inf, inf)
     """

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from bayesperiodic import checks
-from bayesperiodic.inference.blocks import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
-from bayesperiodic.inference.noise import VARIANCE, Noise
+from bayesperiodic.inference.noise.blocks import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
+from bayesperiodic.inference.noise.models import VARIANCE, Noise
 
 
 class Likelihood:

@@ -30,7 +30,7 @@ def undetermined(
     Examples
     --------
     >>> import numpy as np
-    >>> from bayesperiodic.inference.undetermined import undetermined
+    >>> from bayesperiodic.inference.estimation.undetermined import undetermined
     >>> row = np.array([2.0, 1.0]) / [3.0, 5.0]
     >>> undetermined(np.outer(row, row), np.array([3.0, 5.0]), ["a", "b"], np.array([True, True]))
     ('a → a·t, b → b·t^-2',)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from bayesperiodic.inference.gauss_newton import Iterate, Objective, climb
+from bayesperiodic.inference.estimation.gauss_newton import Iterate, Objective, climb
 from bayesperiodic.inference.linearisation import Linearisation
 from bayesperiodic.inference.problem import Problem
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from bayesperiodic import fourier
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.inference.gauss_newton import Iterate
+from bayesperiodic.inference.estimation.gauss_newton import Iterate
 from bayesperiodic.inference.observation import Response
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.inference.responses import leading_multipliers

@@ -10,8 +10,9 @@ import xarray as xr
 
 from bayesperiodic import checks
 from bayesperiodic.expressions import parse_all
-from bayesperiodic.inference import chains, labels
-from bayesperiodic.inference.multivariate import MultivariateNormal
+from bayesperiodic.inference import labels
+from bayesperiodic.inference.priors.multivariate import MultivariateNormal
+from bayesperiodic.inference.sampling import chains
 from bayesperiodic.store import Result
 
 SAMPLED_ONLY = "Only sampled parameters are kept with the draws; write the value of a fixed one as a number."

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from bayesperiodic.inference.priors import Univariate
+from bayesperiodic.inference.priors.univariate import Univariate
 
 
 class FromScipy(Univariate):
@@ -28,7 +28,7 @@ class FromScipy(Univariate):
     Examples
     --------
     >>> from scipy import stats
-    >>> from bayesperiodic.inference.scipy_priors import FromScipy
+    >>> from bayesperiodic.inference.priors.from_scipy import FromScipy
     >>> prior = FromScipy(stats.gamma(2.0, scale=3.0))
     >>> prior
     scipy.stats.gamma(2.0, scale=3.0)

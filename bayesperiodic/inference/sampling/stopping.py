@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bayesperiodic.inference import chains
+from bayesperiodic.inference.sampling import chains
 
 LENGTHS = 50.0
 TAU_CHANGE = 0.05

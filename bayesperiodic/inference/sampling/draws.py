@@ -7,14 +7,14 @@ import numpy as np
 import xarray as xr
 
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.inference import chains
-from bayesperiodic.inference.blocks import SCALE
-from bayesperiodic.inference.checkpoint import fingerprint
-from bayesperiodic.inference.coordinates import SamplingDensity
 from bayesperiodic.inference.labels import CHAIN, CHANNEL, DRAW, EXPERIMENT, NOISE, full_name, local_names, pack
+from bayesperiodic.inference.noise.blocks import SCALE
 from bayesperiodic.inference.parameters import SHIFT
-from bayesperiodic.inference.posterior import Posterior
 from bayesperiodic.inference.problem import Problem
+from bayesperiodic.inference.sampling import chains
+from bayesperiodic.inference.sampling.checkpoint import fingerprint
+from bayesperiodic.inference.sampling.coordinates import SamplingDensity
+from bayesperiodic.inference.sampling.posterior import Posterior
 
 ENSEMBLE = "ensemble"
 

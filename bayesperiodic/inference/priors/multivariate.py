@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from bayesperiodic import checks
-from bayesperiodic.inference.priors import LOG_ROOT_TWO_PI, Normal
+from bayesperiodic.inference.priors.univariate import LOG_ROOT_TWO_PI, Normal
 
 
 @dataclass(frozen=True, repr=False, eq=False)

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from bayesperiodic.inference.coordinates import SamplingDensity
-from bayesperiodic.inference.estimate import MapEstimate
-from bayesperiodic.inference.noise_estimate import estimate_noise
+from bayesperiodic.inference.estimation.estimate import MapEstimate
+from bayesperiodic.inference.noise.estimate import estimate_noise
+from bayesperiodic.inference.sampling.coordinates import SamplingDensity
 from bayesperiodic.periodic.compiled import CONVERGED
 
 LAPLACE, PRIOR, OVERDISPERSED = "laplace", "prior", "overdispersed"

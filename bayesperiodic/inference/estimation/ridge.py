@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesperiodic.inference.gauss_newton import PRESSED, Iterate, Objective, climb
-from bayesperiodic.inference.priors import Prior
+from bayesperiodic.inference.estimation.gauss_newton import PRESSED, Iterate, Objective, climb
+from bayesperiodic.inference.priors.univariate import Prior
 
 # How far apart points lie, as changes of the root of the drop; how steps grow, are cut, and when they are short.
 SPACING, GROWTH, SHORTENED, SMALLEST = 0.5, 3.0, 0.25, 0.01

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesperiodic.inference.blocks import POINTS, SPECTRAL
-from bayesperiodic.inference.gauss_newton import Iterate
+from bayesperiodic.inference.estimation.gauss_newton import Iterate
+from bayesperiodic.inference.estimation.whiteness import Whiteness, of_components
+from bayesperiodic.inference.noise.blocks import POINTS, SPECTRAL
 from bayesperiodic.inference.problem import Problem
-from bayesperiodic.inference.whiteness import Whiteness, of_components
 
 
 @dataclass(frozen=True)

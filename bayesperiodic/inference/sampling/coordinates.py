@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln
 
-from bayesperiodic.inference.estimate import MapEstimate
-from bayesperiodic.inference.joint_laplace import logarithmic
-from bayesperiodic.inference.noise import FLAT, JEFFREYS, Independent
+from bayesperiodic.inference.estimation.estimate import MapEstimate
+from bayesperiodic.inference.estimation.joint_laplace import logarithmic
+from bayesperiodic.inference.noise.models import FLAT, JEFFREYS, Independent
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 

@@ -13,9 +13,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesperiodic import checks
-from bayesperiodic.inference.blocks import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
-from bayesperiodic.inference.joint_prior import as_prior
-from bayesperiodic.inference.priors import LogNormal, Prior
+from bayesperiodic.inference.noise.blocks import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
+from bayesperiodic.inference.priors.joint import as_prior
+from bayesperiodic.inference.priors.univariate import LogNormal, Prior
 
 CHANNEL, EXPERIMENT = "channel", "experiment"
 JEFFREYS, FLAT = "jeffreys", "flat"
@@ -75,12 +75,19 @@ class Noise(ABC):
         return {JEFFREYS: "Jeffreys prior 1/v", FLAT: "flat prior"}.get(self.prior, f"prior {self.prior!r}")
 
     def check(self, blocks: Sequence[Block]) -> None:
-        """Raise a ValueError for channels whose scatter is needed and not known."""
-        for block in blocks:
-            if self.needs_scatter and block.kind in (SPECTRAL, POINTS) and not block.measured > 0.0:
+        """Raise a ValueError for channels whose scatter is needed and not known, or grids that cannot be mixed."""
+        points: dict[str, int] = {}
+        for block in (b for b in blocks if b.kind in (SPECTRAL, POINTS)):
+            if self.needs_scatter and not block.measured > 0.0:
                 raise ValueError(
                     f"noise: {self.name!r} is not allowed; experiment {block.experiment!r} has no scatter of "
                     f"{block.channel!r}. Give scatter and cycles, or take 'independent'."
+                )
+            if not self.flat and points.setdefault(self.label(block), block.points) != block.points:
+                raise ValueError(
+                    f"noise: {self.name!r} is not allowed; experiments have {points[self.label(block)]} and "
+                    f"{block.points} points in the response period, and share the correlation of {block.channel!r}. "
+                    "Give all the same samples and periods, or take per='experiment'."
                 )
 
     def label(self, block: Block) -> str:

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesperiodic.inference.blocks import SPECTRAL, Block
-from bayesperiodic.inference.gauss_newton import Iterate
-from bayesperiodic.inference.noise import LENGTHSCALE
+from bayesperiodic.inference.estimation.gauss_newton import Iterate
+from bayesperiodic.inference.noise.blocks import SPECTRAL, Block
+from bayesperiodic.inference.noise.models import LENGTHSCALE
 from bayesperiodic.inference.problem import Problem
 
 # Correlation lengths tried, in response periods; white noise beside them has this prior probability.

@@ -8,9 +8,9 @@ import pandas as pd
 from tqdm import tqdm
 
 from bayesperiodic import checks
-from bayesperiodic.inference.doubling import doubling_shift
-from bayesperiodic.inference.estimate import MapEstimate
-from bayesperiodic.inference.gauss_newton import (
+from bayesperiodic.inference.estimation.doubling import doubling_shift
+from bayesperiodic.inference.estimation.estimate import MapEstimate
+from bayesperiodic.inference.estimation.gauss_newton import (
     SINGULAR,
     Iterate,
     Objective,
@@ -19,13 +19,13 @@ from bayesperiodic.inference.gauss_newton import (
     climb,
     information,
 )
-from bayesperiodic.inference.input_noise import input_noise
-from bayesperiodic.inference.joint_laplace import joint_laplace, logarithmic
-from bayesperiodic.inference.noise_uncertainty import with_uncertain_noise
+from bayesperiodic.inference.estimation.input_noise import input_noise
+from bayesperiodic.inference.estimation.joint_laplace import joint_laplace, logarithmic
+from bayesperiodic.inference.estimation.noise_uncertainty import with_uncertain_noise
+from bayesperiodic.inference.estimation.residual_split import channel_whiteness, noise_split
+from bayesperiodic.inference.estimation.robust import robust_covariance
+from bayesperiodic.inference.estimation.undetermined import undetermined
 from bayesperiodic.inference.problem import Problem
-from bayesperiodic.inference.residual_split import channel_whiteness, noise_split
-from bayesperiodic.inference.robust import robust_covariance
-from bayesperiodic.inference.undetermined import undetermined
 
 NOISE_SHARE = 0.1
 LARGEST_SHIFT = 0.1

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from bayesperiodic.inference.blocks import SPECTRAL
-from bayesperiodic.inference.gauss_newton import Iterate
+from bayesperiodic.inference.estimation.gauss_newton import Iterate
+from bayesperiodic.inference.noise.blocks import SPECTRAL
 from bayesperiodic.inference.problem import Problem
 
 # Quantiles of the priors of a spectrum's shape that are tried: many of the first parameter, few of any other.

@@ -11,12 +11,12 @@ from scipy.optimize import brentq
 from scipy.special import ndtri
 
 from bayesperiodic import checks
-from bayesperiodic.inference.estimate import MapEstimate
-from bayesperiodic.inference.gauss_newton import Iterate, Objective, bias_correction
+from bayesperiodic.inference.estimation.estimate import MapEstimate
+from bayesperiodic.inference.estimation.gauss_newton import Iterate, Objective, bias_correction
+from bayesperiodic.inference.estimation.ridge import Point, Ridge
 from bayesperiodic.inference.linearisation import Linearisation
 from bayesperiodic.inference.parameters import SHIFT
 from bayesperiodic.inference.problem import Problem
-from bayesperiodic.inference.ridge import Point, Ridge
 from bayesperiodic.store import Result
 
 WIDEST = 0.99

@@ -13,15 +13,15 @@ import numpy as np
 from tqdm import tqdm
 
 from bayesperiodic import checks
-from bayesperiodic.inference import chains
-from bayesperiodic.inference.checkpoint import Checkpoint, Saved
-from bayesperiodic.inference.coordinates import COLLAPSED, NATURAL, RIDGE, SAMPLED, RidgeMap, SamplingDensity
-from bayesperiodic.inference.draws import gather
-from bayesperiodic.inference.estimate import MapEstimate
-from bayesperiodic.inference.posterior import Posterior
+from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.problem import Problem
-from bayesperiodic.inference.starts import LAPLACE, PRIOR, STARTS, start_points
-from bayesperiodic.inference.stopping import shortfall
+from bayesperiodic.inference.sampling import chains
+from bayesperiodic.inference.sampling.checkpoint import Checkpoint, Saved
+from bayesperiodic.inference.sampling.coordinates import COLLAPSED, NATURAL, RIDGE, SAMPLED, RidgeMap, SamplingDensity
+from bayesperiodic.inference.sampling.draws import gather
+from bayesperiodic.inference.sampling.posterior import Posterior
+from bayesperiodic.inference.sampling.starts import LAPLACE, PRIOR, STARTS, start_points
+from bayesperiodic.inference.sampling.stopping import shortfall
 from bayesperiodic.parallel import available_cores
 
 BLOCK, PIECE = 250, 25

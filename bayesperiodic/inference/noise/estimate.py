@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import minimize
 
-from bayesperiodic.inference.blocks import CORRELATED, SCALE
-from bayesperiodic.inference.likelihood import Likelihood
-from bayesperiodic.inference.noise import FLAT, JEFFREYS, VARIANCE, Independent
+from bayesperiodic.inference.noise.blocks import CORRELATED, SCALE
+from bayesperiodic.inference.noise.likelihood import Likelihood
+from bayesperiodic.inference.noise.models import FLAT, JEFFREYS, VARIANCE, Independent
 
 LOWEST, HIGHEST = 25.0, 8.0
 TINY = np.finfo(float).tiny

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesperiodic.inference.linearisation import Linearisation
-from bayesperiodic.inference.noise_estimate import estimate_noise
+from bayesperiodic.inference.noise.estimate import estimate_noise
 from bayesperiodic.inference.problem import Problem
 
 MAX_ITERATIONS = 100

@@ -11,9 +11,9 @@ from scipy.special import stdtrit
 from bayesperiodic import checks
 from bayesperiodic.expressions import Expression, parse_all
 from bayesperiodic.inference import labels
-from bayesperiodic.inference.multivariate import MultivariateNormal
-from bayesperiodic.inference.residual_split import NoiseSplit
-from bayesperiodic.inference.whiteness import Whiteness
+from bayesperiodic.inference.estimation.residual_split import NoiseSplit
+from bayesperiodic.inference.estimation.whiteness import Whiteness
+from bayesperiodic.inference.priors.multivariate import MultivariateNormal
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.store import Result
 

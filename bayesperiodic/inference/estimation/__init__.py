@@ -1,0 +1,1 @@
+"""The estimate, and everything that a fit tells of itself."""

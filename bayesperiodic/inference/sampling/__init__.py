@@ -1,0 +1,1 @@
+"""Draws from the posterior, and how far to trust them."""
