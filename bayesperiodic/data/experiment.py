@@ -33,7 +33,8 @@ class Experiment(Result):
     cycles : int
         Cycles behind the mean.
     independent : mapping of str to int, optional
-        Number of independent values behind the samples, by output; by default every sample is one.
+        Number of independent values behind the samples, by output; by default every measured sample is one, but no
+        more than 2·harmonics + 1 are.
     harmonics : mapping of str to int, optional
         Highest harmonic of the response period that each channel keeps; the model's outputs are projected onto the
         same harmonics before they are compared. By default nothing was removed.

@@ -345,8 +345,11 @@ def test_gradients_are_those_of_high_order_differences(model, share):
         assert by_noise[i] == pytest.approx(expected, rel=1e-8, abs=1e-8)
     for b, r in enumerate(residuals):
         for unit, found in zip(np.eye(r.size), by_residual[b], strict=True):
-            moved = lambda t, b=b, unit=unit: [*residuals[:b], residuals[b] + t * unit, *residuals[b + 1 :]]  # noqa: E731
-            expected = slope(lambda t, moved=moved: total(moved(t), values))
+
+            def moved(t, b=b, unit=unit):
+                return total([*residuals[:b], residuals[b] + t * unit, *residuals[b + 1 :]], values)
+
+            expected = slope(moved)
             assert found == pytest.approx(expected, rel=1e-8, abs=1e-8)
 
 

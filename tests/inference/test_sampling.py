@@ -37,19 +37,48 @@ def test_emcee_matches_the_closed_form_within_monte_carlo_error(known_variance, 
     assert np.cov(draws.T) / np.outer(sd, sd) == pytest.approx(covariance / np.outer(sd, sd), abs=np.sqrt(2) * error)
 
 
-def test_unknown_variance_follows_its_closed_form():
-    """Flat priors on θ, Jeffreys' prior on v, n − l degrees of freedom: M/v is χ² and θ is Student's t."""
+@pytest.mark.parametrize(
+    ("variances", "prior", "lost"), [("sampled", "jeffreys", 0), ("collapsed", "jeffreys", 0), ("collapsed", "flat", 2)]
+)
+def test_unknown_variance_follows_its_closed_form(variances, prior, lost):
+    """Flat priors on θ and 1/v (or flat) on v: M/v is χ² with n − l (− 2) degrees of freedom and θ is Student's t."""
     flat = {"k": bp.Normal(900.0, 1e6), "coulomb": bp.Normal(25.0, 1e6)}
-    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=2)], priors=flat, fixed={"c": 40.0})
+    noise = bp.noise.Independent(prior=prior)
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=2)], priors=flat, fixed={"c": 40.0}, noise=noise)
     fit = bp.map_estimate(problem)
-    posterior = bp.sample(problem, fit, seed=2, **QUIET)
-    moment, degrees = fit.rms["force"] ** 2 * 40, 38
+    posterior = bp.sample(problem, fit, seed=2, variances=variances, **QUIET)
+    moment, degrees = fit.rms["force"] ** 2 * 40, 38 - lost
+    assert list(posterior.ess) == ["k", "coulomb", "variance[force]"]
     error = 4 / np.sqrt(min(posterior.ess.values()))
     variance = posterior.draws("variance[force]")
     expected = moment / (degrees - 2)
     assert variance.mean() == pytest.approx(expected, rel=error * np.sqrt(2 / (degrees - 4)))
-    student = fit.sd["coulomb"] * np.sqrt(degrees / (degrees - 2))
+    assert variance.var() == pytest.approx(2 * expected**2 / (degrees - 4), rel=2.5 * error)
+    student = np.sqrt(moment * np.linalg.inv(regressors().T @ regressors())[1, 1] / (degrees - 2))
     assert posterior.draws("coulomb").std() == pytest.approx(student, rel=error)
+    values = [
+        float(problem.log_posterior(posterior_point(posterior, problem, i), {"force": variance[i]})) for i in (0, 7)
+    ]
+    lp = posterior.data["sample_stats"]["lp"].transpose("chain", "draw").to_numpy().ravel()[[0, 7]]
+    assert values[0] - values[1] == pytest.approx(lp[0] - lp[1], abs=1e-8)
+
+
+def regressors() -> np.ndarray:
+    return linear_regressors(0.05, 2.0, grid(40))[:, [0, 2]]
+
+
+def posterior_point(posterior: bp.Posterior, problem: bp.Problem, index: int) -> np.ndarray:
+    return np.array([posterior.draws(name)[index] for name in problem.names])
+
+
+@pytest.mark.parametrize("start", ["prior", "overdispersed"])
+def test_other_starts_lead_to_the_same_posterior(known_variance, posterior, start):
+    """Means within 4 Monte Carlo errors of both runs."""
+    other = bp.sample(*known_variance, seed=3, start=start, **QUIET)
+    assert other.converged
+    for name in ("k", "c", "coulomb"):
+        error = 4 * np.sqrt(1 / posterior.ess[name] + 1 / other.ess[name])
+        assert abs(other.draws(name).mean() - posterior.draws(name).mean()) < error * posterior.draws(name).std()
 
 
 def test_positive_parameter_sampled_in_its_logarithm_keeps_its_natural_density():
@@ -142,6 +171,9 @@ def test_summary_names_its_interval(posterior):
         ({"ensembles": 1}, "ensembles: 1 is not allowed"),
         ({"max_steps": 10}, "max_steps: 10 is not allowed"),
         ({"seed": -1}, "seed: -1 is not allowed"),
+        ({"start": "laplac"}, "start: 'laplac' is not known; allowed: 'laplace', 'prior', 'overdispersed'"),
+        ({"coordinates": "log"}, "coordinates: 'log' is not known; allowed: 'ridge', 'natural'"),
+        ({"variances": "collapsed"}, "variances: 'collapsed' is not allowed; there is no unknown variance"),
     ],
 )
 def test_bad_arguments_are_named(known_variance, arguments, message):

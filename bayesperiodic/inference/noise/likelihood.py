@@ -150,7 +150,7 @@ class Likelihood:
         self, block: Block, r: np.ndarray, values: np.ndarray, share: float
     ) -> tuple[float, np.ndarray, np.ndarray]:
         """Return the log-likelihood of one residual with a dense covariance, and its gradients by r and ln φ."""
-        covariance, slopes = self.model.covariance(block, values)  # type: ignore[misc]
+        covariance, slopes = self.model.covariance(block, values)
         try:
             factor = np.linalg.cholesky(covariance)
         except np.linalg.LinAlgError:
@@ -190,7 +190,7 @@ class Likelihood:
                 result.append(r)
                 continue
             if self._is_dense(block):
-                covariance, _ = self.model.covariance(block, values[columns])  # type: ignore[misc]
+                covariance, _ = self.model.covariance(block, values[columns])
                 white = solve_triangular(np.linalg.cholesky(covariance), r.reshape(-1, block.size).T, lower=True)
                 result.append(np.sqrt(block.weight) * white.T.reshape(r.shape))
             else:

@@ -106,9 +106,10 @@ class Noise(ABC):
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return V (…, size) and ∂ ln V/∂ ln φ (…, size, parameters) of a spectral block at values (…, parameters)."""
 
-    def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the covariance of a block of points (size, size) and its derivatives by ln φ; None if it is `flat`."""
-        return None
+    def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the covariance of a block of points (size, size), and its derivatives by ln φ (parameters, …)."""
+        variances, slopes = self.spectrum(block, values)
+        return np.diag(variances), np.stack([np.diag(variances * slope) for slope in slopes.T])
 
     def log_prior(self, kind: str, value: np.ndarray, measured: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the log-density over ln φ of a noise parameter (…,), and its derivative by ln φ."""
@@ -236,7 +237,7 @@ class Circulant(Noise):
         """Return V = v·S_h, S with mean 1 over the components."""
         return self._spectrum(block.harmonic, values)
 
-    def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return v·Σ_h S_h cos(2πh(t_i − t_j))/n at the points of a mask."""
         harmonic = np.minimum(np.arange(block.points), block.points - np.arange(block.points))
         variances, slopes = self._spectrum(harmonic, values)
