@@ -139,34 +139,27 @@ class Observation:
         return self._components(moved, known, [directions.frequency] if self._free_phase else [])
 
     def pulled(self, response: Response, weights: list[np.ndarray]) -> Response:
-        """Return the derivatives of Σ weights · predicted components by everything in the response."""
-        e, total = self.experiment, np.zeros_like(self._data)
-        joint = np.zeros(0)
+        """Return the derivatives of Σ weights · predicted components by everything in a forced model's response."""
+        e, total, joint = self.experiment, np.zeros_like(self._data), np.zeros(0)
         if e.multipliers is not None:
-            joint = weights[-2 if self._free_phase else -1] @ self._joint[2]
+            joint = weights[-1] @ self._joint[2]
         if e.covariance is not None:
             whitening, slopes, _ = self._joint
-            by_value = weights[0] @ whitening - slopes.T @ joint
             at = slice(None) if e.mask is None else e.mask
-            total[at] = by_value.reshape(-1, len(self.channels))
+            total[at] = (weights[0] @ whitening - slopes.T @ joint).reshape(-1, len(self.channels))
         else:
             for c, channel in enumerate(self.channels):
                 if e.mask is not None:
                     total[e.mask, c] = weights[c]
                 else:
                     total[:, c] = self._spread(weights[c], self._harmonic(channel))
-        by_frequency = weights[-1][0] / e.frequency_se if self._free_phase else 0.0
         by_delay = 0.0
         if self._shifted:
-            by_fraction = -float(np.sum(total * self._rate(response)))
+            by_delay = -float(np.sum(total * self._rate(response))) * float(response.frequency) / e.periods
             total = self._shift(total, -self._fraction(response))
-            by_delay = by_fraction * float(response.frequency) / e.periods
-            by_frequency += by_fraction * float(response.delay) / e.periods
-            if self._free_phase:
-                total[:, 0] += by_fraction * self._phase_gradient(response)
         outputs = np.zeros_like(response.outputs)
         outputs[:, self._columns] = total
-        return Response(outputs, np.array(by_frequency), joint, np.array(by_delay))
+        return Response(outputs, np.zeros(()), joint, np.array(by_delay))
 
     def predicted(self, response: Response) -> dict[str, np.ndarray]:
         """Return ŷ (…, points) of each measured channel, turned and delayed."""

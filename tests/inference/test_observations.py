@@ -61,7 +61,7 @@ def test_a_local_parameter_may_have_its_own_prior_or_a_value_in_single_runs():
     problem = bp.Problem(
         LINEAR,
         runs,
-        priors=PRIORS | {"coulomb[run 2]": bp.Uniform(0.0, 50.0)},
+        priors={"coulomb[run 2]": bp.Uniform(0.0, 50.0)} | PRIORS,
         fixed=KNOWN | {"coulomb": {"run 3": 40.0}},
         local=["coulomb"],
     )

@@ -12,7 +12,7 @@ from bayesperiodic.inference.problem import Problem
 MAX_ITERATIONS = 100
 MAX_HALVINGS = 30
 SCALED_STEP = 1e-8
-SMALL_STEP = 1e-4
+SMALL_STEP, SMALL_GAIN = 1e-4, 1e-12
 SINGULAR = 1e-13
 MAX_ROUNDS, PRESSED = 10, 1e-3
 
@@ -175,10 +175,12 @@ def _ascend(
                 return now, "converged", history
         if trial is None:
             return now, "stalled", history
-        now = objective.anchored(trial)
+        gain, now = trial.objective - now.objective, objective.anchored(trial)
         history.append(now.objective)
         if report is not None:
             report(now, damping * size)
+        if size < SMALL_STEP and gain < SMALL_GAIN:
+            return now, "converged", history
     return now, "iterations", history
 
 

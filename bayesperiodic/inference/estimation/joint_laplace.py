@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from bayesperiodic.inference.estimation.gauss_newton import Iterate, Objective, climb
+from bayesperiodic.inference.estimation.gauss_newton import SINGULAR, Iterate, Objective, climb
 from bayesperiodic.inference.linearisation import Linearisation
 from bayesperiodic.inference.problem import Problem
 
@@ -51,12 +51,13 @@ def joint_laplace(problem: Problem, start: Iterate) -> JointLaplace:
     free = [problem.noise_names.index(name) for name in problem.free_noise]
     values = [*mode.theta.tolist(), *mode.noise[free].tolist()]
     hessian = _hessian(problem, objective, mode, free)
-    try:
-        np.linalg.cholesky(hessian)
-    except np.linalg.LinAlgError:
+    if not np.isfinite(hessian).all() or not np.all(np.diag(hessian) > 0.0):
         return JointLaplace(dict(zip(labels, values, strict=True)), nothing)
     scale = 1.0 / np.sqrt(np.diag(hessian))
-    covariance = np.linalg.inv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
+    curvatures, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+    if curvatures.min() < SINGULAR * curvatures.max():
+        return JointLaplace(dict(zip(labels, values, strict=True)), nothing)
+    covariance = (vectors / curvatures) @ vectors.T * np.outer(scale, scale)
     return JointLaplace(dict(zip(labels, values, strict=True)), pd.DataFrame(covariance, index=labels, columns=labels))
 
 

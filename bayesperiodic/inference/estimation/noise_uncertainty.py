@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from bayesperiodic.inference.estimation.gauss_newton import Iterate
+from bayesperiodic.inference.estimation.gauss_newton import Iterate, information
 from bayesperiodic.inference.noise.blocks import SPECTRAL
 from bayesperiodic.inference.problem import Problem
 
 # Quantiles of the priors of a spectrum's shape that are tried: many of the first parameter, few of any other.
 MANY, FEW = 60, 9
 TAIL = 0.005
-ROUNDS = 3
+ROUNDS, RIDGE = 3, 1e-12
 
 
 def with_uncertain_noise(problem: Problem, estimate: Iterate, covariance: np.ndarray) -> np.ndarray:
@@ -33,24 +33,32 @@ def with_uncertain_noise(problem: Problem, estimate: Iterate, covariance: np.nda
     .. [1] D. A. Harville, Maximum likelihood approaches to variance component estimation and to related problems,
        Journal of the American Statistical Association 72 (1977) 320-338.
     """
+    shaped = [(group, members) for group, members in problem.likelihood.groups() if _is_shaped(problem, group, members)]
+    if not shaped or not np.all(np.diag(covariance) > 0.0):
+        return covariance
+    total = information(problem, estimate)[0] + problem.joint_prior.curvature(estimate.theta)
     result = covariance.copy()
-    for group, members in problem.likelihood.groups():
-        shaped = [name for name in group if name.partition("[")[0] in problem.noise.shape_priors]
-        kinds = {problem.likelihood.blocks[b].kind for b in members}
-        if shaped and set(group) <= set(problem.free_noise) and kinds == {SPECTRAL}:
-            result += _mixture(problem, estimate, covariance, group, members) - covariance
-    values, vectors = np.linalg.eigh(_scaled(result, covariance))
+    for group, members in shaped:
+        result += _mixture(problem, estimate, total, covariance, group, members) - covariance
     scale = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(result / np.outer(scale, scale))
     return (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale)
 
 
-def _scaled(matrix: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    scale = 1.0 / np.sqrt(np.diag(covariance))
-    return matrix * np.outer(scale, scale)
+def _is_shaped(problem: Problem, group: tuple[str, ...], members: list[int]) -> bool:
+    """Return whether a group of noise parameters, all unknown, has a shape beside its variance, over whole periods."""
+    shaped = any(name.partition("[")[0] in problem.noise.shape_priors for name in group)
+    spectral = all(problem.likelihood.blocks[b].kind == SPECTRAL for b in members)
+    return shaped and spectral and set(group) <= set(problem.free_noise)
 
 
 def _mixture(
-    problem: Problem, estimate: Iterate, covariance: np.ndarray, group: tuple[str, ...], members: list[int]
+    problem: Problem,
+    estimate: Iterate,
+    hessian: np.ndarray,
+    covariance: np.ndarray,
+    group: tuple[str, ...],
+    members: list[int],
 ) -> np.ndarray:
     """Return the covariance of the mixture over the noise parameters of one group, the others held."""
     likelihood, blocks = problem.likelihood, [problem.likelihood.blocks[b] for b in members]
@@ -60,7 +68,7 @@ def _mixture(
     weight = np.concatenate([np.full(block.size, block.weight) for block in blocks])
     here = estimate.noise[[likelihood.names.index(name) for name in group]]
     now = weight / np.concatenate([problem.noise.spectrum(block, here)[0] for block in blocks])
-    others = np.linalg.inv(covariance) * np.outer(scale, scale) - (s * now) @ s.T
+    others = hessian * np.outer(scale, scale) - (s * now) @ s.T + RIDGE * np.eye(scale.size)
     pull, freedom = -(s * now) @ r, max(float(weight.sum()) - len(problem.names), 1.0)
     points, log_prior = _points(problem)
     log_posterior, found = np.empty(len(points)), np.empty((len(points), *covariance.shape))
