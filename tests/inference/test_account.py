@@ -58,11 +58,15 @@ def second_differences(density: SamplingDensity, mode: np.ndarray, steps: np.nda
 
 
 @pytest.mark.filterwarnings("ignore:Twice as many points")
-@pytest.mark.parametrize("noise", ["independent", "circulant"])
-def test_joint_laplace_is_that_of_the_sampled_density(noise):
+@pytest.mark.parametrize(
+    ("noise", "known"), [("independent", {}), ("circulant", {}), ("independent", {"variance[displacement]": 3.0})]
+)
+def test_joint_laplace_is_that_of_the_sampled_density(noise, known):
     """Its mode is where the density of the sampling coordinates is stationary, its covariance the inverse Hessian."""
     runs = [duffing_run(harmonics={"displacement": 9}), duffing_run("run 2", 0.13, 2, harmonics={"displacement": 9})]
-    problem = bp.Problem(bp.models.duffing, runs, priors=DUFFING_PRIORS, fixed={"m": 1.0}, local=["c"], noise=noise)
+    problem = bp.Problem(
+        bp.models.duffing, runs, priors=DUFFING_PRIORS, fixed={"m": 1.0} | known, local=["c"], noise=noise
+    )
     fit = bp.map_estimate(problem, progress=False)
     density = SamplingDensity(problem.anchored(fit.theta))
     mode, covariance = density.laplace(fit)
