@@ -164,8 +164,10 @@ def test_interrupted_runs_give_what_they_have_and_can_go_on(problem, uninterrupt
 def test_a_chain_may_be_continued_further(problem, uninterrupted, tmp_path):
     path = tmp_path / "run.h5"
     bp.sample(*problem, checkpoint=path, **(RUN | {"max_steps": 100}))
-    bp.sample(*problem, checkpoint=path, **RUN)
+    further = bp.sample(*problem, checkpoint=path, **RUN)
     assert same(content(path), uninterrupted[1])
+    again = bp.sample(*problem, checkpoint=path, **RUN)
+    assert again.reason == further.reason == uninterrupted[0].reason
 
 
 def test_a_file_that_is_damaged_locked_or_of_another_run_is_refused(problem, tmp_path):

@@ -178,7 +178,7 @@ class _Run:
         self.state = state or {
             "anchor": anchor.tolist(), "guesses": _as_lists(guesses),
             "origin": self.map.origin.tolist(), "axes": self.map.axes.tolist(),
-            "steps": 0, "passes": 0, "tau": [np.inf] * plain.dimension, "converged": False, "reason": "",
+            "steps": 0, "checked": 0, "passes": 0, "missing": [], "tau": [np.inf] * plain.dimension, "converged": False, "reason": "",
         }  # fmt: skip
         self.ensembles = [
             self._ensemble(density, fit, start, walkers, np.random.default_rng(sequences[i]), saved, i)
@@ -221,48 +221,50 @@ class _Run:
         return _Ensemble(density, sampler, self.map.inwards(start_points(density, fit, start, walkers, generator)))
 
     def go(self, max_steps: int, store: Checkpoint | None, progress: bool) -> None:
-        """Walk block by block until the stop rule is passed twice in succession, or `max_steps` are reached."""
-        state, missing = self.state, ["nothing was checked"]
+        """Walk block by block until the stop rule is passed twice in succession, `max_steps` are reached, or Ctrl-C."""
+        try:
+            self._walk(max_steps, store, progress)
+        except KeyboardInterrupt:
+            done = min(ensemble.sampler.iteration for ensemble in self.ensembles)
+            if done < FEWEST_STEPS:
+                raise
+            self.state |= {"steps": done, "converged": False, "reason": f"interrupted after {done} steps"}
+            self._save(store, now=True)
+
+    def _walk(self, max_steps: int, store: Checkpoint | None, progress: bool) -> None:
+        state = self.state
+        if state["converged"]:
+            return
         with tqdm(total=max_steps, unit="step", desc="sampling", disable=not progress) as bar:
-            for steps in range(state["steps"] + BLOCK, max_steps + 1, BLOCK):
-                if state["converged"]:
-                    return
-                if not self._advance(steps):
-                    done = min(e.sampler.iteration for e in self.ensembles)
-                    if done < FEWEST_STEPS:
-                        raise KeyboardInterrupt
-                    state["steps"], state["reason"] = done, f"interrupted after {done} steps"
-                    self._save(store, now=True)
-                    return
+            for steps in range(state["checked"] + BLOCK, max_steps + 1, BLOCK):
+                self._advance(steps)
                 kept = self._kept(steps)
                 tau = chains.autocorrelation_time(kept)
                 missing = shortfall(kept, tau, np.array(state["tau"]))
-                state["steps"], state["tau"] = steps, tau.tolist()
-                state["passes"] = 0 if missing else state["passes"] + 1
-                state["converged"] = state["passes"] >= PASSES
+                passes = 0 if missing else state["passes"] + 1
+                state |= {"steps": steps, "checked": steps, "tau": tau.tolist(), "passes": passes, "missing": missing}
                 bar.update(steps - bar.n)
                 bar.set_postfix_str(self._account(kept, tau))
-                if state["converged"]:
+                if passes >= PASSES:
                     shape = f"{len(self.ensembles)} × {self.ensembles[0].sampler.nwalkers} walkers"
-                    state["reason"] = f"stop rule passed after {steps} steps of {shape}"
-                self._save(store, now=state["converged"] or steps + BLOCK > max_steps)
-        if not state["converged"]:
-            left = ", ".join(missing) or "the stop rule passed only once"
-            state["reason"] = f"max_steps = {max_steps} reached with {left}"
+                    reason = f"stop rule passed after {steps} steps of {shape}"
+                    state |= {"converged": True, "reason": reason}
+                    self._save(store, now=True)
+                    return
+                self._save(store, now=steps + BLOCK > max_steps)
+        left = ", ".join(state["missing"]) or "the stop rule passed only once"
+        state |= {"steps": state["checked"], "reason": f"max_steps = {max_steps} reached with {left}"}
 
-    def _advance(self, steps: int) -> bool:
-        """Walk all ensembles to a number of steps; return False if Ctrl-C came."""
+    def _advance(self, steps: int) -> None:
+        """Walk all ensembles to a number of steps; Ctrl-C stops them after a few."""
         stop = threading.Event()
         with ThreadPoolExecutor(available_cores()) as pool:
             waiting = [pool.submit(ensemble.advance, steps, stop) for ensemble in self.ensembles]
             try:
                 for future in waiting:
                     future.result()
-            except KeyboardInterrupt:
-                return False
             finally:
                 stop.set()
-        return True
 
     def _account(self, kept: np.ndarray, tau: np.ndarray) -> str:
         text = f"acceptance {self._acceptance():.2f}, tau {tau.max():.0f}, length {kept.shape[1] / tau.max():.0f} tau"
