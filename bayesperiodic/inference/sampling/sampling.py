@@ -178,7 +178,8 @@ class _Run:
         self.state = state or {
             "anchor": anchor.tolist(), "guesses": _as_lists(guesses),
             "origin": self.map.origin.tolist(), "axes": self.map.axes.tolist(),
-            "steps": 0, "checked": 0, "passes": 0, "missing": [], "tau": [np.inf] * plain.dimension, "converged": False, "reason": "",
+            "steps": 0, "checked": 0, "passes": 0, "missing": [], "tau": [np.inf] * plain.dimension,
+            "converged": False, "reason": "",
         }  # fmt: skip
         self.ensembles = [
             self._ensemble(density, fit, start, walkers, np.random.default_rng(sequences[i]), saved, i)
