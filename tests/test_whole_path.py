@@ -16,6 +16,7 @@ PRIORS = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:Twice as many points")
 def test_parameters_of_a_noise_free_dahl_damper_are_recovered():
     """Discretisation, folding and the finite number of harmonics together stay below 0.1 % of the friction terms."""
     displacement = 0.0126 * np.cos(2 * np.pi * grid(64)) + 0.0004 * np.sin(6 * np.pi * grid(64))

@@ -160,6 +160,7 @@ def test_several_directions_are_told_apart():
     assert found == ("a → a·t, d → d·t^-1", "b → b·t, d → d·t^-1", "c → c·t, d → d·t^-1")
 
 
+@pytest.mark.filterwarnings("ignore:Twice as many points")
 def test_residuals_hold_the_harmonics_that_were_kept():
     run = duffing_run(harmonics={"displacement": 3})
     problem = bp.Problem(bp.models.duffing, [run], priors=DUFFING_PRIORS, fixed={"m": 1.0})
