@@ -31,7 +31,7 @@ class Linearisation:
 
     @cached_property
     def _solves(self) -> dict:
-        return self.responses.solve(self.theta[None])
+        return self.responses.solve(self.theta[None], keep=True)
 
     @property
     def statuses(self) -> dict[str, str]:

@@ -89,7 +89,7 @@ class Responses:
         """Return the same with its anchors at a θ (names,), solved from the present ones or else from the start."""
         other = Responses(self.model, self.experiments, self.maps, self.scheme)
         other.__dict__["equations"] = self.equations
-        found = self.solve(theta[None]) if self._anchors is not None else {}
+        found = self.solve(theta[None], keep=True) if self._anchors is not None else {}
         other._anchors = {}
         for name, equations in self.equations.items():
             parameters = self.parameters(theta[None], name)[0]
@@ -133,13 +133,17 @@ class Responses:
             for group in groups.values()
         ]
 
-    def solve(self, theta: np.ndarray, threads: int | None = None) -> dict[str, SolvedResponse]:
-        """Solve every experiment for θ (solves, names); the result does not depend on the number of threads."""
+    def solve(self, theta: np.ndarray, threads: int | None = None, *, keep: bool = False) -> dict[str, SolvedResponse]:
+        """Solve every experiment for θ (solves, names); the result does not depend on the number of threads.
+
+        The periodic parts z are there if they are asked for.
+        """
         result = {}
         for experiments, batch in self._batches:
             values = self.maps[experiments[0].name].values(theta)
             parameters = np.ascontiguousarray(values[:, :-1])
-            solved = batch.solve(parameters, threads)
+            wanted = keep or any(e.multipliers is not None for e in experiments)
+            solved = batch.solve(parameters, threads, keep=wanted)
             for i, e in enumerate(experiments):
                 status = solved.status[i].copy()
                 logarithms = self._log_multipliers(e, solved.z[i], solved.frequency[i], parameters, status)
@@ -169,7 +173,7 @@ class Responses:
     def solutions(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
         """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""
         solutions = {}
-        for name, solved in self.solve(theta[None]).items():
+        for name, solved in self.solve(theta[None], keep=True).items():
             equations = self.equations[name].at_frequency(float(solved.response.frequency[0]))
             parameters = self.parameters(theta[None], name)[0]
             code = int(solved.status[0])

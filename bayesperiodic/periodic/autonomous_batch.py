@@ -26,7 +26,7 @@ class AutonomousBatch:
     def __init__(self, sets: Sequence[PeriodicEquations], anchors: Sequence[Anchor]):
         self._sets, self._anchors = tuple(sets), tuple(anchors)
 
-    def solve(self, parameters: np.ndarray, threads: int | None = None) -> BatchSolution:
+    def solve(self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False) -> BatchSolution:
         """Follow every orbit to every parameter vector (solves, parameters); see `batch.Batch.solve`."""
         found = [[_follow(e, a, theta) for theta in parameters] for e, a in zip(self._sets, self._anchors, strict=True)]
         outputs = [
@@ -34,7 +34,7 @@ class AutonomousBatch:
             for e, row in zip(self._sets, found, strict=True)
         ]
         return BatchSolution(
-            np.array([[f.z for f in row] for row in found]),
+            np.array([[f.z if keep else f.z[:0] for f in row] for row in found]),
             np.array(outputs),
             np.array([[f.values[0] for f in row] for row in found]),
             np.array([[f.code for f in row] for row in found]),

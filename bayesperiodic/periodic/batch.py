@@ -23,7 +23,7 @@ class BatchSolution(NamedTuple):
     Attributes
     ----------
     z : array (sets, solves, points, states)
-        The periodic parts.
+        The periodic parts; without entries unless they were asked for.
     outputs : array (sets, solves, points, channels)
     frequency : array (sets, solves)
         [Hz].
@@ -122,7 +122,7 @@ class Batch:
         )
         self._inputs = np.stack([e.inputs for e in sets])
 
-    def solve(self, parameters: np.ndarray, threads: int | None = None) -> BatchSolution:
+    def solve(self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False) -> BatchSolution:
         """Solve every input set for every parameter vector; the result does not depend on the number of threads.
 
         Parameters
@@ -130,11 +130,13 @@ class Batch:
         parameters : array (solves, parameters)
         threads : int, optional
             By default as many as there are cores.
+        keep : bool
+            Return z too.
         """
         model, grid = self._first.model, self._first.grid
         parameters = np.ascontiguousarray(parameters, dtype=float)
         total = self._size * len(parameters)
-        z = np.empty((self._size, len(parameters), grid.points, self._first.count))
+        z = np.empty((self._size, len(parameters), grid.points if keep else 0, self._first.count))
         y = np.empty((self._size, len(parameters), grid.points, model.kernels.channels))
         status, iterations = np.empty((2, self._size, len(parameters)), dtype=np.int64)
 

@@ -626,7 +626,7 @@ def solve_many(
     frequency : array (sets,)
     drift : array (sets, states)
     anchor_parameters, anchor_z, anchor_sensitivities, anchor_factors : arrays (sets, …)
-    kept_z : array (sets, solves, points, states)
+    kept_z : array (sets, solves, points, states), or without entries if z is not wanted
     y : array (sets, solves, points, channels)
     status, iterations : int arrays (sets, solves)
     """
@@ -676,5 +676,6 @@ def solve_many(
                     break
         differentiate(z, turn, grid, tau, f, states)
         outputs(states, inputs[e], theta, tau, f, y[e, b])
-        kept_z[e, b] = z
+        if kept_z.size > 0:
+            kept_z[e, b] = z
         status[e, b], iterations[e, b] = code, used
