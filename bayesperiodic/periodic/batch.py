@@ -145,6 +145,7 @@ class Batch:
                 model.kernels.residual_jacobian,
                 model.kernels.outputs,
                 grid.packed,
+                grid.periods,
                 self._inputs,
                 parameters,
                 *self._shared,

@@ -36,6 +36,7 @@ CHORD_RATE = 0.2
 ROUNDING = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
 FAR = 0.3
+SAME = 1e-6
 PATH_STEPS = 16
 
 GROWTH, TOO_MUCH_GROWTH = 1e4, 1e8
@@ -586,9 +587,38 @@ def is_far(z, predicted, anchor_z):
     return False
 
 
+@njit(f"boolean({MATRIX}, int64)", **OPTIONS)
+def was_damped(history, iterations):
+    """Return whether Newton's iteration took a shortened step."""
+    for iteration in range(iterations):
+        if history[iteration, 2] < 1.0:
+            return True
+    return False
+
+
+@njit(f"int64({MATRIX}, int64)", **OPTIONS)
+def repetitions(z, periods):
+    """Return how many times z repeats itself within so many forcing periods: 1 if that is its shortest period."""
+    points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
+    for times in range(periods, 1, -1):
+        if periods % times == 0:
+            shift, same = points // times, True
+            for s in range(count):
+                off, low, high = 0.0, np.inf, -np.inf
+                for i in range(points):
+                    off = max(off, abs(z[i, s] - z[i - shift, s]))
+                    low, high = min(low, z[i, s]), max(high, z[i, s])
+                if off > SAME * (high - low):
+                    same = False
+                    break
+            if same:
+                return times
+    return 1
+
+
 @njit(
-    f"void({FUNCTION}, {FUNCTION}, {GRID}, {CUBE}, {MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, {CUBE}, {GAINS}, "
-    f"Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
+    f"void({FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, {CUBE}, "
+    f"{GAINS}, Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
     f"int64, int64, {GAINS}, {GAINS}, {INDICES}, {INDICES})",
     **OPTIONS,
 )
@@ -596,6 +626,7 @@ def solve_many(
     residual_jacobian,
     outputs,
     grid,
+    periods,
     inputs,
     parameters,
     tau,
@@ -615,9 +646,10 @@ def solve_many(
     """Solve for input sets times parameter vectors, those of the flat indices start … stop (vectors run fastest).
 
     Each solve starts from the linear prediction of its set's anchor: chord steps with the anchor's factors, else
-    Newton's iteration, else that from the anchor itself. A result far from the prediction of a solved anchor is not
-    trusted: then small steps are taken along the way from the anchor's parameters, and where they lead is where the
-    orbit went; if one fails or leaps, the status is "other orbit". Nothing depends on the order of the solves.
+    Newton's iteration, else that from the anchor itself. Where all fail, or the result is far from the prediction of a
+    solved anchor or of a shorter period than it, small steps are taken along the way from the anchor's parameters.
+    Where they lead is where the orbit went; if one leaps, or the period becomes shorter, the status is "other orbit".
+    Nothing depends on the order of the solves.
 
     Parameters
     ----------
@@ -647,7 +679,7 @@ def solve_many(
         )  # fmt: skip
         predict(at, anchor_sensitivities[e], anchor_parameters[e], theta, 1.0, predicted)
         z[:] = predicted
-        done, used, code = False, 0, CONVERGED
+        done, used, code, doubtful = False, 0, CONVERGED, False
         if ends[e, 0] >= 0:
             done, used = chord(residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, states, columns, kept)
         if not done:
@@ -656,13 +688,17 @@ def solve_many(
                 residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, history, states, columns, own
             )  # fmt: skip
             used += more
+            doubtful = was_damped(history, more)
             if code != CONVERGED:
                 z[:] = at
                 code, more = newton(
                     residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, history, states, columns, own
                 )  # fmt: skip
                 used += more
-        if code == CONVERGED and ends[e, 0] >= 0 and is_far(z, predicted, at):
+                doubtful = True
+        once = repetitions(at, periods)
+        if ends[e, 0] >= 0 and (doubtful or is_far(z, predicted, at) or repetitions(z, periods) > once):
+            leapt = code == CONVERGED
             z[:] = at
             for part in range(1, PATH_STEPS + 1):
                 predicted[:] = z
@@ -671,8 +707,11 @@ def solve_many(
                     residual_jacobian, grid, inputs[e], between, tau, f, turn, z, history, states, columns, own
                 )  # fmt: skip
                 used += more
-                if code != CONVERGED or is_far(z, predicted, predicted):
+                if (leapt and code != CONVERGED) or (
+                    code == CONVERGED and (is_far(z, predicted, predicted) or repetitions(z, periods) > once)
+                ):
                     code = OTHER_ORBIT
+                if code != CONVERGED:
                     break
         differentiate(z, turn, grid, tau, f, states)
         outputs(states, inputs[e], theta, tau, f, y[e, b])

@@ -19,7 +19,7 @@ from bayesperiodic.periodic.transient import measured_cycle, settled_period
 GUESSES = ("static", "integration")
 FEW_STEPS = 4
 EQUILIBRIUM = 1e-6
-SAME = 1e-6
+ABSENT = 1e-6
 
 
 def solve_periodic(
@@ -176,22 +176,10 @@ def _first_success(*routes: tuple[str, Callable[[], Solved | None]]) -> tuple[So
 
 def _same_orbit(equations: PeriodicEquations, solved: Solved, guess: np.ndarray) -> Solved:
     """Return the solve, marked "other orbit" if it repeats more often within the response period than its guess."""
-    if solved.code == CONVERGED and _repeats(equations, solved.z) > _repeats(equations, guess):
+    times, periods = equations.kernels.repetitions, equations.grid.periods
+    if solved.code == CONVERGED and times(solved.z, periods) > times(guess, periods):
         return solved._replace(code=OTHER_ORBIT)
     return solved
-
-
-def _repeats(equations: PeriodicEquations, z: np.ndarray) -> int:
-    """Return how many times the orbit repeats itself within the response period (angles modulo their turns)."""
-    grid = equations.grid
-    turns = np.array([equations.winding.get(state, 0) for state in equations.model.states])
-    size = np.maximum(np.ptp(z, axis=0), 1e-300)
-    for times in range(grid.periods, 1, -1):
-        shift = grid.samples * grid.periods // times
-        whole = grid.periods % times == 0 and np.all(turns % times == 0)
-        if whole and np.all(np.abs(np.roll(z, shift, axis=0) - z).max(axis=0) <= SAME * size):
-            return times
-    return 1
 
 
 def solve_free(
@@ -234,7 +222,7 @@ def collapsed(z: np.ndarray, guess: np.ndarray) -> bool:
 def has_shorter_period(z: np.ndarray) -> bool:
     """Return whether only every k-th harmonic is there, for a k of 2 or more."""
     power = np.sum(np.abs(np.fft.rfft(z, axis=0)) ** 2, axis=1)[1:]
-    present = np.flatnonzero(power > SAME**2 * power.max()) + 1
+    present = np.flatnonzero(power > ABSENT**2 * power.max()) + 1
     return bool(power.max() > 0 and np.gcd.reduce(present) > 1)
 
 

@@ -5,7 +5,9 @@ import bayesperiodic as bp
 from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT
 from bayesperiodic.periodic.equations import PeriodicEquations
+from tests import shooting
 from tests.known import grid
+from tests.periodic.test_orbits import PENDULUM, pendulum_solution
 
 DUFFING = np.array([0.45, 1.3, 900.0, 4e5])
 
@@ -134,3 +136,55 @@ def test_no_solve_slips_to_another_branch():
             followed = step.z
             assert code == 0 and y == pytest.approx(followed[:, 0], rel=1e-6, abs=1e-8)
     assert not still
+
+
+def test_distant_solves_arrive_where_a_continuation_in_small_steps_does():
+    """Spreads by a factor e^0.5 in every parameter: Newton's iteration alone fails or slips on three of 400."""
+    tau, theta = grid(200), np.array([1.0, 0.1, 1.0, 0.5])
+    equations = build(20.0 * np.cos(2 * np.pi * tau), 0.3)
+    start = equations.solve(theta, equations.static_guess(theta))
+    parameters = theta * np.exp(0.5 * np.random.default_rng(0).standard_normal((400, 4)))
+    batch = Batch([equations], [Anchor.at(equations, theta, start.z)])
+    _, (outputs,), _, (status,), (iterations,) = batch.solve(parameters)
+    for hardest in np.argsort(iterations)[-12:]:
+        z, arrived = start.z, True
+        for share in np.linspace(0.0, 1.0, 201):
+            step = equations.solve(theta + share * (parameters[hardest] - theta), z)
+            arrived &= step.code == CONVERGED and np.max(np.abs(step.z - z)) < 0.15 * np.ptp(z)
+            z = step.z
+        assert (status[hardest] == CONVERGED) == arrived
+        if arrived:
+            assert outputs[hardest, :, 0] == pytest.approx(z[:, 0], abs=1e-8 * np.ptp(z))
+    assert np.sum(status != CONVERGED) < 3
+
+
+def test_an_orbit_of_period_two_does_not_become_one_of_period_one():
+    """It exists while the rotation of period 1 has a multiplier below −1; where it merges with it, it is lost."""
+    known, frequency = shooting.STABLE[0], 11.5 / (2 * np.pi)
+    rotation = bp.continue_periodic(
+        bp.models.pendulum, pendulum_solution(known, 200, "central4"), "frequency", until=frequency, progress=False
+    )
+    doubled = bp.double_period(bp.models.pendulum, rotation.period_doublings[0], "frequency")
+    branch = bp.continue_periodic(bp.models.pendulum, doubled, "frequency", until=frequency, progress=False)
+    orbit, theta = branch[-1], np.array([PENDULUM[name] for name in bp.models.pendulum.parameters])
+    equations = PeriodicEquations.build(
+        bp.models.pendulum, {}, frequency=frequency, samples=200, scheme="central4", periods=2, winding=orbit.winding
+    )
+    periodic = orbit.states["phi"] - 2 * np.pi * known.winding * 2 * orbit.tau / 2
+    parameters = np.tile(theta, (41, 1))
+    column = bp.models.pendulum.parameters.index("a")
+    parameters[:, column] *= np.linspace(0.9, 1.1, 41)
+    anchor = Anchor.at(equations, theta, equations.solve(theta, periodic[:, None]).z)
+    (z,), _, _, (status,), _ = Batch([equations], [anchor]).solve(parameters, keep=True)
+    one, lost = rotation[-1], 0
+    for values, found, code in zip(parameters, z[:, :, 0], status, strict=True):
+        one = bp.solve_periodic(
+            bp.models.pendulum, dict(zip(PENDULUM, values, strict=True)), frequency=frequency, samples=200,
+            scheme="central4", winding=known.winding, guess=one,
+        )  # fmt: skip
+        if one.multipliers.real.min() < -1.0:
+            assert code == CONVERGED and np.max(np.abs(found - np.roll(found, 200))) > 0.05
+        else:
+            assert code == OTHER_ORBIT
+            lost += 1
+    assert 10 < lost < 31
