@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from bayesperiodic.data.recording import Recording
     from bayesperiodic.diagnosis.comparison import Comparison, compare
     from bayesperiodic.diagnosis.predictive import Prediction, predict
+    from bayesperiodic.diagnosis.prior_predictive import PriorPredictive, prior_predictive
     from bayesperiodic.inference.estimation.estimate import MapEstimate
     from bayesperiodic.inference.estimation.map_estimate import map_estimate
     from bayesperiodic.inference.estimation.profile import Profile, profile
@@ -48,6 +49,7 @@ _HOMES = {
     "bayesperiodic.data.recording": ["Recording"],
     "bayesperiodic.diagnosis.comparison": ["Comparison", "compare"],
     "bayesperiodic.diagnosis.predictive": ["Prediction", "predict"],
+    "bayesperiodic.diagnosis.prior_predictive": ["PriorPredictive", "prior_predictive"],
     "bayesperiodic.inference.estimation.estimate": ["MapEstimate"],
     "bayesperiodic.inference.estimation.map_estimate": ["map_estimate"],
     "bayesperiodic.inference.sampling.posterior": ["Posterior"],
@@ -84,10 +86,11 @@ _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [  # noqa: PLE0604
     "Branch", "Comparison", "Experiment", "HalfNormal", "InverseGamma", "LogNormal", "LogUniform", "MapEstimate",
-    "Model", "MultivariateNormal", "Normal", "PeriodicSolution", "Posterior", "Prediction", "Problem", "Profile",
-    "Recording", "Scheme", "StudentT", "TruncatedNormal", "Uniform", "compare", "continue_periodic", "double_period",
-    "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "noise", "plot", "predict",
-    "profile", "sample", "simulate", "smooth_abs", "smooth_sign", "solve_periodic",
+    "Model", "MultivariateNormal", "Normal", "PeriodicSolution", "Posterior", "Prediction", "PriorPredictive",
+    "Problem", "Profile", "Recording", "Scheme", "StudentT", "TruncatedNormal", "Uniform", "compare",
+    "continue_periodic", "double_period", "iterate_periodic", "load", "map_estimate", "models",
+    "multiplier_sensitivities", "noise", "plot", "predict", "prior_predictive", "profile", "sample", "simulate",
+    "smooth_abs", "smooth_sign", "solve_periodic",
 ]  # fmt: skip
 
 

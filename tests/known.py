@@ -26,6 +26,28 @@ RUNAWAY = bp.Model(
     outputs=lambda s, p, u: {"x": s.x},
 )
 
+# Equilibria ±√a for a > 0, none for a < 0.
+SADDLE_NODE = bp.Model(
+    "saddle_node",
+    states=["x"],
+    inputs=["u"],
+    parameters=["a"],
+    equations=lambda s, p, u: [s.dx - p.a + s.x**2 - u.u],
+    outputs=lambda s, p, u: {"x": s.x},
+)
+
+# A cycle of radius √mu and rate omega for mu > 0, none for mu < 0.
+CYCLE = bp.Model(
+    "cycle",
+    states=["x", "y"],
+    parameters=["mu", "omega"],
+    equations=lambda s, p, u: [
+        s.dx - p.mu * s.x + p.omega * s.y + s.x * (s.x**2 + s.y**2),
+        s.dy - p.mu * s.y - p.omega * s.x + s.y * (s.x**2 + s.y**2),
+    ],
+    outputs=lambda s, p, u: {"x": s.x},
+)
+
 
 def grid(samples: int) -> np.ndarray:
     """Return τ on a grid."""

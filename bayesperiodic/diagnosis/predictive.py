@@ -68,17 +68,37 @@ def predict(problem: Problem, posterior: Posterior, *, draws: int = 200) -> Pred
     outputs, converged = anchored.outputs(points)
     if not converged.any():
         raise RuntimeError("posterior: none of its draws has a periodic solution, so nothing can be predicted.")
+    return bands(problem, outputs, converged, variances)
+
+
+def bands(
+    problem: Problem,
+    outputs: dict[str, dict[str, np.ndarray]],
+    converged: np.ndarray,
+    variances: dict[tuple[str, str], np.ndarray],
+) -> Prediction:
+    """Return the bands of outputs (draws, points), by experiment and channel, at the draws that converged.
+
+    Parameters
+    ----------
+    problem : Problem
+    outputs : dict of str to dict of str to array (draws, points)
+    converged : bool array (draws,)
+    variances : dict of (str, str) to array (draws,)
+        Of the residual, by experiment and channel; zero where there is none.
+    """
+    count = converged.size
     quantiles = [0.5, 0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY]
     scores = ndtri((np.arange(NOISE_LEVELS) + 0.5) / NOISE_LEVELS)
-    bands: list[dict[str, dict[str, np.ndarray]]] = [{}, {}, {}]
+    found: list[dict[str, dict[str, np.ndarray]]] = [{}, {}, {}]
     for e in problem.experiments:
         for channel in e.outputs:
             variance = variances.get((e.name, channel), np.zeros(count))
             expected = e.project(channel, outputs[e.name][channel])
             noise = np.sqrt(variance)[:, None, None] * scores[:, None]
             values = (expected[:, None] + noise)[converged].reshape(-1, expected.shape[1])
-            for band, q in zip(bands, quantiles, strict=True):
+            for band, q in zip(found, quantiles, strict=True):
                 level = np.median(expected[converged], axis=0) if q == 0.5 else np.quantile(values, q, axis=0)
                 band.setdefault(e.name, {})[channel] = level
-    median, low, high = bands
+    median, low, high = found
     return Prediction(median, low, high, PROBABILITY, count, int(count - converged.sum()))

@@ -14,6 +14,7 @@ from bayesperiodic.periodic.autonomous_batch import AutonomousBatch
 from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
+from bayesperiodic.periodic.reach import LOST, reach
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities, output_gradient
 from bayesperiodic.periodic.solution import PeriodicSolution, describe
@@ -150,6 +151,12 @@ class Responses:
                 response = Response(solved.outputs[i], solved.frequency[i], logarithms, values[:, -1])
                 result[e.name] = SolvedResponse(response, solved.z[i], status)
         return {e.name: result[e.name] for e in self.experiments}
+
+    def reach(self, theta: np.ndarray, experiment: str) -> str:
+        """Return how the branch through an experiment's anchor ends on the way to a θ (names,), see `reach.reach`."""
+        assert self._anchors is not None
+        anchor, parameters = self._anchors[experiment], self.parameters(theta[None], experiment)[0]
+        return LOST if anchor.sensitivities is None else reach(self.equations[experiment], anchor, parameters)
 
     def _log_multipliers(
         self, experiment: Experiment, z: np.ndarray, frequency: np.ndarray, parameters: np.ndarray, status: np.ndarray

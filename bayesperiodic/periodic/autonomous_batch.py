@@ -1,7 +1,6 @@
 """Many parameter vectors times several orbits of an autonomous model, whose frequency is part of the solution."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -43,41 +42,53 @@ class AutonomousBatch:
 
 
 def _follow(equations: PeriodicEquations, anchor: Anchor, theta: np.ndarray) -> Found:
-    """Solve from the anchor's linear prediction, or else in small steps; "other orbit" where that leads elsewhere."""
-    found, predicted = _step(equations, anchor, theta)
-    if found.code == CONVERGED and not _is_far(equations, found, predicted, anchor):
+    """Solve from the anchor's linear prediction, or else in small steps; "other orbit" where one of them leaps."""
+    there = _prediction(anchor, theta - anchor.parameters)
+    found = _solve(equations, theta, there)
+    straight = found.code == CONVERGED and not np.any(found.history[:, 2] < 1.0)
+    if straight and not _is_far(equations, found, there, anchor.z):
         return found
-    z, frequency = anchor.z, anchor.frequency
-    steps = equations.kernels.PATH_STEPS
-    for part in range(1, steps + 1):
-        between = anchor.parameters + (theta - anchor.parameters) * (part / steps)
-        here = replace(anchor, z=z, frequency=frequency, sensitivities=None)
-        found, predicted = _step(equations, here, between)
-        if found.code != CONVERGED:
-            return found
-        if _is_far(equations, found, predicted, here):
-            return found._replace(code=OTHER_ORBIT)
-        z, frequency = found.z, float(found.values[0])
+    return _creep(equations, anchor, theta)
+
+
+def _creep(equations: PeriodicEquations, anchor: Anchor, theta: np.ndarray) -> Found:
+    """Follow the orbit from the anchor's parameters in small steps, shorter ones where they fail or leap."""
+    change, largest = theta - anchor.parameters, equations.kernels.LARGEST_PART
+    done, step, before = 0.0, largest, largest
+    here, last = (anchor.z, anchor.frequency), _prediction(anchor, -before * change)
+    while done < 1.0:
+        ratio = step / before
+        there = here[0] + ratio * (here[0] - last[0]), here[1] + ratio * (here[1] - last[1])
+        found = _solve(equations, anchor.parameters + change * (done + step), there)
+        if found.code != CONVERGED or _is_far(equations, found, there, here[0]):
+            step *= 0.5
+            if step < equations.kernels.SMALLEST_PART:
+                return found._replace(code=OTHER_ORBIT) if found.code == CONVERGED else found
+            continue
+        here, last = (found.z, float(found.values[0])), here
+        done, before = done + step, step
+        step = min(2.0 * step, largest, 1.0 - done)
     return found
 
 
-def _step(equations: PeriodicEquations, anchor: Anchor, theta: np.ndarray) -> tuple[Found, tuple[np.ndarray, float]]:
-    z, frequency = anchor.z, anchor.frequency
-    if anchor.sensitivities is not None and anchor.frequency_sensitivities is not None:
-        change = theta - anchor.parameters
-        z = z + np.tensordot(change, anchor.sensitivities, 1)
-        frequency = frequency + float(change @ anchor.frequency_sensitivities)
-        frequency = frequency if frequency > 0.0 else anchor.frequency
-    here = equations.at_frequency(frequency)
-    found = solve_autonomous(Family(here, theta, (FREQUENCY,)), z, frequency)
-    return found, (z, frequency)
+def _prediction(anchor: Anchor, change: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return z and the frequency that the anchor predicts after a change of the parameters."""
+    if anchor.sensitivities is None or anchor.frequency_sensitivities is None:
+        return anchor.z, anchor.frequency
+    frequency = anchor.frequency + float(change @ anchor.frequency_sensitivities)
+    return anchor.z + np.tensordot(change, anchor.sensitivities, 1), frequency if frequency > 0.0 else anchor.frequency
 
 
-def _is_far(equations: PeriodicEquations, found: Found, predicted: tuple[np.ndarray, float], anchor: Anchor) -> bool:
-    """Return whether an orbit is no continuation of the anchor's: shrunk, of a shorter period, or far off."""
+def _solve(equations: PeriodicEquations, theta: np.ndarray, start: tuple[np.ndarray, float]) -> Found:
+    z, frequency = start
+    return solve_autonomous(Family(equations.at_frequency(frequency), theta, (FREQUENCY,)), z, frequency)
+
+
+def _is_far(equations: PeriodicEquations, found: Found, predicted: tuple[np.ndarray, float], start: np.ndarray) -> bool:
+    """Return whether an orbit is no continuation of the one at the start: shrunk, of a shorter period, or far off."""
     z, frequency = predicted
-    if collapsed(found.z, anchor.z) or has_shorter_period(found.z):
+    if collapsed(found.z, start) or has_shorter_period(found.z):
         return True
     limit, off = equations.kernels.FAR, np.max(np.abs(found.z - z), axis=0)
-    far = (off > limit * np.ptp(anchor.z, axis=0)) & (off > limit * np.max(np.abs(z - anchor.z), axis=0))
+    far = (off > limit * np.ptp(start, axis=0)) & (off > limit * np.max(np.abs(z - start), axis=0))
     return bool(far.any()) or bool(abs(found.values[0] - frequency) > limit * frequency)

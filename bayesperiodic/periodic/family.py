@@ -9,7 +9,7 @@ from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, SINGULAR, STA
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations
 from bayesperiodic.periodic.sensitivity import frequency_derivatives
 
-INPUTS = "inputs"
+INPUTS, PARAMETERS = "inputs", "parameters"
 
 
 class Found(NamedTuple):
@@ -30,15 +30,19 @@ class Family:
     equations : PeriodicEquations
     parameters : array (parameters,)
     free : tuple of str
-        "frequency", "inputs" (what multiplies `input_change`) or a parameter's name.
+        "frequency", "inputs" or "parameters" (what multiplies `input_change` or `parameter_change`), or a parameter's
+        name.
     input_change : array (points, 3·inputs)
         The inputs are those of `equations` plus a scalar times this.
+    parameter_change : array (parameters,)
+        The parameters are `parameters` plus a scalar times this.
     """
 
     equations: PeriodicEquations
     parameters: np.ndarray
     free: tuple[str, ...]
     input_change: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+    parameter_change: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def at(self, values: np.ndarray) -> tuple[PeriodicEquations, np.ndarray]:
         """Return equations and parameters at values of the free scalars."""
@@ -48,6 +52,8 @@ class Family:
                 equations = equations.at_frequency(float(value))
             elif name == INPUTS:
                 equations = equations.with_inputs(equations.inputs + value * self.input_change)
+            elif name == PARAMETERS:
+                parameters = parameters + value * self.parameter_change
             else:
                 parameters = parameters.copy()
                 parameters[self.equations.model.parameters.index(name)] = value
@@ -63,6 +69,8 @@ class Family:
                 result[k] = frequency_derivatives(equations, z, columns, d)[0]
             elif name == INPUTS:
                 result[k] = np.einsum("neu,nu->ne", d.g_u, self.input_change)
+            elif name == PARAMETERS:
+                result[k] = d.g_theta @ self.parameter_change
             else:
                 result[k] = d.g_theta[:, :, equations.model.parameters.index(name)]
         return result

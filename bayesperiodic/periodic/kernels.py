@@ -37,7 +37,7 @@ ROUNDING = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
 FAR = 0.3
 SAME = 1e-6
-PATH_STEPS = 16
+LARGEST_PART, SMALLEST_PART = 1.0 / 16.0, 1.0 / 256.0
 
 GROWTH, TOO_MUCH_GROWTH = 1e4, 1e8
 MAX_SEGMENTS = 12
@@ -664,7 +664,8 @@ def solve_many(
     """
     bands, pivots, inverses, gains, transfers, ends, reduced, reduced_pivots = anchor_factors
     points, count, solves = anchor_z.shape[1], anchor_z.shape[2], parameters.shape[0]
-    states, z, predicted = np.empty((points, 3 * count)), np.empty((points, count)), np.empty((points, count))
+    states, z = np.empty((points, 3 * count)), np.empty((points, count))
+    predicted, here, last = np.empty((points, count)), np.empty((points, count)), np.empty((points, count))
     columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MAX_ITERATIONS, 3))
     own = (
         np.empty_like(bands[0]), np.empty_like(pivots[0]), np.empty_like(inverses[0]), np.empty_like(gains[0]),
@@ -679,10 +680,10 @@ def solve_many(
         )  # fmt: skip
         predict(at, anchor_sensitivities[e], anchor_parameters[e], theta, 1.0, predicted)
         z[:] = predicted
-        done, used, code, doubtful = False, 0, CONVERGED, False
+        close, used, code, doubtful = False, 0, CONVERGED, False
         if ends[e, 0] >= 0:
-            done, used = chord(residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, states, columns, kept)
-        if not done:
+            close, used = chord(residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, states, columns, kept)
+        if not close:
             z[:] = predicted
             code, more = newton(
                 residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, history, states, columns, own
@@ -699,20 +700,29 @@ def solve_many(
         once = repetitions(at, periods)
         if ends[e, 0] >= 0 and (doubtful or is_far(z, predicted, at) or repetitions(z, periods) > once):
             leapt = code == CONVERGED
-            z[:] = at
-            for part in range(1, PATH_STEPS + 1):
-                predicted[:] = z
-                between = anchor_parameters[e] + (theta - anchor_parameters[e]) * (part / PATH_STEPS)
+            done, step, before = 0.0, LARGEST_PART, LARGEST_PART
+            here[:], last[:] = at, at
+            predict(at, anchor_sensitivities[e], anchor_parameters[e], theta, -before, last)
+            while done < 1.0:
+                predicted[:] = here + (here - last) * (step / before)
+                z[:] = predicted
+                between = anchor_parameters[e] + (theta - anchor_parameters[e]) * (done + step)
                 code, more = newton(
                     residual_jacobian, grid, inputs[e], between, tau, f, turn, z, history, states, columns, own
                 )  # fmt: skip
                 used += more
-                if (leapt and code != CONVERGED) or (
-                    code == CONVERGED and (is_far(z, predicted, predicted) or repetitions(z, periods) > once)
-                ):
+                if code == CONVERGED and repetitions(z, periods) > once:
                     code = OTHER_ORBIT
-                if code != CONVERGED:
                     break
+                if code != CONVERGED or is_far(z, predicted, here):
+                    code = OTHER_ORBIT if leapt or code == CONVERGED else code
+                    step *= 0.5
+                    if step < SMALLEST_PART:
+                        break
+                    continue
+                last[:], here[:] = here, z
+                done, before = done + step, step
+                step = min(2.0 * step, LARGEST_PART, 1.0 - done)
         differentiate(z, turn, grid, tau, f, states)
         outputs(states, inputs[e], theta, tau, f, y[e, b])
         if kept_z.size > 0:
