@@ -165,6 +165,33 @@ class Observation:
         """Return ŷ (…, points) of each measured channel, turned and delayed."""
         return dict(zip(self.channels, np.moveaxis(self._predicted(response), -1, 0), strict=True))
 
+    def replicates(self, response: Response, components: list[np.ndarray]) -> dict[str, np.ndarray]:
+        """Return what might have been measured, ŷ plus noise (draws, points), by channel; NaN outside the mask.
+
+        Angles are within half a turn of the data.
+
+        Parameters
+        ----------
+        response : Response
+            With draws on its leading axis.
+        components : list of array (draws, size)
+            Of the noise, one array a block.
+        """
+        e, noise = self.experiment, np.full((len(components[0]), *self._data.shape), np.nan)
+        if e.covariance is not None:
+            values = solve_triangular(self._joint[0], components[0].T, lower=True).T
+            mask = np.ones(self._points, dtype=bool) if e.mask is None else e.mask
+            noise[:, mask] = values.reshape(len(values), -1, len(self.channels))
+        else:
+            for c, channel in enumerate(self.channels):
+                if e.mask is None:
+                    noise[..., c] = self._signal(components[c], self._harmonic(channel))
+                else:
+                    noise[:, e.mask, c] = components[c]
+        values = self._predicted(response) + noise
+        turned = self._data - (np.mod(self._data - values + np.pi, 2 * np.pi) - np.pi)
+        return {n: (turned if self._angles[c] else values)[..., c] for c, n in enumerate(self.channels)}
+
     def compared(self, response: Response) -> dict[str, np.ndarray]:
         """Return y − ŷ (points,) of each channel, within the harmonics kept and zero where nothing was measured."""
         difference = self._data - self._predicted(response)
@@ -207,18 +234,22 @@ class Observation:
             parts.append((signal @ alternating)[..., None] * np.sqrt(harmonic.size))
         return np.concatenate(parts, axis=-1)
 
-    def _spread(self, weights: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
-        """Return the transpose of `_spectral` applied to weights (size,)."""
+    def _signal(self, components: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
+        """Return the signals (…, points) that have these real Fourier components (…, size): `_spectral` undone."""
         highest = (harmonic.size - 1) // 2
-        amplitudes = weights[: highest + 1].astype(complex)
-        amplitudes[1:] += 1j * weights[highest + 1 : 2 * highest + 1]
-        amplitudes *= np.sqrt(2.0 * harmonic.size) / self._points
-        amplitudes[0] *= np.sqrt(0.5)
+        amplitudes = components[..., : highest + 1].astype(complex)
+        amplitudes[..., 1:] += 1j * components[..., highest + 1 : 2 * highest + 1]
+        amplitudes *= np.sqrt(2.0 / harmonic.size)
+        amplitudes[..., 0] *= np.sqrt(0.5)
         signal = fourier.on_grid(amplitudes, self._points)
         if harmonic.size % 2 == 0:
             alternating = np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0)
-            signal += weights[-1] * np.sqrt(harmonic.size) / self._points * alternating
+            signal += components[..., -1:] / np.sqrt(harmonic.size) * alternating
         return signal
+
+    def _spread(self, weights: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
+        """Return the transpose of `_spectral` applied to weights (size,), its inverse but for a factor."""
+        return self._signal(weights, harmonic) * harmonic.size / self._points
 
     def _predicted(self, response: Response) -> np.ndarray:
         """Return the model's outputs (…, points, channels), turned and delayed."""

@@ -177,6 +177,14 @@ class Responses:
                 result[i] = np.log(np.abs(found))
         return result
 
+    def largest_multipliers(self, theta: np.ndarray, experiment: str, solved: SolvedResponse) -> np.ndarray:
+        """Return the modulus (solves,) of the largest multiplier at θ (solves, names); NaN where the solve failed."""
+        parameters, result = self.parameters(theta, experiment), np.full(len(theta), np.nan)
+        for i in np.flatnonzero(solved.status == CONVERGED):
+            equations = self.equations[experiment].at_frequency(float(solved.response.frequency[i]))
+            result[i] = np.abs(leading_multipliers(equations, parameters[i], solved.z[i], 1)).max(initial=0.0)
+        return result
+
     def solutions(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
         """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""
         solutions = {}

@@ -11,7 +11,7 @@ import bayesperiodic as bp
 from bayesperiodic.inference.sampling import chains
 from bayesperiodic.inference.sampling.coordinates import SamplingDensity
 from bayesperiodic.inference.sampling.draws import gather
-from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+from tests.known import LINEAR, SADDLE_NODE, grid, linear_experiment, linear_regressors
 
 FIRST, SECOND = "run 7", "run 8, 14.5 Hz"
 TRUTH = np.array([900.0, 40.0, 25.0])
@@ -386,3 +386,16 @@ def test_local_parameters_are_compared_one_by_one(local):
     table = bp.compare(*local).table
     assert list(table.index) == list(local[0].names)
     assert set(table["verdict"]) == {"fine"}
+
+
+def test_failed_solves_are_told_by_cause():
+    """A prior beyond whose bound no orbit exists: proposals there fail, and the account says so."""
+    run = bp.Experiment(
+        "run", 1.0, {"x": 0.3 + 0.2 * np.random.default_rng(1).standard_normal(12)}, {"u": np.zeros(12)}, samples=12
+    )
+    problem = bp.Problem(SADDLE_NODE, [run], priors={"a": bp.Normal(0.1, 0.3)}, fixed={"variance[x]": 0.2})
+    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, **QUIET)
+    assert posterior.converged and posterior.draws("a").min() > 0.0
+    assert sum(posterior.failures.values()) > 0.05
+    assert posterior.summary().attrs["failures"] == posterior.failures
+    assert f"{next(iter(posterior.failures))} " in repr(posterior)

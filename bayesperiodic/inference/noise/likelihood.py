@@ -197,6 +197,19 @@ class Likelihood:
                 result.append(r * np.sqrt(block.weight / self._variances(block, values[columns])[0]))
         return result
 
+    def simulate(self, values: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:
+        """Return noise at values (draws, names): components (draws, size), one array a block."""
+        result = []
+        for block, columns in zip(self.blocks, self._columns, strict=True):
+            white = generator.standard_normal((len(values), block.size))
+            if self._is_dense(block):
+                factors = np.linalg.cholesky([self.model.covariance(block, row)[0] for row in values[:, columns]])
+                white = np.einsum("dij,dj->di", factors, white)
+            elif block.kind != KNOWN:
+                white *= np.sqrt(self._variances(block, values[:, columns])[0])
+            result.append(white)
+        return result
+
     def guess(self) -> np.ndarray:
         """Return where the noise parameters start, (names,): variances 1, shapes at the medians of their priors."""
         values = np.ones(len(self.names))

@@ -15,6 +15,8 @@ from bayesperiodic.inference.sampling import chains
 from bayesperiodic.inference.sampling.checkpoint import fingerprint
 from bayesperiodic.inference.sampling.coordinates import SamplingDensity
 from bayesperiodic.inference.sampling.posterior import Posterior
+from bayesperiodic.inference.sampling.replicates import posterior_predictive
+from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 
 ENSEMBLE = "ensemble"
 
@@ -41,7 +43,7 @@ def gather(
         See `Posterior`.
     """
     problem, labels = density.problem, density.labels
-    data = tree(problem, *density.to_natural(kept), log_density)
+    data = tree(problem, *density.to_natural(kept), log_density, seed)
     data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason}
     tau = chains.autocorrelation_time(kept)
     return Posterior(
@@ -58,16 +60,19 @@ def gather(
     )
 
 
-def tree(problem: Problem, theta: np.ndarray, noise: np.ndarray, log_density: np.ndarray) -> xr.DataTree:
+def tree(problem: Problem, theta: np.ndarray, noise: np.ndarray, log_density: np.ndarray, seed: int) -> xr.DataTree:
     """Return draws as the groups of `Posterior.data`.
 
     Parameters
     ----------
     problem : Problem
+        With its anchors set.
     theta : array (ensembles, steps, walkers, names)
         Natural values.
     noise : array (ensembles, steps, walkers, noise_names)
     log_density : array (ensembles, steps, walkers)
+    seed : int
+        Of the replicates.
     """
     ensembles, steps, walkers = log_density.shape
     theta, noise, lp = (_by_chain(values) for values in (theta, noise, log_density[..., None]))
@@ -76,10 +81,21 @@ def tree(problem: Problem, theta: np.ndarray, noise: np.ndarray, log_density: np
         DRAW: np.arange(steps),
         ENSEMBLE: (CHAIN, np.repeat(np.arange(ensembles), walkers)),
     }
+    posterior = _variables(problem, theta, noise).assign_coords(coords)
+    status = np.where(np.isfinite(lp[..., 0]), CONVERGED, NOT_FINITE).astype(np.int8)
+    meanings = {
+        "flag_values": list(range(len(STATUSES))),
+        "flag_meanings": " ".join(s.replace(" ", "_") for s in STATUSES),
+    }
     result = xr.DataTree.from_dict(
         {
-            "posterior": _variables(problem, theta, noise).assign_coords(coords),
-            "sample_stats": xr.Dataset({"lp": ((CHAIN, DRAW), lp[..., 0])}, coords=coords),
+            "posterior": posterior,
+            "sample_stats": xr.Dataset(
+                {"lp": ((CHAIN, DRAW), lp[..., 0]), "status": ((CHAIN, DRAW), status, meanings)}, coords=coords
+            ),
+            "posterior_predictive": posterior_predictive(
+                problem, posterior, {e.name: _time(e) for e in problem.experiments}, seed
+            ),
             "observed_data": _signals(problem, "outputs"),
             "constant_data": _signals(problem, "inputs"),
         }

@@ -35,7 +35,9 @@ class Posterior(Result):
         noise parameters are kept with the others, with their values; NaN stands where there is none, such as the
         variance of a channel in an experiment that lacks it. Attributes: ``units``, or ``units of <channel>`` of
         ``variance``; ``noise``, the noise model's name, on its parameters alone. Group ``sample_stats``: lp, the
-        log-density in sampling coordinates. Groups ``observed_data`` and ``constant_data``: outputs and inputs.
+        log-density in sampling coordinates, and the status of the draw's solves. Group ``posterior_predictive``: at a
+        few draws, replicates of the measured outputs, noise included, and largest_multiplier, the modulus of each
+        orbit's largest Floquet multiplier. Groups ``observed_data`` and ``constant_data``: outputs and inputs.
     converged : bool
         True if the stop rule was passed.
     reason : str
@@ -87,13 +89,18 @@ class Posterior(Result):
         return [n for n, (variable, _) in labels.places(self._group).items() if labels.is_noise(self._group, variable)]
 
     def summary(self) -> pd.DataFrame:
-        """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, a row a parameter."""
-        return _table(
+        """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, a row a parameter.
+
+        Its ``attrs`` tell the interval, whether the draws converged and why, and the failed solves by status.
+        """
+        table = _table(
             {
                 name: _described(self.draws(name), self.ess[name]) | {"tau": self.tau[name], "rhat": self.rhat[name]}
                 for name in self.names
             }
         )
+        table.attrs |= {"converged": self.converged, "reason": self.reason, "failures": dict(self.failures)}
+        return table
 
     def derive(self, expressions: Mapping[str, str], *, experiment: str | None = None) -> pd.DataFrame:
         """Return quantities derived from the sampled parameters, evaluated at every draw.
@@ -178,7 +185,10 @@ class Posterior(Result):
 
     def __repr__(self) -> str:
         state = "converged" if self.converged else "NOT CONVERGED"
-        return f"Posterior ({state}: {self.reason})\n{self.summary().to_string(float_format='{:.5g}'.format)}"
+        failed = ", ".join(f"{status} {share:.2%}" for status, share in self.failures.items())
+        solves = f"; failed solves of {self.log_posterior_calls} proposals: {failed or 'none'}"
+        table = self.summary().to_string(float_format="{:.5g}".format)
+        return f"Posterior ({state}: {self.reason}{solves})\n{table}"
 
 
 def _described(draws: np.ndarray, ess: float) -> dict[str, float]:

@@ -297,7 +297,7 @@ class _Run:
             moments = np.stack([e.sampler.get_blobs()[part] for e in self.ensembles])
             moments = moments.reshape(*kept.shape[:-1], -1)
             kept, log_density = self.ensembles[0].density.expanded(kept, log_density, moments, self.redraws)
-        whole = SamplingDensity(self.plain.problem, coordinates=self.plain.coordinates)
+        whole = SamplingDensity(self.ensembles[0].density.problem, coordinates=self.plain.coordinates)
         whole.calls = sum(e.density.calls for e in self.ensembles)
         whole.failures = sum((e.density.failures for e in self.ensembles), Counter())
         return gather(
