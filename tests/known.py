@@ -48,6 +48,13 @@ CYCLE = bp.Model(
     outputs=lambda s, p, u: {"x": s.x},
 )
 
+# A consistent landing gear for eq. (9): SI units, theta11 = -1e5 theta4 (ambient pressure), nitrogen of 0.8 mol.
+GEAR = {
+    "theta1": 80.0, "theta2": 0.0, "theta3": 8e3, "theta4": 5e-3, "theta5": 1e6 / 293, "theta6": -2.5, "theta7": 0.0,
+    "theta8": 150.0, "theta9": 1e-4, "theta10": 300.0, "theta11": -500.0, "theta12": 0.0, "theta15": 17.0,
+    "theta16": 2.0, "theta17": -293.0,
+}  # fmt: skip
+
 
 def grid(samples: int) -> np.ndarray:
     """Return τ on a grid."""

@@ -394,8 +394,8 @@ def test_failed_solves_are_told_by_cause():
         "run", 1.0, {"x": 0.3 + 0.2 * np.random.default_rng(1).standard_normal(12)}, {"u": np.zeros(12)}, samples=12
     )
     problem = bp.Problem(SADDLE_NODE, [run], priors={"a": bp.Normal(0.1, 0.3)}, fixed={"variance[x]": 0.2})
-    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, **QUIET)
-    assert posterior.converged and posterior.draws("a").min() > 0.0
+    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=250, **QUIET)
+    assert posterior.draws("a").min() > 0.0
     assert sum(posterior.failures.values()) > 0.05
     assert posterior.summary().attrs["failures"] == posterior.failures
     assert f"{next(iter(posterior.failures))} " in repr(posterior)
