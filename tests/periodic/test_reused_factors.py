@@ -42,8 +42,8 @@ def rig(drive: str, scheme: str) -> list[PeriodicEquations]:
 def test_every_solve_converges_to_what_a_solve_from_scratch_finds(drive, scheme, spread):
     """Spreads are standard deviations relative to theta4, theta6 and theta16; many theta16 are negative.
 
-    At theta16 = -0.006 the smallest singular value is 1/350 of the anchor's, and so much larger is what a step of 1e-9 with
-    the anchor's factors leaves.
+    At theta16 = -0.006 the smallest singular value is 1/350 of the anchor's, and 350 times as much is left after a step
+    of 1e-9 with the anchor's factors.
     """
     sets = rig(drive, scheme)
     anchors = [Anchor.at(e, THETA, e.solve(THETA, e.static_guess(THETA)).z) for e in sets]
