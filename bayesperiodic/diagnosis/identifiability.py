@@ -1,0 +1,280 @@
+"""What the data determine, what only the prior does, and what to do about it: a verdict for each parameter."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.special import ndtr
+
+from bayesperiodic.diagnosis.design import Candidate, default_candidates, rank_candidates
+from bayesperiodic.diagnosis.information import Information
+from bayesperiodic.diagnosis.power_scaling import power_scaling
+from bayesperiodic.inference.estimation.directions import combinations, in_words, reduced
+from bayesperiodic.inference.estimation.estimate import MapEstimate
+from bayesperiodic.inference.estimation.profile import ONE_SIDED, Profile
+from bayesperiodic.inference.estimation.profile import profile as profile_of
+from bayesperiodic.inference.problem import Problem
+from bayesperiodic.inference.sampling.posterior import Posterior
+from bayesperiodic.store import Result
+
+DETERMINED, PRIOR_ONLY = "determined", "only with the prior"
+COMBINATION, SIGN, NOTHING = "only in combination", "sign undetermined", "not determined"
+# In prior sds: what the data alone may leave for a parameter to be determined (a contraction of 0.9), and from where on
+# they say nothing (1 % of the prior's information).
+ENOUGH, SILENT = 1.0 / 3.0, 10.0
+COLLINEAR = 5.0
+ONE_SIGN = 0.975
+MONTE_CARLO_ERRORS = 3.0
+NULL = 1e-9
+PRIOR_DRAWS = 20_000
+BOTH_SIGNS = "both signs fit the data: take a prior of one sign, or measure an output that is odd in it"
+
+
+@dataclass(frozen=True)
+class Identifiability(Result):
+    """What the data say about each parameter and each direction, against what the prior says.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row a parameter. ``verdict``: "determined", "only with the prior", "only in combination", "sign undetermined"
+        or "not determined". ``contraction``: 1 − (posterior sd / prior sd)², of the logarithm of positive parameters,
+        with its Monte Carlo error ``contraction_mcse``. ``alone`` and ``together``: the sd that the data alone leave,
+        in prior sds, if the other parameters are known and if they are not; ``collinearity`` their ratio. ``profile``:
+        its shape. ``p_negative`` and ``p_negative_mcse``: probability of a value below zero; NaN for positive
+        parameters. ``prior_sensitivity`` and ``likelihood_sensitivity``: see `power_scaling`. ``evidence`` and
+        ``remedy`` in words.
+    directions : DataFrame
+        A row a direction in parameter space, the one that the data say least about first: information of the data over
+        that of the prior, contraction, the direction in words, and combinations that do not change along it.
+    spectrum : array (names,)
+        Eigenvalues of the Fisher information, descending, per unit of the logarithm of positive parameters and of the
+        prior's sd of signed ones.
+    condition : float
+        The largest over the smallest.
+    experiments : DataFrame
+        Candidates for a further experiment, the most informative first: gain in nats, and what would be left of each
+        parameter's sd.
+    converged : bool
+        False if the draws, where there are any, have not converged.
+    """
+
+    table: pd.DataFrame
+    directions: pd.DataFrame
+    spectrum: np.ndarray
+    condition: float
+    experiments: pd.DataFrame
+    converged: bool
+
+    @property
+    def verdicts(self) -> dict[str, str]:
+        """The verdict of each parameter."""
+        return dict(self.table["verdict"])
+
+    def __repr__(self) -> str:
+        lines = [] if self.converged else ["The draws have NOT CONVERGED; neither has what follows."]
+        for name, row in self.table.iterrows():
+            lines.append(f"{name}: {row['verdict']}; {row['evidence']}.")
+            if row["remedy"]:
+                lines.append(f"    {row['remedy']}.")
+        lines.append(f"Fisher information: condition number {self.condition:.3g}.")
+        return "\n".join(lines)
+
+
+def identifiability(
+    problem: Problem,
+    fit: MapEstimate,
+    posterior: Posterior | None = None,
+    *,
+    profile: Profile | bool = True,
+    candidates: Iterable[tuple[str, float, float]] | None = None,
+) -> Identifiability:
+    """Say of each parameter whether the data determine it, with the evidence and a remedy.
+
+    Widths are those of the draws, or of the Laplace approximation where there are none, relative to the prior. In this
+    order: a signed parameter whose size is determined and whose sign is not (probability of either above 2.5 %, by more
+    than three Monte Carlo errors) has its "sign undetermined". One whose profile ends at the prior's support on one
+    side is determined "only with the prior". Where the data, with all else known, have less than 1 % of the prior's
+    information, it is "not determined". Where they alone, the others unknown, leave less than a third of the prior's
+    sd, it is "determined". For the rest, it is so "only in combination" if the other parameters make it at least five
+    times wider, else "only with the prior".
+
+    Parameters
+    ----------
+    problem : Problem
+    fit : MapEstimate
+    posterior : Posterior, optional
+    profile : Profile or bool
+        The profiles of all parameters, True to compute them, False to do without.
+    candidates : iterable of (run, frequency [Hz], scale), optional
+        Experiments that could be done: the inputs of a run, their variation scaled, at another frequency. By default
+        half, the same and twice the frequency and the amplitude of up to five runs.
+
+    Returns
+    -------
+    Identifiability
+    """
+    information = Information.of(problem, fit)
+    profiles = profile_of(problem, fit) if profile is True else (profile or None)
+    widths, errors = _widths(problem, fit, posterior, information)
+    options = default_candidates(problem) if candidates is None else [Candidate(*c) for c in candidates]
+    experiments = rank_candidates(problem, fit, information, options)
+    directions = _directions(information)
+    scaling = power_scaling(problem, posterior) if posterior is not None else {}
+    rows = {}
+    for i, name in enumerate(problem.names):
+        together = np.sqrt(1.0 / max(1.0 / widths[i] ** 2 - 1.0, 1e-12)) if posterior else information.together[i]
+        row: dict[str, object] = {
+            "contraction": 1.0 - widths[i] ** 2,
+            "contraction_mcse": errors[i],
+            "alone": information.alone[i],
+            "together": together,
+            "collinearity": information.collinearity[i],
+            "profile": profiles.shape[name] if profiles and name in profiles.names else "",
+        }
+        negative, error = _negative(problem, fit, posterior, name)
+        row |= {"p_negative": negative, "p_negative_mcse": error}
+        row |= dict(zip(("prior_sensitivity", "likelihood_sensitivity"), scaling.get(name, (np.nan,) * 2), strict=True))
+        row["verdict"] = _verdict(row, _size_known(problem, fit, posterior, name))
+        row["evidence"] = _evidence(row)
+        both = row["verdict"] == SIGN and abs(fit.theta[name]) > 2.0 * fit.sd[name]
+        row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments)
+        rows[name] = row
+    table = pd.DataFrame.from_dict(rows, orient="index")
+    table = table[["verdict", *(c for c in table.columns if c != "verdict")]]
+    converged = posterior is None or posterior.converged
+    return Identifiability(table, directions, information.spectrum, information.condition, experiments, converged)
+
+
+def _widths(
+    problem: Problem, fit: MapEstimate, posterior: Posterior | None, information: Information
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return posterior over prior sd of each parameter in its coordinate, and the contraction's Monte Carlo error."""
+    if posterior is None:
+        labels = list(problem.names)
+        variances = np.diag(fit.joint_covariance.loc[labels, labels])
+        return np.sqrt(variances) / information.prior_sd, np.zeros(len(labels))
+    prior = problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))
+    widths, errors = np.empty((2, len(problem.names)))
+    for i, name in enumerate(problem.names):
+        values = information.coordinate(name, posterior.draws(name))
+        widths[i] = _half_width(values) / _half_width(information.coordinate(name, prior[:, i]))
+        # The error of half the central 68 % interval of a normal sample is 1.1 times that of its sd.
+        errors[i] = 2.0 * widths[i] ** 2 * 1.1 / np.sqrt(2.0 * posterior.ess[name])
+    return widths, errors
+
+
+def _half_width(values: np.ndarray) -> float:
+    low, high = np.quantile(values, [ndtr(-1.0), ndtr(1.0)])
+    return float(0.5 * (high - low))
+
+
+def _is_signed(problem: Problem, name: str) -> bool:
+    low, high = problem.joint_prior.supports[name]
+    return low < 0.0 < high
+
+
+def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, name: str) -> tuple[float, float]:
+    """Return the probability that a parameter is negative, and its Monte Carlo error; NaN if it cannot be."""
+    if not _is_signed(problem, name):
+        return np.nan, np.nan
+    if posterior is None:
+        return float(ndtr(-fit.theta[name] / fit.sd[name])), 0.0
+    share = float(np.mean(posterior.draws(name) < 0.0))
+    size = posterior.ess[name]
+    bounded = np.clip(share, 1.0 / (size + 2.0), 1.0 - 1.0 / (size + 2.0))
+    return share, float(np.sqrt(bounded * (1.0 - bounded) / size))
+
+
+def _size_known(problem: Problem, fit: MapEstimate, posterior: Posterior | None, name: str) -> bool:
+    """Return whether the data halve, at least, the prior's spread of a signed parameter's absolute value."""
+    if not _is_signed(problem, name):
+        return False
+    column = problem.names.index(name)
+    prior = np.abs(problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))[:, column])
+    if posterior is None:
+        normal = np.random.default_rng(1).standard_normal(PRIOR_DRAWS)
+        return _half_width(np.abs(fit.theta[name] + fit.sd[name] * normal)) < 0.5 * _half_width(prior)
+    return _half_width(np.abs(posterior.draws(name))) < 0.5 * _half_width(prior)
+
+
+def _verdict(row: dict, size_known: bool) -> str:
+    margin = MONTE_CARLO_ERRORS * row["p_negative_mcse"]
+    if size_known and max(row["p_negative"], 1.0 - row["p_negative"]) < ONE_SIGN - margin:
+        return SIGN
+    if row["profile"] == ONE_SIDED:
+        return PRIOR_ONLY
+    if row["alone"] > SILENT:
+        return NOTHING
+    if row["together"] <= ENOUGH:
+        return DETERMINED
+    return COMBINATION if row["collinearity"] >= COLLINEAR and row["alone"] < 1.0 else PRIOR_ONLY
+
+
+def _evidence(row: dict) -> str:
+    error = f" ± {row['contraction_mcse']:.2g}" if row["contraction_mcse"] else ""
+    text = f"contraction {row['contraction']:.3g}{error}"
+    if row["collinearity"] >= COLLINEAR:
+        wider = "without limit" if not row["collinearity"] < 1e6 else f"{row['collinearity']:.3g} times"
+        text += f", the other parameters widen it {wider}"
+    if row["alone"] > ENOUGH and row["profile"] != ONE_SIDED:
+        text += f", the data alone would leave {row['alone']:.3g} prior sds with all else known"
+    if row["profile"] and row["profile"] != "closed":
+        text += f", its profile is {row['profile']}"
+    if np.isfinite(row["p_negative"]):
+        text += f", P(negative) = {row['p_negative']:.3g}"
+        text += f" ± {row['p_negative_mcse']:.2g}" if row["p_negative_mcse"] else ""
+    if np.isfinite(row["prior_sensitivity"]) and row["prior_sensitivity"] > 0.05:
+        text += f", sensitive to the prior ({row['prior_sensitivity']:.2g} a doubling)"
+    return text
+
+
+def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame) -> str:
+    """Return what to do about a parameter: what to fix, what to report, what to measure."""
+    if row["verdict"] == DETERMINED:
+        return ""
+    if row["verdict"] == COMBINATION:
+        own = directions[directions["parameters"].str.split(", ").apply(lambda members: name in members)]
+        own = own[own["gain"] < 1.0 / ENOUGH**2]
+        if len(own):
+            best = own.iloc[0]
+            combos = f", or report {best['combinations']}" if best["combinations"] else ""
+            return f"fix one of {best['parameters']}{combos}"
+    if len(experiments) and name in experiments:
+        ranked = experiments.dropna(subset=[name]).sort_values(name)
+        if len(ranked) and ranked.iloc[0][name] < 0.9:
+            best = ranked.iloc[0]
+            return (
+                f"measure {best['run']} at {best['frequency']:.3g} Hz with {best['scale']:.3g} times its amplitude: "
+                f"that would leave {best[name]:.0%} of the sd"
+            )
+    return "report it with its prior, or fix it; no candidate for a further experiment narrows it by a tenth"
+
+
+def _directions(information: Information) -> pd.DataFrame:
+    """Return the directions of parameter space by what the data say about them, the least first.
+
+    Directions about which they say nothing are shown with as few parameters each as possible.
+    """
+    gains, vectors = information.gains, information.directions.T
+    silent = gains < NULL * gains.max()
+    shown = vectors.copy()
+    if silent.sum() > 1:
+        shown[silent] = reduced(vectors[silent])
+    rows = []
+    for gain, vector in zip(gains, shown, strict=True):
+        natural = np.where(np.abs(vector) > 0.05 * np.abs(vector).max(), vector, 0.0)
+        members = [name for name, part in zip(information.names, natural, strict=True) if part]
+        rows.append(
+            {
+                "gain": gain,
+                "contraction": gain / (1.0 + gain),
+                "direction": in_words(vector, information.names, information.logarithmic),
+                "parameters": ", ".join(members),
+                "combinations": ", ".join(combinations(vector, information.names, information.logarithmic))
+                if gain < 1.0 / ENOUGH**2
+                else "",
+            }
+        )
+    return pd.DataFrame(rows)
