@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from bayesperiodic.data.experiment import Experiment
     from bayesperiodic.data.recording import Recording
     from bayesperiodic.diagnosis.comparison import Comparison, compare
+    from bayesperiodic.diagnosis.identifiability import Identifiability, identifiability
     from bayesperiodic.diagnosis.predictive import Prediction, predict
     from bayesperiodic.diagnosis.prior_predictive import PriorPredictive, prior_predictive
     from bayesperiodic.inference.estimation.estimate import MapEstimate
@@ -48,6 +49,7 @@ _HOMES = {
     "bayesperiodic.data.experiment": ["Experiment"],
     "bayesperiodic.data.recording": ["Recording"],
     "bayesperiodic.diagnosis.comparison": ["Comparison", "compare"],
+    "bayesperiodic.diagnosis.identifiability": ["Identifiability", "identifiability"],
     "bayesperiodic.diagnosis.predictive": ["Prediction", "predict"],
     "bayesperiodic.diagnosis.prior_predictive": ["PriorPredictive", "prior_predictive"],
     "bayesperiodic.inference.estimation.estimate": ["MapEstimate"],
@@ -69,7 +71,12 @@ _HOMES = {
     "bayesperiodic.inference.sampling.sampling": ["sample"],
     "bayesperiodic.models.model": ["Model"],
     "bayesperiodic.models.smooth": ["smooth_abs", "smooth_sign"],
-    "bayesperiodic.periodic.continuation": ["Branch", "continue_periodic", "double_period", "iterate_periodic"],
+    "bayesperiodic.periodic.continuation": [
+        "Branch",
+        "continue_periodic",
+        "double_period",
+        "iterate_periodic",
+    ],
     "bayesperiodic.periodic.schemes": ["Scheme"],
     "bayesperiodic.periodic.solution": ["PeriodicSolution"],
     "bayesperiodic.periodic.solve": ["solve_periodic"],
@@ -85,12 +92,12 @@ _MODULES = {
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [  # noqa: PLE0604
-    "Branch", "Comparison", "Experiment", "HalfNormal", "InverseGamma", "LogNormal", "LogUniform", "MapEstimate",
-    "Model", "MultivariateNormal", "Normal", "PeriodicSolution", "Posterior", "Prediction", "PriorPredictive",
-    "Problem", "Profile", "Recording", "Scheme", "StudentT", "TruncatedNormal", "Uniform", "compare",
-    "continue_periodic", "double_period", "iterate_periodic", "load", "map_estimate", "models",
-    "multiplier_sensitivities", "noise", "plot", "predict", "prior_predictive", "profile", "sample", "simulate",
-    "smooth_abs", "smooth_sign", "solve_periodic",
+    "Branch", "Comparison", "Experiment", "HalfNormal", "Identifiability", "InverseGamma", "LogNormal",
+    "LogUniform", "MapEstimate", "Model", "MultivariateNormal", "Normal", "PeriodicSolution", "Posterior",
+    "Prediction", "PriorPredictive", "Problem", "Profile", "Recording", "Scheme", "StudentT", "TruncatedNormal",
+    "Uniform", "compare", "continue_periodic", "double_period", "identifiability", "iterate_periodic", "load",
+    "map_estimate", "models", "multiplier_sensitivities", "noise", "plot", "predict", "prior_predictive", "profile",
+    "sample", "simulate", "smooth_abs", "smooth_sign", "solve_periodic",
 ]  # fmt: skip
 
 

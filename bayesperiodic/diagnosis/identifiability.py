@@ -26,7 +26,7 @@ ENOUGH, SILENT = 1.0 / 3.0, 10.0
 COLLINEAR = 5.0
 ONE_SIGN = 0.975
 MONTE_CARLO_ERRORS = 3.0
-NULL = 1e-9
+NULL = 1e-13
 PRIOR_DRAWS = 20_000
 BOTH_SIGNS = "both signs fit the data: take a prior of one sign, or measure an output that is odd in it"
 

@@ -94,8 +94,8 @@ class Information:
         floor = SMALLEST * max(values[-1], np.finfo(float).tiny)
         with np.errstate(divide="ignore"):
             inverse = np.where(values > floor, 1.0 / np.maximum(values, floor), np.inf)
-        shares = np.where(np.abs(vectors) > np.sqrt(SMALLEST), vectors**2, 0.0)
-        return np.sqrt(np.sum(np.where(shares > 0.0, shares * inverse, 0.0), axis=1))
+        moving = np.abs(vectors) > np.sqrt(SMALLEST)
+        return np.sqrt(np.sum(np.where(moving, np.where(moving, vectors, 1.0) ** 2 * inverse, 0.0), axis=1))
 
     @property
     def collinearity(self) -> np.ndarray:
