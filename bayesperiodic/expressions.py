@@ -83,6 +83,9 @@ class Expression:
     names: tuple[str, ...]
     steps: tuple[float | str | Operation, ...]
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return parse, ("expression", self.text, self.names)
+
     def value(self, values: Mapping[str, Any]) -> np.ndarray:
         """Return the value at numbers or arrays, NumPy's rules of broadcasting; NaN or infinite where undefined."""
         given, shape = self._given(values)

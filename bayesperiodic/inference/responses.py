@@ -82,6 +82,10 @@ class Responses:
             for e in self.experiments
         }
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled functions and the factors at the anchors are made again; the anchors are kept, to the last bit.
+        return {key: value for key, value in self.__dict__.items() if key not in ("equations", "_batches")}
+
     def parameters(self, theta: np.ndarray, experiment: str) -> np.ndarray:
         """Return every parameter of the model (points, parameters) in an experiment from θ (points, names)."""
         return np.ascontiguousarray(self.maps[experiment].values(theta)[:, :-1])

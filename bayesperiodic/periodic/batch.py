@@ -1,15 +1,13 @@
 """Many parameter vectors times many input sets of a forced model, shared among the cores."""
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from bayesperiodic.parallel import available_cores
+from bayesperiodic.parallel import available_cores, in_threads
 from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
 from bayesperiodic.periodic.sensitivity import Sensitivities, parameter_sensitivities
 
@@ -140,7 +138,7 @@ class Batch:
         y = np.empty((self._size, len(parameters), grid.points, model.kernels.channels))
         status, iterations = np.empty((2, self._size, len(parameters)), dtype=np.int64)
 
-        def part(start: int, stop: int) -> None:
+        def part(block: tuple[int, int]) -> None:
             self._first.kernels.solve_many(
                 model.kernels.residual_jacobian,
                 model.kernels.outputs,
@@ -149,8 +147,7 @@ class Batch:
                 self._inputs,
                 parameters,
                 *self._shared,
-                start,
-                stop,
+                *block,
                 z,
                 y,
                 status,
@@ -159,20 +156,6 @@ class Batch:
 
         workers = max(1, min(threads or available_cores(), total // SMALLEST_PART))
         parts = 1 if workers == 1 else max(workers, min(workers * PARTS_EACH, total // SMALLEST_PART))
-        waiting = iter(list(pairwise([total * k // parts for k in range(parts + 1)])))
-
-        def work() -> None:
-            for block in waiting:
-                part(*block)
-
-        elsewhere = [_threads().submit(work) for _ in range(workers - 1)]
-        work()
-        for future in elsewhere:
-            future.result()
+        in_threads(part, list(pairwise([total * k // parts for k in range(parts + 1)])), workers)
         frequency = np.repeat(self._shared[1][:, None], len(parameters), axis=1)
         return BatchSolution(z, y, frequency, status, iterations)
-
-
-@cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(available_cores(), thread_name_prefix="bayesperiodic")

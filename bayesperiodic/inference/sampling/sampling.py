@@ -1,14 +1,11 @@
 """Sampling of θ and the noise parameters with emcee."""
 
-import threading
 from collections import Counter
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import emcee
 import numpy as np
 from tqdm import tqdm
 
@@ -19,12 +16,13 @@ from bayesperiodic.inference.sampling import chains
 from bayesperiodic.inference.sampling.checkpoint import Checkpoint, Saved
 from bayesperiodic.inference.sampling.coordinates import COLLAPSED, NATURAL, RIDGE, SAMPLED, RidgeMap, SamplingDensity
 from bayesperiodic.inference.sampling.draws import gather
+from bayesperiodic.inference.sampling.ensemble import Ensemble, Ground, Walked, walk
 from bayesperiodic.inference.sampling.posterior import Posterior
 from bayesperiodic.inference.sampling.starts import LAPLACE, PRIOR, STARTS, start_points
 from bayesperiodic.inference.sampling.stopping import shortfall
-from bayesperiodic.parallel import available_cores
+from bayesperiodic.parallel import Team, WorkersLost, available_cores, checked_executor, team
 
-BLOCK, PIECE = 250, 25
+BLOCK = 250
 PASSES = 2
 FEWEST_STEPS = 50
 
@@ -41,6 +39,7 @@ def sample(
     coordinates: str = RIDGE,
     variances: str = SAMPLED,
     checkpoint: str | Path | None = None,
+    executor: Any = None,
     progress: bool = True,
 ) -> Posterior:
     """Sample the posterior of θ and the free noise parameters with emcee's affine-invariant ensembles.
@@ -54,7 +53,8 @@ def sample(
 
     Sampling stops when the chain is 50 autocorrelation times long after a fifth of it was dropped, that time has
     changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and 95 % quantiles agree
-    within a quarter of a standard deviation, twice in succession. Ctrl-C ends it with what is there, not converged.
+    within a quarter of a standard deviation, twice in succession. Ctrl-C ends it with what is there, not converged, and
+    so does the loss of the executor's workers.
 
     Parameters
     ----------
@@ -62,9 +62,9 @@ def sample(
     fit : MapEstimate
         Its point anchors the periodic solves and starts the walkers.
     seed : int
-        The same seed gives the same draws, whatever the number of threads.
+        The same seed gives the same draws, bit for bit, whatever the executor and the number of threads.
     ensembles : int
-        At least 2.
+        At least 2; as many workers of an executor are busy.
     walkers : int, optional
         Of each ensemble, even and at least twice the number of coordinates.
     max_steps : int
@@ -80,7 +80,14 @@ def sample(
     checkpoint : path, optional
         An HDF5 file that holds the run so far, whenever the process may be killed; the same call resumes it. A finished
         one returns at once. emcee's HDFBackend reads it, in coordinates in which the Laplace approximation is a unit
-        sphere.
+        sphere. A run may go on with another executor.
+    executor : None, int, Dask Client, or executor with the interface of concurrent.futures
+        Who walks. By default the cores of this machine share walkers and experiments of vectorised calls in this
+        process, which is fastest where there is one machine and calls are not tiny. A number means that many processes,
+        for which a script must keep its calls below ``if __name__ == "__main__":``. ``mpi4py.futures.MPIPoolExecutor``
+        and Dask reach the nodes of a cluster, which should be alike: other processors may round differently. A worker
+        takes an ensemble some steps on, so that at most `ensembles` of them are busy; it uses one core. The problem is
+        sent to it once.
     progress : bool
         Show a progress bar with acceptance, tau and length in units of tau.
 
@@ -92,7 +99,10 @@ def sample(
     ------
     ValueError
         For too few or an odd number of walkers, a start with no finite log-posterior, variances that cannot be
-        integrated out, a checkpoint of another problem, damaged or in use.
+        integrated out, a checkpoint of another problem, damaged or in use, an executor that takes no tasks.
+    RuntimeError
+        If the executor's workers were lost before there were enough steps for a result; what there was is in the
+        checkpoint.
 
     References
     ----------
@@ -106,6 +116,7 @@ def sample(
     checks.one_of("start", start, STARTS)
     checks.one_of("coordinates", coordinates, (RIDGE, NATURAL))
     checks.one_of("variances", variances, (SAMPLED, COLLAPSED))
+    executor = checked_executor(executor)
     plain = SamplingDensity(problem, coordinates=coordinates, variances=variances)
     if variances == COLLAPSED and not plain.collapsed:
         raise ValueError(
@@ -117,7 +128,7 @@ def sample(
     with nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings) as store:
         saved = None if store is None else store.load()
         run = _Run(problem, fit, plain, seed, start, walkers, ensembles, saved)
-        run.go(max_steps, store, progress)
+        run.go(max_steps, store, executor, progress)
         return run.posterior()
 
 
@@ -131,21 +142,6 @@ def _checked_walkers(walkers: int | None, density: SamplingDensity) -> int:
             f"{', '.join(density.labels)}."
         )
     return walkers
-
-
-@dataclass
-class _Ensemble:
-    """One emcee ensemble, its density, and where it starts (None if it goes on)."""
-
-    density: SamplingDensity
-    sampler: emcee.EnsembleSampler
-    start: np.ndarray | None
-
-    def advance(self, steps: int, stop: threading.Event) -> None:
-        """Walk until so many steps are done in all, or `stop` is set."""
-        while (missing := steps - self.sampler.iteration) > 0 and not stop.is_set():
-            here, self.start = self.start, None
-            self.sampler.run_mcmc(here, min(missing, PIECE), skip_initial_state_check=True, progress=False)
 
 
 class _Run:
@@ -169,7 +165,8 @@ class _Run:
         anchor = np.array(state["anchor"]) if saved else problem.vector(fit.theta)
         guesses = state["guesses"] if saved else {name: s.states for name, s in fit.solutions.items()}
         anchored = problem.anchored(anchor, guesses)
-        densities = [self._density(anchored, ensembles) for _ in range(ensembles)]
+        threads = max(1, available_cores() // ensembles)
+        densities = [self._density(anchored, threads) for _ in range(ensembles)]
         self.map = (
             RidgeMap(np.array(state["origin"]), np.array(state["axes"]))
             if saved
@@ -181,14 +178,15 @@ class _Run:
             "steps": 0, "checked": 0, "passes": 0, "missing": [], "tau": [np.inf] * plain.dimension,
             "converged": False, "reason": "",
         }  # fmt: skip
+        self.density = densities[0]
         self.ensembles = [
             self._ensemble(density, fit, start, walkers, np.random.default_rng(sequences[i]), saved, i)
             for i, density in enumerate(densities)
         ]
 
-    def _density(self, problem: Problem, ensembles: int) -> SamplingDensity:
+    def _density(self, problem: Problem, threads: int) -> SamplingDensity:
         variances = COLLAPSED if self.plain.collapsed else SAMPLED
-        return SamplingDensity(problem, max(1, available_cores() // ensembles), self.plain.coordinates, variances)
+        return SamplingDensity(problem, threads, self.plain.coordinates, variances)
 
     def _ensemble(
         self,
@@ -199,55 +197,58 @@ class _Run:
         generator: np.random.Generator,
         saved: Saved | None,
         number: int,
-    ) -> _Ensemble:
-        moves = [
-            (emcee.moves.DEMove(), 0.7),
-            (emcee.moves.DEMove(gamma0=1.0), 0.1),
-            (emcee.moves.StretchMove(), 0.2),
-        ]
-        backend = saved.backends[number] if saved else emcee.backends.Backend()
-        sampler = emcee.EnsembleSampler(
-            walkers,
-            density.dimension,
-            lambda u: density(self.map.outwards(u)),
-            moves=moves,
-            vectorize=True,
-            backend=backend,
-        )
+    ) -> Ensemble:
         if saved:
-            density.calls = self.state["calls"][number]
-            density.failures = Counter(self.state["failures"][number])
-            return _Ensemble(density, sampler, None)
-        sampler.random_state = np.random.RandomState(generator.integers(2**32, size=4)).get_state()
-        return _Ensemble(density, sampler, self.map.inwards(start_points(density, fit, start, walkers, generator)))
+            counts = self.state["calls"][number], Counter(self.state["failures"][number])
+            return Ensemble(saved.backends[number], saved.backends[number].get_last_sample(), *counts)
+        steps = np.random.RandomState(generator.integers(2**32, size=4))
+        return Ensemble.at(self.map.inwards(start_points(density, fit, start, walkers, generator)), steps, density)
 
-    def go(self, max_steps: int, store: Checkpoint | None, progress: bool) -> None:
-        """Walk block by block until the stop rule is passed twice in succession, `max_steps` are reached, or Ctrl-C."""
-        try:
-            self._walk(max_steps, store, progress)
-        except KeyboardInterrupt:
-            done = min(ensemble.sampler.iteration for ensemble in self.ensembles)
-            if done < FEWEST_STEPS:
-                raise
-            self.state |= {"steps": done, "converged": False, "reason": f"interrupted after {done} steps"}
-            self._save(store, now=True)
-
-    def _walk(self, max_steps: int, store: Checkpoint | None, progress: bool) -> None:
-        state = self.state
-        if state["converged"]:
+    def go(self, max_steps: int, store: Checkpoint | None, executor: Any, progress: bool) -> None:
+        """Walk until the stop rule is passed twice in succession, `max_steps` are reached, Ctrl-C, or workers die."""
+        if self.state["converged"]:
             return
+        density = self.density if executor is None else self._density(self.density.problem, 1)
+        try:
+            with team(executor, Ground(density, self.map)) as crew:
+                self._walk(max_steps, store, crew, progress)
+        except KeyboardInterrupt:
+            if not self._stopped("interrupted", store):
+                raise
+        except WorkersLost as lost:
+            if not self._stopped("stopped", store, f": {lost}"):
+                kept = "is in the checkpoint, from which the same call goes on" if store else "is lost"
+                raise RuntimeError(
+                    f"{lost} That was after {self._done} steps, too few for a result; what there was {kept}."
+                ) from lost
+
+    @property
+    def _done(self) -> int:
+        """How many steps all ensembles have walked."""
+        return min(ensemble.steps for ensemble in self.ensembles)
+
+    def _stopped(self, how: str, store: Checkpoint | None, why: str = "") -> bool:
+        """Keep what there is of a run that was stopped; return whether it is enough for a result."""
+        enough = self._done >= FEWEST_STEPS
+        if enough:
+            self.state |= {"steps": self._done, "converged": False, "reason": f"{how} after {self._done} steps{why}"}
+        if self._done:
+            self._save(store, now=True)
+        return enough
+
+    def _walk(self, max_steps: int, store: Checkpoint | None, crew: Team, progress: bool) -> None:
+        state = self.state
         with tqdm(total=max_steps, unit="step", desc="sampling", disable=not progress) as bar:
             for steps in range(state["checked"] + BLOCK, max_steps + 1, BLOCK):
-                self._advance(steps)
+                self._advance(steps, crew, bar)
                 kept = self._kept(steps)
                 tau = chains.autocorrelation_time(kept)
                 missing = shortfall(kept, tau, np.array(state["tau"]))
                 passes = 0 if missing else state["passes"] + 1
                 state |= {"steps": steps, "checked": steps, "tau": tau.tolist(), "passes": passes, "missing": missing}
-                bar.update(steps - bar.n)
                 bar.set_postfix_str(self._account(kept, tau))
                 if passes >= PASSES:
-                    shape = f"{len(self.ensembles)} × {self.ensembles[0].sampler.nwalkers} walkers"
+                    shape = f"{len(self.ensembles)} × {self.ensembles[0].backend.shape[0]} walkers"
                     reason = f"stop rule passed after {steps} steps of {shape}"
                     state |= {"converged": True, "reason": reason}
                     self._save(store, now=True)
@@ -256,50 +257,51 @@ class _Run:
         left = ", ".join(state["missing"]) or "the stop rule passed only once"
         state |= {"steps": state["checked"], "reason": f"max_steps = {max_steps} reached with {left}"}
 
-    def _advance(self, steps: int) -> None:
-        """Walk all ensembles to a number of steps; Ctrl-C stops them after a few."""
-        stop = threading.Event()
-        with ThreadPoolExecutor(available_cores()) as pool:
-            waiting = [pool.submit(ensemble.advance, steps, stop) for ensemble in self.ensembles]
-            try:
-                for future in waiting:
-                    future.result()
-            finally:
-                stop.set()
+    def _advance(self, steps: int, crew: Team, bar: tqdm) -> None:
+        """Walk all ensembles to a number of steps, each piece by piece."""
+        behind = [number for number, ensemble in enumerate(self.ensembles) if ensemble.steps < steps]
+
+        def then(task: int, walked: Walked) -> Any:
+            number = behind[task]
+            self.ensembles[number] = self.ensembles[number].after(walked)
+            return self.ensembles[number].piece(steps)
+
+        for _ in crew.run(walk, [self.ensembles[number].piece(steps) for number in behind], then):
+            bar.update(self._done - bar.n)
 
     def _account(self, kept: np.ndarray, tau: np.ndarray) -> str:
         text = f"acceptance {self._acceptance():.2f}, tau {tau.max():.0f}, length {kept.shape[1] / tau.max():.0f} tau"
-        calls = sum(e.density.calls for e in self.ensembles)
-        failed = sum(sum(e.density.failures.values()) for e in self.ensembles)
+        calls = sum(e.calls for e in self.ensembles)
+        failed = sum(sum(e.failures.values()) for e in self.ensembles)
         return text + (f", failed solves {failed / calls:.1%}" if failed else "")
 
     def _save(self, store: Checkpoint | None, *, now: bool) -> None:
         if store is not None:
-            calls = [e.density.calls for e in self.ensembles]
-            failures = [dict(e.density.failures) for e in self.ensembles]
-            backends = [e.sampler.backend for e in self.ensembles]
+            calls = [e.calls for e in self.ensembles]
+            failures = [dict(e.failures) for e in self.ensembles]
+            backends = [e.backend for e in self.ensembles]
             store.save(backends, self.state | {"calls": calls, "failures": failures}, now=now)
 
     def _kept(self, steps: int) -> np.ndarray:
         """Return the chains (ensembles, steps, walkers, coordinates) up to a step, without their first fifth."""
-        walked = np.stack([e.sampler.get_chain()[steps // 5 : steps] for e in self.ensembles])
+        walked = np.stack([e.backend.get_chain()[steps // 5 : steps] for e in self.ensembles])
         return self.map.outwards(walked)
 
     def _acceptance(self) -> float:
-        return float(np.mean([e.sampler.acceptance_fraction for e in self.ensembles]))
+        return float(np.mean([e.backend.accepted / e.steps for e in self.ensembles]))
 
     def posterior(self) -> Posterior:
         """Return the draws, with the variances that were integrated out drawn again."""
         steps = self.state["steps"]
         kept, part = self._kept(steps), slice(steps // 5, steps)
-        log_density = np.stack([e.sampler.get_log_prob()[part] for e in self.ensembles])
+        log_density = np.stack([e.backend.get_log_prob()[part] for e in self.ensembles])
         if self.plain.collapsed:
-            moments = np.stack([e.sampler.get_blobs()[part] for e in self.ensembles])
+            moments = np.stack([e.backend.get_blobs()[part] for e in self.ensembles])
             moments = moments.reshape(*kept.shape[:-1], -1)
-            kept, log_density = self.ensembles[0].density.expanded(kept, log_density, moments, self.redraws)
-        whole = SamplingDensity(self.ensembles[0].density.problem, coordinates=self.plain.coordinates)
-        whole.calls = sum(e.density.calls for e in self.ensembles)
-        whole.failures = sum((e.density.failures for e in self.ensembles), Counter())
+            kept, log_density = self.density.expanded(kept, log_density, moments, self.redraws)
+        whole = SamplingDensity(self.density.problem, coordinates=self.plain.coordinates)
+        whole.calls = sum(e.calls for e in self.ensembles)
+        whole.failures = sum((e.failures for e in self.ensembles), Counter())
         return gather(
             whole,
             kept,
