@@ -1,3 +1,6 @@
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
 import matplotlib
 import pytest
 
@@ -14,6 +17,24 @@ def solved():
     problem = bp.Problem(LINEAR, [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)], priors=priors)
     fit = bp.map_estimate(problem)
     return problem, fit, bp.sample(problem, fit, seed=1, progress=False)
+
+
+@pytest.fixture(scope="session")
+def processes():
+    """Return a pool of two processes; starting them takes seconds, so all tests share it."""
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        yield pool
+
+
+@pytest.fixture(scope="session")
+def dask():
+    """Return a client of a Dask cluster of two processes."""
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        yield client
 
 
 @pytest.fixture(autouse=True)

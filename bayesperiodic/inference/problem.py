@@ -17,11 +17,13 @@ from bayesperiodic.inference.priors.joint import JointPrior
 from bayesperiodic.inference.priors.univariate import Uniform
 from bayesperiodic.inference.responses import Responses
 from bayesperiodic.models.model import Model
+from bayesperiodic.parallel import available_cores, in_threads
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import PeriodicSolution
 
 METHODS = ("adjoint", "forward")
+SMALLEST_SHARED = 10_000
 
 
 class Problem:
@@ -291,11 +293,17 @@ class Problem:
         """
         solved = self.responses.solve(theta, threads)
         status = np.max([s.status for s in solved.values()], axis=0)
-        good, residuals = status == CONVERGED, []
-        with np.errstate(over="ignore", invalid="ignore"):
-            for name, observation in self.observations.items():
-                residuals += observation.residuals(Response(*(part[good] for part in solved[name].response)))
-        return residuals, status
+        good = status == CONVERGED
+        kept = slice(None) if good.all() else good
+
+        def compared(name: str) -> list[np.ndarray]:
+            with np.errstate(over="ignore", invalid="ignore"):
+                return self.observations[name].residuals(Response(*(part[kept] for part in solved[name].response)))
+
+        # Shared by experiments, not by θ: the rounding of a matrix product may depend on how many rows it has.
+        small = max(s.response.outputs.size for s in solved.values()) < SMALLEST_SHARED
+        found = in_threads(compared, [*self.observations], 1 if small else threads or available_cores())
+        return [residual for own in found for residual in own], status
 
     def log_posterior(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> np.ndarray:
         """Return log-prior plus log-likelihood, shape (…), a density over (θ, log φ)."""

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,6 +18,7 @@ from bayesperiodic.inference.estimation.ridge import Point, Ridge
 from bayesperiodic.inference.linearisation import Linearisation
 from bayesperiodic.inference.parameters import SHIFT
 from bayesperiodic.inference.problem import Problem
+from bayesperiodic.parallel import checked_executor, team
 from bayesperiodic.store import Result
 
 WIDEST = 0.99
@@ -146,7 +148,7 @@ def _crossing(values: np.ndarray, roots: np.ndarray, level: float, limit: float)
     return float(brentq(lambda x: float(curve(x)) - level, values[last], values[last + 1], xtol=1e-300, rtol=1e-14))
 
 
-def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = None) -> Profile:
+def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = None, *, executor: Any = None) -> Profile:
     """Follow the best log-density from the estimate along every parameter, outwards and back again.
 
     What is profiled is what `map_estimate` maximises: eq. (6) of [1]_ with the bias correction of eq. (7), the priors
@@ -162,6 +164,9 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
         Of this problem.
     names : sequence of str, optional
         Parameters to profile; by default all that are free.
+    executor : None, int, Dask Client, or executor with the interface of concurrent.futures
+        Who follows them, one parameter a task, as in `sample`: by default threads of this process. It does not change
+        the result.
 
     Returns
     -------
@@ -170,7 +175,10 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     Raises
     ------
     ValueError
-        For an unknown name, or an estimate that has no finite log-posterior in this problem.
+        For an unknown name, an estimate that has no finite log-posterior in this problem, or an executor that takes no
+        tasks.
+    WorkersLost
+        If the executor's workers died (a RuntimeError).
 
     Warns
     -----
@@ -200,13 +208,14 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     k         0.94  0.94          1.06  1.06
     """
     chosen = _checked_names(problem, names)
+    executor = checked_executor(executor)
     objective, peak = _at_estimate(problem, fit)
+    with team(executor, (objective, peak)) as crew:
+        found = dict(crew.run(_followed, [problem.names.index(name) for name in chosen]))
     top, best = peak.objective, peak.theta
     values, density, paths, limits = {}, {}, {}, {}
-    for name in chosen:
-        ridge = Ridge(objective, problem.names.index(name), peak)
-        limits[name] = ridge.limits()
-        values[name], density[name], paths[name] = _arrays(ridge.followed(), len(problem.names))
+    for number, name in enumerate(chosen):
+        limits[name], values[name], density[name], paths[name] = found[number]
         if np.nanmax(density[name]) > top:
             top, best = np.nanmax(density[name]), paths[name][np.nanargmax(density[name])]
     result = Profile(
@@ -256,6 +265,14 @@ def _at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate
             "an estimate of this problem."
         )
     return objective, objective.anchored(peak)
+
+
+def _followed(
+    start: tuple[Objective, Iterate], column: int
+) -> tuple[tuple[float, float], np.ndarray, np.ndarray, np.ndarray]:
+    """Return the limits of the parameter in a column of θ, and the values, the objective and θ along its profile."""
+    ridge = Ridge(start[0], column, start[1])
+    return ridge.limits(), *_arrays(ridge.followed(), start[1].theta.size)
 
 
 def _arrays(points: list[Point], size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
