@@ -53,7 +53,7 @@ class Recording(ProcessPoolExecutor):
         super().__init__(workers, get_context("spawn"))
         self.carried: list[bool] = []
 
-    def submit(self, function, /, *arguments):
+    def submit(self, function, /, *arguments):  # noqa: D102
         self.carried.append(arguments[3] is not None)
         return super().submit(function, *arguments)
 
@@ -64,7 +64,7 @@ class Forgetful:
     def __init__(self):
         self.carried: list[bool] = []
 
-    def submit(self, function, /, *arguments) -> Future:
+    def submit(self, function, /, *arguments) -> Future:  # noqa: D102
         self.carried.append(arguments[3] is not None)
         if len(self.carried) % 3 == 0:
             parallel._OPENED.clear()

@@ -236,9 +236,10 @@ import bayesperiodic as bp
 if __name__ == "__main__":
     force = np.cos(2 * np.pi * np.arange(50) / 50)
     fixed = {"m": 1.0, "k3": 0.5}
-    truth = bp.solve_periodic(bp.models.duffing, fixed | {"c": 0.2, "k": 1.0}, {"force": force}, frequency=0.1, samples=50)
+    values, inputs = fixed | {"c": 0.2, "k": 1.0}, {"force": force}
+    truth = bp.solve_periodic(bp.models.duffing, values, inputs, frequency=0.1, samples=50)
     x = truth.outputs["displacement"] + 0.01 * np.random.default_rng(1).standard_normal(50)
-    run = bp.Experiment("run", 0.1, {"displacement": x}, {"force": force}, samples=50)
+    run = bp.Experiment("run", 0.1, {"displacement": x}, inputs, samples=50)
     priors = {"c": bp.LogNormal(0.2, 0.3), "k": bp.Normal(1.0, 0.3)}
     problem = bp.Problem(bp.models.duffing, [run], priors=priors, fixed=fixed)
     fit = bp.map_estimate(problem, progress=False)
