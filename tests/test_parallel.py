@@ -151,6 +151,16 @@ def test_dead_workers_are_one_clear_error():
         list(crew.run(power, [1]))
 
 
+def test_a_task_that_kills_dask_workers_ends_the_run(dask, monkeypatch):
+    """Dask gives a task up when too many workers have died of it; here, the first."""
+    monkeypatch.setattr(dask.cluster.scheduler, "allowed_failures", 0)
+    with (
+        pytest.raises(WorkersLost, match=r"executor: its workers were lost \(KilledWorker: "),
+        team(dask, None) as crew,
+    ):
+        list(crew.run(die, [0]))
+
+
 def test_a_script_without_its_guard_is_told_so(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(

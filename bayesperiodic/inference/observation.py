@@ -67,7 +67,7 @@ class Observation:
         else:
             for channel in self.channels:
                 kind = SPECTRAL if e.mask is None else POINTS
-                size = len(self._harmonic(channel)) if e.mask is None else int(e.mask.sum())
+                size = len(self._harmonics[channel]) if e.mask is None else int(e.mask.sum())
                 found.append(self._block(channel, kind, float(e.independent[channel]), size))
         if e.multipliers is not None:
             found.append(self._block("multipliers", KNOWN, 0.0, e.multipliers.size))
@@ -83,7 +83,7 @@ class Observation:
             kind,
             count,
             size,
-            self._harmonic(channel) if kind == SPECTRAL else np.empty(0),
+            self._harmonics[channel] if kind == SPECTRAL else np.empty(0),
             np.flatnonzero(mask) / self._points if kind == POINTS and mask is not None else np.empty(0),
             self._points,
             _measured_variance(self.experiment, channel),
@@ -94,12 +94,16 @@ class Observation:
         mask = self.experiment.mask
         return (self._points if mask is None else int(mask.sum())) * len(self.channels)
 
-    def _harmonic(self, channel: str) -> np.ndarray:
-        kept = self.experiment.harmonics.get(channel)
-        highest = fourier.highest_harmonic(self._points)
-        harmonics = np.arange(1, 1 + min(highest if kept is None else kept, highest))
-        nyquist = [self._points // 2] if kept is None and self._points % 2 == 0 else []
-        return np.array([0, *harmonics, *harmonics, *nyquist])
+    @cached_property
+    def _harmonics(self) -> dict[str, np.ndarray]:
+        """The harmonic of each spectral component, by channel."""
+        result, highest = {}, fourier.highest_harmonic(self._points)
+        for channel in self.channels:
+            kept = self.experiment.harmonics.get(channel)
+            harmonics = np.arange(1, 1 + min(highest if kept is None else kept, highest))
+            nyquist = [self._points // 2] if kept is None and self._points % 2 == 0 else []
+            result[channel] = np.array([0, *harmonics, *harmonics, *nyquist])
+        return result
 
     @cached_property
     def _joint(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -152,7 +156,7 @@ class Observation:
                 if e.mask is not None:
                     total[e.mask, c] = weights[c]
                 else:
-                    total[:, c] = self._spread(weights[c], self._harmonic(channel))
+                    total[:, c] = self._spread(weights[c], self._harmonics[channel])
         by_delay = 0.0
         if self._shifted:
             by_delay = -float(np.sum(total * self._rate(response))) * float(response.frequency) / e.periods
@@ -215,7 +219,7 @@ class Observation:
         else:
             for c, channel in enumerate(self.channels):
                 column = picked[..., c]
-                found.append(column if e.mask is not None else self._spectral(column, self._harmonic(channel)))
+                found.append(column if e.mask is not None else self._spectral(column, self._harmonics[channel]))
         for logarithms in multipliers:
             _, slopes, whitening = self._joint
             explained = flat @ slopes.T if slopes.shape[1] else 0.0

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 import bayesperiodic as bp
 from bayesperiodic.inference import problem as problem_module
-from bayesperiodic.inference.sampling import sampling
+from bayesperiodic.inference.sampling import ensemble, sampling
 from tests.inference.observed import (
     DUFFING,
     DUFFING_PRIORS,
@@ -71,6 +71,16 @@ def test_same_bits_with_any_number_of_threads(posed, serial, cores, monkeypatch)
     monkeypatch.setattr(sampling, "available_cores", lambda: cores)
     monkeypatch.setattr(problem_module, "SMALLEST_SHARED", 1)
     assert alike(sampled(posed), serial[0])
+
+
+def test_pieces_leave_no_trace(posed, serial, monkeypatch):
+    """In pieces of another length the same chain, and accepted proposals are those that moved a walker."""
+    monkeypatch.setattr(ensemble, "PIECE", 7)
+    assert alike(sampled(posed), serial[0])
+    kept = content(serial[1])
+    for name in ("ensemble 0", "ensemble 1"):
+        moved = np.any(np.diff(kept[f"{name} chain"], axis=0) != 0.0, axis=-1).sum(axis=0)
+        assert set(kept[f"{name} accepted"] - moved) <= {0.0, 1.0}, "the first step has no predecessor in the chain"
 
 
 @pytest.mark.parametrize("which", ["processes", "dask", "threads"])
