@@ -90,7 +90,7 @@ def team(executor: Any, shared: Any) -> Iterator["Team"]:
     Raises
     ------
     ValueError
-        If tasks cannot be handed to the executor.
+        If tasks cannot be handed to the executor, or the shared data cannot be pickled.
     """
     given = checked_executor(executor)
     with ExitStack() as stack:
@@ -131,14 +131,12 @@ class Team:
         if isinstance(executor, ThreadPoolExecutor):
             self._always = True
             return
-        import cloudpickle
-
-        payload = cloudpickle.dumps(shared)
+        payload = _pickled(shared)
         self._key, self._content = hashlib.sha256(payload).hexdigest(), payload
         self._always = _is_dask(executor) and hasattr(executor, "scatter")
         if self._always:
             self._submit = partial(executor.submit, pure=False)
-            with warnings.catch_warnings(), _losses():
+            with warnings.catch_warnings(), _losses(RuntimeError, OSError):
                 warnings.simplefilter("ignore")  # of a large task graph: it is large once
                 self._content = self._submit(_same, payload)
             return
@@ -204,6 +202,18 @@ class Team:
             with suppress(Exception):
                 future.cancel()
         self._running.clear()
+
+
+def _pickled(shared: Any) -> bytes:
+    import cloudpickle
+
+    try:
+        return cloudpickle.dumps(shared)
+    except Exception as error:  # whatever an object of the user's answers to pickle
+        raise ValueError(
+            f"executor: it is not allowed here, the problem cannot be pickled ({type(error).__name__}: {error}); leave "
+            "the executor out, or give what is in the problem (priors, noise model) a form that can."
+        ) from error
 
 
 def _is_dask(thing: Any) -> bool:

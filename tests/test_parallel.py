@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import uuid
 from collections import Counter
@@ -176,6 +177,12 @@ def test_a_script_without_its_guard_is_told_so(tmp_path):
 def test_what_takes_no_tasks_is_refused(bad):
     with pytest.raises(ValueError, match=r"executor: .* is not allowed; it must be None, a number of processes of at"):
         checked_executor(bad)
+
+
+def test_what_cannot_be_pickled_is_refused(processes):
+    with pytest.raises(ValueError, match=r"executor: .* the problem cannot be pickled \(TypeError: cannot pickle '_th"):
+        with team(processes, threading.Lock()):
+            pass
 
 
 def test_items_shared_by_threads_keep_their_order_and_raise():

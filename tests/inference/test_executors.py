@@ -139,8 +139,8 @@ def killed(pool: ProcessPoolExecutor) -> None:
 def test_dead_workers_leave_what_was_walked(posed, serial, tmp_path, monkeypatch):
     """First so early that there is no result, then late enough for one, then to the end without workers."""
     path = tmp_path / "run.h5"
-    for steps in (0, 75):
-        with ProcessPoolExecutor(2, get_context("spawn")) as pool, monkeypatch.context() as patch:
+    for workers, steps in ((1, 0), (2, 75)):
+        with ProcessPoolExecutor(workers, get_context("spawn")) as pool, monkeypatch.context() as patch:
             hooked(patch, steps, lambda pool=pool: killed(pool))
             if steps:
                 partial = sampled(posed, executor=pool, checkpoint=path, progress=True)
