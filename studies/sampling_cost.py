@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from multiprocessing import get_context
 from typing import Any
 
@@ -17,7 +17,7 @@ from studies.solver_cost import GEAR, RIG
 
 SAMPLES = 800
 LOG_POSTERIOR = 5e-3
-WALKERS, ENSEMBLES, STEPS = 4, 2, 250
+WALKERS, ENSEMBLES, STEPS = 8, 2, 250
 POINTS = 64
 LOOP = 5_000_000
 
@@ -59,10 +59,13 @@ def estimate(problem: bp.Problem) -> bp.MapEstimate:
 def pool_overhead(repeats: int = 5) -> dict[str, Any]:
     """Compare a sampling run on one thread with the same run in a pool of one worker, log-posteriors taking 5 ms.
 
-    All runs are held on one core of the machine, so that nothing that a pool does besides can hide on another: the
-    worker, the process that waits for it, and Dask's scheduler share it. The pools have done a run before, as starting
-    processes takes seconds whatever the length of a run. Repeats are interleaved; with as few walkers as allowed a pool
-    has the least to do between messages.
+    The pools have done a run before, as starting processes takes seconds whatever the length of a run. Repeats are
+    interleaved. With a quarter of the walkers that are the default, a message is worth a quarter of the usual work.
+
+    Parameters
+    ----------
+    repeats : int
+        A minute each.
 
     Returns
     -------
@@ -73,28 +76,22 @@ def pool_overhead(repeats: int = 5) -> dict[str, Any]:
     """
     from distributed import Client, LocalCluster
 
-    with _one_core():
-        problem, fit = _sized()
-        settings: dict[str, Any] = {
-            "seed": 1,
-            "ensembles": ENSEMBLES,
-            "walkers": WALKERS,
-            "max_steps": STEPS,
-            "progress": False,
-        }
+    problem, fit = _sized()
+    settings: dict[str, Any] = {"ensembles": ENSEMBLES, "walkers": WALKERS, "max_steps": STEPS, "progress": False}
 
-        def run(executor: Any) -> tuple[float, bp.Posterior]:
+    def run(executor: Any) -> tuple[float, bp.Posterior]:
+        with _one_core() if executor is None else nullcontext():
             before = time.perf_counter()
-            posterior = bp.sample(problem, fit, variances="collapsed", executor=executor, **settings)
+            posterior = bp.sample(problem, fit, seed=1, variances="collapsed", executor=executor, **settings)
             return time.perf_counter() - before, posterior
 
-        with (
-            ProcessPoolExecutor(1, get_context("spawn")) as process,
-            LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
-            Client(cluster) as dask,
-        ):
-            executors = {"serial": None, "process": process, "dask": dask}
-            runs = [{name: run(executor) for name, executor in executors.items()} for _ in range(repeats + 1)][1:]
+    with (
+        ProcessPoolExecutor(1, get_context("spawn")) as process,
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster) as dask,
+    ):
+        executors = {"serial": None, "process": process, "dask": dask}
+        runs = [{name: run(executor) for name, executor in executors.items()} for _ in range(repeats + 1)][1:]
     times = {name: np.array([entry[name][0] for entry in runs]) for name in executors}
     posterior = runs[0]["serial"][1]
     for name in executors:
@@ -183,7 +180,7 @@ def _seconds(action: Callable[[], Any], calls: int) -> float:
 
 @contextmanager
 def _one_core() -> Iterator[None]:
-    """Hold this thread, and all that it starts, on one core."""
+    """Hold this thread, and those that it starts, on one core."""
     if not hasattr(os, "sched_setaffinity"):
         raise RuntimeError("Only Linux holds a process on one core, and this comparison needs that.")
     before = os.sched_getaffinity(0)
