@@ -217,10 +217,8 @@ class _Run:
                 raise
         except WorkersLost as lost:
             if not self._stopped("stopped", store, f": {lost}"):
-                kept = "is in the checkpoint, from which the same call goes on" if store else "is lost"
-                raise RuntimeError(
-                    f"{lost} That was after {self._done} steps, too few for a result; what there was {kept}."
-                ) from lost
+                kept = "the same call goes on from the checkpoint" if store and self._done else "start again"
+                raise RuntimeError(f"{lost} That was after {self._done} steps, too few for a result; {kept}.") from lost
 
     @property
     def _done(self) -> int:
