@@ -8,9 +8,10 @@ from scipy.special import gammaln
 
 from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.estimation.joint_laplace import logarithmic
+from bayesperiodic.inference.linearisation import Linearisation
 from bayesperiodic.inference.noise.models import FLAT, JEFFREYS, Independent
 from bayesperiodic.inference.problem import Problem
-from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
+from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
 
 RIDGE, NATURAL = "ridge", "natural"
 SAMPLED, COLLAPSED = "sampled", "collapsed"
@@ -126,6 +127,41 @@ class SamplingDensity:
                     values[good] += np.sum(0.5 * moments[good] + self._integrals(moments[good]), axis=-1)
         values = np.where(inside & np.isfinite(values), values, -np.inf)
         return np.concatenate([values[:, None], moments], axis=1) if self.collapsed else values
+
+    def value_and_gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the log-density of one point (dimension,) and its gradient there, variances not integrated out.
+
+        The value is that of `__call__`. A forced model takes one periodic solve and one transposed one. Where a solve
+        fails, or a derivative does not exist, which counts as "singular", the value is −inf and the gradient zero.
+        """
+        theta, noise = self.to_natural(point)
+        self.calls += 1
+        nothing, likelihood = (-np.inf, np.zeros(self.dimension)), self.problem.likelihood
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            value = float(self.problem.log_prior(theta) + likelihood.log_prior(noise))
+            value += float(point[: theta.size][self.logarithmic].sum())
+            if not np.isfinite(value):
+                return nothing
+            here = Linearisation(theta, self.problem.responses, self.problem.observations)
+            if not here.converged:
+                self.failures[max(here.statuses.values(), key=STATUSES.index)] += 1
+                return nothing
+            value += float(likelihood(here.residuals, noise))
+            if not np.isfinite(value):
+                return nothing
+            by_residual, by_noise = likelihood.gradients(here.residuals, noise)
+            if self.problem.model.autonomous:
+                by_theta = self.problem.linearised(theta).forward(by_residual)
+            else:
+                by_theta = here.adjoint(by_residual)
+            by_theta += self.problem.joint_prior.gradient(theta)
+        by_theta[self.logarithmic] = by_theta[self.logarithmic] * theta[self.logarithmic] + 1.0
+        free = [self.problem.noise_names.index(name) for name in self.free]
+        gradient = np.concatenate([by_theta, by_noise[free]])
+        if not np.isfinite(gradient).all():
+            self.failures[STATUSES[SINGULAR]] += 1
+            return nothing
+        return value, gradient
 
     def _integrals(self, moments: np.ndarray) -> np.ndarray:
         """Return ln ∫ exp(−½ [n ln v + M/v]) p(v) dv of each collapsed variance."""

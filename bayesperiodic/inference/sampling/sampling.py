@@ -17,11 +17,13 @@ from bayesperiodic.inference.sampling.checkpoint import Checkpoint, Saved
 from bayesperiodic.inference.sampling.coordinates import COLLAPSED, NATURAL, RIDGE, SAMPLED, RidgeMap, SamplingDensity
 from bayesperiodic.inference.sampling.draws import gather
 from bayesperiodic.inference.sampling.ensemble import Ensemble, Ground, Walked, walk
+from bayesperiodic.inference.sampling.nuts import refuse_for_nuts, sample_nuts
 from bayesperiodic.inference.sampling.posterior import Posterior
-from bayesperiodic.inference.sampling.starts import LAPLACE, PRIOR, STARTS, start_points
+from bayesperiodic.inference.sampling.starts import LAPLACE, STARTS, start_points, walking_axes
 from bayesperiodic.inference.sampling.stopping import shortfall
 from bayesperiodic.parallel import Team, WorkersLost, available_cores, checked_executor, team
 
+EMCEE, NUTS = "emcee", "nuts"
 BLOCK = 250
 PASSES = 2
 FEWEST_STEPS = 50
@@ -38,6 +40,7 @@ def sample(
     start: str = LAPLACE,
     coordinates: str = RIDGE,
     variances: str = SAMPLED,
+    sampler: str = EMCEE,
     checkpoint: str | Path | None = None,
     executor: Any = None,
     progress: bool = True,
@@ -55,6 +58,10 @@ def sample(
     changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and 95 % quantiles agree
     within a quarter of a standard deviation, twice in succession. Ctrl-C ends it with what is there, not converged, and
     so does the loss of the executor's workers.
+
+    A second sampler checks the first: ``sampler="nuts"`` samples the same density by its gradient, with the no-U-turn
+    sampler of nutpie. Each ensemble is then a single chain, which tunes itself over 500 draws that are dropped, and has
+    to be 500 autocorrelation times long; the rest of the stop rule is the same, and so are start, axes and Ctrl-C.
 
     Parameters
     ----------
@@ -77,6 +84,10 @@ def sample(
     variances : "sampled" or "collapsed"
         "collapsed" integrates the unknown variances out and draws them exactly afterwards: the same posterior in fewer
         dimensions. Only for independent errors with the prior 1/v or a flat one.
+    sampler : "emcee" or "nuts"
+        "nuts" takes ``pip install "bayesperiodic[nuts]"``, no `walkers`, no `checkpoint` and no collapsed variances;
+        `max_steps` does not count its tuning, `acceptance` is that of its trajectories, and ``sample_stats`` tells more
+        about each draw. Trajectories that diverge are counted in `reason`.
     checkpoint : path, optional
         An HDF5 file that holds the run so far, whenever the process may be killed; the same call resumes it. A finished
         one returns at once. emcee's HDFBackend reads it, in coordinates in which the Laplace approximation is a unit
@@ -99,16 +110,26 @@ def sample(
     ------
     ValueError
         For too few or an odd number of walkers, a start with no finite log-posterior, variances that cannot be
-        integrated out, a checkpoint of another problem, damaged or in use, an executor that takes no tasks.
+        integrated out, a checkpoint of another problem, damaged or in use, an executor that takes no tasks, an argument
+        that "nuts" does not take.
     RuntimeError
         If the executor's workers were lost before there were enough steps for a result; what there was is in the
         checkpoint.
+    ImportError
+        For "nuts" without nutpie.
+
+    Warns
+    -----
+    UserWarning
+        If trajectories of "nuts" diverged.
 
     References
     ----------
     D. Foreman-Mackey, D. W. Hogg, D. Lang, J. Goodman, emcee: the MCMC hammer, PASP 125 (2013) 306-312.
     C. J. F. ter Braak, A Markov chain Monte Carlo version of the genetic algorithm differential evolution, Statistics
     and Computing 16 (2006) 239-249.
+    M. D. Hoffman, A. Gelman, The no-U-turn sampler: adaptively setting path lengths in Hamiltonian Monte Carlo,
+    Journal of Machine Learning Research 15 (2014) 1593-1623.
     """
     checks.integer("ensembles", ensembles, 2)
     checks.integer("max_steps", max_steps, BLOCK)
@@ -117,12 +138,16 @@ def sample(
     checks.one_of("coordinates", coordinates, (RIDGE, NATURAL))
     checks.one_of("variances", variances, (SAMPLED, COLLAPSED))
     executor = checked_executor(executor)
+    checks.one_of("sampler", sampler, (EMCEE, NUTS))
     plain = SamplingDensity(problem, coordinates=coordinates, variances=variances)
     if variances == COLLAPSED and not plain.collapsed:
         raise ValueError(
             "variances: 'collapsed' is not allowed; there is no unknown variance of independent errors with the prior "
             "1/v or a flat one."
         )
+    if sampler == NUTS:
+        refuse_for_nuts(walkers, variances, checkpoint)
+        return sample_nuts(plain, fit, seed, ensembles, max_steps, start, progress)
     walkers = _checked_walkers(walkers, plain)
     settings = f"seed {seed}, {ensembles} ensembles of {walkers} walkers, {start}, {coordinates}, {variances}"
     with nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings) as store:
@@ -170,7 +195,7 @@ class _Run:
         self.map = (
             RidgeMap(np.array(state["origin"]), np.array(state["axes"]))
             if saved
-            else _axes(densities[0], fit, start, np.random.default_rng(sequences[ensembles + 1]))
+            else walking_axes(densities[0], fit, start, np.random.default_rng(sequences[ensembles + 1]))
         )
         self.state = state or {
             "anchor": anchor.tolist(), "guesses": _as_lists(guesses),
@@ -313,14 +338,3 @@ class _Run:
 
 def _as_lists(guesses: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, list[float]]]:
     return {run: {state: values.tolist() for state, values in states.items()} for run, states in guesses.items()}
-
-
-def _axes(density: SamplingDensity, fit: MapEstimate, start: str, generator: np.random.Generator) -> RidgeMap:
-    """Return the axes of the walk: those of the Laplace approximation, or the spread of the start where it has none."""
-    try:
-        return RidgeMap.of(*density.laplace(fit))
-    except ValueError:
-        if start != PRIOR:
-            raise
-    points = start_points(density, fit, start, 10 * density.dimension, generator)
-    return RidgeMap(points.mean(axis=0), np.diag(points.std(axis=0)))

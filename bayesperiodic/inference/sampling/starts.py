@@ -4,7 +4,7 @@ import numpy as np
 
 from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.noise.estimate import estimate_noise
-from bayesperiodic.inference.sampling.coordinates import SamplingDensity
+from bayesperiodic.inference.sampling.coordinates import RidgeMap, SamplingDensity
 from bayesperiodic.periodic.compiled import CONVERGED
 
 LAPLACE, PRIOR, OVERDISPERSED = "laplace", "prior", "overdispersed"
@@ -59,3 +59,14 @@ def _from_prior(density: SamplingDensity, size: int, generator: np.random.Genera
         best[free] *= np.exp(NOISE_SPREAD * generator.standard_normal(len(free)))
         noise.append(best)
     return density.from_natural(theta[status == CONVERGED], np.array(noise).reshape(-1, len(likelihood.names)))
+
+
+def walking_axes(density: SamplingDensity, fit: MapEstimate, start: str, generator: np.random.Generator) -> RidgeMap:
+    """Return the axes of the walk: those of the Laplace approximation, or the spread of the start where it has none."""
+    try:
+        return RidgeMap.of(*density.laplace(fit))
+    except ValueError:
+        if start != PRIOR:
+            raise
+    points = start_points(density, fit, start, 10 * density.dimension, generator)
+    return RidgeMap(points.mean(axis=0), np.diag(points.std(axis=0)))

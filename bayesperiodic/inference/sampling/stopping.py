@@ -5,6 +5,7 @@ import numpy as np
 from bayesperiodic.inference.sampling import chains
 
 LENGTHS = 50.0
+LENGTHS_ALONE = 500.0
 TAU_CHANGE = 0.05
 RHAT = 1.005
 QUANTILE_SPREAD = 0.25
@@ -12,6 +13,9 @@ QUANTILE_SPREAD = 0.25
 
 def shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray) -> list[str]:
     """Return what the stop rule misses, in words; nothing if it is passed.
+
+    An ensemble of 32 walkers that is 50 autocorrelation times long holds 1600 independent draws, a walker alone would
+    hold 50, so that it has to be 500 long; all else is the same for both.
 
     Parameters
     ----------
@@ -22,7 +26,8 @@ def shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray) -> list[str]:
     found = []
     if not np.isfinite(tau).all():
         return ["a coordinate that does not move"]
-    if (lengths := kept.shape[1] / tau.max()) < LENGTHS:
+    needed = LENGTHS if kept.shape[2] > 1 else LENGTHS_ALONE
+    if (lengths := kept.shape[1] / tau.max()) < needed:
         found.append(f"length only {lengths:.0f} tau")
     if (change := np.max(np.abs(tau - last) / tau)) > TAU_CHANGE:
         found.append(f"tau changed by {change:.0%}")
