@@ -21,7 +21,7 @@ from bayesperiodic.inference.sampling.starts import start_points, walking_axes
 from bayesperiodic.inference.sampling.stopping import shortfall
 from bayesperiodic.parallel import available_cores
 
-TUNE = 500
+TUNE = 300
 BLOCK = 250
 PASSES = 2
 PAUSE = 0.01
@@ -143,7 +143,7 @@ class _Chain:
             make_initial_point_fn=lambda _: np.ascontiguousarray(u),
         )
         self.sampler = nutpie.sample(
-            model, chains=1, cores=1, tune=TUNE, draws=most, seed=seed, progress_bar=False, blocking=False
+            model, chains=1, cores=1, tune=TUNE, draws=most + 1, seed=seed, progress_bar=False, blocking=False
         )
 
     def _value_and_gradient(self, u: np.ndarray) -> tuple[float, np.ndarray]:
@@ -162,8 +162,8 @@ class _Chain:
 
     @property
     def done(self) -> int:
-        """Draws since the end of tuning."""
-        return max(0, len(self.draws) - TUNE)
+        """Draws since the end of tuning that nutpie surely has too: it may not have filed the last one yet."""
+        return max(0, len(self.draws) - TUNE - 1)
 
     def check(self) -> None:
         """Raise what ended the chain before its time."""
@@ -195,7 +195,7 @@ class _Run:
             self.steps = min(chain.done for chain in self.chains)
             if self.steps < BLOCK:
                 raise
-            self.converged, self.reason = False, f"interrupted after {self.steps} draws"
+            self.reason = f"interrupted after {self.steps} draws"
 
     def _judge(self, max_steps: int, progress: bool) -> None:
         passes, last = 0, np.full(self.density.dimension, np.inf)
@@ -208,10 +208,8 @@ class _Run:
                 bar.set_postfix_str(f"tau {tau.max():.1f}, length {steps / tau.max():.0f} tau")
                 passes = 0 if missing else passes + 1
                 if passes >= PASSES:
-                    self.converged, self.reason = (
-                        True,
-                        f"stop rule passed after {steps} draws of {len(self.chains)} chains",
-                    )
+                    self.converged = True
+                    self.reason = f"stop rule passed after {steps} draws of {len(self.chains)} chains"
                     return
         left = ", ".join(missing) or "the stop rule passed only once"
         self.reason = f"max_steps = {max_steps} reached with {left}"

@@ -60,7 +60,7 @@ def sample(
     so does the loss of the executor's workers.
 
     A second sampler checks the first: ``sampler="nuts"`` samples the same density by its gradient, with the no-U-turn
-    sampler of nutpie. Each ensemble is then a single chain, which tunes itself over 500 draws that are dropped, and has
+    sampler of nutpie. Each ensemble is then a single chain, which tunes itself over 300 draws that are dropped, and has
     to be 500 autocorrelation times long; the rest of the stop rule is the same, and so are start, axes and Ctrl-C.
 
     Parameters
