@@ -100,10 +100,7 @@ def test_where_nothing_is_finite_value_and_gradient_say_so(edge):
 
 @needs_nutpie
 def test_nuts_matches_the_closed_form_within_monte_carlo_error(monkeypatch):
-    """Mean, variance and three quantiles of three parameters within 4 Monte Carlo errors: false alarms below 0.1 %.
-
-    The chains depend on each other no more than by chance, 5 standard deviations for the largest of 18 correlations.
-    """
+    """Mean, variance and three quantiles of three parameters within 4 Monte Carlo errors: false alarms below 0.1 %."""
     for name, looser in {"TAU_CHANGE": 0.2, "QUANTILE_SPREAD": 0.5, "RHAT": 1.02}.items():
         monkeypatch.setattr(stopping, name, looser)
     priors = PRIORS | {"c": bp.Normal(30.0, 20.0)}
@@ -123,8 +120,6 @@ def test_nuts_matches_the_closed_form_within_monte_carlo_error(monkeypatch):
         for values, expected in facts:
             found, error = mean_and_error(values.astype(float))
             assert abs(found - expected) < 4 * error
-        between = np.corrcoef(unit[:, :, 0]) - np.eye(4)
-        assert np.abs(between).max() < 5 / np.sqrt(unit.shape[1])
 
 
 @needs_nutpie
