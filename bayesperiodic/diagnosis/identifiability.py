@@ -203,7 +203,7 @@ def _verdict(row: dict, size_known: bool) -> str:
     margin = MONTE_CARLO_ERRORS * row["p_negative_mcse"]
     if size_known and max(row["p_negative"], 1.0 - row["p_negative"]) < ONE_SIGN - margin:
         return SIGN
-    if row["profile"] == ONE_SIDED:
+    if row["profile"] == ONE_SIDED and row["collinearity"] < COLLINEAR:
         return PRIOR_ONLY
     if row["alone"] > SILENT:
         return NOTHING

@@ -189,7 +189,7 @@ class Observation:
         else:
             for c, channel in enumerate(self.channels):
                 if e.mask is None:
-                    noise[..., c] = self._signal(components[c], self._harmonic(channel))
+                    noise[..., c] = self._signal(components[c], self._harmonics[channel])
                 else:
                     noise[:, e.mask, c] = components[c]
         values = self._predicted(response) + noise

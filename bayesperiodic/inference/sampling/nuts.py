@@ -6,6 +6,7 @@ from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -37,7 +38,7 @@ STATISTICS = {
 }
 
 
-def refuse_for_nuts(walkers: int | None, variances: str, checkpoint: str | Path | None) -> None:
+def refuse_for_nuts(walkers: int | None, variances: str, checkpoint: str | Path | None, executor: Any) -> None:
     """Raise a ValueError for arguments of `sample` that the no-U-turn sampler does not take."""
     for argument, value, default, hint in (
         ("walkers", walkers, None, "a chain has no walkers, so leave it out, and see ensembles"),
@@ -48,8 +49,9 @@ def refuse_for_nuts(walkers: int | None, variances: str, checkpoint: str | Path 
             "their gradient is not to be had when they are integrated out, so sample them",
         ),
         ("checkpoint", checkpoint, None, "its chains cannot be resumed, so leave it out"),
+        ("executor", executor, None, "its chains run in threads of this process, so leave it out"),
     ):
-        if value != default:
+        if value is not default and value != default:
             raise ValueError(f"{argument}: {value!r} is not allowed with sampler='nuts'; {hint}.")
 
 
@@ -96,7 +98,7 @@ def sample_nuts(
     density = SamplingDensity(problem, available_cores(), plain.coordinates)
     axes = walking_axes(density, fit, start, np.random.default_rng(sequences[ensembles]))
     starts = start_points(density, fit, start, ensembles, np.random.default_rng(sequences[ensembles + 1]))
-    run = _Run(plain, axes)
+    run = _Run(SamplingDensity(problem, coordinates=plain.coordinates), axes)
     try:
         for u, sequence in zip(axes.inwards(starts), sequences, strict=False):
             own = SamplingDensity(problem, coordinates=plain.coordinates)

@@ -85,7 +85,7 @@ def sample(
         "collapsed" integrates the unknown variances out and draws them exactly afterwards: the same posterior in fewer
         dimensions. Only for independent errors with the prior 1/v or a flat one.
     sampler : "emcee" or "nuts"
-        "nuts" takes ``pip install "bayesperiodic[nuts]"``, no `walkers`, no `checkpoint` and no collapsed variances;
+        "nuts" takes ``pip install "bayesperiodic[nuts]"``, no `walkers`, `checkpoint`, `executor` or collapsed variances;
         `max_steps` does not count its tuning, `acceptance` is that of its trajectories, and ``sample_stats`` tells more
         about each draw. Trajectories that diverge are counted in `reason`.
     checkpoint : path, optional
@@ -137,8 +137,8 @@ def sample(
     checks.one_of("start", start, STARTS)
     checks.one_of("coordinates", coordinates, (RIDGE, NATURAL))
     checks.one_of("variances", variances, (SAMPLED, COLLAPSED))
-    executor = checked_executor(executor)
     checks.one_of("sampler", sampler, (EMCEE, NUTS))
+    executor = checked_executor(executor)
     plain = SamplingDensity(problem, coordinates=coordinates, variances=variances)
     if variances == COLLAPSED and not plain.collapsed:
         raise ValueError(
@@ -146,7 +146,7 @@ def sample(
             "1/v or a flat one."
         )
     if sampler == NUTS:
-        refuse_for_nuts(walkers, variances, checkpoint)
+        refuse_for_nuts(walkers, variances, checkpoint, executor)
         return sample_nuts(plain, fit, seed, ensembles, max_steps, start, progress)
     walkers = _checked_walkers(walkers, plain)
     settings = f"seed {seed}, {ensembles} ensembles of {walkers} walkers, {start}, {coordinates}, {variances}"
