@@ -85,7 +85,7 @@ def sample(
         "collapsed" integrates the unknown variances out and draws them exactly afterwards: the same posterior in fewer
         dimensions. Only for independent errors with the prior 1/v or a flat one.
     sampler : "emcee" or "nuts"
-        "nuts" takes ``pip install "bayesperiodic[nuts]"``, no `walkers`, `checkpoint`, `executor` or collapsed variances;
+        "nuts" takes ``pip install "bayesperiodic[nuts]"``; no walkers, checkpoint, executor or collapsed variances;
         `max_steps` does not count its tuning, `acceptance` is that of its trajectories, and ``sample_stats`` tells more
         about each draw. Trajectories that diverge are counted in `reason`.
     checkpoint : path, optional
