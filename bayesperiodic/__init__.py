@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from bayesperiodic.inference.sampling.sampling import sample
     from bayesperiodic.models.model import Model
     from bayesperiodic.models.smooth import smooth_abs, smooth_sign
+    from bayesperiodic.models.structure.result import Structure
+    from bayesperiodic.models.structure.structure import structure
     from bayesperiodic.periodic.continuation import Branch, continue_periodic, double_period, iterate_periodic
     from bayesperiodic.periodic.schemes import Scheme
     from bayesperiodic.periodic.solution import PeriodicSolution
@@ -54,7 +56,7 @@ _HOMES = {
     "bayesperiodic.diagnosis.prior_predictive": ["PriorPredictive", "prior_predictive"],
     "bayesperiodic.inference.estimation.estimate": ["MapEstimate"],
     "bayesperiodic.inference.estimation.map_estimate": ["map_estimate"],
-    "bayesperiodic.inference.sampling.posterior": ["Posterior"],
+    "bayesperiodic.inference.estimation.profile": ["Profile", "profile"],
     "bayesperiodic.inference.priors.multivariate": ["MultivariateNormal"],
     "bayesperiodic.inference.priors.univariate": [
         "HalfNormal",
@@ -67,16 +69,13 @@ _HOMES = {
         "Uniform",
     ],
     "bayesperiodic.inference.problem": ["Problem"],
-    "bayesperiodic.inference.estimation.profile": ["Profile", "profile"],
+    "bayesperiodic.inference.sampling.posterior": ["Posterior"],
     "bayesperiodic.inference.sampling.sampling": ["sample"],
     "bayesperiodic.models.model": ["Model"],
     "bayesperiodic.models.smooth": ["smooth_abs", "smooth_sign"],
-    "bayesperiodic.periodic.continuation": [
-        "Branch",
-        "continue_periodic",
-        "double_period",
-        "iterate_periodic",
-    ],
+    "bayesperiodic.models.structure.result": ["Structure"],
+    "bayesperiodic.models.structure.structure": ["structure"],
+    "bayesperiodic.periodic.continuation": ["Branch", "continue_periodic", "double_period", "iterate_periodic"],
     "bayesperiodic.periodic.schemes": ["Scheme"],
     "bayesperiodic.periodic.solution": ["PeriodicSolution"],
     "bayesperiodic.periodic.solve": ["solve_periodic"],
@@ -94,10 +93,10 @@ _HOME = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = [  # noqa: PLE0604
     "Branch", "Comparison", "Experiment", "HalfNormal", "Identifiability", "InverseGamma", "LogNormal",
     "LogUniform", "MapEstimate", "Model", "MultivariateNormal", "Normal", "PeriodicSolution", "Posterior",
-    "Prediction", "PriorPredictive", "Problem", "Profile", "Recording", "Scheme", "StudentT", "TruncatedNormal",
-    "Uniform", "compare", "continue_periodic", "double_period", "identifiability", "iterate_periodic", "load",
-    "map_estimate", "models", "multiplier_sensitivities", "noise", "plot", "predict", "prior_predictive", "profile",
-    "sample", "simulate", "smooth_abs", "smooth_sign", "solve_periodic",
+    "Prediction", "PriorPredictive", "Problem", "Profile", "Recording", "Scheme", "Structure", "StudentT",
+    "TruncatedNormal", "Uniform", "compare", "continue_periodic", "double_period", "identifiability",
+    "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "noise", "plot", "predict",
+    "prior_predictive", "profile", "sample", "simulate", "smooth_abs", "smooth_sign", "solve_periodic", "structure",
 ]  # fmt: skip
 
 

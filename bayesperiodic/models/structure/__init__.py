@@ -1,0 +1,1 @@
+"""Structural identifiability: what equations and measured channels can determine at all, before any data."""

@@ -1,0 +1,258 @@
+"""Structural identifiability: which parameters the equations and the measured channels can determine at all."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import sympy as sp
+
+from bayesperiodic import checks
+from bayesperiodic.models.model import Model
+from bayesperiodic.models.structure.determining import determining_equations
+from bayesperiodic.models.structure.flow import Flow, flow_of, verified
+from bayesperiodic.models.structure.generators import Generator, generators_of
+from bayesperiodic.models.structure.invariants import coefficients_of, combinations_of
+from bayesperiodic.models.structure.rank import silent_directions
+from bayesperiodic.models.structure.result import Structure, Symmetry
+from bayesperiodic.models.structure.system import System, system_of
+from bayesperiodic.models.structure.text import written
+
+SMALL = 1e-7
+
+
+def structure(
+    model: Model, *, outputs: Iterable[str] | None = None, fixed: Mapping[str, float] | Iterable[str] = ()
+) -> Structure:
+    """Find which parameters, and which combinations of them, can be determined from the measured outputs at all.
+
+    Everything is taken at its best: no noise, no end of data, any inputs, frequencies and motions, and parameters in
+    general position. What is found undetermined here no experiment can determine; the converse needs the data.
+
+    Two searches meet. From above: infinitesimal transformations of the parameters and, affine in the states and
+    inputs, of the states, that map solutions to solutions and leave outputs, inputs and time alone (Lie symmetries, as
+    in [1]_ [2]_). They obey linear equations, solved exactly over the rational functions of the parameters; finite
+    transformations are accepted only if substitution in the symbolic equations confirms them. From below: the rank of
+    exact sensitivities of the outputs' Taylor coefficients at random values, which bounds the number of symmetries of
+    any kind [3]_. Where the two numbers agree, nothing is left open.
+
+    Parameters
+    ----------
+    model : Model
+    outputs : iterable of str, optional
+        The measured ones; by default all.
+    fixed : iterable of str, or mapping of str to number, optional
+        Parameters that are known. A value of zero removes their terms, any other is taken as general.
+
+    Returns
+    -------
+    Structure
+
+    Raises
+    ------
+    ValueError
+        For an unknown output or parameter, no output, or a value of zero that the equations divide by.
+
+    Notes
+    -----
+    Discrete ambiguities, such as the common sign of two factors, are not looked for. A jump (not a corner) whose place
+    depends on a parameter is seen by the symmetries but not by the sensitivities.
+
+    References
+    ----------
+    .. [1] J. W. T. Yates, N. D. Evans, M. J. Chappell, Structural identifiability analysis via symmetries of
+       differential equations, Automatica 45, 2009, 2585-2591.
+    .. [2] B. Merkt, J. Timmer, D. Kaschek, Higher-order Lie symmetries in identifiability and predictability analysis
+       of dynamic models, Physical Review E 92, 2015, 012920.
+    .. [3] A. Sedoglavic, A probabilistic algorithm to test local algebraic observability in polynomial time, Journal
+       of Symbolic Computation 33, 2002, 735-755.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> found = bp.structure(bp.models.pendulum, fixed=["a", "g", "v0"])
+    >>> found.combinations
+    ('k1/(m*l**2)', 'k2/(m*l**2)', 'k3/(m*l**2)')
+    >>> found.table.verdict["l"]
+    'determined'
+    """
+    measured = model.outputs if outputs is None else tuple(outputs)
+    for name in measured:
+        checks.one_of("outputs", name, model.outputs)
+    if not measured:
+        raise ValueError("outputs: () is not allowed; at least one must be measured.")
+    for name in fixed:
+        checks.one_of("fixed", name, model.parameters)
+    values = dict(fixed) if isinstance(fixed, Mapping) else {}
+    zeros = [name for name, value in values.items() if checks.finite_number(f"fixed[{name!r}]", value) == 0.0]
+    whole = system_of(model, measured)
+    system = whole.given(fixed, {whole.parameters[name]: sp.S.Zero for name in zeros})
+    for name in zeros:
+        if any(e.has(sp.zoo, sp.nan, sp.oo) for e in (*system.equations, *system.outputs.values())):
+            raise ValueError(f"fixed: {name} = 0 is not allowed; the equations divide by it.")
+    return analysed(model.name, system, tuple(fixed))
+
+
+def analysed(name: str, whole: System, known: tuple[str, ...]) -> Structure:
+    """Return the structure of a symbolic system, in which parameters may have been replaced by expressions."""
+    system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if n in whole.appearing})
+    names = {s: n for n, s in (whole.parameters | whole.known).items()}
+    kinds, generators, flows = _symmetries(system)
+    coefficients = coefficients_of(system)
+    found = combinations_of(system, generators, [f for f in flows if f], coefficients)
+    combinations = {c: written(c, names).removeprefix("-") for c in found}
+    silent = silent_directions(system) if system.parameters else []
+    unexplained = _unexplained(system, generators, silent)
+    if unexplained and _has_moving_switches(system):
+        silent, unexplained = [], ()
+    return Structure(
+        model=name,
+        outputs=tuple(system.outputs),
+        known=known,
+        to_fix=_smallest_set(system, generators),
+        table=_table(whole, system, generators, coefficients, combinations, unexplained, names),
+        combinations=tuple(combinations.values()),
+        symmetries=tuple(
+            _symmetry(system, kind, generator, flow, combinations, names)
+            for kind, generator, flow in zip(kinds, generators, flows, strict=True)
+        ),
+        rank=len(system.parameters) - min(len(rows) for _, rows in silent) if silent else None,
+        points=len(silent),
+        unexplained=unexplained,
+    )
+
+
+def _symmetries(system: System) -> tuple[list[str], list[Generator], list[Flow | None]]:
+    """Return the kinds of the symmetries, their generators and, where there is a closed one, their finite forms."""
+    found = generators_of(determining_equations(system)) if system.parameters else []
+    flows = [verified(system, flow) if (flow := flow_of(g)) else None for g in found]
+    return (
+        [_kind(g) for g in found],
+        [flow.generator if flow else g for g, flow in zip(found, flows, strict=True)],
+        flows,
+    )
+
+
+def _kind(generator: Generator) -> str:
+    if generator.weights:
+        return "scaling"
+    constant = any(move.is_number for move in (*generator.parameters.values(), *generator.states.values()))
+    return "shift" if constant else "other"
+
+
+def _table(
+    whole: System,
+    system: System,
+    generators: Sequence[Generator],
+    coefficients: Mapping[sp.Expr, bool],
+    combinations: Mapping[sp.Expr, str],
+    unexplained: Sequence[str],
+    names: Mapping[sp.Symbol, str],
+) -> pd.DataFrame:
+    appearing = list(system.parameters)
+    slopes = _slopes(system, generators)
+    moved = [n for n in appearing if any(n in g.parameters for g in generators)]
+    rows = {}
+    for parameter, symbol in whole.parameters.items():
+        verdict, enters, partners = "determined", [t for c, t in combinations.items() if symbol in c.free_symbols], []
+        if parameter not in appearing:
+            verdict = "does not appear"
+        elif parameter in moved:
+            column = appearing.index(parameter)
+            alone = _rank(np.delete(slopes, column, axis=1)) < len(slopes)
+            verdict = "not determined" if alone else "only in combination"
+            pairs = [n for n in moved if n != parameter and _rank(slopes[:, [column, appearing.index(n)]]) == 1]
+            partners = [] if alone else pairs
+        elif parameter in unexplained:
+            verdict = "only in combination"
+        else:
+            unsure = {system.parameters[n] for n in (*moved, *unexplained)}
+            own = [c for c in coefficients if symbol in c.free_symbols and not c.free_symbols & unsure]
+            own.sort(key=lambda c: not coefficients[c])
+            own = [] if any(c.free_symbols == {symbol} for c in own) else own
+            enters = [written(c, names).removeprefix("-") + " (in the drive)" * coefficients[c] for c in own]
+        rows[parameter] = {
+            "verdict": verdict,
+            "enters": "; ".join(enters),
+            "fix": ", ".join(str(i) for i, g in enumerate(generators, 1) if parameter in g.parameters),
+            "partners": ", ".join(partners),
+        }
+    return pd.DataFrame.from_dict(rows, orient="index", columns=["verdict", "enters", "fix", "partners"])
+
+
+def _symmetry(
+    system: System,
+    kind: str,
+    generator: Generator,
+    flow: Flow | None,
+    combinations: Mapping[sp.Expr, str],
+    names: Mapping[sp.Symbol, str],
+) -> Symmetry:
+    symbols = system.parameters | {s: system.symbols[s] for s in generator.states}
+    moves = generator.parameters | generator.states
+    shared = [c.free_symbols for c in combinations if c.free_symbols & {symbols[n] for n in generator.parameters}]
+    texts = {**names, **{system.symbols[s]: s for s in (*system.symbols,)}}
+    amount = ""
+    if flow is not None:
+        wanted = ("t", "scale", "scale_factor") if flow.amount.is_positive else ("delta", "shift_by", "amount")
+        amount = next(n for n in wanted if n not in texts.values())
+        texts[flow.amount] = amount
+    return Symmetry(
+        kind=kind,
+        parameters=tuple(generator.parameters),
+        generator={n: written(move, texts) for n, move in moves.items()},
+        transformation={n: written(flow.images[symbols[n]], texts) for n in moves} if flow else {},
+        amount=amount,
+        factor=tuple(tuple(written(e, texts) for e in flow.factor.row(i)) for i in range(flow.factor.rows))
+        if flow and flow.factor
+        else (),
+        no_help=tuple(
+            n for n, s in system.parameters.items() if n not in generator.parameters and any(s in c for c in shared)
+        ),
+    )
+
+
+def _slopes(
+    system: System, generators: Sequence[Generator], values: Mapping[sp.Symbol, float] | None = None
+) -> np.ndarray:
+    """Return how the parameters move under each generator, (generators, parameters), by default at general values."""
+    if values is None:
+        symbols = (*system.parameters.values(), *system.known.values())
+        values = {s: 0.5 + (0.618 * k) % 1 for k, s in enumerate(symbols, 1)}
+    rows = [[float(g.parameters.get(n, sp.S.Zero).subs(values)) for n in system.parameters] for g in generators]
+    return np.array(rows).reshape(len(generators), len(system.parameters))
+
+
+def _smallest_set(system: System, generators: Sequence[Generator]) -> tuple[str, ...]:
+    """Return the first parameters of the model that, once known, leave no symmetry."""
+    slopes = _slopes(system, generators)
+    chosen: list[int] = []
+    for column in range(len(system.parameters)):
+        if _rank(slopes[:, [*chosen, column]]) > len(chosen):
+            chosen.append(column)
+    return tuple(list(system.parameters)[column] for column in chosen)
+
+
+def _rank(matrix: np.ndarray) -> int:
+    return int(np.linalg.matrix_rank(matrix, tol=SMALL)) if matrix.size else 0
+
+
+def _has_moving_switches(system: System) -> bool:
+    """Return whether a jump may depend on a parameter in a way that derivatives do not see."""
+    switches = set().union(*(e.atoms(sp.sign) for e in (*system.equations, *system.outputs.values())))
+    return any(switch.free_symbols & set(system.parameters.values()) for switch in switches)
+
+
+def _unexplained(
+    system: System, generators: Sequence[Generator], silent: Sequence[tuple[dict[sp.Symbol, float], np.ndarray]]
+) -> tuple[str, ...]:
+    """Return the parameters in directions that no output reacts to at any of the values, beyond the symmetries."""
+    if not silent:
+        return ()
+    values, directions = min(silent, key=lambda found: len(found[1]))
+    theta = np.array([values[s] for s in system.parameters.values()])
+    basis = np.linalg.qr((_slopes(system, generators, values) / theta).T)[0]
+    rest = directions - directions @ basis @ basis.T
+    return tuple(
+        n for n, size in zip(system.parameters, np.abs(rest).max(axis=0, initial=0.0), strict=True) if size > SMALL
+    )
