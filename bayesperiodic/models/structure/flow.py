@@ -108,7 +108,10 @@ def _image(generator: Generator, symbol: sp.Symbol, amount: sp.Symbol) -> sp.Exp
 
 
 def _shortest(expression: sp.Expr) -> sp.Expr:
-    return min(sp.factor(expression), sp.expand(expression), key=sp.count_ops)
+    factored = sp.factor(expression)
+    if sp.fraction(factored)[1].atoms(sp.Add):
+        return factored
+    return min(sp.expand(expression), factored, key=sp.count_ops)
 
 
 def _series(generator: Generator, start: sp.Expr, amount: sp.Symbol) -> sp.Expr | None:

@@ -13,7 +13,7 @@ from bayesperiodic.models.structure.determining import Determining, derivative
 HEAVY = 100
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Generator:
     """An infinitesimal symmetry.
 

@@ -78,11 +78,12 @@ def _others(
     system: System, moving: Sequence[sp.Symbol], generators: Sequence[Generator], flows: Sequence[Flow]
 ) -> list[sp.Expr]:
     """Return monomials that the scalings leave alone, of the parameters after the other symmetries made some zero."""
-    rows = [_weights_of_parameters(system, g) for g in generators]
-    scalings = [row for row in rows if row is not None]
-    others = [f.generator for f in flows if _weights_of_parameters(system, f.generator) is None]
-    moved, zero = _with_zeros(system, others)
-    left = [n for n, s in system.parameters.items() if s in moving and s not in zero]
+    rates = {g: _weights_of_parameters(system, g) for g in generators}
+    curved = [f.generator for f in flows if len(rates[f.generator]) < len(f.generator.parameters)]
+    moved, zero = _with_zeros(system, curved)
+    scalings = [row for g, row in rates.items() if g not in zero.values()]
+    bent = {n for g, row in rates.items() if g not in zero.values() for n in g.parameters if n not in row}
+    left = [n for n, s in system.parameters.items() if s in moving and s not in zero and n not in bent]
     weights = sp.Matrix(len(scalings), len(left), lambda i, j: scalings[i].get(left[j], 0))
     null = [list(v) for v in weights.nullspace()] if scalings else sp.eye(len(left)).tolist()
     if not null:
@@ -96,23 +97,28 @@ def _others(
     return [sp.factor(sp.cancel(p)) for p in products]
 
 
-def _weights_of_parameters(system: System, generator: Generator) -> dict[str, int] | None:
-    """Return whole numbers if the parameters move as under a scaling, whatever the states do."""
+def _weights_of_parameters(system: System, generator: Generator) -> dict[str, int]:
+    """Return whole numbers for the parameters that move as under a scaling, whatever the others and the states do."""
     rates = {n: sp.cancel(move / system.parameters[n]) for n, move in generator.parameters.items()}
-    first = next(iter(rates.values()))
-    ratios = {n: sp.cancel(rate / first) for n, rate in rates.items()}
-    if not all(r.is_Rational for r in ratios.values()):
-        return None
-    common = math.lcm(*(int(r.q) for r in ratios.values()))
-    return {n: int(r * common) for n, r in ratios.items()}
+    best: dict[str, sp.Expr] = {}
+    for unit in rates.values():
+        ratios = {n: sp.cancel(rate / unit) for n, rate in rates.items()}
+        rational = {n: ratio for n, ratio in ratios.items() if ratio.is_Rational}
+        best = max(best, rational, key=len)
+    common = math.lcm(*(int(ratio.q) for ratio in best.values()))
+    return {n: int(ratio * common) for n, ratio in best.items()}
 
 
-def _with_zeros(system: System, generators: Sequence[Generator]) -> tuple[dict[sp.Symbol, sp.Expr], set[sp.Symbol]]:
-    """Return the parameters after one each was made zero along the symmetries, and which were."""
+def _with_zeros(
+    system: System, generators: Sequence[Generator]
+) -> tuple[dict[sp.Symbol, sp.Expr], dict[sp.Symbol, Generator]]:
+    """Return the parameters after one each was made zero along the symmetries, and which by which symmetry."""
     moved = {s: s for s in system.parameters.values()}
     zero: dict[sp.Symbol, Generator] = {}
-    for generator in generators:
-        for symbol, earlier in zero.items():
+    straight: dict[sp.Symbol, Generator] = {}
+    for given in generators:
+        generator = given
+        for symbol, earlier in straight.items():
             generator = generator.minus(earlier, generator.field.get(symbol, sp.S.Zero))
         flow = flow_of(generator)
         unit = [] if flow is None else [s for s in moved if flow.generator.field.get(s) == 1 and s not in zero]
@@ -120,8 +126,8 @@ def _with_zeros(system: System, generators: Sequence[Generator]) -> tuple[dict[s
             continue
         images = {s: image.subs(flow.amount, -unit[0]) for s, image in flow.images.items()}
         moved = {s: sp.factor(images.get(s, s).subs(moved, simultaneous=True)) for s in moved}
-        zero[unit[0]] = flow.generator
-    return moved, set(zero)
+        zero[unit[0]], straight[unit[0]] = given, flow.generator
+    return moved, zero
 
 
 def _normal(expression: sp.Expr) -> sp.Expr:

@@ -106,7 +106,9 @@ class Structure(Result):
         if names := named.get("determined"):
             lines.append(f"  Determined: {', '.join(map(self._through, names))}.")
         if names := named.get("only in combination"):
-            forms = f", which enter only by {', '.join(self.combinations)}" if self.combinations else ""
+            missing = int((self.table["fix"] != "").sum()) - len(self.symmetries) - len(self.combinations)
+            more = f" and {missing} more without a closed form" * (missing > 0)
+            forms = f", which enter only by {', '.join(self.combinations)}{more}" if self.combinations else ""
             lines.append(f"  Only in combination: {', '.join(names)}{forms}.")
         for verdict in ("not determined", "does not appear"):
             if names := named.get(verdict):
@@ -133,8 +135,8 @@ class Structure(Result):
         order = list(self.table.index)
         groups = {tuple(sorted((n, *p.split(", ")), key=order.index)) for n, p in self.table["partners"].items() if p}
         if groups:
-            told = [_listed(group, "or") for group in sorted(groups, key=lambda g: order.index(g[0]))]
-            lines.append(f"  One that is known determines the others of its group: {'; '.join(told)}.")
+            told = [", ".join(group) for group in sorted(groups, key=lambda g: order.index(g[0]))]
+            lines.append(f"  Knowing one of a group determines the rest of it: {'; '.join(told)}.")
         return lines
 
     def _confirmation(self) -> str:
@@ -143,7 +145,7 @@ class Structure(Result):
         appearing = int((self.table["verdict"] != "does not appear").sum())
         said = f"Rank of exact sensitivities at {self.points} random parameter values: {self.rank} of {appearing}"
         if self.unexplained:
-            return f"{said}, less than the symmetries explain: {', '.join(self.unexplained)} are not all determined."
+            return f"{said}; further changes, for which no form was found, involve {', '.join(self.unexplained)}."
         return f"{said}, so no other change leaves the outputs as they are."
 
 

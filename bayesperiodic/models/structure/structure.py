@@ -102,21 +102,21 @@ def analysed(name: str, whole: System, known: tuple[str, ...]) -> Structure:
     found = combinations_of(system, generators, [f for f in flows if f], coefficients)
     combinations = {c: written(c, names).removeprefix("-") for c in found}
     silent = silent_directions(system) if system.parameters else []
-    unexplained = _unexplained(system, generators, silent)
+    directions, unexplained = _directions(system, generators, silent)
     if unexplained and _has_moving_switches(system):
-        silent, unexplained = [], ()
+        directions, unexplained, silent = *_directions(system, generators, []), []
     return Structure(
         model=name,
         outputs=tuple(system.outputs),
         known=known,
-        to_fix=_smallest_set(system, generators),
-        table=_table(whole, system, generators, coefficients, combinations, unexplained, names),
+        to_fix=_smallest_set(system, directions),
+        table=_table(whole, system, generators, directions, coefficients, combinations, names),
         combinations=tuple(combinations.values()),
         symmetries=tuple(
             _symmetry(system, kind, generator, flow, combinations, names)
             for kind, generator, flow in zip(kinds, generators, flows, strict=True)
         ),
-        rank=len(system.parameters) - min(len(rows) for _, rows in silent) if silent else None,
+        rank=len(system.parameters) - len(directions) if silent else None,
         points=len(silent),
         unexplained=unexplained,
     )
@@ -144,32 +144,28 @@ def _table(
     whole: System,
     system: System,
     generators: Sequence[Generator],
+    directions: np.ndarray,
     coefficients: Mapping[sp.Expr, bool],
     combinations: Mapping[sp.Expr, str],
-    unexplained: Sequence[str],
     names: Mapping[sp.Symbol, str],
 ) -> pd.DataFrame:
-    appearing = list(system.parameters)
-    slopes = _slopes(system, generators)
-    moved = [n for n in appearing if any(n in g.parameters for g in generators)]
+    columns = dict(zip(system.parameters, directions.T, strict=True))
+    moved = [n for n, column in columns.items() if np.any(np.abs(column) > SMALL)]
+    unsure = {system.parameters[n] for n in moved}
     rows = {}
     for parameter, symbol in whole.parameters.items():
         verdict, enters, partners = "determined", [t for c, t in combinations.items() if symbol in c.free_symbols], []
-        if parameter not in appearing:
+        if parameter not in columns:
             verdict = "does not appear"
         elif parameter in moved:
-            column = appearing.index(parameter)
-            alone = _rank(np.delete(slopes, column, axis=1)) < len(slopes)
+            others = np.array([column for n, column in columns.items() if n != parameter])
+            alone = _rank(others) < len(directions)
             verdict = "not determined" if alone else "only in combination"
-            pairs = [n for n in moved if n != parameter and _rank(slopes[:, [column, appearing.index(n)]]) == 1]
-            partners = [] if alone else pairs
-        elif parameter in unexplained:
-            verdict = "only in combination"
+            partners = [] if alone else _partners(parameter, {n: columns[n] for n in moved})
         else:
-            unsure = {system.parameters[n] for n in (*moved, *unexplained)}
             own = [c for c in coefficients if symbol in c.free_symbols and not c.free_symbols & unsure]
-            own.sort(key=lambda c: not coefficients[c])
             own = [] if any(c.free_symbols == {symbol} for c in own) else own
+            own.sort(key=lambda c: not coefficients[c])
             enters = [written(c, names).removeprefix("-") + " (in the drive)" * coefficients[c] for c in own]
         rows[parameter] = {
             "verdict": verdict,
@@ -178,6 +174,12 @@ def _table(
             "partners": ", ".join(partners),
         }
     return pd.DataFrame.from_dict(rows, orient="index", columns=["verdict", "enters", "fix", "partners"])
+
+
+def _partners(parameter: str, columns: Mapping[str, np.ndarray]) -> list[str]:
+    """Return the parameters that move in a fixed ratio to one under all symmetries."""
+    own = columns[parameter]
+    return [n for n, column in columns.items() if n != parameter and _rank(np.array([own, column])) == 1]
 
 
 def _symmetry(
@@ -212,23 +214,32 @@ def _symmetry(
     )
 
 
-def _slopes(
-    system: System, generators: Sequence[Generator], values: Mapping[sp.Symbol, float] | None = None
-) -> np.ndarray:
-    """Return how the parameters move under each generator, (generators, parameters), by default at general values."""
-    if values is None:
-        symbols = (*system.parameters.values(), *system.known.values())
-        values = {s: 0.5 + (0.618 * k) % 1 for k, s in enumerate(symbols, 1)}
-    rows = [[float(g.parameters.get(n, sp.S.Zero).subs(values)) for n in system.parameters] for g in generators]
-    return np.array(rows).reshape(len(generators), len(system.parameters))
+def _directions(
+    system: System, generators: Sequence[Generator], silent: Sequence[tuple[dict[sp.Symbol, float], np.ndarray]]
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return orthonormal directions to which no output reacts, and the parameters in those no symmetry explains.
+
+    The directions are relative to the parameters at general values: those of the fewest sensitivities, or, without
+    sensitivities, those of the symmetries.
+    """
+    symbols = (*system.parameters.values(), *system.known.values())
+    general = {s: 0.5 + (0.618 * k) % 1 for k, s in enumerate(symbols, 1)}
+    values, directions = min(silent, key=lambda found: len(found[1]), default=(general, None))
+    moves = [[g.parameters.get(n, sp.S.Zero) / s for n, s in system.parameters.items()] for g in generators]
+    slopes = np.array([[float(move.subs(values)) for move in row] for row in moves])
+    explained = np.linalg.qr(slopes.reshape(len(generators), len(system.parameters)).T)[0].T
+    if directions is None:
+        return explained, ()
+    rest = directions - directions @ explained.T @ explained
+    sizes = np.abs(rest).max(axis=0, initial=0.0)
+    return directions, tuple(n for n, size in zip(system.parameters, sizes, strict=True) if size > SMALL)
 
 
-def _smallest_set(system: System, generators: Sequence[Generator]) -> tuple[str, ...]:
-    """Return the first parameters of the model that, once known, leave no symmetry."""
-    slopes = _slopes(system, generators)
+def _smallest_set(system: System, directions: np.ndarray) -> tuple[str, ...]:
+    """Return the first parameters of the model that, once known, leave no direction undetermined."""
     chosen: list[int] = []
     for column in range(len(system.parameters)):
-        if _rank(slopes[:, [*chosen, column]]) > len(chosen):
+        if _rank(directions[:, [*chosen, column]]) > len(chosen):
             chosen.append(column)
     return tuple(list(system.parameters)[column] for column in chosen)
 
@@ -241,18 +252,3 @@ def _has_moving_switches(system: System) -> bool:
     """Return whether a jump may depend on a parameter in a way that derivatives do not see."""
     switches = set().union(*(e.atoms(sp.sign) for e in (*system.equations, *system.outputs.values())))
     return any(switch.free_symbols & set(system.parameters.values()) for switch in switches)
-
-
-def _unexplained(
-    system: System, generators: Sequence[Generator], silent: Sequence[tuple[dict[sp.Symbol, float], np.ndarray]]
-) -> tuple[str, ...]:
-    """Return the parameters in directions that no output reacts to at any of the values, beyond the symmetries."""
-    if not silent:
-        return ()
-    values, directions = min(silent, key=lambda found: len(found[1]))
-    theta = np.array([values[s] for s in system.parameters.values()])
-    basis = np.linalg.qr((_slopes(system, generators, values) / theta).T)[0]
-    rest = directions - directions @ basis @ basis.T
-    return tuple(
-        n for n, size in zip(system.parameters, np.abs(rest).max(axis=0, initial=0.0), strict=True) if size > SMALL
-    )

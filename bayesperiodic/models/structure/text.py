@@ -21,13 +21,11 @@ def written(expression: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
     below = [(sp.Integer(number.q), sp.S.One)] if number.q != 1 else []
     for factor in sorted(sp.Mul.make_args(rest), key=lambda f: _place(f, order)):
         base, power = (factor, sp.S.One) if isinstance(factor, sp.exp) else factor.as_base_exp()
-        rational = power.is_Rational
         if base.is_Add and power.is_Integer and _terms(base, order)[0].as_coeff_Mul()[0] < 0:
             base, negative = -base, negative ^ (power.is_odd)
         if base != 1:
-            (below if power.is_Rational and power < 0 else above).append(
-                (base, abs(power) if power.is_Rational else power)
-            )
+            rational = power.is_Rational
+            (below if rational and power < 0 else above).append((base, abs(power) if rational else power))
     several = len(above) + len(below) > 1 or bool(negative)
     upper = "*".join(_power(base, power, names, several) for base, power in above) or "1"
     lower = "*".join(_power(base, power, names, True) for base, power in below)
