@@ -28,9 +28,7 @@ TEMPERATURE = {"theta5", "theta7", "theta15", "theta16", "theta17"}
 
 def small(states, parameters, equations, outputs, inputs=("u",)):
     """Return a model of a few lines."""
-    return bp.Model(
-        "small", states=states, inputs=inputs, parameters=parameters, equations=equations, outputs=outputs
-    )
+    return bp.Model("small", states=states, inputs=inputs, parameters=parameters, equations=equations, outputs=outputs)
 
 
 def compartments(outputs=lambda s, p, u: {"y": s.x1}):
@@ -275,14 +273,14 @@ def test_an_offset_of_the_silverbox_is_a_change_of_its_stiffness_and_the_other_o
     }
 
 
-@pytest.mark.parametrize("name", LIBRARY)
+@pytest.mark.parametrize("name", [name for name, (*_, symmetries) in LIBRARY.items() if symmetries])
 def test_combinations_are_as_many_as_needed_independent_and_unmoved(name, found):
     _, _, structure = found(name)
     moved = [n for n in structure.table.index if structure.table.fix[n]]
     assert len(structure.combinations) == len(moved) - len(structure.symmetries)
     values = {n: 0.4 + 0.13 * k for k, n in enumerate(structure.table.index)}
     expressions = [parse("combination", text, values) for text in structure.combinations]
-    slopes = np.array([[e.gradient(values, moved)[n] for n in moved] for e in expressions]).reshape(-1, len(moved))
+    slopes = np.array([[e.gradient(values, moved)[n] for n in moved] for e in expressions])
     assert np.linalg.matrix_rank(slopes) == len(structure.combinations)
     for symmetry in structure.symmetries:
         amount = {symmetry.amount: 1.3 if symmetry.amount == "t" else 0.2}
@@ -349,7 +347,7 @@ def test_two_compartments_with_one_leak_are_determined(leak):
 
 
 def test_the_feedthrough_of_an_input_moves_into_the_state():
-    """x' = a x + b u + c u', y = x + d u has the transfer function (b + a c + (c + d)(s − a))/(s − a)."""
+    """X' = a x + b u + c u', y = x + d u has the transfer function (b + a c + (c + d)(s − a))/(s − a)."""
     model = small(
         ["x"],
         ["a", "b", "c", "d"],
@@ -403,7 +401,7 @@ def test_a_parameter_that_a_hidden_state_absorbs_is_not_determined():
 
 
 def test_what_the_symmetries_miss_the_rank_finds():
-    """y = z/(1 + b z) has y' = a u for every b; the change of z that absorbs b is a Möbius map, not an affine one."""
+    """Y = z/(1 + b z) has y' = a u for every b; the change of z that absorbs b is a Möbius map, not an affine one."""
     model = small(
         ["z"],
         ["a", "b"],

@@ -13,7 +13,7 @@ class Algebra:
 
     Transcendental functions and roots are variables of their own, so that two expressions are equal if their elements
     are; only sin² + cos² = 1, cosh² − sinh² = 1, sign² = 1 and the powers of roots are known relations. The converse
-    holds unless the expressions contain other relations, such as exp(x)² = exp(2x): nothing false is ever found equal.
+    holds unless the expressions contain other relations, such as tan = sin/cos. Denominators under roots are positive.
 
     Parameters
     ----------

@@ -8,6 +8,7 @@ import sympy as sp
 from sympy.polys.matrices import DomainMatrix
 
 from bayesperiodic.models.structure import modular
+from bayesperiodic.models.structure.directions import Directions
 from bayesperiodic.models.structure.flow import Flow, flow_of
 from bayesperiodic.models.structure.generators import Generator
 from bayesperiodic.models.structure.system import System
@@ -46,30 +47,34 @@ def coefficients_of(system: System) -> dict[sp.Expr, bool]:
 
 
 def combinations_of(
-    system: System, generators: Sequence[Generator], flows: Sequence[Flow], coefficients: Iterable[sp.Expr]
+    system: System,
+    generators: Sequence[Generator],
+    flows: Sequence[Flow],
+    directions: Directions,
+    coefficients: Iterable[sp.Expr],
 ) -> list[sp.Expr]:
     """Return independent combinations of the parameters that move, which all symmetries leave alone.
 
     Coefficients of the equations come first, then the simplest others. There are as many as parameters that move less
-    the symmetries, unless a symmetry has no closed form.
+    the directions in which they do, unless a symmetry has no closed form.
     """
-    moving = [s for n, s in system.parameters.items() if any(n in g.parameters for g in generators)]
-    wanted = len(moving) - len(generators)
+    symbols = tuple(system.parameters.values())
+    moving = [system.parameters[n] for n in directions.moved]
+    wanted = len(moving) - len(directions.rows)
     offered = sorted((c for c in coefficients if c.free_symbols & set(moving)), key=sp.count_ops)
     plain = [c for c in offered if not c.atoms(sp.Add)]
     others = [c for c in offered if c.atoms(sp.Add)] + _others(system, moving, generators, flows)
     others.sort(key=lambda e: (sp.count_ops(e) + AWKWARD * bool(sp.fraction(e)[1].atoms(sp.Add)), str(e)))
-    point = {s: 0.5 + (0.618 * k) % 1 for k, s in enumerate((*system.parameters.values(), *system.known.values()), 1)}
     chosen: list[sp.Expr] = []
     slopes = np.empty((0, len(moving)))
     for candidate in dict.fromkeys([*plain, *others]):
         if len(chosen) == wanted:
             break
-        if any(_normal(g.applied(candidate)) != 0 for g in generators):
+        if not directions.leave(candidate, symbols) or any(_normal(g.applied(candidate)) != 0 for g in generators):
             continue
-        slope = [float(sp.diff(candidate, s).subs(point)) for s in moving]
-        if np.linalg.matrix_rank(np.vstack([slopes, slope]), tol=1e-9) > len(slopes):
-            slopes = np.vstack([slopes, slope])
+        extended = np.vstack([slopes, directions.slope(candidate, moving)])
+        if np.linalg.matrix_rank(extended, tol=1e-9) == len(extended):
+            slopes = extended
             chosen.append(candidate)
     return chosen
 

@@ -64,9 +64,10 @@ class Structure(Result):
         coefficients without undetermined ones) by which it enters; fix: the numbers, from 1, of the symmetries that
         knowing it removes; partners: others that determine it once one of them is known.
     combinations : tuple of str
-        Independent combinations that are determined, of the parameters that are not; texts that `derive` takes.
+        Independent combinations that are determined, of the parameters that are not; texts that `derive` takes. With
+        directions that are `unexplained`, confirmed along these at random values only.
     symmetries : tuple of Symmetry
-        Independent of each other: as many parameters must be fixed.
+        Independent of each other.
     to_fix : tuple of str
         The first parameters, in the model's order, that leave no symmetry once they are known.
     rank : int or None
@@ -106,7 +107,7 @@ class Structure(Result):
         if names := named.get("determined"):
             lines.append(f"  Determined: {', '.join(map(self._through, names))}.")
         if names := named.get("only in combination"):
-            missing = int((self.table["fix"] != "").sum()) - len(self.symmetries) - len(self.combinations)
+            missing = len(names) - len(self.to_fix) - len(self.combinations)
             more = f" and {missing} more without a closed form" * (missing > 0)
             forms = f", which enter only by {', '.join(self.combinations)}{more}" if self.combinations else ""
             lines.append(f"  Only in combination: {', '.join(names)}{forms}.")
@@ -129,9 +130,9 @@ class Structure(Result):
             wanted = "" if len(symmetry.parameters) == 1 else "one of "
             helpless = f"; fixing {_listed(symmetry.no_help, 'or')} does not help" if symmetry.no_help else ""
             lines += [f"    {number}. {symmetry!r}", f"       Fix {wanted}{', '.join(symmetry.parameters)}{helpless}."]
-        if len(self.symmetries) == 1:
+        if len(self.to_fix) == 1:
             return lines
-        lines.append(f"  {len(self.symmetries)} parameters must be fixed, for example {_listed(self.to_fix, 'and')}.")
+        lines.append(f"  {len(self.to_fix)} parameters must be fixed, for example {_listed(self.to_fix, 'and')}.")
         order = list(self.table.index)
         groups = {tuple(sorted((n, *p.split(", ")), key=order.index)) for n, p in self.table["partners"].items() if p}
         if groups:
@@ -143,6 +144,8 @@ class Structure(Result):
         if self.rank is None:
             return "The rank of exact sensitivities is not available, so further symmetries are not ruled out."
         appearing = int((self.table["verdict"] != "does not appear").sum())
+        if not appearing:
+            return "No unknown parameter appears."
         said = f"Rank of exact sensitivities at {self.points} random parameter values: {self.rank} of {appearing}"
         if self.unexplained:
             return f"{said}; further changes, for which no form was found, involve {', '.join(self.unexplained)}."

@@ -3,22 +3,19 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
 import pandas as pd
 import sympy as sp
 
 from bayesperiodic import checks
 from bayesperiodic.models.model import Model
 from bayesperiodic.models.structure.determining import determining_equations
+from bayesperiodic.models.structure.directions import Directions, directions_of
 from bayesperiodic.models.structure.flow import Flow, flow_of, verified
 from bayesperiodic.models.structure.generators import Generator, generators_of
 from bayesperiodic.models.structure.invariants import coefficients_of, combinations_of
-from bayesperiodic.models.structure.rank import silent_directions
 from bayesperiodic.models.structure.result import Structure, Symmetry
 from bayesperiodic.models.structure.system import System, system_of
 from bayesperiodic.models.structure.text import written
-
-SMALL = 1e-7
 
 
 def structure(
@@ -98,27 +95,24 @@ def analysed(name: str, whole: System, known: tuple[str, ...]) -> Structure:
     system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if n in whole.appearing})
     names = {s: n for n, s in (whole.parameters | whole.known).items()}
     kinds, generators, flows = _symmetries(system)
+    directions = directions_of(system, generators)
     coefficients = coefficients_of(system)
-    found = combinations_of(system, generators, [f for f in flows if f], coefficients)
+    found = combinations_of(system, generators, [f for f in flows if f], directions, coefficients)
     combinations = {c: written(c, names).removeprefix("-") for c in found}
-    silent = silent_directions(system) if system.parameters else []
-    directions, unexplained = _directions(system, generators, silent)
-    if unexplained and _has_moving_switches(system):
-        directions, unexplained, silent = *_directions(system, generators, []), []
     return Structure(
         model=name,
         outputs=tuple(system.outputs),
         known=known,
-        to_fix=_smallest_set(system, directions),
         table=_table(whole, system, generators, directions, coefficients, combinations, names),
         combinations=tuple(combinations.values()),
         symmetries=tuple(
             _symmetry(system, kind, generator, flow, combinations, names)
             for kind, generator, flow in zip(kinds, generators, flows, strict=True)
         ),
-        rank=len(system.parameters) - len(directions) if silent else None,
-        points=len(silent),
-        unexplained=unexplained,
+        to_fix=directions.smallest_set(),
+        rank=len(system.parameters) - len(directions.rows) if directions.points or not system.parameters else None,
+        points=directions.points,
+        unexplained=directions.unexplained,
     )
 
 
@@ -144,24 +138,22 @@ def _table(
     whole: System,
     system: System,
     generators: Sequence[Generator],
-    directions: np.ndarray,
+    directions: Directions,
     coefficients: Mapping[sp.Expr, bool],
     combinations: Mapping[sp.Expr, str],
     names: Mapping[sp.Symbol, str],
 ) -> pd.DataFrame:
-    columns = dict(zip(system.parameters, directions.T, strict=True))
-    moved = [n for n, column in columns.items() if np.any(np.abs(column) > SMALL)]
+    moved = directions.moved
     unsure = {system.parameters[n] for n in moved}
     rows = {}
     for parameter, symbol in whole.parameters.items():
         verdict, enters, partners = "determined", [t for c, t in combinations.items() if symbol in c.free_symbols], []
-        if parameter not in columns:
+        if parameter not in system.parameters:
             verdict = "does not appear"
         elif parameter in moved:
-            others = np.array([column for n, column in columns.items() if n != parameter])
-            alone = _rank(others) < len(directions)
+            alone = directions.alone(parameter)
             verdict = "not determined" if alone else "only in combination"
-            partners = [] if alone else _partners(parameter, {n: columns[n] for n in moved})
+            partners = [] if alone else directions.partners(parameter)
         else:
             own = [c for c in coefficients if symbol in c.free_symbols and not c.free_symbols & unsure]
             own = [] if any(c.free_symbols == {symbol} for c in own) else own
@@ -174,12 +166,6 @@ def _table(
             "partners": ", ".join(partners),
         }
     return pd.DataFrame.from_dict(rows, orient="index", columns=["verdict", "enters", "fix", "partners"])
-
-
-def _partners(parameter: str, columns: Mapping[str, np.ndarray]) -> list[str]:
-    """Return the parameters that move in a fixed ratio to one under all symmetries."""
-    own = columns[parameter]
-    return [n for n, column in columns.items() if n != parameter and _rank(np.array([own, column])) == 1]
 
 
 def _symmetry(
@@ -212,43 +198,3 @@ def _symmetry(
             n for n, s in system.parameters.items() if n not in generator.parameters and any(s in c for c in shared)
         ),
     )
-
-
-def _directions(
-    system: System, generators: Sequence[Generator], silent: Sequence[tuple[dict[sp.Symbol, float], np.ndarray]]
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return orthonormal directions to which no output reacts, and the parameters in those no symmetry explains.
-
-    The directions are relative to the parameters at general values: those of the fewest sensitivities, or, without
-    sensitivities, those of the symmetries.
-    """
-    symbols = (*system.parameters.values(), *system.known.values())
-    general = {s: 0.5 + (0.618 * k) % 1 for k, s in enumerate(symbols, 1)}
-    values, directions = min(silent, key=lambda found: len(found[1]), default=(general, None))
-    moves = [[g.parameters.get(n, sp.S.Zero) / s for n, s in system.parameters.items()] for g in generators]
-    slopes = np.array([[float(move.subs(values)) for move in row] for row in moves])
-    explained = np.linalg.qr(slopes.reshape(len(generators), len(system.parameters)).T)[0].T
-    if directions is None:
-        return explained, ()
-    rest = directions - directions @ explained.T @ explained
-    sizes = np.abs(rest).max(axis=0, initial=0.0)
-    return directions, tuple(n for n, size in zip(system.parameters, sizes, strict=True) if size > SMALL)
-
-
-def _smallest_set(system: System, directions: np.ndarray) -> tuple[str, ...]:
-    """Return the first parameters of the model that, once known, leave no direction undetermined."""
-    chosen: list[int] = []
-    for column in range(len(system.parameters)):
-        if _rank(directions[:, [*chosen, column]]) > len(chosen):
-            chosen.append(column)
-    return tuple(list(system.parameters)[column] for column in chosen)
-
-
-def _rank(matrix: np.ndarray) -> int:
-    return int(np.linalg.matrix_rank(matrix, tol=SMALL)) if matrix.size else 0
-
-
-def _has_moving_switches(system: System) -> bool:
-    """Return whether a jump may depend on a parameter in a way that derivatives do not see."""
-    switches = set().union(*(e.atoms(sp.sign) for e in (*system.equations, *system.outputs.values())))
-    return any(switch.free_symbols & set(system.parameters.values()) for switch in switches)
