@@ -8,7 +8,7 @@ from bayesperiodic.models.structure.algebra import Algebra
 from bayesperiodic.models.structure.generators import Generator
 from bayesperiodic.models.structure.system import System
 
-LONGEST = 6
+LONGEST = 5
 POWERS = (1, -1, 2)
 
 
