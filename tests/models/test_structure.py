@@ -8,6 +8,10 @@ import sympy as sp
 
 import bayesperiodic as bp
 from bayesperiodic.expressions import parse
+from bayesperiodic.models.structure.flow import Flow, verified
+from bayesperiodic.models.structure.generators import Generator
+from bayesperiodic.models.structure.structure import analysed
+from bayesperiodic.models.structure.system import system_of
 
 GEAR = {
     "theta1": 1.0, "theta2": 0.5, "theta3": 0.6, "theta4": 1.0, "theta5": 1.2, "theta6": -0.5, "theta7": 0.3,
@@ -440,10 +444,26 @@ def test_a_symmetry_may_not_use_names_that_the_model_has():
     assert symmetry.transformation["t"] in ("t*scale_factor", "t/scale_factor")
 
 
-def test_tied_parameters_enter_as_expressions():
-    from bayesperiodic.models.structure.structure import analysed
-    from bayesperiodic.models.structure.system import system_of
+@pytest.mark.parametrize(
+    ("images", "confirmed"),
+    [
+        ({"a": "a + delta", "b": "b - delta"}, True),
+        ({"a": "a + delta", "b": "b - 2*delta"}, False),
+        ({"a": "a + delta"}, False),
+        ({"c": "c + delta"}, False),
+    ],
+)
+def test_a_transformation_that_changes_an_equation_or_an_output_is_refused(images, confirmed):
+    model = small(
+        ["x"], ["a", "b", "c"], lambda s, p, u: [s.dx + (p.a + p.b) * s.x - u.u], lambda s, p, u: {"y": s.x + p.c}
+    )
+    symbols, delta = model.parameter_symbols, sp.Symbol("delta", real=True)
+    moved = {symbols[n]: sp.sympify(e, locals=symbols | {"delta": delta}) for n, e in images.items()}
+    flow = Flow(Generator({}, {}, {}), delta, moved)
+    assert (verified(system_of(model, ["y"]), flow) is not None) == confirmed
 
+
+def test_tied_parameters_enter_as_expressions():
     model = small(["x"], ["a", "b"], lambda s, p, u: [s.dx + p.a * p.b * s.x - u.u], lambda s, p, u: {"y": s.x})
     a, b = model.parameter_symbols.values()
     whole = system_of(model, model.outputs)
