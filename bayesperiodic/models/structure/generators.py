@@ -45,7 +45,7 @@ class Generator:
         """Return self − factor · other."""
         parts = []
         for own, its in zip(_parts(self), _parts(other), strict=True):
-            moves = {k: sp.factor(own.get(k, 0) - factor * its.get(k, 0)) for k in (*own, *(set(its) - set(own)))}
+            moves = {k: sp.factor(own.get(k, 0) - factor * its.get(k, 0)) for k in dict.fromkeys((*own, *its))}
             parts.append({k: v for k, v in moves.items() if v != 0})
         return Generator(*parts)
 

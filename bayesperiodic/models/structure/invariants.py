@@ -21,7 +21,7 @@ def coefficients_of(system: System) -> dict[sp.Expr, bool]:
 
     An equation is first divided by the coefficient of its highest derivative. Arguments of functions count as well.
     """
-    highest = {system.symbols["d" * n + s] for s, n in system.orders.items()}
+    highest = [system.symbols["d" * n + s] for s, n in system.orders.items()]
     parameters = (*system.parameters.values(), *system.known.values())
     drive = {system.symbols["tau"], *(system.symbols[d + n] for d in ("", "d", "dd") for n in system.inputs)}
     moving = set(system.jets)
@@ -37,7 +37,7 @@ def coefficients_of(system: System) -> dict[sp.Expr, bool]:
             ratio = sp.factor(sp.cancel(coefficient / leading)).as_independent(*parameters, as_Add=False)[1]
             if ratio.free_symbols:
                 found[ratio] = found.get(ratio, False) or bool(rest.free_symbols & drive)
-            for function in rest.atoms(sp.Function):
+            for function in sorted(rest.atoms(sp.Function), key=sp.default_sort_key):
                 for argument in function.args:
                     collect(argument)
 
@@ -61,7 +61,7 @@ def combinations_of(
     symbols = tuple(system.parameters.values())
     moving = [system.parameters[n] for n in directions.moved]
     wanted = len(moving) - len(directions.rows)
-    offered = sorted((c for c in coefficients if c.free_symbols & set(moving)), key=sp.count_ops)
+    offered = sorted((c for c in coefficients if c.free_symbols & set(moving)), key=lambda e: (sp.count_ops(e), str(e)))
     plain = [c for c in offered if not c.atoms(sp.Add)]
     others = [c for c in offered if c.atoms(sp.Add)] + _others(system, moving, generators, flows)
     others.sort(key=lambda e: (sp.count_ops(e) + AWKWARD * bool(sp.fraction(e)[1].atoms(sp.Add)), str(e)))

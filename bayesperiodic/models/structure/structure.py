@@ -26,12 +26,12 @@ def structure(
     Everything is taken at its best: no noise, no end of data, any inputs, frequencies and motions, and parameters in
     general position. What is found undetermined here no experiment can determine; the converse needs the data.
 
-    Two searches meet. From above: infinitesimal transformations of the parameters and, affine in the states and
-    inputs, of the states, that map solutions to solutions and leave outputs, inputs and time alone (Lie symmetries, as
-    in [1]_ [2]_). They obey linear equations, solved exactly over the rational functions of the parameters; finite
-    transformations are accepted only if substitution in the symbolic equations confirms them. From below: the rank of
-    exact sensitivities of the outputs' Taylor coefficients at random values, which bounds the number of symmetries of
-    any kind [3]_. Where the two numbers agree, nothing is left open.
+    Two searches meet. One is for transformations of the parameters and the states that map solutions to solutions and
+    leave outputs, inputs and time alone (Lie symmetries, as in [1]_ [2]_; those of the states affine in states and
+    inputs). They obey linear equations, solved exactly over the rational functions of the parameters; a finite
+    transformation is accepted only if substitution in the symbolic equations confirms it. The other is the rank of
+    exact sensitivities of the outputs' Taylor coefficients at random values, beyond which no symmetry of any kind can
+    exist [3]_. Where the two add up to the number of parameters, nothing is left open.
 
     Parameters
     ----------
@@ -52,8 +52,9 @@ def structure(
 
     Notes
     -----
-    Discrete ambiguities, such as the common sign of two factors, are not looked for. A jump (not a corner) whose place
-    depends on a parameter is seen by the symmetries but not by the sensitivities.
+    "Determined" means up to isolated alternatives: discrete ambiguities, such as the common sign of two factors, are
+    not looked for. A jump (not a corner) whose place depends on a parameter is seen by the symmetries but not by the
+    sensitivities, so that no rank is given then.
 
     References
     ----------
@@ -78,16 +79,17 @@ def structure(
         checks.one_of("outputs", name, model.outputs)
     if not measured:
         raise ValueError("outputs: () is not allowed; at least one must be measured.")
-    for name in fixed:
+    known = tuple(fixed)
+    for name in known:
         checks.one_of("fixed", name, model.parameters)
     values = dict(fixed) if isinstance(fixed, Mapping) else {}
     zeros = [name for name, value in values.items() if checks.finite_number(f"fixed[{name!r}]", value) == 0.0]
     whole = system_of(model, measured)
-    system = whole.given(fixed, {whole.parameters[name]: sp.S.Zero for name in zeros})
+    system = whole.given(known, {whole.parameters[name]: sp.S.Zero for name in zeros})
     for name in zeros:
         if any(e.has(sp.zoo, sp.nan, sp.oo) for e in (*system.equations, *system.outputs.values())):
             raise ValueError(f"fixed: {name} = 0 is not allowed; the equations divide by it.")
-    return analysed(model.name, system, tuple(fixed))
+    return analysed(model.name, system, known)
 
 
 def analysed(name: str, whole: System, known: tuple[str, ...]) -> Structure:
