@@ -350,6 +350,20 @@ def test_two_compartments_with_one_leak_are_determined(leak):
     assert structure.rank == 3
 
 
+def test_without_its_mass_an_oscillator_is_of_first_order():
+    structure = bp.structure(bp.models.duffing, fixed={"m": 0.0})
+    assert dict(structure.table.verdict) == dict.fromkeys(["c", "k", "k3"], "determined")
+    assert structure.complete
+
+
+def test_without_heat_capacity_the_temperature_follows_at_once():
+    """What then ties theta15 to the other parameters is gone; the scaling of T and the shift stay."""
+    structure = bp.structure(bp.models.landing_gear("displacement"), fixed={"theta15": 0.0})
+    assert structure.complete
+    assert structure.rank == 12
+    assert {symmetry.kind for symmetry in structure.symmetries} == {"scaling", "shift"}
+
+
 def test_the_feedthrough_of_an_input_moves_into_the_state():
     """X' = a x + b u + c u', y = x + d u has the transfer function (b + a c + (c + d)(s − a))/(s − a)."""
     model = small(

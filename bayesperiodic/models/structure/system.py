@@ -17,7 +17,7 @@ class System:
     Attributes
     ----------
     orders : dict
-        State -> 1 or 2, of those that the measured outputs depend on.
+        State -> 1 or 2, of those that the measured outputs depend on; 0 where known parameters removed derivatives.
     inputs : tuple of str
     symbols : dict
         Name -> symbol of states ("x", "dx", "ddx"), inputs (likewise), "tau" and "frequency".
@@ -80,7 +80,13 @@ def system_of(model: Model, outputs: Iterable[str]) -> System:
 
 
 def _observed(system: System) -> System:
-    """Return the system without the states and equations that no measured output depends on."""
+    """Return the system without the states and equations that no measured output depends on.
+
+    The orders are those that are left where a highest derivative lost its factor.
+    """
+    used = set().union(*(e.free_symbols for e in (*system.equations, *system.outputs.values())))
+    left = {s: max((k for k in range(3) if system.symbols["d" * k + s] in used), default=0) for s in system.orders}
+    system = replace(system, orders=left)
     pending = list(system.outputs.values())
     states: set[str] = set()
     rows: set[int] = set()
