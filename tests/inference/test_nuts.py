@@ -161,7 +161,7 @@ def test_too_few_draws_are_not_converged_and_what_nuts_knows_is_kept(linear, bri
     assert known.attrs["nutpie"]
     group = known["sample_stats"]
     assert dict(group.sizes) == {"chain": 2, "draw": 250}
-    assert {"lp", "diverging", "energy", "tree_depth", "n_steps", "step_size", "acceptance_rate"} == set(
+    assert {"lp", "status", "diverging", "energy", "tree_depth", "n_steps", "step_size", "acceptance_rate"} == set(
         group.data_vars
     )
     assert group["diverging"].dtype == bool
