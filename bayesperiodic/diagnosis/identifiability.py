@@ -10,12 +10,14 @@ from scipy.special import ndtr
 from bayesperiodic.diagnosis.design import Candidate, default_candidates, rank_candidates
 from bayesperiodic.diagnosis.information import Information
 from bayesperiodic.diagnosis.power_scaling import power_scaling
+from bayesperiodic.diagnosis.structural import structure_of
 from bayesperiodic.inference.estimation.directions import combinations, in_words, reduced
 from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.inference.estimation.profile import profile as profile_of
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.inference.sampling.posterior import Posterior
+from bayesperiodic.models.structure.result import Structure
 from bayesperiodic.store import Result
 
 DETERMINED, PRIOR_ONLY = "determined", "only with the prior"
@@ -42,9 +44,9 @@ class Identifiability(Result):
         or "not determined". ``contraction``: 1 − (posterior sd / prior sd)², of the logarithm of positive parameters,
         with its Monte Carlo error ``contraction_mcse``. ``alone`` and ``together``: the sd that the data alone leave,
         in prior sds, if the other parameters are known and if they are not; ``collinearity`` their ratio. ``profile``:
-        its shape. ``p_negative`` and ``p_negative_mcse``: probability of a value below zero; NaN for positive
-        parameters. ``prior_sensitivity`` and ``likelihood_sensitivity``: see `power_scaling`. ``evidence`` and
-        ``remedy`` in words.
+        its shape. ``structural``: the parameters with which the equations let it change unseen, if any. ``p_negative``
+        and ``p_negative_mcse``: probability of a value below zero; NaN for positive parameters. ``prior_sensitivity``
+        and ``likelihood_sensitivity``: see `power_scaling`. ``evidence`` and ``remedy`` in words.
     directions : DataFrame
         A row a direction in parameter space, the one that the data say least about first: information of the data over
         that of the prior, contraction, the direction in words, and combinations that do not change along it.
@@ -56,6 +58,8 @@ class Identifiability(Result):
     experiments : DataFrame
         Candidates for a further experiment, the most informative first: gain in nats, and what would be left of each
         parameter's sd.
+    structure : Structure
+        What the equations and the measured channels could determine at all, of the free parameters.
     converged : bool
         False if the draws, where there are any, have not converged.
     """
@@ -65,6 +69,7 @@ class Identifiability(Result):
     spectrum: np.ndarray
     condition: float
     experiments: pd.DataFrame
+    structure: Structure
     converged: bool
 
     @property
@@ -95,10 +100,11 @@ def identifiability(
     Widths are those of the draws, or of the Laplace approximation where there are none, relative to the prior. In this
     order: a signed parameter whose size is determined and whose sign is not (probability of either above 2.5 %, by more
     than three Monte Carlo errors) has its "sign undetermined". One whose profile ends at the prior's support on one
-    side is determined "only with the prior". Where the data, with all else known, have less than 1 % of the prior's
-    information, it is "not determined". Where they alone, the others unknown, leave less than a third of the prior's
-    sd, it is "determined". For the rest, it is so "only in combination" if the other parameters make it at least five
-    times wider, else "only with the prior".
+    side, and not because of other parameters, is determined "only with the prior". Where the data, with all else known,
+    have less than 1 % of the prior's information, it is "not determined". One that the equations themselves let change
+    together with others unseen, see `structure`, is determined "only in combination". Where the data alone, the others
+    unknown, leave less than a third of the prior's sd, it is "determined". For the rest, it is so "only in combination"
+    if the other parameters make it at least five times wider, else "only with the prior".
 
     Parameters
     ----------
@@ -122,7 +128,7 @@ def identifiability(
     experiments = rank_candidates(problem, fit, information, options)
     directions = _directions(information)
     scaling = power_scaling(problem, posterior) if posterior is not None else {}
-    rows = {}
+    structure, rows = structure_of(problem), {}
     for i, name in enumerate(problem.names):
         together = np.sqrt(1.0 / max(1.0 / widths[i] ** 2 - 1.0, 1e-12)) if posterior else information.together[i]
         row: dict[str, object] = {
@@ -132,6 +138,7 @@ def identifiability(
             "together": together,
             "collinearity": information.collinearity[i],
             "profile": profiles.shape[name] if profiles and name in profiles.names else "",
+            "structural": ", ".join(_partners(structure, name)),
         }
         negative, error = _negative(problem, fit, posterior, name)
         row |= {"p_negative": negative, "p_negative_mcse": error}
@@ -139,12 +146,21 @@ def identifiability(
         row["verdict"] = _verdict(row, _size_known(problem, fit, posterior, name))
         row["evidence"] = _evidence(row)
         both = row["verdict"] == SIGN and abs(fit.theta[name]) > 2.0 * fit.sd[name]
-        row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments)
+        row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments, structure)
         rows[name] = row
     table = pd.DataFrame.from_dict(rows, orient="index")
     table = table[["verdict", *(c for c in table.columns if c != "verdict")]]
     converged = posterior is None or posterior.converged
-    return Identifiability(table, directions, information.spectrum, information.condition, experiments, converged)
+    return Identifiability(
+        table, directions, information.spectrum, information.condition, experiments, structure, converged
+    )
+
+
+def _partners(structure: Structure, name: str) -> list[str]:
+    """Return the parameters with which the equations let one change unseen, itself among them; nothing if they do not."""
+    plain = name.partition("[")[0]
+    found = [p for symmetry in structure.symmetries if plain in symmetry.parameters for p in symmetry.parameters]
+    return list(dict.fromkeys(found))
 
 
 def _widths(
@@ -207,6 +223,8 @@ def _verdict(row: dict, size_known: bool) -> str:
         return PRIOR_ONLY
     if row["alone"] > SILENT:
         return NOTHING
+    if row["structural"]:
+        return COMBINATION
     if row["together"] <= ENOUGH:
         return DETERMINED
     return COMBINATION if row["collinearity"] >= COLLINEAR and row["alone"] < 1.0 else PRIOR_ONLY
@@ -218,6 +236,8 @@ def _evidence(row: dict) -> str:
     if row["collinearity"] >= COLLINEAR:
         wider = "without limit" if not row["collinearity"] < 1e6 else f"{row['collinearity']:.3g} times"
         text += f", the other parameters widen it {wider}"
+    if row["structural"]:
+        text += ", by the equations themselves"
     if row["alone"] > ENOUGH and row["profile"] != ONE_SIDED:
         text += f", the data alone would leave {row['alone']:.3g} prior sds with all else known"
     if row["profile"] and row["profile"] != "closed":
@@ -230,10 +250,14 @@ def _evidence(row: dict) -> str:
     return text
 
 
-def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame) -> str:
+def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame, structure: Structure) -> str:
     """Return what to do about a parameter: what to fix, what to report, what to measure."""
     if row["verdict"] == DETERMINED:
         return ""
+    if row["verdict"] == COMBINATION and row["structural"]:
+        return f"fix one of {row['structural']}, or report {', '.join(structure.combinations)}".removesuffix(
+            ", or report "
+        )
     if row["verdict"] == COMBINATION:
         own = directions[directions["parameters"].str.split(", ").apply(lambda members: name in members)]
         own = own[own["gain"] < 1.0 / ENOUGH**2]

@@ -86,8 +86,11 @@ def combinations(direction: np.ndarray, names: Sequence[str], logarithmic: np.nd
         if rational is None:
             return []
         pivot = min(range(len(rational)), key=lambda i: (abs(rational[i]), i))
+        ratios = [r / rational[pivot] for r in rational]
+        if max(max(abs(r.numerator), r.denominator) for r in ratios) > LARGEST:
+            return []
         return [
-            _product(names[shown[i]], rational[i] / rational[pivot], names[shown[pivot]], first=i < pivot)
+            _product(names[shown[i]], ratios[i], names[shown[pivot]], first=i < pivot)
             for i in range(len(rational))
             if i != pivot
         ]
