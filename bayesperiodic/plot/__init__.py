@@ -1,0 +1,10 @@
+"""Figures; every function takes the data and returns the matplotlib Figure."""
+
+from bayesperiodic.plot.branches import branch
+from bayesperiodic.plot.pairs import corner
+from bayesperiodic.plot.periods import fit, loops
+from bayesperiodic.plot.profiles import profile
+from bayesperiodic.plot.style import COLOURS
+from bayesperiodic.plot.walks import traces
+
+__all__ = ["COLOURS", "branch", "corner", "fit", "loops", "profile", "traces"]

@@ -1,0 +1,151 @@
+"""All pairs of parameters: draws, and the Laplace approximation on top."""
+
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bayesperiodic import checks
+from bayesperiodic.inference.estimation.estimate import MapEstimate
+from bayesperiodic.inference.sampling.posterior import Posterior
+from bayesperiodic.plot.style import COLOURS, caveats, unit_of, wrapped_label
+
+LEVELS = (0.5, 0.9)
+
+
+def corner(
+    posterior: Posterior,
+    *,
+    laplace: MapEstimate | None = None,
+    names: Sequence[str] | None = None,
+    figure: Figure | None = None,
+) -> Figure:
+    """Draw all pairs of parameters, with the Laplace approximation's ellipses on top.
+
+    Contours of draws and ellipses hold 50 and 90 % of the probability. The ellipses of parameters are those of
+    `MapEstimate.covariance`. Noise parameters are drawn as v ± v·sd(ln v) around the mode in sampling coordinates,
+    independent of the parameters; what has no Laplace approximation has no ellipse.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    laplace : MapEstimate, optional
+    names : sequence of str, optional
+        Full names such as "k", "theta16[run 7]" and "variance[force]", in the order of the rows; by default all.
+    figure : Figure, optional
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ValueError
+        For an unknown name, or an estimate of another problem.
+    """
+    import corner as corner_package
+
+    names = _chosen(names, posterior.names)
+    draws = np.stack([posterior.draws(name) for name in names], axis=-1)
+    span = [tuple(np.quantile(draws[:, i], [0.0005, 0.9995])) for i in range(len(names))]
+    titles = [wrapped_label(name, unit_of(posterior, name)) for name in names]
+    margin = 0.9 + 0.17 * max(title.count("\n") for title in titles)
+    size = 1.75 * len(names) + margin + 0.2
+    figure = corner_package.corner(
+        draws,
+        labels=titles,
+        levels=LEVELS,
+        range=span,
+        bins=35,
+        smooth=1.0,
+        color=COLOURS["mcmc"],
+        plot_datapoints=False,
+        fill_contours=True,
+        hist_kwargs={"density": True, "lw": 1.4},
+        contour_kwargs={"linewidths": 0.9, "colors": COLOURS["map"]},
+        max_n_ticks=3,
+        labelpad=0.12,
+        fig=figure or plt.figure(figsize=(size, size)),
+    )
+    if laplace is not None:
+        mean, covariance = _laplace(names, laplace)
+        _laplace_on_corner(np.array(figure.axes).reshape(len(names), len(names)), mean, covariance)
+    _corner_legend(figure, posterior, laplace is not None, min(14, 4 * max(len(names), 2)))
+    width, height = figure.get_size_inches()
+    top = 0.98 if len(names) > 1 else 0.75
+    figure.subplots_adjust(left=margin / width, bottom=margin / height, right=0.98, top=top)
+    return figure
+
+
+def _corner_legend(figure: Figure, posterior: Posterior, laplace: bool, fontsize: int) -> None:
+    handles = [plt.Line2D([], [], color=COLOURS["mcmc"], lw=4, label=f"MCMC, {_levels()}")]
+    if laplace:
+        handles.append(plt.Line2D([], [], color=COLOURS["laplace"], lw=1.6, ls="--", label=f"Laplace, {_levels()}"))
+    figure.legend(
+        handles=handles,
+        loc="upper right",
+        bbox_to_anchor=(0.97, 0.97),
+        frameon=False,
+        fontsize=fontsize,
+        title=caveats(posterior) or None,
+        title_fontsize=fontsize,
+    )
+
+
+def _chosen(names: Sequence[str] | None, every: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names to draw, checked."""
+    if names is None:
+        return every
+    if isinstance(names, str) or not len(names):
+        raise ValueError(f"names: {names!r} is not allowed; it must be a sequence of names, such as [{every[0]!r}].")
+    for name in names:
+        checks.one_of("names", name, every)
+    if len(set(names)) < len(names):
+        raise ValueError(f"names: {list(names)} is not allowed; a name is in it twice.")
+    return tuple(names)
+
+
+def _laplace(names: tuple[str, ...], fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean (names,) and covariance (names, names) in natural values; NaN where there are none."""
+    for name in names:
+        checks.one_of("laplace", name, [*fit.theta, *fit.noise])
+    theta, noise = [n for n in names if n in fit.theta], [n for n in names if n not in fit.theta]
+    mean = np.array([fit.theta[n] if n in fit.theta else fit.joint_mode.get(n, np.nan) for n in names])
+    covariance = pd.DataFrame(0.0, index=[*names], columns=[*names])
+    covariance.loc[theta, theta] = fit.covariance.loc[theta, theta]
+    modes = [fit.joint_mode.get(n, np.nan) for n in noise]
+    covariance.loc[noise, noise] = fit.joint_covariance.reindex(noise, columns=noise) * np.outer(modes, modes)
+    return mean, covariance.to_numpy()
+
+
+def _laplace_on_corner(axes: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
+    variances = np.diag(covariance)
+    drawn = np.flatnonzero(np.isfinite(mean) & np.isfinite(variances) & (variances > 0.0))
+    for i in drawn:
+        left, right = axes[i, i].get_xlim()
+        x = np.linspace(left, right, 200)
+        sd = np.sqrt(variances[i])
+        density = np.exp(-0.5 * ((x - mean[i]) / sd) ** 2) / (sd * np.sqrt(2 * np.pi))
+        axes[i, i].plot(x, density, color=COLOURS["laplace"], lw=1.6, ls="--")
+        axes[i, i].set_ylim(0.0, 1.1 * max(density.max(), axes[i, i].get_ylim()[1] / 1.1))
+        for j in drawn[drawn < i]:
+            sds = np.sqrt(variances[[j, i]])
+            _ellipses(axes[i, j], mean[[j, i]], sds, covariance[i, j] / np.prod(sds))
+
+
+def _ellipses(axes: Axes, centre: np.ndarray, sds: np.ndarray, correlation: float) -> None:
+    """Draw the ellipses that hold the levels of a normal distribution of two quantities."""
+    turn = np.linspace(0.0, 2 * np.pi, 200)
+    across = np.cos(turn)
+    up = correlation * across + np.sqrt(max(1.0 - correlation**2, 0.0)) * np.sin(turn)
+    for level in LEVELS:
+        radius = np.sqrt(-2.0 * np.log(1.0 - level))
+        x, y = (c + radius * sd * wave for c, sd, wave in zip(centre, sds, (across, up), strict=True))
+        axes.plot(x, y, color=COLOURS["laplace"], lw=1.4, ls="--", zorder=5)
+
+
+def _levels() -> str:
+    return " and ".join(f"{level:.0%}" for level in LEVELS)

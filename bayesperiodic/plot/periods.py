@@ -1,0 +1,126 @@
+"""Measured and fitted periods: over time, and as loops of an output against an input."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from bayesperiodic import checks, fourier
+from bayesperiodic.diagnosis.predictive import Prediction
+from bayesperiodic.inference.estimation.estimate import MapEstimate
+from bayesperiodic.inference.problem import Problem
+from bayesperiodic.plot.style import COLOURS, axis_label
+
+
+def fit(
+    problem: Problem, estimate: MapEstimate, prediction: Prediction | None = None, *, figure: Figure | None = None
+) -> Figure:
+    """Draw each measured mean period with the fitted one, a predictive band and the residual below.
+
+    Parameters
+    ----------
+    problem : Problem
+    estimate : MapEstimate
+    prediction : Prediction, optional
+    figure : Figure, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    Figure
+    """
+    shown = [(e, channel) for e in problem.experiments for channel in e.outputs]
+    figure = figure or plt.figure(figsize=(7.0, 4.6 * len(shown)), layout="constrained")
+    grid = figure.add_gridspec(2 * len(shown), 1, height_ratios=[3, 1] * len(shown))
+    for row, (e, channel) in enumerate(shown):
+        top = figure.add_subplot(grid[2 * row])
+        below = figure.add_subplot(grid[2 * row + 1], sharex=top)
+        predicted = e.outputs[channel] - estimate.residuals[e.name][channel]
+        if prediction is not None:
+            band = f"{prediction.probability:.0%} predictive band"
+            low, high = prediction.low[e.name][channel], prediction.high[e.name][channel]
+            top.fill_between(e.time, low, high, color=COLOURS["mcmc"], alpha=0.45, lw=0, label=band)
+            below.fill_between(e.time, low - predicted, high - predicted, color=COLOURS["mcmc"], alpha=0.45, lw=0)
+        top.plot(e.time, e.outputs[channel], color=COLOURS["measured"], lw=1.6, label=_measured(problem, e.cycles))
+        top.plot(e.time, predicted, color=COLOURS["map"], lw=1.2, ls="--", label="MAP")
+        below.plot(e.time, estimate.residuals[e.name][channel], color=COLOURS["measured"], lw=1.0)
+        below.axhline(0.0, color=COLOURS["map"], lw=1.0, ls="--")
+        unit = problem.model.units.get(channel, "")
+        top.set_ylabel(axis_label(channel, unit))
+        below.set_ylabel(axis_label("residual", unit))
+        below.set_xlabel("time in the period [s]")
+        top.tick_params(labelbottom=False)
+        top.set_title(e.name)
+        top.legend(frameon=False)
+    return figure
+
+
+def loops(
+    problem: Problem,
+    estimate: MapEstimate,
+    *,
+    output: str | None = None,
+    input: str | None = None,
+    figure: Figure | None = None,
+) -> Figure:
+    """Draw an output against an input and against that input's rate, measured and fitted, for every experiment.
+
+    Parameters
+    ----------
+    problem : Problem
+    estimate : MapEstimate
+    output, input : str, optional
+        By default the first of each.
+    figure : Figure, optional
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ValueError
+        For an unknown name, or a model without inputs.
+    """
+    output = problem.channels[0] if output is None else output
+    checks.one_of("output", output, problem.channels)
+    input = next(iter(problem.model.inputs), "") if input is None else input
+    checks.one_of("input", input, problem.model.inputs)
+    figure = figure or plt.figure(figsize=(9.0, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    for number, e in enumerate(problem.experiments):
+        measured = e.outputs[output]
+        predicted = measured - estimate.residuals[e.name][output]
+        amplitudes = fourier.coefficients(e.inputs[input])
+        rate = fourier.on_grid(fourier.derivative(amplitudes, e.frequency / e.periods), measured.size)
+        for axes, across in ((left, e.inputs[input]), (right, rate)):
+            first = number == 0
+            axes.plot(
+                _closed(across),
+                _closed(measured),
+                color=COLOURS["measured"],
+                lw=1.6,
+                label=_measured(problem, e.cycles) if first else None,
+            )
+            axes.plot(
+                _closed(across),
+                _closed(predicted),
+                color=COLOURS["map"],
+                lw=1.2,
+                ls="--",
+                label="MAP" if first else None,
+            )
+    unit = problem.model.units.get(input, "")
+    left.set_xlabel(axis_label(input, unit))
+    right.set_xlabel(axis_label(f"rate of {input}", f"{unit}/s" if unit else ""))
+    left.set_ylabel(axis_label(output, problem.model.units.get(output, "")))
+    left.legend(frameon=False)
+    return figure
+
+
+def _closed(values: np.ndarray) -> np.ndarray:
+    return np.append(values, values[0])
+
+
+def _measured(problem: Problem, cycles: int) -> str:
+    synthetic = any(e.synthetic for e in problem.experiments)
+    return f"{'synthetic' if synthetic else 'measured'}, mean of {cycles} cycles"

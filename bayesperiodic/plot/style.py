@@ -1,0 +1,35 @@
+"""What all figures share: colours, and words.
+
+One colour means one thing everywhere: measured, MAP, Laplace, MCMC.
+"""
+
+import textwrap
+
+from bayesperiodic.inference import labels
+from bayesperiodic.inference.sampling.posterior import Posterior
+
+COLOURS = {"measured": "#000000", "map": "#0072B2", "laplace": "#D55E00", "mcmc": "#56B4E9"}
+ENSEMBLES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
+LABEL_LENGTH = 24
+
+
+def caveats(posterior: Posterior) -> str:
+    """Return what a reader of a figure of these draws must be told, in words."""
+    said = ["synthetic data"] if posterior.data.attrs.get("synthetic") else []
+    return ", ".join(said + ([] if posterior.converged else ["NOT CONVERGED"]))
+
+
+def unit_of(posterior: Posterior, name: str) -> str:
+    """Return the unit of what has this full name; "" where there is none."""
+    return labels.unit(posterior.data["posterior"].to_dataset(), name)
+
+
+def wrapped_label(name: str, unit: str) -> str:
+    """Return a label of short lines, the unit on its own."""
+    return axis_label(textwrap.fill(name, LABEL_LENGTH), unit).replace(" [", "\n[")
+
+
+def axis_label(name: str, unit: str) -> str:
+    """Return a name with its unit, as matplotlib shows it."""
+    text = name.replace("$", r"\$")
+    return f"{text} [{unit}]" if unit else text
