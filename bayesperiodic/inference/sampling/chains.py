@@ -7,6 +7,8 @@ import emcee
 import numpy as np
 import xarray as xr
 
+FEWEST_WEIGHTS, EQUAL, SMALLEST = 0.25, 1e-6, 700.0
+
 
 def arviz() -> ModuleType:
     """Return the arviz module, imported without the notice that its 0.23 series prints."""
@@ -44,3 +46,32 @@ def quantile_spread(chains: np.ndarray) -> np.ndarray:
     pooled = chains.reshape(ensembles, steps * walkers, count)
     quantiles = np.quantile(pooled, [0.05, 0.5, 0.95], axis=1)
     return np.ptp(quantiles, axis=1).max(axis=0) / pooled.reshape(-1, count).std(axis=0)
+
+
+def pareto_k(log_weights: np.ndarray) -> float:
+    """Return the Pareto shape k̂ of the upper tail of importance weights [1]_; ∞ where few of them are positive.
+
+    Equal weights, to within a millionth, have no tail: 0.
+
+    Parameters
+    ----------
+    log_weights : array (draws,)
+        −∞ for a weight of zero.
+
+    References
+    ----------
+    .. [1] A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry, Pareto smoothed importance sampling, Journal of Machine
+       Learning Research 25 (2024) 1-58.
+    """
+    positive = np.isfinite(log_weights)
+    if positive.mean() < FEWEST_WEIGHTS:
+        return np.inf
+    if np.ptp(log_weights[positive]) < EQUAL:
+        return 0.0
+    top = log_weights[positive].max()
+    weights = np.maximum(log_weights, top - SMALLEST)
+    module = arviz()
+    if hasattr(module, "psislw"):
+        return float(module.psislw(weights)[1])
+    # ArviZ 1.x takes the negative, as if it were a log-likelihood that is left out.
+    return float(xr.DataArray(-weights, dims="draw").azstats.psislw(dim="draw")[1])

@@ -1,0 +1,112 @@
+"""The figures behind a comparison of Laplace with MCMC, and the verdicts on them."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from bayesperiodic.diagnosis.approximation import Approximation, importance_k
+from bayesperiodic.diagnosis.distances import Sample, radii, skewness, wasserstein_distance
+from bayesperiodic.diagnosis.verdicts import (
+    FINE,
+    LEVELS,
+    MODE,
+    ellipsoid_radii,
+    joint_verdict,
+    marginal_verdict,
+)
+from bayesperiodic.inference.estimation.estimate import MapEstimate
+from bayesperiodic.inference.labels import CHAIN
+from bayesperiodic.inference.problem import Problem
+from bayesperiodic.inference.sampling.posterior import Posterior
+
+QUANTILES = {"q05": (0.05, -1.6448536269514722), "q50": (0.5, 0.0), "q95": (0.95, 1.6448536269514722)}
+
+
+@dataclass(frozen=True)
+class Scores:
+    """A Laplace approximation, the draws in its coordinates, and what is to be said of the two.
+
+    Attributes
+    ----------
+    laplace : Approximation
+    samples : dict of str to Sample
+        By name.
+    distances : Sample
+        Mahalanobis distances from Laplace's centre; NaN without a finite covariance.
+    verdicts : dict of str to str
+        By name, as if the draws had converged.
+    pareto_k : tuple of float
+        With its error.
+    joint : str
+        The verdict on all together.
+    """
+
+    laplace: Approximation
+    samples: dict[str, Sample]
+    distances: Sample
+    verdicts: dict[str, str]
+    pareto_k: tuple[float, float]
+    joint: str
+
+    @property
+    def fine(self) -> bool:
+        """True if every verdict is "fine"."""
+        return {self.joint, *self.verdicts.values()} == {FINE}
+
+    def inside(self, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the shares of draws in the ellipsoids that hold these probabilities, and their errors."""
+        limits = ellipsoid_radii(levels, self.laplace.mean.size)
+        pairs = [
+            self.distances.share(lambda r, R=limit: r < R, level)  # type: ignore[misc]
+            for limit, level in zip(limits, levels, strict=True)
+        ]
+        shares, errors = np.array(pairs).T
+        return shares, errors
+
+
+def scores(
+    problem: Problem, fit: MapEstimate, posterior: Posterior, laplace: Approximation, coordinates: str
+) -> Scores:
+    """Return the scores of a Laplace approximation."""
+    points = laplace.points(posterior)
+    ensemble = posterior.data["posterior"]["ensemble"].to_numpy()
+    if ensemble.shape != (posterior.data["posterior"].sizes[CHAIN],):
+        raise ValueError("posterior: its coordinate 'ensemble' is not allowed; every chain must belong to one.")
+    samples = {name: Sample.of(points[:, i], ensemble, posterior.ess[name]) for i, name in enumerate(laplace.names)}
+    jointly = partial(Sample.of, ensemble=ensemble, size=min(posterior.ess[name] for name in laplace.names))
+    verdicts = {
+        name: marginal_verdict(samples[name], *about)
+        for name, *about in zip(laplace.names, laplace.mean, laplace.sds, laplace.supports, strict=True)
+    }
+    finite = np.isfinite(laplace.covariance).all()
+    distances = radii(points, laplace.mean, laplace.covariance) if finite else np.full(len(points), np.nan)
+    k = importance_k(problem, fit, coordinates)
+    joint = MODE if MODE in verdicts.values() else joint_verdict(points, laplace.mean, laplace.covariance, jointly, k)
+    return Scores(laplace, samples, jointly(distances), verdicts, k, joint)
+
+
+def row(sample: Sample, mean: float, sd: float) -> dict[str, float]:
+    """Return the figures of one quantity and their Monte Carlo errors, see `Comparison.table`."""
+    own_mean, own = float(sample.whole.mean()), float(sample.whole.std(ddof=1))
+    spread = sample.error(lambda x: np.std(x, axis=-1, ddof=1))
+    found = {"map": mean, "laplace_sd": sd, "mean": own_mean, "sd": own}
+    found |= {"shift": (own_mean - mean) / own, "shift_mcse": sample.error(lambda x: x.mean(axis=-1)) / own}
+    found |= {"sd_ratio": sd / own, "sd_ratio_mcse": sd / own * spread / own}
+    found["skewness"], found["skewness_mcse"] = sample.estimate(skewness)
+    for label, (probability, z) in QUANTILES.items():
+        value, error = sample.estimate(lambda x, p=probability: np.quantile(x, p, axis=-1))  # type: ignore[misc]
+        end = mean + z * sd if z else mean
+        found |= {f"laplace_{label}": end, label: value}
+        found |= {f"{label}_difference": (value - end) / own, f"{label}_difference_mcse": error / own}
+    found["wasserstein"], found["wasserstein_mcse"] = wasserstein_distance(sample, mean, sd)
+    return found
+
+
+def joint_row(scored: Scores) -> dict[str, float]:
+    """Return the figures of all coordinates together, see `Comparison.joint`."""
+    found: dict[str, float] = {"dimension": scored.laplace.mean.size}
+    for level, share, error in zip(LEVELS, *scored.inside(np.array(LEVELS)), strict=True):
+        key = f"share_{100 * level:.0f}"
+        found |= {key: float(share), f"{key}_mcse": float(error)}
+    return found | {"pareto_k": scored.pareto_k[0], "pareto_k_mcse": scored.pareto_k[1]}
