@@ -127,11 +127,12 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     the posterior sd, and so does the whole distribution. "too narrow" and "too wide": both ends are off in opposite
     directions. "wrong shape": shifted, skewed, or piled up at an end of the prior's support. "wrong mode": more than
     5 % of the draws lie in another mode, or nearly none of them where Laplace is. Whatever is not "fine" is so beyond
-    three Monte Carlo errors. "not converged" where the draws cannot be trusted.
+    three Monte Carlo errors. "not converged" where the draws cannot be trusted, unless every ensemble by itself shows
+    another mode.
 
     Jointly what counts is the share of draws inside Laplace's ellipsoids, and the Pareto k̂ of the importance weights of
-    2000 draws from Laplace ([1]_; above 0.7 it is of no use as a proposal). Where variances can be integrated out in
-    closed form that is done for k̂ in natural coordinates.
+    2000 draws from Laplace ([1]_; above 0.7 it is of no use as a proposal, and it cannot see a mode that Laplace does
+    not reach). Where variances can be integrated out in closed form that is done for k̂ in natural coordinates.
 
     Parameters
     ----------
@@ -184,14 +185,14 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
             f"density has no maximum with finite curvature ({'; '.join(fit.undetermined) or fit.status})."
         )
     scored = scores(problem, fit, posterior, laplace, coordinates)
-    other = both[SAMPLING] if coordinates == NATURAL and not scored.fine else None
+    other = both[SAMPLING] if coordinates == NATURAL and posterior.converged and not scored.fine else None
     cured = None if other is None else scores(problem, fit, posterior, other, SAMPLING)
     group, names = posterior.data["posterior"].to_dataset(), laplace.names
     shares, errors = scored.inside(PROBABILITIES)
     histograms = {name: _histogram(scored.samples[name].whole) for name in names}
     return Comparison(
-        table=_table(scored, cured, posterior.converged),
-        joint=_joint(scored, cured, posterior.converged),
+        table=_table(scored, cured),
+        joint=_joint(scored, cured),
         coordinates=coordinates,
         probabilities=PROBABILITIES,
         quantiles={name: np.quantile(scored.samples[name].whole, PROBABILITIES) for name in names},
@@ -212,40 +213,40 @@ def _histogram(draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return counts / (draws.size * np.diff(edges)), edges
 
 
-def _table(scored: Scores, cured: Scores | None, converged: bool) -> pd.DataFrame:
+def _table(scored: Scores, cured: Scores | None) -> pd.DataFrame:
     laplace, rows = scored.laplace, {}
     for i, name in enumerate(laplace.names):
         verdict, sd = scored.verdicts[name], float(laplace.sds[i])
-        elsewhere = "" if cured is None else cured.verdicts[name]
+        cure = cured is not None and cured.verdicts[name] == FINE
         logarithm = cured is not None and bool(cured.laplace.logarithmic[i])
         rows[name] = {
             "coordinate": laplace.coordinates[i],
             **row(scored.samples[name], float(laplace.mean[i]), sd),
-            "verdict": verdict if converged else UNCONVERGED,
-            "recommendation": _recommendation(verdict, elsewhere, logarithm, bool(np.isfinite(sd)), converged),
+            "verdict": verdict,
+            "recommendation": _recommendation(verdict, cure, logarithm, bool(np.isfinite(sd))),
         }
     return pd.DataFrame.from_dict(rows, orient="index")
 
 
-def _joint(scored: Scores, cured: Scores | None, converged: bool) -> dict[str, float | str]:
+def _joint(scored: Scores, cured: Scores | None) -> dict[str, float | str]:
     logarithm = cured is not None and bool(cured.laplace.logarithmic[: scored.laplace.mean.size].any())
     finite = bool(np.isfinite(scored.laplace.covariance).all())
-    advice = _recommendation(scored.joint, "" if cured is None else cured.joint, logarithm, finite, converged)
-    if converged and scored.joint == FINE and scored.pareto_k[0] > USABLE_K:
-        advice += ", but not as an importance proposal"
-    return joint_row(scored) | {"verdict": scored.joint if converged else UNCONVERGED, "recommendation": advice}
+    advice = _recommendation(scored.joint, cured is not None and cured.fine, logarithm, finite)
+    if scored.joint == FINE:
+        others = [name for name, verdict in scored.verdicts.items() if verdict != FINE]
+        advice += f", except for {', '.join(others)}" if others else ""
+        advice += ", not as an importance proposal" if scored.pareto_k[0] > USABLE_K else ""
+    return joint_row(scored) | {"verdict": scored.joint, "recommendation": advice}
 
 
-def _recommendation(verdict: str, in_sampling: str, logarithm: bool, determined: bool, converged: bool) -> str:
-    """Return what to do; `in_sampling` is the verdict in sampling coordinates, where it was asked for."""
-    if not converged:
-        return "sample longer" + ("; there seem to be several modes" if verdict == MODE else "")
+def _recommendation(verdict: str, cure: bool, logarithm: bool, determined: bool) -> str:
+    """Return what to do; `cure` is whether Laplace is fine in sampling coordinates, where it was asked for."""
     if verdict == FINE:
         return "use Laplace"
+    if verdict == UNCONVERGED:
+        return "sample longer"
     if verdict == MODE:
         return "report each mode by itself; try map_estimate(starts=…)"
-    if in_sampling == FINE:
+    if cure:
         return ("logarithms cure it: " if logarithm else "") + "use Laplace in sampling coordinates"
-    if not determined:
-        return "the data do not determine it; report a combination that they do"
-    return "report the MCMC quantiles"
+    return "report the MCMC quantiles" if determined else "report a combination that the data determine"

@@ -11,6 +11,9 @@ from bayesperiodic.diagnosis.verdicts import (
     FINE,
     LEVELS,
     MODE,
+    NARROW,
+    SHAPE,
+    WIDE,
     ellipsoid_radii,
     joint_verdict,
     marginal_verdict,
@@ -35,7 +38,7 @@ class Scores:
     distances : Sample
         Mahalanobis distances from Laplace's centre; NaN without a finite covariance.
     verdicts : dict of str to str
-        By name, as if the draws had converged.
+        By name.
     pareto_k : tuple of float
         With its error.
     joint : str
@@ -76,13 +79,19 @@ def scores(
     samples = {name: Sample.of(points[:, i], ensemble, posterior.ess[name]) for i, name in enumerate(laplace.names)}
     jointly = partial(Sample.of, ensemble=ensemble, size=min(posterior.ess[name] for name in laplace.names))
     verdicts = {
-        name: marginal_verdict(samples[name], *about)
-        for name, *about in zip(laplace.names, laplace.mean, laplace.sds, laplace.supports, strict=True)
+        name: marginal_verdict(
+            samples[name], float(laplace.mean[i]), float(laplace.sds[i]), laplace.supports[i], posterior.converged
+        )
+        for i, name in enumerate(laplace.names)
     }
     finite = np.isfinite(laplace.covariance).all()
     distances = radii(points, laplace.mean, laplace.covariance) if finite else np.full(len(points), np.nan)
     k = importance_k(problem, fit, coordinates)
-    joint = MODE if MODE in verdicts.values() else joint_verdict(points, laplace.mean, laplace.covariance, jointly, k)
+    joint = joint_verdict(points, laplace.mean, laplace.covariance, jointly, k, posterior.converged)
+    if MODE in verdicts.values():
+        joint = MODE
+    elif joint in (NARROW, WIDE) and SHAPE in verdicts.values():
+        joint = SHAPE
     return Scores(laplace, samples, jointly(distances), verdicts, k, joint)
 
 

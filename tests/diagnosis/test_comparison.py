@@ -19,7 +19,9 @@ def test_a_normal_posterior_is_fine(solved):
     table = bp.compare(problem, fit, posterior).table
     assert list(table["verdict"]) == ["fine"] * 3
     assert table.loc["k", "sd_ratio"] == pytest.approx(1.0, abs=0.1)
-    assert table.loc["k", "laplace_q95"] - table.loc["k", "laplace_q05"] == pytest.approx(2 * 1.6448536269514722 * fit.sd["k"])
+    assert table.loc["k", "laplace_q95"] - table.loc["k", "laplace_q05"] == pytest.approx(
+        2 * 1.6448536269514722 * fit.sd["k"]
+    )
 
 
 @pytest.mark.parametrize(
