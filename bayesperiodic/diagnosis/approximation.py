@@ -13,7 +13,7 @@ from bayesperiodic.inference.sampling.posterior import Posterior
 from bayesperiodic.parallel import available_cores
 
 SAMPLING = "sampling"
-PROPOSALS, SEED = 2000, 1
+PROPOSALS, SEED = 8000, 1
 
 
 @dataclass(frozen=True)

@@ -131,7 +131,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     another mode.
 
     Jointly what counts is the share of draws inside Laplace's ellipsoids, and the Pareto k̂ of the importance weights of
-    2000 draws from Laplace ([1]_; above 0.7 it is of no use as a proposal, and it cannot see a mode that Laplace does
+    8000 draws from Laplace ([1]_; above 0.7 it is of no use as a proposal, and it cannot see a mode that Laplace does
     not reach). Where variances can be integrated out in closed form that is done for k̂ in natural coordinates.
 
     Parameters

@@ -90,6 +90,8 @@ def wasserstein_distance(sample: Sample, mean: float, sd: float) -> tuple[float,
     A distance is biased upwards: draws of the normal distribution itself are 1.3/√ESS sds away from it. The error is
     the root of the squares of the spread between batches and of this bias.
     """
+    if not np.isfinite(sd):
+        return np.inf, np.nan
     own = float(sample.whole.std())
     value, spread = sample.estimate(lambda x: wasserstein(x, mean, sd))
     return value / own, float(np.hypot(spread / own, WASSERSTEIN_FLOOR / np.sqrt(sample.size)))

@@ -19,7 +19,6 @@ from bayesperiodic.diagnosis.verdicts import (
     marginal_verdict,
 )
 from bayesperiodic.inference.estimation.estimate import MapEstimate
-from bayesperiodic.inference.labels import CHAIN
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.inference.sampling.posterior import Posterior
 
@@ -57,15 +56,16 @@ class Scores:
         """True if every verdict is "fine"."""
         return {self.joint, *self.verdicts.values()} == {FINE}
 
-    def inside(self, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the shares of draws in the ellipsoids that hold these probabilities, and their errors."""
+    def inside(self, levels: np.ndarray) -> np.ndarray:
+        """Return the shares of draws in the ellipsoids that hold these probabilities, and their errors, (2, levels)."""
+        if not np.isfinite(self.laplace.covariance).all():
+            return np.full((2, levels.size), np.nan)
         limits = ellipsoid_radii(levels, self.laplace.mean.size)
         pairs = [
             self.distances.share(lambda r, R=limit: r < R, level)  # type: ignore[misc]
             for limit, level in zip(limits, levels, strict=True)
         ]
-        shares, errors = np.array(pairs).T
-        return shares, errors
+        return np.array(pairs).T
 
 
 def scores(
@@ -74,8 +74,6 @@ def scores(
     """Return the scores of a Laplace approximation."""
     points = laplace.points(posterior)
     ensemble = posterior.data["posterior"]["ensemble"].to_numpy()
-    if ensemble.shape != (posterior.data["posterior"].sizes[CHAIN],):
-        raise ValueError("posterior: its coordinate 'ensemble' is not allowed; every chain must belong to one.")
     samples = {name: Sample.of(points[:, i], ensemble, posterior.ess[name]) for i, name in enumerate(laplace.names)}
     jointly = partial(Sample.of, ensemble=ensemble, size=min(posterior.ess[name] for name in laplace.names))
     verdicts = {

@@ -108,7 +108,7 @@ def joint_verdict(
     quarter of a sd moves the ends of a 90 % interval), and too many accordingly; by more than three Monte Carlo errors.
     The approximation is then too narrow or too wide if a normal distribution with the draws' own mean and covariance
     would be fine and a shift of the mean alone is not what is wrong; otherwise, and where the Pareto k̂ is above 0.7 by
-    three Monte Carlo errors, its shape is wrong.
+    its error, the shape is wrong.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def joint_verdict(
         return MODE
     found = _ellipsoids(sampled(radii(points, mean, covariance)), mean.size)
     if found == FINE:
-        return SHAPE if pareto_k[0] - ERRORS * pareto_k[1] > USABLE_K else FINE
+        return SHAPE if pareto_k[0] - pareto_k[1] > USABLE_K else FINE
     if _ellipsoids(sampled(radii(points, own_mean, own_covariance)), mean.size) != FINE:
         return SHAPE
     return SHAPE if _ellipsoids(sampled(radii(points, own_mean, covariance)), mean.size) == FINE else found

@@ -1,10 +1,12 @@
 """Figures; every function takes the data and returns the matplotlib Figure."""
 
 from bayesperiodic.plot.branches import branch
+from bayesperiodic.plot.marginal import marginals
 from bayesperiodic.plot.pairs import corner
 from bayesperiodic.plot.periods import fit, loops
 from bayesperiodic.plot.profiles import profile
+from bayesperiodic.plot.scorecard import comparison
 from bayesperiodic.plot.style import COLOURS
 from bayesperiodic.plot.walks import traces
 
-__all__ = ["COLOURS", "branch", "corner", "fit", "loops", "profile", "traces"]
+__all__ = ["COLOURS", "branch", "comparison", "corner", "fit", "loops", "marginals", "profile", "traces"]

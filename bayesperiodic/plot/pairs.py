@@ -48,7 +48,7 @@ def corner(
     """
     import corner as corner_package
 
-    names = _chosen(names, posterior.names)
+    names = chosen(names, posterior.names)
     draws = np.stack([posterior.draws(name) for name in names], axis=-1)
     span = [tuple(np.quantile(draws[:, i], [0.0005, 0.9995])) for i in range(len(names))]
     titles = [wrapped_label(name, unit_of(posterior, name)) for name in names]
@@ -71,7 +71,7 @@ def corner(
         fig=figure or plt.figure(figsize=(size, size)),
     )
     if laplace is not None:
-        mean, covariance = _laplace(names, laplace)
+        mean, covariance = normal_approximation(names, laplace)
         _laplace_on_corner(np.array(figure.axes).reshape(len(names), len(names)), mean, covariance)
     _corner_legend(figure, posterior, laplace is not None, min(14, 4 * max(len(names), 2)))
     width, height = figure.get_size_inches()
@@ -95,7 +95,7 @@ def _corner_legend(figure: Figure, posterior: Posterior, laplace: bool, fontsize
     )
 
 
-def _chosen(names: Sequence[str] | None, every: tuple[str, ...]) -> tuple[str, ...]:
+def chosen(names: Sequence[str] | None, every: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names to draw, checked."""
     if names is None:
         return every
@@ -108,7 +108,7 @@ def _chosen(names: Sequence[str] | None, every: tuple[str, ...]) -> tuple[str, .
     return tuple(names)
 
 
-def _laplace(names: tuple[str, ...], fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
+def normal_approximation(names: tuple[str, ...], fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean (names,) and covariance (names, names) in natural values; NaN where there are none."""
     for name in names:
         checks.one_of("laplace", name, [*fit.theta, *fit.noise])

@@ -15,8 +15,12 @@ LABEL_LENGTH = 24
 
 def caveats(posterior: Posterior) -> str:
     """Return what a reader of a figure of these draws must be told, in words."""
-    said = ["synthetic data"] if posterior.data.attrs.get("synthetic") else []
-    return ", ".join(said + ([] if posterior.converged else ["NOT CONVERGED"]))
+    return said_of(bool(posterior.data.attrs.get("synthetic")), posterior.converged)
+
+
+def said_of(synthetic: bool, converged: bool) -> str:
+    """Return what a reader must be told of data and draws, in words."""
+    return ", ".join((["synthetic data"] if synthetic else []) + ([] if converged else ["NOT CONVERGED"]))
 
 
 def unit_of(posterior: Posterior, name: str) -> str:
