@@ -180,6 +180,8 @@ def test_a_given_figure_is_used_and_returned(solved):
         lambda f: bp.plot.loops(problem, fit, figure=f),
         lambda f: bp.plot.corner(posterior, figure=f),
         lambda f: bp.plot.traces(posterior, figure=f),
+        lambda f: bp.plot.marginals(posterior, figure=f),
+        lambda f: bp.plot.comparison(bp.compare(problem, fit, posterior), figure=f),
     ):
         figure = plt.figure()
         assert draw(figure) is figure
@@ -233,3 +235,60 @@ def test_profiles_that_do_not_come_down_fail_or_lie_above_the_estimate_are_told_
     peak = next(line for line in right.lines if line.get_marker() == "o")
     assert list(peak.get_ydata()) == [-1.0]
     assert right.get_ylim()[0] < -5.0
+
+
+def test_marginals_have_the_area_one_and_laplace_on_top(solved):
+    _, fit, posterior = solved
+    figure = bp.plot.marginals(posterior, laplace=fit)
+    assert labels(figure) == {"k\n[N/m]", "c\n[N s/m]", "coulomb\n[N]", "variance[force]\n[N²]"}
+    for axes, name in zip(figure.axes[:3], ("k", "c", "coulomb"), strict=True):
+        values, edges, _ = axes.patches[0].get_data()
+        assert np.sum(values * np.diff(edges)) == pytest.approx(1.0)
+        assert [edges[0], edges[-1]] == pytest.approx(np.quantile(posterior.draws(name), [0.0005, 0.9995]))
+        (normal,) = axes.lines
+        assert (normal.get_color(), normal.get_linestyle()) == (COLOURS["laplace"], "--")
+        x, density = normal.get_data()
+        assert x[np.argmax(density)] == pytest.approx(fit.theta[name], abs=0.02 * fit.sd[name])
+        assert density.max() == pytest.approx(1 / (fit.sd[name] * np.sqrt(2 * np.pi)), rel=1e-3)
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["MCMC", "Laplace"]
+    assert not bp.plot.marginals(posterior, names=["c"]).axes[0].lines
+    with pytest.raises(ValueError, match="names: 'kk' is not known"):
+        bp.plot.marginals(posterior, names=["kk"])
+
+
+def test_a_comparison_shows_marginals_quantiles_and_coverage(solved):
+    problem, fit, posterior = solved
+    found = bp.compare(problem, fit, posterior)
+    figure = bp.plot.comparison(found)
+    *panels, quantiles, coverage = figure.axes
+    assert [axes.get_title() for axes in panels] == ["fine"] * 3
+    assert {axes.get_xlabel() for axes in panels} == {"k\n[N/m]", "c\n[N s/m]", "coulomb\n[N]"}
+    diagonal, *curves = quantiles.lines
+    assert len(curves) == 3 and [t.get_text() for t in quantiles.get_legend().get_texts()] == ["fine"]
+    for line in curves:
+        x, y = line.get_data()
+        assert y[2:-2] == pytest.approx(x[2:-2], abs=0.25)
+    line = next(line for line in coverage.lines if line.get_label() == "MCMC")
+    assert np.array_equal(line.get_xydata(), np.stack([found.probabilities, found.shares], axis=-1))
+    assert coverage.lines[-1].get_ydata() == pytest.approx([found.joint[f"share_{level}"] for level in (50, 90, 95)])
+    assert len(bp.plot.comparison(found, names=["c"]).axes) == 3
+    with pytest.raises(ValueError, match="names: 'variance.force.' is not known"):
+        bp.plot.comparison(found, names=["variance[force]"])
+
+
+def test_a_comparison_names_what_is_wrong_and_says_in_which_coordinates(solved):
+    problem, fit, posterior = solved
+    found = bp.compare(problem, fit, replace(posterior, converged=False), coordinates="sampling")
+    table = found.table.assign(verdict=["fine", "too wide", "fine", "wrong shape"])
+    table.loc["k", "laplace_sd"] = np.inf
+    figure = bp.plot.comparison(replace(found, table=table))
+    *panels, quantiles, _ = figure.axes
+    assert [axes.get_title() for axes in panels] == ["fine", "too wide", "fine", "wrong shape"]
+    assert panels[1].get_xlabel() == "ln c\n(in N s/m)"
+    assert not panels[0].lines
+    assert {t.get_text() for t in quantiles.get_legend().get_texts()} == {
+        "fine",
+        "c: too wide",
+        "variance[force]: wrong shape",
+    }
+    assert figure.subfigs[0].get_suptitle() == "NOT CONVERGED"
