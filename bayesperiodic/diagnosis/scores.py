@@ -86,11 +86,18 @@ def scores(
     distances = radii(points, laplace.mean, laplace.covariance) if finite else np.full(len(points), np.nan)
     k = importance_k(problem, fit, coordinates)
     joint = joint_verdict(points, laplace.mean, laplace.covariance, jointly, k, posterior.converged)
-    if MODE in verdicts.values():
-        joint = MODE
-    elif joint in (NARROW, WIDE) and SHAPE in verdicts.values():
-        joint = SHAPE
-    return Scores(laplace, samples, jointly(distances), verdicts, k, joint)
+    return Scores(laplace, samples, jointly(distances), verdicts, k, _reconciled(joint, set(verdicts.values())))
+
+
+def _reconciled(joint: str, rows: set[str]) -> str:
+    """Return the joint verdict in the light of those on the rows: it is not better than all, nor milder than shape."""
+    if MODE in rows:
+        return MODE
+    if joint in (NARROW, WIDE) and SHAPE in rows:
+        return SHAPE
+    if joint == FINE and FINE not in rows:
+        return rows.pop() if len(rows) == 1 else SHAPE
+    return joint
 
 
 def row(sample: Sample, mean: float, sd: float) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """Laplace against draws whose posterior is known in closed form, drawn exactly."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from xml.etree import ElementTree
 
 import numpy as np
@@ -252,6 +252,23 @@ def test_joint_departures_are_named(change, verdict):
     assert bp.compare(problem, fit, posterior_of(problem, points)).joint["verdict"] == verdict
 
 
+@pytest.mark.parametrize(
+    ("scale", "shift", "k", "verdict"),
+    [
+        (1.0, 0.0, 0.3, "fine"),
+        (1.0, 1.0, 0.3, "wrong shape"),
+        (1.4, 0.0, 0.3, "too narrow"),
+        (0.7, 0.0, 0.3, "too wide"),
+        (1.0, 0.0, 0.9, "wrong shape"),
+        (1.0, 0.0, 0.75, "fine"),
+    ],
+)
+def test_the_joint_verdict_tells_a_shift_from_a_scale_and_counts_pareto_k(scale, shift, k, verdict):
+    points = shift + scale * np.random.default_rng(14).standard_normal((6400, 3))
+    sampled = partial(Sample.of, ensemble=np.repeat(np.arange(4), SHAPE[2]), size=6400.0)
+    assert joint_verdict(points, np.zeros(3), np.eye(3), sampled, (k, 0.1), True) == verdict
+
+
 def test_a_heavy_tailed_posterior_has_a_large_pareto_k():
     """A Cauchy prior that the data hardly change."""
     faint = model("edge", ["a"], lambda p: {"force": p.a})
@@ -267,7 +284,7 @@ def test_modes_are_told_before_convergence_only_where_every_ensemble_shows_them(
     problem, fit, posterior, draw = case("square")
     points = draw(np.random.default_rng(13))
     stuck = np.abs(points)
-    stuck[0] *= -1.0
+    stuck[0] = points[0]
     for values, verdict in ((points, "wrong mode"), (stuck, "not converged")):
         found = bp.compare(problem, fit, replace(redrawn(problem, posterior, values), converged=False))
         assert (found.table.loc["a", "verdict"], found.joint["verdict"]) == (verdict, verdict)
