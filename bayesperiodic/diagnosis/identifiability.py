@@ -157,7 +157,7 @@ def identifiability(
 
 
 def _partners(structure: Structure, name: str) -> list[str]:
-    """Return the parameters with which the equations let one change unseen, itself among them; nothing if they do not."""
+    """Return the parameters with which the equations let one change unseen, itself among them; none if they do not."""
     plain = name.partition("[")[0]
     found = [p for symmetry in structure.symmetries if plain in symmetry.parameters for p in symmetry.parameters]
     return list(dict.fromkeys(found))

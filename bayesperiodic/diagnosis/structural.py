@@ -15,8 +15,8 @@ from bayesperiodic.models.structure.system import system_of
 def structure_of(problem: Problem) -> Structure:
     """Return the structure of a problem's model for its measured channels, free parameters and ties.
 
-    A parameter that is fixed at zero in every experiment is left out of the equations, any other fixed one is known. One
-    that experiments have their own of is taken as one parameter.
+    A parameter that is fixed at zero in every experiment is left out of the equations, any other fixed one is known.
+    One that experiments have their own of is taken as one parameter.
     """
     free = {name for name in problem.names if "[" not in name} | set(local_names(problem.names))
     fixed = {name: set(values.values()) for name, values in problem.fixed.items() if name not in free}
