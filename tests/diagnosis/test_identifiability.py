@@ -6,10 +6,14 @@ import bayesperiodic as bp
 from bayesperiodic.diagnosis.design import Candidate, rank_candidates
 from bayesperiodic.diagnosis.information import Information
 from bayesperiodic.diagnosis.power_scaling import cumulative_jensen_shannon
+from bayesperiodic.diagnosis.structural import structure_of
+from tests.inference.observed import pendulum_run
 from tests.inference.test_targets import known, model, run
-from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+from tests.known import GEAR, LINEAR, grid, linear_experiment, linear_regressors
+from tests.periodic.test_orbits import PENDULUM
 
 QUIET = {"progress": False}
+SHORT = QUIET | {"seed": 1, "ensembles": 2, "max_steps": 500}
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.LogNormal(800.0, 0.2), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
 WIDE = bp.Normal(0.0, 2.0)
@@ -32,7 +36,7 @@ def one(force, value: float, sd: float, **priors) -> tuple[bp.Problem, bp.MapEst
 
 
 def verdicts(problem: bp.Problem, fit: bp.MapEstimate, **changes) -> dict[str, str]:
-    posterior = bp.sample(problem, fit, seed=1, max_steps=1000, **({"start": "laplace"} | changes), **QUIET)
+    posterior = bp.sample(problem, fit, **(SHORT | changes))
     return bp.identifiability(problem, fit, posterior).verdicts
 
 
@@ -61,7 +65,7 @@ def test_contraction_is_that_of_the_normal_posterior(linear):
     posterior = np.linalg.inv(design.T @ design / 9.0 + np.diag([0.0, 20.0**-2, 10.0**-2]))
     expected = 1.0 - np.diag(posterior)[1:] / [20.0**2, 10.0**2]
     assert table.loc[["c", "coulomb"], "contraction"].to_numpy() == pytest.approx(expected, abs=2e-3)
-    drawn = bp.identifiability(problem, fit, bp.sample(problem, fit, seed=1, **QUIET), profile=False).table
+    drawn = bp.identifiability(problem, fit, bp.sample(problem, fit, **SHORT), profile=False).table
     off = drawn.loc[["c", "coulomb"], "contraction"].to_numpy() - expected
     assert np.all(np.abs(off) < 4 * drawn.loc[["c", "coulomb"], "contraction_mcse"] + 2e-3)
     assert set(drawn["verdict"]) == {"determined"} and not any(drawn["remedy"])
@@ -99,7 +103,7 @@ def test_a_number_that_is_measured_directly(value, sd, prior, verdict):
     """The probability of the wrong sign is Φ(−value/sd), within four Monte Carlo errors."""
     problem, fit = one(lambda p: p.a, value, sd, a=prior)
     assert bp.identifiability(problem, fit).verdicts == {"a": verdict}
-    posterior = bp.sample(problem, fit, seed=1, max_steps=1000, **QUIET)
+    posterior = bp.sample(problem, fit, **SHORT)
     found = bp.identifiability(problem, fit, posterior)
     assert found.verdicts == {"a": verdict}
     row = found.table.loc["a"]
@@ -113,7 +117,7 @@ def test_a_number_that_is_measured_directly(value, sd, prior, verdict):
 def test_a_sign_that_the_data_cannot_see():
     """Only a² is measured; the remedy is no further experiment."""
     problem, fit = one(lambda p: p.a**2, 1.0, 0.1, a=WIDE)
-    posterior = bp.sample(problem, fit, seed=1, start="prior", max_steps=1000, **QUIET)
+    posterior = bp.sample(problem, fit, **SHORT, start="prior")
     found = bp.identifiability(problem, fit, posterior, profile=False)
     assert found.verdicts == {"a": "sign undetermined"}
     assert "both signs fit the data" in found.table.loc["a", "remedy"]
@@ -173,14 +177,10 @@ def test_distance_of_weighted_draws_is_that_of_their_distributions():
 def test_power_scaling_tells_the_prior_from_the_data(linear):
     """A posterior that is the prior's reacts to it alone, one that is the data's to them."""
     problem, fit = one(lambda p: p.a, 1.0, 5.0, a=bp.LogNormal(1.0, 0.1))
-    table = bp.identifiability(
-        problem, fit, bp.sample(problem, fit, seed=1, max_steps=500, **QUIET), profile=False
-    ).table
+    table = bp.identifiability(problem, fit, bp.sample(problem, fit, **SHORT), profile=False).table
     assert table.loc["a", "prior_sensitivity"] > 0.05 > table.loc["a", "likelihood_sensitivity"]
     problem, fit = one(lambda p: p.a, 1.0, 0.05, a=WIDE)
-    table = bp.identifiability(
-        problem, fit, bp.sample(problem, fit, seed=1, max_steps=500, **QUIET), profile=False
-    ).table
+    table = bp.identifiability(problem, fit, bp.sample(problem, fit, **SHORT), profile=False).table
     assert table.loc["a", "likelihood_sensitivity"] > 0.05 > table.loc["a", "prior_sensitivity"]
 
 
@@ -188,3 +188,44 @@ def test_it_is_saved_and_loaded(linear, tmp_path):
     found = bp.identifiability(*linear, profile=False)
     found.save(tmp_path / "verdict.h5")
     assert repr(bp.load(tmp_path / "verdict.h5")) == repr(found)
+
+
+@pytest.mark.filterwarnings("ignore:The data do not change under")
+def test_what_the_equations_leave_open_is_named_whatever_the_data():
+    """In one rotation of the pendulum m, k1, k2 and k3 appear only as k/(m l²), and l is determined by the drive."""
+    fixed = {name: PENDULUM[name] for name in ("a", "g", "v0")}
+    free = {name: bp.LogNormal(PENDULUM[name], 0.5) for name in ("m", "l", "k1", "k2", "k3")}
+    problem = bp.Problem(bp.models.pendulum, [pendulum_run()], priors=free, fixed=fixed, scheme="central4")
+    fit = bp.map_estimate(problem, start={name: PENDULUM[name] for name in free}, **QUIET)
+    found = bp.identifiability(problem, fit, profile=False)
+    assert found.verdicts["l"] == "determined"
+    assert {found.verdicts[name] for name in ("m", "k1", "k2", "k3")} == {"only in combination"}
+    assert found.structure.combinations == ("k1/(m*l**2)", "k2/(m*l**2)", "k3/(m*l**2)")
+    assert "fix one of m, k1, k2, k3, or report k1/(m*l**2), k2/(m*l**2), k3/(m*l**2)" in repr(found)
+    known = bp.Problem(
+        bp.models.pendulum, [pendulum_run()], priors={n: free[n] for n in ("l", "k2", "k3")}, scheme="central4",
+        fixed=fixed | {"m": 0.1, "k1": PENDULUM["k1"]},
+    )  # fmt: skip
+    assert not structure_of(known).symmetries
+
+
+def test_structure_knows_ties_and_fixed_zeros():
+    """The temperature scaling of the landing gear ends with theta5 fixed, the shift with theta12 at zero."""
+    gear = bp.models.landing_gear("displacement")
+    wave = np.cos(2 * np.pi * grid(40))
+    noise = np.random.default_rng(1).standard_normal((2, 40))
+    run = bp.Experiment(
+        "run", 0.1, {"force": 5e3 + noise[0], "pressure": 1e6 + noise[1]}, {"displacement": 0.12 + 0.05 * wave},
+        samples=40,
+    )  # fmt: skip
+
+    def found(free: tuple[str, ...], tied: dict[str, str]) -> bp.Structure:
+        priors = {name: bp.Normal(GEAR[name], 0.1 * abs(GEAR[name]) + 0.1) for name in free}
+        fixed = {name: value for name, value in GEAR.items() if name not in (*free, *tied)}
+        return structure_of(bp.Problem(gear, [run], priors=priors, fixed=fixed, tied=tied))
+
+    assert not found(("theta4", "theta6", "theta16"), {"theta11": "-1e5*theta4"}).symmetries
+    loose = found(("theta5", "theta15", "theta16", "theta17"), {})
+    assert [s.parameters for s in loose.symmetries] == [("theta5", "theta15", "theta16", "theta17")]
+    held = found(("theta5", "theta15", "theta16"), {"theta17": "-293*theta16/2"})
+    assert not held.symmetries
