@@ -102,7 +102,7 @@ def posterior_of(problem, points):
 
 def redrawn(problem, posterior, points):
     density = SamplingDensity(problem)
-    return replace(posterior, data=tree(problem, *density.to_natural(points), points[..., 0]))
+    return replace(posterior, data=tree(problem, *density.to_natural(points), points[..., 0], 0))
 
 
 def by_inversion(log_density, values, generator):
