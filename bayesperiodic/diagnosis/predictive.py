@@ -1,104 +1,172 @@
-"""Posterior predictive bands on the measured periods."""
+"""Posterior predictive checks: bands, on periods and on transients, and whether the model explains the data at all."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.special import ndtri
+import pandas as pd
 
 from bayesperiodic import checks
+from bayesperiodic.diagnosis.adequacy import ALL, LEVEL, MISSPECIFIED, TESTS, adequacy
+from bayesperiodic.diagnosis.bands import Bands, bands
+from bayesperiodic.diagnosis.transients import Run, Transient, transient
+from bayesperiodic.inference.labels import CHAIN, DRAW
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.inference.sampling.posterior import Posterior
-from bayesperiodic.store import Result
+from bayesperiodic.periodic.compiled import CONVERGED
 
-PROBABILITY = 0.9
-NOISE_LEVELS = 21
+SAID = {
+    "whiteness": "its residual is not white",
+    "harmonics": "its residual has too much power in some harmonics",
+    "size": "its residual is larger than the measured noise",
+    "amplitude": "its amplitude is not what the posterior expects",
+    "consistency": "no common parameters explain what each experiment and channel allows on its own",
+}
 
 
 @dataclass(frozen=True)
-class Prediction(Result):
-    """What the posterior expects of the mean period of each experiment.
+class Prediction(Bands):
+    """What the posterior expects of the mean period of each experiment, and whether that is what was measured.
+
+    The verdict is on the model, not on how much the data determine: parameters that the data leave open can still fit
+    them ("adequate"), and parameters known to many digits can belong to a model that does not ("misspecified").
 
     Attributes
     ----------
-    median, low, high : dict of str to dict of str to array (points,)
-        By experiment and channel: the median and the central 90 % band of the mean period, residual variance included
-        and taken as normal at each point, within the harmonics kept. Section values with a covariance of their own have
-        the band of the model alone.
-    probability : float
-        Of the band.
-    draws : int
-        Posterior draws used.
-    failed : int
-        Of these, how many had no periodic solution.
+    table : DataFrame
+        A row for every experiment and channel, and the row "all". p-values, NaN where a test is not possible:
+        ``whiteness`` and ``harmonics`` of the residual along the period, in units of the noise model; ``size``, the
+        residual's variance against the measured scatter of the cycles (or a known variance); ``amplitude``, the
+        rms of the period against replicates; ``consistency`` (row "all"), one set of parameters against one for each
+        experiment and channel. ``harmonic``: where the residual has most power for its degrees of freedom, of a mask's
+        points the half cosine waves over 2. ``model_error_share``: the fraction of the residual's variance that the
+        scatter of the cycles does not explain; NaN where it is not known. ``p``: the row's smallest, adjusted by Holm's
+        method for all tests of the table; ``verdict``: "misspecified" where it is below 1 %, "adequate", or "not
+        tested".
+    transient : Transient or None
+        Bands on the recordings that `run` makes.
+    note : str
+        What the noise model hides from the tests; "" if nothing.
     """
 
-    median: dict[str, dict[str, np.ndarray]]
-    low: dict[str, dict[str, np.ndarray]]
-    high: dict[str, dict[str, np.ndarray]]
-    probability: float
-    draws: int
-    failed: int
+    table: pd.DataFrame
+    transient: Transient | None
+    note: str
+
+    @property
+    def verdict(self) -> str:
+        """The verdict on the model as a whole."""
+        return str(self.table.loc[ALL, "verdict"])
+
+    def __repr__(self) -> str:
+        lines = [
+            f"Prediction from {self.draws} draws ({self.failed} without a periodic solution): the model is "
+            f"{self.verdict} (all tests together, false-alarm rate {LEVEL:.0%})."
+            if self.verdict != "not tested"
+            else f"Prediction from {self.draws} draws ({self.failed} without a periodic solution); nothing to test."
+        ]
+        for label, row in self.table[self.table["verdict"] == MISSPECIFIED].iterrows():
+            said = [SAID[test] + f" (p = {row[test]:.2g})" for test in TESTS if row[test] < LEVEL / self._tested]
+            if said:
+                share = row["model_error_share"]
+                error = "" if np.isnan(share) else f"; {share:.1%} of its variance is model error"
+                lines.append(f"  {label}: {', '.join(said)}{error}")
+        lines += [self.note] if self.note else []
+        lines += [repr(self.transient)] if self.transient else []
+        return "\n".join([*lines, self.table.to_string(float_format="{:.2g}".format, na_rep="-")])
+
+    @property
+    def _tested(self) -> int:
+        return int(self.table[[*TESTS]].notna().to_numpy().sum())
 
 
-def predict(problem: Problem, posterior: Posterior, *, draws: int = 200) -> Prediction:
-    """Predict the mean period of every experiment from equally spaced posterior draws.
+def predict(
+    problem: Problem,
+    posterior: Posterior,
+    *,
+    draws: int = 200,
+    run: Run | None = None,
+    experiment: str | None = None,
+) -> Prediction:
+    """Predict the mean period of every experiment, and test whether the measured one could have come from the model.
+
+    The tests are made where their p-values are known: on the residual at the draw with the highest density, without all
+    that a change of the parameters, in that experiment and channel alone, could explain. They are exact for models
+    linear in the parameters, whatever the priors, and do not depend on how well the data determine the parameters. The
+    amplitude is compared with replicates, whose parameters were fitted to the data: its p is conservative.
+
+    What is meant by noise decides what can be seen. Noise of unknown variance takes a misfit of any size as noise, so
+    only its shape along the period, or the scatter of the measured cycles, gives it away. Circulant noise takes a
+    correlated misfit as noise too, and then only the scatter does. A wrong prior is not a wrong model; only the
+    amplitude responds to it.
 
     Parameters
     ----------
     problem : Problem
     posterior : Posterior
     draws : int
-        At least 20.
+        Equally spaced posterior draws, at least 20.
+    run : callable, optional
+        Makes the recording of a transient from the value of every parameter of the model at one draw, such as
+        ``lambda p: bp.simulate(model, p, inputs, frequency=1.0, duration=30.0, sampling_rate=100.0)``. Called once a
+        draw; all recordings must have the same times and outputs.
+    experiment : str, optional
+        Whose parameters `run` gets, where experiments differ in some.
+
+    Returns
+    -------
+    Prediction
 
     Raises
     ------
+    ValueError
+        For too few draws, an `experiment` that is needed and not given, or without `run`, recordings that differ in
+        their times or outputs.
     RuntimeError
-        If no draw has a periodic solution.
+        If no draw has a periodic solution, or no run succeeds.
+
+    References
+    ----------
+    A. Gelman, X.-L. Meng, H. Stern, Posterior predictive assessment of model fitness via realized discrepancies,
+    Statistica Sinica 6 (1996) 733-807.
+    X.-L. Meng, Posterior predictive p-values, Annals of Statistics 22 (1994) 1142-1160.
     """
     count = checks.integer("draws", draws, 20)
+    if experiment is not None and run is None:
+        raise ValueError(f"experiment: {experiment!r} is not allowed without run, whose parameters it chooses.")
     columns = {name: posterior.draws(name) for name in posterior.names}
     chosen = np.linspace(0, next(iter(columns.values())).size - 1, count).astype(int)
+    best = int(np.argmax(posterior.data["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()))
     free = (
         np.stack([columns[n][chosen] for n in problem.free_noise], -1) if problem.free_noise else np.empty((count, 0))
     )
-    variances = problem.likelihood.value_variances(problem.likelihood.complete(free))
-    theta = {name: float(np.median(columns[name])) for name in problem.names}
-    anchored = problem.anchored(theta)
+    noise = problem.likelihood.complete(free)
     points = np.stack([columns[name][chosen] for name in problem.names], axis=-1)
-    outputs, converged = anchored.outputs(points)
+    peak = np.array([columns[name][best] for name in problem.names])
+    anchored = problem.anchored(peak)
+    solved = anchored.responses.solve(points)
+    converged = np.all([s.status == CONVERGED for s in solved.values()], axis=0)
     if not converged.any():
         raise RuntimeError("posterior: none of its draws has a periodic solution, so nothing can be predicted.")
-    return bands(problem, outputs, converged, variances)
-
-
-def bands(
-    problem: Problem,
-    outputs: dict[str, dict[str, np.ndarray]],
-    converged: np.ndarray,
-    variances: dict[tuple[str, str], np.ndarray],
-) -> Prediction:
-    """Return the bands of outputs (draws, points), by experiment and channel, at the draws that converged.
-
-    Parameters
-    ----------
-    problem : Problem
-    outputs : dict of str to dict of str to array (draws, points)
-    converged : bool array (draws,)
-    variances : dict of (str, str) to array (draws,)
-        Of the residual, by experiment and channel; zero where there is none.
-    """
-    count = converged.size
-    quantiles = [0.5, 0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY]
-    scores = ndtri((np.arange(NOISE_LEVELS) + 0.5) / NOISE_LEVELS)
-    found: list[dict[str, dict[str, np.ndarray]]] = [{}, {}, {}]
+    outputs = {name: o.predicted(solved[name].response) for name, o in problem.observations.items()}
+    predicted = bands(problem, outputs, converged, problem.likelihood.value_variances(noise))
+    components = problem.likelihood.simulate(noise, np.random.default_rng(posterior.seed))
+    replicates = {}
     for e in problem.experiments:
-        for channel in e.outputs:
-            variance = variances.get((e.name, channel), np.zeros(count))
-            expected = e.project(channel, outputs[e.name][channel])
-            noise = np.sqrt(variance)[:, None, None] * scores[:, None]
-            values = (expected[:, None] + noise)[converged].reshape(-1, expected.shape[1])
-            for band, q in zip(found, quantiles, strict=True):
-                level = np.median(expected[converged], axis=0) if q == 0.5 else np.quantile(values, q, axis=0)
-                band.setdefault(e.name, {})[channel] = level
-    median, low, high = found
-    return Prediction(median, low, high, PROBABILITY, count, int(count - converged.sum()))
+        observation = problem.observations[e.name]
+        own, components = components[: len(observation.blocks)], components[len(observation.blocks) :]
+        for channel, values in observation.replicates(solved[e.name].response, own).items():
+            replicates[e.name, channel] = values[converged]
+    table = adequacy(problem, anchored.linearised(peak), noise, replicates)
+    recorded = None if run is None else transient(problem, points, run, experiment)
+    given = {f.name: getattr(predicted, f.name) for f in fields(predicted)}
+    return Prediction(**given, table=table, transient=recorded, note=_note(problem, table))
+
+
+def _note(problem: Problem, table: pd.DataFrame) -> str:
+    """Return what the noise model hides."""
+    if not problem.noise.flat and table["size"].drop(ALL).isna().any():
+        return (
+            f"{problem.noise.name.capitalize()} noise takes a correlated misfit as noise; only the scatter of the "
+            "measured cycles would give it away, and it is not known everywhere."
+        )
+    return ""

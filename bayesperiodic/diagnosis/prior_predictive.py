@@ -8,7 +8,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from bayesperiodic import checks
-from bayesperiodic.diagnosis.predictive import Prediction, bands
+from bayesperiodic.diagnosis.bands import Bands, bands
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.periodic import reach
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
@@ -38,14 +38,14 @@ class PriorPredictive(Result):
         outputs. In the row "all" a draw counts by its worst experiment, in this order.
     causes : dict of str to float
         Share of all solves, draws times experiments, by cause.
-    outputs : Prediction
+    outputs : Bands
         Median and central 90 % band of the outputs over the draws, without noise.
     draws : int
     """
 
     table: pd.DataFrame
     causes: dict[str, float]
-    outputs: Prediction
+    outputs: Bands
     draws: int
 
     def __repr__(self) -> str:
@@ -107,7 +107,7 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     return PriorPredictive(table, shares, prediction, count)
 
 
-def _inside(problem: Problem, prediction: Prediction, index: int) -> float:
+def _inside(problem: Problem, prediction: Bands, index: int) -> float:
     """Return the share of an experiment's measured values within the band."""
     e = problem.experiments[index]
     within = [

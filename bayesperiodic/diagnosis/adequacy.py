@@ -1,0 +1,178 @@
+"""Whether a model explains its data: discrepancy tests of every experiment and channel, and the verdict."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+from scipy.fft import dct
+
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.diagnosis.discrepancy import NOT_TESTED, Unexplained, consistency, excess, holm
+from bayesperiodic.inference.linearisation import Linearisation
+from bayesperiodic.inference.noise.blocks import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
+from bayesperiodic.inference.problem import Problem
+
+LEVEL = 0.01
+SHAPES = 20
+TESTS = ("whiteness", "harmonics", "size", "amplitude", "consistency")
+ADEQUATE, MISSPECIFIED, UNTESTED = "adequate", "misspecified", "not tested"
+ALL = "all"
+
+
+def adequacy(
+    problem: Problem, here: Linearisation, noise: np.ndarray, replicates: Mapping[tuple[str, str], np.ndarray]
+) -> pd.DataFrame:
+    """Return the table of `Prediction`: the p-values of all tests, and what they say together.
+
+    Parameters
+    ----------
+    problem : Problem
+    here : Linearisation
+        At a draw near the best fit.
+    noise : array (draws, noise_names)
+        Draws of the noise parameters.
+    replicates : mapping of (str, str) to array (draws, points)
+        Of the data, by experiment and channel; NaN outside the mask and where a solve failed.
+    """
+    likelihood = problem.likelihood
+    shapes = np.median(noise, axis=0)[None] if problem.noise.flat else noise[:: max(1, len(noise) // SHAPES)]
+    rows: dict[str, dict[str, float | str]] = {}
+    white = [_Whitened(problem, here, shape) for shape in shapes]
+    for i, block in enumerate(likelihood.blocks):
+        if block.kind == KNOWN:
+            continue
+        row: dict[str, float | str] = {"experiment": block.experiment, "channel": block.channel}
+        # The spectrum of correlated noise is known by its draws alone: their mean p is that of the realised residual.
+        found = [w.spectral_tests(i) for w in white]
+        whiteness, harmonics, harmonic = np.array(found).T
+        row |= {"whiteness": float(whiteness.mean()), "harmonics": float(harmonics.mean()), "harmonic": harmonic[0]}
+        row |= _size(problem, here, block, i, white[0])
+        row["amplitude"] = _amplitude(problem, block, replicates)
+        rows[f"{block.experiment} {block.channel}"] = row
+    common = float(np.mean([w.consistency() for w in white]))
+    rows[ALL] = {"experiment": ALL, "channel": ALL, "consistency": common}
+    columns = ["experiment", "channel", *TESTS, "harmonic", "model_error_share"]
+    return _judged(pd.DataFrame.from_dict(rows, orient="index", columns=columns))
+
+
+def _judged(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the table with each row's smallest p, adjusted for the number of all tests, and its verdict."""
+    adjusted = holm(table[[*TESTS]].to_numpy(dtype=float).ravel()).reshape(len(table), -1)
+    smallest = np.min(np.where(np.isnan(adjusted), np.inf, adjusted), axis=1)
+    smallest[-1] = min(smallest)
+    table["p"] = np.where(np.isinf(smallest), np.nan, smallest)
+    table["verdict"] = np.select([np.isinf(smallest), smallest < LEVEL], [UNTESTED, MISSPECIFIED], ADEQUATE)
+    return table
+
+
+class _Whitened:
+    """Residual components and their derivatives in units of the noise at one value (names,) of its parameters.
+
+    Where fewer values are independent than there are components, the measured period is a smooth curve, and the
+    components are those of the lowest harmonics, as many as independent values.
+    """
+
+    def __init__(self, problem: Problem, here: Linearisation, noise: np.ndarray):
+        likelihood = problem.likelihood
+        self.blocks = likelihood.blocks
+        self.groups = [" ".join(problem.noise.parameter_names(block)) or KNOWN for block in self.blocks]
+        known = {g for g in self.groups if g == KNOWN or set(g.split(" ")) <= set(likelihood.fixed)}
+        self.known = frozenset(known)
+        residuals = likelihood.whitened(here.residuals, noise)
+        changes = likelihood.whitened(here.changes, noise)
+        self.parts = [
+            (kept(block, r), kept(block, j), labels(block))
+            for block, r, j in zip(self.blocks, residuals, changes, strict=True)
+        ]
+
+    def spectral_tests(self, index: int) -> tuple[float, float, float]:
+        """Return p of whiteness and of the harmonic content of a block, and the harmonic with most power."""
+        r, j, harmonic = self.parts[index]
+        if self.blocks[index].kind == CORRELATED or not _testable(r, j):
+            return NOT_TESTED, NOT_TESTED, NOT_TESTED
+        unexplained = Unexplained(r, j, harmonic)
+        return unexplained.whiteness(), *unexplained.harmonic_content()
+
+    def consistency(self) -> float:
+        """Return p of the test of common parameters."""
+        parts = [(r, j, g) for (r, j, _), g in zip(self.parts, self.groups, strict=True) if _testable(r, j)]
+        return consistency(parts, self.known) if len(parts) == len(self.parts) else NOT_TESTED
+
+
+def _testable(r: np.ndarray, j: np.ndarray) -> bool:
+    return bool(np.isfinite(r).all() and np.isfinite(j).all())
+
+
+def kept(block: Block, components: np.ndarray) -> np.ndarray:
+    """Return the components (…, kept) that the tests take, points as cosine components along the period."""
+    if block.kind == POINTS:
+        components = dct(components, norm="ortho", axis=-1)
+    return components[..., _order(block)]
+
+
+def labels(block: Block) -> np.ndarray:
+    """Return the harmonics (kept,) of the components that the tests take."""
+    return _harmonic(block)[_order(block)]
+
+
+def _order(block: Block) -> np.ndarray:
+    number = min(block.size, int(np.rint(block.count))) if block.kind in (SPECTRAL, POINTS) else block.size
+    return np.sort(np.argsort(_harmonic(block), kind="stable")[:number])
+
+
+def _harmonic(block: Block) -> np.ndarray:
+    if block.kind == SPECTRAL:
+        return block.harmonic
+    return (np.arange(block.size) + 1) // 2
+
+
+def _size(problem: Problem, here: Linearisation, block: Block, index: int, white: _Whitened) -> dict[str, float | str]:
+    """Return p of a residual larger than the measured noise, or the known one, and the share that is model error."""
+    nothing: dict[str, float | str] = {"size": NOT_TESTED, "model_error_share": NOT_TESTED}
+    r, j = (np.sqrt(block.weight) * kept(block, part[index]) for part in (here.residuals, here.changes))
+    if not _testable(r, j):
+        return nothing
+    if not block.measured > 0.0:
+        if white.groups[index] not in white.known:
+            return nothing
+        unexplained, measured = Unexplained(*white.parts[index]), 1.0
+        freedom, behind = float(unexplained.freedom), np.inf
+    else:
+        unexplained, measured = Unexplained(r, j, labels(block)), block.measured
+        e = next(e for e in problem.experiments if e.name == block.experiment)
+        # A sum of squares of unequal variances has fewer degrees of freedom.
+        evenness = _evenness(e, block)
+        freedom = unexplained.freedom * evenness
+        behind = (e.cycles - 1) * block.count * evenness if e.cycles > 1 else np.inf
+    if not unexplained.freedom:
+        return nothing
+    variance = unexplained.square / unexplained.freedom
+    return {
+        "size": excess(variance, freedom, measured, behind),
+        "model_error_share": max(0.0, 1.0 - measured / variance) if variance > 0.0 else 0.0,
+    }
+
+
+def _evenness(experiment: Experiment, block: Block) -> float:
+    """Return the effective share of degrees of freedom where the variance differs between harmonics (Satterthwaite)."""
+    if block.channel not in experiment.amplitude_variance:
+        return 1.0
+    variance = experiment.amplitude_variance[block.channel]
+    each = np.concatenate([variance[:1], np.repeat(0.25 * variance[1:], 2)])
+    return float(each.sum() ** 2 / (each.size * np.sum(each**2)))
+
+
+def _amplitude(problem: Problem, block: Block, replicates: Mapping[tuple[str, str], np.ndarray]) -> float:
+    """Return the two-sided posterior predictive p of the rms about the mean, normal between the replicates."""
+    if (block.experiment, block.channel) not in replicates:
+        return NOT_TESTED
+    e = next(e for e in problem.experiments if e.name == block.experiment)
+    mask = slice(None) if e.mask is None else e.mask
+    values = replicates[block.experiment, block.channel][:, mask]
+    found = values[np.isfinite(values).all(axis=1)].std(axis=1)
+    sd = found.std(ddof=1) if found.size > 1 else 0.0
+    if not sd > 0.0:
+        return NOT_TESTED
+    score = (e.outputs[block.channel][mask].std() - found.mean()) / (sd * np.sqrt(1.0 + 1.0 / found.size))
+    return float(2.0 * stats.t.sf(abs(score), found.size - 1))
