@@ -56,9 +56,14 @@ def adequacy(
     return _judged(pd.DataFrame.from_dict(rows, orient="index", columns=columns))
 
 
+def adjusted_p(table: pd.DataFrame) -> np.ndarray:
+    """Return the p-values (rows, tests) of a table, adjusted for the number of all of them."""
+    return holm(table[[*TESTS]].to_numpy(dtype=float).ravel()).reshape(len(table), -1)
+
+
 def _judged(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the table with each row's smallest p, adjusted for the number of all tests, and its verdict."""
-    adjusted = holm(table[[*TESTS]].to_numpy(dtype=float).ravel()).reshape(len(table), -1)
+    """Return the table with each row's smallest adjusted p, and its verdict."""
+    adjusted = adjusted_p(table)
     smallest = np.min(np.where(np.isnan(adjusted), np.inf, adjusted), axis=1)
     smallest[-1] = min(smallest)
     table["p"] = np.where(np.isinf(smallest), np.nan, smallest)
@@ -76,9 +81,11 @@ class _Whitened:
     def __init__(self, problem: Problem, here: Linearisation, noise: np.ndarray):
         likelihood = problem.likelihood
         self.blocks = likelihood.blocks
-        self.groups = [" ".join(problem.noise.parameter_names(block)) or KNOWN for block in self.blocks]
-        known = {g for g in self.groups if g == KNOWN or set(g.split(" ")) <= set(likelihood.fixed)}
-        self.known = frozenset(known)
+        names = [problem.noise.parameter_names(block) for block in self.blocks]
+        self.groups = [own[0] if own else KNOWN for own in names]
+        self.known = frozenset(
+            g for g, own in zip(self.groups, names, strict=True) if set(own) <= set(likelihood.fixed)
+        )
         residuals = likelihood.whitened(here.residuals, noise)
         changes = likelihood.whitened(here.changes, noise)
         self.parts = [

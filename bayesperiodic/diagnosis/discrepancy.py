@@ -81,7 +81,7 @@ class Unexplained:
         return of_periodogram(np.maximum(power, 0.0)).p if power.size >= 2 else NOT_TESTED
 
     def harmonic_content(self) -> tuple[float, float]:
-        """Return p of too much power in a single harmonic or in the lowest 2ᵏ + 1, and the harmonic that has most.
+        """Return p of too much power in one harmonic or in the lowest 2ᵏ + 1, and the harmonic that has most.
 
         The smallest p of the F tests, times their number.
         """
@@ -95,7 +95,8 @@ class Unexplained:
             return NOT_TESTED, NOT_TESTED
         p = np.ones(len(sets))
         p[tested] = _f_test(square[tested], freedom[tested], (self.square - square)[tested], rest[tested])
-        return min(1.0, float(p.min() * tested.sum())), float(self.harmonics[np.argmin(p[:count])])
+        _, _, power, size = self._sums
+        return min(1.0, float(p.min() * tested.sum())), float(self.harmonics[np.argmax(power / size)])
 
 
 def column_space(changes: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from bayesperiodic import checks
-from bayesperiodic.diagnosis.adequacy import ALL, LEVEL, MISSPECIFIED, TESTS, adequacy
+from bayesperiodic.diagnosis.adequacy import ALL, LEVEL, TESTS, UNTESTED, adequacy, adjusted_p
 from bayesperiodic.diagnosis.bands import Bands, bands
 from bayesperiodic.diagnosis.transients import Run, Transient, transient
 from bayesperiodic.inference.labels import CHAIN, DRAW
@@ -35,13 +35,12 @@ class Prediction(Bands):
     table : DataFrame
         A row for every experiment and channel, and the row "all". p-values, NaN where a test is not possible:
         ``whiteness`` and ``harmonics`` of the residual along the period, in units of the noise model; ``size``, the
-        residual's variance against the measured scatter of the cycles (or a known variance); ``amplitude``, the
-        rms of the period against replicates; ``consistency`` (row "all"), one set of parameters against one for each
-        experiment and channel. ``harmonic``: where the residual has most power for its degrees of freedom, of a mask's
-        points the half cosine waves over 2. ``model_error_share``: the fraction of the residual's variance that the
-        scatter of the cycles does not explain; NaN where it is not known. ``p``: the row's smallest, adjusted by Holm's
-        method for all tests of the table; ``verdict``: "misspecified" where it is below 1 %, "adequate", or "not
-        tested".
+        residual's variance against the measured scatter of the cycles (taken as exact with one cycle) or a variance
+        that was given; ``amplitude``, the rms of the period against replicates; ``consistency`` (row "all"), one set of
+        parameters against one for each experiment and channel. ``harmonic``: where the residual has most power in units
+        of the noise; of a mask's points it counts cosine waves. ``model_error_share``: the fraction of the residual's
+        variance beyond that of ``size``, NaN where none is known. ``p``: the row's smallest, adjusted by Holm's method
+        for all tests of the table; ``verdict``: "misspecified" where it is below 1 %, "adequate", or "not tested".
     transient : Transient or None
         Bands on the recordings that `run` makes.
     note : str
@@ -58,14 +57,14 @@ class Prediction(Bands):
         return str(self.table.loc[ALL, "verdict"])
 
     def __repr__(self) -> str:
-        lines = [
-            f"Prediction from {self.draws} draws ({self.failed} without a periodic solution): the model is "
-            f"{self.verdict} (all tests together, false-alarm rate {LEVEL:.0%})."
-            if self.verdict != "not tested"
-            else f"Prediction from {self.draws} draws ({self.failed} without a periodic solution); nothing to test."
-        ]
-        for label, row in self.table[self.table["verdict"] == MISSPECIFIED].iterrows():
-            said = [SAID[test] + f" (p = {row[test]:.2g})" for test in TESTS if row[test] < LEVEL / self._tested]
+        head = f"Prediction from {self.draws} draws, {self.failed} without a periodic solution: "
+        if self.verdict == UNTESTED:
+            head += "too few values to test the model."
+        else:
+            head += f"the model is {self.verdict} (all tests together give a false alarm in {LEVEL:.0%})."
+        lines = [head]
+        for (label, row), small in zip(self.table.iterrows(), adjusted_p(self.table) < LEVEL, strict=True):
+            said = [f"{SAID[test]} (p = {row[test]:.2g})" for test, found in zip(TESTS, small, strict=True) if found]
             if said:
                 share = row["model_error_share"]
                 error = "" if np.isnan(share) else f"; {share:.1%} of its variance is model error"
@@ -73,10 +72,6 @@ class Prediction(Bands):
         lines += [self.note] if self.note else []
         lines += [repr(self.transient)] if self.transient else []
         return "\n".join([*lines, self.table.to_string(float_format="{:.2g}".format, na_rep="-")])
-
-    @property
-    def _tested(self) -> int:
-        return int(self.table[[*TESTS]].notna().to_numpy().sum())
 
 
 def predict(
@@ -122,7 +117,7 @@ def predict(
         For too few draws, an `experiment` that is needed and not given, or without `run`, recordings that differ in
         their times or outputs.
     RuntimeError
-        If no draw has a periodic solution, or no run succeeds.
+        If no draw, or not the one with the highest density, has a periodic solution, or no run succeeds.
 
     References
     ----------
@@ -156,7 +151,10 @@ def predict(
         own, components = components[: len(observation.blocks)], components[len(observation.blocks) :]
         for channel, values in observation.replicates(solved[e.name].response, own).items():
             replicates[e.name, channel] = values[converged]
-    table = adequacy(problem, anchored.linearised(peak), noise, replicates)
+    here = anchored.linearised(peak)
+    if not here.converged:
+        raise RuntimeError("posterior: its draw of the highest density has no periodic solution, so nothing is tested.")
+    table = adequacy(problem, here, noise, replicates)
     recorded = None if run is None else transient(problem, points, run, experiment)
     given = {f.name: getattr(predicted, f.name) for f in fields(predicted)}
     return Prediction(**given, table=table, transient=recorded, note=_note(problem, table))

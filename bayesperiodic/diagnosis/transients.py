@@ -51,8 +51,8 @@ class Transient(Result):
         reasons = "".join(f"\n  {count} times: {reason}" for reason, count in self.failures.items())
         return (
             f"Transient of {', '.join(self.median)} over {self.time[0]:g} to {self.time[-1]:g} s: "
-            f"{self.probability:.0%} band of the signal without measurement noise from {self.draws} runs, {self.failed} "
-            f"failed{reasons}"
+            f"{self.probability:.0%} band of the signal without measurement noise from {self.draws} runs, "
+            f"{self.failed} failed{reasons}"
         )
 
 

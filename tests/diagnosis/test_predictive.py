@@ -3,12 +3,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy import stats
 
 import bayesperiodic as bp
+from bayesperiodic.diagnosis.adequacy import TESTS
 from tests.diagnosis.exact import draw, posterior_of
-from tests.inference.observed import DUFFING, DUFFING_PRIORS, SAMPLES, pendulum_problem, section_run
-from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+from tests.inference.observed import DUFFING, DUFFING_PRIORS, SAMPLES
+from tests.inference.test_gradient import CASES
+from tests.known import LINEAR, RUNAWAY, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 FLAT = {"k": bp.Normal(900.0, 1e5), "c": bp.Normal(40.0, 1e4), "coulomb": bp.Normal(25.0, 1e4)}
@@ -67,15 +68,15 @@ def linear_draws(problem: bp.Problem, seed: int) -> bp.Posterior:
 
 
 def test_well_determined_linear_problems_raise_no_alarm():
-    """60 problems of two experiments; the level is 1 %, and 4 alarms or more have a probability of 0.3 %."""
+    """40 problems of two experiments; the level is 1 %, and 3 alarms or more have a probability of 0.7 %."""
     alarms = 0
-    for seed in range(60):
+    for seed in range(40):
         runs = [linear_experiment(TRUTH, 3.0, seed=2 * seed + i, name=f"run {i}") for i in range(2)]
         problem = bp.Problem(LINEAR, runs, priors=FLAT)
         table = bp.predict(problem, linear_draws(problem, seed), draws=20).table
         assert table[["whiteness", "harmonics", "amplitude"]].drop("all").notna().all(axis=None)
         alarms += table.loc["all", "verdict"] == "misspecified"
-    assert alarms <= stats.binom.ppf(0.997, 60, 0.01)
+    assert alarms <= 2
 
 
 def test_an_experiment_under_other_parameters_is_no_single_fault_but_one_of_the_whole():
@@ -93,28 +94,34 @@ def test_an_experiment_under_other_parameters_is_no_single_fault_but_one_of_the_
 def duffing_posterior(k2: float, seed: int = 1, sd: float = 0.02, noise: str = "independent", cycles: int = 10):
     """Return a Duffing problem without k2, and draws of its Laplace approximation, for data made with k2."""
     force = np.cos(2 * np.pi * grid(SAMPLES)) + 0.2 * np.sin(4 * np.pi * grid(SAMPLES))
-    truth = bp.solve_periodic(ASYMMETRIC, DUFFING | {"k2": k2}, {"force": force}, frequency=0.1, samples=SAMPLES)
+    truth = bp.solve_periodic(
+        ASYMMETRIC, DUFFING | {"k2": k2}, {"force": force}, frequency=0.1, samples=SAMPLES, scheme="central4"
+    )
     outputs = {c: x + sd * np.random.default_rng(seed).standard_normal(x.size) for c, x in truth.outputs.items()}
     scatter = {"displacement": sd * np.sqrt(cycles)}
     run = bp.Experiment("run", 0.1, outputs, {"force": force}, samples=SAMPLES, scatter=scatter, cycles=cycles)
-    problem = bp.Problem(bp.models.duffing, [run], priors=DUFFING_PRIORS, fixed={"m": DUFFING["m"]}, noise=noise)
+    problem = bp.Problem(
+        bp.models.duffing, [run], priors=DUFFING_PRIORS, fixed={"m": DUFFING["m"]}, noise=noise, scheme="central4"
+    )
     fit = bp.map_estimate(problem, progress=False)
     return problem, draw(problem, fit, seed)
 
 
 def test_plenty_of_data_and_a_missing_stiffness_is_misspecified():
-    """The parameters are known to a few per cent; the second harmonic is missing, and most of the residual is error."""
+    """The stiffness is known within 20 %, and a mean and a second harmonic are left that the model cannot have."""
     problem, posterior = duffing_posterior(0.1)
     assert max(posterior.draws(n).std() / abs(posterior.draws(n).mean()) for n in ("k", "k3")) < 0.2
     prediction = bp.predict(problem, posterior, draws=40)
     row = prediction.table.loc["run displacement"]
     assert row["verdict"] == prediction.verdict == "misspecified"
-    assert max(row["whiteness"], row["harmonics"], row["size"]) < 1e-6
-    assert row["harmonic"] in (0.0, 2.0)
+    assert max(row["harmonics"], row["size"]) < 1e-6
+    assert row["harmonic"] <= 2.0
     residual = problem.linearised({n: posterior.draws(n).mean() for n in problem.names}).residuals[0]
     assert row["model_error_share"] == pytest.approx(1.0 - 0.02**2 / np.mean(residual**2), abs=0.03)
     said = repr(prediction)
-    assert "the model is misspecified" in said and "its residual is not white" in said and "is model error" in said
+    assert (
+        "the model is misspecified" in said and "too much power in some harmonics" in said and "is model error" in said
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -127,7 +134,7 @@ def test_the_right_model_is_adequate(seed):
 
 
 def test_power_against_a_missing_stiffness():
-    """Of 20 records with k2 = 3 % of k and 5 % noise all are named; where 95 % are, that has a probability of 36 %."""
+    """With k2 = 5 % of k and noise of 1 % of the peak-to-peak value, 95 % are named; 19 of 20 or more, at least."""
     verdicts = [bp.predict(*duffing_posterior(0.05, seed), draws=20).verdict for seed in range(20)]
     assert verdicts.count("misspecified") >= 19
 
@@ -215,18 +222,41 @@ def test_few_independent_values_behind_a_smooth_curve_are_no_alarm():
     assert verdicts == {11: "adequate", 40: "misspecified"}
 
 
-def test_section_points_with_an_unknown_scale_leave_nothing_to_test():
-    """Two values of a section point, their scale and two parameters."""
-    problem = pendulum_problem([section_run()], noise=bp.noise.Independent(prior=bp.InverseGamma(3.0, 2.0)))
-    theta = np.array([0.3, 4.5e-4]) * np.exp(0.001 * np.random.default_rng(1).standard_normal((40, 2)))
-    prediction = bp.predict(problem, posterior_of(problem, theta, np.ones((40, 1))), draws=20)
-    assert list(prediction.table["verdict"]) == ["not tested", "not tested"]
-    assert "nothing to test" in repr(prediction)
+@pytest.mark.parametrize(
+    ("case", "tests"),
+    [
+        ("local and delayed", 7),
+        ("harmonics kept, tied", 3),
+        ("angle of a rotation", 7),
+        ("section and multiplier", 0),
+        ("autonomous", 3),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Twice as many points")
+def test_every_kind_of_observation_is_tested_where_values_are_left(case, tests):
+    """Data made with the model: no alarm at 1 % a case (fixed seeds)."""
+    problem, _ = CASES[case]()
+    posterior = draw(problem, bp.map_estimate(problem, progress=False), 1, draws=40)
+    found = bp.predict(problem, posterior, draws=20)
+    assert found.verdict == ("adequate" if tests else "not tested")
+    assert found.table[[*TESTS]].notna().sum(axis=None) == tests
+    assert ("too few values" in repr(found)) is (tests == 0)
 
 
-def test_a_posterior_without_periodic_solutions_predicts_nothing(solved):
-    problem, _, posterior = solved
-    nothing = posterior_of(problem, np.full((40, 3), 1e200), np.ones((40, 1)))
+def test_points_of_a_mask_are_white_in_the_units_of_correlated_noise():
+    problem, theta = CASES["masked, correlated"]()
+    scale = problem.linearised(theta).residuals[0].var()
+    values = np.tile(problem.likelihood.guess(), (20, 1))
+    values[:, [n.startswith("variance") for n in problem.noise_names]] *= scale
+    table = bp.predict(problem, posterior_of(problem, np.tile(theta, (20, 1)), values), draws=20).table
+    assert table[["whiteness", "harmonics"]].drop("all").min(axis=None) > 0.01
+
+
+def test_a_posterior_without_periodic_solutions_predicts_nothing():
+    generator = np.random.default_rng(1)
+    run = bp.Experiment("run", 1.0, {"x": generator.standard_normal(40)}, {"u": np.zeros(40)}, samples=40)
+    problem = bp.Problem(RUNAWAY, [run], priors={"a": bp.LogNormal(1.0, 0.5)})
+    nothing = posterior_of(problem, generator.lognormal(0.0, 0.1, (40, 1)), np.ones((40, 1)))
     with pytest.raises(RuntimeError, match="none of its draws has a periodic solution"):
         bp.predict(problem, nothing)
 
