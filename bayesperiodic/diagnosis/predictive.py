@@ -44,7 +44,7 @@ class Prediction(Bands):
     transient : Transient or None
         Bands on the recordings that `run` makes.
     note : str
-        What the noise model hides from the tests; "" if nothing.
+        What the noise model hides from the tests, and whether the draws have not converged; "" if nothing.
     """
 
     table: pd.DataFrame
@@ -157,14 +157,17 @@ def predict(
     table = adequacy(problem, here, noise, replicates)
     recorded = None if run is None else transient(problem, points, run, experiment)
     given = {f.name: getattr(predicted, f.name) for f in fields(predicted)}
-    return Prediction(**given, table=table, transient=recorded, note=_note(problem, table))
+    return Prediction(**given, table=table, transient=recorded, note=_note(problem, posterior, table))
 
 
-def _note(problem: Problem, table: pd.DataFrame) -> str:
-    """Return what the noise model hides."""
+def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:
+    """Return what the noise model hides, and whether the draws can be trusted."""
+    said = []
+    if not posterior.converged:
+        said.append(f"The draws have not converged ({posterior.reason}), so bands and p-values are provisional.")
     if not problem.noise.flat and table["size"].drop(ALL).isna().any():
-        return (
+        said.append(
             f"{problem.noise.name.capitalize()} noise takes a correlated misfit as noise; only the scatter of the "
             "measured cycles would give it away, and it is not known everywhere."
         )
-    return ""
+    return " ".join(said)

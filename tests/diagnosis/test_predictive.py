@@ -56,6 +56,13 @@ def test_too_few_draws_are_refused(solved):
         bp.predict(problem, posterior, draws=5)
 
 
+def test_draws_that_have_not_converged_are_told(solved):
+    problem, _, posterior = solved
+    assert bp.predict(problem, posterior, draws=20).note == ""
+    unfinished = replace(posterior, converged=False, reason="max_steps = 250 reached")
+    assert "have not converged (max_steps = 250 reached)" in repr(bp.predict(problem, unfinished, draws=20))
+
+
 def linear_draws(problem: bp.Problem, seed: int) -> bp.Posterior:
     """Return exact draws of LINEAR under flat priors, from the normal equations."""
     design = np.concatenate([linear_regressors(0.05, 2.0, grid(40))] * len(problem.experiments))
@@ -80,7 +87,7 @@ def test_well_determined_linear_problems_raise_no_alarm():
 
 
 def test_an_experiment_under_other_parameters_is_no_single_fault_but_one_of_the_whole():
-    """Each run is explained by parameters of its own, 900 and 960 N/m (sd 19), and not by common ones."""
+    """Each run is explained by parameters of its own, 900 and 1100 N/m, and not by common ones."""
     runs = [linear_experiment([k, 40.0, 25.0], 3.0, seed=i, name=f"run {i}") for i, k in enumerate((900.0, 1100.0))]
     problem = bp.Problem(LINEAR, runs, priors=FLAT)
     prediction = bp.predict(problem, linear_draws(problem, 1), draws=40)
@@ -126,7 +133,7 @@ def test_plenty_of_data_and_a_missing_stiffness_is_misspecified():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_right_model_is_adequate(seed):
-    """The false-alarm rate of each is 1 %; the seeds are those of no alarm."""
+    """The false-alarm rate of each is 1 %, the seeds are fixed."""
     problem, posterior = duffing_posterior(0.0, seed)
     prediction = bp.predict(problem, posterior, draws=40)
     assert prediction.verdict == "adequate"
