@@ -253,7 +253,7 @@ def test_one_posterior_is_the_next_prior():
         bp.InverseGamma(3.0, 2000.0),
         stats.gamma(4.0, scale=200.0),
     ],
-    ids=repr,
+    ids=lambda prior: type(prior).__name__,
 )
 def test_every_prior_leads_to_the_mode_of_the_density(experiment, prior):
     """The gradient at the estimate vanishes and the covariance is the inverse of the curvature, in closed form."""
