@@ -137,7 +137,8 @@ def predict(
     noise = problem.likelihood.complete(free)
     points = np.stack([columns[name][chosen] for name in problem.names], axis=-1)
     peak = np.array([columns[name][best] for name in problem.names])
-    anchored = problem.anchored(peak)
+    runs = [e.name for e in problem.experiments]
+    anchored = problem.anchored(peak, posterior.guesses(runs, problem.model.states))
     solved = anchored.responses.solve(points)
     converged = np.all([s.status == CONVERGED for s in solved.values()], axis=0)
     if not converged.any():

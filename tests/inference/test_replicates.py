@@ -7,7 +7,7 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.inference.observation import Response
-from tests.inference.observed import pendulum_problem, pendulum_run
+from tests.inference.observed import pendulum_problem, pendulum_run, rotation
 from tests.inference.test_gradient import CASES
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 
@@ -80,3 +80,14 @@ def test_multipliers_are_reported_and_reject_nothing():
     assert float(largest.sel(at)) == pytest.approx(abs(solution.multipliers[0]), rel=1e-8)
     data = problem.experiments[0].outputs["angle"]
     assert np.all(np.abs(group["rotation angle"] - data) <= np.pi)
+
+
+def test_orbits_are_kept_with_the_draws_so_that_predictions_start_from_them():
+    """A second guess leads elsewhere: the prediction stays on the rotation that was sampled."""
+    problem = pendulum_problem([pendulum_run()])
+    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=250, progress=False)
+    states = posterior.guesses(["rotation"], ["phi"])["rotation"]
+    assert states["phi"][-1] - states["phi"][0] == pytest.approx(2 * np.pi, abs=0.2)
+    astray = pendulum_problem([pendulum_run(guess={"phi": rotation().states["phi"] + np.pi})])
+    median = bp.predict(astray, posterior, draws=20).median["rotation"]["rate"]
+    assert median == pytest.approx(rotation().outputs["rate"], abs=0.5)

@@ -15,7 +15,7 @@ from bayesperiodic.inference.sampling import chains
 from bayesperiodic.inference.sampling.checkpoint import fingerprint
 from bayesperiodic.inference.sampling.coordinates import SamplingDensity
 from bayesperiodic.inference.sampling.posterior import Posterior
-from bayesperiodic.inference.sampling.replicates import posterior_predictive
+from bayesperiodic.inference.sampling.replicates import orbits, posterior_predictive
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 
 ENSEMBLE = "ensemble"
@@ -75,13 +75,14 @@ def tree(problem: Problem, theta: np.ndarray, noise: np.ndarray, log_density: np
         Of the replicates.
     """
     ensembles, steps, walkers = log_density.shape
+    best = theta.reshape(-1, theta.shape[-1])[np.argmax(log_density)]
     theta, noise, lp = (_by_chain(values) for values in (theta, noise, log_density[..., None]))
     coords = {
         CHAIN: np.arange(ensembles * walkers),
         DRAW: np.arange(steps),
         ENSEMBLE: (CHAIN, np.repeat(np.arange(ensembles), walkers)),
     }
-    posterior = _variables(problem, theta, noise).assign_coords(coords)
+    posterior, time = _variables(problem, theta, noise).assign_coords(coords), _time_axes(problem)
     status = np.where(np.isfinite(lp[..., 0]), CONVERGED, NOT_FINITE).astype(np.int8)
     meanings = {
         "flag_values": list(range(len(STATUSES))),
@@ -93,9 +94,8 @@ def tree(problem: Problem, theta: np.ndarray, noise: np.ndarray, log_density: np
             "sample_stats": xr.Dataset(
                 {"lp": ((CHAIN, DRAW), lp[..., 0]), "status": ((CHAIN, DRAW), status, meanings)}, coords=coords
             ),
-            "posterior_predictive": posterior_predictive(
-                problem, posterior, {e.name: _time(e) for e in problem.experiments}, seed
-            ),
+            "posterior_predictive": posterior_predictive(problem, posterior, time, seed),
+            "orbits": orbits(problem, best, time),
             "observed_data": _signals(problem, "outputs"),
             "constant_data": _signals(problem, "inputs"),
         }
@@ -178,6 +178,10 @@ def _signals(problem: Problem, kind: str) -> xr.Dataset:
         },
         coords={_time(experiment): experiment.time for experiment in problem.experiments},
     )
+
+
+def _time_axes(problem: Problem) -> dict[str, str]:
+    return {experiment.name: _time(experiment) for experiment in problem.experiments}
 
 
 def _time(experiment: Experiment) -> str:

@@ -1,7 +1,7 @@
 """Posterior: draws, and how far they can be trusted."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,7 +37,8 @@ class Posterior(Result):
         ``variance``; ``noise``, the noise model's name, on its parameters alone. Group ``sample_stats``: lp, the
         log-density in sampling coordinates, and the status of the draw's solves. Group ``posterior_predictive``: at a
         few draws, replicates of the measured outputs, noise included, and largest_multiplier, the modulus of each
-        orbit's largest Floquet multiplier. Groups ``observed_data`` and ``constant_data``: outputs and inputs.
+        orbit's largest Floquet multiplier. Group ``orbits``: every experiment's states, turns included, at the draw
+        with the highest density. Groups ``observed_data`` and ``constant_data``: outputs and inputs.
     converged : bool
         True if the stop rule was passed.
     reason : str
@@ -78,6 +79,11 @@ class Posterior(Result):
             For an unknown name.
         """
         return labels.column(self._group, name).ravel()
+
+    def guesses(self, experiments: Iterable[str], states: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
+        """Return the states at the draw with the highest density, by experiment, from which to solve again."""
+        group, states = self.data["orbits"].to_dataset(), tuple(states)
+        return {run: {state: group[f"{run} {state}"].to_numpy() for state in states} for run in experiments}
 
     @property
     def _group(self) -> xr.Dataset:

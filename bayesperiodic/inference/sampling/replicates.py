@@ -1,4 +1,4 @@
-"""What a posterior expects to be measured, and how stable its orbits are: the group `posterior_predictive`."""
+"""What a posterior expects to be measured, how stable its orbits are, and where they are."""
 
 import numpy as np
 import xarray as xr
@@ -49,6 +49,24 @@ def posterior_predictive(problem: Problem, posterior: xr.Dataset, time: dict[str
         largest.append(problem.responses.largest_multipliers(theta, e.name, found).reshape(shape))
     variables["largest_multiplier"] = ((CHAIN, DRAW, EXPERIMENT), np.stack(largest, axis=-1))
     return xr.Dataset(variables, coords=chosen.coords)
+
+
+def orbits(problem: Problem, theta: np.ndarray, time: dict[str, str]) -> xr.Dataset:
+    """Return the states, turns included, of every experiment's orbit at one θ (names,).
+
+    Returns
+    -------
+    Dataset
+        Variables ``<experiment> <state>`` over the experiment's time axis.
+    """
+    return xr.Dataset(
+        {
+            f"{name} {state}": ((time[name],), values)
+            for name, solution in problem.solve(theta).items()
+            for state, values in solution.states.items()
+        },
+        coords={time[e.name]: e.time for e in problem.experiments},
+    )
 
 
 def _spread(size: int, wanted: int) -> np.ndarray:
