@@ -35,9 +35,9 @@ def rhat(chains: np.ndarray) -> np.ndarray:
 
 def autocorrelation_time(chains: np.ndarray) -> np.ndarray:
     """Return the integrated autocorrelation time of each coordinate in steps, the mean over the ensembles."""
-    return np.mean(
-        [emcee.autocorr.integrated_time(ensemble, tol=0, quiet=True, has_walkers=True) for ensemble in chains], axis=0
-    )
+    with np.errstate(invalid="ignore"):  # a walker that has not moved yet
+        times = [emcee.autocorr.integrated_time(e, tol=0, quiet=True, has_walkers=True) for e in chains]
+    return np.mean(times, axis=0)
 
 
 def quantile_spread(chains: np.ndarray) -> np.ndarray:

@@ -1,5 +1,9 @@
 """Where the walkers start."""
 
+from collections.abc import Callable
+from functools import partial
+from itertools import combinations
+
 import numpy as np
 
 from bayesperiodic.inference.estimation.estimate import MapEstimate
@@ -12,6 +16,10 @@ STARTS = (LAPLACE, PRIOR, OVERDISPERSED)
 SPREAD = {LAPLACE: 2.0, OVERDISPERSED: 5.0}
 REDRAWS = 100
 NOISE_SPREAD = 0.3
+# A mirrored mode counts from this share of the first one's density on, and this many standard deviations away; how many
+# signs are turned in all combinations.
+CREDIBLE, SEPARATE, MOST_SIGNS = 1e-3, 3.0, 4
+FEWEST = 2
 
 
 def start_points(
@@ -22,29 +30,76 @@ def start_points(
     "laplace" and "overdispersed" draw from the Laplace approximation with twice and five times its standard deviations,
     "prior" draws the parameters from their priors, and the noise parameters around those that suit them best.
 
+    Where turning the signs of signed parameters leads to another mode, as in a·b with both negative, the first two of
+    these also start walkers there: its share, but at least two, and no more than half of them in all such modes.
+
     Raises
     ------
     ValueError
         If after a hundred times as many draws there are too few.
     """
-    points, drawn = np.empty((0, density.dimension)), 0
-    while len(points) < walkers and drawn < REDRAWS * walkers:
-        if start == PRIOR:
-            candidates = _from_prior(density, walkers, generator)
-        else:
-            mean, covariance = density.laplace(fit)
-            scale = np.sqrt(np.diag(covariance))
-            factor = scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
-            candidates = mean + SPREAD[start] * generator.standard_normal((walkers, mean.size)) @ factor.T
-        drawn += walkers
+    if start == PRIOR:
+        return _finite(density, lambda count: _from_prior(density, count, generator), walkers, start)
+    mean, covariance = density.laplace(fit)
+    scale = np.sqrt(np.diag(covariance))
+    factor = SPREAD[start] * scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
+
+    def drawn(count: int) -> np.ndarray:
+        return mean + generator.standard_normal((count, mean.size)) @ factor.T
+
+    points = _finite(density, drawn, walkers, start)
+    left = walkers // 2
+    for signs, share in mirrored_modes(density, mean, covariance):
+        count = min(max(FEWEST, round(share * walkers)), left)
+        points[left - count : left] = _finite(density, partial(_turned, signs, drawn), count, start)
+        left -= count
+    return points
+
+
+def _turned(signs: np.ndarray, drawn: Callable[[int], np.ndarray], count: int) -> np.ndarray:
+    return signs * drawn(count)
+
+
+def mirrored_modes(
+    density: SamplingDensity, mean: np.ndarray, covariance: np.ndarray
+) -> list[tuple[np.ndarray, float]]:
+    """Return the signs (dimension,) that lead from a mode to others, and the density there over its own; highest first.
+
+    The signs of up to four signed parameters are turned in all combinations, those of more one by one and all together.
+    """
+    supports = density.problem.joint_prior.supports.values()
+    signed = [i for i, (low, high) in enumerate(supports) if low < 0.0 < high]
+    sizes = range(1, len(signed) + 1) if len(signed) <= MOST_SIGNS else (1, len(signed))
+    turned = [list(columns) for size in sizes for columns in combinations(signed, size)]
+    if not turned:
+        return []
+    signs = np.ones((len(turned), mean.size))
+    for row, columns in zip(signs, turned, strict=True):
+        row[columns] = -1.0
+    values = density(np.concatenate([mean[None], signs * mean]))
+    values = values[:, 0] if values.ndim > 1 else values
+    with np.errstate(over="ignore"):
+        shares = np.exp(values[1:] - values[0])
+    steps = (signs - 1.0) * mean
+    far = np.einsum("mi,mi->m", steps, np.linalg.solve(covariance, steps.T).T) > SEPARATE**2
+    kept = [i for i in np.argsort(-shares) if far[i] and shares[i] > CREDIBLE]
+    return [(signs[i], float(shares[i])) for i in kept]
+
+
+def _finite(density: SamplingDensity, drawn: Callable[[int], np.ndarray], wanted: int, start: str) -> np.ndarray:
+    """Return so many drawn points with a finite density, drawn again until there are enough."""
+    points, tried = np.empty((0, density.dimension)), 0
+    while len(points) < wanted and tried < REDRAWS * wanted:
+        candidates = drawn(wanted)
+        tried += wanted
         values = density(candidates) if len(candidates) else np.empty(0)
         points = np.concatenate([points, candidates[np.isfinite(values[:, 0] if values.ndim > 1 else values)]])
-    if len(points) < walkers:
+    if len(points) < wanted:
         raise ValueError(
-            f"fit: of {drawn} start points drawn (start={start!r}) {1 - len(points) / drawn:.1%} have no finite "
+            f"fit: of {tried} start points drawn (start={start!r}) {1 - len(points) / tried:.1%} have no finite "
             "log-posterior, so the walkers cannot start; check the priors' support and the fit's status."
         )
-    return points[:walkers]
+    return points[:wanted]
 
 
 def _from_prior(density: SamplingDensity, size: int, generator: np.random.Generator) -> np.ndarray:

@@ -9,13 +9,15 @@ LENGTHS_ALONE = 500.0
 TAU_CHANGE = 0.05
 RHAT = 1.005
 QUANTILE_SPREAD = 0.25
+APART = 8.0
 
 
 def shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray) -> list[str]:
     """Return what the stop rule misses, in words; nothing if it is passed.
 
     An ensemble of 32 walkers that is 50 autocorrelation times long holds 1600 independent draws, a walker alone would
-    hold 50, so that it has to be 500 long; all else is the same for both.
+    hold 50, so that it has to be 500 long; all else is the same for both. The mean of a walker scatters by its standard
+    deviation over √(steps/tau); one that is eight times as far off stays in a mode of its own.
 
     Parameters
     ----------
@@ -33,6 +35,14 @@ def shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray) -> list[str]:
         found.append(f"tau changed by {change:.0%}")
     if (spread := chains.quantile_spread(kept).max()) > QUANTILE_SPREAD:
         found.append(f"quantiles of the ensembles {spread:.2f} sd apart")
+    if not found and (alone := _furthest(kept, tau)) > APART:
+        found.append(f"walkers that stay apart, by {alone:.0f} standard errors")
     if not found and (worst := chains.rhat(kept).max()) > RHAT:
         found.append(f"R-hat {worst:.3f}")
     return found
+
+
+def _furthest(kept: np.ndarray, tau: np.ndarray) -> float:
+    """Return how far the mean of a walker is from that of all, at most, in standard errors of such a mean."""
+    off = np.abs(kept.mean(axis=1) - kept.mean(axis=(0, 1, 2)))
+    return float(np.max(off / (kept.std(axis=(0, 1, 2)) * np.sqrt(tau / kept.shape[1]))))
