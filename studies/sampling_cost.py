@@ -1,25 +1,77 @@
 """What sampling costs beside its log-posteriors: in a pool of workers, and in one vectorised call on several cores."""
 
+from __future__ import annotations
+
+import importlib.util
 import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from multiprocessing import get_context
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
 import bayesperiodic as bp
 from bayesperiodic.parallel import available_cores
+from studies.sampling_rows import Row, row, unjudged
 from studies.solver_cost import GEAR, RIG
 
 SAMPLES = 800
 LOG_POSTERIOR = 5e-3
-WALKERS, ENSEMBLES, STEPS = 8, 2, 250
+WALKERS, ENSEMBLES, STEPS, PIECE = 4, 2, 250, 25
+POOLS = ("process", "dask")
 POINTS = 64
 LOOP = 5_000_000
+POOL_LIMIT, GAIN_LIMIT = 1.05, 0.9
+LEAST_GAIN = 1.5
+QUIET = 0.5
+
+
+def run_cost(quick: bool) -> dict[str, Any]:
+    """Measure what sampling costs on this machine; a quick run leaves the pools out."""
+    load = [*os.getloadavg()] if hasattr(os, "getloadavg") else None
+    found: dict[str, Any] = {"load_average": load, "cores": available_cores()}
+    found["vectorised"] = vectorised_gain(3 if quick else 15)
+    found["pools"] = None if quick or not hasattr(os, "sched_setaffinity") else pool_overhead()
+    return found
+
+
+def rows(cost: dict[str, Any]) -> list[Row]:
+    """Return what must show of the costs; where this machine cannot tell, there is no verdict."""
+    result, pools, vectorised = [], cost["pools"], cost["vectorised"]
+    for name in POOLS:
+        what = f"wall time of a pool of one {name} worker over that of one thread"
+        if pools is None or name not in pools["ratios"]:
+            why = "not measured in a quick run, without dask, or where a process cannot be held on one core"
+            result.append(row(what, None, 0.0, POOL_LIMIT, why))
+        else:
+            entry = pools["ratios"][name]
+            result.append(row(what, entry["median"], 0.0, POOL_LIMIT, _quartiles(entry["quartiles"])))
+    for drive in ("force", "displacement"):
+        entry = vectorised[drive]
+        what = f"gain of {vectorised['cores']} cores on a vectorised call over that of a plain loop, {drive}-driven"
+        gain, plain = row(what, entry["ratio"], GAIN_LIMIT, None, _quartiles(entry["ratio_quartiles"])), entry["plain"]
+        if plain < LEAST_GAIN:
+            gain = unjudged(gain, f"not measurable on this machine or under this load: a plain loop gains {plain:.2f}")
+        result.append(gain)
+    return result
+
+
+def _quartiles(pair: list[float]) -> str:
+    return f"quartiles {pair[0]:.3f} … {pair[1]:.3f}"
+
+
+def loaded(cost: dict[str, Any]) -> str:
+    """Return a note if others were using the machine when the measurements began, nothing otherwise."""
+    load = cost["load_average"]
+    if load is None or load[0] <= QUIET * cost["cores"]:
+        return ""
+    return f"the machine was busy (load {load[0]:.1f} on {cost['cores']} cores): times are not for quoting"
 
 
 def gear_problem(drive: str = "force", samples: int = SAMPLES, free: tuple[str, ...] = ()) -> bp.Problem:
@@ -56,70 +108,153 @@ def estimate(problem: bp.Problem) -> bp.MapEstimate:
     return bp.map_estimate(problem, start={name: GEAR[name] for name in problem.names}, progress=False)
 
 
-def pool_overhead(repeats: int = 5) -> dict[str, Any]:
-    """Compare a sampling run on one thread with the same run in a pool of one worker, log-posteriors taking 5 ms.
+class Pool(NamedTuple):
+    """An executor with one worker held on a core.
 
-    The pools have done a run before, as starting processes takes seconds whatever the length of a run. Repeats are
-    interleaved. With a quarter of the walkers that are the default, a message is worth a quarter of the usual work.
+    Attributes
+    ----------
+    executor : object
+        None for a thread of this process.
+    clock : callable
+        Returns the processor time [s] that the worker has used.
+    """
+
+    executor: Any
+    clock: Callable[[], float]
+
+
+def pool_overhead(repeats: int = 4, pools: tuple[str, ...] = POOLS, seconds: float = LOG_POSTERIOR) -> dict[str, Any]:
+    """Compare a sampling run on one thread with the same run handed to one worker, log-posteriors taking 5 ms.
+
+    Both compute on the same core, the worker while this process waits on another one: then neither the cores' speeds
+    nor what else runs on them tells the two apart. Runs alternate, thread, processes, thread, Dask, thread, and so on,
+    and each is compared with the mean of its two neighbours. The workers have done a short run before, as starting
+    processes takes seconds whatever the length of a run. A piece, which is what a message carries, is 4 walkers × 25
+    steps, an eighth of what the default walkers make it, so that the overhead of a default run is smaller.
 
     Parameters
     ----------
     repeats : int
-        A minute each.
+        Of each pool, 20 s each.
+    pools : tuple of str
+        "process", "dask"; the latter is left out where it is not installed.
+    seconds : float
+        What a log-posterior shall take.
 
     Returns
     -------
     dict
-        "process" and "dask": medians of the ratios of wall times, pool to serial; "quartiles" of these;
-        "milliseconds" a log-posterior takes in the serial run; "samples" that make it so; "log_posteriors" a run;
-        "target".
+        "ratios" by pool: "median" and "quartiles" of wall times over those of the thread, and the median ratio of
+        "processor_time", this process and the worker together, which other load changes little; "milliseconds" a
+        log-posterior takes in the thread, by the wall clock and the processor's; "samples" that make it so; "walkers";
+        "log_posteriors" a run and a piece.
     """
-    from distributed import Client, LocalCluster
-
-    problem, fit = _sized()
-    settings: dict[str, Any] = {"ensembles": ENSEMBLES, "walkers": WALKERS, "max_steps": STEPS, "progress": False}
-
-    def run(executor: Any) -> tuple[float, bp.Posterior]:
-        with _one_core() if executor is None else nullcontext():
-            before = time.perf_counter()
-            posterior = bp.sample(problem, fit, seed=1, variances="collapsed", executor=executor, **settings)
-            return time.perf_counter() - before, posterior
-
-    with (
-        ProcessPoolExecutor(1, get_context("spawn")) as process,
-        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
-        Client(cluster) as dask,
-    ):
-        executors = {"serial": None, "process": process, "dask": dask}
-        runs = [{name: run(executor) for name, executor in executors.items()} for _ in range(repeats + 1)][1:]
-    times = {name: np.array([entry[name][0] for entry in runs]) for name in executors}
-    posterior = runs[0]["serial"][1]
-    for name in executors:
-        if not np.array_equal(runs[0][name][1].draws("theta16"), posterior.draws("theta16")):
-            raise RuntimeError(f"The chain of {name!r} is not that of the serial run.")
-    ratios = {name: times[name] / times["serial"] for name in ("process", "dask")}
+    kinds = [name for name in pools if name != "dask" or importlib.util.find_spec("distributed")]
+    core, *others = sorted(os.sched_getaffinity(0))
+    with _only_on({core}):
+        problem, fit = _sized(seconds)
+    small = gear_problem(free=("theta16",))
+    first = estimate(small)
+    times: dict[str, list[np.ndarray]] = {name: [] for name in ("thread", *kinds)}
+    with ExitStack() as stack:
+        workers = {"thread": Pool(None, float)} | {name: stack.enter_context(_POOLS[name](core)) for name in kinds}
+        for name in kinds:
+            _timed_run(small, first, workers[name], core, others)
+        order = ["thread", *(name for _ in range(repeats) for kind in kinds for name in (kind, "thread"))]
+        chains = {}
+        for name in order:
+            used, chains[name] = _timed_run(problem, fit, workers[name], core, others)
+            times[name].append(used)
+    reference = chains["thread"].draws("theta16")
+    for name, chain in chains.items():
+        if not np.array_equal(chain.draws("theta16"), reference):
+            raise RuntimeError(f"The chain of {name!r} is not that of the thread.")
+    thread = np.array(times["thread"])
+    between = 0.5 * (thread[1:] + thread[:-1])
+    count = chains["thread"].log_posterior_calls
+    wall, processor = np.median(thread, axis=0) / count * 1e3
+    ratios = {name: np.array(times[name]) / between[i :: len(kinds)] for i, name in enumerate(kinds)}
     return {
-        **{name: float(np.median(values)) for name, values in ratios.items()},
-        "quartiles": {name: np.quantile(values, [0.25, 0.75]).tolist() for name, values in ratios.items()},
-        "milliseconds": float(np.median(times["serial"])) / posterior.log_posterior_calls * 1e3,
+        "ratios": {
+            name: {
+                "median": float(np.median(values[:, 0])),
+                "quartiles": np.quantile(values[:, 0], [0.25, 0.75]).tolist(),
+                "processor_time": float(np.median(values[:, 1])),
+            }
+            for name, values in ratios.items()
+        },
+        "milliseconds": {"wall": float(wall), "processor": float(processor)},
         "samples": problem.experiments[0].samples,
-        "log_posteriors": posterior.log_posterior_calls,
-        "target": 1.05,
+        "walkers": WALKERS,
+        "log_posteriors": {"run": count, "piece": WALKERS * PIECE},
     }
 
 
-def _sized() -> tuple[bp.Problem, bp.MapEstimate]:
-    """Return the problem of theta16 alone, with as many samples as make a log-posterior take 5 ms on one core."""
-    samples, cost = SAMPLES, 0.0
+def _timed_run(
+    problem: bp.Problem, fit: bp.MapEstimate, pool: Pool, core: int, others: list[int]
+) -> tuple[np.ndarray, bp.Posterior]:
+    """Return wall and processor seconds of a run, this process waiting on another core where a worker computes."""
+    with _only_on({core} if pool.executor is None or not others else {others[0]}):
+        before = time.perf_counter(), time.process_time() + pool.clock()
+        posterior = bp.sample(
+            problem, fit, seed=1, variances="collapsed", executor=pool.executor, ensembles=ENSEMBLES, walkers=WALKERS,
+            max_steps=STEPS, progress=False,
+        )  # fmt: skip
+        after = time.perf_counter(), time.process_time() + pool.clock()
+    return np.subtract(after, before), posterior
+
+
+@contextmanager
+def _process_pool(core: int) -> Iterator[Pool]:
+    with ProcessPoolExecutor(1, get_context("spawn"), _stay_on, (core,)) as pool:
+        yield Pool(pool, lambda: pool.submit(time.process_time).result())
+
+
+@contextmanager
+def _dask_pool(core: int) -> Iterator[Pool]:
+    from distributed import Client, LocalCluster
+
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+    ):
+        client.run(_stay_on, core)
+        yield Pool(client, lambda: sum(client.run(time.process_time).values()))
+
+
+_POOLS = {"process": _process_pool, "dask": _dask_pool}
+
+
+def _stay_on(core: int) -> None:
+    """Hold all threads of this process, and those that they start, on one core."""
+    for thread in Path("/proc/self/task").iterdir():
+        os.sched_setaffinity(int(thread.name), {core})
+
+
+@contextmanager
+def _only_on(cores: set[int]) -> Iterator[None]:
+    """Hold this thread, and those that it starts, on some cores."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def _sized(seconds: float) -> tuple[bp.Problem, bp.MapEstimate]:
+    """Return the problem of theta16 alone, with as many samples as make a log-posterior take so long on one core."""
+    samples = SAMPLES
     for _ in range(3):
         problem = gear_problem(samples=samples, free=("theta16",))
         fit = estimate(problem)
         anchored, noise = problem.anchored(fit.theta), np.array(list(fit.noise.values()))
         theta = _draws(fit, WALKERS // 2)
-        cost = _seconds(lambda: anchored.log_likelihood(theta, noise, 1), 20) / len(theta)  # noqa: B023
-        if abs(cost / LOG_POSTERIOR - 1.0) < 0.1:
+        call = partial(anchored.log_likelihood, theta, noise, 1)
+        cost = _seconds(call, 20, time.thread_time) / len(theta)
+        if abs(cost / seconds - 1.0) < 0.1:
             break
-        samples = max(100, 2 * round(0.5 * samples * LOG_POSTERIOR / cost))
+        samples = max(100, 2 * round(0.5 * samples * seconds / cost))
     return problem, fit
 
 
@@ -132,7 +267,7 @@ def vectorised_gain(repeats: int = 15) -> dict[str, Any]:
     Returns
     -------
     dict
-        "cores", and by drive: "gain" of the call, "gain_of_plain_loop", "ratio" (median of their ratios),
+        "cores", and by drive: "gain" of the call, "plain" (gain of the plain loop), "ratio" (median of their ratios),
         "ratio_quartiles", "milliseconds" on one core.
     """
     cores, result = available_cores(), {}
@@ -149,17 +284,17 @@ def vectorised_gain(repeats: int = 15) -> dict[str, Any]:
                 "loop_one": lambda: [_loop(LOOP) for _ in range(cores)],
                 "loop_many": lambda: list(pool.map(_loop, [LOOP] * cores)),
             }
-            rows = [{name: _seconds(action, 1) for name, action in actions.items()} for _ in range(repeats + 1)][1:]
-            times = {name: np.array([row[name] for row in rows]) for name in actions}
+            rounds = [{name: _seconds(action, 1) for name, action in actions.items()} for _ in range(repeats + 1)][1:]
+            times = {name: np.array([one[name] for one in rounds]) for name in actions}
             gains, plain = times["one"] / times["many"], times["loop_one"] / times["loop_many"]
             result[drive] = {
                 "gain": float(np.median(gains)),
-                "gain_of_plain_loop": float(np.median(plain)),
+                "plain": float(np.median(plain)),
                 "ratio": float(np.median(gains / plain)),
                 "ratio_quartiles": np.quantile(gains / plain, [0.25, 0.75]).tolist(),
                 "milliseconds": float(np.median(times["one"])) * 1e3,
             }
-    return {"cores": cores, "walkers": POINTS, "experiments": len(RIG), "target_ratio": 0.9, **result}
+    return {"cores": cores, "walkers": POINTS, "experiments": len(RIG), **result}
 
 
 def _draws(fit: bp.MapEstimate, size: int) -> np.ndarray:
@@ -168,27 +303,14 @@ def _draws(fit: bp.MapEstimate, size: int) -> np.ndarray:
     return mean + sd * np.random.default_rng(5).standard_normal((size, mean.size))
 
 
-def _seconds(action: Callable[[], Any], calls: int) -> float:
+def _seconds(action: Callable[[], Any], calls: int, clock: Callable[[], float] = time.perf_counter) -> float:
     """Return the median time of a call."""
     times = []
     for _ in range(calls):
-        before = time.perf_counter()
+        before = clock()
         action()
-        times.append(time.perf_counter() - before)
+        times.append(clock() - before)
     return float(np.median(times))
-
-
-@contextmanager
-def _one_core() -> Iterator[None]:
-    """Hold this thread, and those that it starts, on one core."""
-    if not hasattr(os, "sched_setaffinity"):
-        raise RuntimeError("Only Linux holds a process on one core, and this comparison needs that.")
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(before)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
 
 
 @numba.njit(nogil=True)
