@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -22,11 +23,13 @@ from studies.sampling_rows import Row, row, unjudged
 from studies.solver_cost import GEAR, RIG
 
 SAMPLES = 800
-LOG_POSTERIOR = 5e-3
+LOG_POSTERIOR, SHORT = 5e-3, 1e-5
 WALKERS, ENSEMBLES, STEPS, PIECE = 4, 2, 250, 25
 POOLS = ("process", "dask")
 POINTS = 64
 LOOP = 5_000_000
+TURNS = 100_000
+PRIOR = bp.Normal(1.0, 1.0)
 POOL_LIMIT, GAIN_LIMIT = 1.05, 0.9
 LEAST_GAIN = 1.5
 QUIET = 0.5
@@ -74,17 +77,13 @@ def loaded(cost: dict[str, Any]) -> str:
     return f"the machine was busy (load {load[0]:.1f} on {cost['cores']} cores): times are not for quoting"
 
 
-def gear_problem(drive: str = "force", samples: int = SAMPLES, free: tuple[str, ...] = ()) -> bp.Problem:
-    """Return the problem of the landing gear with the 14 experiments of `RIG` (synthetic, noise of 0.3 % of the range).
+def gear_problem(drive: str) -> bp.Problem:
+    """Return the problem of theta4, theta6 and theta16 of the landing gear with the 14 experiments of `RIG`.
 
-    Parameters
-    ----------
-    drive : "force" or "displacement"
-    samples : int
-    free : tuple of str
-        By default theta4, theta6 and theta16.
+    They are synthetic, with noise of 0.3 % of the range; `drive` is "force" or "displacement".
     """
-    model, wave = bp.models.landing_gear(drive), np.cos(2 * np.pi * np.arange(samples) / samples)
+    model, samples = bp.models.landing_gear(drive), SAMPLES
+    wave = np.cos(2 * np.pi * np.arange(samples) / samples)
     generator, experiments = np.random.default_rng(4), []
     for frequency, force, stroke in RIG:
         inputs = {drive: 4500.0 + force * wave if drive == "force" else 0.12 + stroke * wave}
@@ -92,12 +91,11 @@ def gear_problem(drive: str = "force", samples: int = SAMPLES, free: tuple[str, 
         outputs = {name: y + 3e-3 * np.ptp(y) * generator.standard_normal(samples) for name, y in truth.outputs.items()}
         run = bp.Experiment(f"{frequency} Hz", frequency, outputs, inputs, samples=samples, synthetic=True)
         experiments.append(run)
-    every = {
+    priors = {
         "theta4": bp.LogNormal(GEAR["theta4"], 1.0),
         "theta6": bp.Normal(GEAR["theta6"], 2.5),
         "theta16": bp.Normal(GEAR["theta16"], 4.0),
     }
-    priors = {name: every[name] for name in free or every}
     tied = {"theta11": "-1e5*theta4"}
     fixed = {name: value for name, value in GEAR.items() if name not in (*priors, *tied)}
     return bp.Problem(model, experiments, priors=priors, fixed=fixed, tied=tied)
@@ -123,7 +121,7 @@ class Pool(NamedTuple):
     clock: Callable[[], float]
 
 
-def pool_overhead(repeats: int = 4, pools: tuple[str, ...] = POOLS, seconds: float = LOG_POSTERIOR) -> dict[str, Any]:
+def pool_overhead(repeats: int = 3, pools: tuple[str, ...] = POOLS, seconds: float = LOG_POSTERIOR) -> dict[str, Any]:
     """Compare a sampling run on one thread with the same run handed to one worker, log-posteriors taking 5 ms.
 
     Both compute on the same core, the worker while this process waits on another one: then neither the cores' speeds
@@ -146,28 +144,26 @@ def pool_overhead(repeats: int = 4, pools: tuple[str, ...] = POOLS, seconds: flo
     dict
         "ratios" by pool: "median" and "quartiles" of wall times over those of the thread, and the median ratio of
         "processor_time", this process and the worker together, which other load changes little; "milliseconds" a
-        log-posterior takes in the thread, by the wall clock and the processor's; "samples" that make it so; "walkers";
-        "log_posteriors" a run and a piece.
+        log-posterior takes in the thread, by the wall clock and the processor's; "walkers"; "log_posteriors" a run and
+        a piece.
     """
     kinds = [name for name in pools if name != "dask" or importlib.util.find_spec("distributed")]
     core, *others = sorted(os.sched_getaffinity(0))
     with _only_on({core}):
-        problem, fit = _sized(seconds)
-    small = gear_problem(free=("theta16",))
-    first = estimate(small)
+        problem, fit = slow_problem(seconds)
     times: dict[str, list[np.ndarray]] = {name: [] for name in ("thread", *kinds)}
     with ExitStack() as stack:
         workers = {"thread": Pool(None, float)} | {name: stack.enter_context(_POOLS[name](core)) for name in kinds}
         for name in kinds:
-            _timed_run(small, first, workers[name], core, others)
+            _timed_run(*slow_problem(SHORT), workers[name], core, others)
         order = ["thread", *(name for _ in range(repeats) for kind in kinds for name in (kind, "thread"))]
         chains = {}
         for name in order:
             used, chains[name] = _timed_run(problem, fit, workers[name], core, others)
             times[name].append(used)
-    reference = chains["thread"].draws("theta16")
+    reference = chains["thread"].draws("k")
     for name, chain in chains.items():
-        if not np.array_equal(chain.draws("theta16"), reference):
+        if not np.array_equal(chain.draws("k"), reference):
             raise RuntimeError(f"The chain of {name!r} is not that of the thread.")
     thread = np.array(times["thread"])
     between = 0.5 * (thread[1:] + thread[:-1])
@@ -184,7 +180,6 @@ def pool_overhead(repeats: int = 4, pools: tuple[str, ...] = POOLS, seconds: flo
             for name, values in ratios.items()
         },
         "milliseconds": {"wall": float(wall), "processor": float(processor)},
-        "samples": problem.experiments[0].samples,
         "walkers": WALKERS,
         "log_posteriors": {"run": count, "piece": WALKERS * PIECE},
     }
@@ -242,20 +237,56 @@ def _only_on(cores: set[int]) -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def _sized(seconds: float) -> tuple[bp.Problem, bp.MapEstimate]:
-    """Return the problem of theta16 alone, with as many samples as make a log-posterior take so long on one core."""
-    samples = SAMPLES
-    for _ in range(3):
-        problem = gear_problem(samples=samples, free=("theta16",))
-        fit = estimate(problem)
-        anchored, noise = problem.anchored(fit.theta), np.array(list(fit.noise.values()))
-        theta = _draws(fit, WALKERS // 2)
-        call = partial(anchored.log_likelihood, theta, noise, 1)
-        cost = _seconds(call, 20, time.thread_time) / len(theta)
-        if abs(cost / seconds - 1.0) < 0.1:
-            break
-        samples = max(100, 2 * round(0.5 * samples * seconds / cost))
-    return problem, fit
+@dataclass(frozen=True)
+class SlowPrior:
+    """A normal prior, N(1, 1), that takes a plain loop of so many turns for every value: what a hard model would take.
+
+    With a model that is quick to solve, nothing else takes time in a run, before the walk or after it.
+    """
+
+    turns: int
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """The interval outside of which the density is zero."""
+        return PRIOR.support
+
+    def log_prob(self, x: Any) -> Any:
+        """Return the log-density, after the loop."""
+        _loop(self.turns * np.size(x))
+        return PRIOR.log_prob(x)
+
+    def gradient(self, x: Any) -> Any:
+        """Return the derivative of the log-density."""
+        return PRIOR.gradient(x)
+
+    def curvature(self, x: Any) -> Any:
+        """Return minus its second derivative."""
+        return PRIOR.curvature(x)
+
+    def quantile(self, p: Any) -> Any:
+        """Return quantiles."""
+        return PRIOR.quantile(p)
+
+    def sample(self, size: int, generator: np.random.Generator) -> np.ndarray:
+        """Return independent draws, (size,)."""
+        return PRIOR.sample(size, generator)
+
+
+def slow_problem(seconds: float) -> tuple[bp.Problem, bp.MapEstimate]:
+    """Return a problem of the Duffing oscillator of which a log-posterior takes so many seconds on one core."""
+    _loop(10)
+    turn = min(_seconds(partial(_loop, TURNS), 1, time.thread_time) for _ in range(10)) / TURNS
+    values, samples = {"m": 1.0, "c": 0.5, "k": 1.0, "k3": 0.1}, 40
+    force = {"force": np.cos(2 * np.pi * np.arange(samples) / samples)}
+    truth = bp.solve_periodic(bp.models.duffing, values, force, frequency=0.1, samples=samples, scheme="fourier")
+    noise = 0.05 * np.random.default_rng(4).standard_normal(samples)
+    outputs = {"displacement": truth.outputs["displacement"] + noise}
+    run = bp.Experiment("run", 0.1, outputs, force, samples=samples, synthetic=True)
+    fixed = {name: value for name, value in values.items() if name != "k"}
+    prior = SlowPrior(round(seconds / turn))
+    problem = bp.Problem(bp.models.duffing, [run], priors={"k": prior}, fixed=fixed, scheme="fourier")
+    return problem, bp.map_estimate(problem, progress=False)
 
 
 def vectorised_gain(repeats: int = 15) -> dict[str, Any]:

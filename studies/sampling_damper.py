@@ -14,6 +14,7 @@ from scipy import stats
 
 import bayesperiodic as bp
 from studies import damper
+from studies.sampling_batches import BATCHES, standard_error
 from studies.sampling_rows import Row, row
 
 SAMPLERS: dict[str, dict[str, Any]] = {
@@ -21,7 +22,6 @@ SAMPLERS: dict[str, dict[str, Any]] = {
     "emcee, collapsed": {"variances": "collapsed"},
     "NUTS": {"sampler": "nuts"},
 }
-BATCHES = 5
 FALSE_ALARM = 0.01
 MISSING = 'nutpie is not installed (pip install "bayesperiodic[nuts]")'
 
@@ -55,7 +55,7 @@ def sample_damper(options: argparse.Namespace) -> Sampled:
     for name, settings in SAMPLERS.items():
         if name == "NUTS" and importlib.util.find_spec("nutpie") is None:
             continue
-        shorter = {"max_steps": 250, "ensembles": 2} if options.quick else {}
+        shorter: dict[str, Any] = {"max_steps": 250, "ensembles": 2} if options.quick else {}
         before = time.perf_counter()
         posteriors[name] = bp.sample(problem, fit, seed=options.seed, progress=False, **shorter, **settings)
         seconds[name] = time.perf_counter() - before
@@ -64,30 +64,19 @@ def sample_damper(options: argparse.Namespace) -> Sampled:
 
 
 def moments(posterior: bp.Posterior) -> dict[str, dict[str, float]]:
-    """Return mean and sd of every quantity with their Monte Carlo errors, from the means of batches of draws.
+    """Return mean and sd of every quantity with their Monte Carlo errors.
 
-    Each ensemble, or chain of NUTS, is cut into consecutive batches. Means of batches know of the dependence in time,
-    of walkers on each other, and of ensembles that disagree; what a draw contributes to the sd is, to first order,
-    ((x − mean)² − sd²)/(2 sd).
+    What a draw contributes to the sd is, to first order, ((x − mean)² − sd²)/(2 sd).
     """
-    group = posterior.data["posterior"]
-    ensemble = group["ensemble"].to_numpy()
     found = {}
     for name in posterior.names:
-        values = posterior.draws(name).reshape(group.sizes["chain"], group.sizes["draw"])
+        values = posterior.draws(name)
         mean, sd = float(values.mean()), float(values.std())
-        batches = [
-            batch
-            for number in np.unique(ensemble)
-            for batch in np.array_split(values[ensemble == number], BATCHES, axis=1)
-        ]
-        of_mean = [batch.mean() for batch in batches]
-        of_sd = [np.mean((batch - mean) ** 2 - sd**2) / (2.0 * sd) for batch in batches]
         found[name] = {
             "mean": mean,
             "sd": sd,
-            "mean_error": float(stats.sem(of_mean)),
-            "sd_error": float(stats.sem(of_sd)),
+            "mean_error": standard_error(posterior, values),
+            "sd_error": standard_error(posterior, (values - mean) ** 2 / (2.0 * sd)),
         }
     return found
 

@@ -78,8 +78,8 @@ def draw_samplers(sampled: Sampled, found: dict[str, Any]) -> Figure:
     figure.legend(handles, labels, frameon=False, ncols=len(labels), loc="outside lower center")
     worst = max((d["errors"] for d in found["differences"]), default=np.nan)
     figure.suptitle(
-        f"The damper, {'synthetic data' if found['data']['synthetic'] else 'measured'}: of all differences in a mean or "
-        f"sd the largest is {worst:.1f} Monte Carlo errors (limit {found['limit']:.1f})",
+        f"The damper, {'synthetic data' if found['data']['synthetic'] else 'measured'}: of all differences in means "
+        f"and sds the largest is {worst:.1f} Monte Carlo errors (limit {found['limit']:.1f})",
         fontsize=11,
     )
     return figure
