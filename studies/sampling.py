@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> None:
     }
     found["checks"] = [
         *sampling_ridge.rows(found["ridge"]),
-        *sampling_damper.rows(found["damper"]),
+        *sampling_damper.rows(found["damper"], options.quick),
         *sampling_cost.rows(cost),
     ]
     with watch.part("figures", "drawing"):

@@ -15,7 +15,7 @@ from scipy import stats
 import bayesperiodic as bp
 from studies import damper
 from studies.sampling_batches import BATCHES, standard_error
-from studies.sampling_rows import Row, row
+from studies.sampling_rows import Row, row, unjudged
 
 SAMPLERS: dict[str, dict[str, Any]] = {
     "emcee": {},
@@ -134,8 +134,8 @@ def _account(posterior: bp.Posterior, seconds: float) -> dict[str, Any]:
     }
 
 
-def rows(found: dict[str, Any]) -> list[Row]:
-    """Return what must show on the damper: convergence, and agreement of the samplers in pairs."""
+def rows(found: dict[str, Any], quick: bool) -> list[Row]:
+    """Return what must show on the damper: agreement of the samplers in pairs, and convergence unless `quick`."""
     kind = "damper, synthetic" if found["data"]["synthetic"] else "damper"
     result = []
     for name in SAMPLERS:
@@ -144,7 +144,8 @@ def rows(found: dict[str, Any]) -> list[Row]:
         if entry is None:
             result.append(row(what, None, 1.0, 1.0, MISSING))
         else:
-            result.append(row(what, entry["converged"], 1.0, 1.0, "" if entry["converged"] else entry["reason"]))
+            judged = row(what, entry["converged"], 1.0, 1.0, "" if entry["converged"] else entry["reason"])
+            result.append(unjudged(judged, f"a quick run: {entry['reason']}") if quick else judged)
     for one, other in combinations(SAMPLERS, 2):
         pair = [d for d in found["differences"] if d["samplers"] == [one, other]]
         worst = max(pair, key=lambda d: d["errors"], default=None)
