@@ -33,6 +33,7 @@ PRIOR = bp.Normal(1.0, 1.0)
 POOL_LIMIT, GAIN_LIMIT = 1.05, 0.9
 LEAST_GAIN = 1.5
 QUIET = 0.5
+ONLY_LINUX = "not measurable here: only Linux holds a process on one core"
 
 
 def run_cost(quick: bool) -> dict[str, Any]:
@@ -40,7 +41,9 @@ def run_cost(quick: bool) -> dict[str, Any]:
     load = [*os.getloadavg()] if hasattr(os, "getloadavg") else None
     found: dict[str, Any] = {"load_average": load, "cores": available_cores()}
     found["vectorised"] = vectorised_gain(3 if quick else 15)
-    found["pools"] = None if quick or not hasattr(os, "sched_setaffinity") else pool_overhead()
+    able = hasattr(os, "sched_setaffinity")
+    found["pools"] = None if quick or not able else pool_overhead()
+    found["without_pools"] = "not measured in a quick run" if quick else "dask is not installed" if able else ONLY_LINUX
     return found
 
 
@@ -50,8 +53,7 @@ def rows(cost: dict[str, Any]) -> list[Row]:
     for name in POOLS:
         what = f"wall time of a pool of one {name} worker over that of one thread"
         if pools is None or name not in pools["ratios"]:
-            why = "not measured in a quick run, without dask, or where a process cannot be held on one core"
-            result.append(row(what, None, 0.0, POOL_LIMIT, why))
+            result.append(row(what, None, 0.0, POOL_LIMIT, cost["without_pools"]))
         else:
             entry = pools["ratios"][name]
             result.append(row(what, entry["median"], 0.0, POOL_LIMIT, _quartiles(entry["quartiles"])))

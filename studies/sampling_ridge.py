@@ -54,11 +54,12 @@ def sample_ridge(seed: int, quick: bool) -> Ridge:
     cut = bp.TruncatedNormal(1.0, 1.0, 0.0, np.inf)
     positive, both = _problem(cut), _problem(bp.Normal(1.0, 1.0))
     fits = [bp.map_estimate(problem, progress=False) for problem in (positive, both)]
+    few = {"max_steps": 250, "ensembles": 2}
     runs: dict[str, tuple[bp.Problem, bp.MapEstimate, dict[str, Any]]] = {
         "default": (positive, fits[0], {}),
         "natural": (positive, fits[0], {"coordinates": "natural", "max_steps": 500 if quick else SHORT}),
-        "uncut": (both, fits[1], {"max_steps": 250} if quick else {}),
-        "uncut_prior": (both, fits[1], {"start": "prior", "max_steps": 250 if quick else LONG}),
+        "uncut": (both, fits[1], few if quick else {}),
+        "uncut_prior": (both, fits[1], {"start": "prior"} | (few if quick else {"max_steps": LONG})),
     }
     found, seconds = {}, {}
     for name, (problem, fit, settings) in runs.items():

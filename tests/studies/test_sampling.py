@@ -128,7 +128,11 @@ def test_a_worker_walks_the_chain_of_the_thread_and_is_timed():
 
 def test_gain_has_no_verdict_where_a_plain_loop_gains_nothing():
     drive = {"gain": 1.2, "plain": 1.3, "ratio": 0.95, "ratio_quartiles": [0.9, 1.0]}
-    cost = {"pools": None, "vectorised": {"cores": 2, "force": drive, "displacement": drive | {"plain": 1.9}}}
+    cost = {
+        "pools": None,
+        "without_pools": "why",
+        "vectorised": {"cores": 2, "force": drive, "displacement": drive | {"plain": 1.9}},
+    }
     pool, dask, force, displacement = sampling_cost.rows(cost)
     assert pool["met"] is None and dask["met"] is None
     assert force["met"] is None and "not measurable" in force["note"] and force["value"] == 0.95
