@@ -1,0 +1,371 @@
+"""The gallery: small models with stated truths, synthetic data, and what has to be said of every parameter.
+
+Where only the noise of one run stands between a parameter and its sign, one data set in twenty shows the sign by luck.
+So the case with an open sign has an unknown delay of the recording, which acts as a damping, and the one with a
+truncated posterior a prior whose end lies two and a half standard errors short of the truth: there the answer is known
+for every data set.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+import bayesperiodic as bp
+
+DETERMINED, PRIOR_ONLY = "determined", "only with the prior"
+COMBINATION, SIGN = "only in combination", "sign undetermined"
+FINE, WIDE, SHAPE, MODE = "fine", "too wide", "wrong shape", "wrong mode"
+ADEQUATE, MISSPECIFIED = "adequate", "misspecified"
+IDENTIFIABILITY, COMPARE, JOINT, PREDICT = "identifiability", "compare", "joint", "predict"
+STROKE = 0.01
+
+Expected = Mapping[str, Mapping[str, tuple[str, ...]]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A case whose answer is known.
+
+    Attributes
+    ----------
+    title : str
+        What is wrong, in words.
+    truth : dict of str to float
+        Of every parameter, also of those that the fitted model lacks.
+    problem : callable
+        Makes the problem of a data seed.
+    shown : str
+        The parameter of the figure.
+    expected : dict of str to dict of str to tuple of str
+        By tool and parameter: the verdicts that are right.
+    fault : dict of str to tuple of str
+        By tool, the parameters whose verdicts name the fault; empty where nothing is wrong.
+    sampling : dict
+        Arguments of `bp.sample`.
+    drawless : bool
+        Whether the verdicts do not use draws, so that replicates over data seeds do without them.
+    """
+
+    title: str
+    truth: Mapping[str, float]
+    problem: Callable[[int], bp.Problem]
+    shown: str
+    expected: Expected
+    fault: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    sampling: Mapping[str, Any] = field(default_factory=dict)
+    drawless: bool = False
+
+
+def _driven(name: str, parameters: Mapping[str, str], force: Callable[[Any, Any], sp.Expr]) -> bp.Model:
+    """Return a model whose output is a force of a measured displacement; its state has no part in it."""
+    return bp.Model(
+        name,
+        states=["w"],
+        inputs=["x"],
+        parameters=dict(parameters),
+        units={"x": "m", "force": "N", "w": "m"},
+        equations=lambda s, p, u: [s.dw + s.w - u.x],
+        outputs=lambda s, p, u: {"force": force(p, u)},
+    )
+
+
+PRODUCT = _driven("product", {"a": "1", "b": "N/m"}, lambda p, u: p.a * p.b * u.x)
+SUM = _driven("sum", {"a": "N/m", "b": "N/m"}, lambda p, u: (p.a + p.b) * u.x)
+DAMPED = _driven("damped", {"k": "N/m", "c": "N s/m"}, lambda p, u: p.k * u.x + p.c * u.dx)
+RUBBING = _driven(
+    "rubbing",
+    {"k": "N/m", "c": "N s/m", "coulomb": "N"},
+    lambda p, u: p.k * u.x + p.c * u.dx + p.coulomb * sp.tanh(u.dx / 0.02),
+)
+BEAM = _driven("beam", {"position": "1", "k": "N/m"}, lambda p, u: p.k * sp.sin(sp.pi * p.position) * u.x)
+
+
+def _generator(model: bp.Model, data_seed: int) -> np.random.Generator:
+    return np.random.default_rng([zlib.crc32(model.name.encode()), data_seed])
+
+
+def _measured(
+    model: bp.Model, truth: Mapping[str, float], data_seed: int, *, frequency: float, noise: float, samples: int = 40
+) -> bp.Experiment:
+    """Return a synthetic run under a sine of 10 mm, white noise of this sd [N] on every sample of the force."""
+    displacement = STROKE * np.sin(2 * np.pi * np.arange(samples) / samples)
+    exact = bp.solve_periodic(
+        model, dict(truth), {"x": displacement}, frequency=frequency, samples=samples, scheme="central4"
+    )
+    force = exact.outputs["force"] + noise * _generator(model, data_seed).standard_normal(samples)
+    return bp.Experiment(
+        "run", frequency, {"force": force}, {"x": displacement}, samples=samples, synthetic=True
+    )
+
+
+def _every(tool: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    return {name: (verdict,) for name, verdict in tool.items()}
+
+
+def _expected(**tools: Mapping[str, str]) -> dict[str, dict[str, tuple[str, ...]]]:
+    return {tool: _every(verdicts) for tool, verdicts in tools.items()}
+
+
+QUICKLY = {"ensembles": 2, "walkers": 16, "variances": "collapsed", "max_steps": 6000}
+
+
+def product_ridge() -> Case:
+    """Return a·b, measured to 1 %, of two factors known to a factor of two."""
+    truth = {"a": 1.0, "b": 1e4}
+
+    def problem(data_seed: int) -> bp.Problem:
+        run = _measured(PRODUCT, truth, data_seed, frequency=2.0, noise=4.0)
+        return bp.Problem(PRODUCT, [run], priors={"a": bp.LogNormal(1.0, 0.7), "b": bp.LogNormal(1e4, 0.7)})
+
+    return Case(
+        "only the product of a and b shows",
+        truth,
+        problem,
+        "a",
+        _expected(
+            identifiability={"a": COMBINATION, "b": COMBINATION},
+            compare={"a": SHAPE, "b": SHAPE},
+            predict={"all": ADEQUATE},
+        ),
+        {IDENTIFIABILITY: ("a", "b")},
+        QUICKLY,
+    )
+
+
+def sum_ridge() -> Case:
+    """Return a + b, measured to 1 %, of two springs side by side."""
+    truth = {"a": 6e3, "b": 4e3}
+
+    def problem(data_seed: int) -> bp.Problem:
+        run = _measured(SUM, truth, data_seed, frequency=2.0, noise=4.0)
+        return bp.Problem(SUM, [run], priors={"a": bp.Normal(5e3, 2e3), "b": bp.Normal(5e3, 2e3)})
+
+    return Case(
+        "only the sum of a and b shows",
+        truth,
+        problem,
+        "a",
+        _expected(
+            identifiability={"a": COMBINATION, "b": COMBINATION},
+            compare={"a": FINE, "b": FINE},
+            joint={"all": FINE},
+            predict={"all": ADEQUATE},
+        ),
+        {IDENTIFIABILITY: ("a", "b")},
+        QUICKLY,
+    )
+
+
+PENDULUM_TRUTH = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4}
+PENDULUM_FIXED = {"a": 0.11, "g": 9.81, "v0": 0.05}
+ROTATION = 13.0 / (2 * np.pi)
+
+
+@cache
+def _rotations(samples: int = 100) -> tuple[bp.PeriodicSolution, ...]:
+    """Return locked rotations of the pendulum, one turn a forcing period, at two frequencies."""
+    tau, found = np.arange(samples) / samples, []
+    for frequency in (ROTATION, 1.15 * ROTATION):
+        found.append(
+            bp.solve_periodic(
+                bp.models.pendulum, PENDULUM_TRUTH | PENDULUM_FIXED, frequency=frequency, samples=samples,
+                scheme="central4", winding=1, guess={"phi": 2 * np.pi * tau - 0.57},
+            )
+        )  # fmt: skip
+    return tuple(found)
+
+
+def scaling_symmetry() -> Case:
+    """Return the paper's pendulum with all five parameters free: m, k1, k2 and k3 may all grow by one factor."""
+
+    def problem(data_seed: int) -> bp.Problem:
+        generator, runs = _generator(bp.models.pendulum, data_seed), []
+        for number, true in enumerate(_rotations(), 1):
+            if not true.converged:
+                raise RuntimeError(f"rotation {number}: no periodic solution ({true.status}).")
+            size = true.samples
+            outputs = {
+                "angle": np.mod(true.outputs["angle"] + 0.01 * generator.standard_normal(size) + np.pi, 2 * np.pi)
+                - np.pi,
+                "rate": true.outputs["rate"] + 0.1 * generator.standard_normal(size),
+            }
+            runs.append(
+                bp.Experiment(
+                    f"rotation {number}", true.frequency, outputs, samples=size, winding=1, guess=true.states,
+                    synthetic=True,
+                )
+            )  # fmt: skip
+        priors = {name: bp.LogNormal(value, 0.5) for name, value in PENDULUM_TRUTH.items()}
+        return bp.Problem(bp.models.pendulum, runs, priors=priors, fixed=PENDULUM_FIXED, scheme="central4")
+
+    return Case(
+        "pendulum: m, k1, k2, k3 may all grow by one factor",
+        PENDULUM_TRUTH,
+        problem,
+        "m",
+        _expected(
+            identifiability={name: COMBINATION for name in ("m", "k1", "k2", "k3")} | {"l": DETERMINED},
+            predict={"all": ADEQUATE},
+        ),
+        {IDENTIFIABILITY: ("m", "k1", "k2", "k3")},
+        {"ensembles": 2, "variances": "collapsed", "max_steps": 12_000},
+        drawless=True,
+    )
+
+
+def linear() -> Case:
+    """Return stiffness, damping and dry friction, each determined by the data."""
+    truth = {"k": 1e4, "c": 40.0, "coulomb": 15.0}
+
+    def problem(data_seed: int) -> bp.Problem:
+        run = _measured(RUBBING, truth, data_seed, frequency=2.0, noise=1.0)
+        priors = {"k": bp.Normal(8e3, 4e3), "c": bp.Normal(50.0, 50.0), "coulomb": bp.Normal(10.0, 20.0)}
+        return bp.Problem(RUBBING, [run], priors=priors)
+
+    return Case(
+        "nothing",
+        truth,
+        problem,
+        "c",
+        _expected(
+            identifiability=dict.fromkeys(truth, DETERMINED),
+            compare=dict.fromkeys(truth, FINE),
+            joint={"all": FINE},
+            predict={"all": ADEQUATE},
+        ),
+        {},
+        QUICKLY,
+    )
+
+
+def sign_undetermined() -> Case:
+    """Return a small damping behind a delay of the recording, known to 1 ms, that acts as ±10 N s/m."""
+    truth = {"k": 1e4, "c": 3.0}
+
+    def problem(data_seed: int) -> bp.Problem:
+        run = _measured(DAMPED, truth, data_seed, frequency=2.0, noise=1.0)
+        priors = {"k": bp.Normal(8e3, 4e3), "c": bp.Normal(0.0, 100.0), "shift": bp.Normal(0.0, 1e-3)}
+        return bp.Problem(DAMPED, [run], priors=priors)
+
+    return Case(
+        "a delay of the recording may be the damping",
+        truth | {"shift[run]": 0.0},
+        problem,
+        "c",
+        _expected(
+            identifiability={"k": DETERMINED, "c": SIGN},
+            compare=dict.fromkeys(("k", "c", "shift[run]"), FINE),
+            predict={"all": ADEQUATE},
+        ),
+        {IDENTIFIABILITY: ("c",)},
+        QUICKLY,
+    )
+
+
+def prior_dominated() -> Case:
+    """Return a damping that a slow run leaves ±7 N s/m wide, and the prior ±3."""
+    truth = {"k": 1e4, "c": 20.0}
+
+    def problem(data_seed: int) -> bp.Problem:
+        run = _measured(DAMPED, truth, data_seed, frequency=0.5, noise=1.0)
+        return bp.Problem(DAMPED, [run], priors={"k": bp.Normal(8e3, 4e3), "c": bp.Normal(20.0, 3.0)})
+
+    return Case(
+        "what is known of the damping is its prior",
+        truth,
+        problem,
+        "c",
+        _expected(
+            identifiability={"k": DETERMINED, "c": PRIOR_ONLY},
+            compare={"k": FINE, "c": FINE},
+            joint={"all": FINE},
+            predict={"all": ADEQUATE},
+        ),
+        {IDENTIFIABILITY: ("c",)},
+        QUICKLY,
+    )
+
+
+def truncated() -> Case:
+    """Return a damping whose prior ends at 20 N s/m, two and a half standard errors below the truth."""
+    truth = {"k": 1e4, "c": 24.5}
+
+    def problem(data_seed: int) -> bp.Problem:
+        run = _measured(DAMPED, truth, data_seed, frequency=2.0, noise=1.0)
+        return bp.Problem(DAMPED, [run], priors={"k": bp.Normal(8e3, 4e3), "c": bp.Uniform(0.0, 20.0)})
+
+    return Case(
+        "the prior ends before the data do",
+        truth,
+        problem,
+        "c",
+        {
+            IDENTIFIABILITY: _every({"k": DETERMINED, "c": PRIOR_ONLY}),
+            COMPARE: {"k": (FINE,), "c": (SHAPE, WIDE)},
+            PREDICT: _every({"all": ADEQUATE}),
+        },
+        {IDENTIFIABILITY: ("c",), COMPARE: ("c",)},
+        QUICKLY,
+    )
+
+
+def two_modes() -> Case:
+    """Return where along a beam a force acts, from the first mode shape alone: p and 1 − p give the same."""
+    truth = {"position": 0.25, "k": 1e4}
+
+    def problem(data_seed: int) -> bp.Problem:
+        run = _measured(BEAM, truth, data_seed, frequency=2.0, noise=4.0)
+        return bp.Problem(
+            BEAM, [run], priors={"position": bp.TruncatedNormal(0.4, 0.3, 0.0, 1.0)}, fixed={"k": truth["k"]}
+        )
+
+    return Case(
+        "either side of the beam fits",
+        truth,
+        problem,
+        "position",
+        _expected(compare={"position": MODE}, joint={"all": MODE}, predict={"all": ADEQUATE}),
+        {COMPARE: ("position",)},
+        QUICKLY | {"start": "prior", "walkers": 32},
+    )
+
+
+def misspecified() -> Case:
+    """Return dry friction that the fitted model lacks, in plenty of data."""
+    truth = {"k": 1e4, "c": 40.0, "coulomb": 5.0}
+
+    def problem(data_seed: int) -> bp.Problem:
+        run = _measured(RUBBING, truth, data_seed, frequency=2.0, noise=1.0, samples=400)
+        priors = {"k": bp.Normal(8e3, 4e3), "c": bp.Normal(50.0, 50.0)}
+        return bp.Problem(DAMPED, [run], priors=priors)
+
+    return Case(
+        "the model lacks the dry friction",
+        truth,
+        problem,
+        "c",
+        _expected(
+            identifiability={"k": DETERMINED, "c": DETERMINED},
+            compare={"k": FINE, "c": FINE},
+            joint={"all": FINE},
+            predict={"all": MISSPECIFIED},
+        ),
+        {PREDICT: ("all",)},
+        QUICKLY,
+    )
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    case.__name__: case
+    for case in (
+        product_ridge, sum_ridge, scaling_symmetry, linear, sign_undetermined, prior_dominated, truncated, two_modes,
+        misspecified,
+    )
+}  # fmt: skip
