@@ -100,9 +100,7 @@ def _measured(
         model, dict(truth), {"x": displacement}, frequency=frequency, samples=samples, scheme="central4"
     )
     force = exact.outputs["force"] + noise * _generator(model, data_seed).standard_normal(samples)
-    return bp.Experiment(
-        "run", frequency, {"force": force}, {"x": displacement}, samples=samples, synthetic=True
-    )
+    return bp.Experiment("run", frequency, {"force": force}, {"x": displacement}, samples=samples, synthetic=True)
 
 
 def _every(tool: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
@@ -113,7 +111,7 @@ def _expected(**tools: Mapping[str, str]) -> dict[str, dict[str, tuple[str, ...]
     return {tool: _every(verdicts) for tool, verdicts in tools.items()}
 
 
-QUICKLY = {"ensembles": 2, "walkers": 16, "variances": "collapsed", "max_steps": 6000}
+QUICKLY = {"ensembles": 2, "walkers": 32, "variances": "collapsed", "max_steps": 6000}
 
 
 def product_ridge() -> Case:
@@ -333,7 +331,7 @@ def two_modes() -> Case:
         "position",
         _expected(compare={"position": MODE}, joint={"all": MODE}, predict={"all": ADEQUATE}),
         {COMPARE: ("position",)},
-        QUICKLY | {"start": "prior", "walkers": 32},
+        QUICKLY | {"start": "prior"},
     )
 
 

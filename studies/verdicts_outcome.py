@@ -89,6 +89,12 @@ class Outcome:
         """Of the estimate, and of the draws where there are any."""
         return self.fit.converged and (self.posterior is None or self.posterior.converged)
 
+    @property
+    def p_values(self) -> dict[str, dict[str, float]]:
+        """Of the discrepancy tests, by row of the prediction; those that are not possible left out."""
+        table = self.prediction.table.select_dtypes("number")
+        return {str(row): {c: float(v) for c, v in values.items() if pd.notna(v)} for row, values in table.iterrows()}
+
     def line(self) -> dict[str, Any]:
         """Return what is kept of a replicate."""
         return {
@@ -120,7 +126,7 @@ def examine(name: str, data_seed: int, sampler_seed: int, *, drawless: bool = Fa
         posterior,
         bp.identifiability(problem, fit, posterior),
         bp.compare(problem, fit, posterior),
-        bp.predict(problem, posterior) if hasattr(bp, "xx") else None,
+        bp.predict(problem, posterior),
         time.perf_counter() - start,
     )
 

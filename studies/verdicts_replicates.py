@@ -1,0 +1,150 @@
+"""The gallery again and again: other data, other sampler seeds; resumed where it was interrupted."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import warnings
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import bayesperiodic as bp
+from studies import verdicts_cases, verdicts_outcome
+from studies.verdicts_outcome import Outcome, examine
+
+DATA, SAMPLER = "data", "sampler"
+MOST_SAMPLER_SEEDS = 20
+STRIDE = 1000
+FILE = "replicates.jsonl"
+
+Task = tuple[str, str, int, int]
+
+
+def first_seed(seed: int) -> int:
+    """Return the data seed of the gallery itself, and of the replicates with other sampler seeds."""
+    return STRIDE * seed
+
+
+def replicate(task: Task) -> dict[str, Any]:
+    """Return one replicate: case, what varies, number, seed of the study."""
+    name, kind, number, seed = task
+    found: dict[str, Any] = {"case": name, "kind": kind, "number": number, "seed": seed, "source": source()}
+    data = first_seed(seed) + (number if kind == DATA else 0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return found | examine(name, data, first_seed(seed) + number, drawless=kind == DATA).line()
+        except (RuntimeError, ValueError) as error:
+            return found | {"error": f"{type(error).__name__}: {error}"}
+
+
+def source() -> str:
+    """Return what tells replicates of other cases, or of another version, apart."""
+    text = "".join(Path(m.__file__).read_text(encoding="utf-8") for m in (verdicts_cases, verdicts_outcome))
+    return hashlib.sha256((bp.__version__ + text).encode()).hexdigest()[:12]
+
+
+def replicates(folder: Path, names: Sequence[str], count: int, seed: int) -> list[dict[str, Any]]:
+    """Do the replicates that the file in the folder lacks, and return all of them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / FILE
+    tasks: list[Task] = []
+    for number in range(count):
+        tasks += [(name, DATA, number, seed) for name in names]
+        tasks += [(name, SAMPLER, number, seed) for name in names if number < MOST_SAMPLER_SEEDS]
+    done = {_key(line): line for line in _read(path) if line["source"] == source()}
+    missing = [task for task in tasks if task not in done]
+    print(f"  {len(tasks) - len(missing)} replicates found in {path}, {len(missing)} to do", flush=True)
+    with path.open("a", encoding="utf-8") as file, _workers() as pool:
+        futures = [pool.submit(replicate, task) for task in missing]
+        try:
+            for number, future in enumerate(as_completed(futures), 1):
+                line = future.result()
+                done[_key(line)] = line
+                file.write(json.dumps(line, ensure_ascii=False) + "\n")
+                file.flush()
+                if number % 50 == 0:
+                    print(f"  {number} of {len(missing)}", flush=True)
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+    return [done[task] for task in tasks]
+
+
+def _workers() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn"))
+
+
+def _key(line: Mapping[str, Any]) -> Task:
+    return line["case"], line["kind"], line["number"], line["seed"]
+
+
+def _read(path: Path) -> list[dict[str, Any]]:
+    """Return the lines of a file, without a last one that was cut off; that one is taken out of it."""
+    if not path.is_file():
+        return []
+    text = path.read_text(encoding="utf-8")
+    whole = text[: text.rfind("\n") + 1]
+    if whole != text:
+        path.write_text(whole, encoding="utf-8")
+    return [json.loads(line) for line in whole.splitlines()]
+
+
+def summary(lines: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
+    """Return the counts of each case: other data, and other sampler seeds on the first data set."""
+    found = {}
+    for name, outcome in outcomes.items():
+        own = [line for line in lines if line["case"] == name]
+        by_kind = {kind: [line for line in own if line["kind"] == kind] for kind in (DATA, SAMPLER)}
+        found[name] = {kind: _counts(members) for kind, members in by_kind.items()}
+        found[name][SAMPLER]["verdicts_that_flip"] = _flips(by_kind[SAMPLER], outcome)
+        drawless = outcome.case.drawless
+        found[name][DATA]["sampled"] = not drawless
+    return found
+
+
+def _counts(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return how many replicates are right, name the fault, warn and converged; shares with their errors."""
+    whole = [line for line in lines if "error" not in line]
+    counts: dict[str, Any] = {"replicates": len(lines), "errors": [line["error"] for line in lines if "error" in line]}
+    for key in ("right", "named", "warned", "converged"):
+        number = sum(line[key] for line in whole)
+        share = number / len(lines)
+        # Laplace's rule of succession keeps the error of a share of 0 or 1 from being zero.
+        smoothed = (number + 1) / (len(lines) + 2)
+        error = float(np.sqrt(smoothed * (1.0 - smoothed) / len(lines)))
+        counts |= {key: number, f"{key}_share": [share, float(f"{error:.2g}")]}
+    wrong = Counter(f"{what}: {verdict}" for line in whole for what, verdict in line["wrong"].items())
+    seconds = [line["seconds"] for line in whole]
+    return counts | {"wrong": dict(wrong), "seconds_each": round(float(np.mean(seconds)), 2) if seconds else None}
+
+
+def _flips(lines: Sequence[Mapping[str, Any]], outcome: Outcome) -> dict[str, list[str]]:
+    """Return the verdicts, of those that are expected, that are not the same for every sampler seed."""
+    said: dict[str, set[str]] = {}
+    for line in lines:
+        for tool, rows in outcome.case.expected.items():
+            for name in rows if tool in line.get("verdicts", {}) else ():
+                said.setdefault(f"{tool} {name}", set()).add(line["verdicts"][tool][name])
+    return {what: sorted(verdicts) for what, verdicts in said.items() if len(verdicts) > 1}
+
+
+def account(found: Mapping[str, Any]) -> str:
+    """Return the counts as a table to print."""
+    lines = [f"  {'case':18s} {'kind':8s} replicates right named warned converged  s each"]
+    for name, kinds in found.items():
+        for kind, c in kinds.items():
+            lines.append(
+                f"  {name:18s} {kind:8s} {c['replicates']:10d} {c['right']:5d} {c['named']:5d} {c['warned']:6d} "
+                f"{c['converged']:9d}  {c['seconds_each']}"
+            )
+            lines += [f"      {number} times {what}" for what, number in c["wrong"].items()]
+            lines += [f"      flips: {what}: {', '.join(v)}" for what, v in c.get("verdicts_that_flip", {}).items()]
+            lines += [f"      {error}" for error in c["errors"]]
+    return "\n".join(lines)

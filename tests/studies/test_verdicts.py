@@ -1,0 +1,132 @@
+import contextlib
+import io
+import json
+
+import pytest
+
+from studies import verdicts, verdicts_replicates
+from studies.__main__ import main
+from studies.verdicts_cases import CASES
+from studies.verdicts_outcome import examine
+
+
+def run(folder, *arguments):
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        assert main(["verdicts", "--out", str(folder), "--quick", *arguments]) == 0
+    return json.loads((folder / "results.json").read_text(encoding="utf-8")), printed.getvalue()
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    """Return the folder, the results and the printed account of a quick run."""
+    folder = tmp_path_factory.mktemp("verdicts")
+    return folder, *run(folder)
+
+
+def test_every_verdict_of_the_quick_gallery_is_right(quick):
+    _, results, printed = quick
+    assert set(results) == {*verdicts.QUICK, "study"}
+    for name in verdicts.QUICK:
+        case = results[name]
+        assert case["right"] and case["named"] and case["converged"] and not case["wrong"], (name, case["wrong"])
+    assert "SYNTHETIC" in printed and "WRONG" not in printed
+    assert results["misspecified"]["verdicts"]["identifiability"] == {"k": "determined", "c": "determined"}
+    assert results["misspecified"]["verdicts"]["predict"]["all"] == "misspecified"
+    assert results["linear"]["numbers"]["joint"]["pareto_k"][0] < 0.5
+
+
+def test_open_sign_has_the_probability_that_the_delay_gives_it(quick):
+    """The damping is 3 ± 10 N s/m: P(negative) = Φ(−0.3), up to what noise of ±1.8 N s/m can do to it (4 errors)."""
+    _, results, _ = quick
+    value, error = results["sign_undetermined"]["numbers"]["c"]["p_negative"]
+    assert 0.0 < error < 0.05
+    assert value == pytest.approx(0.382, abs=0.3)
+
+
+def test_figures_are_drawn(quick):
+    folder, _, _ = quick
+    found = {path.name: path.stat().st_size for path in folder.glob("*.png")}
+    assert set(found) == {"gallery.png", "product_ridge.png"} and max(found.values()) < 200_000
+
+
+def test_replicates_are_saved_one_by_one_and_resumed(tmp_path, monkeypatch):
+    """A line that was cut off, and one of another version of the cases, are done again; the others are not."""
+    calls = []
+
+    class Here:
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            return None
+
+        def submit(self, function, task):
+            from concurrent.futures import Future
+
+            future = Future()
+            calls.append(task)
+            future.set_result(function(task))
+            return future
+
+        def shutdown(self, **_):
+            return None
+
+    fake = {"right": True, "named": True, "warned": False, "converged": True, "wrong": {}, "verdicts": {}, "seconds": 1}
+    monkeypatch.setattr(verdicts_replicates, "_workers", Here)
+    monkeypatch.setattr(
+        verdicts_replicates,
+        "replicate",
+        lambda task: (
+            dict(zip(("case", "kind", "number", "seed"), task, strict=True))
+            | {"source": verdicts_replicates.source()}
+            | fake
+        ),
+    )
+    first = verdicts_replicates.replicates(tmp_path, ("linear",), 2, 1)
+    assert len(first) == len(calls) == 4
+    path = tmp_path / verdicts_replicates.FILE
+    lines = path.read_text().splitlines()
+    path.write_text(
+        "\n".join([lines[0], lines[1].replace(verdicts_replicates.source(), "other"), lines[2], lines[3][:9]])
+    )
+    calls.clear()
+    assert verdicts_replicates.replicates(tmp_path, ("linear",), 2, 1) == first
+    assert len(calls) == 2
+    assert len(path.read_text().splitlines()) == 5
+
+
+def test_counts_tell_what_is_wrong_and_what_flips(quick):
+    folder, results, _ = quick
+    outcome = examine("scaling_symmetry", 0, 0, drawless=True)
+    assert outcome.posterior is None and not outcome.wrong and outcome.named
+    line = {"case": "scaling_symmetry", "kind": "data", "number": 0, "seed": 1} | outcome.line()
+    other = line | {
+        "kind": "sampler", "right": False, "named": False,
+        "wrong": {"identifiability m": "determined"},
+        "verdicts": {"identifiability": line["verdicts"]["identifiability"] | {"m": "determined"}},
+    }  # fmt: skip
+    found = verdicts_replicates.summary([line, line | {"kind": "sampler"}, other], {"scaling_symmetry": outcome})[
+        "scaling_symmetry"
+    ]
+    assert found["data"]["right_share"] == [1.0, pytest.approx(0.47, abs=0.01)]
+    assert found["sampler"]["right"] == 1 and found["sampler"]["wrong"] == {"identifiability m: determined": 1}
+    assert found["sampler"]["verdicts_that_flip"] == {"identifiability m": ["determined", "only in combination"]}
+    assert "1 times identifiability m" in verdicts_replicates.account({"scaling_symmetry": found})
+
+
+def test_a_replicate_that_fails_is_counted_and_told(monkeypatch):
+    def fails(*_, **__):
+        raise RuntimeError("no orbit")
+
+    monkeypatch.setattr(verdicts_replicates, "examine", fails)
+    line = verdicts_replicates.replicate(("linear", "data", 0, 1))
+    assert line["error"] == "RuntimeError: no orbit"
+    counts = verdicts_replicates._counts([line])
+    assert counts["right"] == 0 and counts["errors"] == ["RuntimeError: no orbit"] and counts["seconds_each"] is None
+
+
+def test_every_case_states_what_its_tools_must_say():
+    for name, make in CASES.items():
+        case = make()
+        assert set(case.fault) <= set(case.expected), name
+        assert case.shown in case.truth and set(case.problem(1).names) <= set(case.truth), name
