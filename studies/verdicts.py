@@ -1,7 +1,7 @@
 """A gallery of cases with known answers, and what the diagnoses say of each: identifiability, compare, predict.
 
-All data are synthetic, with noise. ``--replicates N`` repeats every case on N data sets, and samples the first data set
-with up to 20 seeds; each replicate is saved as it ends, in replicates.jsonl, and the same command does the missing ones.
+All data are synthetic, with noise. ``--replicates N`` repeats every case on N data sets and samples the first data set
+with up to 20 seeds. Each replicate is saved in replicates.jsonl as it ends, and the same command does the missing ones.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> None:
 
 def collect(outcome: Outcome) -> dict[str, Any]:
     """Return the content of results.json on one case."""
-    case, posterior, joint = outcome.case, outcome.posterior, outcome.comparison.joint
+    case, posterior, joint = outcome.case, outcome.drawn.posterior, outcome.drawn.comparison.joint
     return {
         "fault": case.title,
         "truth": dict(case.truth),
@@ -67,5 +67,5 @@ def account(outcome: Outcome) -> str:
     """Return what is printed of a case."""
     said = [f"{tool}: {', '.join(f'{n} {v}' for n, v in rows.items())}" for tool, rows in outcome.verdicts.items()]
     verdict = f"WRONG ({outcome.wrong})" if outcome.wrong else "right"
-    lines = [f"  fault: {outcome.case.title}; every verdict {verdict}; {outcome.posterior.reason}", *said]
+    lines = [f"  fault: {outcome.case.title}; every verdict {verdict}; {outcome.drawn.posterior.reason}", *said]
     return "\n    ".join(lines)

@@ -25,7 +25,7 @@ def figures(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
         if name in outcomes:
             outcome = outcomes[name]
             shown = list(outcome.problem.names) if names is None else names
-            found[name] = bp.plot.corner(outcome.posterior, laplace=outcome.fit, names=shown)
+            found[name] = bp.plot.corner(outcome.drawn.posterior, laplace=outcome.fit, names=shown)
     return found
 
 
@@ -46,7 +46,7 @@ def gallery(outcomes: Mapping[str, Outcome]) -> Figure:
 
 def _marginal(axes: Axes, outcome: Outcome) -> None:
     name, colours = outcome.case.shown, bp.plot.COLOURS
-    draws = outcome.posterior.draws(name)
+    draws = outcome.drawn.posterior.draws(name)
     density, edges = np.histogram(draws, BINS, tuple(np.quantile(draws, SHOWN)), density=True)
     axes.stairs(density, edges, color=colours["mcmc"], fill=True, label="MCMC")
     mean, sd, truth = outcome.fit.theta[name], outcome.fit.sd[name], outcome.case.truth[name]

@@ -25,6 +25,15 @@ GOOD = {IDENTIFIABILITY: DETERMINED, COMPARE: FINE, JOINT: FINE, PREDICT: ADEQUA
 
 
 @dataclass(frozen=True)
+class Drawn:
+    """Draws, and what is said from them."""
+
+    posterior: bp.Posterior
+    comparison: bp.Comparison
+    prediction: bp.Prediction
+
+
+@dataclass(frozen=True)
 class Outcome:
     """Estimate, draws, and what every tool says of them.
 
@@ -33,32 +42,34 @@ class Outcome:
     case : Case
     problem : Problem
     fit : MapEstimate
-    posterior : Posterior or None
-        None where the verdicts do without draws.
     identifiability : Identifiability
-    comparison : Comparison or None
-    prediction : Prediction or None
+    sampled : Drawn or None
+        None where the verdicts do without draws.
     seconds : float
     """
 
     case: Case
     problem: bp.Problem
     fit: bp.MapEstimate
-    posterior: bp.Posterior | None
     identifiability: bp.Identifiability
-    comparison: bp.Comparison | None
-    prediction: bp.Prediction | None
+    sampled: Drawn | None
     seconds: float
+
+    @property
+    def drawn(self) -> Drawn:
+        """Draws and what is said from them, where there are any."""
+        if self.sampled is None:
+            raise ValueError("drawless: there are no draws here.")
+        return self.sampled
 
     @property
     def verdicts(self) -> dict[str, dict[str, str]]:
         """By tool and parameter; "all" for those on the whole."""
         found = {IDENTIFIABILITY: self.identifiability.verdicts}
-        if self.comparison is not None:
-            found[COMPARE] = dict(self.comparison.table["verdict"])
-            found[JOINT] = {"all": str(self.comparison.joint["verdict"])}
-        if self.prediction is not None:
-            found[PREDICT] = dict(self.prediction.table["verdict"])
+        if self.sampled is not None:
+            found[COMPARE] = dict(self.sampled.comparison.table["verdict"])
+            found[JOINT] = {"all": str(self.sampled.comparison.joint["verdict"])}
+            found[PREDICT] = dict(self.sampled.prediction.table["verdict"])
         return found
 
     @property
@@ -87,13 +98,13 @@ class Outcome:
     @property
     def converged(self) -> bool:
         """Of the estimate, and of the draws where there are any."""
-        return self.fit.converged and (self.posterior is None or self.posterior.converged)
+        return self.fit.converged and (self.sampled is None or self.sampled.posterior.converged)
 
     @property
     def p_values(self) -> dict[str, dict[str, float]]:
         """Of the discrepancy tests, by row of the prediction; those that are not possible left out."""
-        table = self.prediction.table.select_dtypes("number")
-        return {str(row): {c: float(v) for c, v in values.items() if pd.notna(v)} for row, values in table.iterrows()}
+        table = self.drawn.prediction.table.select_dtypes("number")
+        return {str(row): {str(c): float(v) for c, v in values.items() if pd.notna(v)} for row, values in table.iterrows()}
 
     def line(self) -> dict[str, Any]:
         """Return what is kept of a replicate."""
@@ -115,34 +126,26 @@ def examine(name: str, data_seed: int, sampler_seed: int, *, drawless: bool = Fa
     problem = case.problem(data_seed)
     fit = bp.map_estimate(problem, progress=False)
     if drawless and case.drawless:
-        return Outcome(
-            case, problem, fit, None, bp.identifiability(problem, fit), None, None, time.perf_counter() - start
-        )
+        found = bp.identifiability(problem, fit)
+        return Outcome(case, problem, fit, found, None, time.perf_counter() - start)
     posterior = bp.sample(problem, fit, seed=sampler_seed, progress=False, **case.sampling)
-    return Outcome(
-        case,
-        problem,
-        fit,
-        posterior,
-        bp.identifiability(problem, fit, posterior),
-        bp.compare(problem, fit, posterior),
-        bp.predict(problem, posterior),
-        time.perf_counter() - start,
-    )
+    found = bp.identifiability(problem, fit, posterior)
+    drawn = Drawn(posterior, bp.compare(problem, fit, posterior), bp.predict(problem, posterior))
+    return Outcome(case, problem, fit, found, drawn, time.perf_counter() - start)
 
 
 def numbers(outcome: Outcome) -> dict[str, Any]:
     """Return the figures behind the verdicts, Monte Carlo errors as pairs (value, error)."""
     table = outcome.identifiability.table
     found: dict[str, Any] = {
-        name: {"contraction": _pair(row, "contraction")} | _signed(row) for name, row in table.iterrows()
+        str(name): {"contraction": _pair(row, "contraction")} | _signed(row) for name, row in table.iterrows()
     }
-    if outcome.comparison is None:
+    if outcome.sampled is None:
         return found
-    for name, row in outcome.comparison.table.iterrows():
-        found[name] |= {column: _pair(row, column) for column in ("shift", "sd_ratio", "skewness", "wasserstein")}
-    joint = outcome.comparison.joint
-    found["joint"] = {key: _pair(joint, key) for key in ("share_50", "share_90", "share_95", "pareto_k")}
+    comparison = outcome.sampled.comparison
+    for name, row in comparison.table.iterrows():
+        found[str(name)] |= {column: _pair(row, column) for column in ("shift", "sd_ratio", "skewness", "wasserstein")}
+    found["joint"] = {key: _pair(comparison.joint, key) for key in ("share_50", "share_90", "share_95", "pareto_k")}
     return found
 
 

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-import bayesperiodic as bp
-from studies import verdicts_cases, verdicts_outcome
+from studies import common, verdicts_cases, verdicts_outcome
 from studies.verdicts_outcome import Outcome, examine
 
 DATA, SAMPLER = "data", "sampler"
@@ -47,8 +46,9 @@ def replicate(task: Task) -> dict[str, Any]:
 
 def source() -> str:
     """Return what tells replicates of other cases, or of another version, apart."""
-    text = "".join(Path(m.__file__).read_text(encoding="utf-8") for m in (verdicts_cases, verdicts_outcome))
-    return hashlib.sha256((bp.__version__ + text).encode()).hexdigest()[:12]
+    files = [Path(str(module.__file__)) for module in (verdicts_cases, verdicts_outcome)]
+    text = common.versions()["bayesperiodic"] + "".join(common.sha256(path) for path in files)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def replicates(folder: Path, names: Sequence[str], count: int, seed: int) -> list[dict[str, Any]]:
