@@ -13,11 +13,13 @@ from studies import common, verdicts_figures, verdicts_replicates
 from studies.verdicts_cases import CASES, FINE
 from studies.verdicts_outcome import Outcome, examine, numbers
 
-QUICK = ("product_ridge", "linear", "sign_undetermined", "truncated", "misspecified")
+QUICK = ("product_ridge", "linear", "prior_dominated", "misspecified")
 
 
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
+    if options.replicates < 0:
+        raise ValueError(f"--replicates: {options.replicates} is not allowed; it must be at least 0.")
     watch = common.Stopwatch()
     print("All data are SYNTHETIC: simulated from the stated truths, with noise.")
     outcomes: dict[str, Outcome] = {}

@@ -60,7 +60,7 @@ def _marginal(axes: Axes, outcome: Outcome) -> None:
     axes.axvline(truth, color="black", lw=1.6, label="truth")
     axes.set_xlim(x[0], x[-1])
     axes.set_yticks([])
-    axes.locator_params(axis="x", nbins=5)
+    axes.locator_params(axis="x", nbins=5, steps=[1, 2, 5, 10])
     axes.spines[["left", "right", "top"]].set_visible(False)
     unit = outcome.problem.model.units.get(name, "1")
     axes.set_xlabel(name if unit == "1" else f"{name} [{unit}]")

@@ -104,7 +104,9 @@ class Outcome:
     def p_values(self) -> dict[str, dict[str, float]]:
         """Of the discrepancy tests, by row of the prediction; those that are not possible left out."""
         table = self.drawn.prediction.table.select_dtypes("number")
-        return {str(row): {str(c): float(v) for c, v in values.items() if pd.notna(v)} for row, values in table.iterrows()}
+        return {
+            str(row): {str(c): float(v) for c, v in values.items() if pd.notna(v)} for row, values in table.iterrows()
+        }
 
     def line(self) -> dict[str, Any]:
         """Return what is kept of a replicate."""
@@ -146,6 +148,7 @@ def numbers(outcome: Outcome) -> dict[str, Any]:
     for name, row in comparison.table.iterrows():
         found[str(name)] |= {column: _pair(row, column) for column in ("shift", "sd_ratio", "skewness", "wasserstein")}
     found["joint"] = {key: _pair(comparison.joint, key) for key in ("share_50", "share_90", "share_95", "pareto_k")}
+    found["joint"]["importance_efficiency"] = float(f"{float(comparison.joint['efficiency']):.5g}")
     return found
 
 

@@ -72,8 +72,10 @@ def approximation(problem: Problem, fit: MapEstimate, coordinates: str) -> Appro
     return Approximation(density.labels, logarithmic, mean, covariance, own)
 
 
-def importance_k(problem: Problem, fit: MapEstimate, coordinates: str) -> tuple[float, float]:
-    """Return the Pareto k̂ of Laplace as an importance proposal for the posterior, and the error of fitting the tail.
+def importance_k(problem: Problem, fit: MapEstimate, coordinates: str) -> tuple[float, float, float]:
+    """Return the Pareto k̂ of Laplace as an importance proposal, the error of fitting the tail, and the efficiency.
+
+    The efficiency is 1 for equal weights: the effective share of the draws, (Σw)²/(nΣw²).
 
     In natural coordinates unknown variances are integrated out where that is possible in closed form. Other noise
     parameters have the joint Laplace approximation of their logarithms, there independent of the parameters. A draw
@@ -85,12 +87,15 @@ def importance_k(problem: Problem, fit: MapEstimate, coordinates: str) -> tuple[
     density = SamplingDensity(anchored, cores, NATURAL, COLLAPSED) if natural else SamplingDensity(anchored, cores)
     mean, covariance = _proposal(density, fit, natural)
     if not np.isfinite(covariance).all():
-        return np.nan, np.nan
+        return np.nan, np.nan, np.nan
     points, log_proposal = normal_draws(mean, covariance, PROPOSALS, np.random.default_rng(SEED))
     values = density(points)
-    k = chains.pareto_k((values[:, 0] if values.ndim > 1 else values) - log_proposal)
+    log_weights = (values[:, 0] if values.ndim > 1 else values) - log_proposal
+    k, top = chains.pareto_k(log_weights), log_weights.max()
+    weights = np.exp(log_weights - top) if np.isfinite(top) else np.ones(1)
+    efficiency = float(weights.sum() ** 2 / np.sum(weights**2) / PROPOSALS)
     tail = min(0.2 * PROPOSALS, 3.0 * np.sqrt(PROPOSALS))
-    return k, float((1.0 + max(k, 0.0)) / np.sqrt(tail)) if np.isfinite(k) else 0.0
+    return k, float((1.0 + max(k, 0.0)) / np.sqrt(tail)) if np.isfinite(k) else 0.0, efficiency
 
 
 def _proposal(density: SamplingDensity, fit: MapEstimate, natural: bool) -> tuple[np.ndarray, np.ndarray]:

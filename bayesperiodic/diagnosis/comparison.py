@@ -9,7 +9,7 @@ import pandas as pd
 from bayesperiodic import checks
 from bayesperiodic.diagnosis.approximation import SAMPLING, approximation
 from bayesperiodic.diagnosis.scores import Scores, joint_row, row, scores
-from bayesperiodic.diagnosis.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, USABLE_K, WIDE
+from bayesperiodic.diagnosis.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, WIDE
 from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.labels import unit
 from bayesperiodic.inference.problem import Problem
@@ -41,7 +41,8 @@ class Comparison(Result):
         verdict and recommendation.
     joint : dict
         dimension; share_50, share_90 and share_95, the shares of draws inside Laplace's ellipsoids; pareto_k, the k̂ of
-        Laplace as an importance proposal, its error that of fitting the tail; verdict and recommendation.
+        Laplace as an importance proposal, its error that of fitting the tail; efficiency, the effective share of such
+        draws; verdict and recommendation.
     coordinates : str
     probabilities : array (probabilities,)
     quantiles : dict of str to array (probabilities,)
@@ -132,7 +133,8 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
 
     Jointly what counts is the share of draws inside Laplace's ellipsoids, and the Pareto k̂ of the importance weights of
     8000 draws from Laplace ([1]_; above 0.7 it is of no use as a proposal, and it cannot see a mode that Laplace does
-    not reach). Where variances can be integrated out in closed form that is done for k̂ in natural coordinates.
+    not reach). It is the shape of their tail alone, and does not count where the weights are even (efficiency above
+    98 %). Where variances can be integrated out in closed form that is done for k̂ in natural coordinates.
 
     Parameters
     ----------
@@ -235,7 +237,7 @@ def _joint(scored: Scores, cured: Scores | None) -> dict[str, float | str]:
     if scored.joint == FINE:
         others = [name for name, verdict in scored.verdicts.items() if verdict != FINE]
         advice += f", except for {', '.join(others)}" if others else ""
-        advice += ", not as an importance proposal" if scored.pareto_k[0] > USABLE_K else ""
+        advice += ", not as an importance proposal" if not scored.usable_as_proposal else ""
     return joint_row(scored) | {"verdict": scored.joint, "recommendation": advice}
 
 

@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
+from bayesperiodic.diagnosis.approximation import importance_k
 from bayesperiodic.diagnosis.distances import Sample
 from bayesperiodic.diagnosis.verdicts import joint_verdict, marginal_verdict
 from bayesperiodic.inference.sampling.coordinates import SamplingDensity
@@ -278,6 +279,20 @@ def test_a_heavy_tailed_posterior_has_a_large_pareto_k():
     found = bp.compare(problem, fit, posterior_of(problem, draws)).joint
     assert found["pareto_k"] > 0.7
     assert found["verdict"] == "wrong shape"
+
+
+def test_the_tail_of_even_importance_weights_does_not_count():
+    """Hardly measured, but for an unknown variance normal: weights differ by a factor of three, and k̂ is above 0.7."""
+    data = linear_experiment([900.0, 40.0, 25.0], 30.0, seed=8)
+    priors = {"k": bp.Normal(900.0, 5000.0), "c": bp.Normal(40.0, 4.0)}
+    problem = bp.Problem(LINEAR, [data], priors=priors, fixed={"coulomb": 25.0})
+    fit = bp.map_estimate(problem, **QUIET)
+    k, error, efficiency = importance_k(problem, fit, "natural")
+    assert k - error > 0.7 and efficiency > 0.98
+    posterior = bp.sample(problem, fit, seed=1, variances="collapsed", **QUIET)
+    found = bp.compare(problem, fit, posterior)
+    assert (found.joint["verdict"], found.joint["recommendation"]) == ("fine", "use Laplace")
+    assert found.joint["efficiency"] == efficiency
 
 
 def test_modes_are_told_before_convergence_only_where_every_ensemble_shows_them():
