@@ -36,7 +36,7 @@ def test_every_verdict_of_the_quick_gallery_is_right(quick):
 
 
 def test_a_prior_that_dominates_contracts_as_it_must(quick):
-    """Data ± 7.1 and prior ± 3 N s/m: contraction 1/(1 + 7.1²/3²) = 0.15, the noise's own variance estimated (± 40 %)."""
+    """Data ± 7.1 and prior ± 3 N s/m: contraction 1/(1 + 7.1²/3²) = 0.15, the variance estimated (± 40 %)."""
     _, results, _ = quick
     value, error = results["prior_dominated"]["numbers"]["c"]["contraction"]
     assert 0.0 < error < 0.05
