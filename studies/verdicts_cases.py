@@ -2,7 +2,7 @@
 
 Where only the noise of one run stands between a parameter and its sign, one data set in twenty shows the sign by luck.
 So the case with an open sign has an unknown delay of the recording, which acts as a damping, and the one with a
-truncated posterior a prior whose end lies two and a half standard errors short of the truth: there the answer is known
+truncated posterior a prior whose end lies about two standard errors short of the truth: there the answer is known
 for every data set.
 """
 
@@ -292,7 +292,7 @@ def prior_dominated() -> Case:
 
 
 def truncated() -> Case:
-    """Return a damping whose prior ends at 20 N s/m, two and a half standard errors below the truth."""
+    """Return a damping whose prior ends at 20 N s/m, about two standard errors below the truth."""
     truth = {"k": 1e4, "c": 24.5}
 
     def problem(data_seed: int) -> bp.Problem:
