@@ -15,7 +15,7 @@ from studies.verdicts_outcome import Outcome
 
 BINS, SHOWN = 50, (0.0005, 0.9995)
 RIDGES = {"product_ridge": None, "sum_ridge": None, "scaling_symmetry": ["m", "k1", "k2", "k3", "l"]}
-WIDTH = 62
+WIDTH = 72
 
 
 def figures(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
@@ -80,7 +80,7 @@ def _words(axes: Axes, outcome: Outcome) -> None:
         bold = tool in case.fault
         axes.text(0.0, place, tool, va="center", fontsize=10, color="#555555")
         weight = "bold" if bold else "normal"
-        axes.text(0.19, place, textwrap.fill(text, WIDTH), va="center", fontsize=10, weight=weight)
+        axes.text(0.19, place, textwrap.fill(text, WIDTH), va="center", fontsize=9, weight=weight)
     mark = "as expected" if not outcome.wrong else "NOT AS EXPECTED"
     axes.text(1.0, 0.14, mark, va="center", ha="right", fontsize=10, style="italic")
 
