@@ -96,7 +96,7 @@ def test_two_modes_of_opposite_sign():
     signed = model("square", ["a"], lambda p: {"force": p.a**2})
     problem = bp.Problem(signed, [run(force=1.0)], priors={"a": bp.Normal(0.0, 2.0)}, fixed=known(force=0.1))
     fit = bp.map_estimate(problem, start={"a": 0.8}, **QUIET)
-    posterior = bp.sample(problem, fit, seed=1, start="prior", max_steps=5000, **QUIET)
+    posterior = bp.sample(problem, fit, seed=1, start="prior", max_steps=2000, **QUIET)
     negative = float(np.mean(posterior.draws("a") < 0.0))
     assert not posterior.converged or abs(negative - 0.5) < ERRORS * 0.5 / np.sqrt(posterior.ess["a"])
 

@@ -95,6 +95,7 @@ def test_replicates_are_saved_one_by_one_and_resumed(tmp_path, monkeypatch):
     assert len(path.read_text().splitlines()) == 5
 
 
+@pytest.mark.filterwarnings("ignore:The data do not change under")
 def test_counts_tell_what_is_wrong_and_what_flips(quick):
     folder, results, _ = quick
     outcome = examine("scaling_symmetry", 0, 0, drawless=True)
