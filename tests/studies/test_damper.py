@@ -1,4 +1,6 @@
+import contextlib
 import hashlib
+import io
 import json
 import os
 from pathlib import Path
@@ -36,31 +38,38 @@ def test_without_a_name_the_studies_are_listed(capsys):
     assert "damper       A measured magneto-rheological damper" in capsys.readouterr().out
 
 
-def test_synthetic_data_are_called_synthetic_and_the_truth_is_found(synthetic, tmp_path, capsys):
-    results = run(tmp_path, "--quick")
-    printed = capsys.readouterr().out
+@pytest.fixture(scope="module")
+def quick(short_recording, tmp_path_factory):
+    """Return the folder, the results and the words of a quick run on synthetic data."""
+    folder, printed = tmp_path_factory.mktemp("quick"), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
+        patch.setattr(common, "find_data", lambda *_: None)
+        patch.setattr(damper, "generate", lambda seed: short_recording)
+        return folder, run(folder, "--quick"), printed.getvalue()
+
+
+def test_synthetic_data_are_called_synthetic_and_the_truth_is_found(quick):
+    folder, results, printed = quick
     assert "SYNTHETIC" in printed and damper.SHA256 in printed and "github.com/labcontrol-data" in printed
     assert results["data"] == {"path": "generated", "sha256": None, "synthetic": True}
     for name in ("Kx", "Kw"):
         assert abs(results["map"][name] - damper.PUBLISHED[name]) < 4 * results["laplace_sd"][name]
     assert results["map"]["rho"] == pytest.approx(damper.PUBLISHED["rho"], rel=0.1)
-    figures = sorted(path.name for path in tmp_path.glob("*.png"))
+    figures = sorted(path.name for path in folder.glob("*.png"))
     assert figures == ["corner.png", "fit.png", "loops.png", "traces.png"]
     assert all(name in printed.splitlines()[-2] for name in figures)
 
 
-def test_same_seed_same_results_but_for_seconds_and_versions(synthetic, tmp_path):
-    first, again = (run(tmp_path / str(k), "--quick", "--seed", "4") for k in range(2))
-    for results in (first, again):
-        del results["seconds"], results["versions"]
-    assert json.dumps(first) == json.dumps(again)
+def test_same_seed_same_results_but_for_seconds_and_versions(quick, synthetic, tmp_path):
+    folder, first, _ = quick
+    kept = [{k: v for k, v in r.items() if k not in ("seconds", "versions")} for r in (first, run(tmp_path, "--quick"))]
+    assert json.dumps(kept[0]) == json.dumps(kept[1])
     for name in ("corner", "fit", "loops", "traces"):
-        one, two = ((tmp_path / str(k) / f"{name}.png").read_bytes() for k in range(2))
-        assert one == two
+        assert (folder / f"{name}.png").read_bytes() == (tmp_path / f"{name}.png").read_bytes()
 
 
-def test_reaching_the_limit_of_a_quick_run_is_said(synthetic, tmp_path):
-    results = run(tmp_path, "--quick")
+def test_reaching_the_limit_of_a_quick_run_is_said(quick):
+    results = quick[1]
     assert results["converged"] is False
     assert "max_steps = 500 reached" in results["reason"]
     assert set(results["comparison"].values()) == {"not converged"}
