@@ -1,0 +1,1 @@
+"""From a chaotic recording to unstable periodic orbits with error bars."""

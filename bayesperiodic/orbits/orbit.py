@@ -1,0 +1,113 @@
+"""Orbit and Orbits: unstable periodic orbits as they were found in a section, and polished with a model."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bayesperiodic.periodic.solution import PeriodicSolution
+from bayesperiodic.store import Result
+
+
+@dataclass(frozen=True)
+class Orbit(Result):
+    """One periodic orbit of a section.
+
+    Attributes
+    ----------
+    name : str
+        Unique among the orbits of a section, such as ``"period 3, winding 1, orbit 2"``.
+    coordinates : tuple of str
+        The two outputs of the model that the section shows.
+    angles : tuple of str
+        The coordinates that are angles.
+    frequency : float
+        Of the forcing [Hz].
+    period : int
+        Prime period in forcing periods.
+    winding : int or None
+        Turns of the angle per response period; None where the section cannot tell, 0 where no coordinate is an angle.
+    points : array (period, 2)
+        Section values at tau = 0, 1, …, angles in (−π, π].
+    joint_covariance : array (2·period + 2, 2·period + 2)
+        Of the points, point by point, and of log|eigenvalue|, largest first; NaN for eigenvalues that are not
+        estimated.
+    eigenvalues : array (2,)
+        Of the linearised return map over the period, largest modulus first, real or complex.
+    eigenvalue_bias : array (2,)
+        Estimated bias of log|eigenvalue|, which was not taken off.
+    returns : int
+        Measured close returns behind the orbit.
+    quality : float
+        P-value of the returns under the orbit and its linearised map; small where there is no orbit.
+    partner : int or None
+        Position of the orbit with all signs changed among the orbits; its own where it is symmetric.
+    cycle : mapping of str to array (samples·period,) or None
+        The closest measured cycle by coordinate, angles running on without jumps; None where the section is of points
+        alone.
+    solution : PeriodicSolution or None
+        The model's orbit, once polished.
+    equilibrium : bool
+        Whether it is a state of rest, which says little of the parameters.
+    synthetic : bool
+        True if the data were simulated.
+    """
+
+    name: str
+    coordinates: tuple[str, str]
+    angles: tuple[str, ...]
+    frequency: float
+    period: int
+    winding: int | None
+    points: np.ndarray
+    joint_covariance: np.ndarray
+    eigenvalues: np.ndarray
+    eigenvalue_bias: np.ndarray
+    returns: int
+    quality: float
+    partner: int | None = None
+    cycle: Mapping[str, np.ndarray] | None = None
+    solution: PeriodicSolution | None = None
+    equilibrium: bool = False
+    synthetic: bool = False
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the points, (2·period, 2·period), point by point."""
+        size = self.points.size
+        return self.joint_covariance[:size, :size]
+
+    @property
+    def eigenvalue_sd(self) -> np.ndarray:
+        """Standard deviations of the eigenvalues' moduli, (2,); NaN where not estimated."""
+        size = self.points.size
+        return np.abs(self.eigenvalues) * np.sqrt(np.diag(self.joint_covariance)[size:])
+
+
+@dataclass(frozen=True)
+class Orbits(Result):
+    """The orbits found in a section, and what was not taken.
+
+    Attributes
+    ----------
+    orbits : tuple of Orbit
+    rejected : tuple of (Orbit, str)
+        With the reason.
+    values : int
+        Numbers in the recording or section from which they were found.
+    method : str
+    """
+
+    orbits: tuple[Orbit, ...]
+    rejected: tuple[tuple[Orbit, str], ...] = field(default=())
+    values: int = 0
+    method: str = ""
+
+    def __len__(self) -> int:
+        return len(self.orbits)
+
+    def __getitem__(self, index: int) -> Orbit:
+        return self.orbits[index]
+
+    def __iter__(self) -> Iterator[Orbit]:
+        return iter(self.orbits)
