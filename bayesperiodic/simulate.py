@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 
 from bayesperiodic import checks, fourier
 from bayesperiodic.data.recording import Recording
+from bayesperiodic.models.integrate import integrate_accurately
 from bayesperiodic.models.model import Model
 
 RELATIVE_TOLERANCE = 1e-10
@@ -15,6 +16,8 @@ SIXTH_ORDER = {
     2: ((-3, 1 / 90), (-2, -3 / 20), (-1, 3 / 2), (0, -49 / 18), (1, 3 / 2), (2, -3 / 20), (3, 1 / 90)),
 }
 DIFFERENCE_STEP = 2e-3
+# In forcing periods.
+LONGEST_STEP = 0.05
 
 Signal = np.ndarray | Callable[[np.ndarray], np.ndarray]
 
@@ -85,7 +88,8 @@ def simulate(
     for name in noise or {}:
         checks.one_of("noise", name, (*model.outputs, *model.inputs))
     system = _FirstOrder(model, theta, frequency, signals)
-    path = _integrate(system, system.start(start or {}), time)
+    integrate = _integrate_compiled if all(isinstance(s, _Periodic) for s in signals) else _integrate
+    path = integrate(system, system.start(start or {}), time)
     outputs = system.outputs(time, path)
     generator = np.random.default_rng(seed)
     channels = {name: outputs[:, i] for i, name in enumerate(model.outputs)}
@@ -110,6 +114,16 @@ class _FirstOrder:
         for name in given:
             checks.one_of("start", name, names)
         return np.array([checks.finite_number(f"start[{n!r}]", given.get(n, 0.0)) for n in names])
+
+    def amplitudes(self) -> np.ndarray:
+        """Return (harmonics, 3·inputs): those of u, u̇, ü, without the harmonics that no periodic input has."""
+        columns = [s.amplitudes[order] for order in range(3) for s in self.signals if isinstance(s, _Periodic)]
+        table = np.zeros((max((c.size for c in columns), default=1), len(columns)), dtype=complex)
+        for j, column in enumerate(columns):
+            table[: column.size, j] = column
+        size = np.abs(table)
+        present = (size > 1e-15 * size.max(axis=0, initial=0.0)).any(axis=1)
+        return table[: 1 + np.flatnonzero(present).max(initial=0)]
 
     def inputs(self, time: np.ndarray) -> np.ndarray:
         """Return (points, 3·inputs): u, u̇, ü."""
@@ -140,17 +154,15 @@ class _FirstOrder:
 
 
 def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
-    span, step = (time[0], time[-1]), 0.05 / system.frequency
-    trial = solve_ivp(system, (span[0], min(span[1], 3.0 / system.frequency)), start, rtol=1e-3, max_step=step)
-    size = np.max(np.abs(trial.y), axis=1) + np.finfo(float).tiny
+    step = LONGEST_STEP / system.frequency
     result = solve_ivp(
         system,
-        span,
+        (time[0], time[-1]),
         start,
         method="DOP853",
         t_eval=time,
         rtol=RELATIVE_TOLERANCE,
-        atol=RELATIVE_TOLERANCE * size,
+        atol=RELATIVE_TOLERANCE * _size(system, start, time),
         max_step=step,
     )
     if not result.success or not np.isfinite(result.y).all():
@@ -158,20 +170,63 @@ def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.n
     return result.y.T
 
 
+def _integrate_compiled(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Return what `_integrate` does, for inputs that are Fourier series; many periods take seconds."""
+    size = _size(system, start, time)
+    relative = np.full(size.size, RELATIVE_TOLERANCE)
+    # The error of an angle counts by the turn, however far it has gone.
+    turning = [i for i, state in enumerate(system.model.states) if state in system.model.angles]
+    relative[turning], size[turning] = 0.0, np.maximum(size[turning], np.pi)
+    path = integrate_accurately(
+        system.model,
+        start,
+        system.amplitudes(),
+        system.theta,
+        frequency=system.frequency,
+        time=time * system.frequency,
+        absolute=RELATIVE_TOLERANCE * size,
+        relative=relative,
+    )
+    if len(path) < time.size or not np.isfinite(path).all():
+        raise RuntimeError(
+            f"The time integration of {system.model.name!r} failed after {time[len(path) - 1]:.6g} s: the step became "
+            "too small."
+        )
+    return path
+
+
+def _size(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Return the largest values of states and rates in a short trial."""
+    span, step = (time[0], min(time[-1], 3.0 / system.frequency)), LONGEST_STEP / system.frequency
+    trial = solve_ivp(system, span, start, rtol=1e-3, max_step=step)
+    return np.max(np.abs(trial.y), axis=1) + np.finfo(float).tiny
+
+
+class _Periodic:
+    """A Fourier series and its first two derivatives as a function of time [s]."""
+
+    def __init__(self, argument: str, signal: np.ndarray, frequency: float):
+        values = fourier.coefficients(checks.finite_vector(argument, signal))
+        self.frequency = frequency
+        self.amplitudes = np.stack([fourier.derivative(values, frequency, order) for order in range(3)])
+
+    def __call__(self, time: np.ndarray) -> list[np.ndarray]:
+        size = np.abs(self.amplitudes[0])
+        present = np.flatnonzero(size > 1e-15 * size.max(initial=0.0))
+        wave = np.exp(2j * np.pi * self.frequency * np.multiply.outer(present, time))
+        return list((self.amplitudes[:, present] @ wave).real)
+
+
 def _with_derivatives(name: str, signal: Signal, frequency: float) -> Callable[[np.ndarray], list[np.ndarray]]:
-    if callable(signal):
-        function, step = signal, DIFFERENCE_STEP / frequency
+    if not callable(signal):
+        return _Periodic(f"inputs[{name!r}]", signal, frequency)
+    function, step = signal, DIFFERENCE_STEP / frequency
 
-        def sampled(time: np.ndarray) -> list[np.ndarray]:
-            derivatives = [np.asarray(function(time), dtype=float)]
-            for order in (1, 2):
-                terms = [weight * function(time + offset * step) for offset, weight in SIXTH_ORDER[order]]
-                derivatives.append(np.sum(terms, axis=0) / step**order)
-            return derivatives
+    def sampled(time: np.ndarray) -> list[np.ndarray]:
+        derivatives = [np.asarray(function(time), dtype=float)]
+        for order in (1, 2):
+            terms = [weight * function(time + offset * step) for offset, weight in SIXTH_ORDER[order]]
+            derivatives.append(np.sum(terms, axis=0) / step**order)
+        return derivatives
 
-        return sampled
-    amplitudes = fourier.coefficients(checks.finite_vector(f"inputs[{name!r}]", signal))
-    present = np.flatnonzero(np.abs(amplitudes) > 1e-15 * np.abs(amplitudes).max())
-    series = np.stack([fourier.derivative(amplitudes, frequency, order)[present] for order in range(3)])
-    speed = 2j * np.pi * frequency * present
-    return lambda time: list((series @ np.exp(np.multiply.outer(speed, time))).real)
+    return sampled

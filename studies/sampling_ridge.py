@@ -36,8 +36,8 @@ class Ridge:
     default, natural : Posterior
         Priors cut at zero: the default settings, and a short chain in natural coordinates.
     uncut, uncut_prior : Posterior
-        Priors over both signs: the default settings, and some steps from draws of the priors, which lie on both
-        branches.
+        Priors over both signs: the default settings but for fewer steps at most, and as many from draws of the priors,
+        which lie on both branches.
     seconds : dict of str to float
         Of the four, by name.
     """
@@ -58,7 +58,7 @@ def sample_ridge(seed: int, quick: bool) -> Ridge:
     runs: dict[str, tuple[bp.Problem, bp.MapEstimate, dict[str, Any]]] = {
         "default": (positive, fits[0], {}),
         "natural": (positive, fits[0], {"coordinates": "natural", "max_steps": 500 if quick else SHORT}),
-        "uncut": (both, fits[1], few if quick else {}),
+        "uncut": (both, fits[1], few if quick else {"max_steps": LONG}),
         "uncut_prior": (both, fits[1], {"start": "prior"} | (few if quick else {"max_steps": LONG})),
     }
     found, seconds = {}, {}

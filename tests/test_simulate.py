@@ -3,6 +3,7 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
+from tests import shooting
 from tests.known import grid
 
 OSCILLATOR = {"m": 1.3, "c": 0.4, "k": 20.0, "k3": 0.0}
@@ -75,6 +76,45 @@ def test_periodic_solver_and_time_integration_agree_on_the_steady_state():
         for n in (800, 1600)
     )
     assert last == pytest.approx(fine + (fine - coarse) / 3, abs=1e-8)
+
+
+@pytest.mark.parametrize("rate", [7.3, 90.0], ids=["seldom", "often"])
+def test_driven_pendulum_is_that_of_another_integrator(rate):
+    """Six forcing periods with turns over the top; the reference takes SciPy's steps at tolerances of 1e-13."""
+    omega, start = 9.09, [1.0, 0.3]
+    slope, _, period = shooting.pendulum(omega)
+    parameters = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
+    run = bp.simulate(
+        bp.models.pendulum,
+        parameters,
+        frequency=1.0 / period,
+        duration=6 * period,
+        sampling_rate=rate / period,
+        start={"phi": start[0], "dphi": start[1]},
+    )
+    exact = shooting.trajectory(slope, np.array([0.0, 6 * period]), np.array([start]), run.time)
+    assert np.ptp(exact[:, 0]) > 2 * np.pi
+    assert run.outputs["angle"] == pytest.approx(exact[:, 0], abs=1e-6)
+    assert run.outputs["rate"] == pytest.approx(exact[:, 1], abs=1e-5)
+
+
+@pytest.mark.parametrize("drive", [np.sin(2 * np.pi * grid(16)) + 0.3, np.sign(grid(64) - 0.5)], ids=["sine", "square"])
+def test_arrays_and_functions_of_time_give_the_same_run(drive):
+    """The first are integrated by compiled code, the second by SciPy's."""
+    amplitudes = np.fft.rfft(drive)[: (drive.size + 1) // 2] * 2 / drive.size
+    amplitudes[0] /= 2
+    harmonic = np.arange(amplitudes.size)
+
+    def signal(time):
+        return (np.exp(2j * np.pi * np.multiply.outer(np.asarray(time), harmonic)) @ amplitudes).real
+
+    arguments = {"frequency": 1.0, "duration": 5.0, "sampling_rate": 33.0, "start": {"x": 0.1}}
+    one, other = (
+        bp.simulate(bp.models.duffing, OSCILLATOR | {"k3": 50.0}, {"force": force}, **arguments)
+        for force in (drive, signal)
+    )
+    assert one.outputs["displacement"] == pytest.approx(other.outputs["displacement"], abs=1e-8)
+    assert one.inputs["force"] == pytest.approx(other.inputs["force"], abs=1e-12)
 
 
 def test_noise_has_its_standard_deviation_and_its_seed():

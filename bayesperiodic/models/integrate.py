@@ -1,19 +1,81 @@
-"""Time integration with fixed steps, compiled: quick transients on the grid of a periodic problem."""
+"""Compiled time integration: quick transients on the grid of a periodic problem, and accurate ones at any times."""
 
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.integrate import DOP853
 
 from bayesperiodic.models.cache import load
 from bayesperiodic.models.model import Model
 
+TRIALS = 100_000
+
 
 @cache
-def _runge_kutta() -> Any:
+def _kernels() -> dict[str, Any]:
     source = Path(__file__).with_name("integrate_kernels.py").read_text(encoding="utf-8")
-    return load(source, ("runge_kutta",))["runge_kutta"]
+    return load(source, ("runge_kutta", "dormand_prince"))
+
+
+@cache
+def _tableau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return stages, nodes and error weights of the method of order 8, with the step's end as the last stage."""
+    a = np.vstack([DOP853.A, DOP853.B])
+    return a, np.append(DOP853.C, 1.0), np.stack([DOP853.E5, DOP853.E3])
+
+
+def integrate_accurately(
+    model: Model,
+    start: np.ndarray,
+    amplitudes: np.ndarray,
+    parameters: np.ndarray,
+    *,
+    frequency: float,
+    time: np.ndarray,
+    absolute: np.ndarray,
+    relative: np.ndarray,
+) -> np.ndarray:
+    """Integrate by the Runge-Kutta method of order 8 of Dormand and Prince, with error control.
+
+    Parameters
+    ----------
+    model : Model
+    start : array (size,)
+        The states, then the rates of the second-order ones.
+    amplitudes : complex array (harmonics, 3·inputs)
+        Of u, u̇, ü, from harmonic 0 on; the signals are the real part of the Fourier series.
+    parameters : array (parameters,)
+    frequency : float
+        Forcing frequency [Hz].
+    time : array (times,)
+        [forcing periods]; the integration starts at the first.
+    absolute, relative : array (size,)
+        Tolerances of a step.
+
+    Returns
+    -------
+    array (times, size)
+        Fewer rows where the integration could not go on.
+    """
+    path = np.empty((time.size, start.size))
+    path[0] = start
+    orders = np.array([model.orders[state] for state in model.states])
+    known = _kernels()["dormand_prince"](
+        model.kernels.residual_jacobian,
+        np.ascontiguousarray(amplitudes, dtype=complex),
+        parameters,
+        frequency,
+        orders,
+        time,
+        path,
+        *_tableau(),
+        absolute,
+        relative,
+        TRIALS,
+    )
+    return path[:known]
 
 
 def integrate(
@@ -51,7 +113,7 @@ def integrate(
     """
     orders = np.array([model.orders[state] for state in model.states])
     path = np.empty((kept, orders.sum()))
-    finished = _runge_kutta()(
+    finished = _kernels()["runge_kutta"](
         model.kernels.residual_jacobian,
         np.array(start, dtype=float),
         np.ascontiguousarray(inputs),
