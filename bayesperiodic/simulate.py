@@ -17,7 +17,7 @@ SIXTH_ORDER = {
 }
 DIFFERENCE_STEP = 2e-3
 # In forcing periods.
-LONGEST_STEP = 0.05
+LONGEST_STEP, TRIAL = 0.05, 3.0
 
 Signal = np.ndarray | Callable[[np.ndarray], np.ndarray]
 
@@ -155,6 +155,8 @@ class _FirstOrder:
 
 def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
     step = LONGEST_STEP / system.frequency
+    short = (time[0], min(time[-1], TRIAL / system.frequency))
+    size = np.abs(solve_ivp(system, short, start, rtol=1e-3, max_step=step).y).max(axis=1)
     result = solve_ivp(
         system,
         (time[0], time[-1]),
@@ -162,7 +164,7 @@ def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.n
         method="DOP853",
         t_eval=time,
         rtol=RELATIVE_TOLERANCE,
-        atol=RELATIVE_TOLERANCE * _size(system, start, time),
+        atol=RELATIVE_TOLERANCE * (size + np.finfo(float).tiny),
         max_step=step,
     )
     if not result.success or not np.isfinite(result.y).all():
@@ -172,34 +174,32 @@ def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.n
 
 def _integrate_compiled(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Return what `_integrate` does, for inputs that are Fourier series; many periods take seconds."""
-    size = _size(system, start, time)
-    relative = np.full(size.size, RELATIVE_TOLERANCE)
+
+    def path(tau: np.ndarray, absolute: np.ndarray, relative: np.ndarray) -> np.ndarray:
+        return integrate_accurately(
+            system.model,
+            start,
+            amplitudes,
+            system.theta,
+            frequency=system.frequency,
+            time=tau,
+            absolute=absolute,
+            relative=relative,
+        )
+
+    amplitudes, tau, ones = system.amplitudes(), time * system.frequency, np.ones(start.size)
+    trial = path(np.linspace(0.0, min(tau[-1], TRIAL), 61), 1e-12 * ones, 1e-3 * ones)
+    size, relative = np.abs(trial).max(axis=0) + np.finfo(float).tiny, RELATIVE_TOLERANCE * ones
     # The error of an angle counts by the turn, however far it has gone.
     turning = [i for i, state in enumerate(system.model.states) if state in system.model.angles]
-    relative[turning], size[turning] = 0.0, np.maximum(size[turning], np.pi)
-    path = integrate_accurately(
-        system.model,
-        start,
-        system.amplitudes(),
-        system.theta,
-        frequency=system.frequency,
-        time=time * system.frequency,
-        absolute=RELATIVE_TOLERANCE * size,
-        relative=relative,
-    )
-    if len(path) < time.size or not np.isfinite(path).all():
+    size[turning], relative[turning] = np.maximum(size[turning], np.pi), 0.0
+    found = path(tau, RELATIVE_TOLERANCE * size, relative)
+    if len(found) < time.size or not np.isfinite(found).all():
         raise RuntimeError(
-            f"The time integration of {system.model.name!r} failed after {time[len(path) - 1]:.6g} s: the step became "
+            f"The time integration of {system.model.name!r} failed after {time[len(found) - 1]:.6g} s: the step became "
             "too small."
         )
-    return path
-
-
-def _size(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Return the largest values of states and rates in a short trial."""
-    span, step = (time[0], min(time[-1], 3.0 / system.frequency)), LONGEST_STEP / system.frequency
-    trial = solve_ivp(system, span, start, rtol=1e-3, max_step=step)
-    return np.max(np.abs(trial.y), axis=1) + np.finfo(float).tiny
+    return found
 
 
 class _Periodic:

@@ -3,6 +3,7 @@ from dataclasses import replace
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.contour import ContourSet
 from matplotlib.path import Path
 
 import bayesperiodic as bp
@@ -43,6 +44,25 @@ def test_corner_draws_laplace_ellipses_where_the_draws_are(solved):
         assert inside.mean() == pytest.approx(level, abs=0.04)
         assert line.get_xydata()[:-1].mean(axis=0) == pytest.approx([fit.theta["k"], fit.theta["c"]])
     assert axes[3, 0].get_xlabel() == "k\n[N/m]"
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.99])
+def test_corner_draws_a_ridge_no_wider_than_it_is(solved, correlation):
+    """Share of draws inside the 90 % contour; with 35 bins that of the ridge holds 96 % of them."""
+    _, _, posterior = solved
+    data, generator = posterior.data.copy(), np.random.default_rng(5)
+    shape = data["posterior"]["k"].shape
+    one, other = generator.standard_normal((2, *shape))
+    group = data["posterior"].to_dataset()
+    group["k"] = (group["k"].dims, one)
+    group["c"] = (group["c"].dims, correlation * one + np.sqrt(1 - correlation**2) * other)
+    data["posterior"] = type(data)(group)
+    ridge = replace(posterior, data=data)
+    axes = bp.plot.corner(ridge, names=["k", "c"]).axes[2]
+    draws = np.stack([ridge.draws("k"), ridge.draws("c")], axis=-1)
+    lines = next(c for c in axes.collections if isinstance(c, ContourSet) and not c.filled)
+    inside = lines.get_paths()[0].contains_points(draws).mean()
+    assert inside == pytest.approx(0.9, abs=0.03)
 
 
 def test_corner_takes_the_noise_from_the_joint_laplace_approximation(solved):

@@ -14,6 +14,7 @@ from bayesperiodic.inference.sampling.posterior import Posterior
 from bayesperiodic.plot.style import COLOURS, caveats, unit_of, wrapped_label
 
 LEVELS = (0.5, 0.9)
+BINS, MOST_BINS = 35, 150
 
 
 def corner(
@@ -52,6 +53,7 @@ def corner(
     draws = np.stack([posterior.draws(name) for name in names], axis=-1)
     span = [tuple(np.quantile(draws[:, i], [0.0005, 0.9995])) for i in range(len(names))]
     titles = [wrapped_label(name, unit_of(posterior, name)) for name in names]
+    bins = _bins(draws)
     margin = 0.9 + 0.17 * max(title.count("\n") for title in titles)
     size = 1.75 * len(names) + margin + 0.2
     figure = corner_package.corner(
@@ -59,7 +61,8 @@ def corner(
         labels=titles,
         levels=LEVELS,
         range=span,
-        bins=35,
+        bins=bins,
+        hist_bin_factor=BINS / bins,
         smooth=1.0,
         color=COLOURS["mcmc"],
         plot_datapoints=False,
@@ -78,6 +81,15 @@ def corner(
     top = 0.98 if len(names) > 1 else 0.75
     figure.subplots_adjust(left=margin / width, bottom=margin / height, right=0.98, top=top)
     return figure
+
+
+def _bins(draws: np.ndarray) -> int:
+    """Return how many bins it takes for a ridge to be drawn no wider than it is."""
+    correlation = np.corrcoef(draws.T) if draws.shape[1] > 1 else np.zeros((1, 1))
+    np.fill_diagonal(correlation, 0.0)
+    across = np.sqrt(1.0 - np.nanmax(correlation**2, initial=0.0))
+    # The range holds 6.6 standard deviations, and a smoothed bin must be smaller than that across the ridge.
+    return int(np.clip(10.0 / max(across, 1e-9), BINS, MOST_BINS))
 
 
 def _corner_legend(figure: Figure, posterior: Posterior, laplace: bool, fontsize: int) -> None:
