@@ -14,7 +14,7 @@ from bayesperiodic.inference.sampling.posterior import Posterior
 from bayesperiodic.plot.style import COLOURS, caveats, unit_of, wrapped_label
 
 LEVELS = (0.5, 0.9)
-BINS, MOST_BINS = 35, 150
+BINS, MOST_BINS = 35, 200
 
 
 def corner(
@@ -88,8 +88,8 @@ def _bins(draws: np.ndarray) -> int:
     correlation = np.corrcoef(draws.T) if draws.shape[1] > 1 else np.zeros((1, 1))
     np.fill_diagonal(correlation, 0.0)
     across = np.sqrt(1.0 - np.nanmax(correlation**2, initial=0.0))
-    # The range holds 6.6 standard deviations, and a smoothed bin must be smaller than that across the ridge.
-    return int(np.clip(10.0 / max(across, 1e-9), BINS, MOST_BINS))
+    # The range holds 6.6 standard deviations, of which three bins should span one across the ridge.
+    return int(np.clip(20.0 / max(across, 1e-9), BINS, MOST_BINS))
 
 
 def _corner_legend(figure: Figure, posterior: Posterior, laplace: bool, fontsize: int) -> None:
