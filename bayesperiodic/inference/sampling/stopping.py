@@ -32,7 +32,7 @@ def shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray) -> list[str]:
     if (lengths := kept.shape[1] / tau.max()) < needed:
         found.append(f"length only {lengths:.0f} tau")
     if (change := np.max(np.abs(tau - last) / tau)) > TAU_CHANGE:
-        found.append(f"tau changed by {change:.0%}")
+        found.append(f"tau changed by {change:.0%}" if np.isfinite(change) else "tau known from one check alone")
     if (spread := chains.quantile_spread(kept).max()) > QUANTILE_SPREAD:
         found.append(f"quantiles of the ensembles {spread:.2f} sd apart")
     if not found and (alone := _furthest(kept, tau)) > APART:
