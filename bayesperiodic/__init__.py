@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from bayesperiodic.models.smooth import smooth_abs, smooth_sign
     from bayesperiodic.models.structure.result import Structure
     from bayesperiodic.models.structure.structure import structure
+    from bayesperiodic.orbits.polish import polish_orbits
     from bayesperiodic.periodic.continuation import Branch, continue_periodic, double_period, iterate_periodic
     from bayesperiodic.periodic.schemes import Scheme
     from bayesperiodic.periodic.solution import PeriodicSolution
@@ -75,6 +76,7 @@ _HOMES = {
     "bayesperiodic.models.smooth": ["smooth_abs", "smooth_sign"],
     "bayesperiodic.models.structure.result": ["Structure"],
     "bayesperiodic.models.structure.structure": ["structure"],
+    "bayesperiodic.orbits.polish": ["polish_orbits"],
     "bayesperiodic.periodic.continuation": ["Branch", "continue_periodic", "double_period", "iterate_periodic"],
     "bayesperiodic.periodic.schemes": ["Scheme"],
     "bayesperiodic.periodic.solution": ["PeriodicSolution"],
@@ -95,8 +97,9 @@ __all__ = [  # noqa: PLE0604
     "LogUniform", "MapEstimate", "Model", "MultivariateNormal", "Normal", "PeriodicSolution", "Posterior",
     "Prediction", "PriorPredictive", "Problem", "Profile", "Recording", "Scheme", "Structure", "StudentT",
     "TruncatedNormal", "Uniform", "compare", "continue_periodic", "double_period", "identifiability",
-    "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "noise", "plot", "predict",
-    "prior_predictive", "profile", "sample", "simulate", "smooth_abs", "smooth_sign", "solve_periodic", "structure",
+    "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "noise", "plot",
+    "polish_orbits", "predict", "prior_predictive", "profile", "sample", "simulate", "smooth_abs", "smooth_sign",
+    "solve_periodic", "structure",
 ]  # fmt: skip
 
 

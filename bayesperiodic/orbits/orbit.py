@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.orbits.as_experiment import orbit_experiment
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.store import Result
 
@@ -82,6 +84,50 @@ class Orbit(Result):
         """Standard deviations of the eigenvalues' moduli, (2,); NaN where not estimated."""
         size = self.points.size
         return np.abs(self.eigenvalues) * np.sqrt(np.diag(self.joint_covariance)[size:])
+
+    def experiment(
+        self,
+        *,
+        samples: int = 800,
+        multipliers: bool = False,
+        whole: bool = False,
+        states: Mapping[str, str] | None = None,
+    ) -> Experiment:
+        """Return the orbit as an experiment: its section points at tau = 0, 1, …, as in de Kraker et al. (1997).
+
+        Their covariance is known up to one factor, the noise parameter "scale", common to all orbits of a problem.
+
+        Parameters
+        ----------
+        samples : int
+            Grid points per forcing period.
+        multipliers : bool
+            Compare the unstable eigenvalues too, as log|μ| with fixed sign and with the covariance they share with the
+            points. One that is complex, not estimated, or whose bias exceeds half its standard deviation is left out,
+            and so is every smaller one.
+        whole : bool
+            Compare all samples of the measured cycle instead, with a variance per channel. A cycle that is but a close
+            return does not close; the gap counts as noise.
+        states : mapping of str to str, optional
+            Which coordinate is which state of the model, such as ``{"phi": "angle"}``: the first solve then starts from
+            the measured cycle. By default it starts from the polished solution.
+
+        Returns
+        -------
+        Experiment
+
+        Raises
+        ------
+        ValueError
+            If the orbit is not polished and `states` or the winding are not known, if `whole` or `states` are given and
+            there is no measured cycle, if `samples` is no multiple of the cycle's.
+
+        Warns
+        -----
+        UserWarning
+            If an unstable eigenvalue is left out.
+        """
+        return orbit_experiment(self, samples=samples, multipliers=multipliers, whole=whole, states=states)
 
 
 @dataclass(frozen=True)
