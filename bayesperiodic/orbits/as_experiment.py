@@ -53,7 +53,7 @@ def orbit_experiment(
 
 
 def _with_multipliers(orbit: Orbit, experiment: Experiment) -> Experiment:
-    """Return the experiment with the unstable eigenvalues that are data, and the covariance they share with the points."""
+    """Return the experiment with the unstable eigenvalues that are data, and their covariance with the points."""
     size = orbit.points.size
     sd = np.sqrt(np.diag(orbit.joint_covariance)[size:])
     with np.errstate(invalid="ignore"):
