@@ -15,7 +15,7 @@ from bayesperiodic.periodic.equations import PeriodicEquations
 if TYPE_CHECKING:
     from bayesperiodic.orbits.orbit import Orbit
 
-NOISE_FLOOR = 3.0
+NOISE_FLOOR = 5.0
 MOST_TRIED = 12
 TURN = 2 * np.pi
 
@@ -64,7 +64,7 @@ def resampled_cycle(orbit: Orbit, winding: int, samples: int) -> np.ndarray:
     """Return the measured cycle (samples·period, 2) on another grid, closed, without harmonics that are mere noise.
 
     The gap between its end and its beginning is spread over the cycle. A harmonic is noise where it and all above it
-    stay below three times the median amplitude of the upper half of the spectrum.
+    stay below five times the median amplitude of the upper half of the spectrum.
     """
     assert orbit.cycle is not None
     tau, columns = np.arange(samples * orbit.period) / samples, []

@@ -8,6 +8,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from bayesperiodic import checks
+from bayesperiodic.inference.estimation.all_at_once import all_at_once
 from bayesperiodic.inference.estimation.doubling import doubling_shift
 from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.estimation.gauss_newton import (
@@ -49,6 +50,9 @@ def map_estimate(
     Other noise models have their parameters in place of the variances, found by maximising the same objective. Steps
     are halved until the objective, eq. (6) with nN replaced by nN − l/s, rises; it never falls. Where convex log-priors
     outweigh the data, steps (not the covariance) take their curvature with the opposite sign.
+
+    Where every experiment of a forced model has a guess of its orbit, orbits and parameters are first found together,
+    from these guesses and `start`: the orbits need not exist at the start, and none is lost or swapped on the way.
 
     Parameters
     ----------
@@ -109,8 +113,16 @@ def _first_iterate(objective: Objective, theta: np.ndarray) -> Iterate | None:
     """Return the anchored iterate at a start; None where the log-posterior is not finite."""
     if not np.isfinite(objective.problem.log_prior(theta)):
         return None
-    near = objective.problem.linearised(theta)
-    iterate = objective.at(theta, near, objective.problem.likelihood.guess())
+    problem = objective.problem
+    together = all_at_once(problem, theta)
+    if together is not None:
+        there, states = together
+        near = problem.anchored(there, states).linearised(there)
+        iterate = objective.at(there, near, problem.likelihood.guess())
+        if iterate is not None:
+            return Iterate(there, near, iterate.noise, iterate.objective)
+    near = problem.linearised(theta)
+    iterate = objective.at(theta, near, problem.likelihood.guess())
     return iterate and Iterate(theta, near, iterate.noise, iterate.objective)
 
 
