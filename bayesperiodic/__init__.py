@@ -39,7 +39,10 @@ if TYPE_CHECKING:
     from bayesperiodic.models.smooth import smooth_abs, smooth_sign
     from bayesperiodic.models.structure.result import Structure
     from bayesperiodic.models.structure.structure import structure
+    from bayesperiodic.orbits.find import find_orbits
+    from bayesperiodic.orbits.orbit import Orbit, Orbits
     from bayesperiodic.orbits.polish import polish_orbits
+    from bayesperiodic.orbits.section import PoincareSection
     from bayesperiodic.periodic.continuation import Branch, continue_periodic, double_period, iterate_periodic
     from bayesperiodic.periodic.schemes import Scheme
     from bayesperiodic.periodic.solution import PeriodicSolution
@@ -76,7 +79,10 @@ _HOMES = {
     "bayesperiodic.models.smooth": ["smooth_abs", "smooth_sign"],
     "bayesperiodic.models.structure.result": ["Structure"],
     "bayesperiodic.models.structure.structure": ["structure"],
+    "bayesperiodic.orbits.find": ["find_orbits"],
+    "bayesperiodic.orbits.orbit": ["Orbit", "Orbits"],
     "bayesperiodic.orbits.polish": ["polish_orbits"],
+    "bayesperiodic.orbits.section": ["PoincareSection"],
     "bayesperiodic.periodic.continuation": ["Branch", "continue_periodic", "double_period", "iterate_periodic"],
     "bayesperiodic.periodic.schemes": ["Scheme"],
     "bayesperiodic.periodic.solution": ["PeriodicSolution"],
@@ -94,12 +100,13 @@ _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [  # noqa: PLE0604
     "Branch", "Comparison", "Experiment", "HalfNormal", "Identifiability", "InverseGamma", "LogNormal",
-    "LogUniform", "MapEstimate", "Model", "MultivariateNormal", "Normal", "PeriodicSolution", "Posterior",
-    "Prediction", "PriorPredictive", "Problem", "Profile", "Recording", "Scheme", "Structure", "StudentT",
-    "TruncatedNormal", "Uniform", "compare", "continue_periodic", "double_period", "identifiability",
-    "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "noise", "plot",
-    "polish_orbits", "predict", "prior_predictive", "profile", "sample", "simulate", "smooth_abs", "smooth_sign",
-    "solve_periodic", "structure",
+    "LogUniform", "MapEstimate", "Model", "MultivariateNormal", "Normal", "Orbit", "Orbits", "PeriodicSolution",
+    "PoincareSection", "Posterior", "Prediction", "PriorPredictive", "Problem", "Profile", "Recording", "Scheme",
+    "Structure", "StudentT", "TruncatedNormal", "Uniform", "compare", "continue_periodic", "double_period",
+    "find_orbits", "identifiability", "iterate_periodic", "load", "map_estimate", "models",
+    "multiplier_sensitivities", "noise", "plot", "polish_orbits", "predict", "prior_predictive", "profile", "sample",
+    "simulate",
+    "smooth_abs", "smooth_sign", "solve_periodic", "structure",
 ]  # fmt: skip
 
 

@@ -6,7 +6,10 @@ from bayesperiodic.plot.pairs import corner
 from bayesperiodic.plot.periods import fit, loops
 from bayesperiodic.plot.profiles import profile
 from bayesperiodic.plot.scorecard import comparison
+from bayesperiodic.plot.sections import orbits, section
 from bayesperiodic.plot.style import COLOURS
 from bayesperiodic.plot.walks import traces
 
-__all__ = ["COLOURS", "branch", "comparison", "corner", "fit", "loops", "marginals", "profile", "traces"]
+__all__ = [
+    "COLOURS", "branch", "comparison", "corner", "fit", "loops", "marginals", "orbits", "profile", "section", "traces",
+]  # fmt: skip

@@ -1,0 +1,202 @@
+"""find_orbits: unstable periodic orbits of a chaotic section, without a model."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from bayesperiodic import checks
+from bayesperiodic.orbits.angles import wrapped
+from bayesperiodic.orbits.chained import Estimate, refine
+from bayesperiodic.orbits.cycles import has_shorter_period, shift_between
+from bayesperiodic.orbits.local import REACH, LocalMaps
+from bayesperiodic.orbits.orbit import Orbit, Orbits
+from bayesperiodic.orbits.scatter import noise_of
+from bayesperiodic.orbits.search import Candidate, candidates
+from bayesperiodic.orbits.section import PoincareSection
+
+METHODS = ("chained", "boxes")
+SEARCH_DEGREE = 2
+# Of a local fit in the search, in standard deviations of the noise.
+SEARCH_WIDTH = 5.0
+# Beyond, a point with this standard deviation is nowhere in particular; in units of the attractor's size.
+LARGEST_SD = 0.02
+STILL = 0.02
+
+
+@dataclass(frozen=True)
+class _Scaled:
+    """A section in units of the attractor's size."""
+
+    points: np.ndarray
+    size: np.ndarray
+    maps: LocalMaps
+
+
+def find_orbits(
+    section: PoincareSection,
+    *,
+    periods: Iterable[int],
+    method: str = "chained",
+    neighbours: int = 32,
+    box: float = 0.01,
+) -> Orbits:
+    """Find the periodic orbits in a section."""
+    wanted = sorted({checks.integer("periods", p, 1) for p in periods})
+    checks.one_of("method", method, METHODS)
+    neighbours = checks.integer("neighbours", neighbours, 16)
+    box = checks.positive("box", box)
+    scaled = _scaled(section, neighbours)
+    count = _search_count(scaled.maps, neighbours)
+    found: list[tuple[Candidate, Estimate]] = []
+    for period in wanted:
+        first = len(found)
+        for candidate in candidates(scaled.maps, scaled.points, period, count, SEARCH_DEGREE):
+            estimate = refine(scaled.maps, candidate.points, neighbours)
+            if estimate is None or not _sound(scaled.maps, estimate):
+                continue
+            if any(_same(scaled.maps, estimate, other) for _, other in found[first:]):
+                continue
+            found.append((candidate, estimate))
+    orbits = [_orbit(section, scaled, candidate, estimate) for candidate, estimate in found]
+    orbits = _named(_with_partners(orbits, scaled))
+    return Orbits(tuple(orbits), values=section.values, method=method)
+
+
+def _scaled(section: PoincareSection, neighbours: int) -> _Scaled:
+    size = np.ptp(section.points, axis=0)
+    turn = np.array([2.0 * np.pi if name in section.angles else np.inf for name in section.coordinates]) / size
+    points = section.points / size
+    noise = np.zeros(2) if section.noise is None else section.noise / size
+    maps = LocalMaps(points[:-1], section.increments / size, turn, section.winds, noise)
+    if section.noise is None:
+        noise = noise_of(maps, neighbours)
+        maps = LocalMaps(points[:-1], section.increments / size, turn, section.winds, noise)
+    return _Scaled(points, size, maps)
+
+
+def _search_count(maps: LocalMaps, neighbours: int) -> int:
+    """Return the neighbours of a local fit in the search: enough to be wide against the noise."""
+    centres = maps.arguments[:: max(1, len(maps.arguments) // 500)]
+    count = int(2.25 * neighbours)
+    while count < len(maps.arguments) // 40:
+        if np.median(maps.nearest(centres, count)[0][:, -1]) / REACH > SEARCH_WIDTH * maps.noise.max():
+            break
+        count = int(1.5 * count)
+    return count
+
+
+def _sound(maps: LocalMaps, estimate: Estimate) -> bool:
+    size = estimate.points.size
+    sd = np.sqrt(np.diag(estimate.covariance)[:size])
+    tolerance = max(2e-3, 3.0 * float(sd.max()))
+    return bool(sd.max() < LARGEST_SD and not has_shorter_period(estimate.points, maps.wrap, tolerance))
+
+
+def _same(maps: LocalMaps, one: Estimate, other: Estimate) -> bool:
+    if len(one.points) != len(other.points):
+        return False
+    distance, _ = shift_between(one.points, other.points, maps.wrap)
+    sd = np.sqrt(max(np.diag(e.covariance)[: one.points.size].max() for e in (one, other)))
+    return distance < max(1e-3, 2.0 * float(sd))
+
+
+def _orbit(section: PoincareSection, scaled: _Scaled, candidate: Candidate, estimate: Estimate) -> Orbit:
+    period = len(estimate.points)
+    order = (np.arange(period) + candidate.shift) % period
+    estimate = _begun_at(estimate, order)
+    points = estimate.points * scaled.size
+    for k, name in enumerate(section.coordinates):
+        if name in section.angles:
+            points[:, k] = wrapped(points[:, k])
+    units = np.concatenate([np.tile(scaled.size, period), np.ones(2)])
+    bias = estimate.bias * units
+    covariance = estimate.covariance * np.outer(units, units)
+    covariance[: 2 * period, : 2 * period] += np.outer(bias[: 2 * period], bias[: 2 * period])
+    sd = np.sqrt(np.diag(covariance))
+    for k in (2 * period, 2 * period + 1):
+        if not (abs(bias[k]) <= sd[k] and sd[k] < 0.5):
+            covariance[k, :] = covariance[:, k] = np.nan
+    cycle = section.cycle(candidate.closest, period)
+    equilibrium = False
+    if cycle is not None and section.signals is not None:
+        extent = np.ptp(section.signals, axis=0)
+        for k, name in enumerate(section.coordinates):
+            if name in section.angles:
+                extent[k] = min(extent[k], 2.0 * np.pi)
+        equilibrium = all(
+            np.ptp(cycle[name]) < (STILL + 6.0 * n) * e
+            for name, e, n in zip(section.coordinates, extent, scaled.maps.noise, strict=True)
+        )
+    return Orbit(
+        name="",
+        coordinates=section.coordinates,
+        angles=section.angles,
+        frequency=section.frequency,
+        period=period,
+        winding=round(estimate.turns) if section.winds else None,
+        points=points,
+        joint_covariance=covariance,
+        eigenvalues=estimate.eigenvalues,
+        eigenvalue_bias=bias[2 * period :],
+        returns=candidate.returns,
+        quality=_quality(scaled, candidate, estimate),
+        cycle=cycle,
+        equilibrium=equilibrium,
+        synthetic=section.synthetic,
+    )
+
+
+def _begun_at(estimate: Estimate, order: np.ndarray) -> Estimate:
+    """Return the estimate with the orbit's points in another cyclic order."""
+    size = 2 * len(order)
+    index = np.concatenate([(2 * order[:, None] + np.arange(2)).ravel(), [size, size + 1]])
+    return replace(
+        estimate,
+        points=estimate.points[order],
+        covariance=estimate.covariance[np.ix_(index, index)],
+        bias=estimate.bias[index],
+    )
+
+
+def _quality(scaled: _Scaled, candidate: Candidate, estimate: Estimate) -> float:
+    """Return the p-value of the closest return under the linearised maps along the orbit."""
+    period = len(estimate.points)
+    maps = scaled.maps
+    steps = np.arange(candidate.closest, candidate.closest + period + 1)
+    away = maps.wrap(scaled.points[steps] - np.take(estimate.points, np.arange(period + 1), 0, mode="wrap"))
+    fit = maps.fit(estimate.points, _search_count(maps, 32), SEARCH_DEGREE, influence=False)
+    expected = np.einsum("pij,pj->pi", fit.jacobian, away[:-1])
+    expected += 0.5 * np.einsum("pijk,pj,pk->pi", fit.hessian, away[:-1], away[:-1])
+    variance = maps.rest(estimate.points, fit)
+    left = maps.wrap(away[1:] - expected)
+    return float(chi2.sf(np.sum(left**2 / variance), 2 * period))
+
+
+def _with_partners(orbits: list[Orbit], scaled: _Scaled) -> list[Orbit]:
+    """Return the orbits with the position of the one that has all signs changed."""
+    result = []
+    for orbit in orbits:
+        partner = None
+        closest = np.inf
+        for k, other in enumerate(orbits):
+            if other.period != orbit.period:
+                continue
+            distance, _ = shift_between(orbit.points / scaled.size, -other.points / scaled.size, scaled.maps.wrap)
+            sd = np.sqrt([np.diag(o.covariance).reshape(-1, 2).max(0) / scaled.size**2 for o in (orbit, other)]).max()
+            if distance < max(2e-3, 4.0 * sd) and distance < closest:
+                partner, closest = k, distance
+        result.append(replace(orbit, partner=partner))
+    return result
+
+
+def _named(orbits: list[Orbit]) -> list[Orbit]:
+    counts: dict[tuple[int, int | None], int] = {}
+    result = []
+    for orbit in orbits:
+        key = (orbit.period, orbit.winding)
+        counts[key] = counts.get(key, 0) + 1
+        winding = "" if orbit.winding is None else f", winding {orbit.winding}"
+        result.append(replace(orbit, name=f"period {orbit.period}{winding}, orbit {counts[key]}"))
+    return result
