@@ -56,6 +56,6 @@ def check_rate(name: str, other: str, time: np.ndarray, angle: np.ndarray, rate:
     for factor, unit in ((DEGREES, "degrees"), (1.0 / DEGREES, "radians and its rate in degrees per second")):
         if abs(ratio / factor - 1.0) < 0.1:
             raise ValueError(
-                f"outputs[{name!r}]: {ratio:.3g} times the integral of {other!r} is not allowed; the angle in {unit} is "
-                "suspected, radians and radians per second are needed."
+                f"outputs[{name!r}]: {ratio:.3g} times the integral of {other!r} is not allowed; the angle in {unit} "
+                "is suspected, radians and radians per second are needed."
             )

@@ -11,6 +11,8 @@ DEGREE = 3
 # A wider neighbourhood is taken as long as its fit agrees with those of the narrower ones within so many of their sds.
 AGREEMENT = 1.5
 SIZES = 7
+# Of the smallest neighbourhood's bandwidth, in standard deviations of the noise.
+ROOM = 2.5
 STEPS = 12
 CONVERGED = 1e-6
 # Bias grows with the third power of the bandwidth in slopes and with the fourth in points.
@@ -97,21 +99,25 @@ def _counts(maps: LocalMaps, points: np.ndarray, neighbours: int) -> np.ndarray:
     most = len(maps.arguments) // 8
     sizes = [n for n in (int(2.25 * neighbours) * 2**k for k in range(SIZES)) if n <= most] or [most]
     fits = [maps.fit(points, n, DEGREE) for n in sizes]
-    middle = np.median([fit.jacobian for fit in fits], axis=0)
-    right, left = directions(middle, 0)
-    slopes, sds = [], []
-    for fit in fits:
-        slopes.append(np.einsum("pi,pij,pj->p", np.roll(left, -1, axis=0), fit.jacobian, right).real)
-        each = np.einsum("pi,pnji,pj->pn", np.roll(left, -1, axis=0), fit.influence[:, :, 1:3], right).real
-        sds.append(np.sqrt((each**2).sum(1)))
-    chosen = np.zeros(len(points), dtype=int)
-    for j in range(len(points)):
-        for k in range(1, len(sizes)):
-            agrees = all(abs(slopes[k][j] - slopes[i][j]) <= AGREEMENT * sds[i][j] for i in range(k))
-            if not agrees:
+    roomy = np.array([fit.bandwidth >= ROOM * maps.noise.max() for fit in fits])
+    roomy[-1] = True
+    smallest = np.argmax(roomy, axis=0)
+    start = np.array([fits[k].jacobian[j] for j, k in enumerate(smallest)])
+    right, left = directions(start, 0)
+    left = np.roll(left, -1, axis=0)
+    slopes = np.array([np.einsum("pi,pij,pj->p", left, fit.jacobian, right).real for fit in fits])
+    sds = np.array(
+        [np.sqrt((np.einsum("pi,pnji,pj->pn", left, fit.influence[:, :, 1:3], right).real ** 2).sum(1)) for fit in fits]
+    )
+    chosen = []
+    for j, first in enumerate(smallest):
+        best = first
+        for k in range(first + 1, len(sizes)):
+            if np.any(np.abs(slopes[k, j] - slopes[first:k, j]) > AGREEMENT * sds[first:k, j]):
                 break
-            chosen[j] = k
-    return np.array([max(sizes[k] // 2, sizes[0]) for k in chosen])
+            best = k
+        chosen.append(sizes[max(best - 1, first)])
+    return np.array(chosen)
 
 
 def directions(jacobian: np.ndarray, which: int) -> tuple[np.ndarray, np.ndarray]:

@@ -68,7 +68,7 @@ class PoincareSection(Result):
         origin: float = 0.0,
         angles: Iterable[str] = (),
     ) -> "PoincareSection":
-        """Look at a recording once a forcing period, at tau = 0, 1, 2, …
+        """Look at a recording once a forcing period, at whole tau.
 
         Between and, with noise, across the samples a local polynomial is taken, as wide as the signal allows without
         bias, so that a dense recording gives points with less noise than a sample.

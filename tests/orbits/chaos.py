@@ -1,4 +1,4 @@
-"""The chaotic pendulum at 9.09 rad/s as a recording, by a fixed-step Runge-Kutta method that shares nothing with the package."""
+"""The chaotic pendulum at 9.09 rad/s, recorded; its Runge-Kutta method shares nothing with the package."""
 
 from functools import cache
 
