@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ def with_noise(recording: bp.Recording, fraction: float, seed: int) -> bp.Record
         name: values + fraction * SIZE[name] * generator.standard_normal(values.size)
         for name, values in recording.outputs.items()
     }
-    return bp.Recording.from_arrays(recording.time, outputs, name=recording.name)
+    return replace(recording, outputs=outputs)
 
 
 def read(path: Path) -> tuple[bp.Recording, dict[str, Any]]:
