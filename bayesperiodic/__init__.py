@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from bayesperiodic.orbits.orbit import Orbit, Orbits
     from bayesperiodic.orbits.polish import polish_orbits
     from bayesperiodic.orbits.section import PoincareSection
+    from bayesperiodic.orbits.selection import select_orbits
     from bayesperiodic.periodic.continuation import Branch, continue_periodic, double_period, iterate_periodic
     from bayesperiodic.periodic.schemes import Scheme
     from bayesperiodic.periodic.solution import PeriodicSolution
@@ -83,6 +84,7 @@ _HOMES = {
     "bayesperiodic.orbits.orbit": ["Orbit", "Orbits"],
     "bayesperiodic.orbits.polish": ["polish_orbits"],
     "bayesperiodic.orbits.section": ["PoincareSection"],
+    "bayesperiodic.orbits.selection": ["select_orbits"],
     "bayesperiodic.periodic.continuation": ["Branch", "continue_periodic", "double_period", "iterate_periodic"],
     "bayesperiodic.periodic.schemes": ["Scheme"],
     "bayesperiodic.periodic.solution": ["PeriodicSolution"],
@@ -99,13 +101,12 @@ _MODULES = {
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [  # noqa: PLE0604
-    "Branch", "Comparison", "Experiment", "HalfNormal", "Identifiability", "InverseGamma", "LogNormal",
-    "LogUniform", "MapEstimate", "Model", "MultivariateNormal", "Normal", "Orbit", "Orbits", "PeriodicSolution",
-    "PoincareSection", "Posterior", "Prediction", "PriorPredictive", "Problem", "Profile", "Recording", "Scheme",
-    "Structure", "StudentT", "TruncatedNormal", "Uniform", "compare", "continue_periodic", "double_period",
-    "find_orbits", "identifiability", "iterate_periodic", "load", "map_estimate", "models",
-    "multiplier_sensitivities", "noise", "plot", "polish_orbits", "predict", "prior_predictive", "profile", "sample",
-    "simulate",
+    "Branch", "Comparison", "Experiment", "HalfNormal", "Identifiability", "InverseGamma", "LogNormal", "LogUniform",
+    "MapEstimate", "Model", "MultivariateNormal", "Normal", "Orbit", "Orbits", "PeriodicSolution", "PoincareSection",
+    "Posterior", "Prediction", "PriorPredictive", "Problem", "Profile", "Recording", "Scheme", "Structure",
+    "StudentT", "TruncatedNormal", "Uniform", "compare", "continue_periodic", "double_period", "find_orbits",
+    "identifiability", "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "noise",
+    "plot", "polish_orbits", "predict", "prior_predictive", "profile", "sample", "select_orbits", "simulate",
     "smooth_abs", "smooth_sign", "solve_periodic", "structure",
 ]  # fmt: skip
 

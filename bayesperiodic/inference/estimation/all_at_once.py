@@ -1,9 +1,10 @@
 """Orbits and parameters found together: a start for the estimator where the start's own orbits are far or do not exist.
 
-From measured orbits the equations of motion need not hold until the end. Each iteration linearises g(z, θ) = 0 at the
-present orbit z of every experiment and at θ, z and θ no solution of each other, and takes the Gauss-Newton step of all
-unknowns; its orbits are eliminated, as dz = −g_z⁻¹ (g + g_θ dθ) ([1]_). Every orbit is led from the measured one by steps
-over which the equations are nearly linear, so none is lost, and none turns into another on the way.
+With measured orbits the equations of motion need not hold until the end. First θ is moved to where they hold best along
+the measured orbits. Then each iteration linearises g(z, θ) = 0 at the present orbit z of every experiment and at θ,
+which do not solve it yet, and takes the Gauss-Newton step of all unknowns; the orbits are eliminated, as
+dz = −g_z⁻¹ (g + g_θ dθ) ([1]_). Every orbit is led from the measured one by steps over which the equations are nearly
+linear, so none is lost, and none turns into another on the way.
 
 References
 ----------
@@ -12,6 +13,7 @@ References
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,16 +57,26 @@ class Linear:
     changes: list[np.ndarray]
 
 
-def all_at_once(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, dict[str, dict[str, np.ndarray]]] | None:
-    """Return θ (names,) and the states of every experiment near the MAP point; None if there is no way to it.
+class Together(NamedTuple):
+    """What was found: θ (names,), the states of every experiment, and which experiment stood in the way, if any.
 
-    The way starts at a θ and at the experiments' own guesses, which all must have. Multipliers are not looked at, and
-    positive parameters move in their logarithms.
+    Without states θ is where the way ended.
+    """
+
+    theta: np.ndarray
+    states: dict[str, dict[str, np.ndarray]]
+    blocked: str
+
+
+def all_at_once(problem: Problem, theta: np.ndarray) -> Together | None:
+    """Return θ and orbits near the MAP point; None where the model is autonomous or an experiment has no guess.
+
+    The way starts at a θ and at the experiments' own guesses. Multipliers are not looked at, and positive parameters
+    move in their logarithms.
 
     Parameters
     ----------
     problem : Problem
-        Of a forced model.
     theta : array (names,)
     """
     if problem.model.autonomous or not all(e.guess for e in problem.experiments):
@@ -91,7 +103,7 @@ class _Together:
 
     def fitting(self, theta: np.ndarray) -> np.ndarray:
         """Return the θ near which the equations hold best along the experiments' guesses, by damped Gauss-Newton."""
-        prior, now = self.problem.joint_prior, self._misfit(theta)
+        now = self._misfit(theta)
         for _ in range(MAX_ITERATIONS):
             total, count = 0.0, 0
             hessian, gradient = np.zeros((theta.size, theta.size)), np.zeros(theta.size)
@@ -135,23 +147,26 @@ class _Together:
     def _there(self, theta: np.ndarray, step: np.ndarray) -> np.ndarray:
         return np.where(self.logarithmic, theta * np.exp(step * self.logarithmic), theta + step)
 
-    def iterate(self, theta: np.ndarray) -> tuple[np.ndarray, dict[str, dict[str, np.ndarray]]] | None:
+    def iterate(self, theta: np.ndarray) -> Together:
+        """Return where the Gauss-Newton iteration in orbits and θ leads to from the guesses and a θ."""
         orbits, noise = self.guess, self.likelihood.guess()
         for _ in range(MAX_ITERATIONS):
-            linear = {name: self._linearise(name, z, theta) for name, z in orbits.items()}
-            found = {name: one for name, one in linear.items() if one is not None}
-            if len(found) < len(linear):
-                return None
-            noise = estimate_noise(self.likelihood, [r for one in found.values() for r in one.residuals], noise, 1.0)
-            step, size = self._step(*self._information(found, noise), theta)
-            off = max(_size(one.correction, orbits[name]) for name, one in found.items())
-            if off < ON_ORBIT and size < SMALL_STEP:
-                return theta, {name: self._states(name, z) for name, z in orbits.items()}
-            moved = self._moved(found, orbits, theta, step)
-            if moved is None:
-                return None
-            theta, orbits = moved
-        return None
+            linear = {}
+            for name, z in orbits.items():
+                one = self._linearise(name, z, theta)
+                if one is None:
+                    return Together(theta, {}, name)
+                linear[name] = one
+            noise = estimate_noise(self.likelihood, [r for one in linear.values() for r in one.residuals], noise, 1.0)
+            step, size = self._step(*self._information(linear, noise), theta)
+            off = {name: _size(one.correction, orbits[name]) for name, one in linear.items()}
+            worst = max(off, key=lambda name: off[name])
+            if off[worst] < ON_ORBIT and size < SMALL_STEP:
+                return Together(theta, {name: self._states(name, z) for name, z in orbits.items()}, "")
+            theta, orbits, blocked = self._moved(linear, orbits, theta, step)
+            if blocked:
+                return Together(theta, {}, blocked)
+        return Together(theta, {}, worst)
 
     def _linearise(self, name: str, z: np.ndarray, theta: np.ndarray) -> Linear | None:
         """Return one experiment's equations linearised at an orbit and θ; None where ∂g/∂z is singular."""
@@ -197,22 +212,24 @@ class _Together:
 
     def _moved(
         self, linear: dict[str, Linear], orbits: dict[str, np.ndarray], theta: np.ndarray, step: np.ndarray
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
-        """Return θ and the orbits a step further, shortened until all equations are nearly linear over it."""
-        share = 1.0
+    ) -> tuple[np.ndarray, dict[str, np.ndarray], str]:
+        """Return θ and the orbits a step further, so short that all equations are nearly linear; or what forbids it."""
+        share, blocked = 1.0, next(iter(orbits))
         while share > SMALLEST_SHARE:
             there = self._there(theta, share * step)
-            result = {}
-            if np.isfinite(self.problem.log_prior(there)):
-                for name, one in linear.items():
-                    z = self._orbit_moved(name, one, orbits[name], there - theta, there, share)
-                    if z is None:
-                        break
-                    result[name] = z
-            if len(result) == len(linear):
-                return there, result
             share *= 0.5
-        return None
+            if not np.isfinite(self.problem.log_prior(there)):
+                continue
+            moved: dict[str, np.ndarray] = {}
+            for name, one in linear.items():
+                z = self._orbit_moved(name, one, orbits[name], there - theta, there, 2.0 * share)
+                if z is None:
+                    blocked = name
+                    break
+                moved[name] = z
+            else:
+                return there, moved, ""
+        return theta, orbits, blocked
 
     def _orbit_moved(
         self, name: str, linear: Linear, z: np.ndarray, change: np.ndarray, there: np.ndarray, share: float

@@ -115,12 +115,13 @@ def _first_iterate(objective: Objective, theta: np.ndarray) -> Iterate | None:
         return None
     problem = objective.problem
     together = all_at_once(problem, theta)
-    if together is not None:
-        there, states = together
-        near = problem.anchored(there, states).linearised(there)
-        iterate = objective.at(there, near, problem.likelihood.guess())
+    if together is not None and together.states:
+        near = problem.anchored(together.theta, together.states).linearised(together.theta)
+        iterate = objective.at(together.theta, near, problem.likelihood.guess())
         if iterate is not None:
-            return Iterate(there, near, iterate.noise, iterate.objective)
+            return Iterate(together.theta, near, iterate.noise, iterate.objective)
+    if together is not None and all(e.mask is not None for e in problem.experiments):
+        return None
     near = problem.linearised(theta)
     iterate = objective.at(theta, near, problem.likelihood.guess())
     return iterate and Iterate(theta, near, iterate.noise, iterate.objective)
@@ -269,7 +270,17 @@ def _not_finite(problem: Problem, theta: np.ndarray) -> str:
             f"start: {excluded} is not allowed; the log-posterior is not finite there, the prior's support is "
             f"({low:g}, {high:g})."
         )
-    statuses = {name: s for name, s in problem.linearised(theta).statuses.items() if s != "converged"}
+    together = all_at_once(problem, theta)
+    if together is not None and together.blocked:
+        return (
+            f"start: {values} is not allowed; {together.blocked!r} cannot be followed from its guess to parameters at "
+            "which the other experiments' orbits are. Leave it out if it may be none, or start elsewhere."
+        )
+    if together is not None and together.states:
+        near = problem.anchored(together.theta, together.states).linearised(together.theta)
+    else:
+        near = problem.linearised(theta)
+    statuses = {name: s for name, s in near.statuses.items() if s != "converged"}
     return (
         f"start: {values} is not allowed; the log-posterior is not finite there, the periodic solve ended with "
         f"{statuses}. Start elsewhere."
