@@ -31,7 +31,8 @@ def polish_orbits(
     model integrated over one forcing period from each of them, for the winding numbers that this leaves open. A
     solution that repeats itself is brought to its prime period, and the measured points with it. It is accepted if
     every section point lies within five standard errors of the measured one: the covariance of the points, the floor
-    `tolerance` and the doubt about the parameters taken together. Of several on one orbit (cyclic shifts included) the
+    `tolerance` and the doubt about the parameters taken together, and if its unstable multiplier has the sign of the
+    measured eigenvalue, where that is known to 30 %. Of several on one orbit (cyclic shifts included) the
     one with the most returns is kept. An orbit and its mirror image under the change of all signs are two orbits, whose
     noise is independent; they know each other as partners.
 

@@ -19,6 +19,7 @@ from bayesperiodic.periodic.solution import describe
 from bayesperiodic.periodic.solve import solve_forced
 
 MOST_ERRORS = 5.0
+SURE, REAL = 0.3, 1e-6
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,8 @@ class Polisher:
         solution = describe(equations, self.theta, solved._replace(code=CONVERGED), found_by)
         if not solution.converged:
             return orbit, f"the periodic solve ended with {solution.status!r}"
+        if times % 2 == 0:
+            orbit = replace(orbit, eigenvalues=np.copysign(np.abs(orbit.eigenvalues), solution.multipliers.real))
         orbit = replace(orbit, winding=winding, solution=solution, equilibrium=still)
         return orbit, self._elsewhere(orbit)
 
@@ -136,9 +139,23 @@ class Polisher:
         off = np.abs(differences(own, orbit.points, self.angles)) / np.sqrt(variance)
         at, coordinate = np.unravel_index(int(np.argmax(off)), off.shape)
         if off.max() <= MOST_ERRORS:
-            return ""
+            return self._flipped(orbit)
         kind = "a state of rest" if orbit.equilibrium else f"another orbit of period {orbit.period}"
         return (
             f"the solve landed on {kind}: {orbit.coordinates[coordinate]!r} at point {at} is {off.max():.3g} standard "
             "errors from the measured one"
         )
+
+    def _flipped(self, orbit: Orbit) -> str:
+        """Return that the solution's multiplier has another sign than the measured one; nothing where it has not.
+
+        The sign of a multiplier above 1 cannot change while an orbit is followed in the parameters.
+        """
+        assert orbit.solution is not None
+        measured, own = orbit.eigenvalues[0], orbit.solution.multipliers[0]
+        sd = np.sqrt(orbit.joint_covariance[orbit.points.size, orbit.points.size])
+        both_real = max(abs(np.angle(value**2)) for value in (measured, own)) < REAL
+        sure = both_real and sd < SURE and min(abs(measured), abs(own)) > 1.0
+        if not sure or measured.real * own.real > 0.0:
+            return ""
+        return f"the solve landed on another orbit, of multiplier {own.real:.4g} where {measured.real:.4g} was measured"

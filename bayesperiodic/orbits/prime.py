@@ -12,7 +12,7 @@ def once_round(orbit: Orbit, times: int, angles: np.ndarray) -> Orbit:
     """Return an orbit that goes `times` round within its period as one of its prime period.
 
     Points are averaged, log|eigenvalue| is divided by `times`, and the covariance follows. An even number of times
-    leaves the signs of the eigenvalues open; they are given as positive.
+    leaves the signs of the eigenvalues open; the moduli are given.
 
     Parameters
     ----------
