@@ -11,6 +11,8 @@ from scipy.integrate import solve_ivp
 TURN = 2 * np.pi
 ITERATIONS = 12
 TOLERANCE = 1e-12
+# Newton's last step: the error after it is of the order of its square.
+SMALL, LOST = 1e-6, 1e3
 
 
 class Shot(NamedTuple):
@@ -40,27 +42,18 @@ def shoot(parameters: Mapping[str, float], omega: float, points: np.ndarray) -> 
 
     The turns of each segment are those that its first integration needs.
     """
-    states = np.array(points, dtype=float)
-    period, turns, size = len(states), None, np.inf
+    states, size = np.array(points, dtype=float), np.inf
+    ends, transfers = _advance(parameters, omega, states)
+    turns = np.round((ends[:, 0] - np.roll(states[:, 0], -1)) / TURN)
     for _ in range(ITERATIONS):
-        ends, transfers = _advance(parameters, omega, states)
-        following = np.roll(states, -1, axis=0)
-        if turns is None:
-            turns = np.round((ends[:, 0] - following[:, 0]) / TURN)
-        gap = following - ends
-        gap[:, 0] += TURN * turns
-        if size < 1e-9:
-            break
-        matrix = np.zeros((2 * period, 2 * period))
-        for k in range(period):
-            rows, after = slice(2 * k, 2 * k + 2), 2 * ((k + 1) % period)
-            matrix[rows, rows] += transfers[k]
-            matrix[rows, after : after + 2] -= np.eye(2)
-        step = np.linalg.solve(matrix, gap.ravel()).reshape(-1, 2)
+        step = _newton_step(states, ends, transfers, turns)
         size = float(np.abs(step).max())
-        if not size < 1e3:
+        if not size < LOST:
             break
         states += step
+        if size < SMALL:
+            break
+        ends, transfers = _advance(parameters, omega, states)
     product = np.eye(2)
     for transfer in transfers:
         product = transfer @ product
@@ -68,7 +61,19 @@ def shoot(parameters: Mapping[str, float], omega: float, points: np.ndarray) -> 
     multipliers = multipliers[np.argsort(-np.abs(multipliers))]
     wrapped = states.copy()
     wrapped[:, 0] = -((-wrapped[:, 0] + np.pi) % TURN - np.pi)
-    return Shot(wrapped, int(np.sum(turns)), multipliers, _prime(wrapped), size < 1e-9)
+    return Shot(wrapped, int(turns.sum()), multipliers, _prime(wrapped), size < SMALL)
+
+
+def _newton_step(states: np.ndarray, ends: np.ndarray, transfers: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    period = len(states)
+    gap = np.roll(states, -1, axis=0) - ends
+    gap[:, 0] += TURN * turns
+    matrix = np.zeros((2 * period, 2 * period))
+    for k in range(period):
+        rows, after = slice(2 * k, 2 * k + 2), 2 * ((k + 1) % period)
+        matrix[rows, rows] += transfers[k]
+        matrix[rows, after : after + 2] -= np.eye(2)
+    return np.linalg.solve(matrix, gap.ravel()).reshape(-1, 2)
 
 
 def distance(one: np.ndarray, other: np.ndarray) -> float:

@@ -1,7 +1,7 @@
 """Poincaré sections, and the periodic orbits found in them."""
 
 from collections.abc import Mapping, Sequence
-from typing import cast
+from typing import Any, cast
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -58,12 +58,12 @@ def section(
         ax = (figure or plt.figure(figsize=(7.0, 5.2), layout="constrained")).add_subplot()
     every = 1 + len(section.points) // MOST_POINTS
     shown = section.points[::every]
-    name = "section" if every == 1 else f"section, every {every}th point"
+    name = "section" if every == 1 else f"section, one point in {every}"
     ax.plot(*shown.T, ",", color="0.65", rasterized=True, zorder=1)
     handles = [plt.Line2D([], [], marker=".", ls="", color="0.65", label=f"{name} ({len(shown)})")]
     for rank, period in enumerate(sorted({orbit.period for orbit in orbits})):
         members = [orbit for orbit in orbits if orbit.period == period]
-        style = {"marker": MARKERS[rank % len(MARKERS)], "color": ENSEMBLES[rank % len(ENSEMBLES)], "ls": "", "ms": 5}
+        style: dict[str, Any] = {"marker": MARKERS[rank % len(MARKERS)], "color": ENSEMBLES[rank % len(ENSEMBLES)], "ls": "", "ms": 5}
         points = np.concatenate([orbit.points for orbit in members])
         ax.plot(*points.T, mec="black", mew=0.5, zorder=3, **style)
         noun = "orbit" if len(members) == 1 else "orbits"
@@ -124,7 +124,8 @@ def orbits(
 def _portrait(ax: Axes, orbit: Orbit) -> None:
     for signals, style in _cycles(orbit):
         x, y = (_wrapped(signals[c]) if c in orbit.angles else signals[c] for c in orbit.coordinates)
-        jump = np.flatnonzero(np.abs(np.diff(x)) > np.pi) + 1 if orbit.coordinates[0] in orbit.angles else []
+        # An angle that passes ±π jumps; nothing else moves by half its range between samples.
+        jump = np.flatnonzero(np.abs(np.diff(x)) > np.pi) + 1 if orbit.angles else np.empty(0, dtype=int)
         ax.plot(np.insert(x, jump, np.nan), np.insert(y, jump, np.nan), **style)
     ax.plot(*orbit.points.T, "o", color=ENSEMBLES[1], mec="black", mew=0.6, ms=4.5, zorder=4)
     turns = "" if orbit.winding is None else f", winding {orbit.winding}"
