@@ -9,15 +9,16 @@ from bayesperiodic.orbits.local import LocalFit, LocalMaps
 
 DEGREE = 3
 # A wider neighbourhood is taken as long as its fit agrees with those of the narrower ones within so many of their sds.
-AGREEMENT = 1.5
-SIZES = 7
+AGREEMENT = 2.5
+SIZES = 6
 # Of the smallest neighbourhood's bandwidth, in standard deviations of the noise.
 ROOM = 2.5
 STEPS = 12
 CONVERGED = 1e-6
-# Bias grows with the third power of the bandwidth in slopes and with the fourth in points.
+# Bias grows with the third power of the bandwidth in slopes, so that twice the neighbours differ by this much of it.
 SLOPE_GROWTH = 2.0**1.5 - 1.0
-POINT_GROWTH = 2.0**2 - 1.0
+# Measured: of the difference of the points two thirds come back as error, not the third that theory has.
+POINT_GROWTH = 1.5
 
 
 @dataclass(frozen=True)
@@ -105,19 +106,25 @@ def _counts(maps: LocalMaps, points: np.ndarray, neighbours: int) -> np.ndarray:
     start = np.array([fits[k].jacobian[j] for j, k in enumerate(smallest)])
     right, left = directions(start, 0)
     left = np.roll(left, -1, axis=0)
-    slopes = np.array([np.einsum("pi,pij,pj->p", left, fit.jacobian, right).real for fit in fits])
-    sds = np.array(
-        [np.sqrt((np.einsum("pi,pnji,pj->pn", left, fit.influence[:, :, 1:3], right).real ** 2).sum(1)) for fit in fits]
-    )
+    targets, sds = zip(*(_along(fit, left, right) for fit in fits), strict=True)
+    targets, sds = np.array(targets), np.array(sds)
     chosen = []
     for j, first in enumerate(smallest):
         best = first
         for k in range(first + 1, len(sizes)):
-            if np.any(np.abs(slopes[k, j] - slopes[first:k, j]) > AGREEMENT * sds[first:k, j]):
+            if np.any(np.abs(targets[k, j] - targets[first:k, j]) > AGREEMENT * sds[first:k, j]):
                 break
             best = k
         chosen.append(sizes[max(best - 1, first)])
     return np.array(chosen)
+
+
+def _along(fit: LocalFit, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the slope along the orbit's direction and the two values of each fit, and their standard deviations."""
+    slope = np.einsum("pi,pij,pj->p", left, fit.jacobian, right).real
+    slopes = np.einsum("pi,pnji,pj->pn", left, fit.influence[:, :, 1:3], right).real
+    sd = np.sqrt(np.concatenate([(slopes**2).sum(1)[:, None], (fit.influence[:, :, 0] ** 2).sum(1)], axis=1))
+    return np.concatenate([slope[:, None], fit.value], axis=1), sd
 
 
 def directions(jacobian: np.ndarray, which: int) -> tuple[np.ndarray, np.ndarray]:

@@ -22,6 +22,8 @@ SEARCH_DEGREE = 2
 SEARCH_WIDTH = 5.0
 # Beyond, a point with this standard deviation is nowhere in particular; in units of the attractor's size.
 LARGEST_SD = 0.02
+# Beyond, the delta method says nothing of an eigenvalue.
+LARGEST_LOGARITHM_SD = 0.5
 STILL = 0.02
 
 
@@ -113,10 +115,10 @@ def _orbit(section: PoincareSection, scaled: _Scaled, candidate: Candidate, esti
     units = np.concatenate([np.tile(scaled.size, period), np.ones(2)])
     bias = estimate.bias * units
     covariance = estimate.covariance * np.outer(units, units)
-    covariance[: 2 * period, : 2 * period] += np.outer(bias[: 2 * period], bias[: 2 * period])
     sd = np.sqrt(np.diag(covariance))
+    covariance += np.outer(bias, bias)
     for k in (2 * period, 2 * period + 1):
-        if not (abs(bias[k]) <= sd[k] and sd[k] < 0.5):
+        if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
     equilibrium = False

@@ -85,22 +85,20 @@ def _fit(
     """Return estimates, their variance for unit noise, and the residual variance, from 2·half samples each."""
     count = 2 * half
     first = np.clip(np.searchsorted(time, at) - half, 0, time.size - count)
+    centre = np.polynomial.legendre.legvander(np.zeros(1), degree)[0]
+    free = max(count - degree - 1, 1)
     values, gains, rests = [], [], []
     for k in range(0, len(at), BLOCK):
         index = first[k : k + BLOCK, None] + np.arange(count)
         width = 0.5 * (time[index[:, -1]] - time[index[:, 0]])
         basis = np.polynomial.legendre.legvander((time[index] - at[k : k + BLOCK, None]) / width[:, None], degree)
-        centre = np.polynomial.legendre.legvander(np.zeros(1), degree)[0]
-        weights = centre @ np.linalg.pinv(basis)
+        normal = basis.transpose(0, 2, 1) @ basis
         local = signals[index]
-        reference = local[:, half : half + 1]
-        values.append(reference[:, 0] + np.einsum("mn,mnc->mc", weights, local - reference))
-        gains.append((weights**2).sum(1))
-        free = count - degree - 1
-        if free > 0:
-            q, _ = np.linalg.qr(basis)
-            rest = (local - reference) - q @ (q.transpose(0, 2, 1) @ (local - reference))
-            rests.append((rest**2).sum(1) / free)
-        else:
-            rests.append(np.zeros((len(index), signals.shape[1])))
+        reference = local[:, half]
+        local = local - reference[:, None]
+        weights = basis @ np.linalg.solve(normal, np.broadcast_to(centre[:, None], (len(index), degree + 1, 1)))
+        values.append(reference + (weights.transpose(0, 2, 1) @ local)[:, 0])
+        gains.append((weights[..., 0] ** 2).sum(1))
+        rest = local - basis @ np.linalg.solve(normal, basis.transpose(0, 2, 1) @ local)
+        rests.append((rest**2).sum(1) / free)
     return np.concatenate(values), np.concatenate(gains), np.concatenate(rests)

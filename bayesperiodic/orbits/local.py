@@ -13,6 +13,7 @@ TERMS = {1: 3, 2: 6, 3: 10}
 REACH = 3.0
 # Of a bandwidth: with more noise than that, deconvolution leaves nothing to fit to.
 MOST_NOISE = 0.75
+MOST_LEVERAGE = 0.9
 BLOCK = 4_000_000
 
 
@@ -150,8 +151,9 @@ class LocalMaps:
             # What each neighbour leaves over in the normal equations, at the solution.
             product = weighted[..., sums[..., 0]] * moments[1][..., sums[..., 1]]
             residual = regressors[..., None] * image[:, :, None] - product @ solution[:, None]
-            room = np.sqrt(effective / np.maximum(effective - len(powers), 1.0))
-            influence = (inverse[:, None] @ residual) * (scale * room[:, None, None])[:, None]
+            # A neighbour with leverage draws the fit to itself; what it would leave without that is more.
+            leverage = np.clip(np.einsum("mab,mnab->mn", inverse, product), 0.0, MOST_LEVERAGE)
+            influence = (inverse[:, None] @ residual) * scale[:, None] / (1.0 - leverage)[..., None, None]
         derivatives = solution * scale
         value = centres + reference[:, 0] + derivatives[:, 0]
         return LocalFit(value, derivatives, bandwidth, index, influence, effective)
