@@ -35,8 +35,6 @@ class Estimate:
         Estimated.
     turns : float
         Turns of the angle, from the fits.
-    moved : float
-        Farthest that a point moved from the candidate's.
     """
 
     points: np.ndarray
@@ -44,7 +42,6 @@ class Estimate:
     covariance: np.ndarray
     bias: np.ndarray
     turns: float
-    moved: float
 
 
 def refine(maps: LocalMaps, points: np.ndarray, neighbours: int) -> Estimate | None:
@@ -70,10 +67,9 @@ def refine(maps: LocalMaps, points: np.ndarray, neighbours: int) -> Estimate | N
     return Estimate(
         maps.wrap(cycle),
         values,
-        _covariance(cycle, fits, jacobian),
+        joint_covariance(fits, cycle),
         np.concatenate([point_bias, slope_bias]),
         float(np.sum(run[np.isfinite(maps.turn)]) / turn[0]) if turn.size else 0.0,
-        float(np.abs(maps.wrap(cycle - points)).max()),
     )
 
 
@@ -138,13 +134,14 @@ def directions(jacobian: np.ndarray, which: int) -> tuple[np.ndarray, np.ndarray
     return np.array(right), np.array(left)
 
 
-def _covariance(cycle: np.ndarray, fits: list[LocalFit], jacobian: np.ndarray) -> np.ndarray:
+def joint_covariance(fits: list[LocalFit], cycle: np.ndarray) -> np.ndarray:
     """Return the joint covariance of the points and of log|eigenvalue|, by the delta method.
 
     A pair of points errs by its own noise and shares it with the pairs before and after it; so errors add up over the
     runs of consecutive pairs, and are independent from run to run.
     """
     p = len(cycle)
+    jacobian = np.concatenate([fit.jacobian for fit in fits])
     by_value = -np.linalg.inv(closing_matrix(jacobian[None])[0])
     by_slope = np.zeros((2, p, 2, 2))
     by_point = np.zeros((2, p, 2))

@@ -8,6 +8,7 @@ from scipy.stats import chi2
 
 from bayesperiodic import checks
 from bayesperiodic.orbits.angles import wrapped
+from bayesperiodic.orbits.boxes import box_orbits
 from bayesperiodic.orbits.chained import Estimate, refine
 from bayesperiodic.orbits.cycles import has_shorter_period, shift_between
 from bayesperiodic.orbits.local import REACH, LocalMaps
@@ -18,6 +19,8 @@ from bayesperiodic.orbits.section import PoincareSection
 
 METHODS = ("chained", "boxes")
 SEARCH_DEGREE = 2
+QUALITY_DEGREE = 3
+FEWEST_NEIGHBOURS = 32
 # Of a local fit in the search, in standard deviations of the noise.
 SEARCH_WIDTH = 5.0
 # Beyond, a point with this standard deviation is nowhere in particular; in units of the attractor's size.
@@ -50,20 +53,27 @@ def find_orbits(
     neighbours = checks.integer("neighbours", neighbours, 16)
     box = checks.positive("box", box)
     scaled = _scaled(section, neighbours)
-    count = _search_count(scaled.maps, neighbours)
     found: list[tuple[Candidate, Estimate]] = []
     for period in wanted:
-        first = len(found)
-        for candidate in candidates(scaled.maps, scaled.points, period, count, SEARCH_DEGREE):
-            estimate = refine(scaled.maps, candidate.points, neighbours)
-            if estimate is None or not _sound(scaled.maps, estimate):
-                continue
-            if any(_same(scaled.maps, estimate, other) for _, other in found[first:]):
-                continue
-            found.append((candidate, estimate))
+        if method == "boxes":
+            found += box_orbits(scaled.maps, scaled.points, period, neighbours, box)
+        else:
+            found += _chained(scaled, period, neighbours)
     orbits = [_orbit(section, scaled, candidate, estimate) for candidate, estimate in found]
     orbits = _named(_with_partners(orbits, scaled))
     return Orbits(tuple(orbits), values=section.values, method=method)
+
+
+def _chained(scaled: _Scaled, period: int, neighbours: int) -> list[tuple[Candidate, Estimate]]:
+    maps, found = scaled.maps, []
+    count = _search_count(maps, neighbours)
+    for candidate in candidates(maps, scaled.points, period, count, SEARCH_DEGREE):
+        estimate = refine(maps, candidate.points, neighbours)
+        if estimate is None or not _sound(maps, estimate):
+            continue
+        if not any(_same(maps, estimate, other) for _, other in found):
+            found.append((candidate, estimate))
+    return found
 
 
 def _scaled(section: PoincareSection, neighbours: int) -> _Scaled:
@@ -97,8 +107,6 @@ def _sound(maps: LocalMaps, estimate: Estimate) -> bool:
 
 
 def _same(maps: LocalMaps, one: Estimate, other: Estimate) -> bool:
-    if len(one.points) != len(other.points):
-        return False
     distance, _ = shift_between(one.points, other.points, maps.wrap)
     sd = np.sqrt(max(np.diag(e.covariance)[: one.points.size].max() for e in (one, other)))
     return distance < max(1e-3, 2.0 * float(sd))
@@ -163,17 +171,20 @@ def _begun_at(estimate: Estimate, order: np.ndarray) -> Estimate:
 
 
 def _quality(scaled: _Scaled, candidate: Candidate, estimate: Estimate) -> float:
-    """Return the p-value of the closest return under the linearised maps along the orbit."""
-    period = len(estimate.points)
-    maps = scaled.maps
-    steps = np.arange(candidate.closest, candidate.closest + period + 1)
+    """Return the p-value of the closest return under the maps along the orbit."""
+    maps, period = scaled.maps, len(estimate.points)
+    steps = candidate.closest + np.arange(period + 1)
     away = maps.wrap(scaled.points[steps] - np.take(estimate.points, np.arange(period + 1), 0, mode="wrap"))
-    fit = maps.fit(estimate.points, _search_count(maps, 32), SEARCH_DEGREE, influence=False)
-    expected = np.einsum("pij,pj->pi", fit.jacobian, away[:-1])
-    expected += 0.5 * np.einsum("pijk,pj,pk->pi", fit.hessian, away[:-1], away[:-1])
-    variance = maps.rest(estimate.points, fit)
-    left = maps.wrap(away[1:] - expected)
-    return float(chi2.sf(np.sum(left**2 / variance), 2 * period))
+    least = _search_count(maps, FEWEST_NEIGHBOURS)
+    statistic = 0.0
+    for point, here, there in zip(estimate.points, away[:-1], away[1:], strict=True):
+        count = least
+        while maps.nearest(point[None], count)[0][0, -1] < 1.5 * np.abs(here).max() and 4 * count < len(maps.arguments):
+            count *= 2
+        fit = maps.fit(point[None], count, QUALITY_DEGREE, influence=False)
+        left = maps.wrap(there - (maps.predict(fit, here[None])[0] - fit.value[0]))
+        statistic += float(np.sum(left**2 / maps.rest(point[None], fit)[0]))
+    return float(chi2.sf(statistic, 2 * period))
 
 
 def _with_partners(orbits: list[Orbit], scaled: _Scaled) -> list[Orbit]:
@@ -189,7 +200,9 @@ def _with_partners(orbits: list[Orbit], scaled: _Scaled) -> list[Orbit]:
             sd = np.sqrt([np.diag(o.covariance).reshape(-1, 2).max(0) / scaled.size**2 for o in (orbit, other)]).max()
             if distance < max(2e-3, 4.0 * sd) and distance < closest:
                 partner, closest = k, distance
-        result.append(replace(orbit, partner=partner))
+        # Points alone do not show whether there is motion between them.
+        rest = orbit.equilibrium or (orbit.cycle is None and orbit.period == 1 and partner == len(result))
+        result.append(replace(orbit, partner=partner, equilibrium=rest))
     return result
 
 

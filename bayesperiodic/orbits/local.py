@@ -115,16 +115,22 @@ class LocalMaps:
         parts = [self._fit(centres[k : k + rows], count, degree, influence) for k in range(0, len(centres), rows)]
         return LocalFit(*(np.concatenate([getattr(p, name) for p in parts]) for name in LocalFit.__dataclass_fields__))
 
+    @staticmethod
+    def predict(fit: LocalFit, away: np.ndarray) -> np.ndarray:
+        """Return images (m, …, 2) at distances (m, …, 2) from the centres."""
+        terms = fit.derivatives.shape[1]
+        monomials = np.stack([away[..., 0] ** a * away[..., 1] ** b for a, b in POWERS[1:terms]], axis=-1)
+        slopes = fit.derivatives[:, 1:] / FACTORIALS[1:terms, None]
+        shape = (len(away), *(1,) * (away.ndim - 2), 2)
+        return fit.value.reshape(shape) + np.einsum("m...t,mtc->m...c", monomials, slopes)
+
     def rest(self, centres: np.ndarray, fit: LocalFit) -> np.ndarray:
         """Return the variance (m, 2) that fits leave of their neighbours' images, with the fit's weights."""
         away = self.wrap(self.arguments[fit.index] - centres[:, None])
-        image = away + self.increments[fit.index] - (fit.value - centres)[:, None]
-        terms = fit.derivatives.shape[1]
-        monomials = np.stack([away[..., 0] ** a * away[..., 1] ** b for a, b in POWERS[1:terms]], axis=-1)
-        left = image - monomials @ (fit.derivatives[:, 1:] / FACTORIALS[1:terms, None])
+        left = away + self.increments[fit.index] + centres[:, None] - self.predict(fit, away)
         left = left if self.winds else self.wrap(left)
         weight = np.exp(-0.5 * np.sum(away**2, axis=-1) / fit.bandwidth[:, None] ** 2)
-        room = np.maximum(fit.effective - terms, 1.0) / fit.effective
+        room = np.maximum(fit.effective - fit.derivatives.shape[1], 1.0) / fit.effective
         return np.einsum("mn,mnc->mc", weight, left**2) / weight.sum(1)[:, None] / room[:, None]
 
     def _fit(self, centres: np.ndarray, count: int, degree: int, wants_influence: bool) -> LocalFit:
