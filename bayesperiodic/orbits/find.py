@@ -11,6 +11,7 @@ from bayesperiodic.orbits.angles import wrapped
 from bayesperiodic.orbits.boxes import box_orbits
 from bayesperiodic.orbits.chained import Estimate, refine
 from bayesperiodic.orbits.cycles import has_shorter_period, shift_between
+from bayesperiodic.orbits.determinism import check_chaos
 from bayesperiodic.orbits.local import REACH, LocalMaps
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.scatter import noise_of
@@ -78,10 +79,13 @@ def _chained(scaled: _Scaled, period: int, neighbours: int) -> list[tuple[Candid
 
 def _scaled(section: PoincareSection, neighbours: int) -> _Scaled:
     size = np.ptp(section.points, axis=0)
+    if not np.all(size > 0.0):
+        raise ValueError("section: a motion of period 1 is not allowed; a coordinate is the same at all points.")
     turn = np.array([2.0 * np.pi if name in section.angles else np.inf for name in section.coordinates]) / size
     points = section.points / size
     noise = np.zeros(2) if section.noise is None else section.noise / size
     maps = LocalMaps(points[:-1], section.increments / size, turn, section.winds, noise)
+    check_chaos(maps, points)
     if section.noise is None:
         noise = noise_of(maps, neighbours)
         maps = LocalMaps(points[:-1], section.increments / size, turn, section.winds, noise)
