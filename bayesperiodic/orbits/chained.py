@@ -125,7 +125,8 @@ def _along(fit: LocalFit, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarr
 
 def directions(jacobian: np.ndarray, which: int) -> tuple[np.ndarray, np.ndarray]:
     """Return right and left eigenvectors (p, 2) of the chain begun at each of its points, largest eigenvalue first."""
-    right, left = [], []
+    right: list[np.ndarray] = []
+    left: list[np.ndarray] = []
     for j in range(len(jacobian)):
         whole = product(np.roll(jacobian, -j, axis=0))
         for matrix, vectors in ((whole, right), (whole.T, left)):

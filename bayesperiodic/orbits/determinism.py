@@ -39,8 +39,9 @@ def check_chaos(maps: LocalMaps, section: np.ndarray) -> None:
     images = _distance(maps, section[centre + 1], section[neighbour + 1])
     if np.median(images) > UNPREDICTED * apart:
         raise ValueError(
-            f"section: images of neighbouring points {np.median(images) / apart:.0%} as far apart as any two points are "
-            "not allowed; no return map is to be seen. A wrong frequency, or noise as large as the motion, is suspected."
+            f"section: images of neighbouring points {np.median(images) / apart:.0%} as far apart as any two points "
+            "are not allowed; no return map is to be seen. A wrong frequency, or noise as large as the motion, is "
+            "suspected."
         )
     later = np.median(_distance(maps, section[centre + PARTING_STEPS], section[neighbour + PARTING_STEPS]))
     if later < PARTED * now:

@@ -28,7 +28,8 @@ SEARCH_WIDTH = 5.0
 LARGEST_SD = 0.02
 # Beyond, the delta method says nothing of an eigenvalue.
 LARGEST_LOGARITHM_SD = 0.5
-STILL = 0.02
+# A state of rest moves by less than this share of the whole motion, and some standard deviations of the noise.
+STILL, SPREAD = 0.02, 20.0
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,62 @@ def find_orbits(
     neighbours: int = 32,
     box: float = 0.01,
 ) -> Orbits:
-    """Find the periodic orbits in a section."""
-    wanted = sorted({checks.integer("periods", p, 1) for p in periods})
+    """Find the unstable periodic orbits in a section of a chaotic motion, without a model.
+
+    "chained": a motion that nearly comes back after p returns is near an orbit of period p. The return map is fitted
+    locally (quadratically) at its p points, and Newton's method moves all p points together until the chain of these
+    maps closes. The orbits that this leads to are fitted once more with cubic polynomials in neighbourhoods that are
+    as wide as the map's curvature allows; errors in the arguments do not bias these fits (deconvoluting kernels, see
+    `LocalMaps`). Eigenvalues are those of the chained slopes. Covariances are sandwich estimates over runs of
+    consecutive pairs, and hold the estimated bias.
+
+    "boxes": the recipe of [1]_ as a baseline: boxes of 1 % of the attractor, recurrence to the own or a neighbouring
+    box, and one linear fit of the map over the whole period, whose eigenvalues are biased where the noise or the
+    curvature is felt.
+
+    Parameters
+    ----------
+    section : PoincareSection
+    periods : iterable of int
+        Prime periods in returns.
+    method : {"chained", "boxes"}
+    neighbours : int
+        Fewest (effective) neighbours of a local fit, at least 16.
+    box : float
+        Size of a box for "boxes", as a fraction of the attractor's size.
+
+    Returns
+    -------
+    Orbits
+        In the order of period, then of search. States of rest are found like others and marked `equilibrium`. The
+        covariance of log|eigenvalue| is NaN ("not estimated") where the estimated bias exceeds the standard deviation,
+        or the latter 0.5.
+
+    Raises
+    ------
+    ValueError
+        For a section that is periodic, quasi-periodic or has no return map (which says which), for unknown methods,
+        for periods that are no whole numbers.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, in: D. H. van Campen (Ed.), Interaction between Dynamics and Control in Advanced
+       Mechanical Systems, Kluwer, 1997, 191-198; section 5.
+
+    Examples
+    --------
+    The Hénon map has one orbit of period 1 and one of period 2 on its attractor:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> x = np.zeros((2000, 2))
+    >>> for k in range(1999):
+    ...     x[k + 1] = 1 - 1.4 * x[k, 0] ** 2 + x[k, 1], 0.3 * x[k, 0]
+    >>> section = bp.PoincareSection.from_points(x[100:], ("x", "y"), frequency=1.0)
+    >>> [orbit.period for orbit in bp.find_orbits(section, periods=[1, 2, 3])]
+    [1, 2]
+    """
+    wanted = _periods(periods, len(section))
     checks.one_of("method", method, METHODS)
     neighbours = checks.integer("neighbours", neighbours, 16)
     box = checks.positive("box", box)
@@ -65,8 +120,22 @@ def find_orbits(
     return Orbits(tuple(orbits), values=section.values, method=method)
 
 
+def _periods(periods: Iterable[int], count: int) -> list[int]:
+    try:
+        wanted = sorted({checks.integer("periods", p, 1) for p in periods})
+    except TypeError:
+        raise ValueError(f"periods: {periods!r} is not allowed; it is a collection such as range(1, 6).") from None
+    if not wanted or wanted[-1] > count // 20:
+        raise ValueError(
+            f"periods: {wanted} is not allowed; one at least is needed and, with {count} points, none above "
+            f"{count // 20}."
+        )
+    return wanted
+
+
 def _chained(scaled: _Scaled, period: int, neighbours: int) -> list[tuple[Candidate, Estimate]]:
-    maps, found = scaled.maps, []
+    maps = scaled.maps
+    found: list[tuple[Candidate, Estimate]] = []
     count = _search_count(maps, neighbours)
     for candidate in candidates(maps, scaled.points, period, count, SEARCH_DEGREE):
         estimate = refine(maps, candidate.points, neighbours)
@@ -133,16 +202,10 @@ def _orbit(section: PoincareSection, scaled: _Scaled, candidate: Candidate, esti
         if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
-    equilibrium = False
-    if cycle is not None and section.signals is not None:
-        extent = np.ptp(section.signals, axis=0)
+    if cycle is not None:
         for k, name in enumerate(section.coordinates):
             if name in section.angles:
-                extent[k] = min(extent[k], 2.0 * np.pi)
-        equilibrium = all(
-            np.ptp(cycle[name]) < (STILL + 6.0 * n) * e
-            for name, e, n in zip(section.coordinates, extent, scaled.maps.noise, strict=True)
-        )
+                cycle[name] = cycle[name] + 2.0 * np.pi * np.round((points[0, k] - cycle[name][0]) / (2.0 * np.pi))
     return Orbit(
         name="",
         coordinates=section.coordinates,
@@ -157,9 +220,18 @@ def _orbit(section: PoincareSection, scaled: _Scaled, candidate: Candidate, esti
         returns=candidate.returns,
         quality=_quality(scaled, candidate, estimate),
         cycle=cycle,
-        equilibrium=equilibrium,
+        equilibrium=cycle is not None and _at_rest(section, scaled, cycle),
         synthetic=section.synthetic,
     )
+
+
+def _at_rest(section: PoincareSection, scaled: _Scaled, cycle: dict[str, np.ndarray]) -> bool:
+    """Return whether a measured cycle shows no motion but noise and the distance to the orbit."""
+    assert section.signals is not None
+    extent = np.ptp(section.signals, axis=0)
+    extent = np.where(np.isfinite(scaled.maps.turn), np.minimum(extent, 2.0 * np.pi), extent)
+    limit = (STILL + SPREAD * scaled.maps.noise) * extent
+    return all(np.ptp(cycle[name]) < limit[k] for k, name in enumerate(section.coordinates))
 
 
 def _begun_at(estimate: Estimate, order: np.ndarray) -> Estimate:
@@ -193,7 +265,7 @@ def _quality(scaled: _Scaled, candidate: Candidate, estimate: Estimate) -> float
 
 def _with_partners(orbits: list[Orbit], scaled: _Scaled) -> list[Orbit]:
     """Return the orbits with the position of the one that has all signs changed."""
-    result = []
+    result: list[Orbit] = []
     for orbit in orbits:
         partner = None
         closest = np.inf

@@ -106,8 +106,8 @@ class LocalMaps:
 
     def nearest(self, centres: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Return distances and positions of the nearest arguments, (m, count) each."""
-        distance, index = self._tree.query(self.inside(centres), count)
-        return distance.reshape(len(centres), count), index.reshape(len(centres), count)
+        distance, index = self._tree.query(self.inside(centres), np.arange(1, count + 1))
+        return np.asarray(distance), np.asarray(index)
 
     def fit(self, centres: np.ndarray, count: int, degree: int, *, influence: bool = True) -> LocalFit:
         """Fit polynomials about the centres (m, 2) to their `count` nearest neighbours; without `influence` quicker."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -9,6 +10,14 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.orbits.as_experiment import orbit_experiment
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.store import Result
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_COLUMNS = (
+    "name", "period", "winding", "returns", "quality", "multiplier", "multiplier_sd", "contraction", "contraction_sd",
+    "estimated", "modulus", "sd_first", "sd_second", "partner", "equilibrium", "rejected",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -72,6 +81,14 @@ class Orbit(Result):
     solution: PeriodicSolution | None = None
     equilibrium: bool = False
     synthetic: bool = False
+
+    def __repr__(self) -> str:
+        kind = ", at rest" if self.equilibrium else ""
+        large = self.eigenvalues[0]
+        shown = f"{large.real:.5g}" if np.isreal(large) else f"{large.real:.4g} ± {abs(large.imag):.4g}i"
+        sd = self.eigenvalue_sd[0]
+        error = f"sd {sd:.2g}" if np.isfinite(sd) else "sd not estimated"
+        return f"Orbit({self.name!r}{kind}: eigenvalue {shown} ({error}), {self.returns} returns)"
 
     @property
     def covariance(self) -> np.ndarray:
@@ -149,6 +166,33 @@ class Orbits(Result):
     values: int = 0
     method: str = ""
 
+    @property
+    def table(self) -> "pd.DataFrame":
+        """One row an orbit, those not taken below with their reason.
+
+        Columns: name, period, winding (missing where unknown), returns, quality, multiplier and contraction (the two
+        eigenvalues), their standard deviations (NaN: not estimated), `estimated` (whether that of the multiplier is),
+        modulus of the multiplier, largest standard deviation of a point in the first and in the second coordinate,
+        the partner's name, equilibrium, rejected (the reason, empty for orbits that were taken).
+        """
+        import pandas as pd
+
+        names = [orbit.name for orbit in self.orbits]
+        rows = [_row(orbit, names, "") for orbit in self.orbits]
+        rows += [_row(orbit, names, reason) for orbit, reason in self.rejected]
+        table = pd.DataFrame(rows, columns=list(_COLUMNS))
+        return table.astype({"winding": "Int64"})
+
+    def __repr__(self) -> str:
+        if not self.orbits:
+            return f"Orbits(none, {len(self.rejected)} rejected)"
+        counts = [(p, sum(o.period == p for o in self.orbits)) for p in sorted({o.period for o in self.orbits})]
+        listed = ", ".join(f"{count} of period {period}" for period, count in counts)
+        return (
+            f"Orbits({listed}; {len(self.rejected)} rejected; method {self.method!r}, from {self.values:,} numbers)\n"
+            f"{self.table.drop(columns=['rejected']).head(len(self.orbits)).to_string(index=False)}"
+        )
+
     def __len__(self) -> int:
         return len(self.orbits)
 
@@ -157,3 +201,26 @@ class Orbits(Result):
 
     def __iter__(self) -> Iterator[Orbit]:
         return iter(self.orbits)
+
+
+def _row(orbit: Orbit, names: list[str], reason: str) -> tuple[Any, ...]:
+    sds = np.sqrt(np.diag(orbit.covariance)).reshape(-1, 2).max(axis=0)
+    multiplier, contraction = (value.real if np.isreal(value) else value for value in orbit.eigenvalues)
+    partner = "" if orbit.partner is None or orbit.partner >= len(names) else names[orbit.partner]
+    return (
+        orbit.name,
+        orbit.period,
+        orbit.winding,
+        orbit.returns,
+        orbit.quality,
+        multiplier,
+        orbit.eigenvalue_sd[0],
+        contraction,
+        orbit.eigenvalue_sd[1],
+        bool(np.isfinite(orbit.eigenvalue_sd[0])),
+        float(abs(orbit.eigenvalues[0])),
+        *sds,
+        partner,
+        orbit.equilibrium,
+        reason,
+    )
