@@ -23,7 +23,7 @@ SEARCH_DEGREE = 2
 QUALITY_DEGREE = 3
 FEWEST_NEIGHBOURS = 32
 # Of a local fit in the search, in standard deviations of the noise.
-SEARCH_WIDTH = 5.0
+SEARCH_WIDTH = 4.0
 # Beyond, a point with this standard deviation is nowhere in particular; in units of the attractor's size.
 LARGEST_SD = 0.02
 # Beyond, the delta method says nothing of an eigenvalue.
@@ -165,7 +165,7 @@ def _search_count(maps: LocalMaps, neighbours: int) -> int:
     """Return the neighbours of a local fit in the search: enough to be wide against the noise."""
     centres = maps.arguments[:: max(1, len(maps.arguments) // 500)]
     count = int(2.25 * neighbours)
-    while count < len(maps.arguments) // 40:
+    while count < len(maps.arguments) // 100:
         if np.median(maps.nearest(centres, count)[0][:, -1]) / REACH > SEARCH_WIDTH * maps.noise.max():
             break
         count = int(1.5 * count)

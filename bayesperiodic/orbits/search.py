@@ -15,6 +15,7 @@ STEPS = 14
 CONVERGED = 2e-4
 # Where the neighbourhood is wider, or the next points farther than so many bandwidths, the cycle has left the data.
 WIDEST = 0.06
+MERGED = 2e-3
 SAME = 3e-3
 
 
@@ -53,10 +54,12 @@ def candidates(maps: LocalMaps, section: np.ndarray, period: int, count: int, de
         Neighbours of each local fit.
     degree : int
     """
-    starts, returns, members = _close_returns(maps, section, period)
+    starts, members = _close_returns(maps, section, period)
     chains = section[starts[:, None] + np.arange(period)]
+    noise = float(maps.noise.max())
     step = np.full(len(starts), np.inf)
-    active = np.arange(len(starts))
+    heir = np.arange(len(starts))
+    active = heir
     for _ in range(STEPS):
         if active.size == 0:
             break
@@ -66,59 +69,68 @@ def candidates(maps: LocalMaps, section: np.ndarray, period: int, count: int, de
         correction = newton_step(defect, fit.jacobian.reshape(*shape, 2, 2))
         size = np.abs(correction).max((1, 2))
         chains[active] += correction * np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))[:, None, None]
-        step[active] = size
-        lost = (fit.bandwidth.reshape(shape).max(1) > np.maximum(WIDEST, 2.0 * maps.noise.max())) | ~np.isfinite(size)
-        step[active[lost]] = np.inf
-        active = active[(size > 0.01 * CONVERGED) & ~lost]
-    tolerance = max(SAME, 3.0 * float(maps.noise.max()))
-    return _distinct(maps, section, chains, step, starts, returns, members, tolerance)
+        lost = (fit.bandwidth.reshape(shape).max(1) > max(WIDEST, 2.0 * noise)) | ~np.isfinite(size)
+        step[active] = np.where(lost, np.inf, size)
+        active = active[(size > max(0.01 * CONVERGED, 0.05 * noise)) & ~lost]
+        # Chains that have come to one place share their future.
+        cells = _cells(maps, chains[active], max(MERGED, noise))
+        _, first, owner = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        heir[active] = active[first][owner.ravel()]
+        active = active[first]
+    for _ in range(STEPS):
+        heir = heir[heir]
+    members = [np.concatenate([members[i] for i in np.flatnonzero(heir == k)]) for k in np.unique(heir)]
+    kept = np.unique(heir)
+    return _distinct(maps, section, chains[kept], step[kept], members)
 
 
-def _close_returns(
-    maps: LocalMaps, section: np.ndarray, period: int
-) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Return where the closest return in each cell of stretches begins, how many there are, and all of them."""
+def _cells(maps: LocalMaps, chains: np.ndarray, size: float) -> np.ndarray:
+    inside = maps.inside(chains.reshape(-1, 2)).reshape(len(chains), 2 * chains.shape[1])
+    return np.floor(inside / size).astype(np.int64)
+
+
+def _close_returns(maps: LocalMaps, section: np.ndarray, period: int) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return where the closest return in each cell of stretches begins, and where all of that cell begin."""
+    noise = float(maps.noise.max())
     distance = np.abs(maps.wrap(section[period:] - section[:-period])).max(1)
-    close = np.flatnonzero(distance < CLOSE + 2.0 * maps.noise.max())
+    close = np.flatnonzero(distance < CLOSE + 2.0 * noise)
     close = close[np.argsort(distance[close], kind="stable")]
-    stretch = maps.inside(section[close[:, None] + np.arange(period)].reshape(-1, 2)).reshape(len(close), -1)
-    cells = np.floor(stretch / max(CELL, float(maps.noise.max()))).astype(np.int64)
+    cells = _cells(maps, section[close[:, None] + np.arange(period)], max(CELL, noise))
     _, first, owner, counts = np.unique(cells, axis=0, return_index=True, return_inverse=True, return_counts=True)
     order = np.argsort(owner.ravel(), kind="stable")
-    return close[first], counts, np.split(close[order], np.cumsum(counts)[:-1])
+    return close[first], np.split(close[order], np.cumsum(counts)[:-1])
 
 
 def _distinct(
-    maps: LocalMaps,
-    section: np.ndarray,
-    chains: np.ndarray,
-    step: np.ndarray,
-    starts: np.ndarray,
-    returns: np.ndarray,
-    members: list[np.ndarray],
-    tolerance: float,
+    maps: LocalMaps, section: np.ndarray, chains: np.ndarray, step: np.ndarray, members: list[np.ndarray]
 ) -> list[Candidate]:
-    period = chains.shape[1]
+    noise = float(maps.noise.max())
+    tolerance = max(SAME, 3.0 * noise)
     found: list[np.ndarray] = []
-    groups: list[list[tuple[int, int]]] = []
-    for k in np.flatnonzero(step < max(CONVERGED, 0.1 * float(maps.noise.max()))):
+    stretches: list[list[tuple[np.ndarray, int]]] = []
+    for k in np.argsort(step, kind="stable"):
+        if step[k] > max(CONVERGED, 0.1 * noise):
+            break
         if has_shorter_period(chains[k], maps.wrap, tolerance):
             continue
-        for cycle, group in zip(found, groups, strict=True):
+        for cycle, group in zip(found, stretches, strict=True):
             distance, shift = shift_between(chains[k], cycle, maps.wrap)
             if distance < tolerance:
-                group.append((int(k), shift))
+                group.append((members[k], shift))
                 break
         else:
             found.append(maps.wrap(chains[k]))
-            groups.append([(int(k), 0)])
-    result = []
-    for cycle, group in zip(found, groups, strict=True):
-        stretches = [(int(i), shift) for k, shift in group for i in members[k]]
-        away = [
-            np.abs(maps.wrap(section[i : i + period + 1] - np.take(cycle, np.arange(period + 1) + s, 0, mode="wrap")))
-            for i, s in stretches
-        ]
-        closest, shift = stretches[int(np.argmin([a.max() for a in away]))]
-        result.append(Candidate(cycle, int(sum(returns[k] for k, _ in group)), closest, shift))
-    return result
+            stretches.append([(members[k], 0)])
+    return [_candidate(maps, section, cycle, group) for cycle, group in zip(found, stretches, strict=True)]
+
+
+def _candidate(
+    maps: LocalMaps, section: np.ndarray, cycle: np.ndarray, group: list[tuple[np.ndarray, int]]
+) -> Candidate:
+    steps = np.arange(len(cycle) + 1)
+    starts = np.concatenate([begins for begins, _ in group])
+    shifts = np.concatenate([np.full(len(begins), shift) for begins, shift in group])
+    expected = cycle[(steps + shifts[:, None]) % len(cycle)]
+    away = np.abs(maps.wrap(section[starts[:, None] + steps] - expected)).max((1, 2))
+    closest = int(np.argmin(away))
+    return Candidate(cycle, len(starts), int(starts[closest]), int(shifts[closest]))
