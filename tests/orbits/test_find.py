@@ -1,0 +1,225 @@
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+import bayesperiodic as bp
+from tests.orbits import chaos
+from tests.shooting import UNSTABLE, pendulum_orbit
+
+KNOWN = [k for k in UNSTABLE if k.omega == chaos.OMEGA]
+SCALE = np.array([6.28, 32.6])
+
+
+@cache
+def henon(count, noise=0.0, seed=0):
+    generator = np.random.default_rng(seed)
+    point, path = generator.uniform(-0.1, 0.1, 2), []
+    for _ in range(count + 100):
+        point = np.array([1.0 - 1.4 * point[0] ** 2 + point[1], 0.3 * point[0]])
+        path.append(point)
+    clean = np.array(path[100:])
+    return clean + noise * np.ptp(clean, axis=0) * generator.standard_normal(clean.shape)
+
+
+def henon_section(count, noise=0.0, seed=0):
+    return bp.PoincareSection.from_points(henon(count, noise, seed), ("x", "y"), frequency=1.0)
+
+
+def henon_eigenvalues(points):
+    product = np.eye(2)
+    for x, _ in points:
+        product = np.array([[-2.8 * x, 1.0], [0.3, 0.0]]) @ product
+    values = np.linalg.eigvals(product)
+    return values[np.argsort(-np.abs(values))].real
+
+
+def henon_orbit(guess):
+    """Return the orbit near a guess by Newton's method on the map itself."""
+    points = np.array(guess)
+    for _ in range(20):
+        x, y = points.T
+        image = np.stack([1.0 - 1.4 * x**2 + y, 0.3 * x], axis=1)
+        system = np.zeros((x.size, 2, x.size, 2))
+        for j in range(x.size):
+            system[j, :, j] += [[-2.8 * x[j], 1.0], [0.3, 0.0]]
+            system[j, :, (j + 1) % x.size] -= np.eye(2)
+        defect = (image - np.roll(points, -1, axis=0)).ravel()
+        points = points - np.linalg.solve(system.reshape(points.size, points.size), defect).reshape(points.shape)
+    return points
+
+
+@cache
+def pendulum_orbits(noise=0.0005):
+    recording = chaos.recording(9000, 40, noise)
+    section = bp.PoincareSection.from_recording(
+        recording, ("angle", "rate"), frequency=chaos.FREQUENCY, angles=("angle",)
+    )
+    return section, bp.find_orbits(section, periods=[1, 2, 3])
+
+
+def wrapped(difference):
+    difference = np.array(difference)
+    difference[:, 0] -= 2 * np.pi * np.round(difference[:, 0] / (2 * np.pi))
+    return difference
+
+
+def test_henon_has_these_cycles_and_no_others():
+    # Known numbers of prime cycles at a = 1.4, b = 0.3 on the attractor: 1, 1, 0, 1, 0, 2 for periods 1 to 6.
+    orbits = bp.find_orbits(henon_section(5000), periods=range(1, 7))
+    assert [sum(o.period == p for o in orbits) for p in range(1, 7)] == [1, 1, 0, 1, 0, 2]
+    for orbit in orbits:
+        np.testing.assert_allclose(orbit.points, henon_orbit(orbit.points), atol=1e-9)
+        np.testing.assert_allclose(orbit.eigenvalues, henon_eigenvalues(orbit.points), rtol=1e-6)
+        assert orbit.winding == 0
+        assert orbit.cycle is None
+
+
+def test_error_bars_cover_at_a_tenth_of_a_percent_of_noise():
+    """Nominal 90 % intervals of log|eigenvalue| and of the points; false alarms: 1 % each (two-sided binomial band).
+
+    The points' band takes the coordinates of an orbit as one and a half independent values.
+    """
+    inside, total, points, values = 0, 0, 0, 0
+    for seed in range(8):
+        for orbit in bp.find_orbits(henon_section(4000, 0.001, seed), periods=[1, 2, 4, 6]):
+            true = henon_orbit(orbit.points)
+            sd = np.sqrt(np.diag(orbit.joint_covariance))
+            points += np.sum(np.abs(orbit.points - true).ravel() < 1.645 * sd[: true.size])
+            values += true.size
+            errors = np.log(np.abs(orbit.eigenvalues / henon_eigenvalues(true)))
+            if np.isfinite(sd[-2]):
+                inside, total = inside + (abs(errors[0]) < 1.645 * sd[-2]), total + 1
+    assert total >= 20
+    assert binom.ppf(0.005, total, 0.9) <= inside <= binom.ppf(0.995, total, 0.9)
+    share = values / 4.0
+    assert binom.ppf(0.005, int(share), 0.9) / share <= points / values <= binom.ppf(0.995, int(share), 0.9) / share
+
+
+def test_orbits_of_the_pendulum_are_those_of_shooting():
+    _, orbits = pendulum_orbits()
+    found = 0
+    for known in [k for k in KNOWN if len(k.section) <= 3 and abs(k.multipliers[0]) < 200]:
+        for sign in (1, -1):
+            section = sign * np.array(known.section)
+            for orbit in orbits:
+                if orbit.period != len(section) or orbit.winding != sign * known.winding:
+                    continue
+                away = [wrapped(np.roll(section, s, axis=0) - orbit.points) / SCALE for s in range(len(section))]
+                best = away[int(np.argmin([np.abs(a).max() for a in away]))]
+                if np.abs(best).max() < 0.02:
+                    found += 1
+                    assert np.all(np.abs(best * SCALE).ravel() < 5.0 * np.sqrt(np.diag(orbit.covariance)))
+                    assert abs(np.log(orbit.eigenvalues[0] / known.multipliers[0])) < 0.3
+    # All but one at most: five classes, and their mirrors.
+    assert found >= 9
+
+
+def test_nothing_is_reported_that_is_no_orbit():
+    _, orbits = pendulum_orbits()
+    assert len(orbits) >= 16
+    for orbit in orbits:
+        if orbit.equilibrium:
+            continue
+        running = orbit.points.copy()
+        cycle = orbit.cycle["angle"]
+        samples = cycle.size // orbit.period
+        running[:, 0] += 2 * np.pi * np.round((cycle[::samples] - orbit.points[:, 0]) / (2 * np.pi))
+        shot = pendulum_orbit(chaos.OMEGA, running, orbit.winding, parts=1, tolerance=1e-9)
+        assert np.abs((shot.states - running) / SCALE).max() < 0.02
+
+
+def test_states_of_rest_are_labelled():
+    section, orbits = pendulum_orbits()
+    rest = [o for o in orbits if o.equilibrium]
+    assert {round(abs(o.points[0, 0]), 1) for o in rest} <= {0.0, 3.1}
+    assert any(abs(o.points[0, 0]) < 0.1 for o in rest)
+    alone = bp.PoincareSection.from_points(section.points, section.coordinates, frequency=1.0, angles=("angle",))
+    again = [o for o in bp.find_orbits(alone, periods=[1]) if o.equilibrium]
+    assert any(np.abs(o.points[0] / SCALE).max() < 0.01 for o in again)
+    assert all(o.winding is None and o.cycle is None for o in again)
+
+
+def test_partners_are_mirrors():
+    _, orbits = pendulum_orbits()
+    assert sum(o.partner is not None for o in orbits) > len(orbits) // 2
+    for orbit in orbits:
+        if orbit.partner is None:
+            continue
+        other = orbits[orbit.partner]
+        distances = [
+            np.abs(wrapped(np.roll(other.points, s, axis=0) + orbit.points) / SCALE).max() for s in range(orbit.period)
+        ]
+        assert min(distances) < 0.05
+        assert other.winding == -orbit.winding
+
+
+def test_orbits_and_their_table_are_saved(tmp_path):
+    _, orbits = pendulum_orbits()
+    orbits.save(tmp_path / "orbits.h5")
+    again = bp.load(tmp_path / "orbits.h5")
+    assert repr(again) == repr(orbits)
+    table = again.table
+    assert list(table["name"]) == [o.name for o in orbits]
+    assert table["name"].is_unique
+    assert list(table["estimated"]) == [bool(np.isfinite(o.eigenvalue_sd[0])) for o in orbits]
+    np.testing.assert_array_equal(again[3].cycle["angle"], orbits[3].cycle["angle"])
+    assert orbits.values == 2 * (9000 * 40 + 1)
+
+
+def test_boxes_find_the_strongest_orbits():
+    orbits = bp.find_orbits(henon_section(20000), periods=[1, 2], method="boxes")
+    assert [o.period for o in orbits] == [1, 2]
+    for orbit in orbits:
+        np.testing.assert_allclose(orbit.points, henon_orbit(orbit.points), atol=5e-3)
+        np.testing.assert_allclose(orbit.eigenvalues[0], henon_eigenvalues(henon_orbit(orbit.points))[0], rtol=0.1)
+
+
+def test_the_noise_of_points_is_seen_in_them():
+    from bayesperiodic.orbits.find import _scaled
+
+    for noise in (0.001, 0.004):
+        section = bp.PoincareSection.from_points(
+            chaos.points(9000, noise), ("angle", "rate"), frequency=1.0, angles=("angle",)
+        )
+        np.testing.assert_allclose(_scaled(section, 32).maps.noise, noise, rtol=0.35)
+
+
+def test_sections_without_chaos_are_refused():
+    turn = np.arange(4000)
+    noise = 0.001 * np.random.default_rng(0).standard_normal((4000, 2))
+    ratio = 2 * np.pi * (np.sqrt(2) - 1)
+    circle = np.stack([np.sin(ratio * turn) + 0.2 * np.sin(2 * ratio * turn), np.cos(ratio * turn)], axis=1)
+    three = np.array([[0.0, 1.0], [1.0, -1.0], [-0.5, 0.3]])[turn % 3]
+    for points, message in ((circle, "quasi-periodic"), (three, "period 3"), (0 * three, "period 1")):
+        for added in (0.0, 1.0) if np.ptp(points) else (0.0,):
+            section = bp.PoincareSection.from_points(points + added * noise, ("x", "y"), frequency=1.0)
+            with pytest.raises(ValueError, match=message):
+                bp.find_orbits(section, periods=[1])
+
+
+@pytest.mark.parametrize("factor", [1.0005, 0.98, 1.1])
+def test_a_wrong_frequency_is_suspected(factor):
+    section = bp.PoincareSection.from_recording(
+        chaos.recording(9000, 40, 0.0005),
+        ("angle", "rate"),
+        frequency=factor * chaos.FREQUENCY,
+        angles=("angle",),
+    )
+    with pytest.raises(ValueError, match="wrong frequency"):
+        bp.find_orbits(section, periods=[1])
+
+
+def test_bad_arguments_are_refused():
+    section = henon_section(500)
+    with pytest.raises(ValueError, match="method: 'box' is not known.*'boxes'"):
+        bp.find_orbits(section, periods=[1], method="box")
+    with pytest.raises(ValueError, match="periods: 0 is not allowed"):
+        bp.find_orbits(section, periods=[0])
+    with pytest.raises(ValueError, match="periods: 3 is not allowed; it is a collection"):
+        bp.find_orbits(section, periods=3)
+    with pytest.raises(ValueError, match="none above 25"):
+        bp.find_orbits(section, periods=[30])
+    with pytest.raises(ValueError, match="neighbours: 3 is not allowed"):
+        bp.find_orbits(section, periods=[1], neighbours=3)
