@@ -8,6 +8,7 @@ import numpy as np
 
 from bayesperiodic import checks
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.inference.all_at_once import all_at_once
 from bayesperiodic.inference.linearisation import Linearisation
 from bayesperiodic.inference.noise.likelihood import Likelihood
 from bayesperiodic.inference.noise.models import Noise, as_noise
@@ -183,9 +184,17 @@ class Problem:
 
     @property
     def responses(self) -> Responses:
-        """The periodic solves, anchored at the medians of the priors unless set."""
+        """The periodic solves, anchored at the medians of the priors unless set.
+
+        Where every experiment of a forced model has a guess of its orbit, they are anchored where these orbits and the
+        parameters fit together instead: at the medians other orbits may be nearest, or none exist.
+        """
         if self._responses._anchors is None:
-            self._responses = self._responses.anchored(self.median())
+            together = all_at_once(self, self.median())
+            if together is not None and together.states:
+                self._responses = self.anchored(together.theta, together.states)._responses
+            else:
+                self._responses = self._responses.anchored(self.median())
         return self._responses
 
     def anchored(

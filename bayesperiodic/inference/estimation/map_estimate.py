@@ -8,7 +8,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from bayesperiodic import checks
-from bayesperiodic.inference.estimation.all_at_once import all_at_once
+from bayesperiodic.inference.all_at_once import all_at_once
 from bayesperiodic.inference.estimation.doubling import doubling_shift
 from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.estimation.gauss_newton import (

@@ -12,19 +12,22 @@ References
    Numerical Treatment of Inverse Problems in Differential and Integral Equations, Birkhäuser, 1983, 95-121.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.inference.estimation.joint_laplace import logarithmic
 from bayesperiodic.inference.noise.estimate import estimate_noise
 from bayesperiodic.inference.noise.likelihood import Likelihood
 from bayesperiodic.inference.observation import Observation, Response
-from bayesperiodic.inference.problem import Problem
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.factors import CyclicFactors
+
+if TYPE_CHECKING:
+    from bayesperiodic.inference.problem import Problem
 
 MAX_ITERATIONS = 60
 LARGEST_STEP = 0.7
@@ -93,7 +96,7 @@ class _Together:
         blocks = [block for observation in self.observations.values() for block in observation.blocks]
         self.likelihood = Likelihood(problem.noise, blocks, problem.likelihood.fixed)
         self.equations: dict[str, PeriodicEquations] = problem._responses.equations
-        self.logarithmic = logarithmic(problem)
+        self.logarithmic = np.array([s == (0.0, np.inf) for s in problem.joint_prior.supports.values()])
         self.guess = {e.name: self._periodic_part(e) for e in experiments}
 
     def _periodic_part(self, e: Experiment) -> np.ndarray:
