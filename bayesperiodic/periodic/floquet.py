@@ -13,9 +13,13 @@ References
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+
+from bayesperiodic.models.cache import load
 
 STENCIL = 8
 GAUSS_NODES = np.array([0.5 - np.sqrt(15) / 10, 0.5, 0.5 + np.sqrt(15) / 10])
@@ -30,8 +34,13 @@ GAUSS_MATRIX = np.array(
 HARMLESS, IN_RANGE = 1e3, 1e60
 SWEEPS = 8
 DECOUPLED = 1e-11
-CHUNK = 4_000_000
 STIFF, MOST_PARTS = 3.0, 32
+
+
+@cache
+def _kernels() -> SimpleNamespace:
+    source = Path(__file__).with_name("floquet_kernels.py").read_text(encoding="utf-8")
+    return SimpleNamespace(**load(source, ("transfer_matrices", "along", "across")))
 
 
 @dataclass(frozen=True)
@@ -56,9 +65,15 @@ class Floquet:
 
         They are given without their growth, each of unit length at each grid point.
         """
-        right = [_between(self._steps, v, self._every) for v in self._along]
-        left = [_between_adjoint(self._steps, w, self._every) for w in self._across]
-        return np.array(right), np.array(left)
+        return self.leading(len(self.exponents))
+
+    def leading(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the eigenfunctions of the first multipliers only, arrays (count, points, size)."""
+        result = np.empty((2, count, *self._steps.shape[:2]), dtype=complex)
+        for k in range(count):
+            _kernels().along(self._steps, np.ascontiguousarray(self._along[k]), self._every, result[0, k])
+            _kernels().across(self._steps, np.ascontiguousarray(self._across[k]), self._every, result[1, k])
+        return result[0], result[1]
 
 
 def first_order_matrix(linearisation: np.ndarray, orders: tuple[int, ...]) -> np.ndarray:
@@ -139,32 +154,15 @@ def floquet(matrix: np.ndarray, period: float) -> Floquet:
 
 def _transfer_matrices(matrix: np.ndarray, step: float) -> np.ndarray:
     """Return (points, size, size): from each grid point to the next."""
-    points = len(matrix)
-    width = min(STENCIL, points)
-    offsets = np.arange(width) - (width // 2 - 1)
-    nearby = [np.roll(matrix, -o, axis=0) for o in offsets]
+    width = min(STENCIL, len(matrix))
+    first = 1 - width // 2
+    offsets = np.arange(width) + first
     stiffness = step * float(np.max(np.linalg.norm(matrix, axis=(1, 2))))
     parts = 1 if stiffness < STIFF else 2 * min(int(np.ceil(0.5 * stiffness / STIFF)), MOST_PARTS // 2)
-    result = np.broadcast_to(np.eye(matrix.shape[1]), matrix.shape)
-    for part in range(parts):
-        nodes = (part + GAUSS_NODES) / parts
-        weights = [_lagrange(offsets, node) for node in nodes]
-        stages = np.stack([sum(w * a for w, a in zip(row, nearby, strict=True)) for row in weights], axis=1)
-        result = _gauss_steps(stages, step / parts) @ result
-    return result
-
-
-def _gauss_steps(stages: np.ndarray, step: float) -> np.ndarray:
-    """Return the transfer matrices (points, size, size) of one step each, A given at the Gauss points."""
-    points, _, size, _ = stages.shape
-    result = np.empty((points, size, size))
-    chunk = max(1, CHUNK // (3 * size) ** 2)
-    for start in range(0, points, chunk):
-        a = stages[start : start + chunk]
-        coupled = -step * np.einsum("ij,nipq->nipjq", GAUSS_MATRIX, a).reshape(-1, 3 * size, 3 * size)
-        coupled += np.eye(3 * size)
-        slopes = np.linalg.solve(coupled, a.reshape(-1, 3 * size, size)).reshape(-1, 3, size, size)
-        result[start : start + chunk] = np.eye(size) + step * np.einsum("i,nipq->npq", GAUSS_WEIGHTS, slopes)
+    weights = np.array([[_lagrange(offsets, node) for node in (part + GAUSS_NODES) / parts] for part in range(parts)])
+    result = np.empty_like(matrix)
+    compiled = _kernels().transfer_matrices
+    compiled(np.ascontiguousarray(matrix), weights, first, step / parts, GAUSS_MATRIX, GAUSS_WEIGHTS, result)
     return result
 
 
@@ -254,30 +252,3 @@ def _block(groups: np.ndarray, x: np.ndarray, y: np.ndarray) -> list[tuple[compl
             across[g] = y[g] @ (gram[g].T @ d)
         found.append((exponent, along, across))
     return found
-
-
-def _between(steps: np.ndarray, at: np.ndarray, length: int) -> np.ndarray:
-    """Return an eigenfunction at every grid point from its values at every `length`-th."""
-    result = np.empty((len(steps), at.shape[1]), dtype=complex)
-    result[::length] = _unit(at)
-    for k in range(1, length):
-        part = result[k::length]
-        part[:] = _unit(
-            np.einsum("npq,nq->np", steps[k - 1 :: length][: len(part)], result[k - 1 :: length][: len(part)])
-        )
-    return result
-
-
-def _between_adjoint(steps: np.ndarray, at: np.ndarray, length: int) -> np.ndarray:
-    points = len(steps)
-    result = np.empty((points + 1, at.shape[1]), dtype=complex)
-    result[:points:length] = _unit(at)
-    result[points] = result[0]
-    for k in range(length - 1, 0, -1):
-        index = np.arange(k, points, length)
-        result[index] = _unit(np.einsum("nqp,nq->np", steps[index], result[index + 1]))
-    return result[:points]
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -1,0 +1,143 @@
+"""The compiled code of `floquet`; loaded through the kernel cache, not imported."""
+
+import numpy as np
+from numba import njit
+
+STAGES = 3
+MATRIX, CUBE = "float64[:,::1]", "float64[:,:,::1]"
+OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
+
+
+@njit(f"boolean({MATRIX}, {MATRIX})", **OPTIONS)
+def solve(matrix, right):
+    """Solve in place for the columns of `right`, with pivoting; return False if the matrix is singular."""
+    size, columns = matrix.shape[0], right.shape[1]
+    for j in range(size):
+        pivot = j
+        for i in range(j + 1, size):
+            if abs(matrix[i, j]) > abs(matrix[pivot, j]):
+                pivot = i
+        if not (abs(matrix[pivot, j]) > 0.0):
+            return False
+        if pivot != j:
+            for k in range(j, size):
+                matrix[pivot, k], matrix[j, k] = matrix[j, k], matrix[pivot, k]
+            for c in range(columns):
+                right[pivot, c], right[j, c] = right[j, c], right[pivot, c]
+        inverse = 1.0 / matrix[j, j]
+        for i in range(j + 1, size):
+            factor = matrix[i, j] * inverse
+            if factor != 0.0:
+                for k in range(j + 1, size):
+                    matrix[i, k] -= factor * matrix[j, k]
+                for c in range(columns):
+                    right[i, c] -= factor * right[j, c]
+    for j in range(size - 1, -1, -1):
+        for c in range(columns):
+            total = right[j, c]
+            for k in range(j + 1, size):
+                total -= matrix[j, k] * right[k, c]
+            right[j, c] = total / matrix[j, j]
+    return True
+
+
+@njit(f"void({CUBE}, {CUBE}, int64, float64, {MATRIX}, float64[::1], {CUBE})", **OPTIONS)
+def transfer_matrices(matrix, weights, first, step, gauss, sums, result):
+    """Fill the transfer matrices (points, size, size) from each grid point to the next; NaN where they do not exist.
+
+    Parameters
+    ----------
+    matrix : array (points, size, size)
+        A of ẏ = A y on the grid.
+    weights : array (parts, 3, width)
+        What interpolates A at the Gauss points of each part of a step, from grid points `first`, first + 1, … on.
+    first : int
+    step : float
+        Length of a part.
+    gauss, sums : arrays (3, 3) and (3,)
+        Of the collocation.
+    result : array (points, size, size)
+    """
+    points, size, _ = matrix.shape
+    stages, slopes = np.empty((STAGES, size, size)), np.empty((STAGES * size, size))
+    coupled, total, product = np.empty((STAGES * size, STAGES * size)), np.empty((size, size)), np.empty((size, size))
+    for point in range(points):
+        for p in range(size):
+            for q in range(size):
+                result[point, p, q] = 1.0 if p == q else 0.0
+        for part in range(weights.shape[0]):
+            stages[:] = 0.0
+            for offset in range(weights.shape[2]):
+                near = (point + first + offset) % points
+                for stage in range(STAGES):
+                    w = weights[part, stage, offset]
+                    for p in range(size):
+                        for q in range(size):
+                            stages[stage, p, q] += w * matrix[near, p, q]
+            for stage in range(STAGES):
+                for p in range(size):
+                    for q in range(size):
+                        slopes[stage * size + p, q] = stages[stage, p, q]
+                        for other in range(STAGES):
+                            unit = 1.0 if stage == other and p == q else 0.0
+                            coupled[stage * size + p, other * size + q] = (
+                                unit - step * gauss[stage, other] * stages[stage, p, q]
+                            )
+            regular = solve(coupled, slopes)
+            for p in range(size):
+                for q in range(size):
+                    total[p, q] = 1.0 if p == q else 0.0
+                    for stage in range(STAGES):
+                        total[p, q] += step * sums[stage] * slopes[stage * size + p, q]
+                    if not regular:
+                        total[p, q] = np.nan
+            for p in range(size):
+                for q in range(size):
+                    product[p, q] = 0.0
+                    for k in range(size):
+                        product[p, q] += total[p, k] * result[point, k, q]
+            result[point] = product
+
+
+@njit("void(complex128[::1])", **OPTIONS)
+def normalise(vector):
+    """Bring a vector to unit length."""
+    square = 0.0
+    for p in range(vector.size):
+        square += vector[p].real ** 2 + vector[p].imag ** 2
+    length = np.sqrt(square)
+    for p in range(vector.size):
+        vector[p] /= length
+
+
+@njit(f"void({CUBE}, complex128[:,::1], int64, complex128[:,::1])", **OPTIONS)
+def along(steps, at, length, result):
+    """Fill an eigenfunction (points, size) of unit length from its values `at` every `length`-th point."""
+    points, size = result.shape
+    for k in range(points):
+        if k % length == 0:
+            result[k] = at[k // length]
+        else:
+            for p in range(size):
+                result[k, p] = 0.0
+                for q in range(size):
+                    result[k, p] += steps[k - 1, p, q] * result[k - 1, q]
+        normalise(result[k])
+
+
+@njit(f"void({CUBE}, complex128[:,::1], int64, complex128[:,::1])", **OPTIONS)
+def across(steps, at, length, result):
+    """Fill an eigenfunction of the adjoint (points, size) likewise, backwards."""
+    points, size = result.shape
+    result[0] = at[0]
+    normalise(result[0])
+    for k in range(points - 1, 0, -1):
+        after = (k + 1) % points
+        if k % length == 0:
+            result[k] = at[k // length]
+        else:
+            for p in range(size):
+                result[k, p] = 0.0
+                for q in range(size):
+                    result[k, p] += steps[k, q, p] * result[after, q]
+        normalise(result[k])
