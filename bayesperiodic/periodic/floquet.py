@@ -92,19 +92,36 @@ def first_order_matrix(linearisation: np.ndarray, orders: tuple[int, ...]) -> np
         If the equations cannot be solved for the highest derivatives.
     """
     highest, lower = _split(linearisation, orders)
-    return _companion(-np.linalg.solve(highest, lower), orders, 1.0)
+    return _companion(-np.linalg.solve(highest, lower), orders)
 
 
-def matrix_change(linearisation: np.ndarray, change: np.ndarray, orders: tuple[int, ...]) -> np.ndarray:
-    """Return the change of `first_order_matrix` for a change of the linearisation, of the same shape."""
-    highest, lower = _split(linearisation, orders)
-    highest_change, lower_change = _split(change, orders)
-    solved = -np.linalg.solve(highest, lower)
-    return _companion(-np.linalg.solve(highest, lower_change + highest_change @ solved), orders, 0.0)
+def change_factors(
+    linearisation: np.ndarray, orders: tuple[int, ...], matrix: np.ndarray, v: np.ndarray, w: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a (multipliers, points, states) and b (…, 3·states) for which wᵀ dA v = aᵀ d∂g/∂(q, q̇, q̈) b.
+
+    Parameters
+    ----------
+    linearisation : array (points, states, 3·states)
+    orders : tuple of int
+    matrix : array (points, size, size)
+        A of the same, `first_order_matrix`.
+    v, w : complex arrays (multipliers, points, size)
+    """
+    count = len(orders)
+    second = [i for i, order in enumerate(orders) if order == 2]
+    rows = [count + second.index(i) if order == 2 else i for i, order in enumerate(orders)]
+    seen = np.zeros((*v.shape[:2], 3 * count), dtype=complex)
+    seen[..., :count] = v[..., :count]
+    seen[..., [count + i for i in second]] = v[..., count:]
+    highest = np.einsum("npq,mnq->mnp", matrix[:, rows], v)
+    seen[..., [order * count + i for i, order in enumerate(orders)]] = highest
+    transposed = np.swapaxes(_split(linearisation, orders)[0], 1, 2)
+    return -np.linalg.solve(transposed[None], w[..., rows, None])[..., 0], seen
 
 
-def _companion(solved: np.ndarray, orders: tuple[int, ...], one: float) -> np.ndarray:
-    """Return the matrix whose rows for the highest derivatives are given, (points, states, size); q̇ = `one` · q̇."""
+def _companion(solved: np.ndarray, orders: tuple[int, ...]) -> np.ndarray:
+    """Return the matrix whose rows for the highest derivatives are given, (points, states, size)."""
     points, count, size = solved.shape
     second = [i for i, order in enumerate(orders) if order == 2]
     matrix = np.zeros((points, size, size))
@@ -112,7 +129,7 @@ def _companion(solved: np.ndarray, orders: tuple[int, ...], one: float) -> np.nd
     for row, state in enumerate(second):
         matrix[:, count + row] = solved[:, state]
         matrix[:, state] = 0.0
-        matrix[:, state, count + row] = one
+        matrix[:, state, count + row] = 1.0
     return matrix
 
 
@@ -207,6 +224,8 @@ def _invariant_bases(groups: np.ndarray, splits: list[int] | None = None) -> tup
             before[g] = basis
             basis = np.linalg.qr(group @ basis)[0]
         turned = start.T @ basis
+        if all(np.linalg.norm(turned[j:, :j]) < DECOUPLED for j in (range(1, size) if splits is None else splits)):
+            break
     if len(groups) == 1:
         before[0], turned = basis, np.ones((size, size))
     if splits is None:

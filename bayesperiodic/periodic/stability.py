@@ -3,8 +3,8 @@
 import numpy as np
 
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic.equations import FREQUENCY
-from bayesperiodic.periodic.floquet import first_order_matrix, matrix_change
+from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations
+from bayesperiodic.periodic.floquet import change_factors, first_order_matrix
 from bayesperiodic.periodic.sensitivity import parameter_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, equations_of
 
@@ -49,32 +49,63 @@ def multiplier_sensitivities(model: Model, solution: PeriodicSolution) -> dict[s
     if solution.floquet is None or derivative is None:
         raise ValueError(f"solution: status {solution.status!r} is not allowed; it must have converged and be regular.")
     names = [*model.parameters, FREQUENCY][: len(derivative.frequency)]
-    orders = tuple(solution.orders.values())
-    sizes = solution._sizes()
-    scale = sizes / sizes[:, None]
-    matrix = first_order_matrix(solution.linearisation, orders) * scale
-    v, w = solution.floquet.eigenfunctions
+    directions = np.eye(len(names), theta.size)
+    frequency = derivative.frequency if model.autonomous else np.eye(len(names))[-1]
+    logarithmic = logarithmic_changes(equations, theta, z, solution, derivative.states, directions, frequency)
+    return {name: solution.multipliers * change for name, change in zip(names, logarithmic, strict=True)}
+
+
+def logarithmic_changes(
+    equations: PeriodicEquations,
+    theta: np.ndarray,
+    z: np.ndarray,
+    solution: PeriodicSolution,
+    states: np.ndarray,
+    directions: np.ndarray,
+    frequency: np.ndarray,
+    count: int | None = None,
+) -> np.ndarray:
+    """Return the changes of log μ along directions, complex (directions, multipliers).
+
+    Parameters
+    ----------
+    equations : PeriodicEquations
+    theta : array (parameters,)
+    z : array (points, states)
+        A solution.
+    solution : PeriodicSolution
+        The same, with its Floquet multipliers.
+    states : array (directions, points, states)
+        Changes of z.
+    directions : array (directions, parameters)
+        Changes of the parameters.
+    frequency : array (directions,)
+        Changes of the frequency [Hz].
+    count : int, optional
+        How many of the largest multipliers are wanted; by default all.
+    """
+    assert solution.floquet is not None
+    model, orders, sizes = equations.model, tuple(solution.orders.values()), solution._sizes()
+    v, w = solution.floquet.leading(len(solution.multipliers) if count is None else count)
+    v, w = v * sizes, w / sizes
+    matrix, jacobian = first_order_matrix(solution.linearisation, orders), solution.linearisation
+    moved_by, seen = change_factors(jacobian, orders, matrix, v, w)
     overlap = np.einsum("mnp,mnp->mn", w, v)
+    stretching = np.einsum("mnp,npq,mnq->mn", w, matrix, v)
     state_rates, input_rates = equations.frequency_changes(z)
-    result = {}
-    for d, name in enumerate(names):
-        frequency = 1.0 if name == FREQUENCY else float(derivative.frequency[d])
-        direct = np.zeros(theta.size + 1)
-        direct[-1] = frequency
-        if name != FREQUENCY:
-            direct[d] = 1.0
-        states = equations.changes(derivative.states[d][None])[0] + frequency * state_rates
-        change = np.empty((len(z), 3 * equations.count**2))
+    along = equations.changes(states)
+    here, change = equations.states(z), np.empty((len(z), jacobian[0].size))
+    result = np.empty((len(directions), len(v)), dtype=complex)
+    for d, direction in enumerate(directions):
         model.jacobian_change(
-            np.ascontiguousarray(np.concatenate([equations.states(z), states], axis=1)),
-            np.ascontiguousarray(np.concatenate([equations.inputs, frequency * input_rates], axis=1)),
-            np.concatenate([theta, direct]),
+            np.ascontiguousarray(np.concatenate([here, along[d] + frequency[d] * state_rates], axis=1)),
+            np.ascontiguousarray(np.concatenate([equations.inputs, frequency[d] * input_rates], axis=1)),
+            np.concatenate([theta, direction, frequency[d : d + 1]]),
             equations.grid.tau,
             equations.frequency,
             change,
         )
-        moved = matrix_change(solution.linearisation, change.reshape(solution.linearisation.shape), orders) * scale
-        moved -= frequency / equations.frequency * matrix
-        logarithmic = np.einsum("mnp,npq,mnq->mn", w, moved, v) / overlap
-        result[name] = solution.multipliers * solution.period * logarithmic.mean(axis=1)
+        moved = np.einsum("mne,nej,mnj->mn", moved_by, change.reshape(jacobian.shape), seen, optimize=True)
+        moved -= frequency[d] / equations.frequency * stretching
+        result[d] = solution.period * (moved / overlap).mean(axis=1)
     return result
