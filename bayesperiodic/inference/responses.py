@@ -19,7 +19,7 @@ from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities, output_gradient
 from bayesperiodic.periodic.solution import PeriodicSolution, describe
 from bayesperiodic.periodic.solve import solve_forced, solve_free
-from bayesperiodic.periodic.stability import multiplier_sensitivities
+from bayesperiodic.periodic.stability import logarithmic_changes
 
 
 class SolvedResponse(NamedTuple):
@@ -216,20 +216,28 @@ class Responses:
         outputs = np.tensordot(slopes[:-1], derivative.outputs, (0, 0))
         multipliers = np.zeros((theta.size, 0))
         if response.log_multipliers.size:
-            equations = self.equations[experiment].at_frequency(float(response.frequency))
-            parameters = self.parameters(theta[None], experiment)[0]
-            multipliers = slopes[:-1].T @ self._multiplier_changes(equations, parameters, z, response)
+            multipliers = self._multiplier_changes(theta, experiment, z, response)
         return Response(outputs, slopes[:-1].T @ derivative.frequency, multipliers, slopes[-1])
 
-    def _multiplier_changes(
-        self, equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, response: Response
-    ) -> np.ndarray:
-        """Return ∂ log|μ|/∂parameter, (parameters, multipliers)."""
+    def _multiplier_changes(self, theta: np.ndarray, experiment: str, z: np.ndarray, response: Response) -> np.ndarray:
+        """Return ∂ log|μ|/∂θ at the anchor, (names, multipliers)."""
+        assert self._anchors is not None
+        anchor, directions = self._anchors[experiment], self.maps[experiment].slopes(theta)[:-1].T
+        assert anchor.sensitivities is not None and anchor.frequency_sensitivities is not None
+        equations = self.equations[experiment].at_frequency(float(response.frequency))
+        parameters, count = self.parameters(theta[None], experiment)[0], response.log_multipliers.size
         solution = _described(equations, parameters, z)
-        by_parameter = multiplier_sensitivities(self.model, solution)
-        every = np.array([by_parameter[name] / solution.multipliers for name in self.model.parameters]).real
-        kept = [_without_trivial(solution, row)[: response.log_multipliers.size] for row in every]
-        return np.array(kept)
+        every = logarithmic_changes(
+            equations,
+            parameters,
+            z,
+            solution,
+            np.tensordot(directions, anchor.sensitivities, (1, 0)),
+            directions,
+            directions @ anchor.frequency_sensitivities,
+            None if solution.autonomous else count,
+        ).real
+        return np.array([_without_trivial(solution, row)[:count] for row in every])
 
     def pulled(
         self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray, weights: Response
@@ -240,10 +248,10 @@ class Responses:
         by_parameter = output_gradient(equations, z, parameters, weights.outputs)
         if by_parameter is None:
             return None
+        by_theta = slopes[:-1].T @ by_parameter + slopes[-1] * weights.delay
         if response.log_multipliers.size:
-            changes = self._multiplier_changes(equations, parameters, z, response)
-            by_parameter = by_parameter + changes @ weights.log_multipliers
-        return slopes[:-1].T @ by_parameter + slopes[-1] * weights.delay
+            by_theta += self._multiplier_changes(theta, experiment, z, response) @ weights.log_multipliers
+        return by_theta
 
 
 def leading_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int) -> np.ndarray:
