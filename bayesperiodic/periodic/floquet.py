@@ -200,13 +200,16 @@ def _harmless_products(steps: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _spread(matrices: np.ndarray) -> np.ndarray:
-    """Return the ratio of the largest to the smallest stretching; infinite where they are far from 1."""
+    """Return condition numbers, in Frobenius norms; infinite where the matrices are far from 1 in size."""
     with np.errstate(all="ignore"):
         if not np.isfinite(matrices).all():
             return np.full(len(matrices), np.inf)
-        values = np.linalg.svd(matrices, compute_uv=False)
-        in_range = (values[:, -1] > 1.0 / IN_RANGE) & (values[:, 0] < IN_RANGE)
-        return np.where(in_range, values[:, 0] / values[:, -1], np.inf)
+        try:
+            back = np.linalg.norm(np.linalg.inv(matrices), axis=(1, 2))
+        except np.linalg.LinAlgError:
+            return np.full(len(matrices), np.inf)
+        there = np.linalg.norm(matrices, axis=(1, 2))
+        return np.where((back < IN_RANGE) & (there < IN_RANGE), there * back, np.inf)
 
 
 def _invariant_bases(groups: np.ndarray, splits: list[int] | None = None) -> tuple[list[int], np.ndarray]:
