@@ -42,6 +42,23 @@ def test_a_noise_of_one_per_cent_does_not_lose_the_gentle_orbits():
     assert found == pytest.approx([k.multipliers[0].real for k in GENTLE], rel=1e-4)
 
 
+def test_points_too_rough_for_the_nearest_winding_lead_to_the_one_that_fits():
+    """At a noise of 4 % the pieces between section points miss by half a turn; all orbits of period 3 are found."""
+    known = [k for k in shooting.UNSTABLE if len(k.section) == 3]
+    polished = polish(*(measured(k, noise=0.04, seed=1, cycle=False) for k in known), samples=400)
+    assert [orbit.winding for orbit in polished] == [k.winding for k in known]
+    found = [orbit.solution.multipliers[0].real for orbit in polished]
+    assert found == pytest.approx([k.multipliers[0].real for k in known], rel=1e-3)
+
+
+def test_a_cycle_tells_the_winding_that_was_not_counted():
+    known = GENTLE[2]
+    (orbit,) = polish(replace(measured(known), winding=None), samples=400)
+    assert orbit.winding == known.winding == 4
+    run = replace(measured(known), winding=None).experiment(states={"phi": "angle"})
+    assert run.winding == 4
+
+
 def test_a_period_gone_round_twice_is_brought_to_its_prime_period():
     """Points averaged over both rounds, their covariance halved, log|eigenvalue| halved with its sd."""
     once = measured(GENTLE[1])
