@@ -14,6 +14,7 @@ from bayesperiodic.periodic.autonomous_batch import AutonomousBatch
 from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
+from bayesperiodic.periodic.floquet import first_order_matrix, largest_multiplier
 from bayesperiodic.periodic.reach import LOST, reach
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities, output_gradient
@@ -258,8 +259,27 @@ def leading_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z:
     """Return the `count` largest multipliers of a solution z, or fewer, without an autonomous orbit's trivial 1."""
     if not count:
         return np.empty(0)
+    if count == 1 and not equations.model.autonomous:
+        alone = _largest_alone(equations, parameters, z)
+        if alone is not None:
+            return np.array([alone], dtype=complex)
     solution = _described(equations, parameters, z)
     return _without_trivial(solution, solution.multipliers)[:count]
+
+
+def _largest_alone(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> float | None:
+    """Return the largest multiplier where it is real and well apart from the others; else None."""
+    orders = tuple(equations.model.orders.values())
+    columns = equations.residual_jacobian(z, parameters)[:, equations.count :]
+    try:
+        matrix = first_order_matrix(columns.reshape(len(z), equations.count, -1), orders)
+    except np.linalg.LinAlgError:
+        return None
+    period = equations.grid.periods / equations.frequency
+    spread = np.ptp(z, axis=0)
+    sizes = np.where(spread > 0.0, spread, 1.0)
+    sizes = np.concatenate([sizes, 2 * np.pi / period * sizes[[order == 2 for order in orders]]])
+    return largest_multiplier(matrix * (sizes / sizes[:, None]), period)
 
 
 def _described(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> PeriodicSolution:

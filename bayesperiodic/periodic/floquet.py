@@ -32,7 +32,7 @@ GAUSS_MATRIX = np.array(
     ]
 )
 HARMLESS, IN_RANGE = 1e3, 1e60
-SWEEPS = 8
+SWEEPS, ROUNDS = 8, 60
 DECOUPLED = 1e-11
 STIFF, MOST_PARTS = 3.0, 32
 
@@ -40,7 +40,7 @@ STIFF, MOST_PARTS = 3.0, 32
 @cache
 def _kernels() -> SimpleNamespace:
     source = Path(__file__).with_name("floquet_kernels.py").read_text(encoding="utf-8")
-    return SimpleNamespace(**load(source, ("transfer_matrices", "along", "across")))
+    return SimpleNamespace(**load(source, ("transfer_matrices", "along", "across", "largest")))
 
 
 @dataclass(frozen=True)
@@ -167,6 +167,26 @@ def floquet(matrix: np.ndarray, period: float) -> Floquet:
             w.append(across)
     order = np.argsort([-e.real for e in exponents], kind="stable")
     return Floquet(np.array(exponents)[order], steps, length, np.array(v)[order], np.array(w)[order])
+
+
+def largest_multiplier(matrix: np.ndarray, period: float) -> float | None:
+    """Return the multiplier of largest modulus of ẏ = A(t) y where it is real and stands well apart; else None.
+
+    A vector carried round the period turns into its eigenvector in a few rounds.
+
+    Parameters
+    ----------
+    matrix : array (points, size, size)
+        A [1/s] on an equidistant grid of one period, end point excluded.
+    period : float
+        [s].
+    """
+    points, size, _ = matrix.shape
+    start = np.full(size, 1.0 / np.sqrt(size))
+    steps = _transfer_matrices(matrix, period / points)
+    found, logarithm, sign = _kernels().largest(steps, start, ROUNDS, DECOUPLED)
+    with np.errstate(over="ignore"):
+        return float(sign * np.exp(logarithm)) if found else None
 
 
 def _transfer_matrices(matrix: np.ndarray, step: float) -> np.ndarray:

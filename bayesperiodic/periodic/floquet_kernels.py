@@ -141,3 +141,34 @@ def across(steps, at, length, result):
                 for q in range(size):
                     result[k, p] += steps[k, q, p] * result[after, q]
         normalise(result[k])
+
+
+@njit(f"Tuple((boolean, float64, float64))({CUBE}, float64[::1], int64, float64)", **OPTIONS)
+def largest(steps, vector, sweeps, tolerance):
+    """Carry a vector round the period until its direction stays; return whether it does, log|μ| and the sign of μ."""
+    points, size, _ = steps.shape
+    start, after = np.empty(size), np.empty(size)
+    for _ in range(sweeps):
+        growth = 0.0
+        start[:] = vector
+        for k in range(points):
+            square = 0.0
+            for p in range(size):
+                after[p] = 0.0
+                for q in range(size):
+                    after[p] += steps[k, p, q] * vector[q]
+                square += after[p] ** 2
+            length = np.sqrt(square)
+            growth += np.log(length)
+            for p in range(size):
+                vector[p] = after[p] / length
+        along = 0.0
+        for p in range(size):
+            along += vector[p] * start[p]
+        sign = 1.0 if along > 0.0 else -1.0
+        off = 0.0
+        for p in range(size):
+            off = max(off, abs(vector[p] - sign * start[p]))
+        if off < tolerance:
+            return True, growth, sign
+    return False, 0.0, 0.0

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.periodic.floquet import first_order_matrix, floquet
+from bayesperiodic.periodic.floquet import first_order_matrix, floquet, largest_multiplier
 from tests.known import grid
 
 PERIOD = 1.7
@@ -204,3 +204,18 @@ def test_multipliers_of_overly_stiff_equations_are_stable_and_positive():
     for points in (200, 201):
         multiplier = np.exp(floquet(np.full((points, 1, 1), -1e8), 1.0).exponents[0])
         assert 0.0 <= multiplier.real < 1.0 and multiplier.imag == 0.0
+
+
+def test_a_vector_carried_round_finds_the_largest_multiplier_where_it_is_real_and_alone():
+    """Constant matrices, their multipliers known: signs by half a turn, none where two are a pair or nearly equal."""
+    tau = np.arange(100) / 100
+    real = np.array([[1.0, 3.0], [0.5, -2.0]])
+    largest = np.exp(3.0 * np.linalg.eigvals(real).max())
+    assert largest_multiplier(np.tile(real, (100, 1, 1)), 3.0) == pytest.approx(largest, rel=1e-9)
+    # Seen from axes that turn by half a turn in the period the multipliers change their signs.
+    turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+    axes = [np.cos(np.pi * t) * np.eye(2) + np.sin(np.pi * t) * turn for t in tau]
+    seen = np.array([a @ real @ a.T + np.pi / 3.0 * turn for a in axes])
+    assert largest_multiplier(seen, 3.0) == pytest.approx(-largest, rel=1e-6)
+    assert largest_multiplier(np.tile(turn, (100, 1, 1)), 1.0) is None
+    assert largest_multiplier(np.tile(np.diag([0.1, 0.099]), (100, 1, 1)), 1.0) is None
