@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from bayesperiodic.orbits.angles import wrapped
 from bayesperiodic.periodic.equations import PeriodicEquations
 
 STILL = 1e-6
-TURN = 2 * np.pi
 
 
 def section_points(outputs: np.ndarray, samples: int, angles: np.ndarray) -> np.ndarray:
@@ -13,11 +13,6 @@ def section_points(outputs: np.ndarray, samples: int, angles: np.ndarray) -> np.
     points = np.array(outputs[::samples])
     points[:, angles] = wrapped(points[:, angles])
     return points
-
-
-def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Return angles in (−π, π]."""
-    return np.pi - np.mod(np.pi - angle, TURN)
 
 
 def differences(points: np.ndarray, others: np.ndarray, angles: np.ndarray) -> np.ndarray:
