@@ -8,6 +8,7 @@ from scipy.stats import chi2
 
 from bayesperiodic import checks
 from bayesperiodic.orbits.angles import wrapped
+from bayesperiodic.orbits.atlas import Atlas
 from bayesperiodic.orbits.boxes import box_orbits
 from bayesperiodic.orbits.chained import Estimate, refine
 from bayesperiodic.orbits.cycles import has_shorter_period, shift_between
@@ -19,7 +20,6 @@ from bayesperiodic.orbits.search import Candidate, candidates
 from bayesperiodic.orbits.section import PoincareSection
 
 METHODS = ("chained", "boxes")
-SEARCH_DEGREE = 2
 QUALITY_DEGREE = 3
 FEWEST_NEIGHBOURS = 32
 # Of a local fit in the search, in standard deviations of the noise.
@@ -34,11 +34,25 @@ STILL, SPREAD = 0.02, 20.0
 
 @dataclass(frozen=True)
 class _Scaled:
-    """A section in units of the attractor's size."""
+    """A section in units of the attractor's size.
+
+    Attributes
+    ----------
+    points : array (count, 2)
+    size : array (2,)
+        The unit.
+    maps : LocalMaps
+    extent : array (2,) or None
+        Ranges of the recorded signals.
+    quality_count : int
+        Neighbours of the local fits that the quality of an orbit is judged by, at least.
+    """
 
     points: np.ndarray
     size: np.ndarray
     maps: LocalMaps
+    extent: np.ndarray | None
+    quality_count: int
 
 
 def find_orbits(
@@ -109,12 +123,11 @@ def find_orbits(
     neighbours = checks.integer("neighbours", neighbours, 16)
     box = checks.positive("box", box)
     scaled = _scaled(section, neighbours)
-    found: list[tuple[Candidate, Estimate]] = []
-    for period in wanted:
-        if method == "boxes":
-            found += box_orbits(scaled.maps, scaled.points, period, neighbours, box)
-        else:
-            found += _chained(scaled, period, neighbours)
+    if method == "boxes":
+        found = [pair for p in wanted for pair in box_orbits(scaled.maps, scaled.points, p, neighbours, box)]
+    else:
+        atlas = Atlas(scaled.maps, _search_count(scaled.maps, neighbours))
+        found = [pair for p in wanted for pair in _chained(scaled, atlas, p, neighbours)]
     orbits = [_orbit(section, scaled, candidate, estimate) for candidate, estimate in found]
     orbits = _named(_with_partners(orbits, scaled))
     return Orbits(tuple(orbits), values=section.values, method=method)
@@ -133,11 +146,10 @@ def _periods(periods: Iterable[int], count: int) -> list[int]:
     return wanted
 
 
-def _chained(scaled: _Scaled, period: int, neighbours: int) -> list[tuple[Candidate, Estimate]]:
+def _chained(scaled: _Scaled, atlas: Atlas, period: int, neighbours: int) -> list[tuple[Candidate, Estimate]]:
     maps = scaled.maps
     found: list[tuple[Candidate, Estimate]] = []
-    count = _search_count(maps, neighbours)
-    for candidate in candidates(maps, scaled.points, period, count, SEARCH_DEGREE):
+    for candidate in candidates(maps, atlas, scaled.points, period):
         estimate = refine(maps, candidate.points, neighbours)
         if estimate is None or not _sound(maps, estimate):
             continue
@@ -158,7 +170,8 @@ def _scaled(section: PoincareSection, neighbours: int) -> _Scaled:
     if section.noise is None:
         noise = noise_of(maps, neighbours)
         maps = LocalMaps(points[:-1], section.increments / size, turn, section.winds, noise)
-    return _Scaled(points, size, maps)
+    extent = None if section.signals is None else np.ptp(section.signals, axis=0)
+    return _Scaled(points, size, maps, extent, _search_count(maps, FEWEST_NEIGHBOURS))
 
 
 def _search_count(maps: LocalMaps, neighbours: int) -> int:
@@ -227,9 +240,8 @@ def _orbit(section: PoincareSection, scaled: _Scaled, candidate: Candidate, esti
 
 def _at_rest(section: PoincareSection, scaled: _Scaled, cycle: dict[str, np.ndarray]) -> bool:
     """Return whether a measured cycle shows no motion but noise and the distance to the orbit."""
-    assert section.signals is not None
-    extent = np.ptp(section.signals, axis=0)
-    extent = np.where(np.isfinite(scaled.maps.turn), np.minimum(extent, 2.0 * np.pi), extent)
+    assert scaled.extent is not None
+    extent = np.where(np.isfinite(scaled.maps.turn), np.minimum(scaled.extent, 2.0 * np.pi), scaled.extent)
     limit = (STILL + SPREAD * scaled.maps.noise) * extent
     return all(np.ptp(cycle[name]) < limit[k] for k, name in enumerate(section.coordinates))
 
@@ -251,10 +263,9 @@ def _quality(scaled: _Scaled, candidate: Candidate, estimate: Estimate) -> float
     maps, period = scaled.maps, len(estimate.points)
     steps = candidate.closest + np.arange(period + 1)
     away = maps.wrap(scaled.points[steps] - np.take(estimate.points, np.arange(period + 1), 0, mode="wrap"))
-    least = _search_count(maps, FEWEST_NEIGHBOURS)
     statistic = 0.0
     for point, here, there in zip(estimate.points, away[:-1], away[1:], strict=True):
-        count = least
+        count = scaled.quality_count
         while maps.nearest(point[None], count)[0][0, -1] < 1.5 * np.abs(here).max() and 4 * count < len(maps.arguments):
             count *= 2
         fit = maps.fit(point[None], count, QUALITY_DEGREE, influence=False)

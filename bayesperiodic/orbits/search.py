@@ -1,14 +1,16 @@
 """Close returns of a section, and the cycles of the local maps that they lead to."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from bayesperiodic.orbits.atlas import Atlas
 from bayesperiodic.orbits.cycles import has_shorter_period, newton_step, shift_between
 from bayesperiodic.orbits.local import LocalMaps
 
 # In units of the attractor's size: a return that is this close begins a search; stretches in one cell begin one search.
-CLOSE = 0.05
+CLOSE = 0.08
 CELL = 0.01
 LONGEST_STEP = 0.03
 STEPS = 14
@@ -16,7 +18,10 @@ CONVERGED = 2e-4
 # Where the neighbourhood is wider, or the next points farther than so many bandwidths, the cycle has left the data.
 WIDEST = 0.06
 MERGED = 2e-3
+NEARLY, EXACT_STEPS = 0.02, 4
 SAME = 3e-3
+
+Images = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -41,35 +46,42 @@ class Candidate:
     shift: int
 
 
-def candidates(maps: LocalMaps, section: np.ndarray, period: int, count: int, degree: int) -> list[Candidate]:
+def candidates(maps: LocalMaps, atlas: Atlas, section: np.ndarray, period: int) -> list[Candidate]:
     """Return the prime cycles of a period that close returns lead to.
 
     Parameters
     ----------
     maps : LocalMaps
+    atlas : Atlas
     section : array (n, 2)
         All points in the order of time, in units of the attractor's size.
     period : int
-    count : int
-        Neighbours of each local fit.
-    degree : int
     """
     starts, members = _close_returns(maps, section, period)
     chains = section[starts[:, None] + np.arange(period)]
+    step, heir = _settle(maps, atlas, chains)
+    kept = np.unique(heir)
+    members = [np.concatenate([members[i] for i in np.flatnonzero(heir == k)]) for k in kept]
+    near = step[kept] < NEARLY
+    chains, step = chains[kept[near]], step[kept[near]]
+    # The patches of the atlas do not quite meet, and Newton's method may stumble over that: a few steps without it.
+    for _ in range(EXACT_STEPS):
+        step = _newton(maps, chains, atlas.exactly)[0]
+    return _distinct(maps, section, chains, step, [m for m, is_near in zip(members, near, strict=True) if is_near])
+
+
+def _settle(maps: LocalMaps, atlas: Atlas, chains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Move chains (m, period, 2) by Newton's method on the atlas; return their last steps, and whom each has joined."""
     noise = float(maps.noise.max())
-    step = np.full(len(starts), np.inf)
-    heir = np.arange(len(starts))
+    step, heir = np.full(len(chains), np.inf), np.arange(len(chains))
     active = heir
     for _ in range(STEPS):
         if active.size == 0:
             break
-        fit = maps.fit(chains[active].reshape(-1, 2), count, degree, influence=False)
-        shape = (active.size, period)
-        defect = maps.wrap(fit.value.reshape(*shape, 2) - np.roll(chains[active], -1, axis=1))
-        correction = newton_step(defect, fit.jacobian.reshape(*shape, 2, 2))
-        size = np.abs(correction).max((1, 2))
-        chains[active] += correction * np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))[:, None, None]
-        lost = (fit.bandwidth.reshape(shape).max(1) > max(WIDEST, 2.0 * noise)) | ~np.isfinite(size)
+        moved = chains[active]
+        size, bandwidth = _newton(maps, moved, atlas.at)
+        chains[active] = moved
+        lost = (bandwidth > max(WIDEST, 2.0 * noise)) | ~np.isfinite(size)
         step[active] = np.where(lost, np.inf, size)
         active = active[(size > max(0.01 * CONVERGED, 0.05 * noise)) & ~lost]
         # Chains that have come to one place share their future.
@@ -79,9 +91,20 @@ def candidates(maps: LocalMaps, section: np.ndarray, period: int, count: int, de
         active = active[first]
     for _ in range(STEPS):
         heir = heir[heir]
-    members = [np.concatenate([members[i] for i in np.flatnonzero(heir == k)]) for k in np.unique(heir)]
-    kept = np.unique(heir)
-    return _distinct(maps, section, chains[kept], step[kept], members)
+    return step, heir
+
+
+def _newton(maps: LocalMaps, chains: np.ndarray, images: Images) -> tuple[np.ndarray, np.ndarray]:
+    """Move chains (m, period, 2) by a step; return its sizes and the widest bandwidths, (m,) each."""
+    if not len(chains):
+        return np.empty(0), np.empty(0)
+    shape = chains.shape[:2]
+    image, jacobian, bandwidth = images(chains.reshape(-1, 2))
+    defect = maps.wrap(image.reshape(*shape, 2) - np.roll(chains, -1, axis=1))
+    correction = newton_step(defect, jacobian.reshape(*shape, 2, 2))
+    size = np.abs(correction).max((1, 2))
+    chains += correction * np.minimum(1.0, LONGEST_STEP / np.maximum(size, 1e-300))[:, None, None]
+    return size, bandwidth.reshape(shape).max(1)
 
 
 def _cells(maps: LocalMaps, chains: np.ndarray, size: float) -> np.ndarray:
