@@ -20,7 +20,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="folder for results.json and figures (default figures/NAME)")
     parser.add_argument("--seed", type=int, default=1, help="of everything random (default 1)")
     parser.add_argument("--quick", action="store_true", help="short chains, into figures/quick/NAME; not for quoting")
-    parser.add_argument("--replicates", type=int, default=0, help="of the study verdicts: data sets a case (default 0)")
+    parser.add_argument("--noise", type=float, default=1e-3, help="pendulum: fraction of the attractor (default 0.001)")
+    parser.add_argument("--replicates", type=int, default=0, help="verdicts, pendulum: data sets (default 0)")
     options = parser.parse_args(arguments)
     names = (m.name for m in pkgutil.iter_modules(studies.__path__))
     known = [name for name in names if name != "common" and "_" not in name]  # an underscore: a part of a study

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import bayesperiodic as bp
-from studies.pendulum_recording import KNOWN, TRUTH
+from studies.pendulum_recording import TRUTH
 
 # Of the start, in table 1 of the paper.
 START_ERRORS = {"m": 0.51, "l": 0.189, "k3": 1.0}
 PAPER_ERRORS = {"m": 0.096, "l": 0.003, "k3": 0.116}
 START = {name: TRUTH[name] * (1.0 + error) for name, error in START_ERRORS.items()}
-LARGEST_MULTIPLIER = 50.0
+LARGEST = 50.0
 SAMPLES = 100
 SCHEME = "central4"
 FREE = {"m and l": ("m", "l"), "k3": ("k3",), "all five": ("m", "l", "k1", "k2", "k3")}
@@ -57,7 +57,7 @@ def identify(orbits: bp.Orbits, *, which: Sequence[str] = tuple(FREE)) -> Identi
     values = TRUTH | first.theta
     doubt = {name: 3.0 * first.sd[name] for name in first.theta}
     polished = bp.polish_orbits(bp.models.pendulum, orbits, values, parameter_sd=doubt, samples=SAMPLES, scheme=SCHEME)
-    selected = bp.select_orbits(polished, FREE["m and l"], largest_multiplier=LARGEST_MULTIPLIER)
+    selected = bp.select_orbits(polished, FREE["m and l"], largest_multiplier=LARGEST)
     problems = {name: problem_of([o.experiment(samples=SAMPLES) for o in selected], FREE[name]) for name in which}
     fits = {name: _fit(problem) for name, problem in problems.items()}
     return Identified(polished, selected, problems, fits, tuple(lost))
@@ -89,12 +89,13 @@ def _start(name: str) -> float:
 
 
 def _moderate(orbit: bp.Orbit) -> bool:
-    return bool(abs(orbit.eigenvalues[0]) < LARGEST_MULTIPLIER and orbit.quality >= 1e-3)
+    return bool(abs(orbit.eigenvalues[0]) < LARGEST and orbit.quality >= 1e-3)
 
 
 def _first_estimate(orbits: Sequence[bp.Orbit]) -> tuple[bp.MapEstimate, list[tuple[str, str]]]:
     """Return m and l from measured cycles, without the orbits that cannot be solved on the way."""
-    used, lost = list(orbits), []
+    used = list(orbits)
+    lost: list[tuple[str, str]] = []
     while True:
         problem = problem_of([o.experiment(samples=SAMPLES, states=STATES) for o in used], FREE["m and l"])
         try:
@@ -117,9 +118,7 @@ def covers(fit: bp.MapEstimate, probability: float = 0.9) -> dict[str, bool]:
     return {name: bool(low <= TRUTH[name] <= high) for name, (low, high) in fit.interval(probability).items()}
 
 
-def told(fit: bp.MapEstimate) -> dict[str, Mapping[str, float]]:
-    """Return estimate, standard deviation and relative error of each parameter."""
-    return {
-        name: {"value": fit.theta[name], "sd": fit.sd[name], "relative_error": error}
-        for name, error in errors(fit).items()
-    }
+def told(fit: bp.MapEstimate, *, synthetic: bool) -> dict[str, Mapping[str, float]]:
+    """Return estimate and standard deviation of each parameter, and its relative error where the truth is known."""
+    found = {name: {"value": value, "sd": fit.sd[name]} for name, value in fit.theta.items()}
+    return {n: row | ({"relative_error": errors(fit)[n]} if synthetic else {}) for n, row in found.items()}

@@ -48,12 +48,21 @@ def with_noise(recording: bp.Recording, fraction: float, seed: int) -> bp.Record
     return replace(recording, outputs=outputs)
 
 
-def read(path: Path) -> tuple[bp.Recording, dict[str, Any]]:
-    """Return a measured recording, with columns time [s], angle [rad] and rate [rad/s], and what to report of it."""
-    found = common.find_data(path, path.name)
-    assert found is not None
-    recording = bp.Recording.from_csv(found[0], time="time", outputs={"angle": "angle", "rate": "rate"})
-    return recording, {"path": found[1], "sha256": common.sha256(found[0]), "synthetic": False}
+def get(data: Path | None, quick: bool, seed: int) -> tuple[bp.Recording, dict[str, Any]]:
+    """Return the recording without added noise, simulated unless a file is given, and what to report of it.
+
+    A file has the columns time [s], angle [rad] and rate [rad/s], of a pendulum driven at ω = 9.09 rad/s.
+    """
+    about: dict[str, Any] = {"path": "generated", "sha256": None, "synthetic": True}
+    if data is None:
+        recording = simulate(QUICK_PERIODS if quick else PERIODS, seed)
+    else:
+        if not data.is_file():
+            raise FileNotFoundError(f"--data: {str(data)!r} is not allowed; there is no such file.")
+        recording = bp.Recording.from_csv(data, time="time", outputs={name: name for name in COORDINATES})
+        about = {"path": str(data), "sha256": common.sha256(data), "synthetic": False}
+    size = {"values": sum(v.size for v in recording.outputs.values())}
+    return recording, about | size | {"drive_periods": int(np.ptp(recording.time) * FREQUENCY)}
 
 
 def section_of(recording: bp.Recording) -> bp.PoincareSection:

@@ -9,13 +9,14 @@ import numpy as np
 import pandas as pd
 
 import bayesperiodic as bp
+from studies.pendulum_estimates import Identified
 from studies.pendulum_recording import KNOWN, TRUTH
 
 NATURAL = ("m", "l", "k1", "k2", "k3")
 COMBINATIONS = {f"c{i}": f"k{i}/(m*l**2)" for i in (1, 2, 3)}
 DETERMINED = ("l", *COMBINATIONS)
 DETERMINED_UNITS = {"l": "m", "c1": "1/s^2", "c2": "1/s", "c3": "1"}
-QUICK_STEPS = 500
+ALL, QUICK_STEPS = "all five", 250
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,11 @@ class Ridge:
     combinations: pd.DataFrame
 
 
-def sample(problem: bp.Problem, fit: bp.MapEstimate, seed: int, quick: bool) -> Ridge:
+def sample(identified: Identified, seed: int, quick: bool) -> Ridge:
     """Sample the posterior of all five, and let the package say what it says of it."""
-    settings: dict[str, Any] = {"max_steps": QUICK_STEPS, "ensembles": 2} if quick else {}
-    posterior = bp.sample(problem, fit, seed=seed, progress=False, **settings)
+    problem, fit = identified.problems[ALL], identified.fits[ALL]
+    settings: dict[str, Any] = {"max_steps": QUICK_STEPS} if quick else {}
+    posterior = bp.sample(problem, fit, seed=seed, ensembles=2, progress=False, **settings)
     laplace, draws = fit.derive(COMBINATIONS), posterior.derive(COMBINATIONS)
     table = laplace.rename(columns={"sd": "laplace_sd"}).join(draws[["mean", "sd"]])
     l_draws = posterior.draws("l")
@@ -68,8 +70,8 @@ def sample(problem: bp.Problem, fit: bp.MapEstimate, seed: int, quick: bool) -> 
 
 def combination_draws(posterior: bp.Posterior) -> dict[str, np.ndarray]:
     """Return the draws of what the data determine."""
-    m, l, *k = (posterior.draws(name) for name in NATURAL)
-    return {"l": l} | {f"c{i + 1}": k[i] / (m * l**2) for i in range(3)}
+    mass, length, *torques = (posterior.draws(name) for name in NATURAL)
+    return {"l": length} | {f"c{i}": torque / (mass * length**2) for i, torque in enumerate(torques, 1)}
 
 
 def truths() -> dict[str, float]:
@@ -100,7 +102,9 @@ def collect(ridge: Ridge) -> dict[str, Any]:
             }
             for name in NATURAL
         },
-        "combinations": {str(name): {k: float(v) for k, v in row.items()} for name, row in ridge.combinations.iterrows()},
+        "combinations": {
+            str(name): {str(k): float(v) for k, v in row.items()} for name, row in ridge.combinations.iterrows()
+        },
         "joint": {c: str(r.joint["verdict"]) for c, r in (("natural", ridge.natural), ("logarithms", ridge.sampling))},
         "recommendation": str(ridge.natural.joint["recommendation"]),
     }

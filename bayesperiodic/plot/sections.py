@@ -63,7 +63,8 @@ def section(
     handles = [plt.Line2D([], [], marker=".", ls="", color="0.65", label=f"{name} ({len(shown)})")]
     for rank, period in enumerate(sorted({orbit.period for orbit in orbits})):
         members = [orbit for orbit in orbits if orbit.period == period]
-        style: dict[str, Any] = {"marker": MARKERS[rank % len(MARKERS)], "color": ENSEMBLES[rank % len(ENSEMBLES)], "ls": "", "ms": 5}
+        marker, colour = MARKERS[rank % len(MARKERS)], ENSEMBLES[rank % len(ENSEMBLES)]
+        style: dict[str, Any] = {"marker": marker, "color": colour, "ls": "", "ms": 5}
         points = np.concatenate([orbit.points for orbit in members])
         ax.plot(*points.T, mec="black", mew=0.5, zorder=3, **style)
         noun = "orbit" if len(members) == 1 else "orbits"

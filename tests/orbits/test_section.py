@@ -42,14 +42,16 @@ def test_a_sampling_rate_that_does_not_divide_the_period():
 
 @pytest.mark.parametrize("samples", [40, 100])
 def test_dense_noise_is_averaged_without_bias(samples):
-    # The stated sd is that of the errors within 8 %, and their mean is zero within four standard errors.
+    # The stated sd is that of the errors within 8 %; their mean over any tenth of the rates is zero within four
+    # standard errors, which independent ones exceed in one of 800 tests.
     section = bp.PoincareSection.from_recording(chaos.recording(3000, samples, 0.001), BOTH, **ANGLE)
     errors = section.points - chaos.path(3000, samples)[::samples]
     errors[:, 0] -= 2 * np.pi * np.round(errors[:, 0] / (2 * np.pi))
     single = 0.001 * np.array([6.28, 32.6])
     np.testing.assert_allclose(section.noise, errors.std(axis=0), rtol=0.08)
-    assert np.all(section.noise < {40: 0.6, 100: 0.45}[samples] * single)
-    assert np.all(np.abs(errors.mean(axis=0)) < 4.0 * errors.std(axis=0) / np.sqrt(len(errors)))
+    assert np.all(section.noise < {40: 0.75, 100: 0.5}[samples] * single)
+    for tenth in np.array_split(np.argsort(section.points[:, 1]), 10):
+        assert np.all(np.abs(errors[tenth].mean(axis=0)) < 4.0 * errors.std(axis=0) / np.sqrt(len(tenth)))
 
 
 def test_turns_are_counted_and_folded_angles_are_the_same():
