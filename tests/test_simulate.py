@@ -1,3 +1,5 @@
+import sys
+
 import numpy as np
 import pytest
 import sympy as sp
@@ -115,6 +117,25 @@ def test_arrays_and_functions_of_time_give_the_same_run(drive):
     )
     assert one.outputs["displacement"] == pytest.approx(other.outputs["displacement"], abs=1e-8)
     assert one.inputs["force"] == pytest.approx(other.inputs["force"], abs=1e-12)
+
+
+def test_a_stiff_run_under_periodic_inputs_takes_no_interpreted_step(monkeypatch):
+    """A lag of 0.1 ms through 5 s, as stiff as a trial in SciPy's steps would be slow; the answer in closed form."""
+    module = sys.modules["bayesperiodic.simulate"]  # the package's attribute of that name is the function
+    monkeypatch.setattr(module, "solve_ivp", lambda *_, **__: pytest.fail("interpreted steps"))
+    model = bp.Model(
+        "lag",
+        states=["x"],
+        inputs=["u"],
+        parameters={"delay": "s"},
+        equations=lambda s, p, u: [p.delay * s.dx + s.x - u.u],
+        outputs=lambda s, p, u: {"x": s.x},
+    )
+    run = bp.simulate(
+        model, {"delay": 1e-4}, {"u": np.cos(2 * np.pi * grid(8))}, frequency=0.2, duration=5.0, sampling_rate=9.0
+    )
+    answer = (np.exp(2j * np.pi * 0.2 * run.time) / (1 + 2j * np.pi * 0.2 * 1e-4)).real
+    assert run.outputs["x"][1:] == pytest.approx(answer[1:], abs=1e-9)
 
 
 def test_noise_has_its_standard_deviation_and_its_seed():
