@@ -22,29 +22,36 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="short chains, into figures/quick/NAME; not for quoting")
     parser.add_argument("--noise", type=float, default=1e-3, help="pendulum: fraction of the attractor (default 0.001)")
     parser.add_argument("--replicates", type=int, default=0, help="verdicts, pendulum: data sets (default 0)")
+    parser.add_argument("--truth", choices=("A", "B"), help="landing-gear: which damper (default both)")
     options = parser.parse_args(arguments)
-    names = (m.name for m in pkgutil.iter_modules(studies.__path__))
-    known = [name for name in names if name != "common" and "_" not in name]  # an underscore: a part of a study
+    known = _studies()
     if options.name is None:
         for name in sorted(known):
-            print(f"{name:12s} {_first_line(name)}")
+            print(f"{name:12s} {_first_line(known[name])}")
         return 0
     if options.name not in known:
         print(f"error: name: {options.name!r} is not a study; known: {', '.join(sorted(known))}.", file=sys.stderr)
         return 2
     matplotlib.use("Agg")
-    options.out = options.out or Path("figures", *(["quick"] if options.quick else []), options.name)
+    options.out = options.out or Path("figures", *(["quick"] if options.quick else []), known[options.name])
     try:
-        importlib.import_module(f"studies.{options.name}").run(options)
+        importlib.import_module(f"studies.{known[options.name]}").run(options)
     except (ValueError, RuntimeError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def _first_line(name: str) -> str:
+def _studies() -> dict[str, str]:
+    """Return the module of every study by its name; one called like another with an underscore is a part of it."""
+    modules = [m.name for m in pkgutil.iter_modules(studies.__path__) if m.name not in ("common", "__main__")]
+    parts = {part for part in modules for whole in modules if part.startswith(f"{whole}_")}
+    return {module.replace("_", "-"): module for module in modules if module not in parts}
+
+
+def _first_line(module: str) -> str:
     """Return what a study says of itself, read from its text: importing it would load the compiler."""
-    text = Path(studies.__path__[0], f"{name}.py").read_text(encoding="utf-8")
+    text = Path(studies.__path__[0], f"{module}.py").read_text(encoding="utf-8")
     return (ast.get_docstring(ast.parse(text)) or "").splitlines()[0]
 
 

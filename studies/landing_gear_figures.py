@@ -1,0 +1,112 @@
+"""Figures of the landing gear study."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import bayesperiodic as bp
+from studies.landing_gear_identification import Identified
+from studies.landing_gear_rig import Run
+from studies.landing_gear_truth import GEAR
+from studies.landing_gear_verdicts import CONDUCTION, NEGATIVE, POSITIVE, UNDETERMINED, Verdict
+
+SCALES = {"displacement": (1e3, "mm"), "force": (1e-3, "kN"), "pressure": (1e-6, "MPa")}
+SIGNS = {POSITIVE: ("#009E73", "o"), UNDETERMINED: ("#999999", "D"), NEGATIVE: ("#CC79A7", "v")}
+# The scale of theta16 is linear up to here, logarithmic beyond [W/K].
+LINEAR_TO, TICKS = 3.0, (-100, -50, -20, -10, -5, -3, -2, -1, 0, 1, 2, 3, 5, 10, 20)
+TRUTH_NAMES = {"A": "truth A: eq. (9) holds", "B": "truth B: lost motion, line lag, convection, friction heat"}
+
+
+def histories(recordings: Mapping[str, bp.Recording], identified: Mapping[str, Identified]) -> Figure:
+    """Draw recorded displacement, force and pressure of one experiment and what the fit says, a column a truth."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(5.0 * len(recordings) + 1.0, 8.5), layout="constrained")
+    grid = figure.subplots(4, len(recordings), sharex=True, squeeze=False, sharey="row")
+    for column, (truth, recording) in zip(grid.T, recordings.items(), strict=True):
+        _histories(column, recording, identified[truth])
+        column[0].set_title(TRUTH_NAMES[truth], fontsize=10)
+    for axes, label in zip(
+        grid[:, 0], ("displacement [mm]", "force [kN]", "pressure [MPa]", "residual force [N]"), strict=True
+    ):
+        axes.set_ylabel(label)
+    figure.legend(*grid[1, 0].get_legend_handles_labels(), frameon=False, ncols=2, loc="outside lower center")
+    figure.suptitle(f"Landing gear at {next(iter(recordings.values())).name.replace(' Hz ', ' Hz, ±')}, SYNTHETIC data")
+    return figure
+
+
+def _histories(column: np.ndarray, recording: bp.Recording, identified: Identified) -> None:
+    (experiment,), fit = identified.problem.experiments, identified.fit
+    residuals = fit.residuals[experiment.name]
+    until = 2.0 / experiment.frequency
+    kept = recording.time <= until
+    time = np.arange(2 * experiment.samples) / (experiment.samples * experiment.frequency)
+    signals = {**recording.inputs, **recording.outputs}
+    for axes, (channel, (scale, _)) in zip(column, SCALES.items(), strict=False):
+        axes.plot(
+            recording.time[kept],
+            scale * signals[channel][kept],
+            ".",
+            ms=2,
+            color=bp.plot.COLOURS["measured"],
+            label="recorded",
+        )
+        if channel in residuals:
+            fitted = experiment.outputs[channel] - residuals[channel]
+            axes.plot(time, scale * np.tile(fitted, 2), color=bp.plot.COLOURS["map"], lw=1.4, label="MAP")
+    column[3].plot(time, np.tile(residuals["force"], 2), color=bp.plot.COLOURS["map"], lw=1.0)
+    column[3].axhline(0.0, color="black", lw=0.6)
+    column[3].set_xlabel("time [s]")
+
+
+def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict]]) -> Figure:
+    """Draw theta16 by experiment: 90 % intervals of draws and of the Laplace approximation, and the sign verdict."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(11.0, 4.2 * len(verdicts) + 1.0), layout="constrained")
+    grid = figure.subplots(len(verdicts), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (truth, by_run) in zip(grid, verdicts.items(), strict=True):
+        _conductions(axes, [by_run[run.name] for run in runs])
+        axes.set_title(TRUTH_NAMES[truth], fontsize=11)
+    names = [f"{run.frequency:g} Hz\n±{1e3 * run.stroke:g} mm" for run in runs]
+    grid[-1].set_xticks(range(len(runs)), names, fontsize=9)
+    handles, labels = grid[0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, ncols=4, loc="outside lower center", fontsize=9)
+    figure.suptitle(
+        "Heat conduction theta16 by experiment, SYNTHETIC data (filled: model adequate, open: misspecified)"
+    )
+    return figure
+
+
+def _conductions(axes: Axes, verdicts: Sequence[Verdict]) -> None:
+    at = np.arange(len(verdicts))
+    low, high = np.array([_interval(v) for v in verdicts]).T
+    laplace = np.array([v.identified.fit.interval(0.9)[CONDUCTION] for v in verdicts]).T
+    axes.vlines(at - 0.1, low, high, color=bp.plot.COLOURS["mcmc"], lw=5, label="draws, 90 %")
+    axes.vlines(at + 0.1, *laplace, color=bp.plot.COLOURS["laplace"], lw=2, label="Laplace, 90 %")
+    axes.axhline(GEAR[CONDUCTION], color="black", lw=0.9, ls="--", label="true value 2 W/K")
+    axes.axhline(0.0, color="black", lw=0.6)
+    for sign, (colour, marker) in SIGNS.items():
+        axes.plot([], [], marker, color=colour, label=f"sign: {sign}")
+        for i in (i for i, v in enumerate(verdicts) if v.sign == sign):
+            face = "white" if verdicts[i].misspecified else colour
+            value = verdicts[i].identified.fit.theta[CONDUCTION]
+            axes.plot(i, value, marker, color=colour, mfc=face, ms=8, mew=1.8, zorder=5)
+    axes.set_yscale("symlog", linthresh=LINEAR_TO, linscale=1.5)
+    axes.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS])
+    axes.set_yticks([], minor=True)
+    ends = np.concatenate([low, high, *laplace, [-0.5, GEAR[CONDUCTION] + 0.5]])
+    axes.set_ylim(1.2 * ends.min(), 1.2 * ends.max())
+    axes.set_ylabel("theta16 [W/K]")
+    axes.set_xlim(-0.6, len(verdicts) - 0.4)
+
+
+def _interval(verdict: Verdict) -> tuple[float, float]:
+    posterior = verdict.identified.posterior
+    assert posterior is not None
+    low, high = np.quantile(posterior.draws(CONDUCTION), [0.05, 0.95])
+    return float(low), float(high)
