@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesperiodic.parallel import available_cores, in_threads
 from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
-from bayesperiodic.periodic.sensitivity import Sensitivities, parameter_sensitivities
+from bayesperiodic.periodic.sensitivity import Sensitivities, parameter_sensitivities, softest_direction
 
 SMALLEST_PART, PARTS_EACH = 4, 4
 NO_FACTORS = -1
@@ -101,6 +101,8 @@ class Batch:
         self._first, self._size = first, len(sets)
         self._factors = empty_factors(first.grid, first.count, (len(sets),))
         sensitivities = np.zeros((len(sets), len(first.model.parameters), first.grid.points, first.count))
+        left = np.zeros((len(sets), first.grid.points, first.count))
+        right = np.zeros((len(sets), first.grid.points, 3 * first.count))
         for e, (equations, anchor) in enumerate(zip(sets, anchors, strict=True)):
             own = tuple(part[e] for part in self._factors)
             own[5][0] = NO_FACTORS
@@ -109,6 +111,7 @@ class Batch:
                 columns = equations.residual_jacobian(anchor.z, anchor.parameters)
                 if not equations.factorise(columns, anchor.z, own):
                     own[5][0] = NO_FACTORS
+                left[e], right[e] = softest_direction(equations, anchor.z, columns)
         self._shared = (
             first.grid.tau,
             np.array([e.frequency for e in sets]),
@@ -117,6 +120,8 @@ class Batch:
             np.stack([a.z for a in anchors]),
             sensitivities,
             self._factors,
+            left,
+            right,
         )
         self._inputs = np.stack([e.inputs for e in sets])
 

@@ -33,6 +33,7 @@ MAX_ITERATIONS = 50
 MAX_HALVINGS = 20
 MAX_CHORDS = 6
 CHORD_RATE = 0.2
+LEAST_STIFFNESS, MOST_STIFFNESS = 0.3, 3.0
 ROUNDING = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
 FAR = 0.3
@@ -531,30 +532,60 @@ def newton(
 
 @njit(
     f"Tuple((boolean, int64))({FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {MATRIX}, {MATRIX}, "
-    f"{MATRIX}, {FACTORS})",
+    f"{MATRIX}, {FACTORS}, {MATRIX}, {MATRIX})",
     **OPTIONS,
 )
-def chord(residual_jacobian, grid, inputs, parameters, tau, frequency, drift, z, states, columns, factors):
+def chord(residual_jacobian, grid, inputs, parameters, tau, frequency, drift, z, states, columns, factors, left, right):
     """Improve z in place with the factors of a nearby solution; return whether that converged, and the steps.
 
     `states` are left as they were before the last step. A step above `CHORD_RATE` times the one before ends it.
+
+    Where ∂g/∂z is nearly singular, steps with another point's factors say little of what is left in the direction that
+    it makes smallest, and after a change of its stiffness there, or of its sign, they go the wrong way. So this
+    direction takes the stiffness of the present ∂g/∂z, and factors whose own is too far from it are not used at all.
+
+    Parameters
+    ----------
+    left : array (points, states)
+        Weights of the equations that are largest for a residual in this direction.
+    right : array (points, 3·states)
+        The direction with its time derivatives, so long that its stiffness is 1 for the ∂g/∂z of the factors.
     """
     points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
     step, previous = np.empty((points, count)), np.inf
+    correction, tolerance = 0.0, STEP_TOLERANCE
     for iteration in range(MAX_CHORDS):
         differentiate(z, drift, grid, tau, frequency, states)
         residual_jacobian(states, inputs, parameters, tau, frequency, columns)
+        if iteration == 0:
+            stiffness = 0.0
+            for i in range(points):
+                for e in range(count):
+                    change = 0.0
+                    for k in range(3 * count):
+                        change += columns[i, count + e * 3 * count + k] * right[i, k]
+                    stiffness += left[i, e] * change
+            if not (stiffness > LEAST_STIFFNESS and stiffness < MOST_STIFFNESS):
+                return False, 0
+            correction = 1.0 / stiffness - 1.0
+            tolerance = STEP_TOLERANCE * min(1.0, stiffness)
+        along = 0.0
         for i in range(points):
             for s in range(count):
                 step[i, s] = -columns[i, s]
+                along -= left[i, s] * columns[i, s]
         back_substitute(grid, factors, step)
+        along *= correction
+        for i in range(points):
+            for s in range(count):
+                step[i, s] += along * right[i, s]
         full = scaled_step(z, step)
         if not full < min(FAR, CHORD_RATE * previous):
             return False, iteration + 1
         for i in range(points):
             for s in range(count):
                 z[i, s] += step[i, s]
-        if full <= STEP_TOLERANCE or (iteration > 0 and full**2 <= STEP_TOLERANCE * previous):
+        if full <= tolerance or (iteration > 0 and full**2 <= tolerance * previous):
             return True, iteration + 1
         previous = full
     return False, MAX_CHORDS
@@ -619,7 +650,7 @@ def repetitions(z, periods):
 @njit(
     f"void({FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, {CUBE}, "
     f"{GAINS}, Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
-    f"int64, int64, {GAINS}, {GAINS}, {INDICES}, {INDICES})",
+    f"{CUBE}, {CUBE}, int64, int64, {GAINS}, {GAINS}, {INDICES}, {INDICES})",
     **OPTIONS,
 )
 def solve_many(
@@ -636,6 +667,8 @@ def solve_many(
     anchor_z,
     anchor_sensitivities,
     anchor_factors,
+    anchor_left,
+    anchor_right,
     start,
     stop,
     kept_z,
@@ -657,7 +690,7 @@ def solve_many(
     parameters : array (solves, parameters)
     frequency : array (sets,)
     drift : array (sets, states)
-    anchor_parameters, anchor_z, anchor_sensitivities, anchor_factors : arrays (sets, …)
+    anchor_parameters, anchor_z, anchor_sensitivities, anchor_factors, anchor_left, anchor_right : arrays (sets, …)
     kept_z : array (sets, solves, points, states), or without entries if z is not wanted
     y : array (sets, solves, points, channels)
     status, iterations : int arrays (sets, solves)
@@ -682,7 +715,10 @@ def solve_many(
         z[:] = predicted
         close, used, code, doubtful = False, 0, CONVERGED, False
         if ends[e, 0] >= 0:
-            close, used = chord(residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, states, columns, kept)
+            close, used = chord(
+                residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, states, columns, kept, anchor_left[e],
+                anchor_right[e],
+            )  # fmt: skip
         if not close:
             z[:] = predicted
             code, more = newton(

@@ -6,6 +6,8 @@ import numpy as np
 
 from bayesperiodic.periodic.equations import Derivatives, PeriodicEquations
 
+SWEEPS = 3
+
 
 class Sensitivities(NamedTuple):
     """Derivatives along several directions, on the grid.
@@ -106,3 +108,32 @@ def respond(
     else:
         return None
     return Sensitivities(z_change, f + np.einsum("ncq,dnq->dnc", d.f_q, equations.changes(z_change)), frequency)
+
+
+def softest_direction(
+    equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return about the singular vectors of a regular ∂g/∂z with its smallest singular value, by inverse iteration.
+
+    States count in units of their largest values, equations in those of their largest terms.
+
+    Returns
+    -------
+    left : array (points, states)
+        Over the equations.
+    right : array (points, 3·states)
+        The change of the states and of their time derivatives, so long that left · (∂g/∂z) · change is 1.
+    """
+    factors, amplitude = equations.factors(columns), np.abs(z).max(axis=0)
+    size, _ = equations.scales(z, columns)
+    units, terms = np.where(amplitude > 0, amplitude, 1.0), np.where(size > 0, size, 1.0)
+    right = np.broadcast_to(units, z.shape)
+    for _ in range(SWEEPS):
+        left = factors.solve_transposed(right / units**2) * terms**2
+        left /= np.linalg.norm(left / terms)
+        right = factors.solve(left)
+        right /= np.linalg.norm(right / units)
+    left = left / terms**2
+    change = equations.changes(right[None])[0]
+    g_q = columns[:, equations.count :].reshape(len(z), equations.count, -1)
+    return left / np.einsum("ne,neq,nq->", left, g_q, change), change

@@ -43,7 +43,7 @@ def test_every_solve_converges_to_what_a_solve_from_scratch_finds(drive, scheme,
     """Spreads are standard deviations relative to theta4, theta6 and theta16; many theta16 are negative.
 
     At theta16 = -0.006 the smallest singular value is 1/350 of the anchor's, and 350 times as much is left after a step
-    of 1e-9 with the anchor's factors.
+    of 1e-9 with the anchor's factors, unless the step minds the softest direction.
     """
     sets = rig(drive, scheme)
     anchors = [Anchor.at(e, THETA, e.solve(THETA, e.static_guess(THETA)).z) for e in sets]
@@ -56,4 +56,4 @@ def test_every_solve_converges_to_what_a_solve_from_scratch_finds(drive, scheme,
         for i in (3, 17, 40):
             alone = equations.solve(parameters[i], equations.static_guess(parameters[i]))
             assert alone.code == 0
-            assert np.all(np.abs(z[i] - alone.z).max(axis=0) <= 1e-6 * np.abs(alone.z).max(axis=0))
+            assert np.all(np.abs(z[i] - alone.z).max(axis=0) <= 1e-7 * np.abs(alone.z).max(axis=0))
