@@ -14,7 +14,12 @@ from studies.landing_gear_rig import Run
 from studies.landing_gear_truth import GEAR
 from studies.landing_gear_verdicts import CONDUCTION, NEGATIVE, POSITIVE, UNDETERMINED, Verdict
 
-SCALES = {"displacement": (1e3, "mm"), "force": (1e-3, "kN"), "pressure": (1e-6, "MPa")}
+CHANNELS = {
+    "displacement": (1e3, "displacement [mm]"),
+    "force": (1e-3, "force [kN]"),
+    "pressure": (1e-6, "pressure [MPa]"),
+}
+TITLE = "SYNTHETIC data"
 SIGNS = {POSITIVE: ("#009E73", "o"), UNDETERMINED: ("#999999", "D"), NEGATIVE: ("#CC79A7", "v")}
 # The scale of theta16 is linear up to here, logarithmic beyond [W/K].
 LINEAR_TO, TICKS = 3.0, (-100, -50, -20, -10, -5, -3, -2, -1, 0, 1, 2, 3, 5, 10, 20)
@@ -30,12 +35,11 @@ def histories(recordings: Mapping[str, bp.Recording], identified: Mapping[str, I
     for column, (truth, recording) in zip(grid.T, recordings.items(), strict=True):
         _histories(column, recording, identified[truth])
         column[0].set_title(TRUTH_NAMES[truth], fontsize=10)
-    for axes, label in zip(
-        grid[:, 0], ("displacement [mm]", "force [kN]", "pressure [MPa]", "residual force [N]"), strict=True
-    ):
+    for axes, label in zip(grid[:, 0], (*(label for _, label in CHANNELS.values()), "residual force [N]"), strict=True):
         axes.set_ylabel(label)
     figure.legend(*grid[1, 0].get_legend_handles_labels(), frameon=False, ncols=2, loc="outside lower center")
-    figure.suptitle(f"Landing gear at {next(iter(recordings.values())).name.replace(' Hz ', ' Hz, ±')}, SYNTHETIC data")
+    experiment = next(iter(recordings.values())).name.replace(" Hz ", " Hz, ±")
+    figure.suptitle(f"Landing gear at {experiment}, {TITLE}")
     return figure
 
 
@@ -46,15 +50,9 @@ def _histories(column: np.ndarray, recording: bp.Recording, identified: Identifi
     kept = recording.time <= until
     time = np.arange(2 * experiment.samples) / (experiment.samples * experiment.frequency)
     signals = {**recording.inputs, **recording.outputs}
-    for axes, (channel, (scale, _)) in zip(column, SCALES.items(), strict=False):
-        axes.plot(
-            recording.time[kept],
-            scale * signals[channel][kept],
-            ".",
-            ms=2,
-            color=bp.plot.COLOURS["measured"],
-            label="recorded",
-        )
+    for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
+        colours, recorded = bp.plot.COLOURS, scale * signals[channel][kept]
+        axes.plot(recording.time[kept], recorded, ".", ms=2, color=colours["measured"], label="recorded")
         if channel in residuals:
             fitted = experiment.outputs[channel] - residuals[channel]
             axes.plot(time, scale * np.tile(fitted, 2), color=bp.plot.COLOURS["map"], lw=1.4, label="MAP")

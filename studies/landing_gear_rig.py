@@ -109,13 +109,16 @@ def integrate_steady(run: Run, effects: frozenset[str], samples: int) -> bp.Reco
         start["q"] = MEAN_COMPRESSION + run.stroke
     stretch = int(np.ceil(STRETCH * run.frequency))
     for _ in range(ROUNDS):
-        first, second, third = _integrate(run, effects, start, 3 * stretch, 1).outputs["temperature"][stretch::stretch]
+        found = _integrate(run, effects, start, 3 * stretch, 1).outputs
+        first, second, third = found["temperature"][stretch::stretch]
         bend = first - 2 * second + third
         limit = third - (third - second) ** 2 / bend if bend else third
         settled = abs(limit - start["T"]) < SETTLED
         start["T"] = limit
+        if "flexure" in effects:
+            start["q"] = found["compression"][-1]
         if settled:
-            # A wrong start of the compression has died out after a cycle.
+            # What is wrong with the starting speed dies out within milliseconds.
             two = _integrate(run, effects, start, 2, samples)
             return two.between(two.time[samples], two.time[2 * samples - 1])
     raise RuntimeError(f"{run.name}: the gas temperature has not settled.")

@@ -57,8 +57,8 @@ def parameters(effects: Iterable[str]) -> dict[str, float]:
 def damper(effects: frozenset[str]) -> bp.Model:
     """Return the damper under an imposed displacement, with the effects named; without any, eq. (9).
 
-    States are the gas temperature T [K] and, with "flexure", the compression q [m]; outputs force, pressure and, for
-    what no instrument shows, temperature.
+    States are the gas temperature T [K] and, with "flexure", the compression q [m]; outputs force, pressure and, unseen
+    by any instrument, temperature and compression.
     """
     flexure, names = "flexure" in effects, parameters(effects)
 
@@ -78,7 +78,7 @@ def damper(effects: frozenset[str]) -> bp.Model:
         at = _At(effects, s, p, u)
         rate = at.pressure.diff(s.T) * s.dT + at.pressure.diff(s.q if flexure else u.displacement) * at.v
         measured = at.pressure - p.delay * rate if "line" in effects else at.pressure
-        return {"force": at.force, "pressure": measured, "temperature": s.T}
+        return {"force": at.force, "pressure": measured, "temperature": s.T, "compression": at.q}
 
     states, channels = [*(["q"] if flexure else []), "T"], ("displacement", "force", "pressure")
     return bp.Model(
@@ -86,7 +86,7 @@ def damper(effects: frozenset[str]) -> bp.Model:
         states=states,
         inputs=["displacement"],
         parameters={name: _UNITS[name] for name in names},
-        units={name: _UNITS[name] for name in (*states, *channels)} | {"temperature": "K"},
+        units={name: _UNITS[name] for name in (*states, *channels)} | {"temperature": "K", "compression": "m"},
         equations=equations,
         outputs=outputs,
         description="A landing gear damper with effects that eq. (9) lacks, see `studies.landing_gear_truth`.",

@@ -39,9 +39,9 @@ class Verdict:
 
     @property
     def sign(self) -> str:
-        """One sign, where its probability is above 97.5 % by three Monte Carlo errors, else "undetermined"."""
+        """Its sign; "undetermined" by the rule of `bp.identifiability`: above 2.5 % for either by three errors."""
         negative, error = self.p_negative
-        if max(negative, 1.0 - negative) < ONE_SIGN + MONTE_CARLO_ERRORS * error:
+        if max(negative, 1.0 - negative) < ONE_SIGN - MONTE_CARLO_ERRORS * error:
             return UNDETERMINED
         return NEGATIVE if negative > 0.5 else POSITIVE
 
@@ -55,7 +55,7 @@ def judge(identified: Identified) -> Verdict:
     """Return the verdict on an experiment whose posterior was sampled."""
     assert identified.posterior is not None
     stated, fit, posterior = identified.problem, identified.fit, identified.posterior
-    said = bp.identifiability(stated, fit, posterior, profile=False)
+    said = bp.identifiability(stated, fit, posterior, profile=False, candidates=[])
     return Verdict(identified, said, bp.predict(stated, posterior))
 
 

@@ -63,7 +63,8 @@ def rank_candidates(
             row["gain"] = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1])
             row |= dict(zip(problem.names, np.sqrt(np.diag(np.linalg.inv(after))) / now, strict=True))
         rows.append(row)
-    return pd.DataFrame(rows).sort_values("gain", ascending=False, na_position="last", ignore_index=True)
+    table = pd.DataFrame(rows, columns=[*Candidate._fields, "gain", *problem.names])
+    return table.sort_values("gain", ascending=False, na_position="last", ignore_index=True)
 
 
 def _added(

@@ -145,6 +145,13 @@ def test_candidates_add_what_the_same_experiment_would(linear):
     assert louder["scale"] == 2.0 and louder["k"] < again["k"] and louder["c"] < again["c"]
 
 
+def test_without_candidates_the_verdicts_are_the_same(linear):
+    problem, fit = linear
+    bare = bp.identifiability(problem, fit, profile=False, candidates=[])
+    assert bare.experiments.empty and "gain" in bare.experiments
+    assert bare.verdicts == bp.identifiability(problem, fit, profile=False).verdicts
+
+
 def test_own_candidates_are_ranked_and_unknown_runs_refused(linear):
     problem, fit = linear
     found = bp.identifiability(problem, fit, profile=False, candidates=[("run", 1.0, 0.5), ("run", 3.0, 2.0)])

@@ -1,0 +1,121 @@
+import contextlib
+import io
+import json
+
+import numpy as np
+import pytest
+from matplotlib.text import Text
+
+import bayesperiodic as bp
+from studies import common, landing_gear
+from studies.__main__ import main
+from studies.landing_gear_rig import CYCLES, NOISE, RECORDED, RUNS, SPEED_LIMIT, Run, integrate_steady, measure, steady
+from studies.landing_gear_truth import GEAR, TRUTHS
+
+SMALL = next(run for run in RUNS if run.name == "6 Hz 4 mm")
+
+
+def test_the_rig_keeps_its_power_limit_and_varies_the_amplitude_at_equal_frequency():
+    assert len(RUNS) == len({run.name for run in RUNS}) == 14
+    assert max(run.speed for run in RUNS) <= SPEED_LIMIT
+    frequencies = [run.frequency for run in RUNS]
+    assert sum(frequencies.count(f) > 1 for f in set(frequencies)) >= 2
+    assert RUNS[0].stroke == max(run.stroke for run in RUNS) and RUNS[0].frequency == min(frequencies)
+
+
+def test_truth_a_is_eq_9():
+    """The rig's time integration against the periodic solver on the ready-made model, at its order of accuracy."""
+    cycle = integrate_steady(SMALL, TRUTHS["A"], 1600)
+    solved = bp.solve_periodic(
+        bp.models.landing_gear("displacement"), GEAR, cycle.inputs, frequency=SMALL.frequency, samples=1600,
+        scheme="central4",
+    )  # fmt: skip
+    for channel in ("force", "pressure"):
+        size = np.ptp(cycle.outputs[channel])
+        assert cycle.outputs[channel] == pytest.approx(solved.outputs[channel], abs=1e-5 * size)
+
+
+def test_the_rig_is_steady():
+    """The gas of truth B ends a cycle as warm as it began: what it lacks would add up to less than 3 mK."""
+    for run in (SMALL, Run(0.5, 60e-3)):
+        cycle = integrate_steady(run, TRUTHS["B"], 2000).outputs["temperature"]
+        drift = 3 * cycle[-1] - 3 * cycle[-2] + cycle[-3] - cycle[0]
+        assert abs(drift) < 0.003 * (1.0 - np.exp(-0.7 * GEAR["theta16"] / GEAR["theta15"] / run.frequency))
+
+
+def test_the_recording_does_not_repeat_its_phases_and_has_the_stated_noise():
+    recording, clean = measure(SMALL, TRUTHS["A"], 3), steady(SMALL, TRUTHS["A"])
+    phases = np.round((recording.time * SMALL.frequency % 1.0) * RECORDED).astype(int) % RECORDED
+    assert np.unique(phases).size == RECORDED and recording.synthetic
+    assert np.ptp(recording.time) * SMALL.frequency == pytest.approx(CYCLES, abs=0.01)
+    for channel, sd in NOISE.items():
+        noise = {**recording.inputs, **recording.outputs}[channel] - {**clean.inputs, **clean.outputs}[channel]
+        assert noise.std() == pytest.approx(sd, rel=0.03)
+
+
+def fundamental(signal: np.ndarray) -> complex:
+    return complex(np.fft.rfft(signal)[1])
+
+
+def lag(effects: set[str], run: Run) -> float:
+    """Return by how much more than eq. (9) says the pressure lags the displacement, as a phase [rad]."""
+    one, other = (integrate_steady(run, frozenset(e), 400).outputs["pressure"] for e in (set(), effects))
+    return float(np.angle(fundamental(one) / fundamental(other)))
+
+
+def test_a_line_lags_by_its_delay():
+    for run in (SMALL, Run(1.0, 18e-3)):
+        assert lag({"line"}, run) == pytest.approx(2 * np.pi * run.frequency * 1e-4, rel=0.01)
+
+
+def test_lost_motion_lags_the_more_the_smaller_the_stroke():
+    """A friction of 450 N behind 9e-8 m/N loses 0.04 mm either way, 4/π of it in the fundamental."""
+    large, small = (lag({"flexure"}, Run(0.3, stroke)) for stroke in (60e-3, 12e-3))
+    assert small / large == pytest.approx(5.0, rel=0.3)
+    assert small == pytest.approx(4 / np.pi * 9e-8 * 450 / 12e-3, rel=0.2)
+
+
+def test_convection_leads_and_friction_warms():
+    run = Run(0.5, 60e-3)
+    assert lag({"convection"}, run) < -1e-4
+    warm, cold = (integrate_steady(run, frozenset(e), 400).outputs["temperature"] for e in ({"friction_heat"}, set()))
+    assert 0.1 < warm.mean() - cold.mean() < 2.0
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    """Return the figures, the results and the printed account of a quick run."""
+    folder, drawn, save = tmp_path_factory.mktemp("landing_gear"), {}, common.save_figures
+
+    def saved(folder, figures):
+        drawn.update(figures)
+        return save(folder, figures)
+
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
+        patch.setattr(common, "save_figures", saved)
+        assert main(["landing-gear", "--quick", "--out", str(folder)]) == 0
+    assert {path.stem for path in folder.glob("*.png")} == set(drawn)
+    assert max(path.stat().st_size for path in folder.glob("*.png")) < 200_000
+    return drawn, json.loads((folder / "results.json").read_text(encoding="utf-8")), printed.getvalue()
+
+
+def test_a_quick_run_tells_right_model_from_wrong_one(quick):
+    _, results, printed = quick
+    assert "SYNTHETIC" in printed and results["study"]["synthetic"] and results["study"]["quick"]
+    assert results["A"]["misspecified"] == [] and results["A"]["signs"]["negative"] == []
+    assert set(results["B"]["misspecified"]) == {run.name for run in landing_gear.QUICK}
+    for truth in "AB":
+        for one in results[truth]["experiments"].values():
+            assert one["failures"] == {} and one["p_negative"] == pytest.approx(
+                one["p_negative_laplace"]["theta16"], abs=0.08
+            )
+    small = results["B"]["experiments"][landing_gear.SMALL]["map"]["theta16"]
+    assert small < results["A"]["experiments"][landing_gear.SMALL]["map"]["theta16"] - 4.0
+
+
+def test_every_figure_is_drawn_and_says_synthetic(quick):
+    drawn, _, _ = quick
+    corners = {f"corner_{stroke}_{truth}" for stroke in ("large", "small") for truth in "AB"}
+    assert set(drawn) == {"histories", "theta16"} | corners
+    for figure in drawn.values():
+        assert any("synthetic" in text.get_text().lower() for text in figure.findobj(Text))
