@@ -9,14 +9,14 @@ import numpy as np
 import pandas as pd
 
 import bayesperiodic as bp
-from studies.pendulum_estimates import Identified
+from studies.pendulum_estimates import ALL, Identified
 from studies.pendulum_recording import KNOWN, TRUTH
 
 NATURAL = ("m", "l", "k1", "k2", "k3")
 COMBINATIONS = {f"c{i}": f"k{i}/(m*l**2)" for i in (1, 2, 3)}
 DETERMINED = ("l", *COMBINATIONS)
 DETERMINED_UNITS = {"l": "m", "c1": "1/s^2", "c2": "1/s", "c3": "1"}
-ALL, QUICK_STEPS = "all five", 250
+QUICK_STEPS = 250
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def sample(identified: Identified, seed: int, quick: bool) -> Ridge:
     """Sample the posterior of all five, and let the package say what it says of it."""
     problem, fit = identified.problems[ALL], identified.fits[ALL]
     settings: dict[str, Any] = {"max_steps": QUICK_STEPS} if quick else {}
-    posterior = bp.sample(problem, fit, seed=seed, ensembles=2, progress=False, **settings)
+    posterior = bp.sample(problem, fit, seed=seed, ensembles=2, variances="collapsed", progress=False, **settings)
     laplace, draws = fit.derive(COMBINATIONS), posterior.derive(COMBINATIONS)
     table = laplace.rename(columns={"sd": "laplace_sd"}).join(draws[["mean", "sd"]])
     l_draws = posterior.draws("l")
