@@ -22,8 +22,8 @@ FREE = {"m and l": ("m", "l"), "k3": ("k3",), ALL: ("m", "l", "k1", "k2", "k3")}
 PRIORS: dict[str, Any] = {
     "m": bp.LogNormal(START["m"], 1.0),
     "l": bp.LogNormal(START["l"], 0.3),
-    "k1": bp.LogNormal(2e-4, 0.5),
-    "k2": bp.LogNormal(5e-4, 0.5),
+    "k1": bp.LogNormal(2e-4, 0.3),
+    "k2": bp.LogNormal(5e-4, 0.3),
     "k3": bp.LogNormal(START["k3"], 1.0),
 }
 STATES = {"phi": "angle"}
