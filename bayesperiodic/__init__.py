@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from bayesperiodic.periodic.solution import PeriodicSolution
     from bayesperiodic.periodic.solve import solve_periodic
     from bayesperiodic.periodic.stability import multiplier_sensitivities
-    from bayesperiodic.simulate import simulate
+    from bayesperiodic.simulation import simulate
     from bayesperiodic.store import load
 
 _HOMES = {
@@ -90,7 +90,7 @@ _HOMES = {
     "bayesperiodic.periodic.solution": ["PeriodicSolution"],
     "bayesperiodic.periodic.solve": ["solve_periodic"],
     "bayesperiodic.periodic.stability": ["multiplier_sensitivities"],
-    "bayesperiodic.simulate": ["simulate"],
+    "bayesperiodic.simulation": ["simulate"],
     "bayesperiodic.store": ["load"],
 }
 _MODULES = {
