@@ -71,18 +71,16 @@ def test_shooting_of_the_study_is_that_of_the_tests():
         assert shot.multipliers == pytest.approx(np.array(known.multipliers), rel=1e-5)
 
 
-def test_a_measured_recording_is_read_and_no_truth_is_told(tmp_path, capsys):
-    """A file of 6,000 drive periods with noise, as a laboratory would bring it."""
-    recording = pendulum_recording.with_noise(pendulum_recording.simulate(6000, 3), 1e-3, 3)
+def test_a_measured_recording_is_read_and_not_called_synthetic(tmp_path):
+    recording = pendulum_recording.with_noise(pendulum_recording.simulate(300, 3), 1e-3, 3)
     table = np.column_stack([recording.time, *recording.outputs.values()])
     path = tmp_path / "run.csv"
     np.savetxt(path, table, delimiter=",", header="time,angle,rate", comments="")
-    out = tmp_path / "out"
-    assert main(["pendulum", "--quick", "--data", str(path), "--out", str(out)]) == 0
-    results = json.loads((out / "results.json").read_text(encoding="utf-8"))
-    assert not results["recording"]["synthetic"] and "eigenvalues" not in results
-    assert "relative_error" not in results["estimates"]["k3"]["parameters"]["k3"]
-    assert "SYNTHETIC" not in capsys.readouterr().out
+    read, about = pendulum_recording.get(path, quick=False, seed=1)
+    assert not about["synthetic"] and not read.synthetic
+    assert about["values"] == 2 * recording.time.size and about["drive_periods"] in (299, 300)
+    assert read.outputs["rate"] == pytest.approx(recording.outputs["rate"])
+    assert not pendulum_recording.section_of(read).synthetic
 
 
 def test_bad_arguments_are_named(tmp_path, capsys):

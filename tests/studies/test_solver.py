@@ -46,9 +46,10 @@ def test_the_copied_references_are_those_of_the_shooting_tables():
     assert list(solver.DOUBLINGS.values()) == [known.omega for known in shooting.DOUBLINGS]
     assert (solver.LOW_DOUBLING, solver.LOW_FOLD) == (shooting.RETURN.omega, shooting.FOLD.omega)
     by_period = [known.multipliers for known in shooting.UNSTABLE]
+    long = shooting.UNSTABLE[4 : 4 + len(solver.ORBITS)]
     assert [solver.BRANCHES[1], solver.BRANCHES[2], solver.BRANCHES[4]] == by_period[:3]
     assert solver.ROTATIONS["second"] == by_period[3]
-    for (winding, multipliers, section), known in zip(solver.ORBITS, shooting.UNSTABLE[4:], strict=True):
+    for (winding, multipliers, section), known in zip(solver.ORBITS, long, strict=True):
         assert (winding, multipliers) == (known.winding, known.multipliers)
         assert np.abs(np.subtract(section, known.section)).max() < 1e-5
     c = {name: solver.PENDULUM[f"k{i}"] / (0.1 * 0.3**2) for i, name in enumerate(("c1", "c2", "c3"), start=1)}
