@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import bayesperiodic as bp
@@ -17,7 +17,10 @@ START = {name: TRUTH[name] * (1.0 + error) for name, error in START_ERRORS.items
 LARGEST = 50.0
 SAMPLES = 100
 SCHEME = "central4"
-ALL, LONGEST_SAMPLED = "all five", 3
+# Longer orbits share their returns with shorter ones. Their errors are correlated, which the likelihood does not know,
+# and intervals would be too short.
+LONGEST_USED = 3
+ALL = "all five"
 FREE = {"m and l": ("m", "l"), "k3": ("k3",), ALL: ("m", "l", "k1", "k2", "k3")}
 PRIORS: dict[str, Any] = {
     "m": bp.LogNormal(START["m"], 1.0),
@@ -58,11 +61,8 @@ def identify(orbits: bp.Orbits, *, which: Sequence[str] = tuple(FREE)) -> Identi
     values = TRUTH | first.theta
     doubt = {name: 3.0 * first.sd[name] for name in first.theta}
     polished = bp.polish_orbits(bp.models.pendulum, orbits, values, parameter_sd=doubt, samples=SAMPLES, scheme=SCHEME)
-    selected = bp.select_orbits(polished, FREE["m and l"], largest_multiplier=LARGEST)
-    problems = {
-        name: problem_of([o.experiment(samples=SAMPLES) for o in selected if _short(o, name)], FREE[name])
-        for name in which
-    }
+    selected = bp.select_orbits(_short(polished), FREE["m and l"], largest_multiplier=LARGEST)
+    problems = {name: problem_of([o.experiment(samples=SAMPLES) for o in selected], FREE[name]) for name in which}
     fits = {name: _fit(problem) for name, problem in problems.items()}
     return Identified(polished, selected, problems, fits, tuple(lost))
 
@@ -84,9 +84,14 @@ def problem_of(experiments: Sequence[bp.Experiment], free: Sequence[str]) -> bp.
     )
 
 
-def _short(orbit: bp.Orbit, which: str) -> bool:
-    """Return whether an orbit is taken; for the posterior of all five the long ones cost more than they tell."""
-    return which != ALL or orbit.period <= LONGEST_SAMPLED
+def _short(orbits: bp.Orbits) -> bp.Orbits:
+    kept = tuple(orbit for orbit in orbits if orbit.period <= LONGEST_USED)
+    reason = f"longer than {LONGEST_USED} periods: its errors are correlated with those of others"
+    return replace(
+        orbits,
+        orbits=tuple(replace(orbit, partner=None) for orbit in kept),
+        rejected=(*orbits.rejected, *((orbit, reason) for orbit in orbits if orbit.period > LONGEST_USED)),
+    )
 
 
 def _fit(problem: bp.Problem) -> bp.MapEstimate:

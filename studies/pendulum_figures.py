@@ -113,18 +113,19 @@ def errors(lines: Sequence[Mapping[str, Any]]) -> Figure:
         for place, name in enumerate(PAPER_ERRORS):
             values = [100 * abs(x["errors"][name]) for x in lines if x["noise"] == noise and name in x["errors"]]
             box = axes.boxplot([values], positions=[place + 0.28 * (number - 0.5 * (len(noises) - 1))], widths=0.2,
-                               whis=(5, 95), patch_artist=True, manage_ticks=False)  # fmt: skip
+                               whis=(5, 95), patch_artist=True, manage_ticks=False, medianprops={"color": "black"},
+                               flierprops={"ms": 4})  # fmt: skip
             box["boxes"][0].set_facecolor(("#56B4E9", "#E69F00")[number % 2])
             if place == 0:
                 box["boxes"][0].set_label(f"noise {noise:.1%} of the attractor")
     for place, error in enumerate(PAPER_ERRORS.values()):
-        label = "the paper's, its own experiment" if place == 0 else None
+        label = "the paper's table 1" if place == 0 else None
         axes.plot([place - 0.4, place + 0.4], [100 * error] * 2, color="black", lw=2.0, label=label)
     axes.set_yscale("log")
     axes.set_xticks(range(len(PAPER_ERRORS)), [f"{name}" for name in PAPER_ERRORS])
     axes.set_xlabel("parameter")
     axes.set_ylabel("error [%]")
-    axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(0.0, -0.15), ncols=3)
+    figure.legend(loc="outside lower center", ncols=3, frameon=False)
     seeds = len(lines) // len(noises)
-    axes.set_title(f"Errors over {seeds} recordings, boxes: quartiles, whiskers: 90 % ({SYNTHETIC})", fontsize="medium")
+    figure.suptitle(f"Errors over {seeds} recordings, boxes: quartiles, whiskers: 90 % ({SYNTHETIC})")
     return figure
