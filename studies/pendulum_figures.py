@@ -74,7 +74,7 @@ def _marginal(axes: Axes, draws: np.ndarray, mean: float, sd: float, true: float
     if has_truth:
         axes.axvline(true, color=TRUE, lw=1.6, label="truth")
     axes.set_yticks([])
-    axes.locator_params(axis="x", nbins=4)
+    axes.locator_params(axis="x", nbins=3)
     axes.ticklabel_format(axis="x", scilimits=(-3, 4))
 
 
