@@ -51,7 +51,8 @@ def with_noise(recording: bp.Recording, fraction: float, seed: int) -> bp.Record
 def get(data: Path | None, quick: bool, seed: int) -> tuple[bp.Recording, dict[str, Any]]:
     """Return the recording without added noise, simulated unless a file is given, and what to report of it.
 
-    A file has the columns time [s], angle [rad] and rate [rad/s], of a pendulum driven at ω = 9.09 rad/s.
+    A file has the columns time [s], angle [rad] and rate [rad/s], of a pendulum driven at ω = 9.09 rad/s, whose pivot
+    moves by a = 0.11 m; where k1, k2 and k3 are held fixed they have the values of `TRUTH`.
     """
     about: dict[str, Any] = {"path": "generated", "sha256": None, "synthetic": True}
     if data is None:

@@ -15,13 +15,11 @@ import numpy as np
 
 import bayesperiodic as bp
 from studies import common, pendulum_estimates, pendulum_figures, pendulum_orbits
-from studies.pendulum_estimates import FREE, PAPER_ERRORS, START_ERRORS
+from studies.pendulum_estimates import FREE, LONGEST_USED, PAPER_ERRORS, START_ERRORS
 from studies.pendulum_orbits import Reference
 from studies.pendulum_recording import PERIODS, section_of, simulate, with_noise
 
 NOISE_LEVELS = (0.001, 0.01)
-# Longer orbits with |μ| < 50 are few, and the search for them takes half of the time.
-LONGEST = 3
 
 
 def run(options: argparse.Namespace) -> None:
@@ -53,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
 def true_orbits(seed: int) -> list[Reference]:
     """Return the orbits of a recording without noise, by shooting."""
     section = section_of(simulate(PERIODS, seed))
-    found = bp.find_orbits(section, periods=range(1, LONGEST + 1))
+    found = bp.find_orbits(section, periods=range(1, LONGEST_USED + 1))
     polished = bp.polish_orbits(bp.models.pendulum, found, pendulum_orbits.TRUTH, samples=pendulum_orbits.SAMPLES)
     return pendulum_orbits.references(polished)[0]
 
@@ -76,7 +74,7 @@ def replicate(seed: int, truths: Sequence[Reference]) -> list[dict[str, Any]]:
 
 def one(recording: bp.Recording, truths: Sequence[Reference]) -> dict[str, Any]:
     """Return errors, sds and coverage of one recording."""
-    orbits = bp.find_orbits(section_of(recording), periods=range(1, LONGEST + 1))
+    orbits = bp.find_orbits(section_of(recording), periods=range(1, LONGEST_USED + 1))
     found = pendulum_estimates.identify(orbits, which=("m and l", "k3"))
     fits = {"points": found.fits, "with eigenvalues": {}}
     for which in found.fits:

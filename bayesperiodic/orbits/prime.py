@@ -21,8 +21,6 @@ def once_round(orbit: Orbit, times: int, angles: np.ndarray) -> Orbit:
         A divisor of its period.
     angles : bool array (coordinates,)
     """
-    if times == 1:
-        return orbit
     period, coordinates = orbit.period // times, orbit.points.shape[1]
     rounds = orbit.points.reshape(times, period, coordinates)
     mean = rounds[0] + differences(rounds, rounds[0], angles).mean(axis=0)
