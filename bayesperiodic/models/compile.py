@@ -37,11 +37,13 @@ class GridFunction(types.WrapperAddressProtocol):
     """A compiled grid function that other compiled code takes as an argument.
 
     Handing over the compiled function itself would look its address up at every call, for longer than a solve takes.
+    Without `_numba_type_` Numba would make its type anew at every call.
     """
 
     def __init__(self, compiled: Any):
         arguments, result = sigutils.normalize_signature(GRID_SIGNATURE)
         self._signature = result(*arguments)
+        self._numba_type_ = types.FunctionType(self._signature)
         self._compiled = compiled
         code = compiled.get_compile_result(self._signature)
         self._address = code.library.get_pointer_to_function(code.fndesc.llvm_cfunc_wrapper_name)
