@@ -17,8 +17,8 @@ START = {name: TRUTH[name] * (1.0 + error) for name, error in START_ERRORS.items
 LARGEST = 50.0
 SAMPLES = 100
 SCHEME = "central4"
-# Longer orbits share their returns with shorter ones. Their errors are correlated, which the likelihood does not know,
-# and intervals would be too short.
+# With longer orbits standard deviations fall by another 40 %, and l came out 2.3, 1.8 and 1.0 of them high in three
+# recordings: what bias the local fits have, at places that orbits have in common, does not average out.
 LONGEST_USED = 3
 ALL = "all five"
 FREE = {"m and l": ("m", "l"), "k3": ("k3",), ALL: ("m", "l", "k1", "k2", "k3")}
@@ -86,7 +86,7 @@ def problem_of(experiments: Sequence[bp.Experiment], free: Sequence[str]) -> bp.
 
 def _short(orbits: bp.Orbits) -> bp.Orbits:
     kept = tuple(orbit for orbit in orbits if orbit.period <= LONGEST_USED)
-    reason = f"longer than {LONGEST_USED} periods: its errors are correlated with those of others"
+    reason = f"longer than {LONGEST_USED} periods: it shares the bias of shorter ones"
     return replace(
         orbits,
         orbits=tuple(replace(orbit, partner=None) for orbit in kept),

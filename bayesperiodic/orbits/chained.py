@@ -5,20 +5,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesperiodic.orbits.cycles import closing_matrix, eigenvalues, newton_step, product
-from bayesperiodic.orbits.local import LocalFit, LocalMaps
+from bayesperiodic.orbits.local import REACH, LocalFit, LocalMaps
 
 DEGREE = 3
 # A wider neighbourhood is taken as long as its fit agrees with those of the narrower ones within so many of their sds.
 AGREEMENT = 2.5
 SIZES = 6
+# From a neighbourhood to the next.
+WIDENED = 2.0**0.5
 # Of the smallest neighbourhood's bandwidth, in standard deviations of the noise.
 ROOM = 2.5
 STEPS = 12
 CONVERGED = 1e-6
-# Bias grows with the third power of the bandwidth in slopes, so that twice the neighbours differ by this much of it.
-SLOPE_GROWTH = 2.0**1.5 - 1.0
-# Measured: of the difference of the points two thirds come back as error, not the third that theory has.
-POINT_GROWTH = 1.5
+# Bias in slopes grows with the third power of the bandwidth. In values theory has the fourth; measured is less: two
+# thirds of the difference of the points come back as error.
+SLOPE_GROWTH, VALUE_GROWTH = WIDENED**3 - 1.0, 1.5
 
 
 @dataclass(frozen=True)
@@ -47,13 +48,13 @@ class Estimate:
 def refine(maps: LocalMaps, points: np.ndarray, neighbours: int) -> Estimate | None:
     """Return the orbit near the points of a candidate; None where there is none.
 
-    Each point has its own neighbourhood. It is half as large (in neighbours) as the largest whose slope along the
-    orbit's unstable direction agrees with those of all smaller ones, so that what bias there is falls well below the
-    standard deviation; what is left is estimated from the difference to the larger one.
+    Each point has its own neighbourhood. It is narrower by a step than the widest whose slope along the orbit's
+    unstable direction agrees with those of all narrower ones, so that what bias there is falls well below the standard
+    deviation; what is left is estimated from the difference to the wider one.
     """
-    counts = _counts(maps, points, neighbours)
-    narrow = _close(maps, points, counts)
-    wide = _close(maps, points, 2 * counts)
+    bandwidths = _bandwidths(maps, points, neighbours)
+    narrow = _close(maps, points, maps.within(points, bandwidths))
+    wide = _close(maps, points, maps.within(points, WIDENED * bandwidths))
     if narrow is None or wide is None:
         return None
     cycle, fits = narrow
@@ -61,7 +62,7 @@ def refine(maps: LocalMaps, points: np.ndarray, neighbours: int) -> Estimate | N
     values = eigenvalues(jacobian)
     wide_values = eigenvalues(np.concatenate([fit.jacobian for fit in wide[1]]))
     slope_bias = (np.log(np.abs(wide_values)) - np.log(np.abs(values))) / SLOPE_GROWTH
-    point_bias = maps.wrap(wide[0] - cycle).ravel() / POINT_GROWTH
+    point_bias = maps.wrap(wide[0] - cycle).ravel() / VALUE_GROWTH
     turn = maps.turn[np.isfinite(maps.turn)]
     run = np.sum([fit.value[0] - point for fit, point in zip(fits, cycle, strict=True)], axis=0)
     return Estimate(
@@ -91,27 +92,27 @@ def _close(maps: LocalMaps, points: np.ndarray, counts: np.ndarray) -> tuple[np.
     return None
 
 
-def _counts(maps: LocalMaps, points: np.ndarray, neighbours: int) -> np.ndarray:
-    """Return the size of each point's neighbourhood."""
+def _bandwidths(maps: LocalMaps, points: np.ndarray, neighbours: int) -> np.ndarray:
+    """Return the bandwidth of each point's neighbourhood, (period,)."""
+    nearest = maps.nearest(points, int(2.25 * neighbours))[0][:, -1] / REACH
+    smallest = np.maximum(nearest, ROOM * maps.noise.max())
+    ladder = smallest[:, None] * WIDENED ** np.arange(SIZES)
+    counts = [maps.within(points, bandwidths) for bandwidths in ladder.T]
     most = len(maps.arguments) // 8
-    sizes = [n for n in (int(2.25 * neighbours) * 2**k for k in range(SIZES)) if n <= most] or [most]
-    fits = [maps.fit(points, n, DEGREE) for n in sizes]
-    roomy = np.array([fit.bandwidth >= ROOM * maps.noise.max() for fit in fits])
-    roomy[-1] = True
-    smallest = np.argmax(roomy, axis=0)
-    start = np.array([fits[k].jacobian[j] for j, k in enumerate(smallest)])
+    start = np.concatenate([maps.fit(p[None], n, DEGREE).jacobian for p, n in zip(points, counts[0], strict=True)])
     right, left = directions(start, 0)
     left = np.roll(left, -1, axis=0)
-    targets, sds = zip(*(_along(fit, left, right) for fit in fits), strict=True)
-    targets, sds = np.array(targets), np.array(sds)
     chosen = []
-    for j, first in enumerate(smallest):
-        best = first
-        for k in range(first + 1, len(sizes)):
-            if np.any(np.abs(targets[k, j] - targets[first:k, j]) > AGREEMENT * sds[first:k, j]):
+    for j, point in enumerate(points):
+        targets: list[np.ndarray] = []
+        sds: list[np.ndarray] = []
+        for count in (int(n[j]) for n in counts if n[j] <= most):
+            target, sd = _along(maps.fit(point[None], count, DEGREE), left[j : j + 1], right[j : j + 1])
+            if any(np.any(np.abs(target - t) > AGREEMENT * s) for t, s in zip(targets, sds, strict=True)):
                 break
-            best = k
-        chosen.append(sizes[max(best - 1, first)])
+            targets.append(target)
+            sds.append(sd)
+        chosen.append(ladder[j, max(len(targets) - 2, 0)])
     return np.array(chosen)
 
 

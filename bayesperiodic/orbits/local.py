@@ -109,6 +109,10 @@ class LocalMaps:
         distance, index = self._tree.query(self.inside(centres), np.arange(1, count + 1))
         return np.asarray(distance), np.asarray(index)
 
+    def within(self, centres: np.ndarray, bandwidths: np.ndarray) -> np.ndarray:
+        """Return how many arguments a fit of each bandwidth (m,) about the centres (m, 2) takes in."""
+        return np.asarray(self._tree.query_ball_point(self.inside(centres), REACH * bandwidths, return_length=True))
+
     def fit(self, centres: np.ndarray, count: int, degree: int, *, influence: bool = True) -> LocalFit:
         """Fit polynomials about the centres (m, 2) to their `count` nearest neighbours; without `influence` quicker."""
         rows = max(1, BLOCK // (count * TERMS[degree] ** 2))
