@@ -12,7 +12,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import bayesperiodic as bp
-from studies import common, landing_gear_figures, landing_gear_verdicts
+from studies import common, landing_gear_drop, landing_gear_figures, landing_gear_verdicts
+from studies.landing_gear_drop import Dropped
 from studies.landing_gear_identification import DISPLACEMENT, FORCE, PRIORS, Identified, draw, estimate, fold
 from studies.landing_gear_rig import FULL_SCALE, NOISE_SHARE, RUNS, SPEED_LIMIT, Run, measure
 from studies.landing_gear_truth import GEAR, STRENGTHS, TRUTHS
@@ -21,6 +22,7 @@ from studies.landing_gear_verdicts import CONDUCTION, NEGATIVE, POSITIVE, UNDETE
 LARGE, SMALL, FIGURE_1 = "0.2 Hz 80 mm", "3 Hz 4 mm", "1 Hz 18 mm"
 QUICK = tuple(run for run in RUNS if run.name in (FIGURE_1, SMALL))
 LARGE_STROKE, TOLERANCE = 0.06, 0.25
+DROPS, QUICK_DROPS = 200, 20
 
 
 def run(options: argparse.Namespace) -> None:
@@ -30,6 +32,7 @@ def run(options: argparse.Namespace) -> None:
     print("All data are SYNTHETIC: a simulated rig, see studies/landing_gear_rig.py and landing_gear_truth.py.")
     recordings: dict[str, dict[str, bp.Recording]] = {}
     verdicts: dict[str, dict[str, Verdict]] = {}
+    dropped: dict[str, Dropped] = {}
     results: dict[str, Any] = {}
     for truth in truths:
         with watch.part(f"rig {truth}", f"truth {truth}: simulating and recording {len(runs)} experiments"):
@@ -40,10 +43,14 @@ def run(options: argparse.Namespace) -> None:
             joint = estimate([fold(r, DISPLACEMENT) for r in recordings[truth].values()], DISPLACEMENT)
         with watch.part(f"force {truth}", f"truth {truth}: force given"):
             forced = {n: estimate([fold(r, FORCE)], FORCE) for n, r in recordings[truth].items()}
+        with watch.part(f"drop {truth}", f"truth {truth}: the drop test, predicted from all experiments"):
+            gear = landing_gear_drop.identify(recordings[truth].values(), options.seed, quick=options.quick)
+            dropped[truth] = landing_gear_drop.predict(gear, TRUTHS[truth], QUICK_DROPS if options.quick else DROPS)
         results[truth] = collect(runs, verdicts[truth], joint, forced)
+        results[truth]["drop"] = landing_gear_drop.account(dropped[truth])
         print(account(truth, results[truth]))
     with watch.part("figures", "drawing"):
-        paths = common.save_figures(options.out, figures(runs, recordings, verdicts, options.quick))
+        paths = common.save_figures(options.out, figures(runs, recordings, verdicts, dropped, options.quick))
     results |= {"rig": rig(), "study": {"synthetic": True, "seed": options.seed, "quick": options.quick}}
     results |= {"seconds": watch.total(), "versions": common.versions()}
     path = common.write_results(options.out, results)
@@ -111,6 +118,8 @@ def account(truth: str, results: Mapping[str, Any]) -> str:
     signs = "; ".join(f"{sign}: {', '.join(names) or 'none'}" for sign, names in results["signs"].items())
     forced = results["force_given"].values()
     wrong = sum(max(p := e["p_negative_laplace"][CONDUCTION], 1 - p) > 0.975 and p > 0.5 for e in forced)
+    drop = results["drop"]["displacement"]
+    shares = list(drop["share_within_the_band"].values())
     pairs = "; ".join(" against ".join(p["pair"]) for p in results["opposite_pairs"]) or "none"
     return (
         f"  truth {truth}: {signs}\n"
@@ -120,7 +129,9 @@ def account(truth: str, results: Mapping[str, Any]) -> str:
         f"{results['log_posterior_calls']} log-posteriors in {results['seconds']:.0f} s, "
         f"{results['cpu_seconds']:.0f} s of CPU\n"
         f"  force given: {wrong} experiments with P(theta16 < 0) > 0.975 (Laplace); the noise of the measured force is "
-        "not in these standard deviations"
+        "not in these standard deviations\n"
+        f"  drop: true displacement within the 90 % band for {shares[0]:.0%} of the first 2.5 s and {shares[1]:.0%} of "
+        f"the time until 30 s, off the median by up to {1e3 * drop['largest_error_of_the_median']:.3f} mm"
     )
 
 
@@ -128,6 +139,7 @@ def figures(
     runs: Sequence[Run],
     recordings: Mapping[str, Mapping[str, bp.Recording]],
     verdicts: Mapping[str, Mapping[str, Verdict]],
+    dropped: Mapping[str, Dropped],
     quick: bool,
 ) -> dict[str, Any]:
     """Return the figures by name."""
@@ -135,6 +147,7 @@ def figures(
     drawn = {
         "histories": landing_gear_figures.histories(shown, {t: verdicts[t][FIGURE_1].identified for t in shown}),
         "theta16": landing_gear_figures.conductions(runs, verdicts),
+        "drop": landing_gear_figures.drops(dropped),
     }
     for stroke, name in (("large", FIGURE_1 if quick else LARGE), ("small", SMALL)):
         for truth in verdicts:

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
+from studies.landing_gear_drop import SHORT, Dropped
 from studies.landing_gear_identification import Identified
 from studies.landing_gear_rig import Run
 from studies.landing_gear_truth import GEAR
@@ -108,3 +109,48 @@ def _interval(verdict: Verdict) -> tuple[float, float]:
     assert posterior is not None
     low, high = np.quantile(posterior.draws(CONDUCTION), [0.05, 0.95])
     return float(low), float(high)
+
+
+def drops(dropped: Mapping[str, Dropped]) -> Figure:
+    """Draw the drop test, a column a truth: the first 2.5 s, and by how much the displacement is off over 30 s."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(5.0 * len(dropped) + 1.0, 9.0), layout="constrained")
+    grid = figure.subplots(4, len(dropped), squeeze=False, sharey="row")
+    for column, (truth, found) in zip(grid.T, dropped.items(), strict=True):
+        _drop(column, found)
+        column[0].set_title(TRUTH_NAMES[truth], fontsize=10)
+    rows = (*(label for _, label in CHANNELS.values()), "displacement minus\npredicted median [mm]")
+    for axes, label in zip(grid[:, 0], rows, strict=True):
+        axes.set_ylabel(label)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, ncols=3, loc="outside lower center")
+    figure.suptitle(f"Drop test, predicted from the shaker's experiments, {TITLE}")
+    return figure
+
+
+def _drop(column: np.ndarray, found: Dropped) -> None:
+    time, band, colours = found.true.time, found.band, bp.plot.COLOURS
+    early = time <= SHORT
+    for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
+        low, high = scale * band.low[channel][early], scale * band.high[channel][early]
+        axes.plot(
+            time[early], scale * found.true.outputs[channel][early], color=colours["measured"], lw=2.6, label="true"
+        )
+        axes.plot(
+            time[early],
+            scale * band.median[channel][early],
+            "--",
+            color=colours["mcmc"],
+            lw=1.4,
+            label="posterior median",
+        )
+        axes.fill_between(time[early], low, high, color=colours["mcmc"], alpha=0.3, lw=0, label="90 % band")
+        axes.tick_params(labelbottom=channel == "pressure")
+    column[2].set_xlabel("time [s]")
+    median = band.median["displacement"]
+    low, high = 1e3 * (band.low["displacement"] - median), 1e3 * (band.high["displacement"] - median)
+    column[3].fill_between(time, low, high, color=colours["mcmc"], alpha=0.3, lw=0)
+    column[3].plot(time, 1e3 * (found.true.outputs["displacement"] - median), color=colours["measured"], lw=1.2)
+    column[3].axhline(0.0, color=colours["mcmc"], ls="--", lw=1.0)
+    column[3].set_xlabel("time [s], until the gas has cooled")

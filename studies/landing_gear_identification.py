@@ -60,22 +60,22 @@ def fold(recording: bp.Recording, drive: str) -> bp.Experiment:
     return turned.fold(SAMPLES, harmonics=KEPT[drive])
 
 
-def problem(experiments: Sequence[bp.Experiment], drive: str) -> bp.Problem:
-    """Return the problem of one experiment, or of several that share theta4 and theta6."""
+def problem(experiments: Sequence[bp.Experiment], drive: str, *, one_conduction: bool = False) -> bp.Problem:
+    """Return the problem of one experiment, or of several that share theta4 and theta6, and theta16 if it is one."""
     return bp.Problem(
         bp.models.landing_gear(drive),
         experiments,
         priors=PRIORS,
         fixed=FIXED,
         tied=TIED,
-        local=["theta16"] if len(experiments) > 1 else [],
+        local=[] if one_conduction or len(experiments) == 1 else ["theta16"],
         noise=bp.noise.Independent(per="experiment"),
     )
 
 
-def estimate(experiments: Sequence[bp.Experiment], drive: str) -> Identified:
+def estimate(experiments: Sequence[bp.Experiment], drive: str, *, one_conduction: bool = False) -> Identified:
     """Return MAP and Laplace approximation."""
-    stated = problem(experiments, drive)
+    stated = problem(experiments, drive, one_conduction=one_conduction)
     return Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0, 0.0)
 
 

@@ -5,10 +5,12 @@ import json
 import numpy as np
 import pytest
 from matplotlib.text import Text
+from scipy import integrate, optimize
 
 import bayesperiodic as bp
 from studies import common, landing_gear
 from studies.__main__ import main
+from studies.landing_gear_drop import MASS, drop
 from studies.landing_gear_rig import CYCLES, NOISE, RECORDED, RUNS, SPEED_LIMIT, Run, integrate_steady, measure, steady
 from studies.landing_gear_truth import GEAR, TRUTHS
 
@@ -51,6 +53,48 @@ def test_the_recording_does_not_repeat_its_phases_and_has_the_stated_noise():
     for channel, sd in NOISE.items():
         noise = {**recording.inputs, **recording.outputs}[channel] - {**clean.inputs, **clean.outputs}[channel]
         assert noise.std() == pytest.approx(sd, rel=0.03)
+
+
+def compression(psi: float) -> float:
+    return np.hypot(0.58, 1.16) - np.hypot(2.02 * np.cos(psi) - 2.6, 1.16 - 2.02 * np.sin(psi))
+
+
+def lever(psi: float) -> float:
+    """Return the distance of the pivot, at (0, 1.16), from the gear's axis through the floor joint at (2.6, 0)."""
+    axis = np.array([2.02 * np.cos(psi) - 2.6, 1.16 - 2.02 * np.sin(psi)])
+    return abs(axis[0] * 1.16 + axis[1] * 2.6) / np.hypot(*axis)
+
+
+def test_the_drop_is_that_of_equations_written_by_hand():
+    """Moments about the pivot and eq. (9), integrated by SciPy's Radau."""
+    g = GEAR
+
+    def rates(_, y):
+        psi, turning, temperature = y
+        q, arm = compression(psi), lever(psi)
+        v, bend = arm * turning, (lever(psi + 1e-5) - lever(psi - 1e-5)) / 2e-5
+        p = g["theta5"] * temperature / (1 + g["theta6"] * q)
+        still = g["theta3"] * v * abs(v) + g["theta4"] * p + g["theta11"]
+        still += (g["theta8"] + g["theta9"] * p) * np.arctan(g["theta10"] * v) + g["theta1"] * bend * turning**2
+        inertia = MASS * 2.02**2 + g["theta1"] * arm**2
+        heat = (g["theta4"] * p + g["theta11"]) * v - g["theta16"] * (1 + g["theta6"] * q) * (temperature - 293.0)
+        return [turning, (MASS * 9.81 * 2.02 * np.cos(psi) - still * arm) / inertia, heat / g["theta15"]]
+
+    found = drop(GEAR, duration=3.0)
+    start = optimize.brentq(lambda psi: compression(psi) - 0.02, 0.0, 0.1)
+    path = integrate.solve_ivp(rates, (0, 3), [start, 0, 293], "Radau", found.time, rtol=1e-9, atol=1e-10)
+    assert found.outputs["displacement"] == pytest.approx([compression(psi) for psi in path.y[0]], abs=1e-6)
+    pressure = g["theta5"] * path.y[2] / (1 + g["theta6"] * found.outputs["displacement"])
+    assert found.outputs["pressure"] == pytest.approx(pressure, rel=1e-5)
+
+
+def test_the_dropped_gear_comes_to_the_balance_of_moments():
+    """Without friction, after ten minutes, the gas as warm as the room."""
+    free = GEAR | {"theta8": 0.0, "theta9": 0.0}
+    psi = optimize.brentq(
+        lambda psi: MASS * 9.81 * 2.02 * np.cos(psi) - lever(psi) * (5e3 / (1 - 2.5 * compression(psi)) - 500.0), 0, 0.2
+    )
+    assert drop(free, duration=600.0).outputs["displacement"][-1] == pytest.approx(compression(psi), abs=1e-5)
 
 
 def fundamental(signal: np.ndarray) -> complex:
@@ -116,6 +160,6 @@ def test_a_quick_run_tells_right_model_from_wrong_one(quick):
 def test_every_figure_is_drawn_and_says_synthetic(quick):
     drawn, _, _ = quick
     corners = {f"corner_{stroke}_{truth}" for stroke in ("large", "small") for truth in "AB"}
-    assert set(drawn) == {"histories", "theta16"} | corners
+    assert set(drawn) == {"histories", "theta16", "drop"} | corners
     for figure in drawn.values():
         assert any("synthetic" in text.get_text().lower() for text in figure.findobj(Text))
