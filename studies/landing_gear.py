@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import bayesperiodic as bp
-from studies import common, landing_gear_drop, landing_gear_figures, landing_gear_verdicts
+from studies import common, landing_gear_drop, landing_gear_figures, landing_gear_quality, landing_gear_verdicts
 from studies.landing_gear_drop import Dropped
 from studies.landing_gear_identification import DISPLACEMENT, FORCE, PRIORS, Identified, draw, estimate, fold
 from studies.landing_gear_rig import FULL_SCALE, NOISE_SHARE, RUNS, SPEED_LIMIT, Run, measure
@@ -23,6 +23,8 @@ LARGE, SMALL, FIGURE_1 = "0.2 Hz 80 mm", "3 Hz 4 mm", "1 Hz 18 mm"
 QUICK = tuple(run for run in RUNS if run.name in (FIGURE_1, SMALL))
 LARGE_STROKE, TOLERANCE = 0.06, 0.25
 DROPS, QUICK_DROPS = 200, 20
+# Measurements of the reference, units of each kind.
+UNITS, QUICK_UNITS = (10, 60), (1, 1)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -49,8 +51,13 @@ def run(options: argparse.Namespace) -> None:
         results[truth] = collect(runs, verdicts[truth], joint, forced)
         results[truth]["drop"] = landing_gear_drop.account(dropped[truth])
         print(account(truth, results[truth]))
+    with watch.part("quality", "quality control: a reference gear and units, good and faulty"):
+        units = landing_gear_quality.examine_all(*(QUICK_UNITS if options.quick else UNITS), options.seed)
+    results["quality"] = landing_gear_quality.account(*units)
+    print(landing_gear_quality.table(results["quality"]))
     with watch.part("figures", "drawing"):
-        paths = common.save_figures(options.out, figures(runs, recordings, verdicts, dropped, options.quick))
+        drawn = figures(runs, recordings, verdicts, dropped, options.quick)
+        paths = common.save_figures(options.out, drawn | {"quality": landing_gear_figures.quality(*units)})
     results |= {"rig": rig(), "study": {"synthetic": True, "seed": options.seed, "quick": options.quick}}
     results |= {"seconds": watch.total(), "versions": common.versions()}
     path = common.write_results(options.out, results)

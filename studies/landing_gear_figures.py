@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 import bayesperiodic as bp
 from studies.landing_gear_drop import SHORT, Dropped
 from studies.landing_gear_identification import Identified
+from studies.landing_gear_quality import FALSE_ALARM, LIMIT, MEANINGS, Unit, deviations
 from studies.landing_gear_rig import Run
 from studies.landing_gear_truth import GEAR
 from studies.landing_gear_verdicts import CONDUCTION, NEGATIVE, POSITIVE, UNDETERMINED, Verdict
@@ -154,3 +155,40 @@ def _drop(column: np.ndarray, found: Dropped) -> None:
     column[3].plot(time, 1e3 * (found.true.outputs["displacement"] - median), color=colours["measured"], lw=1.2)
     column[3].axhline(0.0, color=colours["mcmc"], ls="--", lw=1.0)
     column[3].set_xlabel("time [s], until the gas has cooled")
+
+
+def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
+    """Draw the quality-control chart: every unit's deviation from the reference, a row a parameter."""
+    from matplotlib import pyplot as plt
+
+    figure, grid = plt.subplots(len(MEANINGS), 1, figsize=(9.0, 9.5), sharex=True, layout="constrained")
+    number = np.arange(1, len(units) + 1)
+    every = [deviations(reference, unit) for unit in units]
+    kinds = list(dict.fromkeys(unit.kind for unit in units))
+    for axes, (name, meaning) in zip(grid, MEANINGS.items(), strict=True):
+        z = np.array([deviation[name] for deviation in every])
+        out = np.abs(z) > LIMIT
+        axes.axhspan(-LIMIT, LIMIT, color="#DDDDDD", lw=0)
+        axes.plot(number[~out], z[~out], "o", ms=3, color=bp.plot.COLOURS["map"], label='"same"')
+        axes.plot(number[out], z[out], "^", ms=4, color=bp.plot.COLOURS["laplace"], label='"different"')
+        axes.set_yscale("symlog", linthresh=10.0, linscale=2.0)
+        axes.set_yticks([-1000, -100, -10, -5, 0, 5, 10, 100, 1000])
+        axes.set_yticklabels(["−1000", "−100", "−10", "−5", "0", "5", "10", "100", "1000"], fontsize=8)
+        axes.set_ylim(-2.0 * max(10.0, np.abs(z).max()), 2.0 * max(10.0, np.abs(z).max()))
+        axes.minorticks_off()
+        axes.set_ylabel(f"{meaning}\n{name}", fontsize=9)
+    for k, kind in enumerate(kinds):
+        members = np.flatnonzero([unit.kind == kind for unit in units])
+        grid[0].text(
+            number[members].mean(), 1.04, kind, ha="center", va="bottom", transform=grid[0].get_xaxis_transform()
+        )
+        for axes in grid if k else ():
+            axes.axvline(number[members[0]] - 0.5, color="black", lw=0.6)
+    grid[-1].set_xlabel("unit")
+    handles = {label: h for axes in grid for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles, frameon=False, ncols=2, loc="outside lower center")
+    figure.suptitle(
+        "Deviation from the reference gear, in common standard deviations [1], SYNTHETIC data\n"
+        f"(grey: ±{LIMIT:.2f}, a false alarm in {FALSE_ALARM:.0%} of good units)"
+    )
+    return figure

@@ -25,6 +25,7 @@ KEPT = {
 PRIORS = {"theta4": bp.LogNormal(5.2e-3, 0.1), "theta6": bp.Normal(-2.3, 0.3), "theta16": bp.Normal(3.0, 20.0)}
 FIXED = {name: value for name, value in GEAR.items() if name not in (*PRIORS, "theta11")}
 TIED = {"theta11": "-1e5*theta4"}
+ENSEMBLES, QUICK_ENSEMBLES = 4, 2
 WALKERS, QUICK_WALKERS = 16, 8
 MAX_STEPS, QUICK_STEPS = 20_000, 250
 
@@ -87,6 +88,7 @@ def draw(estimated: Identified, seed: int, *, quick: bool) -> Identified:
         stated,
         fit,
         seed=seed,
+        ensembles=QUICK_ENSEMBLES if quick else ENSEMBLES,
         walkers=max(QUICK_WALKERS if quick else WALKERS, 2 * len(stated.names)),
         max_steps=QUICK_STEPS if quick else MAX_STEPS,
         variances="collapsed",

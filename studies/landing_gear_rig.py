@@ -29,6 +29,10 @@ FULL_SCALE = {"displacement": 0.2, "force": 2e4, "pressure": 2.5e6}
 NOISE_SHARE = {"displacement": 2e-4, "force": 3e-3, "pressure": 3e-3}
 NOISE = {channel: NOISE_SHARE[channel] * FULL_SCALE[channel] for channel in FULL_SCALE}
 
+# Parameters of a gear that are not those of `GEAR`, with their values.
+Changed = frozenset[tuple[str, float]]
+SAME: Changed = frozenset()
+
 
 @dataclass(frozen=True)
 class Run:
@@ -65,9 +69,9 @@ RUNS = tuple(
 )  # fmt: skip
 
 
-def measure(run: Run, effects: Iterable[str], seed: int) -> bp.Recording:
-    """Return what the instruments record in one experiment."""
-    clean = steady(run, frozenset(effects))
+def measure(run: Run, effects: Iterable[str], seed: int, changed: Changed = SAME) -> bp.Recording:
+    """Return what the instruments record in one experiment, of a gear with some parameters changed."""
+    clean = steady(run, frozenset(effects), changed)
     generator = np.random.default_rng([zlib.crc32(run.name.encode()), seed])
     signals = {**clean.inputs, **clean.outputs}
     noisy = {name: signals[name] + NOISE[name] * generator.standard_normal(RECORDED) for name in NOISE}
@@ -81,13 +85,13 @@ def measure(run: Run, effects: Iterable[str], seed: int) -> bp.Recording:
 
 
 @cache
-def steady(run: Run, effects: frozenset[str]) -> bp.Recording:
+def steady(run: Run, effects: frozenset[str], changed: Changed = SAME) -> bp.Recording:
     """Return 40 steady cycles without noise, by time integration.
 
     One cycle is integrated with a sample at each phase that the recorded ones have: their number, 14,131, and that of
     the cycles have no common divisor, so that sample k of the recording is that of phase 40·k mod 14,131.
     """
-    cycle = integrate_steady(run, effects, RECORDED)
+    cycle = integrate_steady(run, effects, RECORDED, changed)
     phase = np.arange(RECORDED) * CYCLES % RECORDED
     return bp.Recording(
         np.arange(RECORDED) * CYCLES / (RECORDED * run.frequency),
@@ -98,18 +102,19 @@ def steady(run: Run, effects: frozenset[str]) -> bp.Recording:
     )
 
 
-def integrate_steady(run: Run, effects: frozenset[str], samples: int) -> bp.Recording:
+def integrate_steady(run: Run, effects: frozenset[str], samples: int, changed: Changed = SAME) -> bp.Recording:
     """Return one steady cycle without noise, end point excluded, by `bp.simulate`.
 
     The gas takes minutes to reach its mean temperature, to which its distance falls by the same factor in every cycle.
     So the integration starts again from the limit that three stretches foretell (Aitken), until it stays there.
     """
-    start = {"T": -parameters(effects)["theta17"]}
+    values = parameters(effects) | dict(changed)
+    start = {"T": -values["theta17"]}
     if "flexure" in effects:
         start["q"] = MEAN_COMPRESSION + run.stroke
     stretch = int(np.ceil(STRETCH * run.frequency))
     for _ in range(ROUNDS):
-        found = _integrate(run, effects, start, 3 * stretch, 1).outputs
+        found = _integrate(run, effects, values, start, 3 * stretch, 1).outputs
         first, second, third = found["temperature"][stretch::stretch]
         bend = first - 2 * second + third
         limit = third - (third - second) ** 2 / bend if bend else third
@@ -119,18 +124,20 @@ def integrate_steady(run: Run, effects: frozenset[str], samples: int) -> bp.Reco
             start["q"] = found["compression"][-1]
         if settled:
             # What is wrong with the starting speed dies out within milliseconds.
-            two = _integrate(run, effects, start, 2, samples)
+            two = _integrate(run, effects, values, start, 2, samples)
             return two.between(two.time[samples], two.time[2 * samples - 1])
     raise RuntimeError(f"{run.name}: the gas temperature has not settled.")
 
 
-def _integrate(run: Run, effects: frozenset[str], start: dict[str, float], cycles: int, samples: int) -> bp.Recording:
+def _integrate(
+    run: Run, effects: frozenset[str], values: dict[str, float], start: dict[str, float], cycles: int, samples: int
+) -> bp.Recording:
     """Return so many cycles with so many samples each."""
     phase = 2j * np.pi * np.arange(16)[:, None] / 16 * list(HARMONICS)
     shape = (np.exp(phase) @ list(HARMONICS.values())).real
     return bp.simulate(
         damper(effects),
-        parameters(effects),
+        values,
         {"displacement": MEAN_COMPRESSION + run.stroke * shape},
         frequency=run.frequency,
         duration=(cycles + 0.5 / samples) / run.frequency,

@@ -11,6 +11,7 @@ import bayesperiodic as bp
 from studies import common, landing_gear
 from studies.__main__ import main
 from studies.landing_gear_drop import MASS, drop
+from studies.landing_gear_quality import FAULTS
 from studies.landing_gear_rig import CYCLES, NOISE, RECORDED, RUNS, SPEED_LIMIT, Run, integrate_steady, measure, steady
 from studies.landing_gear_truth import GEAR, TRUTHS
 
@@ -157,9 +158,35 @@ def test_a_quick_run_tells_right_model_from_wrong_one(quick):
     assert small < results["A"]["experiments"][landing_gear.SMALL]["map"]["theta16"] - 4.0
 
 
+def test_quality_control_names_what_is_faulty(quick):
+    """One unit of each kind; a false alarm comes in 1 % of units, the faults are 70 standard deviations and more."""
+    _, results, printed = quick
+    kinds = results["quality"]["kinds"]
+    named = {kind: {n for n, count in one["called_different"].items() if count} for kind, one in kinds.items()}
+    assert named == {
+        "good": set(), "low gas charge": {"theta5"}, "worn friction": {"theta8"}, "leaking oil": {"theta5", "theta6"},
+    }  # fmt: skip
+    assert all(one["units_with_all_verdicts_right"] == 1 and not one["not_converged"] for one in kinds.values())
+    assert kinds["good"]["error_rate"]["interval_95"] == pytest.approx([0.0, 0.975], abs=1e-3)
+    assert "quality control" in printed
+
+
+def test_a_faulty_gear_has_the_gas_law_of_its_fault():
+    """A charge lower by 2 % has a pressure lower by as much; oil that leaves makes room for the gas."""
+
+    def mean_pressure(kind):
+        cycle = integrate_steady(SMALL, TRUTHS["A"], 400, FAULTS[kind])
+        return cycle.outputs["pressure"].mean()
+
+    assert mean_pressure("low gas charge") / mean_pressure("good") == pytest.approx(0.98, abs=1e-4)
+    # p ∝ 1/(1 + ε − A q/V): at q = 0.12 m the gas has 0.7 of its volume.
+    assert mean_pressure("leaking oil") / mean_pressure("good") == pytest.approx(0.7 / 0.71, abs=1e-3)
+    assert mean_pressure("worn friction") / mean_pressure("good") == pytest.approx(1.0, abs=1e-9)
+
+
 def test_every_figure_is_drawn_and_says_synthetic(quick):
     drawn, _, _ = quick
     corners = {f"corner_{stroke}_{truth}" for stroke in ("large", "small") for truth in "AB"}
-    assert set(drawn) == {"histories", "theta16", "drop"} | corners
+    assert set(drawn) == {"histories", "theta16", "drop", "quality"} | corners
     for figure in drawn.values():
         assert any("synthetic" in text.get_text().lower() for text in figure.findobj(Text))
