@@ -12,7 +12,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import bayesperiodic as bp
-from studies import common, landing_gear_drop, landing_gear_figures, landing_gear_quality, landing_gear_verdicts
+from studies import (
+    common,
+    landing_gear_drop,
+    landing_gear_figures,
+    landing_gear_quality,
+    landing_gear_slope,
+    landing_gear_verdicts,
+)
 from studies.landing_gear_drop import Dropped
 from studies.landing_gear_identification import DISPLACEMENT, FORCE, PRIORS, Identified, draw, estimate, fold
 from studies.landing_gear_rig import FULL_SCALE, NOISE_SHARE, RUNS, SPEED_LIMIT, Run, measure
@@ -55,6 +62,9 @@ def run(options: argparse.Namespace) -> None:
         units = landing_gear_quality.examine_all(*(QUICK_UNITS if options.quick else UNITS), options.seed)
     results["quality"] = landing_gear_quality.account(*units)
     print(landing_gear_quality.table(results["quality"]))
+    with watch.part("slope", "the friction's slope"):
+        results["friction_slope"] = landing_gear_slope.account(runs)
+    print(landing_gear_slope.line(results["friction_slope"]))
     with watch.part("figures", "drawing"):
         drawn = figures(runs, recordings, verdicts, dropped, options.quick)
         paths = common.save_figures(options.out, drawn | {"quality": landing_gear_figures.quality(*units)})

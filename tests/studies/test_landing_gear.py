@@ -8,7 +8,7 @@ from matplotlib.text import Text
 from scipy import integrate, optimize
 
 import bayesperiodic as bp
-from studies import common, landing_gear
+from studies import common, landing_gear, landing_gear_slope
 from studies.__main__ import main
 from studies.landing_gear_drop import MASS, drop
 from studies.landing_gear_quality import FAULTS
@@ -96,6 +96,15 @@ def test_the_dropped_gear_comes_to_the_balance_of_moments():
         lambda psi: MASS * 9.81 * 2.02 * np.cos(psi) - lever(psi) * (5e3 / (1 - 2.5 * compression(psi)) - 500.0), 0, 0.2
     )
     assert drop(free, duration=600.0).outputs["displacement"][-1] == pytest.approx(compression(psi), abs=1e-5)
+
+
+@pytest.mark.parametrize("slope", landing_gear_slope.SLOPES)
+def test_steep_friction_is_solved_and_a_coarse_grid_is_told(slope):
+    """The arctan changes over within 2/slope of velocity: 3 steps and more of the grid at 300 s/m, not at 1000."""
+    for run in (SMALL, Run(1.0, 18e-3)):
+        found, warned = landing_gear_slope.solve(run, slope, "force")
+        assert found.converged and warned == (slope >= 1000.0)
+        assert landing_gear_slope.solve(run, slope, "displacement")[0].converged
 
 
 def fundamental(signal: np.ndarray) -> complex:
