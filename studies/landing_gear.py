@@ -17,6 +17,7 @@ from studies import (
     landing_gear_drop,
     landing_gear_figures,
     landing_gear_quality,
+    landing_gear_repair,
     landing_gear_slope,
     landing_gear_verdicts,
 )
@@ -58,6 +59,13 @@ def run(options: argparse.Namespace) -> None:
         results[truth] = collect(runs, verdicts[truth], joint, forced)
         results[truth]["drop"] = landing_gear_drop.account(dropped[truth])
         print(account(truth, results[truth]))
+    drawn: dict[str, Any] = {}
+    if "B" in truths:
+        with watch.part("repair", "truth B: better models, compared by what they predict of experiments held out"):
+            fits = landing_gear_repair.repair([r.name for r in runs], "B", options.seed, quick=options.quick)
+        results["repair"] = landing_gear_repair.account(fits)
+        print(landing_gear_repair.table(results["repair"]))
+        drawn["repair"] = landing_gear_figures.repaired(results["repair"])
     with watch.part("quality", "quality control: a reference gear and units, good and faulty"):
         units = landing_gear_quality.examine_all(*(QUICK_UNITS if options.quick else UNITS), options.seed)
     results["quality"] = landing_gear_quality.account(*units)
@@ -66,8 +74,9 @@ def run(options: argparse.Namespace) -> None:
         results["friction_slope"] = landing_gear_slope.account(runs)
     print(landing_gear_slope.line(results["friction_slope"]))
     with watch.part("figures", "drawing"):
-        drawn = figures(runs, recordings, verdicts, dropped, options.quick)
-        paths = common.save_figures(options.out, drawn | {"quality": landing_gear_figures.quality(*units)})
+        drawn |= figures(runs, recordings, verdicts, dropped, options.quick)
+        drawn["quality"] = landing_gear_figures.quality(*units)
+        paths = common.save_figures(options.out, drawn)
     results |= {"rig": rig(), "study": {"synthetic": True, "seed": options.seed, "quick": options.quick}}
     results |= {"seconds": watch.total(), "versions": common.versions()}
     path = common.write_results(options.out, results)

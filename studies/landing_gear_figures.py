@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +13,7 @@ import bayesperiodic as bp
 from studies.landing_gear_drop import SHORT, Dropped
 from studies.landing_gear_identification import Identified
 from studies.landing_gear_quality import FALSE_ALARM, LIMIT, MEANINGS, Unit, deviations
-from studies.landing_gear_rig import Run
+from studies.landing_gear_rig import RUNS, Run
 from studies.landing_gear_truth import GEAR
 from studies.landing_gear_verdicts import CONDUCTION, NEGATIVE, POSITIVE, UNDETERMINED, Verdict
 
@@ -22,6 +23,7 @@ CHANNELS = {
     "pressure": (1e-6, "pressure [MPa]"),
 }
 TITLE = "SYNTHETIC data"
+NORMAL_90 = 1.6448536269514722
 SIGNS = {POSITIVE: ("#009E73", "o"), UNDETERMINED: ("#999999", "D"), NEGATIVE: ("#CC79A7", "v")}
 # The scale of theta16 is linear up to here, logarithmic beyond [W/K].
 LINEAR_TO, TICKS = 3.0, (-100, -50, -20, -10, -5, -3, -2, -1, 0, 1, 2, 3, 5, 10, 20)
@@ -191,4 +193,45 @@ def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
         "Deviation from the reference gear, in common standard deviations [1], SYNTHETIC data\n"
         f"(grey: ±{LIMIT:.2f}, a false alarm in {FALSE_ALARM:.0%} of good units)"
     )
+    return figure
+
+
+def repaired(found: Mapping[str, Any]) -> Figure:
+    """Draw theta16 by experiment under eq. (9) and under the best model, and how each model predicts what it lacks."""
+    from matplotlib import pyplot as plt
+
+    figure, (top, bottom) = plt.subplots(2, 1, figsize=(10.0, 8.5), sharex=True, layout="constrained")
+    styles: dict[str, dict[str, Any]] = {
+        "eq. (9)": {"color": "#0072B2", "lw": 3.0},
+        "pressure line": {"color": "#E69F00", "ls": "--"},
+        "lost motion": {"color": "#CC79A7"},
+        "all four": {"color": "#009E73"},
+    }
+    runs = list(next(iter(found["models"].values()))["scores"])
+    order = [run.name for run in RUNS if run.name in runs]
+    place = np.arange(len(order))
+    for k, (model, one) in enumerate(found["theta16"].items()):
+        values = np.array([one["estimates"][f"{CONDUCTION}[{name}]"] for name in order])
+        top.errorbar(
+            place + 0.12 * (2 * k - 1), values[:, 0], NORMAL_90 * values[:, 1], fmt="o", ms=4, capsize=2,
+            color=styles[model]["color"], label=model,
+        )  # fmt: skip
+    top.axhline(GEAR[CONDUCTION], color="black", lw=0.8, ls=":", label="truth")
+    top.axhline(0.0, color="black", lw=0.8)
+    top.set_yscale("symlog", linthresh=LINEAR_TO, linscale=1.5)
+    top.set_yticks(
+        [t for t in TICKS if abs(t) != 1], [f"{t:g}".replace("-", "−") for t in TICKS if abs(t) != 1], fontsize=8
+    )
+    top.minorticks_off()
+    top.set_ylabel("theta16 [W/K], 90 % interval")
+    top.legend(frameon=False)
+    for model, one in found["models"].items():
+        errors = [one["errors_held_out"][name]["force"] for name in order]
+        bottom.plot(place, errors, "o", ms=4, **{"lw": 1.0, "ls": "-"} | styles[model], label=model)
+    bottom.axhline(found["noise_of_the_mean"]["force"], color="black", lw=0.8, ls=":", label="noise of the mean period")
+    bottom.set_yscale("log")
+    bottom.set_ylabel("rms error of the force [N]\nin experiments held out")
+    bottom.set_xticks(place, [name.replace(" Hz ", " Hz\n±") for name in order], fontsize=8)
+    bottom.legend(frameon=False, ncols=2)
+    figure.suptitle("Better models of the gear of truth B, SYNTHETIC data")
     return figure

@@ -180,6 +180,20 @@ def test_quality_control_names_what_is_faulty(quick):
     assert "quality control" in printed
 
 
+def test_a_model_with_the_lost_motion_predicts_better_what_it_was_not_fitted_to(quick):
+    """Each of the two experiments from the other; the score's gain is the fall of ln(rms) times independent values."""
+    _, results, printed = quick
+    models = results["repair"]["models"]
+    paper, lost = models["eq. (9)"], models["lost motion"]
+    assert lost["experiments_predicted_better"] == 2 and lost["gain_over_eq_9"][0] > 20.0
+    gains = []
+    for name, errors in paper["errors_held_out"].items():
+        ratio = {channel: errors[channel] / lost["errors_held_out"][name][channel] for channel in errors}
+        gains.append(121 * np.log(ratio["force"]) + 41 * np.log(ratio["pressure"]))
+    assert lost["gain_over_eq_9"][0] == pytest.approx(np.mean(gains))
+    assert "gain over eq. (9)" in printed
+
+
 def test_a_faulty_gear_has_the_gas_law_of_its_fault():
     """A charge lower by 2 % has a pressure lower by as much; oil that leaves makes room for the gas."""
 
@@ -196,6 +210,6 @@ def test_a_faulty_gear_has_the_gas_law_of_its_fault():
 def test_every_figure_is_drawn_and_says_synthetic(quick):
     drawn, _, _ = quick
     corners = {f"corner_{stroke}_{truth}" for stroke in ("large", "small") for truth in "AB"}
-    assert set(drawn) == {"histories", "theta16", "drop", "quality"} | corners
+    assert set(drawn) == {"histories", "theta16", "drop", "quality", "repair"} | corners
     for figure in drawn.values():
         assert any("synthetic" in text.get_text().lower() for text in figure.findobj(Text))
