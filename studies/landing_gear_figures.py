@@ -65,7 +65,7 @@ def _histories(column: np.ndarray, recording: bp.Recording, identified: Identifi
     column[3].set_xlabel("time [s]")
 
 
-def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict]]) -> Figure:
+def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict]], drive: str) -> Figure:
     """Draw theta16 by experiment: 90 % intervals of draws and of the Laplace approximation, and the sign verdict."""
     from matplotlib import pyplot as plt
 
@@ -79,7 +79,8 @@ def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict
     handles, labels = grid[0].get_legend_handles_labels()
     figure.legend(handles, labels, frameon=False, ncols=4, loc="outside lower center", fontsize=9)
     figure.suptitle(
-        "Heat conduction theta16 by experiment, SYNTHETIC data (filled: model adequate, open: misspecified)"
+        f"Heat conduction theta16 by experiment, {drive} given, SYNTHETIC data\n"
+        "(filled: model adequate, open: misspecified)"
     )
     return figure
 

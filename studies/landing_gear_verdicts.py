@@ -14,6 +14,7 @@ from studies.landing_gear_identification import Identified
 POSITIVE, NEGATIVE, UNDETERMINED = "positive", "negative", "undetermined"
 ONE_SIGN, MONTE_CARLO_ERRORS = 0.975, 3.0
 CONDUCTION = "theta16"
+FALSE_ALARM = 0.01
 
 
 @dataclass(frozen=True)
@@ -24,12 +25,16 @@ class Verdict:
     ----------
     identified : Identified
     identifiability : Identifiability
-    prediction : Prediction
+    misspecified : bool
+        Whether the model is called that, at a false-alarm rate of 1 % an experiment.
+    p : float
+        Behind it.
     """
 
     identified: Identified
     identifiability: bp.Identifiability
-    prediction: bp.Prediction
+    misspecified: bool
+    p: float
 
     @property
     def p_negative(self) -> tuple[float, float]:
@@ -45,18 +50,14 @@ class Verdict:
             return UNDETERMINED
         return NEGATIVE if negative > 0.5 else POSITIVE
 
-    @property
-    def misspecified(self) -> bool:
-        """Whether `bp.predict` calls the model misspecified, at a false-alarm rate of 1 % an experiment."""
-        return str(self.prediction.table["verdict"]["all"]) == "misspecified"
-
 
 def judge(identified: Identified) -> Verdict:
     """Return the verdict on an experiment whose posterior was sampled."""
     assert identified.posterior is not None
     stated, fit, posterior = identified.problem, identified.fit, identified.posterior
     said = bp.identifiability(stated, fit, posterior, profile=False, candidates=[])
-    return Verdict(identified, said, bp.predict(stated, posterior))
+    table = bp.predict(stated, posterior).table
+    return Verdict(identified, said, str(table["verdict"]["all"]) == "misspecified", float(table["p"]["all"]))
 
 
 def account(verdict: Verdict) -> dict[str, Any]:
@@ -76,7 +77,7 @@ def account(verdict: Verdict) -> dict[str, Any]:
         "sign": verdict.sign,
         "identifiability": verdict.identifiability.verdicts,
         "misspecified": verdict.misspecified,
-        "predict_p": float(verdict.prediction.table["p"]["all"]),
+        "misfit_p": verdict.p,
         "converged": posterior.converged,
         "log_posterior_calls": posterior.log_posterior_calls,
         "failures": posterior.failures,
@@ -110,11 +111,15 @@ def line(name: str, verdict: Verdict) -> str:
     """Return what is printed of an experiment."""
     fit, (negative, error) = verdict.identified.fit, verdict.p_negative
     told = "misspecified" if verdict.misspecified else "adequate"
-    split = fit.noise_split["force"]
+    if "scale" in fit.noise:
+        size = f"scale of the errors {fit.noise['scale']:.2f}"
+    else:
+        split = fit.noise_split["force"]
+        size = f"force: noise {split.measurement:.1f} N, model error {split.model:.1f} N"
     return (
         f"{name:>14s}: theta16 {fit.theta[CONDUCTION]:8.3f} ± {fit.sd[CONDUCTION]:.3f} W/K, "
         f"P(< 0) = {negative:.4f} ± {error:.4f} (Laplace {ndtr(-fit.theta[CONDUCTION] / fit.sd[CONDUCTION]):.4f}), "
-        f"{verdict.sign}, {told}; force: noise {split.measurement:.1f} N, model error {split.model:.1f} N"
+        f"{verdict.sign}, {told}; {size}"
     )
 
 

@@ -1,16 +1,18 @@
 import contextlib
 import io
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from matplotlib.text import Text
-from scipy import integrate, optimize
+from scipy import integrate, optimize, stats
 
 import bayesperiodic as bp
-from studies import common, landing_gear, landing_gear_slope
+from studies import common, landing_gear, landing_gear_force, landing_gear_slope
 from studies.__main__ import main
 from studies.landing_gear_drop import MASS, drop
+from studies.landing_gear_identification import FORCE, fold
 from studies.landing_gear_quality import FAULTS
 from studies.landing_gear_rig import CYCLES, NOISE, RECORDED, RUNS, SPEED_LIMIT, Run, integrate_steady, measure, steady
 from studies.landing_gear_truth import GEAR, TRUTHS
@@ -167,6 +169,41 @@ def test_a_quick_run_tells_right_model_from_wrong_one(quick):
     assert small < results["A"]["experiments"][landing_gear.SMALL]["map"]["theta16"] - 4.0
 
 
+def test_the_force_given_its_noise_leaves_the_sign_open(quick):
+    _, results, _ = quick
+    given = results["A"]["force_given"]
+    (one,) = given["experiments"].values()
+    assert one["sign"] == "undetermined" and not one["misspecified"]
+    value, sd = one["map"]["theta16"], one["laplace_sd"]["theta16"]
+    assert abs(value - GEAR["theta16"]) < 3.0 * sd
+    (exact,) = given["force_taken_for_exact"].values()
+    assert exact["laplace_sd"]["theta16"] < 0.4 * sd
+
+
+def test_errors_with_the_force_given_have_the_covariance_of_all_noise():
+    """Squares of 25 campaigns' errors at the truth in its units, χ² of 2000 values at 0.1 % either way."""
+    run = next(run for run in RUNS if run.name == landing_gear.SMALL)
+    total, covariance = 0.0, None
+    for seed in range(25):
+        experiment = fold(measure(run, (), seed), FORCE)
+        if covariance is None:
+            at_truth = SimpleNamespace(
+                problem=SimpleNamespace(experiments=(experiment,)), fit=SimpleNamespace(theta=GEAR)
+            )
+            carried = landing_gear_force.with_noise_of_the_input(at_truth)
+            covariance, at = carried.covariance, carried.mask
+        exact = bp.solve_periodic(
+            bp.models.landing_gear("force"), GEAR, experiment.inputs, frequency=run.frequency, samples=800
+        )
+        errors = [
+            (experiment.outputs[c] - experiment.project(c, exact.outputs[c]))[at] for c in ("displacement", "pressure")
+        ]
+        error = np.stack(errors, axis=-1).ravel()
+        total += error @ np.linalg.solve(covariance, error)
+    low, high = stats.chi2.ppf([0.001, 0.999], 25 * 80)
+    assert low < total < high
+
+
 def test_quality_control_names_what_is_faulty(quick):
     """One unit of each kind; a false alarm comes in 1 % of units, the faults are 70 standard deviations and more."""
     _, results, printed = quick
@@ -210,6 +247,6 @@ def test_a_faulty_gear_has_the_gas_law_of_its_fault():
 def test_every_figure_is_drawn_and_says_synthetic(quick):
     drawn, _, _ = quick
     corners = {f"corner_{stroke}_{truth}" for stroke in ("large", "small") for truth in "AB"}
-    assert set(drawn) == {"histories", "theta16", "drop", "quality", "repair"} | corners
+    assert set(drawn) == {"histories", "theta16", "theta16_force", "drop", "quality", "repair"} | corners
     for figure in drawn.values():
         assert any("synthetic" in text.get_text().lower() for text in figure.findobj(Text))
