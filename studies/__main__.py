@@ -21,7 +21,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1, help="of everything random (default 1)")
     parser.add_argument("--quick", action="store_true", help="short chains, into figures/quick/NAME; not for quoting")
     parser.add_argument("--noise", type=float, default=1e-3, help="pendulum: fraction of the attractor (default 0.001)")
-    parser.add_argument("--replicates", type=int, default=0, help="verdicts, pendulum: data sets (default 0)")
+    parser.add_argument(
+        "--replicates", type=int, default=0, help="verdicts, pendulum, landing-gear: data sets (default 0)"
+    )
     parser.add_argument("--truth", choices=("A", "B"), help="landing-gear: which damper (default both)")
     options = parser.parse_args(arguments)
     known = _studies()

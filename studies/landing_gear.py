@@ -14,6 +14,7 @@ from typing import Any
 import bayesperiodic as bp
 from studies import (
     common,
+    landing_gear_campaigns,
     landing_gear_drop,
     landing_gear_figures,
     landing_gear_force,
@@ -37,7 +38,12 @@ UNITS, QUICK_UNITS = (10, 60), (1, 1)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the study."""
+    """Run the study, or with ``--replicates`` campaigns of truth A alone."""
+    if options.replicates < 0:
+        raise ValueError(f"--replicates: {options.replicates} is not allowed; it must be at least 0.")
+    if options.replicates:
+        _campaigns(options)
+        return
     watch, runs = common.Stopwatch(), QUICK if options.quick else RUNS
     truths = [options.truth] if options.truth else list(TRUTHS)
     print("All data are SYNTHETIC: a simulated rig, see studies/landing_gear_rig.py and landing_gear_truth.py.")
@@ -88,6 +94,16 @@ def run(options: argparse.Namespace) -> None:
     results |= {"seconds": watch.total(), "versions": common.versions()}
     path = common.write_results(options.out, results)
     print(f"figures (synthetic data): {', '.join(map(str, paths))}\nresults: {path}")
+
+
+def _campaigns(options: argparse.Namespace) -> None:
+    watch, folder = common.Stopwatch(), options.out / "campaigns"
+    with watch.part("campaigns", f"{options.replicates} SYNTHETIC campaigns of truth A"):
+        lines = landing_gear_campaigns.campaigns(folder, options.replicates, options.seed)
+    found = landing_gear_campaigns.account(lines)
+    print(landing_gear_campaigns.table(found))
+    found |= {"synthetic": True, "seed": options.seed, "seconds": watch.total(), "versions": common.versions()}
+    print(f"results: {common.write_results(folder, found)}")
 
 
 def _verdict(recording: bp.Recording, seed: int, quick: bool) -> Verdict:

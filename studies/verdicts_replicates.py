@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import multiprocessing
-import os
 import time
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +14,7 @@ import numpy as np
 
 import bayesperiodic as bp
 from studies import common, verdicts_cases, verdicts_outcome
+from studies.common_resumed import resumed
 from studies.verdicts_cases import CASES, COMPARE, IDENTIFIABILITY
 from studies.verdicts_outcome import Outcome, examine
 
@@ -70,47 +67,15 @@ def source() -> str:
 
 def replicates(folder: Path, names: Sequence[str], count: int, seed: int) -> list[dict[str, Any]]:
     """Do the replicates that the file in the folder lacks, and return all of them."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / FILE
     tasks: list[Task] = []
     for number in range(count):
         tasks += [(name, DATA, number, seed) for name in names]
         tasks += [(name, SAMPLER, number, seed) for name in names if number < MOST_SAMPLER_SEEDS]
-    done = {_key(line): line for line in _read(path) if line["source"] == source()}
-    missing = [task for task in tasks if task not in done]
-    print(f"  {len(tasks) - len(missing)} replicates found in {path}, {len(missing)} to do", flush=True)
-    with path.open("a", encoding="utf-8") as file, _workers() as pool:
-        futures = [pool.submit(replicate, task) for task in missing]
-        try:
-            for number, future in enumerate(as_completed(futures), 1):
-                line = future.result()
-                done[_key(line)] = line
-                file.write(json.dumps(line, ensure_ascii=False) + "\n")
-                file.flush()
-                if number % 50 == 0:
-                    print(f"  {number} of {len(missing)}", flush=True)
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-    return [done[task] for task in tasks]
+    return resumed(folder / FILE, tasks, replicate, _task, source())
 
 
-def _workers() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn"))
-
-
-def _key(line: Mapping[str, Any]) -> Task:
+def _task(line: Mapping[str, Any]) -> Task:
     return line["case"], line["kind"], line["number"], line["seed"]
-
-
-def _read(path: Path) -> list[dict[str, Any]]:
-    """Return the lines of a file, without a last one that was cut off; that one is taken out of it."""
-    if not path.is_file():
-        return []
-    text = path.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]
-    if whole != text:
-        path.write_text(whole, encoding="utf-8")
-    return [json.loads(line) for line in whole.splitlines()]
 
 
 def summary(lines: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outcome]) -> dict[str, Any]:

@@ -9,13 +9,21 @@ from matplotlib.text import Text
 from scipy import integrate, optimize, stats
 
 import bayesperiodic as bp
-from studies import common, landing_gear, landing_gear_force, landing_gear_slope
+from studies import (
+    common,
+    common_resumed,
+    landing_gear,
+    landing_gear_campaigns,
+    landing_gear_force,
+    landing_gear_slope,
+)
 from studies.__main__ import main
 from studies.landing_gear_drop import MASS, drop
 from studies.landing_gear_identification import FORCE, fold
 from studies.landing_gear_quality import FAULTS
 from studies.landing_gear_rig import CYCLES, NOISE, RECORDED, RUNS, SPEED_LIMIT, Run, integrate_steady, measure, steady
 from studies.landing_gear_truth import GEAR, TRUTHS
+from tests.studies.here import InThisProcess
 
 SMALL = next(run for run in RUNS if run.name == "6 Hz 4 mm")
 
@@ -250,3 +258,39 @@ def test_every_figure_is_drawn_and_says_synthetic(quick):
     assert set(drawn) == {"histories", "theta16", "theta16_force", "drop", "quality", "repair"} | corners
     for figure in drawn.values():
         assert any("synthetic" in text.get_text().lower() for text in figure.findobj(Text))
+
+
+def test_campaigns_are_counted_and_resumed(tmp_path, monkeypatch):
+    """Made-up campaigns: of 14 experiments each, one interval misses in every second campaign."""
+    done = []
+
+    def fake(task):
+        done.append(task)
+        truth, seed = task
+        one = {
+            "mcmc_covers": dict.fromkeys(("theta4", "theta6", "theta16"), True),
+            "laplace_covers": dict.fromkeys(("theta4", "theta6", "theta16"), True),
+            "sd": dict.fromkeys(("theta4", "theta6", "theta16"), 1.0),
+            "sign": "positive",
+            "misspecified": False,
+            "map_converged": True,
+            "stop_rule": False,
+        }
+        experiments = {run.name: one for run in RUNS}
+        if seed % 2:
+            experiments[SMALL.name] = one | {"sign": "negative", "mcmc_covers": one["mcmc_covers"] | {"theta6": False}}
+        return {
+            "truth": truth, "seed": seed, "source": landing_gear_campaigns.source(), "experiments": experiments
+        }  # fmt: skip
+
+    monkeypatch.setattr(common_resumed, "workers", InThisProcess)
+    monkeypatch.setattr(landing_gear_campaigns, "campaign", fake)
+    landing_gear_campaigns.campaigns(tmp_path, 2, 1)
+    lines = landing_gear_campaigns.campaigns(tmp_path, 4, 1)
+    assert len(done) == len(lines) == 4
+    found = landing_gear_campaigns.account(lines)
+    assert found["covered"]["mcmc"] == {"theta4": 56, "theta6": 54, "theta16": 56} and found["called_negative"] == 2
+    assert found["covered_by_experiment"][SMALL.name]["theta6"] == 2
+    tail = 0.005 / 3
+    assert found["band"] == [stats.binom.ppf(tail, 56, 0.9), stats.binom.ppf(1 - tail, 56, 0.9)]
+    assert "called negative 2 times" in landing_gear_campaigns.table(found)

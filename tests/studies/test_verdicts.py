@@ -4,10 +4,11 @@ import json
 
 import pytest
 
-from studies import verdicts, verdicts_replicates
+from studies import common_resumed, verdicts, verdicts_replicates
 from studies.__main__ import main
 from studies.verdicts_cases import CASES
 from studies.verdicts_outcome import examine
+from tests.studies.here import InThisProcess
 
 
 def run(folder, *arguments):
@@ -52,32 +53,14 @@ def test_figures_are_drawn(quick):
 def test_replicates_are_saved_one_by_one_and_resumed(tmp_path, monkeypatch):
     """A line that was cut off, and one of another version of the cases, are done again; the others are not."""
     calls = []
-
-    class Here:
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            return None
-
-        def submit(self, function, task):
-            from concurrent.futures import Future
-
-            future = Future()
-            calls.append(task)
-            future.set_result(function(task))
-            return future
-
-        def shutdown(self, **_):
-            return None
-
     fake = {"right": True, "named": True, "warned": False, "converged": True, "wrong": {}, "verdicts": {}, "seconds": 1}
-    monkeypatch.setattr(verdicts_replicates, "_workers", Here)
+    monkeypatch.setattr(common_resumed, "workers", InThisProcess)
     monkeypatch.setattr(
         verdicts_replicates,
         "replicate",
         lambda task: (
-            dict(zip(("case", "kind", "number", "seed"), task, strict=True))
+            calls.append(task)
+            or dict(zip(("case", "kind", "number", "seed"), task, strict=True))
             | {"source": verdicts_replicates.source()}
             | fake
         ),
