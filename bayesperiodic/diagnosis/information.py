@@ -11,7 +11,7 @@ from bayesperiodic.inference.estimation.joint_laplace import logarithmic
 from bayesperiodic.inference.problem import Problem
 
 ONE_SD = float(ndtr(1.0))
-SMALLEST = 1e-12
+SMALLEST, HARDLY = 1e-12, 1e-3
 
 
 @dataclass(frozen=True)
@@ -89,13 +89,15 @@ class Information:
 
     @property
     def together(self) -> np.ndarray:
-        """The same if the others are unknown too; infinite on a direction without information."""
+        """The same if the others are unknown too; infinite for what a direction without information moves.
+
+        It does not move a parameter that changes by less than 0.1 % of its prior's sd where others do by all of theirs.
+        """
         values, vectors = self._relative
-        floor = SMALLEST * max(values[-1], np.finfo(float).tiny)
-        with np.errstate(divide="ignore"):
-            inverse = np.where(values > floor, 1.0 / np.maximum(values, floor), np.inf)
-        moving = np.abs(vectors) > np.sqrt(SMALLEST)
-        return np.sqrt(np.sum(np.where(moving, np.where(moving, vectors, 1.0) ** 2 * inverse, 0.0), axis=1))
+        told = values > SMALLEST * max(values[-1], np.finfo(float).tiny)
+        known = np.sum(vectors[:, told] ** 2 / values[told], axis=1)
+        unseen = np.any(np.abs(vectors[:, ~told]) > HARDLY, axis=1)
+        return np.where(unseen, np.inf, np.sqrt(known))
 
     @property
     def collinearity(self) -> np.ndarray:

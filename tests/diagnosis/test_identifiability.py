@@ -57,6 +57,17 @@ def test_information_is_that_of_the_regression(linear):
     assert found.condition == pytest.approx(np.linalg.cond(scaled), rel=1e-8)
 
 
+@pytest.mark.parametrize(("moved", "left"), [(1e-5, 0.01), (0.1, np.inf)])
+def test_an_open_direction_counts_for_what_it_moves(moved, left):
+    """Nothing is known along (moved, 1, 1); k is known to 0.01 prior sds but for that."""
+    nothing = np.array([moved, 1.0, 1.0])
+    directions = np.linalg.qr(np.column_stack([nothing, [1.0, 0.0, 0.0], [0.0, 1.0, -1.0]]))[0]
+    matrix = directions @ np.diag([0.0, 1e4, 4.0]) @ directions.T
+    found = Information(("k", "c", "shift"), np.zeros(3), np.zeros(3, dtype=bool), matrix, np.ones(3))
+    assert found.together[0] == pytest.approx(left, rel=1e-3)
+    assert np.isinf(found.together[1:]).all()
+
+
 def test_contraction_is_that_of_the_normal_posterior(linear):
     """With draws and without; the draws' within four of the Monte Carlo errors that are stated with it."""
     problem, fit = linear
