@@ -18,7 +18,7 @@ DRIVES = (DISPLACEMENT, FORCE)
 SAMPLES = 800
 KEPT = {
     DISPLACEMENT: {"displacement": 3, "force": 60, "pressure": 20},
-    FORCE: {"displacement": 20, "force": 60, "pressure": 20},
+    FORCE: {"displacement": 40, "force": 60, "pressure": 40},
 }
 # What drawings and a data sheet tell of area and volume; of the conduction its order of magnitude and not its sign. Its
 # median is off zero, where the mean temperature is undetermined and solves are at their worst.

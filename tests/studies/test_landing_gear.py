@@ -1,7 +1,6 @@
 import contextlib
 import io
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -189,16 +188,13 @@ def test_the_force_given_its_noise_leaves_the_sign_open(quick):
 
 
 def test_errors_with_the_force_given_have_the_covariance_of_all_noise():
-    """Squares of 25 campaigns' errors at the truth in its units, χ² of 2000 values at 0.1 % either way."""
+    """Squares of 25 campaigns' errors at the truth in its units, χ² of 4000 values at 0.1 % either way."""
     run = next(run for run in RUNS if run.name == landing_gear.SMALL)
     total, covariance = 0.0, None
     for seed in range(25):
         experiment = fold(measure(run, (), seed), FORCE)
         if covariance is None:
-            at_truth = SimpleNamespace(
-                problem=SimpleNamespace(experiments=(experiment,)), fit=SimpleNamespace(theta=GEAR)
-            )
-            carried = landing_gear_force.with_noise_of_the_input(at_truth)
+            carried = landing_gear_force.with_noise_of_the_input(experiment, GEAR)
             covariance, at = carried.covariance, carried.mask
         exact = bp.solve_periodic(
             bp.models.landing_gear("force"), GEAR, experiment.inputs, frequency=run.frequency, samples=800
@@ -208,7 +204,7 @@ def test_errors_with_the_force_given_have_the_covariance_of_all_noise():
         ]
         error = np.stack(errors, axis=-1).ravel()
         total += error @ np.linalg.solve(covariance, error)
-    low, high = stats.chi2.ppf([0.001, 0.999], 25 * 80)
+    low, high = stats.chi2.ppf([0.001, 0.999], 25 * 160)
     assert low < total < high
 
 
