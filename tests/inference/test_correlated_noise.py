@@ -1,7 +1,7 @@
 """Do 90 % intervals cover 90 % where errors are correlated along the period, and are residuals taken apart rightly.
 
 Recordings of 119 samples a cycle with a first-order autoregressive process on the line, ρ = 0.9 from sample to sample,
-or with white noise, folded to n = 800. 500 each; the count of covered truths must lie in the two-sided 99 % binomial
+or with white noise, folded to n = 800. 300 each; the count of covered truths must lie in the two-sided 99 % binomial
 band (a false-alarm rate of 1 % a statement).
 """
 
@@ -18,7 +18,7 @@ from bayesperiodic.inference.estimation.residual_split import NoiseSplit
 from bayesperiodic.inference.estimation.whiteness import whiteness
 from tests.known import LINEAR, grid, linear_regressors
 
-RECORDINGS, HARMONICS = 500, 20
+RECORDINGS, HARMONICS = 300, 20
 FREQUENCY, PER_CYCLE, AMPLITUDE, SD = 2.0, 119.37, 0.05, 10.0
 TRUTH = {"k": 900.0, "coulomb": 25.0}
 DAMPING, CORRELATION = 40.0, 0.9
@@ -121,7 +121,7 @@ def test_residuals_in_units_of_the_right_noise_are_white():
 
 
 def test_residuals_of_white_noise_are_white():
-    """Uniform p from 500 folded recordings, KS at 0.1 %."""
+    """Uniform p from 300 folded recordings, KS at 0.1 %."""
     assert stats.kstest(all_fitted(0.0, 6)[1], "uniform").pvalue > 1e-3
 
 

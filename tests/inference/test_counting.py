@@ -1,6 +1,6 @@
 """White noise on recordings of 119 samples a cycle, folded to n = 800: do 90 % intervals cover 90 %.
 
-500 recordings each; the count of covered truths must lie in the two-sided 99 % binomial band (a false-alarm rate of 1 %
+300 recordings each; the count of covered truths must lie in the two-sided 99 % binomial band (a false-alarm rate of 1 %
 a number of harmonics).
 """
 
@@ -14,7 +14,7 @@ from scipy import stats
 import bayesperiodic as bp
 from tests.known import LINEAR, linear_regressors
 
-RECORDINGS = 500
+RECORDINGS = 300
 FREQUENCY, PER_CYCLE, CYCLES, AMPLITUDE = 2.0, 119.37, 6, 0.05
 TRUTH = np.array([900.0, 40.0, 25.0])
 FLAT = {"k": bp.Normal(900.0, 1e5), "coulomb": bp.Normal(25.0, 1e4)}
