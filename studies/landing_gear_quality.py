@@ -9,10 +9,7 @@ machined and known; the gas's heat capacity theta15 follows its amount, theta5/t
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +17,7 @@ import numpy as np
 from scipy.stats import binom, norm
 
 import bayesperiodic as bp
+from studies.common_resumed import workers
 from studies.landing_gear_identification import DISPLACEMENT, fold
 from studies.landing_gear_rig import RUNS, SAME, Changed, measure
 from studies.landing_gear_truth import GEAR
@@ -105,7 +103,7 @@ def examine_all(references: int, each: int, seed: int) -> tuple[Unit, list[Unit]
     if len(tasks) <= SERIALLY:
         found = [examine(*task) for task in tasks]
     else:
-        with ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:
+        with workers() as pool:
             found = list(pool.map(examine, *zip(*tasks, strict=True), chunksize=5))
     return _together(found[:references]), found[references:]
 

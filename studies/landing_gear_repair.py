@@ -9,10 +9,7 @@ experiment, and the scatter over experiments gives the standard error of the mea
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +17,7 @@ import numpy as np
 from scipy.special import ndtr
 
 import bayesperiodic as bp
+from studies.common_resumed import workers
 from studies.landing_gear_identification import DISPLACEMENT, FIXED, KEPT, PRIORS, TIED, fold
 from studies.landing_gear_rig import NOISE, RECORDED, RUNS, measure
 from studies.landing_gear_truth import STRENGTHS, TRUTHS, damper
@@ -101,7 +99,7 @@ def repair(names: Sequence[str], truth: str, seed: int, *, quick: bool) -> list[
         return [fit(task) for task in tasks]
     # The longest first.
     tasks = [Task(model, tuple(names), (), truth, seed) for model in (BEST, PAPER)] + tasks[::-1]
-    with ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:
+    with workers() as pool:
         return list(pool.map(fit, tasks))
 
 
