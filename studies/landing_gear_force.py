@@ -37,9 +37,8 @@ from studies.landing_gear_verdicts import FALSE_ALARM, Verdict
 POINTS = 80
 # Of the force's amplitudes, in their standard deviations, for derivatives by differences.
 STEP = 3.0
-# A fit that takes the force for exact is too far off to know how noise moves the gear; one with this covariance is not.
+# The covariance is taken at a fit that takes the force for exact, then once more at the fit that it leads to.
 ROUNDS = 2
-# Slow large strokes show the second order's error on 800 points.
 SCHEME = "central4"
 
 
