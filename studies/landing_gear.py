@@ -15,12 +15,15 @@ import bayesperiodic as bp
 from studies import (
     common,
     landing_gear_campaigns,
+    landing_gear_cost,
     landing_gear_drop,
     landing_gear_figures,
     landing_gear_force,
+    landing_gear_joint,
     landing_gear_quality,
     landing_gear_repair,
     landing_gear_results,
+    landing_gear_sensitivity,
     landing_gear_slope,
     landing_gear_verdicts,
 )
@@ -53,6 +56,8 @@ def run(options: argparse.Namespace) -> None:
         every[truth] = _of_truth(truth, runs, options, watch)
         results[truth] = landing_gear_results.collect(runs, every[truth])
         print(landing_gear_results.account(truth, results[truth]))
+    if "A" in every:
+        results["cost"] = _cost(every["A"].joint, options, watch)
     drawn = _of_all(runs, truths, options, watch, results)
     with watch.part("figures", "drawing"):
         paths = common.save_figures(options.out, drawn | figures(runs, every, options.quick))
@@ -70,14 +75,30 @@ def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace, watc
     with watch.part(f"posteriors {truth}", f"truth {truth}: displacement given, one posterior an experiment"):
         verdicts = {name: _verdict(recording, seed, quick) for name, recording in recordings.items()}
     with watch.part(f"joint {truth}", f"truth {truth}: all experiments at once, theta4 and theta6 in common"):
-        joint = estimate([fold(recording, DISPLACEMENT) for recording in recordings.values()], DISPLACEMENT)
+        joint = {DISPLACEMENT: landing_gear_joint.given_displacement(recordings.values(), seed, quick=quick)}
+    with watch.part(f"sensitivity {truth}", f"truth {truth}: the other parameters under priors"):
+        varied = [r for r in runs if r.name == SMALL] if quick else runs
+        sensitivity = landing_gear_sensitivity.examine_all(varied, truth, seed, quick=quick)
     with watch.part(f"force {truth}", f"truth {truth}: force given, one posterior an experiment"):
         given = {name: recording for name, recording in recordings.items() if name == SMALL or not quick}
         exact, forced = _with_force_given(given, seed, quick)
+    with watch.part(f"force joint {truth}", f"truth {truth}: force given, all experiments at once"):
+        together = landing_gear_joint.given_force(forced, seed, quick=quick)
+        joint |= {FORCE: together} if together else {}
     with watch.part(f"drop {truth}", f"truth {truth}: the drop test, predicted from all experiments"):
         gear = landing_gear_drop.identify(recordings.values(), seed, quick=quick)
         dropped = landing_gear_drop.predict(gear, TRUTHS[truth], QUICK_DROPS if quick else DROPS)
-    return OfTruth(recordings, verdicts, joint, exact, forced, dropped)
+    return OfTruth(recordings, verdicts, joint, sensitivity, exact, forced, dropped)
+
+
+def _cost(joint: Mapping[str, Identified], options: argparse.Namespace, watch: common.Stopwatch) -> dict[str, Any]:
+    with watch.part("cost", "what a log-posterior of truth A costs, against time integration until steady"):
+        found = {
+            drive: landing_gear_cost.measure(drive, one, options.seed, quick=options.quick)
+            for drive, one in joint.items()
+        }
+    print("\n".join(landing_gear_cost.table(drive, one) for drive, one in found.items()))
+    return found
 
 
 def _of_all(

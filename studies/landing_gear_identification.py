@@ -80,7 +80,9 @@ def estimate(experiments: Sequence[bp.Experiment], drive: str, *, one_conduction
     return Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0, 0.0)
 
 
-def draw(estimated: Identified, seed: int, *, quick: bool) -> Identified:
+def draw(
+    estimated: Identified, seed: int, *, quick: bool, ensembles: int = ENSEMBLES, max_steps: int = MAX_STEPS
+) -> Identified:
     """Return the same with draws of the posterior, the variances integrated out."""
     stated, fit = estimated.problem, estimated.fit
     wall, cpu = time.perf_counter(), time.process_time()
@@ -88,9 +90,9 @@ def draw(estimated: Identified, seed: int, *, quick: bool) -> Identified:
         stated,
         fit,
         seed=seed,
-        ensembles=QUICK_ENSEMBLES if quick else ENSEMBLES,
+        ensembles=QUICK_ENSEMBLES if quick else ensembles,
         walkers=max(QUICK_WALKERS if quick else WALKERS, 2 * len(stated.names)),
-        max_steps=QUICK_STEPS if quick else MAX_STEPS,
+        max_steps=QUICK_STEPS if quick else max_steps,
         variances="collapsed",
         progress=False,
     )

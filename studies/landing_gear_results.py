@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import bayesperiodic as bp
-from studies import landing_gear_drop, landing_gear_verdicts
+from studies import landing_gear_drop, landing_gear_joint, landing_gear_sensitivity, landing_gear_verdicts
 from studies.landing_gear_drop import Dropped
 from studies.landing_gear_identification import PRIORS, Identified
 from studies.landing_gear_rig import FULL_SCALE, NOISE_SHARE, RUNS, SPEED_LIMIT, Run
@@ -27,8 +27,10 @@ class OfTruth:
         By experiment.
     verdicts : dict of str to Verdict
         The displacement given.
-    joint : Identified
-        All experiments, theta4 and theta6 in common.
+    joint : dict of str to Identified
+        All experiments, theta4 and theta6 in common, by what is given.
+    sensitivity : dict of str to dict
+        The other parameters under priors, by experiment.
     exact : dict of str to Identified
         The force given and taken for exact.
     forced : dict of str to Verdict
@@ -38,7 +40,8 @@ class OfTruth:
 
     recordings: dict[str, bp.Recording]
     verdicts: dict[str, Verdict]
-    joint: Identified
+    joint: dict[str, Identified]
+    sensitivity: dict[str, dict[str, Any]]
     exact: dict[str, Identified]
     forced: dict[str, Verdict]
     dropped: Dropped
@@ -61,7 +64,8 @@ def collect(runs: Sequence[Run], found: OfTruth) -> dict[str, Any]:
     """Return the content of results.json on one truth."""
     verdicts = found.verdicts
     return _posteriors(verdicts) | {
-        "joint": landing_gear_verdicts.laplace(found.joint),
+        "joint": {drive: landing_gear_joint.account(joint) for drive, joint in found.joint.items()},
+        "others_under_priors": found.sensitivity,
         "force_given": _with_force_given(found),
         "drop": landing_gear_drop.account(found.dropped),
         "surely_negative": [name for name, v in verdicts.items() if v.p_negative[0] > 0.99],
@@ -115,6 +119,7 @@ def account(truth: str, results: Mapping[str, Any]) -> str:
     wrong = sum(e["p_negative_laplace"][CONDUCTION] > 0.975 for e in forced["force_taken_for_exact"].values())
     drop = results["drop"]["displacement"]
     shares = list(drop["share_within_the_band"].values())
+    joint = "\n".join(landing_gear_joint.line(drive, one) for drive, one in results["joint"].items())
     pairs = "; ".join(" against ".join(p["pair"]) for p in results["opposite_pairs"]) or "none"
     return (
         f"  truth {truth}: {signs}\n"
@@ -123,6 +128,7 @@ def account(truth: str, results: Mapping[str, Any]) -> str:
         f"  {results['posteriors_converged']} of {len(results['experiments'])} posteriors converged; "
         f"{results['log_posterior_calls']} log-posteriors in {results['seconds']:.0f} s, "
         f"{results['cpu_seconds']:.0f} s of CPU\n"
+        f"{landing_gear_sensitivity.table(results['others_under_priors'], results['experiments'])}\n{joint}\n"
         f"  force given: {forced_signs}; misspecified: {', '.join(forced['misspecified']) or 'none'}\n"
         f"  {forced['posteriors_converged']} of {len(forced['experiments'])} posteriors converged in "
         f"{forced['seconds']:.0f} s; taking the force for exact, {wrong} would be negative (Laplace)\n"

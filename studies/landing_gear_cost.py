@@ -1,0 +1,190 @@
+"""What a log-posterior of the landing gear costs: the periodic solver against time integration until steady.
+
+All fourteen experiments at draws of their joint posterior, side by side in one run. Timed are whole log-posteriors of
+the periodic solver, of the others the integration alone, each as accurate as the periodic solver or more.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+import bayesperiodic as bp
+from studies.landing_gear_contenders import (
+    COMPILED,
+    SCIPY,
+    Contender,
+    Gear,
+    choose,
+    choose_scipy,
+    error,
+)
+from studies.landing_gear_identification import DISPLACEMENT, FORCE, SAMPLES, Identified
+from studies.landing_gear_integrators import NAMES
+from studies.landing_gear_verdicts import CONDUCTION
+
+DRAWS, QUICK_DRAWS = 10, 2
+REPEATS, QUICK_REPEATS = 9, 1
+WALKERS = 64
+OUTPUTS = {DISPLACEMENT: ("force", "pressure"), FORCE: ("displacement", "pressure")}
+STATIC, ESTIMATE = "from static equilibrium", "from the steady state at the estimate"
+WARM, BATCHED, COLD = "warm", "batched", "cold"
+# Cycles of SciPy's that are timed; the others cost the same.
+TIMED_CYCLES = 3
+
+
+def measure(drive: str, identified: Identified, seed: int, *, quick: bool) -> dict[str, Any]:
+    """Return times and their ratios for one direction, from the joint posterior of all experiments."""
+    theta, left_out = draws(identified, QUICK_DRAWS if quick else DRAWS, seed)
+    fit = identified.fit
+    warm = identified.problem.anchored(fit.theta)
+    gears = [_gear(drive, experiment, identified, theta) for experiment in warm.experiments]
+    own = _own_errors(warm, theta, gears)
+    chosen = [{k: choose(gear, k, allowed) for k in COMPILED} for gear, allowed in zip(gears, own, strict=True)]
+    times = _interleaved(_actions(identified, warm, theta, gears, chosen), QUICK_REPEATS if quick else REPEATS)
+    scipy = {method: sum(_scipy(*one, method) for one in zip(gears, own, chosen, strict=True)) for method in SCIPY}
+    return {
+        "draws": len(theta),
+        "left_out": left_out,
+        "cores": os.cpu_count(),
+        "samples": SAMPLES,
+        "milliseconds": {name: _spread(1e3 * values) for name, values in times.items()},
+        "scipy_milliseconds": {method: 1e3 * seconds for method, seconds in scipy.items()},
+        "ratios": _ratios(times, scipy),
+        "experiments": {
+            gear.experiment.name: {"error": allowed}
+            | {kind: _settings(contender) for kind, contender in by_kind.items()}
+            for gear, allowed, by_kind in zip(gears, own, chosen, strict=True)
+        },
+    }
+
+
+def _settings(found: Contender) -> dict[str, float]:
+    return {name: getattr(found, name) for name in ("fineness", "tolerance", "error", "cycles")}
+
+
+def draws(identified: Identified, count: int, seed: int) -> tuple[np.ndarray, dict[str, int]]:
+    """Return draws (count, names) with every theta16 positive, and of how many draws how many have one that is not.
+
+    At theta16 ≤ 0 the gas has no steady state that an integration could reach.
+    """
+    posterior, names = identified.posterior, identified.problem.names
+    assert posterior is not None
+    every = np.stack([posterior.draws(name) for name in names], axis=-1)
+    able = (every[:, [name.startswith(CONDUCTION) for name in names]] > 0.0).all(axis=1)
+    picked = np.random.default_rng(seed).choice(np.flatnonzero(able), count, replace=False)
+    return every[picked], {"not_positive": int((~able).sum()), "draws": able.size}
+
+
+def _gear(drive: str, experiment: bp.Experiment, identified: Identified, theta: np.ndarray) -> Gear:
+    stated = identified.problem
+    order = [list(stated.model.parameters).index(name) for name in NAMES]
+    estimate = stated.vector(identified.fit.theta)
+    values = np.ascontiguousarray(stated.parameters(np.vstack([theta, estimate]), experiment.name)[:, order])
+    return Gear(drive, experiment, values[:-1], values[-1])
+
+
+def _own_errors(warm: bp.Problem, theta: np.ndarray, gears: Sequence[Gear]) -> list[float]:
+    """Return the periodic solver's largest error at any draw, by experiment."""
+    outputs, converged = warm.outputs(theta)
+    if not converged.all():
+        raise RuntimeError("A periodic solve at a draw of the posterior did not converge.")
+    found = []
+    for gear in gears:
+        own = np.stack([outputs[gear.experiment.name][name] for name in OUTPUTS[gear.drive]], axis=-1)
+        found.append(max(error(one, exact) for one, (_, exact) in zip(own, gear.exact, strict=True)))
+    return found
+
+
+def _actions(
+    identified: Identified,
+    warm: bp.Problem,
+    theta: np.ndarray,
+    gears: Sequence[Gear],
+    chosen: Sequence[Mapping[str, Contender]],
+) -> dict[str, tuple[Callable[[], Any], int]]:
+    """Return what is timed, and of how many log-posteriors each call takes the time."""
+    noise = np.array(list(identified.fit.noise.values()))
+    many = np.resize(theta, (WALKERS, theta.shape[1]))
+    actions: dict[str, tuple[Callable[[], Any], int]] = {
+        WARM: (lambda: [warm.log_posterior(one, noise) for one in theta], len(theta)),
+        BATCHED: (lambda: warm.log_posterior(many, noise), WALKERS),
+        COLD: (lambda: [_cold(gear) for gear in gears], 1),
+    }
+    for kind in COMPILED:
+        contenders = [by_kind[kind] for by_kind in chosen]
+        known = [c.integrate(g.estimate, g.still(g.estimate))[0][0] for g, c in zip(gears, contenders, strict=True)]
+        actions[f"{kind} {STATIC}"] = partial(_integrate, gears, contenders, None), len(theta)
+        actions[f"{kind} {ESTIMATE}"] = partial(_integrate, gears, contenders, known), len(theta)
+    return actions
+
+
+def _integrate(gears: Sequence[Gear], contenders: Sequence[Contender], starts: Sequence[np.ndarray] | None) -> None:
+    for i, (gear, contender) in enumerate(zip(gears, contenders, strict=True)):
+        for parameters in gear.parameters:
+            contender.integrate(parameters, gear.still(parameters) if starts is None else starts[i])
+
+
+def _cold(gear: Gear) -> bp.PeriodicSolution:
+    """Solve from static equilibrium."""
+    return bp.solve_periodic(
+        bp.models.landing_gear(gear.drive),
+        dict(zip(NAMES, gear.parameters[0], strict=True)),
+        gear.experiment.inputs,
+        frequency=gear.experiment.frequency,
+        samples=SAMPLES,
+    )
+
+
+def _scipy(gear: Gear, allowed: float, chosen: Mapping[str, Contender], method: str) -> float:
+    """Return the seconds of one integration until steady: those of a few cycles, times as many as it takes."""
+    integrate = gear.scipy(method, choose_scipy(gear, method, allowed), TIMED_CYCLES)
+    parameters = gear.parameters[0]
+    start, times = gear.still(parameters), []
+    for _ in range(2):
+        before = time.perf_counter()
+        integrate(parameters, start)
+        times.append(time.perf_counter() - before)
+    return min(times) * min(contender.cycles for contender in chosen.values()) / TIMED_CYCLES
+
+
+def _interleaved(actions: Mapping[str, tuple[Callable[[], Any], int]], repeats: int) -> dict[str, np.ndarray]:
+    """Return seconds (repeats,) a log-posterior of every action, all of them in turn within every repeat."""
+    found: dict[str, list[float]] = {name: [] for name in actions}
+    for repeat in range(repeats + 1):
+        for name, (action, count) in actions.items():
+            before = time.perf_counter()
+            action()
+            if repeat:
+                found[name].append((time.perf_counter() - before) / count)
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def _ratios(times: Mapping[str, np.ndarray], scipy: Mapping[str, float]) -> dict[str, Any]:
+    """Return by how much time integration is dearer; the compiled ones by the quicker of the two in each repeat."""
+    quickest = {start: np.min([times[f"{kind} {start}"] for kind in COMPILED], axis=0) for start in (STATIC, ESTIMATE)}
+    found = {f"compiled {start} / {WARM}": values / times[WARM] for start, values in quickest.items()}
+    found |= {f"compiled {STATIC} / {BATCHED}": quickest[STATIC] / times[BATCHED]}
+    found |= {f"compiled {STATIC} / {COLD}": quickest[STATIC] / times[COLD]}
+    found |= {f"{method} {STATIC} / {WARM}": seconds / times[WARM] for method, seconds in scipy.items()}
+    return {name: _spread(values) for name, values in found.items()}
+
+
+def _spread(values: np.ndarray) -> dict[str, float]:
+    return {"median": float(np.median(values)), "least": float(values.min()), "largest": float(values.max())}
+
+
+def table(drive: str, found: Mapping[str, Any]) -> str:
+    """Return what is printed."""
+    lines = [
+        f"  {drive} given: {found['milliseconds'][WARM]['median']:.2f} ms a log-posterior of all experiments; "
+        f"{found['left_out']['not_positive']} of {found['left_out']['draws']} draws left out, having no steady state"
+    ]
+    for name, ratio in found["ratios"].items():
+        lines.append(f"    {name}: {ratio['median']:.0f} ({ratio['least']:.0f} … {ratio['largest']:.0f})")
+    return "\n".join(lines)
