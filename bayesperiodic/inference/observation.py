@@ -1,7 +1,8 @@
 """From a periodic response to what is compared with one experiment, and the derivatives of that."""
 
+from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -131,6 +132,18 @@ class Observation:
         known = [] if e.multipliers is None else [np.log(np.abs(e.multipliers)) - response.log_multipliers]
         frequency = [e.frequency - response.frequency] if self._free_phase else []
         return self._components(difference, known, frequency)
+
+    @cached_property
+    def layout(self) -> tuple[Any, ...] | None:
+        """What experiments have in common that `residuals_alike` can compare; None where there is more to compare."""
+        e = self.experiment
+        if (
+            self._shifted
+            or any(self._angles)
+            or not (e.mask is None and e.covariance is None and e.multipliers is None)
+        ):
+            return None
+        return self._points, self.channels, *(self._harmonics[channel].size for channel in self.channels)
 
     def changes(self, response: Response, directions: Response) -> list[np.ndarray]:
         """Return the derivatives of the predicted components along directions, one array (directions, size) a block."""
@@ -309,6 +322,17 @@ class Observation:
         if self._points % 2 == 0:
             spectrum[-1] = 0.0
         return np.fft.irfft(spectrum, n=self._points, axis=0) + trend
+
+
+def residuals_alike(observations: Sequence[Observation], responses: Sequence[Response]) -> list[list[np.ndarray]]:
+    """Return the residual components of experiments of one layout, a list of arrays (…, size) an experiment."""
+    if len(observations) == 1:
+        return [observations[0].residuals(responses[0])]
+    first = observations[0]
+    outputs = [np.moveaxis(response.outputs[..., first._columns], -1, -2) for response in responses]
+    difference = np.stack([o._data.T - y for o, y in zip(observations, outputs, strict=True)])
+    found = [first._spectral(difference[..., c, :], first._harmonics[n]) for c, n in enumerate(first.channels)]
+    return [list(own) for own in zip(*found, strict=True)]
 
 
 def _whitening(covariance: np.ndarray) -> np.ndarray:

@@ -114,21 +114,11 @@ class ParameterMap:
 
     def values(self, theta: np.ndarray) -> np.ndarray:
         """Return all parameters (points, parameters + 1), the delay last, of θ (points, names)."""
-        template, places = self._layout
-        result = np.tile(template, (len(theta), 1))
-        result[:, places] = theta[:, [*self.columns.values()]]
-        if self.tied:
-            known: dict[str, Any] = dict(zip(self.parameters, result.T, strict=True))
-            for name, expression in self.tied.items():
-                known[name] = expression.value(known)
-                result[:, self.parameters.index(name)] = known[name]
-        return result
+        return self._alone.values(theta)[0]
 
     @cached_property
-    def _layout(self) -> tuple[np.ndarray, list[int]]:
-        """Return the fixed values in their places, NaN elsewhere, and the places of the free ones."""
-        template = np.array([self.fixed.get(name, np.nan) for name in self.parameters])
-        return template, [self.parameters.index(name) for name in self.columns]
+    def _alone(self) -> "ParameterMaps":
+        return ParameterMaps([self])
 
     def slopes(self, theta: np.ndarray) -> np.ndarray:
         """Return ∂(all parameters)/∂θ at one θ (names,), (parameters + 1, names)."""
@@ -140,6 +130,34 @@ class ParameterMap:
             by_name[name] = sum((float(slope) * by_name[n] for n, slope in gradient.items() if n in by_name), nothing)
             known[name] = float(expression.value(known))
         return np.stack([by_name.get(name, nothing) for name in self.parameters])
+
+
+class ParameterMaps:
+    """Maps of several experiments in which the same parameters are free, evaluated together.
+
+    Parameters
+    ----------
+    maps : sequence of ParameterMap
+    """
+
+    def __init__(self, maps: Sequence[ParameterMap]):
+        first = maps[0]
+        if any(m.columns.keys() != first.columns.keys() or m.tied.keys() != first.tied.keys() for m in maps):
+            raise ValueError("maps: the same parameters must be free, and the same tied.")
+        self._parameters, self._tied = first.parameters, first.tied
+        self._fixed = np.array([[m.fixed.get(name, np.nan) for name in first.parameters] for m in maps])
+        self._places = [first.parameters.index(name) for name in first.columns]
+        self._columns = np.array([[m.columns[name] for name in first.columns] for m in maps], dtype=int)
+
+    def values(self, theta: np.ndarray) -> np.ndarray:
+        """Return all parameters (maps, points, parameters + 1), the delay last, of θ (points, names)."""
+        result = np.repeat(self._fixed[:, None], len(theta), axis=1)
+        result[:, :, self._places] = np.moveaxis(theta[:, self._columns], 1, 0)
+        if self._tied:
+            known = {name: result[..., i] for i, name in enumerate(self._parameters)}
+            for name, expression in self._tied.items():
+                known[name][:] = expression.value(known)
+        return result
 
 
 def _ordered(expressions: dict[str, Expression]) -> dict[str, Expression]:

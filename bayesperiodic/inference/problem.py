@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from bayesperiodic.inference.all_at_once import all_at_once
 from bayesperiodic.inference.linearisation import Linearisation
 from bayesperiodic.inference.noise.likelihood import Likelihood
 from bayesperiodic.inference.noise.models import Noise, as_noise
-from bayesperiodic.inference.observation import Observation, Response
+from bayesperiodic.inference.observation import Observation, Response, residuals_alike
 from bayesperiodic.inference.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
 from bayesperiodic.inference.priors.joint import JointPrior
 from bayesperiodic.inference.priors.univariate import Uniform
@@ -305,14 +306,25 @@ class Problem:
         good = status == CONVERGED
         kept = slice(None) if good.all() else good
 
-        def compared(name: str) -> list[np.ndarray]:
+        def compared(names: list[str]) -> list[list[np.ndarray]]:
+            responses = [Response(*(part[kept] for part in solved[name].response)) for name in names]
             with np.errstate(over="ignore", invalid="ignore"):
-                return self.observations[name].residuals(Response(*(part[kept] for part in solved[name].response)))
+                return residuals_alike([self.observations[name] for name in names], responses)
 
         # Shared by experiments, not by θ: the rounding of a matrix product may depend on how many rows it has.
         small = max(s.response.outputs.size for s in solved.values()) < SMALLEST_SHARED
-        found = in_threads(compared, [*self.observations], 1 if small else threads or available_cores())
-        return [residual for own in found for residual in own], status
+        groups = self._alike if small else [[name] for name in self.observations]
+        found = in_threads(compared, groups, 1 if small else threads or available_cores())
+        own = {n: r for names, each in zip(groups, found, strict=True) for n, r in zip(names, each, strict=True)}
+        return [residual for name in self.observations for residual in own[name]], status
+
+    @cached_property
+    def _alike(self) -> list[list[str]]:
+        """The names of the experiments that are compared alike, group by group."""
+        groups: dict[Any, list[str]] = {}
+        for name, observation in self.observations.items():
+            groups.setdefault(observation.layout or name, []).append(name)
+        return list(groups.values())
 
     def log_posterior(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> np.ndarray:
         """Return log-prior plus log-likelihood, shape (…), a density over (θ, log φ)."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.inference.observation import Response
-from bayesperiodic.inference.parameters import ParameterMap
+from bayesperiodic.inference.parameters import ParameterMap, ParameterMaps
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.autonomous_batch import AutonomousBatch
 from bayesperiodic.periodic.batch import Anchor, Batch
@@ -126,16 +126,20 @@ class Responses:
         return equations, solve_forced(equations, parameters, guess)[0]
 
     @cached_property
-    def _batches(self) -> list[tuple[tuple[Experiment, ...], Batch | AutonomousBatch]]:
-        """Experiments on the same grid and with the same parameters, with what solves them together."""
+    def _batches(self) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch]]:
+        """Experiments on the same grid and with the same parameters free, with what solves them together."""
         assert self._anchors is not None
         groups: dict[tuple[Any, ...], list[Experiment]] = {}
         for e in self.experiments:
             own = self.maps[e.name]
-            groups.setdefault((e.samples, e.periods, *own.columns.items(), *own.fixed.items()), []).append(e)
+            groups.setdefault((e.samples, e.periods, *own.columns), []).append(e)
         kind = AutonomousBatch if self.model.autonomous else Batch
         return [
-            (tuple(group), kind([self.equations[e.name] for e in group], [self._anchors[e.name] for e in group]))
+            (
+                tuple(group),
+                ParameterMaps([self.maps[e.name] for e in group]),
+                kind([self.equations[e.name] for e in group], [self._anchors[e.name] for e in group]),
+            )
             for group in groups.values()
         ]
 
@@ -145,15 +149,15 @@ class Responses:
         The periodic parts z are there if they are asked for.
         """
         result = {}
-        for experiments, batch in self._batches:
-            values = self.maps[experiments[0].name].values(theta)
-            parameters = np.ascontiguousarray(values[:, :-1])
+        for experiments, maps, batch in self._batches:
+            values = maps.values(theta)
+            parameters = values[..., :-1]
             wanted = keep or any(e.multipliers is not None for e in experiments)
             solved = batch.solve(parameters, threads, keep=wanted)
             for i, e in enumerate(experiments):
                 status = solved.status[i].copy()
-                logarithms = self._log_multipliers(e, solved.z[i], solved.frequency[i], parameters, status)
-                response = Response(solved.outputs[i], solved.frequency[i], logarithms, values[:, -1])
+                logarithms = self._log_multipliers(e, solved.z[i], solved.frequency[i], parameters[i], status)
+                response = Response(solved.outputs[i], solved.frequency[i], logarithms, values[i, :, -1])
                 result[e.name] = SolvedResponse(response, solved.z[i], status)
         return {e.name: result[e.name] for e in self.experiments}
 

@@ -26,11 +26,15 @@ class AutonomousBatch:
         self._sets, self._anchors = tuple(sets), tuple(anchors)
 
     def solve(self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False) -> BatchSolution:
-        """Follow every orbit to every parameter vector (solves, parameters); see `batch.Batch.solve`."""
-        found = [[_follow(e, a, theta) for theta in parameters] for e, a in zip(self._sets, self._anchors, strict=True)]
+        """Follow every orbit to its parameter vectors; see `batch.Batch.solve`."""
+        every = np.empty((len(self._sets), *parameters.shape[-2:]))
+        every[:] = parameters
+        found = [
+            [_follow(e, a, theta) for theta in own] for e, a, own in zip(self._sets, self._anchors, every, strict=True)
+        ]
         outputs = [
-            [e.at_frequency(float(f.values[0])).outputs(f.z, theta) for f, theta in zip(row, parameters, strict=True)]
-            for e, row in zip(self._sets, found, strict=True)
+            [e.at_frequency(float(f.values[0])).outputs(f.z, theta) for f, theta in zip(row, own, strict=True)]
+            for e, row, own in zip(self._sets, found, every, strict=True)
         ]
         return BatchSolution(
             np.array([[f.z if keep else f.z[:0] for f in row] for row in found]),

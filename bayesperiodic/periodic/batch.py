@@ -130,18 +130,19 @@ class Batch:
 
         Parameters
         ----------
-        parameters : array (solves, parameters)
+        parameters : array (sets, solves, parameters), or (solves, parameters) if they are those of every set
         threads : int, optional
             By default as many as there are cores.
         keep : bool
             Return z too.
         """
         model, grid = self._first.model, self._first.grid
-        parameters = np.ascontiguousarray(parameters, dtype=float)
-        total = self._size * len(parameters)
-        z = np.empty((self._size, len(parameters), grid.points if keep else 0, self._first.count))
-        y = np.empty((self._size, len(parameters), grid.points, model.kernels.channels))
-        status, iterations = np.empty((2, self._size, len(parameters)), dtype=np.int64)
+        solves = parameters.shape[-2]
+        every = np.empty((self._size, solves, parameters.shape[-1]))
+        every[:] = parameters
+        z = np.empty((self._size, solves, grid.points if keep else 0, self._first.count))
+        y = np.empty((self._size, solves, grid.points, model.kernels.channels))
+        status, iterations = np.empty((2, self._size, solves), dtype=np.int64)
 
         def part(block: tuple[int, int]) -> None:
             self._first.kernels.solve_many(
@@ -150,7 +151,7 @@ class Batch:
                 grid.packed,
                 grid.periods,
                 self._inputs,
-                parameters,
+                every,
                 *self._shared,
                 *block,
                 z,
@@ -159,8 +160,9 @@ class Batch:
                 iterations,
             )
 
+        total = self._size * solves
         workers = max(1, min(threads or available_cores(), total // SMALLEST_PART))
         parts = 1 if workers == 1 else max(workers, min(workers * PARTS_EACH, total // SMALLEST_PART))
         in_threads(part, list(pairwise([total * k // parts for k in range(parts + 1)])), workers)
-        frequency = np.repeat(self._shared[1][:, None], len(parameters), axis=1)
+        frequency = np.repeat(self._shared[1][:, None], solves, axis=1)
         return BatchSolution(z, y, frequency, status, iterations)

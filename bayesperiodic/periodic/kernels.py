@@ -648,7 +648,7 @@ def repetitions(z, periods):
 
 
 @njit(
-    f"void({FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, {CUBE}, "
+    f"void({FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {CUBE}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, {CUBE}, "
     f"{GAINS}, Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
     f"{CUBE}, {CUBE}, int64, int64, {GAINS}, {GAINS}, {INDICES}, {INDICES})",
     **OPTIONS,
@@ -687,7 +687,7 @@ def solve_many(
     Parameters
     ----------
     inputs : array (sets, points, 3·inputs)
-    parameters : array (solves, parameters)
+    parameters : array (sets, solves, parameters)
     frequency : array (sets,)
     drift : array (sets, states)
     anchor_parameters, anchor_z, anchor_sensitivities, anchor_factors, anchor_left, anchor_right : arrays (sets, …)
@@ -696,7 +696,7 @@ def solve_many(
     status, iterations : int arrays (sets, solves)
     """
     bands, pivots, inverses, gains, transfers, ends, reduced, reduced_pivots = anchor_factors
-    points, count, solves = anchor_z.shape[1], anchor_z.shape[2], parameters.shape[0]
+    points, count, solves = anchor_z.shape[1], anchor_z.shape[2], parameters.shape[1]
     states, z = np.empty((points, 3 * count)), np.empty((points, count))
     predicted, here, last = np.empty((points, count)), np.empty((points, count)), np.empty((points, count))
     columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MAX_ITERATIONS, 3))
@@ -707,7 +707,7 @@ def solve_many(
     )  # fmt: skip
     for index in range(start, stop):
         e, b = index // solves, index % solves
-        theta, at, turn, f = parameters[b], anchor_z[e], drift[e], frequency[e]
+        theta, at, turn, f = parameters[e, b], anchor_z[e], drift[e], frequency[e]
         kept = (
             bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], reduced[e], reduced_pivots[e]
         )  # fmt: skip

@@ -76,7 +76,7 @@ class Likelihood:
         for block, columns, r in zip(self.blocks, self._columns, residuals, strict=True):
             if block.counted:
                 name = self.names[columns[0]]
-                result[name] = result.get(name, 0.0) + block.weight * np.sum(r**2, axis=-1)
+                result[name] = result.get(name, 0.0) + block.weight * _square(r)
         return result
 
     def value_variances(self, values: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
@@ -118,22 +118,46 @@ class Likelihood:
         """
         total = np.zeros(values.shape[:-1])
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            if self.model.flat:
+                total = self._flat(residuals, values, share)
+                return np.where(np.isfinite(total), total, -np.inf)
             for block, columns, r in zip(self.blocks, self._columns, residuals, strict=True):
                 total = total + self._block(block, r, values[..., columns], share)
         return np.where(np.isfinite(total), total, -np.inf)
 
+    def _flat(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
+        """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
+        at, columns, sizes, weights, measured = self._levels
+        squares = np.stack([_square(r) for r in residuals], axis=-1)
+        v = self.model.level(values[..., columns], measured)
+        terms = weights * (share * sizes * np.log(v) + squares[..., at] / v)
+        return -0.5 * (terms.sum(axis=-1) + squares[..., ~at].sum(axis=-1))
+
+    @cached_property
+    def _levels(self) -> tuple[np.ndarray, list[int], np.ndarray, np.ndarray, np.ndarray]:
+        """Return which blocks have a variance, and of those its column, their size, weight and measured variance."""
+        at = np.array([block.kind != KNOWN for block in self.blocks], dtype=bool)
+        own = [(block, columns[0]) for block, columns in zip(self.blocks, self._columns, strict=True) if columns]
+        return (
+            at,
+            [column for _, column in own],
+            np.array([block.size for block, _ in own]),
+            np.array([block.weight for block, _ in own]),
+            np.array([0.0 if block.kind == CORRELATED else block.measured for block, _ in own]),
+        )
+
     def _block(self, block: Block, r: np.ndarray, values: np.ndarray, share: float) -> np.ndarray:
         """Return the log-likelihood (…,) of one block, the logarithms of the variances multiplied by `share`."""
         if block.kind == KNOWN:
-            return -0.5 * np.sum(r**2, axis=-1)
+            return -0.5 * _square(r)
         if self._is_dense(block):
             flat, rows = values.reshape(-1, values.shape[-1]), r.reshape(-1, r.shape[-1])
             each = [self._dense(block, row, v, share)[0] for row, v in zip(rows, flat, strict=True)]
             return np.array(each).reshape(values.shape[:-1])
         variances = self._variances(block, values)[0]
-        if block.kind == CORRELATED or self.model.flat:
+        if block.kind == CORRELATED:
             v = variances[..., 0]
-            return -0.5 * block.weight * (share * block.size * np.log(v) + np.sum(r**2, axis=-1) / v)
+            return -0.5 * block.weight * (share * block.size * np.log(v) + _square(r) / v)
         return -0.5 * block.weight * np.sum(share * np.log(variances) + r**2 / variances, axis=-1)
 
     def _is_dense(self, block: Block) -> bool:
@@ -219,3 +243,8 @@ class Likelihood:
                 values[i] = float(self.model.shape_priors[kind].quantile(np.array(0.5)))
             values[i] = self.fixed.get(name, values[i])
         return values
+
+
+def _square(r: np.ndarray) -> np.ndarray:
+    """Return the sum of squares (…,) of components (…, size)."""
+    return np.einsum("...i,...i->...", r, r)

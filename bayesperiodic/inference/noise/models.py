@@ -102,6 +102,10 @@ class Noise(ABC):
             return (SCALE if self.per == CHANNEL else f"{SCALE}[{block.experiment}]",)
         return tuple(f"{kind}[{self.label(block)}]" for kind in (VARIANCE, *self.shape_priors))
 
+    def level(self, value: np.ndarray, measured: Any) -> np.ndarray:
+        """Return V of errors whose spectrum is flat, at a variance v; `measured` is what the scatter explains of it."""
+        return value
+
     @abstractmethod
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return V (…, size) and ∂ ln V/∂ ln φ (…, size, parameters) of a spectral block at values (…, parameters)."""
@@ -177,8 +181,12 @@ class Measured(Noise):
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return V = scatter²/cycles + v."""
         shape = (*values.shape[:-1], block.size)
-        total = np.broadcast_to(values[..., :1] + block.measured, shape)
+        total = np.broadcast_to(self.level(values[..., :1], block.measured), shape)
         return total, (values[..., :1] / total)[..., None]
+
+    def level(self, value: np.ndarray, measured: Any) -> np.ndarray:
+        """Return V = scatter²/cycles + v."""
+        return value + measured
 
     def log_prior(self, kind: str, value: np.ndarray, measured: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the log-density over ln v; Jeffreys' is that of 1/(measured + v)."""
