@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from bayesperiodic import models, plot
     from bayesperiodic.data.experiment import Experiment
     from bayesperiodic.data.recording import Recording
+    from bayesperiodic.diagnosis.calibration import Calibration, calibrate
     from bayesperiodic.diagnosis.comparison import Comparison, compare
     from bayesperiodic.diagnosis.identifiability import Identifiability, identifiability
     from bayesperiodic.diagnosis.predictive import Prediction, predict
@@ -55,6 +56,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "bayesperiodic.data.experiment": ["Experiment"],
     "bayesperiodic.data.recording": ["Recording"],
+    "bayesperiodic.diagnosis.calibration": ["Calibration", "calibrate"],
     "bayesperiodic.diagnosis.comparison": ["Comparison", "compare"],
     "bayesperiodic.diagnosis.identifiability": ["Identifiability", "identifiability"],
     "bayesperiodic.diagnosis.predictive": ["Prediction", "predict"],

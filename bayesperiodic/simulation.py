@@ -81,14 +81,11 @@ def simulate(
     frequency = checks.positive("frequency", frequency)
     samples = int(checks.positive("duration", duration) * checks.positive("sampling_rate", sampling_rate)) + 1
     time = np.arange(samples) / sampling_rate
-    checks.same_names("parameters", parameters, model.parameters)
-    theta = np.array([checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
-    checks.same_names("inputs", inputs or {}, model.inputs)
-    signals = [_with_derivatives(name, (inputs or {})[name], frequency) for name in model.inputs]
+    system = FirstOrder.of(model, parameters, inputs or {}, frequency)
+    signals = system.signals
     for name in noise or {}:
         checks.one_of("noise", name, (*model.outputs, *model.inputs))
-    system = _FirstOrder(model, theta, frequency, signals)
-    integrate = _integrate_compiled if all(isinstance(s, _Periodic) for s in signals) else _integrate
+    integrate = integrate_periodic if all(isinstance(s, _Periodic) for s in signals) else _integrate
     path = integrate(system, system.start(start or {}), time)
     outputs = system.outputs(time, path)
     generator = np.random.default_rng(seed)
@@ -100,7 +97,7 @@ def simulate(
     return Recording(time, channels, measured_inputs, name=f"synthetic {model.name}", synthetic=True)
 
 
-class _FirstOrder:
+class FirstOrder:
     """The model as ẏ = f(t, y), y = the states and the first derivatives of the second-order ones."""
 
     def __init__(self, model: Model, theta: np.ndarray, frequency: float, signals: list[Callable]):
@@ -109,7 +106,19 @@ class _FirstOrder:
         self.second = [i for i, state in enumerate(model.states) if model.orders[state] == 2]
         self.highest = [(2 if i in self.second else 1) * self.count + i for i in range(self.count)]
 
+    @classmethod
+    def of(
+        cls, model: Model, parameters: Mapping[str, float], inputs: Mapping[str, Signal], frequency: float
+    ) -> "FirstOrder":
+        """Return the system at checked values of all parameters and under all inputs."""
+        checks.same_names("parameters", parameters, model.parameters)
+        theta = np.array([checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
+        checks.same_names("inputs", inputs, model.inputs)
+        signals = [_with_derivatives(name, inputs[name], frequency) for name in model.inputs]
+        return cls(model, theta, frequency, signals)
+
     def start(self, given: Mapping[str, float]) -> np.ndarray:
+        """Return y from the states and rates that are given, the others zero."""
         names = [*self.model.states, *("d" + self.model.states[i] for i in self.second)]
         for name in given:
             checks.one_of("start", name, names)
@@ -149,11 +158,12 @@ class _FirstOrder:
         return np.array([*rates, *(states[2 * self.count + i] for i in self.second)])
 
     def outputs(self, time: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return (points, outputs)."""
         states, tau = self.states(time, y), time * self.frequency
         return self.model.kernels.evaluate("outputs", states, self.inputs(time), self.theta, tau, self.frequency)
 
 
-def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
+def _integrate(system: FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
     step = LONGEST_STEP / system.frequency
     short = (time[0], min(time[-1], TRIAL / system.frequency))
     size = np.abs(solve_ivp(system, short, start, rtol=1e-3, max_step=step).y).max(axis=1)
@@ -172,7 +182,7 @@ def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.n
     return result.y.T
 
 
-def _integrate_compiled(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
+def integrate_periodic(system: FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Return what `_integrate` does, for inputs that are Fourier series; many periods take seconds."""
 
     def path(tau: np.ndarray, absolute: np.ndarray, relative: np.ndarray) -> np.ndarray:

@@ -223,6 +223,19 @@ class Problem:
         other._responses = responses
         return other
 
+    def with_experiments(self, experiments: Iterable[Experiment]) -> "Problem":
+        """Return the same problem with other data; experiments keep their names."""
+        return Problem(
+            self.model,
+            experiments,
+            priors=self.priors,
+            fixed=self.fixed | self.likelihood.fixed,
+            tied=self.tied,
+            local=self.local,
+            noise=self.noise,
+            scheme=self.scheme,
+        )
+
     @property
     def tied(self) -> dict[str, str]:
         """The expressions of the tied parameters."""

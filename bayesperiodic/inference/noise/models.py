@@ -8,6 +8,7 @@ per component. The noise parameters φ are positive, and densities are over thei
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -123,7 +124,11 @@ class Noise(ABC):
             return np.zeros_like(value), np.zeros_like(value)
         if self.prior == FLAT:
             return np.log(value), np.ones_like(value)
-        return _over_logarithm(as_prior("prior", self.prior), value)
+        return _over_logarithm(self._proper_prior, value)
+
+    @cached_property
+    def _proper_prior(self) -> Prior:
+        return as_prior("prior", self.prior)
 
 
 @dataclass(frozen=True)

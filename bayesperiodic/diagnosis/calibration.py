@@ -1,0 +1,228 @@
+"""Simulation-based calibration: is a 90 % interval a 90 % interval."""
+
+import hashlib
+import importlib.metadata
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bayesperiodic import checks
+from bayesperiodic.diagnosis.campaigns import DONE, LAPLACE, MCMC, METHODS, Campaign, refuse, replicate
+from bayesperiodic.diagnosis.discrepancy import holm
+from bayesperiodic.diagnosis.uniformity import chi_square_test, dispersion_test, ecdf_test, normal_scores
+from bayesperiodic.inference.problem import Problem
+from bayesperiodic.inference.sampling.checkpoint import fingerprint
+from bayesperiodic.resumed import resumed
+from bayesperiodic.store import Result
+
+FILE = "replicates.jsonl"
+LEVELS = (0.5, 0.8, 0.9, 0.95)
+FALSE_ALARMS = 0.01
+CALIBRATED, NARROW, WIDE, SHAPE, FEW = "calibrated", "too narrow", "too wide", "not uniform", "too few replicates"
+FEWEST = 20
+TESTS = ("p_dispersion", "p_ecdf", "p_chi_square")
+
+
+@dataclass(frozen=True)
+class Calibration(Result):
+    """Where the truth lay among the answers, over many simulated campaigns.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row a quantity and method ("mcmc" or "laplace"): replicates counted; dispersion, the mean square of the normal
+        scores, above 1 where intervals are too narrow; shift, their mean; p of the dispersion test, of the ECDF test
+        and of the χ² test of the histogram, each adjusted by Holm's method for the quantities of the method; coverage
+        of the central 50, 80, 90 and 95 % intervals; verdict: "calibrated", "too narrow", "too wide", "not uniform", or
+        "too few replicates" below 20. A well calibrated method gets another verdict than the first for some quantity
+        with a probability of at most 1 % a test.
+    positions : dict of str to dict of str to array (replicates,)
+        By method and quantity, between 0 and 1: for "mcmc" the rank of the truth among independent draws with ties at
+        random, plus a uniform share of one; for "laplace" its distribution function at the truth. Uniform if
+        calibrated. A variance is that of the folded mean.
+    failures : dict of str to int
+        Replicates by what they failed of: "no steady state" (the truth has none, so that nothing can be recorded),
+        "fold failed", "no estimate", "estimate not converged" (without Laplace), "no draws", "draws not usable" (fewer
+        than 20 independent ones, or R-hat above 1.1; without MCMC).
+    replicates : int
+        All of them, failed or not.
+    stop_rule : int
+        How many chains passed the stop rule of `sample` too.
+    draws : float
+        Median number of independent draws behind a rank.
+    failed_solves : float
+        Mean share of proposals whose periodic solve failed.
+    synthetic : bool
+        Always True.
+    """
+
+    table: pd.DataFrame
+    positions: dict[str, dict[str, np.ndarray]]
+    failures: dict[str, int]
+    replicates: int
+    stop_rule: int
+    draws: float
+    failed_solves: float
+    synthetic: bool = True
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The quantities: parameters, then free variances."""
+        return tuple(self.positions[MCMC])
+
+    def __repr__(self) -> str:
+        failed = ", ".join(f"{kind} {count}" for kind, count in self.failures.items()) or "none"
+        head = (
+            f"Calibration over {self.replicates} synthetic campaigns (failed: {failed}; {self.draws:.0f} independent "
+            f"draws a rank, stop rule passed by {self.stop_rule}, failed solves {self.failed_solves:.2%})"
+        )
+        return f"{head}\n{self.table.to_string(float_format='{:.3g}'.format, index=False)}"
+
+
+def calibrate(
+    problem: Problem,
+    *,
+    replicates: int,
+    seed: int,
+    folder: str | Path | None = None,
+    executor: Any = None,
+    ensembles: int = 2,
+    walkers: int | None = None,
+    max_steps: int = 500,
+    progress: bool = True,
+) -> Calibration:
+    """Simulate campaigns with truths from the prior, analyse each, and test where the truths lie ([1]_).
+
+    Each replicate draws θ and the variances, integrates the model in time until it is steady, records as many cycles as
+    the experiment has (three at least) with as many samples a cycle as its grid, adds white noise, folds with the
+    experiment's harmonics and frequency, and finds the MAP point, the Laplace approximation and draws of emcee. The
+    periodic solver has no part in the recording, so that its errors show. Inputs are recorded without noise, as the
+    likelihood takes them.
+
+    A likelihood that counts more independent values than the harmonics have, or a grid that is too coarse, comes out
+    as "too narrow" or "not uniform". A wrong model does not: truths are drawn from the model.
+
+    Parameters
+    ----------
+    problem : Problem
+        Forced, with whole histories of one forcing period, `noise.Independent` with a proper prior or known variances.
+        Of its data only the settings count.
+    replicates : int
+    seed : int
+        Replicate k depends on the seed and k alone, whoever computes it.
+    folder : path, optional
+        Each replicate is written to ``replicates.jsonl`` there as it ends; the same call does only the missing ones,
+        and one with more replicates those that are new.
+    executor : None, int, Dask Client, or executor with the interface of concurrent.futures
+        None does one replicate after the other. Those of a lost Dask worker are done again by others; where other
+        executors lose their workers, the same call goes on from the folder.
+    ensembles, walkers, max_steps
+        Of each replicate's `sample`. By default two ensembles of twice as many walkers as there are dimensions. Short
+        chains are enough: a rank takes only independent draws, at steps two autocorrelation times apart.
+    progress : bool
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    ValueError
+        For an improper prior, or a problem whose recordings are not simulated here; if the folder is in use.
+    RuntimeError
+        If the executor's workers died; what was done is in the folder.
+
+    References
+    ----------
+    .. [1] S. Talts, M. Betancourt, D. Simpson, A. Vehtari, A. Gelman, Validating Bayesian inference algorithms with
+       simulation-based calibration, arXiv:1804.06788, 2018.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = np.cos(2 * np.pi * np.arange(32) / 32)
+    >>> run = bp.Experiment("run", 0.1, {"displacement": force}, {"force": force}, samples=32, cycles=4,
+    ...                     harmonics={"displacement": 5, "force": 5})
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"k": bp.LogNormal(1, 0.1)}, scheme="fourier",
+    ...                      fixed={"m": 1, "c": 0.2, "k3": 0.5, "variance[displacement]": 1e-4})
+    >>> found = bp.calibrate(problem, replicates=2, seed=1, max_steps=250, progress=False)
+    >>> found.failures, found.names, found.table["verdict"].tolist()
+    ({}, ('k',), ['too few replicates', 'too few replicates'])
+    """
+    checks.integer("replicates", replicates, 1)
+    checks.integer("seed", seed, 0)
+    refuse(problem)
+    if walkers is None:
+        walkers = 2 * (len(problem.names) + len(problem.free_noise))
+    settings = f"{fingerprint(problem)}, seed {seed}, {ensembles} x {walkers} walkers, {max_steps} steps"
+    source = hashlib.sha256(f"{importlib.metadata.version('bayesperiodic')}, {settings}".encode()).hexdigest()[:16]
+    campaign = Campaign(problem, seed, source, ensembles, walkers, max_steps)
+    lines = resumed(
+        None if folder is None else Path(folder) / FILE,
+        range(replicates),
+        replicate,
+        lambda line: line["number"],
+        source,
+        shared=campaign,
+        executor=executor,
+        progress=progress,
+    )
+    return summary(lines, (*problem.names, *problem.free_noise))
+
+
+def summary(lines: Sequence[dict[str, Any]], names: Sequence[str]) -> Calibration:
+    """Return what the lines of all replicates say of these quantities."""
+    positions = {
+        method: {name: np.array([line[method][name] for line in lines if method in line]) for name in names}
+        for method in METHODS
+    }
+    failures = Counter(line["status"] for line in lines if line["status"] != DONE)
+    if unconverged := sum("map" in line and LAPLACE not in line for line in lines):
+        failures["estimate not converged"] = unconverged
+    tables = [_table(method, positions[method]) for method in METHODS]
+    return Calibration(
+        table=pd.concat(tables, ignore_index=True),
+        positions=positions,
+        failures=dict(sorted(failures.items())),
+        replicates=len(lines),
+        stop_rule=sum(line.get("stop_rule", False) for line in lines),
+        draws=float(np.median([line["draws"] for line in lines if "draws" in line] or [0])),
+        failed_solves=float(np.mean([line["failed"] for line in lines if "failed" in line] or [0.0])),
+    )
+
+
+def _table(method: str, positions: dict[str, np.ndarray]) -> pd.DataFrame:
+    rows = []
+    for name, values in positions.items():
+        finite = values[np.isfinite(values)]
+        row: dict[str, Any] = {"quantity": name, "method": method, "replicates": finite.size}
+        row |= dict.fromkeys(("dispersion", "shift", *TESTS), np.nan)
+        if finite.size >= FEWEST:
+            row["dispersion"], row["p_dispersion"] = dispersion_test(finite)
+            row["shift"] = float(normal_scores(finite).mean())
+            row["p_ecdf"], row["p_chi_square"] = ecdf_test(finite), chi_square_test(finite)
+        row |= {f"coverage_{100 * level:.0f}": coverage(finite, level) for level in LEVELS}
+        rows.append(row)
+    table = pd.DataFrame(rows)
+    for test in TESTS:
+        table[test] = holm(table[test].to_numpy(dtype=float))
+    table["verdict"] = [_verdict(row) for row in table.to_dict("records")]
+    return table
+
+
+def coverage(positions: np.ndarray, level: float) -> float:
+    """Return the share of truths inside the central interval that should hold them with this probability."""
+    return float(np.mean(np.abs(positions - 0.5) <= 0.5 * level)) if positions.size else np.nan
+
+
+def _verdict(row: dict[str, Any]) -> str:
+    if row["replicates"] < FEWEST:
+        return FEW
+    if row["p_dispersion"] < FALSE_ALARMS:
+        return NARROW if row["dispersion"] > 1.0 else WIDE
+    return SHAPE if min(row["p_ecdf"], row["p_chi_square"]) < FALSE_ALARMS else CALIBRATED
