@@ -22,8 +22,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="short chains, into figures/quick/NAME; not for quoting")
     parser.add_argument("--noise", type=float, default=1e-3, help="pendulum: fraction of the attractor (default 0.001)")
     parser.add_argument(
-        "--replicates", type=int, default=0, help="verdicts, pendulum, landing-gear: data sets (default 0)"
+        "--replicates",
+        type=int,
+        default=0,
+        help="verdicts, pendulum, landing-gear: data sets (default 0); calibration: campaigns (default 20)",
     )
+    workers = parser.add_mutually_exclusive_group()
+    workers.add_argument("--processes", type=int, help="calibration: so many processes on this machine (default: one)")
+    workers.add_argument("--dask", metavar="ADDRESS", help="calibration: a Dask scheduler, such as tcp://host:8786")
+    workers.add_argument("--mpi", action="store_true", help="calibration: MPI, below mpiexec … -m mpi4py.futures")
     parser.add_argument("--truth", choices=("A", "B"), help="landing-gear: which damper (default both)")
     options = parser.parse_args(arguments)
     known = _studies()

@@ -1,0 +1,90 @@
+"""Where truths lie among the answers: histograms, distribution functions, coverage."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy import stats
+
+from bayesperiodic.diagnosis.calibration import Calibration, coverage
+from bayesperiodic.diagnosis.campaigns import METHODS
+from bayesperiodic.diagnosis.uniformity import bin_count, ecdf_band, evaluation_points
+from bayesperiodic.plot.style import COLOURS, wrapped_label
+
+LEVEL = 0.99
+COLUMNS = {
+    "truths in each bin / expected": "position of the truth in the posterior",
+    "distribution function − diagonal": "position of the truth in the posterior",
+    "coverage − probability": "probability of the interval",
+}
+LABELS = {"mcmc": "MCMC", "laplace": "Laplace"}
+
+
+def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
+    """Draw rank histograms, empirical distribution functions and coverage of every quantity, MCMC and Laplace together.
+
+    A row a quantity. Left the histogram of where the truth lies among the answers, flat if calibrated, with the band of
+    99 % of each bin; a ∪ means intervals that are too narrow. In the middle the distribution function less the
+    diagonal, with the band that holds all of it with 99 %. Right the coverage of central intervals less their
+    probability, with the pointwise band of 99 %.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    figure : Figure, optional
+        An empty figure with a constrained layout to draw into.
+
+    Returns
+    -------
+    Figure
+    """
+    names = calibration.names
+    figure = figure or plt.figure(figsize=(10.5, 2.1 * len(names) + 1.0), layout="constrained")
+    panels = figure.subplots(len(names), 3, squeeze=False)
+    verdicts = calibration.table.set_index(["method", "quantity"])["verdict"]
+    for row, name in zip(panels, names, strict=True):
+        for method in METHODS:
+            values = calibration.positions[method][name]
+            values = np.sort(values[np.isfinite(values)])
+            said = f"{LABELS[method]}: {verdicts[method, name]}"
+            _histogram(row[0], values, COLOURS[method], said, method == METHODS[0])
+            _distribution(row[1], values, COLOURS[method], method == METHODS[0])
+            _coverage(row[2], values, COLOURS[method], method == METHODS[0])
+        row[0].set_ylabel(wrapped_label(name, ""))
+        row[0].legend(frameon=False, fontsize="small", loc="lower center")
+    for top, bottom, (title, label) in zip(panels[0], panels[-1], COLUMNS.items(), strict=True):
+        top.set_title(title, fontsize="medium")
+        bottom.set_xlabel(label)
+    figure.suptitle(f"{calibration.replicates} synthetic campaigns; bands of 99 %", fontsize="medium")
+    return figure
+
+
+def _histogram(axes: Axes, values: np.ndarray, colour: str, label: str, banded: bool) -> None:
+    bins = bin_count(values.size)
+    counts, edges = np.histogram(values, bins, (0.0, 1.0))
+    expected = max(values.size, 1) / bins
+    if banded and values.size:
+        low, high = stats.binom.ppf([0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL], values.size, 1.0 / bins) / expected
+        axes.axhspan(low, high, color="grey", alpha=0.25, lw=0)
+    axes.stairs(counts / expected, edges, color=colour, lw=1.6, label=label)
+    axes.set_xlim(0.0, 1.0)
+    axes.set_ylim(bottom=0.0)
+
+
+def _distribution(axes: Axes, values: np.ndarray, colour: str, banded: bool) -> None:
+    points = evaluation_points()
+    if banded and values.size:
+        low, high = ecdf_band(values.size, LEVEL)
+        axes.fill_between(points, low - points, high - points, color="grey", alpha=0.25, lw=0)
+    steps = np.searchsorted(values, points, side="right") / max(values.size, 1)
+    axes.plot(points, steps - points, color=colour, lw=1.4)
+    axes.set_xlim(0.0, 1.0)
+
+
+def _coverage(axes: Axes, values: np.ndarray, colour: str, banded: bool) -> None:
+    levels = evaluation_points()
+    if banded and values.size:
+        low, high = (stats.binom.ppf(q, values.size, levels) / values.size for q in (0.005, 0.995))
+        axes.fill_between(levels, low - levels, high - levels, color="grey", alpha=0.25, lw=0)
+    axes.plot(levels, [coverage(values, level) - level for level in levels], color=colour, lw=1.4)
+    axes.set_xlim(0.0, 1.0)
