@@ -34,7 +34,7 @@ def duffing(overcount: float = 1.0) -> bp.Problem:
 def landing_gear(overcount: float = 1.0) -> bp.Problem:
     """Return the problem of the landing gear: 80 mm about 120 mm at 0.2 Hz, force and pressure measured.
 
-    Both variances have the same prior, one in N², the other in Pa²: about 300 N of 10 kN and 300 Pa of 2 MPa.
+    Both variances have the same prior, one in N², the other in Pa²: about 50 N of 10 kN and 50 Pa of 2 MPa.
     """
     run = _run("0.2 Hz 80 mm", 0.2, {"displacement": (0.12, 0.08)}, {"force": 30, "pressure": 15}, 128, overcount)
     priors = {
@@ -52,7 +52,7 @@ def landing_gear(overcount: float = 1.0) -> bp.Problem:
         priors=priors,
         fixed=fixed,
         tied={"theta11": "-1e5*theta4"},
-        noise=bp.noise.Independent(prior=bp.LogNormal(300.0**2, 1.0)),
+        noise=bp.noise.Independent(prior=bp.LogNormal(50.0**2, 0.5)),
         scheme="central4",
     )
 
