@@ -103,13 +103,14 @@ _MODULES = {
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [  # noqa: PLE0604
-    "Branch", "Comparison", "Experiment", "HalfNormal", "Identifiability", "InverseGamma", "LogNormal", "LogUniform",
-    "MapEstimate", "Model", "MultivariateNormal", "Normal", "Orbit", "Orbits", "PeriodicSolution", "PoincareSection",
-    "Posterior", "Prediction", "PriorPredictive", "Problem", "Profile", "Recording", "Scheme", "Structure",
-    "StudentT", "TruncatedNormal", "Uniform", "compare", "continue_periodic", "double_period", "find_orbits",
-    "identifiability", "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "noise",
-    "plot", "polish_orbits", "predict", "prior_predictive", "profile", "sample", "select_orbits", "simulate",
-    "smooth_abs", "smooth_sign", "solve_periodic", "structure",
+    "Branch", "Calibration", "Comparison", "Experiment", "HalfNormal", "Identifiability", "InverseGamma",
+    "LogNormal", "LogUniform", "MapEstimate", "Model", "MultivariateNormal", "Normal", "Orbit", "Orbits",
+    "PeriodicSolution", "PoincareSection", "Posterior", "Prediction", "PriorPredictive", "Problem", "Profile",
+    "Recording", "Scheme", "Structure", "StudentT", "TruncatedNormal", "Uniform", "calibrate", "compare",
+    "continue_periodic", "double_period", "find_orbits", "identifiability", "iterate_periodic", "load",
+    "map_estimate", "models", "multiplier_sensitivities", "noise", "plot", "polish_orbits", "predict",
+    "prior_predictive", "profile", "sample", "select_orbits", "simulate", "smooth_abs", "smooth_sign",
+    "solve_periodic", "structure",
 ]  # fmt: skip
 
 

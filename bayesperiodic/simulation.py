@@ -153,6 +153,7 @@ class FirstOrder:
         return states
 
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
+        """Return ẏ."""
         states = self.states(np.array([t]), y[None])[0]
         rates = [states[self.count + i] for i in range(self.count)]
         return np.array([*rates, *(states[2 * self.count + i] for i in self.second)])

@@ -80,9 +80,10 @@ def _returning(system: FirstOrder, y: np.ndarray) -> np.ndarray | None:
         end = _after(system, y, 1)
         moved = [_after(system, y + STEP * scale[i] * identity[i], 1) for i in range(y.size)]
         monodromy = np.stack([(m - end) / (STEP * s) for m, s in zip(moved, scale, strict=True)], axis=1)
-        if np.all(np.abs(end - y) <= SETTLED * scale):
-            return y if np.abs(np.linalg.eigvals(monodromy)).max() < 1.0 else None
-        y = y + np.linalg.solve(identity - monodromy, end - y)
-        if not np.isfinite(y).all():
+        step = np.linalg.solve(identity - monodromy, end - y)
+        if not np.isfinite(step).all():
             return None
+        y = y + step
+        if np.all(np.abs(step) <= SETTLED * scale):
+            return y if np.abs(np.linalg.eigvals(monodromy)).max() < 1.0 else None
     return None

@@ -1,16 +1,15 @@
-"""Many tasks whose results are kept one by one in a file, so that the same command does only those that are missing."""
+"""Many tasks on all cores whose results are kept one by one in a file."""
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-REPORTED = 50
+from bayesperiodic import resumed as kept
 
 Task = tuple[Any, ...]
 Line = dict[str, Any]
@@ -33,36 +32,14 @@ def resumed(
     source : str
         Tells results of another version apart.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    done = {task_of(line): line for line in _read(path) if line["source"] == source}
-    missing = [task for task in tasks if task not in done]
-    print(f"  {len(tasks) - len(missing)} replicates found in {path}, {len(missing)} to do", flush=True)
-    with path.open("a", encoding="utf-8") as file, workers() as pool:
-        futures = [pool.submit(work, task) for task in missing]
-        try:
-            for number, future in enumerate(as_completed(futures), 1):
-                line = future.result()
-                done[task_of(line)] = line
-                file.write(json.dumps(line, ensure_ascii=False) + "\n")
-                file.flush()
-                if number % REPORTED == 0:
-                    print(f"  {number} of {len(missing)}", flush=True)
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-    return [done[task] for task in tasks]
+    with workers() as pool:
+        return kept.resumed(path, tasks, _do, task_of, source, shared=work, executor=pool)
+
+
+def _do(work: Callable[[Task], Line], task: Task) -> Line:
+    return work(task)
 
 
 def workers() -> ProcessPoolExecutor:
     """Return a pool of as many fresh processes as there are cores."""
     return ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn"))
-
-
-def _read(path: Path) -> list[Line]:
-    """Return the lines of a file, without a last one that was cut off; that one is taken out of it."""
-    if not path.is_file():
-        return []
-    text = path.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]
-    if whole != text:
-        path.write_text(whole, encoding="utf-8")
-    return [json.loads(line) for line in whole.splitlines()]

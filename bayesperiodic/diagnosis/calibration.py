@@ -3,7 +3,7 @@
 import hashlib
 import importlib.metadata
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -220,7 +220,7 @@ def coverage(positions: np.ndarray, level: float) -> float:
     return float(np.mean(np.abs(positions - 0.5) <= 0.5 * level)) if positions.size else np.nan
 
 
-def _verdict(row: dict[str, Any]) -> str:
+def _verdict(row: Mapping[Any, Any]) -> str:
     if row["replicates"] < FEWEST:
         return FEW
     if row["p_dispersion"] < FALSE_ALARMS:

@@ -58,9 +58,9 @@ def refuse(problem: Problem) -> None:
         )
     if problem.free_noise and not noise.proper:
         raise ValueError(
-            f"problem: the {noise.prior_text} of {problem.free_noise[0]!r} is not allowed; it is improper, and no truth "
-            "can be drawn from it. Give noise.Independent(prior=bp.InverseGamma(…)) or another proper prior, or fix "
-            "the variance."
+            f"problem: the {noise.prior_text} of {problem.free_noise[0]!r} is not allowed; it is improper, and no "
+            "truth can be drawn from it. Give noise.Independent(prior=bp.InverseGamma(…)) or another proper prior, or "
+            "fix the variance."
         )
     if problem.model.autonomous:
         raise ValueError(f"problem: the autonomous model {problem.model.name!r} is not allowed; it must be forced.")
@@ -95,13 +95,13 @@ def replicate(campaign: Campaign, number: int) -> dict[str, Any]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            experiments, used = zip(*(_measured(problem, e, theta, variances, noise) for e in problem.experiments))
+            measured = [_measured(problem, e, theta, variances, noise) for e in problem.experiments]
         except NotSettled:
             return line | {"status": NO_STEADY_STATE}
         except ValueError as error:
             return line | {"status": "fold failed", "error": str(error)}
-        truth = theta | _folded_variances(problem, variances, used)
-        return line | {"truth": truth} | _answers(campaign, experiments, truth, chain, ties)
+        truth = theta | _folded_variances(problem, variances, [share for _, share in measured])
+        return line | {"truth": truth} | _answers(campaign, [again for again, _ in measured], truth, chain, ties)
 
 
 def _drawn_variances(problem: Problem, generator: np.random.Generator) -> dict[str, float]:
@@ -163,7 +163,7 @@ def _first_state(problem: Problem, e: Experiment) -> dict[str, float]:
     return found
 
 
-def _folded_variances(problem: Problem, variances: dict[str, float], used: tuple[float, ...]) -> dict[str, float]:
+def _folded_variances(problem: Problem, variances: dict[str, float], used: list[float]) -> dict[str, float]:
     """Return the free variances of the folded means: larger than drawn where the fold left cycles out."""
     result = {}
     for name in problem.free_noise:
@@ -179,7 +179,7 @@ def _folded_variances(problem: Problem, variances: dict[str, float], used: tuple
 
 def _answers(
     campaign: Campaign,
-    experiments: tuple[Experiment, ...],
+    experiments: list[Experiment],
     truth: dict[str, float],
     chain: np.random.Generator,
     ties: np.random.Generator,
@@ -200,9 +200,8 @@ def _answers(
         )  # fmt: skip
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
         return found | {"status": "no draws", "error": str(error)}
-    found |= {
-        "stop_rule": posterior.converged, "rhat": max(posterior.rhat.values()), "failed": sum(posterior.failures.values()),
-    }  # fmt: skip
+    found |= {"stop_rule": posterior.converged, "rhat": max(posterior.rhat.values())}
+    found["failed"] = sum(posterior.failures.values())
     draws = independent_draws(posterior)
     if not found["rhat"] <= LARGEST_RHAT or draws is None:
         return found | {"status": "draws not usable"}
@@ -247,6 +246,6 @@ def _below_laplace(fit: MapEstimate, truth: dict[str, float]) -> dict[str, float
                 distance = (value - fit.theta[name]) / fit.sd[name]
                 found[name] = float(stdtr(min(fit.degrees_of_freedom, 1e9), distance))
             else:
-                sd = np.sqrt(fit.joint_covariance.loc[name, name])
+                sd = np.sqrt(fit.joint_covariance[name].to_dict()[name])
                 found[name] = float(ndtr(np.log(value / fit.joint_mode[name]) / sd))
     return found

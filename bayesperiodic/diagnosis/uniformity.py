@@ -73,7 +73,12 @@ def ecdf_band(size: int, level: float) -> tuple[np.ndarray, np.ndarray]:
     """
     tail = float(np.quantile(_null(size)[1], 1.0 - level))
     points = evaluation_points()
-    low, high = (stats.binom.ppf(q, size, points) for q in (0.5 * tail, 1.0 - 0.5 * tail))
+    return binomial_band(size, points, tail)
+
+
+def binomial_band(size: int, probabilities: np.ndarray, tail: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return between which shares of `size` trials all but a share `tail` of outcomes lie, at each probability."""
+    low, high = (np.asarray(stats.binom.ppf(q, size, probabilities)) for q in (0.5 * tail, 1.0 - 0.5 * tail))
     return low / size, high / size
 
 

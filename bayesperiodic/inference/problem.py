@@ -229,7 +229,7 @@ class Problem:
             self.model,
             experiments,
             priors=self.priors,
-            fixed=self.fixed | self.likelihood.fixed,
+            fixed={**self.fixed, **self.likelihood.fixed},
             tied=self.tied,
             local=self.local,
             noise=self.noise,

@@ -4,11 +4,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy import stats
 
 from bayesperiodic.diagnosis.calibration import Calibration, coverage
 from bayesperiodic.diagnosis.campaigns import METHODS
-from bayesperiodic.diagnosis.uniformity import bin_count, ecdf_band, evaluation_points
+from bayesperiodic.diagnosis.uniformity import bin_count, binomial_band, ecdf_band, evaluation_points
 from bayesperiodic.plot.style import COLOURS, wrapped_label
 
 LEVEL = 0.99
@@ -64,8 +63,8 @@ def _histogram(axes: Axes, values: np.ndarray, colour: str, label: str, banded: 
     counts, edges = np.histogram(values, bins, (0.0, 1.0))
     expected = max(values.size, 1) / bins
     if banded and values.size:
-        low, high = stats.binom.ppf([0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL], values.size, 1.0 / bins) / expected
-        axes.axhspan(low, high, color="grey", alpha=0.25, lw=0)
+        low, high = binomial_band(values.size, np.array(1.0 / bins), 1.0 - LEVEL)
+        axes.axhspan(float(low) * bins, float(high) * bins, color="grey", alpha=0.25, lw=0)
     axes.stairs(counts / expected, edges, color=colour, lw=1.6, label=label)
     axes.set_xlim(0.0, 1.0)
     axes.set_ylim(bottom=0.0)
@@ -84,7 +83,7 @@ def _distribution(axes: Axes, values: np.ndarray, colour: str, banded: bool) -> 
 def _coverage(axes: Axes, values: np.ndarray, colour: str, banded: bool) -> None:
     levels = evaluation_points()
     if banded and values.size:
-        low, high = (stats.binom.ppf(q, values.size, levels) / values.size for q in (0.005, 0.995))
+        low, high = binomial_band(values.size, levels, 1.0 - LEVEL)
         axes.fill_between(levels, low - levels, high - levels, color="grey", alpha=0.25, lw=0)
     axes.plot(levels, [coverage(values, level) - level for level in levels], color=colour, lw=1.4)
     axes.set_xlim(0.0, 1.0)

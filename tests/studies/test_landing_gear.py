@@ -1,6 +1,7 @@
 import contextlib
 import io
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +24,6 @@ from studies.landing_gear_identification import FORCE, fold
 from studies.landing_gear_quality import FAULTS
 from studies.landing_gear_rig import CYCLES, NOISE, RECORDED, RUNS, SPEED_LIMIT, Run, integrate_steady, measure, steady
 from studies.landing_gear_truth import GEAR, TRUTHS
-from tests.studies.here import InThisProcess
 
 SMALL = next(run for run in RUNS if run.name == "6 Hz 4 mm")
 
@@ -289,7 +289,7 @@ def test_campaigns_are_counted_and_resumed(tmp_path, monkeypatch):
             "truth": truth, "seed": seed, "source": landing_gear_campaigns.source(), "experiments": experiments
         }  # fmt: skip
 
-    monkeypatch.setattr(common_resumed, "workers", InThisProcess)
+    monkeypatch.setattr(common_resumed, "workers", lambda: ThreadPoolExecutor(1))
     monkeypatch.setattr(landing_gear_campaigns, "campaign", fake)
     landing_gear_campaigns.campaigns(tmp_path, 2, 1)
     lines = landing_gear_campaigns.campaigns(tmp_path, 4, 1)

@@ -1,6 +1,7 @@
 import contextlib
 import io
 import json
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -8,7 +9,6 @@ from studies import common_resumed, verdicts, verdicts_replicates
 from studies.__main__ import main
 from studies.verdicts_cases import CASES
 from studies.verdicts_outcome import examine
-from tests.studies.here import InThisProcess
 
 
 def run(folder, *arguments):
@@ -54,7 +54,7 @@ def test_replicates_are_saved_one_by_one_and_resumed(tmp_path, monkeypatch):
     """A line that was cut off, and one of another version of the cases, are done again; the others are not."""
     calls = []
     fake = {"right": True, "named": True, "warned": False, "converged": True, "wrong": {}, "verdicts": {}, "seconds": 1}
-    monkeypatch.setattr(common_resumed, "workers", InThisProcess)
+    monkeypatch.setattr(common_resumed, "workers", lambda: ThreadPoolExecutor(1))
     monkeypatch.setattr(
         verdicts_replicates,
         "replicate",
