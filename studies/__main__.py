@@ -32,6 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
     workers.add_argument("--dask", metavar="ADDRESS", help="calibration: a Dask scheduler, such as tcp://host:8786")
     workers.add_argument("--mpi", action="store_true", help="calibration: MPI, below mpiexec … -m mpi4py.futures")
     parser.add_argument("--truth", choices=("A", "B"), help="landing-gear: which damper (default both)")
+    parser.add_argument("--scaling", action="store_true", help="calibration: measure what two workers gain, only that")
     options = parser.parse_args(arguments)
     known = _studies()
     if options.name is None:

@@ -5,7 +5,8 @@ through fold, MAP point, Laplace approximation and emcee (`bp.calibrate`). The l
 deliberately wrong: it counts a quarter more independent values than there are, as if every variance were a fifth
 smaller. Replicates are saved as they end, and the same command does the missing ones; ``--processes N`` has them done
 by N processes, ``--dask ADDRESS`` by a Dask cluster, ``--mpi`` by the processes of
-``mpiexec -n 3 python -m mpi4py.futures -m studies calibration --mpi``.
+``mpiexec -n 3 python -m mpi4py.futures -m studies calibration --mpi``. ``--scaling`` measures what a second worker
+gains, and nothing else.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 import bayesperiodic as bp
 from studies import common
 from studies.calibration_cases import OVERCOUNT, damper, duffing, landing_gear, miscounted
+from studies.calibration_scaling import scaling
 
 CASES: dict[str, Callable[[], bp.Problem]] = {
     "duffing": duffing,
@@ -36,6 +38,9 @@ def run(options: argparse.Namespace) -> None:
     """Run the study."""
     if options.replicates < 0:
         raise ValueError(f"--replicates: {options.replicates} is not allowed; it must be at least 0.")
+    if options.scaling:
+        print(f"scaling: {common.write_results(options.out / 'scaling', scaling(options.seed))}")
+        return
     count = options.replicates or (QUICK if options.quick else DEFAULT)
     watch = common.Stopwatch()
     print(f"All data are SYNTHETIC: {count} campaigns of every case, their truths drawn from the priors.")
