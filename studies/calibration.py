@@ -30,6 +30,7 @@ CASES: dict[str, Callable[[], bp.Problem]] = {
     "miscounted": miscounted,
 }
 DEFAULT, QUICK = 20, 5
+STRIDE = 4
 STEPS = 250
 BINS = 20
 
@@ -49,7 +50,7 @@ def run(options: argparse.Namespace) -> None:
         for number, (name, case) in enumerate(CASES.items()):
             with watch.part(name, name.replace("_", " ")):
                 found[name] = bp.calibrate(
-                    case(), replicates=count, seed=len(CASES) * options.seed + number, folder=options.out / name,
+                    case(), replicates=count, seed=STRIDE * options.seed + number, folder=options.out / name,
                     executor=executor, max_steps=STEPS,
                 )  # fmt: skip
             print(found[name])
