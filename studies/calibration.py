@@ -1,7 +1,7 @@
 """Is a 90 % interval a 90 % interval: simulated campaigns of three problems, and of one whose likelihood is wrong.
 
 All data are synthetic. Every replicate draws its truth from the priors, records it by time integration, and goes
-through fold, MAP point, Laplace approximation and emcee (`bp.calibrate`). The likelihood of the fourth case is
+through fold, MAP point, Laplace approximation and emcee (`bp.calibrate`). The likelihood of the second case is
 deliberately wrong: it counts a quarter more independent values than there are, as if every variance were a fifth
 smaller. Replicates are saved as they end, and the same command does the missing ones; ``--processes N`` has them done
 by N processes, ``--dask ADDRESS`` by a Dask cluster, ``--mpi`` by the processes of
@@ -25,9 +25,9 @@ from studies.calibration_scaling import scaling
 
 CASES: dict[str, Callable[[], bp.Problem]] = {
     "duffing": duffing,
+    "miscounted": miscounted,
     "damper": damper,
     "landing_gear": landing_gear,
-    "miscounted": miscounted,
 }
 DEFAULT, QUICK = 20, 5
 STRIDE = 4

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from bayesperiodic import checks
-from bayesperiodic.diagnosis.campaigns import DONE, LAPLACE, MCMC, METHODS, Campaign, refuse, replicate
+from bayesperiodic.diagnosis.campaigns import APART, DONE, LAPLACE, MCMC, METHODS, Campaign, refuse, replicate
 from bayesperiodic.diagnosis.discrepancy import holm
 from bayesperiodic.diagnosis.uniformity import chi_square_test, dispersion_test, ecdf_test, normal_scores
 from bayesperiodic.inference.problem import Problem
@@ -123,7 +123,7 @@ def calibrate(
         executors lose their workers, the same call goes on from the folder.
     ensembles, walkers, max_steps
         Of each replicate's `sample`. By default two ensembles of twice as many walkers as there are dimensions. Short
-        chains are enough: a rank takes only independent draws, at steps two autocorrelation times apart.
+        chains are enough: a rank takes only independent draws, at steps five autocorrelation times apart.
     progress : bool
 
     Returns
@@ -159,7 +159,7 @@ def calibrate(
     refuse(problem)
     if walkers is None:
         walkers = 2 * (len(problem.names) + len(problem.free_noise))
-    settings = f"{fingerprint(problem)}, seed {seed}, {ensembles} x {walkers} walkers, {max_steps} steps"
+    settings = f"{fingerprint(problem)}, seed {seed}, {ensembles} x {walkers} walkers, {max_steps} steps, {APART} apart"
     source = hashlib.sha256(f"{importlib.metadata.version('bayesperiodic')}, {settings}".encode()).hexdigest()[:16]
     campaign = Campaign(problem, seed, source, ensembles, walkers, max_steps)
     lines = resumed(

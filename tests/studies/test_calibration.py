@@ -50,7 +50,7 @@ def test_a_second_run_does_nothing_again(found, monkeypatch):
 
 
 @pytest.mark.parametrize("name", calibration.CASES)
-def test_every_case_can_be_simulated_and_only_the_last_miscounts(name):
+def test_every_case_can_be_simulated_and_only_one_miscounts(name):
     problem = calibration.CASES[name]()
     refuse(problem)
     for experiment in problem.experiments:
