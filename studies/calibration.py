@@ -3,10 +3,10 @@
 All data are synthetic. Every replicate draws its truth from the priors, records it by time integration, and goes
 through fold, MAP point, Laplace approximation and emcee (`bp.calibrate`). The likelihood of the second case is
 deliberately wrong: it counts a quarter more independent values than there are, as if every variance were a fifth
-smaller. Replicates are saved as they end, and the same command does the missing ones; ``--processes N`` has them done
-by N processes, ``--dask ADDRESS`` by a Dask cluster, ``--mpi`` by the processes of
-``mpiexec -n 3 python -m mpi4py.futures -m studies calibration --mpi``. ``--scaling`` measures what a second worker
-gains, and nothing else.
+smaller. Replicates are saved as they end, results after each case, and the same command does what is missing.
+``--processes N`` has the replicates done by N processes, ``--dask ADDRESS`` by a Dask cluster, ``--mpi`` by the
+processes of ``mpiexec -n 3 python -m mpi4py.futures -m studies calibration --mpi``. ``--scaling`` measures what a
+second worker gains, and nothing else.
 """
 
 from __future__ import annotations
@@ -45,22 +45,21 @@ def run(options: argparse.Namespace) -> None:
     count = options.replicates or (QUICK if options.quick else DEFAULT)
     watch = common.Stopwatch()
     print(f"All data are SYNTHETIC: {count} campaigns of every case, their truths drawn from the priors.")
-    found: dict[str, bp.Calibration] = {}
+    results: dict[str, Any] = {}
+    about = {"synthetic": True, "seed": options.seed, "replicates": count, "steps": STEPS, "overcount": OVERCOUNT}
     with executor_of(options) as executor:
         for number, (name, case) in enumerate(CASES.items()):
             with watch.part(name, name.replace("_", " ")):
-                found[name] = bp.calibrate(
+                found = bp.calibrate(
                     case(), replicates=count, seed=STRIDE * options.seed + number, folder=options.out / name,
                     executor=executor, max_steps=STEPS,
                 )  # fmt: skip
-            print(found[name])
-    with watch.part("figures", "drawing"):
-        paths = common.save_figures(options.out, {name: bp.plot.ranks(one) for name, one in found.items()})
-    results: dict[str, Any] = {name: collect(one) for name, one in found.items()}
-    about = {"synthetic": True, "seed": options.seed, "replicates": count, "steps": STEPS, "overcount": OVERCOUNT}
-    results["study"] = about | {"seconds": watch.total(), "versions": common.versions()}
-    path = common.write_results(options.out, results)
-    print(f"figures (synthetic data): {', '.join(map(str, paths))}\nresults: {path}")
+            print(found)
+            results[name] = collect(found)
+            study = about | {"cases": list(results), "seconds": watch.total(), "versions": common.versions()}
+            paths = common.save_figures(options.out, {name: bp.plot.ranks(found)})
+            path = common.write_results(options.out, results | {"study": study})
+            print(f"figure (synthetic data): {paths[0]}\nresults so far: {path}")
 
 
 @contextmanager
