@@ -19,8 +19,8 @@ def normal_scores(values: np.ndarray) -> np.ndarray:
 def dispersion_test(values: np.ndarray) -> tuple[float, float]:
     """Return the mean square of the normal scores, 1 on average, and the two-sided p-value of its χ² distribution.
 
-    Intervals that are too narrow put the truth into their tails and raise it: by a fifth if variances are a fifth too
-    small, 4.5 standard errors with 1000 values. A test of the whole distribution has little power against that.
+    Intervals that are too narrow put the truth into their tails and raise it, to 1.25 if variances are a fifth too
+    small. With 1000 values a level of 1 % sees that in 99.7 % of cases, `ecdf_test` in 76 %, Kolmogorov's in 20 %.
     """
     square = float(np.sum(normal_scores(values) ** 2))
     low, high = stats.chi2.cdf(square, values.size), stats.chi2.sf(square, values.size)
