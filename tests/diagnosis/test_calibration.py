@@ -161,8 +161,9 @@ def test_replicates_are_kept_one_by_one_and_only_missing_ones_are_done(without_d
     lines = path.read_bytes().splitlines(keepends=True)
     assert len(lines) == 5
     path.write_bytes(b"".join([lines[0], *lines[2:]]) + lines[1][:40])
-    again = bp.calibrate(linear(), replicates=6, seed=1, folder=tmp_path, progress=False)
-    assert same(again, whole) and len(path.read_bytes().splitlines()) == 7
+    for _ in range(2):
+        again = bp.calibrate(linear(), replicates=6, seed=1, folder=tmp_path, progress=False)
+        assert same(again, whole) and len(path.read_bytes().splitlines()) == 7
     with resumed_module._alone(path), pytest.raises(ValueError, match="in use by another run"):
         bp.calibrate(linear(), replicates=6, seed=1, folder=tmp_path, progress=False)
 
