@@ -23,8 +23,8 @@ MCMC, LAPLACE = "mcmc", "laplace"
 METHODS = (MCMC, LAPLACE)
 DONE, NO_STEADY_STATE = "done", "no steady state"
 FEWEST_CYCLES = 3
-# Steps between draws that count as independent, in autocorrelation times, which short chains underestimate: at two of
-# them the dispersion of exact ranks came out 5 % too large. The fewest of these draws; the largest R-hat.
+# Steps between draws that count as independent, in autocorrelation times, which short chains underestimate; the fewest
+# of these draws; the largest R-hat.
 APART, FEWEST_DRAWS, LARGEST_RHAT = 5.0, 20, 1.1
 
 
