@@ -26,6 +26,7 @@ PRIORS = {"k": bp.Normal(900.0, 60.0), "c": bp.Normal(40.0, 200.0), "coulomb": b
 INVERSE_GAMMA = bp.noise.Independent(prior=bp.InverseGamma(6.0, 40.0))
 FLAT = bp.noise.Independent(prior="flat")
 SHORT = {"max_steps": 250, "progress": False}
+SHORTEST = SHORT | {"walkers": 8}
 
 
 def run(overcount: float = 1.0, cycles: int = 4) -> bp.Experiment:
@@ -181,7 +182,7 @@ def same(one: bp.Calibration, other: bp.Calibration) -> bool:
 
 @pytest.fixture(scope="module")
 def serial():
-    return bp.calibrate(linear(known=False), replicates=4, seed=4, **SHORT)
+    return bp.calibrate(linear(known=False), replicates=4, seed=4, **SHORTEST)
 
 
 def test_a_dask_worker_killed_in_the_middle_changes_nothing(serial, dask, tmp_path, monkeypatch):
@@ -196,9 +197,8 @@ def test_a_dask_worker_killed_in_the_middle_changes_nothing(serial, dask, tmp_pa
 
     killed: list[int] = []
     monkeypatch.setattr(resumed_module, "tqdm", Bar)
-    found = bp.calibrate(
-        linear(known=False), replicates=4, seed=4, executor=dask, folder=tmp_path, max_steps=250
-    )  # fmt: skip
+    shortest = SHORTEST | {"progress": True}
+    found = bp.calibrate(linear(known=False), replicates=4, seed=4, executor=dask, folder=tmp_path, **shortest)
     assert killed == [2] and same(found, serial)
     numbers = [json.loads(line)["number"] for line in (tmp_path / FILE).read_text().splitlines()]
     assert sorted(numbers) == list(range(4))
@@ -208,11 +208,11 @@ SCRIPT = """
 import json, sys
 from mpi4py.futures import MPIPoolExecutor
 import bayesperiodic as bp
-from tests.diagnosis.test_calibration import SHORT, linear
+from tests.diagnosis.test_calibration import SHORTEST, linear
 
 if __name__ == "__main__":
     with MPIPoolExecutor() as pool:
-        found = bp.calibrate(linear(known=False), replicates=4, seed=4, executor=pool, **SHORT)
+        found = bp.calibrate(linear(known=False), replicates=4, seed=4, executor=pool, **SHORTEST)
     found.save(sys.argv[1])
 """
 
