@@ -49,8 +49,9 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
             _histogram(row[0], values, COLOURS[method], said, method == METHODS[0])
             _distribution(row[1], values, COLOURS[method], method == METHODS[0])
             _coverage(row[2], values, COLOURS[method], method == METHODS[0])
+        row[0].set_ylim(bottom=0.0)
         row[0].set_ylabel(wrapped_label(name, ""))
-        row[0].legend(frameon=False, fontsize="small", loc="lower center")
+        row[0].legend(framealpha=0.8, edgecolor="none", fontsize="small", loc="lower center")
     for top, bottom, (title, label) in zip(panels[0], panels[-1], COLUMNS.items(), strict=True):
         top.set_title(title, fontsize="medium")
         bottom.set_xlabel(label)
@@ -67,7 +68,6 @@ def _histogram(axes: Axes, values: np.ndarray, colour: str, label: str, banded: 
         axes.axhspan(float(low) * bins, float(high) * bins, color="grey", alpha=0.25, lw=0)
     axes.stairs(counts / expected, edges, color=colour, lw=1.6, label=label)
     axes.set_xlim(0.0, 1.0)
-    axes.set_ylim(bottom=0.0)
 
 
 def _distribution(axes: Axes, values: np.ndarray, colour: str, banded: bool) -> None:
