@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from bayesperiodic.orbits.section import PoincareSection
     from bayesperiodic.orbits.selection import select_orbits
     from bayesperiodic.periodic.continuation import Branch, continue_periodic, double_period, iterate_periodic
+    from bayesperiodic.periodic.hopf import HopfPoint, emerging_cycle, hopf_points
+    from bayesperiodic.periodic.passages import solutions_at
     from bayesperiodic.periodic.schemes import Scheme
     from bayesperiodic.periodic.solution import PeriodicSolution
     from bayesperiodic.periodic.solve import solve_periodic
@@ -88,6 +90,8 @@ _HOMES = {
     "bayesperiodic.orbits.section": ["PoincareSection"],
     "bayesperiodic.orbits.selection": ["select_orbits"],
     "bayesperiodic.periodic.continuation": ["Branch", "continue_periodic", "double_period", "iterate_periodic"],
+    "bayesperiodic.periodic.hopf": ["HopfPoint", "emerging_cycle", "hopf_points"],
+    "bayesperiodic.periodic.passages": ["solutions_at"],
     "bayesperiodic.periodic.schemes": ["Scheme"],
     "bayesperiodic.periodic.solution": ["PeriodicSolution"],
     "bayesperiodic.periodic.solve": ["solve_periodic"],
@@ -103,14 +107,14 @@ _MODULES = {
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [  # noqa: PLE0604
-    "Branch", "Calibration", "Comparison", "Experiment", "HalfNormal", "Identifiability", "InverseGamma",
-    "LogNormal", "LogUniform", "MapEstimate", "Model", "MultivariateNormal", "Normal", "Orbit", "Orbits",
-    "PeriodicSolution", "PoincareSection", "Posterior", "Prediction", "PriorPredictive", "Problem", "Profile",
-    "Recording", "Scheme", "Structure", "StudentT", "TruncatedNormal", "Uniform", "calibrate", "compare",
-    "continue_periodic", "double_period", "find_orbits", "identifiability", "iterate_periodic", "load",
-    "map_estimate", "models", "multiplier_sensitivities", "noise", "plot", "polish_orbits", "predict",
-    "prior_predictive", "profile", "sample", "select_orbits", "simulate", "smooth_abs", "smooth_sign",
-    "solve_periodic", "structure",
+    "Branch", "Calibration", "Comparison", "Experiment", "HalfNormal", "HopfPoint", "Identifiability",
+    "InverseGamma", "LogNormal", "LogUniform", "MapEstimate", "Model", "MultivariateNormal", "Normal", "Orbit",
+    "Orbits", "PeriodicSolution", "PoincareSection", "Posterior", "Prediction", "PriorPredictive", "Problem",
+    "Profile", "Recording", "Scheme", "Structure", "StudentT", "TruncatedNormal", "Uniform", "calibrate", "compare",
+    "continue_periodic", "double_period", "emerging_cycle", "find_orbits", "hopf_points", "identifiability",
+    "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "noise", "plot",
+    "polish_orbits", "predict", "prior_predictive", "profile", "sample", "select_orbits", "simulate", "smooth_abs",
+    "smooth_sign", "solutions_at", "solve_periodic", "structure",
 ]  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import pint
 import pytest
 
 import bayesperiodic as bp
+from tests.flutter_rig import RIG, flutter_matrices
 
 LIBRARY = {
     "duffing": lambda: bp.models.duffing,
@@ -17,6 +18,7 @@ LIBRARY = {
     "landing_gear_force": lambda: bp.models.landing_gear("force"),
     "landing_gear_displacement": lambda: bp.models.landing_gear("displacement"),
     "chain_3": lambda: bp.models.chain(3),
+    "flutter": lambda: bp.models.flutter,
 }
 PENDULUM = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
 GEAR = {
@@ -26,6 +28,15 @@ GEAR = {
 }  # fmt: skip
 SILVERBOX = {"w0": 6.0, "c": 0.2, "k1": 1.1, "k2": 0.3, "k3": 4.0, "g": 1.3, "u0": 0.1}
 CHAIN = {"m": 0.7, "c": 0.3, "k": 40.0, "k3": 900.0}
+FLUTTER = RIG | {
+    "a": -0.3,
+    "span": 0.8,
+    "U": 16.0,
+    "gain_heave": 5.0,
+    "gain_pitch": 1.1,
+    "offset_heave": 3.0,
+    "offset_pitch": 0.7,
+}
 TYPICAL = {
     "duffing": ({"m": 1.0, "c": 0.2, "k": 3.0, "k3": 2.0}, {"x": 1.0, "force": 1.0}),
     "dahl": ({"Kx": 768.0, "K": 10.0, "F0": 3.0, "Kw": 57.4, "rho": 2e3}, {"w": 1.0, "displacement": 0.01}),
@@ -35,6 +46,7 @@ TYPICAL = {
     "landing_gear_force": (GEAR, {"q": 0.05, "T": 300.0, "force": 5e3}),
     "landing_gear_displacement": (GEAR, {"displacement": 0.05, "T": 300.0}),
     "chain_3": (CHAIN, {"x1": 0.1, "x2": 0.1, "x3": 0.1, "force": 2.0}),
+    "flutter": (FLUTTER, {"h": 0.03, "alpha": 0.1, "w": 0.02}),
 }
 POINTS, FREQUENCY = 20, 1.4
 
@@ -97,6 +109,14 @@ def by_hand_chain_3(q, u, p, tau):
     return [m * a + first - second, m * b + second - third, m * c + third - u[0]], [q[2]]
 
 
+def by_hand_flutter(q, u, p, tau):
+    mass, damping, stiffness = flutter_matrices(p)
+    force = mass @ np.array(q[6:]) + damping @ np.array(q[3:6]) + stiffness @ np.array(q[:3])
+    force[1] += p["k_alpha2"] * q[1] ** 2 + p["k_alpha3"] * q[1] ** 3
+    sensors = p["gain_heave"] * q[0] + p["offset_heave"], p["gain_pitch"] * q[1] + p["offset_pitch"]
+    return list(force), list(sensors)
+
+
 BY_HAND = {
     "pendulum": by_hand_pendulum,
     "silverbox": by_hand_silverbox,
@@ -104,6 +124,7 @@ BY_HAND = {
     "landing_gear_force": by_hand_landing_gear_force,
     "landing_gear_displacement": by_hand_landing_gear_displacement,
     "chain_3": by_hand_chain_3,
+    "flutter": by_hand_flutter,
 }
 
 
@@ -209,8 +230,8 @@ def test_names_are_the_promised_ones():
     assert displacement.outputs == ("force", "pressure")
 
 
-def test_only_van_der_pol_is_autonomous():
-    assert [name for name in LIBRARY if LIBRARY[name]().autonomous] == ["van_der_pol"]
+def test_only_van_der_pol_and_flutter_are_autonomous():
+    assert [name for name in LIBRARY if LIBRARY[name]().autonomous] == ["van_der_pol", "flutter"]
 
 
 def test_pendulum_swings_at_the_root_of_g_over_l():

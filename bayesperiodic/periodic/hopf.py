@@ -1,0 +1,216 @@
+"""Hopf points: where an equilibrium of an autonomous model loses its stability to a cycle, and that cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.optimize import brentq
+
+from bayesperiodic import checks
+from bayesperiodic.models.model import Model
+from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
+from bayesperiodic.periodic.family import Family, solve_family
+from bayesperiodic.periodic.floquet import first_order_matrix
+from bayesperiodic.periodic.schemes import Scheme
+from bayesperiodic.periodic.solution import PeriodicSolution, describe
+from bayesperiodic.store import Result
+
+INTERVALS, FEWEST = 64, 4
+OSCILLATING = 1e-9
+
+
+@dataclass(frozen=True)
+class HopfPoint(Result):
+    """Where a pair of complex eigenvalues of an equilibrium crosses the imaginary axis.
+
+    Attributes
+    ----------
+    model : str
+    vary : str
+        The parameter that was varied.
+    value : float
+        Of that parameter.
+    frequency : float
+        Of the oscillation that starts there [Hz].
+    parameters : dict of str to float
+        All of them, at the point.
+    equilibrium : dict of str to float
+        The states there.
+    mode : complex array (states,)
+        Amplitudes of the states in the oscillation, in the model's order, the largest of them 1.
+    """
+
+    model: str
+    vary: str
+    value: float
+    frequency: float
+    parameters: dict[str, float]
+    equilibrium: dict[str, float]
+    mode: np.ndarray
+
+    def __repr__(self) -> str:
+        return f"HopfPoint({self.model!r}, {self.vary} = {self.value:.6g}, {self.frequency:.6g} Hz)"
+
+
+def hopf_points(
+    model: Model, parameters: Mapping[str, float], vary: str, *, between: tuple[float, float]
+) -> tuple[HopfPoint, ...]:
+    """Find the Hopf points of an equilibrium along a parameter, by the eigenvalues of the linearised equations.
+
+    Parameters
+    ----------
+    model : Model
+        An autonomous one.
+    parameters : mapping of str to float
+        A value for every parameter; that of `vary` is not looked at.
+    vary : str
+        A parameter.
+    between : (low, high)
+        Where to look. A pair of eigenvalues that crosses the axis and comes back within 1/64 of the way is not seen.
+
+    Returns
+    -------
+    tuple of HopfPoint
+        In the order of the parameter's values.
+
+    Raises
+    ------
+    ValueError
+        For a model that is not autonomous, unknown or missing names, values that are not finite or not in order.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> point, = bp.hopf_points(bp.models.van_der_pol, {"mu": 0.0, "omega": 6.0}, "mu", between=(-1.0, 1.5))
+    >>> abs(point.value) < 1e-9, round(point.frequency, 6)
+    (True, 0.95493)
+    """
+    if not model.autonomous:
+        raise ValueError(f"model: {model.name!r} is not allowed; it is driven and never at rest.")
+    checks.one_of("vary", vary, model.parameters)
+    low, high = (checks.finite_number(f"between[{i}]", value) for i, value in enumerate(between))
+    if not low < high:
+        raise ValueError(f"between: {between!r} is not allowed; the first value must be below the second.")
+    given = dict(parameters) | {vary: low}
+    checks.same_names("parameters", given, model.parameters)
+    theta = np.array([checks.finite_number(f"parameters[{n!r}]", given[n]) for n in model.parameters])
+    equations = _equations(model, 1.0, FEWEST, "fourier")
+
+    def growth(value: float) -> float:
+        return _leading(equations, _with(model, theta, vary, value))[0].real
+
+    grid = np.linspace(low, high, INTERVALS + 1)
+    rates = [growth(value) for value in grid]
+    found = []
+    for (a, b), (before, after) in zip(pairwise(grid), pairwise(rates), strict=True):
+        if before * after < 0.0 or (after == 0.0 and before != 0.0):
+            value = float(brentq(growth, a, b, xtol=1e-13 * max(abs(a), abs(b)), rtol=1e-14))
+            found.append(_describe(equations, _with(model, theta, vary, value), vary, value))
+    return tuple(found)
+
+
+def emerging_cycle(
+    model: Model,
+    point: HopfPoint,
+    *,
+    amplitude: Mapping[str, float],
+    samples: int = 800,
+    scheme: str | Scheme = "central2",
+) -> PeriodicSolution:
+    """Step from a Hopf point onto the branch of cycles that starts there, stable or unstable.
+
+    Parameters
+    ----------
+    model : Model
+    point : HopfPoint
+    amplitude : mapping of one str to float
+        A state, and the amplitude of its first harmonic in the cycle wanted; small against the sizes at which the
+        equations are nonlinear.
+    samples, scheme : see `solve_periodic`
+
+    Returns
+    -------
+    PeriodicSolution
+        At the value of the varied parameter at which the model has that cycle; or with the status of the failed solve.
+
+    Raises
+    ------
+    ValueError
+        If the point is of another model, for more than one state, an unknown one or one that the oscillation does not
+        move, an amplitude ≤ 0.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> point, = bp.hopf_points(bp.models.van_der_pol, {"mu": 0.0, "omega": 6.0}, "mu", between=(-1.0, 1.5))
+    >>> bp.emerging_cycle(bp.models.van_der_pol, point, amplitude={"x": 0.5}, samples=100).status
+    'converged'
+    """
+    if point.model != model.name:
+        raise ValueError(f"model: {model.name!r} is not allowed; the point is one of {point.model!r}.")
+    if len(amplitude) != 1:
+        raise ValueError(f"amplitude: {dict(amplitude)!r} is not allowed; give that of one state.")
+    ((state, size),) = amplitude.items()
+    checks.one_of("amplitude", state, model.states)
+    size = checks.positive(f"amplitude[{state!r}]", size)
+    own = point.mode[model.states.index(state)]
+    if not abs(own) > OSCILLATING:
+        raise ValueError(f"amplitude: {state!r} is not allowed; it does not move in the oscillation.")
+    equations = _equations(model, point.frequency, samples, scheme)
+    theta = np.array([point.parameters[n] for n in model.parameters])
+    shape = point.mode * size / own
+    wave = np.exp(2j * np.pi * equations.grid.tau)
+    z = np.array([point.equilibrium[n] for n in model.states]) + np.real(wave[:, None] * shape)
+    rows = np.zeros((2, *z.shape))
+    rows[:, :, model.states.index(state)] = 2.0 / len(z) * np.stack([wave.real, wave.imag])
+    values = np.array([point.value, point.frequency])
+    family = Family(equations, theta, (point.vary, FREQUENCY))
+    scales = np.maximum(np.abs(values), 1.0)
+    found = solve_family(family, z, values, rows, np.zeros((2, 2)), np.array([size, 0.0]), scales)
+    equations, theta = family.at(found.values)
+    return describe(equations, theta, Solved(found.z, found.code, found.history), "Hopf point", sensitivities=False)
+
+
+def _equations(model: Model, frequency: float, samples: int, scheme: str | Scheme) -> PeriodicEquations:
+    return PeriodicEquations.build(
+        model, None, frequency=frequency, samples=samples, scheme=scheme, periods=1, winding=0
+    )
+
+
+def _with(model: Model, theta: np.ndarray, name: str, value: float) -> np.ndarray:
+    other = theta.copy()
+    other[model.parameters.index(name)] = value
+    return other
+
+
+def _leading(equations: PeriodicEquations, theta: np.ndarray) -> tuple[complex, np.ndarray, np.ndarray]:
+    """Return the oscillating eigenvalue [1/s] of largest real part, its vector, and the equilibrium (states,).
+
+    NaN without one.
+    """
+    z, count = equations.static_guess(theta), equations.count
+    columns = equations.residual_jacobian(z, theta)[:1, count:].reshape(1, count, -1)
+    values, vectors = np.linalg.eig(first_order_matrix(columns, tuple(equations.model.orders.values()))[0])
+    turning = np.flatnonzero(values.imag > OSCILLATING * np.abs(values).max())
+    if not turning.size:
+        return complex(np.nan, np.nan), np.full(len(values), np.nan), z[0]
+    first = turning[np.argmax(values.real[turning])]
+    return complex(values[first]), vectors[:, first], z[0]
+
+
+def _describe(equations: PeriodicEquations, theta: np.ndarray, vary: str, value: float) -> HopfPoint:
+    model = equations.model
+    eigenvalue, vector, equilibrium = _leading(equations, theta)
+    mode = vector[: equations.count] / vector[np.argmax(np.abs(vector[: equations.count]))]
+    return HopfPoint(
+        model=model.name,
+        vary=vary,
+        value=value,
+        frequency=eigenvalue.imag / (2 * np.pi),
+        parameters=dict(zip(model.parameters, theta.tolist(), strict=True)),
+        equilibrium=dict(zip(model.states, equilibrium.tolist(), strict=True)),
+        mode=mode,
+    )
