@@ -44,6 +44,8 @@ class Experiment(Result):
         Standard error of the frequency [Hz]; zero where it is known.
     periodicity : float
         Fraction of the variance that the mean period explains, of the channel where it is least.
+    drift : mapping of str to float
+        By what fraction the fundamental of each channel grew over the recording.
     origin : float
         Time [s] of the recording at which τ = 0.
     synthetic : bool
@@ -84,6 +86,7 @@ class Experiment(Result):
     amplitude_variance: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
     frequency_se: float = field(default=0.0, kw_only=True)
     periodicity: float = field(default=1.0, kw_only=True)
+    drift: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     origin: float = field(default=0.0, kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
@@ -108,7 +111,7 @@ class Experiment(Result):
             object.__setattr__(self, kind, channels)
         guess = {key: checks.finite_vector(f"guess[{key!r}]", v, points) for key, v in (self.guess or {}).items()}
         object.__setattr__(self, "guess", guess)
-        for argument in ("scatter", "independent", "harmonics", "amplitude_variance"):
+        for argument in ("scatter", "independent", "harmonics", "amplitude_variance", "drift"):
             given = dict(getattr(self, argument) or {})
             object.__setattr__(self, argument, given)
             for key in given:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 MINIMUM_CYCLES = 3
 MINIMUM_PERIODICITY = 0.5
 FALSE_ALARM_RATE = 0.01
+CROSSING = "crossing"
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ def fold(
     frequency: float | None = None,
     periods: int = 1,
     harmonics: int | Mapping[str, int] | None = None,
-    origin: float = 0.0,
+    origin: float | str = 0.0,
+    largest_drift: float | None = None,
     name: str | None = None,
 ) -> Experiment:
     """Fold the steady part of a recording into its mean period on an equidistant grid.
@@ -66,8 +68,13 @@ def fold(
         Harmonics of the response period to keep, for all channels or by channel. By default each channel keeps all up
         to the last one that stands out of the cycle-to-cycle scatter: an F-test on its squared amplitude with a
         false-alarm rate of 1 % over all harmonics tested.
-    origin : float
-        Time [s] at which τ = 0.
+    origin : float or "crossing"
+        Time [s] at which τ = 0; or, for a free-running system whose phase means nothing, where the fundamental of the
+        first output crosses its mean upwards, for the first time after time 0.
+    largest_drift : float, optional
+        How far the fundamental of a channel may grow or shrink over the whole recording, as a fraction of its mean (a
+        straight line through the amplitudes of the cycles). A free-running system that is held on a cycle, or settles
+        on one, has none.
     name : str, optional
         By default the recording's name.
 
@@ -75,29 +82,32 @@ def fold(
     -------
     Experiment
         With `.frequency_se`, `.cycles` (how many were used), `.scatter`, `.independent` (2·harmonics + 1, at most the
-        number of samples), `.harmonics` and `.periodicity`.
+        number of samples), `.harmonics`, `.periodicity` and `.drift`.
 
     Raises
     ------
     ValueError
         For fewer than three cycles, a constant channel, a signal that is not periodic (its periodicity is told),
-        more harmonics than the samples resolve, an unknown channel in `harmonics`.
+        more harmonics than the samples resolve, an unknown channel in `harmonics`, a drift beyond the largest.
     """
     periods = checks.integer("periods", periods, 1)
     samples = checks.integer("samples", samples, 4)
-    origin = checks.finite_number("origin", origin)
+    start = 0.0 if origin == CROSSING else checks.finite_number("origin", origin)
     names = [*recording.inputs, *recording.outputs]
     signals = np.stack([*recording.inputs.values(), *recording.outputs.values()])
     for channel, values in zip(names, signals, strict=True):
         if np.ptp(values) == 0.0:
             kind = "inputs" if channel in recording.inputs else "outputs"
             raise ValueError(f"{kind}[{channel!r}]: the constant {values[0]:g} is not allowed; a channel must vary.")
-    time = recording.time - origin
+    time = recording.time - start
 
     fundamental = _first_guess(recording, time, signals, frequency, periods)
     if frequency is None:
         fundamental = _track(time, signals, fundamental)
-    steady = _steady_part(time, signals, fundamental)
+    cycle, shape = _cycles_apart(time, signals, fundamental)
+    drift = dict(zip(names, _drift(shape[::-1]), strict=True))
+    _refuse_drift(recording, drift, largest_drift)
+    steady = _steady_part(cycle, shape)
     time, signals = time[steady], signals[:, steady]
     limit = _resolved(time, fundamental, samples * periods)
     if frequency is None:
@@ -111,6 +121,10 @@ def fold(
     kept = {
         channel: _last_significant(fit.amplitudes[i], scatter[i].mean, cycles) for i, channel in enumerate(names)
     } | _chosen(harmonics, names, limit)
+    if origin == CROSSING:
+        start = _crossing(fit.amplitudes[len(recording.inputs), 1], fit.frequency)
+        turn = np.exp(2j * np.pi * fit.frequency * start * np.arange(fit.amplitudes.shape[1]))
+        fit = replace(fit, amplitudes=fit.amplitudes * turn)
     mean = {
         channel: fourier.on_grid(fit.amplitudes[i, : kept[channel] + 1], samples * periods)
         for i, channel in enumerate(names)
@@ -132,7 +146,8 @@ def fold(
         harmonics=kept,
         amplitude_variance={channel: scatter[i].mean[: kept[channel] + 1] for i, channel in enumerate(names)},
         periodicity=periodicity,
-        origin=origin,
+        drift=drift,
+        origin=start,
         synthetic=recording.synthetic,
     )
 
@@ -184,19 +199,46 @@ def _resolved(time: np.ndarray, fundamental: float, points: int) -> int:
     return resolved
 
 
-def _steady_part(time: np.ndarray, signals: np.ndarray, fundamental: float) -> np.ndarray:
-    """Return a mask of the last whole cycles, without the first ones that differ from the later half."""
+def _cycles_apart(time: np.ndarray, signals: np.ndarray, fundamental: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return in which cycle, counted back from the end, each sample is, and their amplitudes in units of the scatter.
+
+    The amplitudes (cycles, channels, harmonics + 1) are of the whole cycles, the last one first.
+    """
     period = 1.0 / fundamental
     total = int(_cycles(time, fundamental))
     back = np.minimum(((time[-1] - time) / period + 1e-9).astype(int), total)
     harmonics = min(5, _resolved(time, fundamental, time.size))
     scale = signals.std(axis=1)[:, None]
-    shape = np.array(
-        [
-            fit_harmonics(time[back == k], signals[:, back == k] / scale, fundamental, harmonics).amplitudes
-            for k in range(total)
-        ]
-    )
+    fits = [fit_harmonics(time[back == k], signals[:, back == k] / scale, fundamental, harmonics) for k in range(total)]
+    return back, np.array([fit.amplitudes for fit in fits])
+
+
+def _drift(shape: np.ndarray) -> list[float]:
+    """Return by what fraction the fundamental of each channel grows from the first cycle to the last one."""
+    size = np.abs(shape[:, :, 1])
+    number = np.arange(len(size)) - 0.5 * (len(size) - 1)
+    return (number @ size / (number @ number) * len(size) / size.mean(axis=0)).tolist()
+
+
+def _refuse_drift(recording: Recording, drift: Mapping[str, float], largest: float | None) -> None:
+    if largest is None:
+        return
+    worst = max(drift, key=lambda channel: abs(drift[channel]))
+    if abs(drift[worst]) > checks.positive("largest_drift", largest):
+        raise ValueError(
+            f"recording: {recording.name!r} is not steady; the fundamental of {worst!r} changes by {drift[worst]:+.1%} "
+            f"over it, and at most {largest:.1%} is allowed. Leave it out, or cut out a steady part with `between`."
+        )
+
+
+def _crossing(amplitude: complex, frequency: float) -> float:
+    """Return the first time ≥ 0 at which the signal Re a·exp(2πi f t) crosses zero upwards."""
+    return float((-0.25 - np.angle(amplitude) / (2 * np.pi)) % 1.0 / frequency)
+
+
+def _steady_part(cycle: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Return a mask of the last whole cycles, without the first ones that differ from the later half."""
+    total = len(shape)
     half = max(total // 2, MINIMUM_CYCLES)
     middle = np.median(shape[:half].real, axis=0) + 1j * np.median(shape[:half].imag, axis=0)
     distance = np.max(np.sqrt(np.sum(np.abs(shape - middle) ** 2, axis=2)), axis=1)
@@ -204,7 +246,7 @@ def _steady_part(time: np.ndarray, signals: np.ndarray, fundamental: float) -> n
     used = total
     while used > MINIMUM_CYCLES and not settled[used - 1 - min(2, used - 1) : used].all():
         used -= 1
-    return back < used
+    return cycle < used
 
 
 def _periodicity(recording: Recording, names: list[str], signals: np.ndarray, fit: HarmonicFit) -> float:

@@ -221,13 +221,23 @@ class Recording(Result):
         frequency: float | None = None,
         periods: int = 1,
         harmonics: int | Mapping[str, int] | None = None,
-        origin: float = 0.0,
+        origin: float | str = 0.0,
+        largest_drift: float | None = None,
         name: str | None = None,
     ) -> "Experiment":
         """Fold the steady part of the recording into its mean period; see `folding.fold`."""
         from bayesperiodic.data.folding import fold
 
-        return fold(self, samples, frequency=frequency, periods=periods, harmonics=harmonics, origin=origin, name=name)
+        return fold(
+            self,
+            samples,
+            frequency=frequency,
+            periods=periods,
+            harmonics=harmonics,
+            origin=origin,
+            largest_drift=largest_drift,
+            name=name,
+        )
 
     def __repr__(self) -> str:
         kind = "synthetic recording" if self.synthetic else "recording"

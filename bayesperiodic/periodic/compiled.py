@@ -9,8 +9,8 @@ from bayesperiodic.models.cache import load
 NAMES = (
     "CONVERGED", "STALLED", "SINGULAR", "NOT_FINITE", "OTHER_ORBIT", "MAX_ITERATIONS", "MAX_SEGMENTS", "MAX_HALVINGS",
     "STEP_TOLERANCE", "MAX_CHORDS", "CHORD_RATE", "FAR", "LARGEST_PART", "SMALLEST_PART", "factor", "solve",
-    "solve_transposed", "differentiate", "assemble", "factorise", "back_substitute", "scales", "norm", "scaled_step", "newton",
-    "repetitions", "solve_many",
+    "solve_transposed", "differentiate", "assemble", "factorise", "back_substitute", "scales", "norm", "scaled_step",
+    "newton", "repetitions", "solve_many",
 )  # fmt: skip
 GENERIC = "STATES, REACH = 0, 0"
 UNROLLED_STATES, UNROLLED_REACH = 3, (2, 3)

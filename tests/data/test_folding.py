@@ -171,3 +171,23 @@ def test_signal_that_is_not_periodic_is_refused_with_its_measure():
 def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         recording().fold(**({"samples": 800} | arguments))
+
+
+def test_phase_origin_at_a_crossing_is_the_same_wherever_the_recording_begins():
+    """The fundamental of y is cos(2πτ + 0.3) in the recording's time; its upward crossing is τ = 0 here."""
+    for offset in (0.0, 3.17):
+        e = recording(noise=0.0, channels=("y",), offset=offset).fold(100, origin="crossing")
+        assert e.outputs["y"] == pytest.approx(mean_period(2 * np.pi * grid(100) - 0.5 * np.pi - 0.3), abs=1e-9)
+        assert e.origin * FREQUENCY == pytest.approx((-0.25 - 0.3 / (2 * np.pi)) % 1.0, abs=1e-9)
+
+
+def test_drift_is_the_growth_of_the_fundamental_over_the_recording():
+    time = np.arange(5000) / 250.0
+    growth = 1.0 + 0.2 * (time - 10.0) / 20.0
+    grown = bp.Recording.from_arrays(time, {"y": growth * np.cos(2 * np.pi * FREQUENCY * time)}, name="grown")
+    assert grown.fold(64).drift["y"] == pytest.approx(0.2, rel=0.02)
+    assert grown.fold(64, largest_drift=0.25).cycles > 3
+    with pytest.raises(ValueError, match="'grown' is not steady; the fundamental of 'y' changes by .19.* most 10.0%"):
+        grown.fold(64, largest_drift=0.1)
+    with pytest.raises(ValueError, match="largest_drift: 0 is not allowed"):
+        grown.fold(64, largest_drift=0.0)
