@@ -25,7 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--replicates",
         type=int,
         default=0,
-        help="verdicts, pendulum, landing-gear: data sets (default 0); calibration: campaigns (default 20)",
+        help="verdicts, pendulum, landing-gear, flutter: data sets (default 0); calibration: campaigns (default 20)",
     )
     workers = parser.add_mutually_exclusive_group()
     workers.add_argument("--processes", type=int, help="calibration: so many processes on this machine (default: one)")

@@ -1,0 +1,151 @@
+"""Figures of the flutter study."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import bayesperiodic as bp
+from studies.flutter_questions import contraction, sizes
+from studies.flutter_rig import AUTHORS, RIG, SENSORS, Fitted, branch
+
+MEASURED, MODEL, THEIRS = "black", {True: "#0072B2", False: "#D55E00"}, "#999999"
+KIND = {True: "stable", False: "unstable"}
+GRID = np.linspace(13.0, 19.0, 241)
+
+
+def all_of(
+    experiments: Mapping[str, bp.Experiment],
+    speeds: Mapping[str, float],
+    fits: Mapping[str, Fitted],
+    stated: bp.Problem,
+    fit: bp.MapEstimate,
+    posterior: bp.Posterior,
+    draws: int,
+) -> dict[str, Figure]:
+    """Return every figure by its name."""
+    return {
+        "bifurcation": bifurcation(experiments, speeds, stated, fit, posterior, draws),
+        "portraits": portraits(experiments, speeds, fit),
+        "corner": bp.plot.corner(posterior, laplace=fit),
+        "contraction": contractions(fits, any(e.synthetic for e in experiments.values())),
+    }
+
+
+def amplitudes(values: Mapping[str, float]) -> dict[tuple[str, bool], np.ndarray]:
+    """Return the amplitude of each channel over the grid of wind speeds, by branch; NaN where there is no cycle."""
+    _, along = branch(values)
+    stable = np.array([orbit.stable for orbit in along])
+    found = {}
+    for channel in ("heave", "pitch"):
+        size = np.array([sizes(orbit.outputs)[channel] for orbit in along])
+        for kind in (True, False):
+            speed, own = along.values[stable == kind], size[stable == kind]
+            order = np.argsort(speed)
+            found[channel, kind] = np.full(GRID.size, np.nan)
+            if speed.size > 1:
+                found[channel, kind] = np.interp(GRID, speed[order], own[order], left=np.nan, right=np.nan)
+    return found
+
+
+def bifurcation(
+    experiments: Mapping[str, bp.Experiment],
+    speeds: Mapping[str, float],
+    stated: bp.Problem,
+    fit: bp.MapEstimate,
+    posterior: bp.Posterior,
+    draws: int,
+) -> Figure:
+    """Draw amplitudes over wind speed: posterior bands of both branches, the authors' values, what was measured."""
+    from matplotlib import pyplot as plt
+
+    every = np.stack([posterior.draws(name).ravel() for name in stated.names], axis=-1)
+    chosen = every[np.linspace(0, len(every) - 1, draws).astype(int)]
+    bands = [amplitudes(RIG | dict(zip(stated.names, row.tolist(), strict=True))) for row in chosen]
+    best, theirs = amplitudes(RIG | fit.theta), amplitudes(RIG | AUTHORS | SENSORS)
+    figure = plt.figure(figsize=(9.0, 8.0), layout="constrained")
+    for axes, channel in zip(figure.subplots(2, 1, sharex=True), ("heave", "pitch"), strict=True):
+        for kind in (True, False):
+            stack = np.array([band[channel, kind] for band in bands])
+            some = np.mean(np.isfinite(stack), axis=0) > 0.5
+            low, high = np.full((2, GRID.size), np.nan)
+            low[some], high[some] = np.nanquantile(stack[:, some], [0.05, 0.95], axis=0)
+            axes.fill_between(
+                GRID, low, high, color=MODEL[kind], alpha=0.25, lw=0, label=f"{KIND[kind]}, 90 % of draws"
+            )
+            axes.plot(
+                GRID, best[channel, kind], color=MODEL[kind], ls="-" if kind else "--", label=f"{KIND[kind]}, MAP"
+            )
+            label = "authors' values" if kind else None
+            axes.plot(GRID, theirs[channel, kind], color=THEIRS, lw=1.0, ls="-" if kind else "--", label=label)
+        for kind in (True, False):
+            names = [name for name in experiments if name.startswith("unstable") != kind]
+            axes.errorbar(
+                [speeds[name] for name in names],
+                [sizes(experiments[name].outputs)[channel] for name in names],
+                [2.0 * experiments[name].scatter[channel] for name in names],
+                fmt="o" if kind else "s", color=MEASURED, mfc=MODEL[kind], ms=6, capsize=3,
+                label=f"{KIND[kind]}, measured ± 2 sd of one cycle",
+            )  # fmt: skip
+        axes.set_ylabel(f"amplitude of {channel} [sensor units]")
+        axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("wind speed [m/s]")
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, ncols=3, loc="outside lower center", fontsize=9)
+    figure.suptitle(f"Flutter rig{_kind(experiments)}: limit cycles")
+    return figure
+
+
+def portraits(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float], fit: bp.MapEstimate) -> Figure:
+    """Draw pitch over heave, measured and fitted, a panel a cycle."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(11.0, 6.0), layout="constrained")
+    for axes, (name, e) in zip(figure.subplots(2, 4, sharex=True, sharey=True).flat, experiments.items(), strict=False):
+        orbit = fit.solutions[name]
+        kind = not name.startswith("unstable")
+        for values, colour, label in ((e.outputs, MEASURED, "measured"), (orbit.outputs, MODEL[kind], "fitted")):
+            smooth = {c: _smooth(values[c]) for c in ("heave", "pitch")}
+            axes.plot(smooth["heave"], smooth["pitch"], color=colour, lw=1.4, label=f"{label}, {KIND[kind]}")
+        axes.set_title(f"{speeds[name]:g} m/s, {KIND[kind]}", fontsize=10)
+        axes.legend(frameon=False, fontsize=7, loc="lower right")
+    for axes in figure.axes[4:]:
+        axes.set_xlabel("heave [sensor units]")
+    for axes in figure.axes[::4]:
+        axes.set_ylabel("pitch [sensor units]")
+    figure.suptitle(f"Flutter rig{_kind(experiments)}: measured and fitted cycles")
+    return figure
+
+
+def contractions(fits: Mapping[str, Fitted], synthetic: bool) -> Figure:
+    """Draw posterior sd over prior sd of each parameter, from the stable cycles, the unstable ones, and both."""
+    from matplotlib import pyplot as plt
+
+    table = contraction(fits)
+    names = list(table)
+    figure = plt.figure(figsize=(8.0, 5.5), layout="constrained")
+    axes = figure.subplots()
+    for number, (kind, colour) in enumerate(zip(fits, (MODEL[True], MODEL[False], MEASURED), strict=True)):
+        at = np.arange(len(names)) + 0.26 * (number - 1)
+        axes.barh(at, [table[name][kind]["over_prior"] for name in names], 0.24, color=colour, label=f"{kind} cycles")
+    axes.axvline(1.0, color=THEIRS, lw=1.0, ls="--", label="prior")
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set_xlabel("Laplace sd over the prior's sd [1]")
+    figure.legend(frameon=False, ncols=4, loc="outside lower center")
+    figure.suptitle(f"Flutter rig{', synthetic data' if synthetic else ''}: what the cycles tell of each parameter")
+    return figure
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    """Return a closed curve through the samples of a cycle, by its Fourier series."""
+    amplitudes = np.fft.rfft(values)
+    curve = np.fft.irfft(amplitudes, 256) * 256 / values.size
+    return np.append(curve, curve[0])
+
+
+def _kind(experiments: Mapping[str, bp.Experiment]) -> str:
+    return ", synthetic data" if any(e.synthetic for e in experiments.values()) else ""

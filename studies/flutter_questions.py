@@ -1,0 +1,188 @@
+"""What the flutter study asks of the fits: what unstable cycles add, what is predicted, how large the misfit is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+import bayesperiodic as bp
+from studies.flutter_rig import (
+    AUTHORS,
+    MODEL,
+    PRIORS,
+    RIG,
+    SENSORS,
+    SPRINGS,
+    START,
+    Fitted,
+    branch,
+    estimate,
+    problem,
+)
+
+NEAR = 0.25
+DRAWS = 60
+FREE_SCALES = ("gain_heave", "gain_pitch")
+CHANNELS = ("heave", "pitch")
+
+
+def sizes(outputs: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return half the range of each channel over the cycle, in sensor units."""
+    return {channel: 0.5 * float(np.ptp(outputs[channel])) for channel in CHANNELS}
+
+
+def errors(fitted: Fitted, experiments: Mapping[str, bp.Experiment]) -> dict[str, Any]:
+    """Return by how much the fitted cycles miss the measured ones, and whether they are of the right stability."""
+    found = {}
+    for name, e in experiments.items():
+        orbit, measured = fitted.fit.solutions[name], sizes(e.outputs)
+        found[name] = {
+            "amplitude_error": {c: v / measured[c] - 1.0 for c, v in sizes(orbit.outputs).items()},
+            "frequency_error": orbit.frequency / e.frequency - 1.0,
+            "stable": orbit.stable,
+            "as_measured": orbit.stable == (not name.startswith("unstable")),
+        }
+    return found
+
+
+def authors_errors(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float]) -> dict[str, Any]:
+    """Return the same for the authors' values and sensor units; None and why where they have no cycle."""
+    point, along = branch(RIG | AUTHORS | SENSORS)
+    found: dict[str, Any] = {}
+    for name, e in experiments.items():
+        try:
+            orbits = bp.solutions_at(MODEL, along, speeds[name])
+        except ValueError as error:
+            why = str(error) + f" The Hopf point is at {point.value:.6g} m/s."
+            found[name] = {"amplitude_error": None, "frequency_error": None, "why": why}
+            continue
+        orbit = next(o for o in orbits if o.stable == (not name.startswith("unstable")))
+        measured = sizes(e.outputs)
+        found[name] = {
+            "amplitude_error": {c: v / measured[c] - 1.0 for c, v in sizes(orbit.outputs).items()},
+            "frequency_error": orbit.frequency / e.frequency - 1.0,
+        }
+    return found
+
+
+def mean_size(found: Mapping[str, Any]) -> float | None:
+    """Return the root mean square of all amplitude errors, None where a cycle is missing altogether."""
+    each = [v for one in found.values() if one["amplitude_error"] for v in one["amplitude_error"].values()]
+    return float(np.sqrt(np.mean(np.square(each)))) if each else None
+
+
+def subsets(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float], both: Fitted) -> dict[str, Fitted]:
+    """Return the fits to the stable cycles alone, to the unstable ones alone, and to both."""
+    found = {"both": both}
+    for kind in ("stable", "unstable"):
+        own = {name: e for name, e in experiments.items() if name.startswith("unstable") == (kind == "unstable")}
+        found[kind] = estimate(own, speeds, start=START | both.fit.theta)
+    return {kind: found[kind] for kind in ("stable", "unstable", "both")}
+
+
+def contraction(fits: Mapping[str, Fitted]) -> dict[str, dict[str, dict[str, float]]]:
+    """Return estimate, Laplace and robust sd, and sd over the prior's sd, by parameter and data."""
+    generator = np.random.default_rng(0)
+    prior = {name: float(np.std(one.sample(20_000, generator))) for name, one in PRIORS.items()}
+    gain = PRIORS["gain_pitch"].sample(20_000, generator)
+    draws = {n: PRIORS[n].sample(20_000, generator) for n in ("k_alpha2", "k_alpha3")}
+    prior["k_alpha2 at gain 1"] = float(np.std(draws["k_alpha2"] / gain))
+    prior["k_alpha3 at gain 1"] = float(np.std(draws["k_alpha3"] / gain**2))
+    table: dict[str, dict[str, dict[str, float]]] = {}
+    for kind, fitted in fits.items():
+        fit = fitted.fit
+        values, sds = dict(fit.theta), dict(fit.sd)
+        for name, (value, sd) in springs(fit).items():
+            values[name], sds[name] = value, sd
+        for name, value in values.items():
+            row = {"estimate": value, "sd": sds[name], "over_prior": sds[name] / prior[name]}
+            if name in fit.robust_sd:
+                row["robust_sd"] = fit.robust_sd[name]
+            table.setdefault(name, {})[kind] = row
+    return table
+
+
+def springs(fit: bp.MapEstimate) -> dict[str, tuple[float, float]]:
+    """Return the nonlinear stiffnesses in units of the pitch sensor, which no scale can touch, with their sds."""
+    gain = fit.theta["gain_pitch"]
+    found = {}
+    for power, (name, spring) in enumerate(zip(SPRINGS, ("k_alpha2", "k_alpha3"), strict=True), 1):
+        value = fit.theta[spring] / gain**power
+        slopes = np.array([value / fit.theta[spring], -power * value / gain])
+        block = fit.covariance.loc[[spring, "gain_pitch"], [spring, "gain_pitch"]].to_numpy()
+        found[name] = value, float(np.sqrt(slopes @ block @ slopes))
+    return found
+
+
+def groups(speeds: Mapping[str, float]) -> list[list[str]]:
+    """Return the names of the records by wind speed, those within a quarter of a metre per second together."""
+    found: list[list[str]] = []
+    for name in sorted(speeds, key=lambda name: speeds[name]):
+        if found and speeds[name] - speeds[found[-1][0]] < NEAR:
+            found[-1].append(name)
+        else:
+            found.append([name])
+    return found
+
+
+def leave_out(
+    experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float], both: Fitted, left: list[str]
+) -> dict[str, Any]:
+    """Return how the fit without some cycles predicts them."""
+    kept = {name: e for name, e in experiments.items() if name not in left}
+    return predictions(estimate(kept, speeds, start=START | both.fit.theta), both, left)
+
+
+def predictions(fitted: Fitted, both: Fitted, left: list[str], seed: int = 0) -> dict[str, Any]:
+    """Return the errors of cycles that were not fitted: in per cent, in posterior sds, and with the model's error.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        Without them.
+    both : Fitted
+        With all cycles: its problem follows each orbit on its own branch.
+    left : list of str
+    seed : int
+        Of the draws from the Laplace approximation.
+    """
+    fit, whole = fitted.fit, both.problem.anchored(both.problem.vector(both.fit.theta))
+    covariance = fit.covariance.to_numpy()
+    draws = np.random.default_rng(seed).multivariate_normal(fitted.problem.vector(fit.theta), covariance, size=DRAWS)
+    theta = np.vstack([fitted.problem.vector(fit.theta), draws])
+    measured = {e.name: e for e in whole.experiments}
+    misses = [
+        v / sizes(e.outputs)[c] - 1.0
+        for e in fitted.problem.experiments
+        for c, v in sizes(fit.solutions[e.name].outputs).items()
+    ]
+    model = float(np.sqrt(np.mean(np.square(misses))))
+    found: dict[str, Any] = {}
+    own = {"left": problem([measured[n] for n in left], _speeds(whole), frequency_error=both.frequency_error)}
+    near = own["left"].anchored(both.problem.vector(both.fit.theta), {n: both.fit.solutions[n].states for n in left})
+    # One orbit may be lost where another exists.
+    for name in left:
+        single = problem([measured[name]], _speeds(whole), frequency_error=both.frequency_error)
+        single = single.anchored(near.vector(both.fit.theta), {name: both.fit.solutions[name].states})
+        outputs, converged = single.outputs(theta)
+        found[name] = {
+            "draws_with_a_cycle": int(converged[1:].sum()),
+            "draws": DRAWS,
+            "cycle_at_map": bool(converged[0]),
+        }
+        for channel in CHANNELS if converged[0] else ():
+            range_ = 0.5 * np.ptp(outputs[name][channel], axis=-1)
+            size, sd = sizes(measured[name].outputs)[channel], float(range_[1:][converged[1:]].std())
+            off = float(range_[0]) - size
+            found[name][channel] = {
+                "error": off / size,
+                "posterior_sds": off / sd,
+                "sds_with_model_error": off / float(np.hypot(sd, model * size)),
+            }
+    return found
+
+
+def _speeds(whole: bp.Problem) -> dict[str, float]:
+    return whole.fixed["U"]

@@ -1,0 +1,120 @@
+"""What is known of the flutter rig, its cycles by continuation from the Hopf point, and the problem that is solved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import bayesperiodic as bp
+
+MODEL = bp.models.flutter
+SAMPLES, SCHEME = 16, "fourier"
+# As published with the data, in SI units.
+RIG = {
+    "b": 0.15, "span": 1.0, "a": -0.5, "rho": 1.204, "x_alpha": 0.234, "m": 5.3, "m_T": 16.9, "I_alpha": 0.1726,
+    "k_h": 3529.4,
+}  # fmt: skip
+AUTHORS = {"c_h": 15.443, "c_alpha": 0.562767, "k_alpha": 54.1162, "k_alpha2": 751.6, "k_alpha3": 5006.0}
+# One unit of the heave sensor is 18 cm, the pitch sensor reads rad; so the authors' code plots them.
+SENSORS = {"gain_heave": 1 / 0.18, "gain_pitch": 1.0, "offset_heave": 3.37, "offset_pitch": 0.71}
+# Near what the measured cycles give: all eight kinds of cycles exist there.
+TRUE = {
+    "c_h": 6.8, "c_alpha": 0.254, "k_alpha": 56.5, "k_alpha2": 684.0, "k_alpha3": 4577.0, "gain_heave": 7.16,
+    "gain_pitch": 0.752, "offset_heave": 3.357, "offset_pitch": 0.7213,
+}  # fmt: skip
+# With a larger k_alpha2 than the authors' the fold lies below all measured speeds, so that every cycle exists.
+START = AUTHORS | SENSORS | {"k_alpha2": 900.0}
+SPREADS = {
+    "c_h": 0.3, "c_alpha": 0.3, "k_alpha": 0.1, "k_alpha2": 0.5, "k_alpha3": 0.5, "gain_heave": 0.3, "gain_pitch": 0.3,
+}  # fmt: skip
+PRIORS: dict[str, Any] = {n: bp.LogNormal(START[n], s) for n, s in SPREADS.items()} | {
+    "offset_heave": bp.Normal(SENSORS["offset_heave"], 0.1),
+    "offset_pitch": bp.Normal(SENSORS["offset_pitch"], 0.1),
+}
+SPRINGS = {"k_alpha2 at gain 1": "k_alpha2/gain_pitch", "k_alpha3 at gain 1": "k_alpha3/gain_pitch**2"}
+FIRST_AMPLITUDE, LOWEST_SPEED, LONGEST_STEP = 5e-3, 8.0, 1.0
+FIRST_SHARE, ROUNDS = 0.01, 2
+
+
+class Fitted(NamedTuple):
+    """A problem, its MAP point, and the error [Hz] that was allowed the model's frequencies."""
+
+    problem: bp.Problem
+    fit: bp.MapEstimate
+    frequency_error: float
+
+
+def branch(values: Mapping[str, float]) -> tuple[bp.HopfPoint, bp.Branch]:
+    """Return the Hopf point and the cycles that start there, unstable and then stable, along the wind speed."""
+    point = bp.hopf_points(MODEL, values, "U", between=(5.0, 25.0))[0]
+    amplitude = {"alpha": FIRST_AMPLITUDE}
+    first = bp.emerging_cycle(MODEL, point, amplitude=amplitude, samples=SAMPLES, scheme=SCHEME)
+    along = bp.continue_periodic(MODEL, first, "U", until=LOWEST_SPEED, step=LONGEST_STEP, progress=False)
+    return point, along
+
+
+def cycles(values: Mapping[str, float], speeds: Mapping[str, float]) -> dict[str, bp.PeriodicSolution]:
+    """Return the cycle of each record at its speed [m/s]: the unstable one, or the stable one, as its name says.
+
+    Raises
+    ------
+    ValueError
+        Where the model has no such cycle; the nearest fold or end of the branch is told.
+    """
+    along, found = branch(values)[1], {}
+    for name, speed in speeds.items():
+        orbits = bp.solutions_at(MODEL, along, speed)
+        fitting = [orbit for orbit in orbits if orbit.stable == (not name.startswith("unstable"))]
+        if not fitting:
+            raise ValueError(f"speeds: {name!r} at {speed:g} m/s is not allowed; the model has no such cycle there.")
+        found[name] = fitting[0] if name.startswith("unstable") else fitting[-1]
+    return found
+
+
+def problem(
+    experiments: Sequence[bp.Experiment],
+    speeds: Mapping[str, float],
+    *,
+    frequency_error: float,
+    known: Mapping[str, float] | None = None,
+    noise: Any = "circulant",
+) -> bp.Problem:
+    """Return the problem of some cycles, the model's frequency allowed an error [Hz] beside the measured one's.
+
+    The delay of the outputs is fixed: τ = 0 is where the fundamental of heave says, in the data and in the model.
+    """
+    known = dict(known or {})
+    allowed = [replace(e, frequency_se=float(np.hypot(e.frequency_se, frequency_error))) for e in experiments]
+    fixed: dict[str, Any] = RIG | known | {"U": {e.name: speeds[e.name] for e in experiments}, "shift": 0.0}
+    priors = {name: prior for name, prior in PRIORS.items() if name not in known}
+    return bp.Problem(MODEL, allowed, priors=priors, fixed=fixed, noise=noise, scheme=SCHEME)
+
+
+def estimate(
+    experiments: Mapping[str, bp.Experiment],
+    speeds: Mapping[str, float],
+    start: Mapping[str, float] = START,
+    known: Mapping[str, float] | None = None,
+) -> Fitted:
+    """Return the MAP point; the frequency's error is what the last fit but one left, root mean square.
+
+    A model that misses the frequencies by more than their standard errors must not be held to these. The way starts at
+    the medians of the priors, on orbits of the right branch, and is followed to `start`.
+    """
+    known = dict(known or {})
+    orbits = cycles(RIG | START | known, {name: speeds[name] for name in experiments})
+    guessed = [replace(e, guess=orbits[name].states) for name, e in experiments.items()]
+    error = FIRST_SHARE * float(np.mean([e.frequency for e in guessed]))
+    point = {name: value for name, value in start.items() if name in PRIORS and name not in known}
+    for _ in range(ROUNDS):
+        stated = problem(guessed, speeds, frequency_error=error, known=known)
+        fit = bp.map_estimate(stated, start=point, progress=False)
+        missed = [fit.solutions[e.name].frequency - e.frequency for e in guessed]
+        measured = float(np.sqrt(np.mean([e.frequency_se**2 for e in guessed])))
+        error = float(np.sqrt(max(np.mean(np.square(missed)) - measured**2, 0.0)))
+        point = dict(fit.theta)
+    stated = problem(guessed, speeds, frequency_error=error, known=known)
+    return Fitted(stated, bp.map_estimate(stated, start=point, progress=False), error)
