@@ -17,10 +17,9 @@ import bayesperiodic as bp
 from studies import common, flutter_campaigns, flutter_figures, flutter_questions
 from studies.flutter_data import ADDRESS, LARGEST_DRIFT, RULE, SHA256, Record, read_records, spectral_frequency, usable
 from studies.flutter_questions import FREE_SCALES
-from studies.flutter_rig import AUTHORS, MODEL, RIG, SENSORS, TRUE, Fitted, branch, estimate, problem
+from studies.flutter_rig import AUTHORS, MODEL, RIG, SENSORS, TRUE, Fitted, cycles, estimate, problem
 
-SAMPLING: dict[str, Any] = {"ensembles": 2, "walkers": 24, "max_steps": 150, "executor": 2, "progress": False}
-QUICK: dict[str, Any] = {"ensembles": 2, "walkers": 24, "max_steps": 4, "progress": False}
+SAMPLING: dict[str, Any] = {"ensembles": 2, "walkers": 24, "max_steps": 250, "executor": 2, "progress": False}
 
 
 def run(options: argparse.Namespace) -> None:
@@ -45,22 +44,25 @@ def run(options: argparse.Namespace) -> None:
         left = left_out(experiments, speeds, fits, options.quick)
     with watch.part("structure", "asking what the equations leave open"):
         structure = bp.structure(MODEL, fixed=[n for n in MODEL.parameters if n in RIG or n in ("U", "c_h", "c_alpha")])
-    with watch.part("sample", "sampling the posterior"):
+    with watch.part("sample", "estimating with the noise's shape known" if options.quick else "sampling the posterior"):
         stated = with_known_noise(both, experiments, speeds)
         fit = bp.map_estimate(stated, start=both.fit.theta, progress=False)
-        posterior = bp.sample(stated, fit, seed=options.seed, **(QUICK if options.quick else SAMPLING))
-        verdicts = bp.compare(stated, fit, posterior), bp.identifiability(stated, fit, posterior)
+        posterior = None if options.quick else bp.sample(stated, fit, seed=options.seed, **SAMPLING)
+        verdict = posterior and bp.identifiability(stated, fit, posterior)
+        compared = posterior and bp.compare(stated, fit, posterior)
     with watch.part("figures", "drawing"):
-        figures = flutter_figures.all_of(experiments, speeds, fits, stated, fit, posterior, 4 if options.quick else 40)
+        draws = 4 if options.quick else 40
+        figures = flutter_figures.all_of(experiments, speeds, fits, fit, posterior, draws)
         paths = common.save_figures(options.out, figures)
 
     results = {"data": data, "seed": options.seed, "quick": options.quick, "rule": RULE, "refused": refused}
     results |= {"records": account_of(records, experiments), "authors_branch": known}
     results |= collect(both, fits, experiments, authors, left)
     results["structure"] = {"text": str(structure), "free_scales": FREE_SCALES}
-    results["posterior"] = draws_of(posterior, fit, verdicts)
+    results["verdicts"] = verdict and verdict.table["verdict"].to_dict()
+    results["posterior"] = posterior and compared and draws_of(posterior, fit, compared)
     results |= {"seconds": watch.total(), "versions": common.versions()}
-    print("\n" + tables(results) + f"\n{structure}\n{verdicts[0]}\n{verdicts[1]}\n")
+    print("\n" + tables(results) + f"\n{structure}\n{verdict or ''}\n{compared or ''}\n")
     path = common.write_results(options.out, results)
     print(f"figures{' (synthetic data)' if data['synthetic'] else ''}: {', '.join(map(str, paths))}\nresults: {path}")
 
@@ -108,11 +110,11 @@ def account_of(records: list[Record], experiments: dict[str, bp.Experiment]) -> 
 
 def hopf_and_fold() -> dict[str, float]:
     """Return where the authors' values have their Hopf point and their fold."""
-    point, along = branch(RIG | AUTHORS | SENSORS)
-    fold = along.folds[0]
+    along = cycles(RIG | AUTHORS | SENSORS)
+    fold = along.branches[0].folds[0]
     return {
-        "hopf_speed": point.value,
-        "hopf_frequency": point.frequency,
+        "hopf_speed": along.hopf.value,
+        "hopf_frequency": along.hopf.frequency,
         "fold_speed": fold.parameters["U"],
         "fold_frequency": fold.frequency,
     }
@@ -125,8 +127,8 @@ def left_out(
     both = fits["both"]
     names = {kind: [n for n in experiments if n.startswith("unstable") == (kind == "unstable")] for kind in fits}
     found = {
-        "unstable from stable": flutter_questions.predictions(fits["stable"], both, names["unstable"]),
-        "stable from unstable": flutter_questions.predictions(fits["unstable"], both, names["stable"]),
+        "unstable from stable": flutter_questions.predictions(fits["stable"], experiments, speeds, names["unstable"]),
+        "stable from unstable": flutter_questions.predictions(fits["unstable"], experiments, speeds, names["stable"]),
     }
     for group in flutter_questions.groups(speeds)[: 1 if quick else None]:
         label = " and ".join(sorted({f"{speeds[name]:g}" for name in group}))
@@ -178,7 +180,7 @@ def collect(
     }
 
 
-def draws_of(posterior: bp.Posterior, fit: bp.MapEstimate, verdicts: tuple[Any, Any]) -> dict[str, Any]:
+def draws_of(posterior: bp.Posterior, fit: bp.MapEstimate, compared: bp.Comparison) -> dict[str, Any]:
     """Return what the draws say, beside Laplace."""
     names = list(fit.theta)
     return {
@@ -188,14 +190,14 @@ def draws_of(posterior: bp.Posterior, fit: bp.MapEstimate, verdicts: tuple[Any, 
         "mean": {n: float(posterior.draws(n).mean()) for n in names},
         "sd": {n: float(posterior.draws(n).std()) for n in names},
         "laplace_sd": {n: fit.sd[n] for n in names},
-        "correlation_of_k_alpha2_and_gain_pitch": float(
-            np.corrcoef(np.log(posterior.draws("k_alpha2").ravel()), np.log(posterior.draws("gain_pitch").ravel()))[
-                0, 1
-            ]
-        ),
-        "laplace_verdicts": verdicts[0].table["verdict"].to_dict(),
-        "verdicts": verdicts[1].table["verdict"].to_dict(),
+        "correlation_of_logarithms": _correlation(posterior, "k_alpha2", "gain_pitch"),
+        "laplace_verdicts": compared.table["verdict"].to_dict(),
     }
+
+
+def _correlation(posterior: bp.Posterior, one: str, other: str) -> float:
+    """Return the correlation of two parameters' logarithms: that of a ridge on which their ratio stays is 1."""
+    return float(np.corrcoef(*(np.log(posterior.draws(name).ravel()) for name in (one, other)))[0, 1])
 
 
 def tables(results: dict[str, Any]) -> str:
@@ -224,13 +226,15 @@ def tables(results: dict[str, Any]) -> str:
     lines += ["", "cycles that were not fitted: error, in posterior sds, in sds with the model's error"]
     for case, found in results["predictions"].items():
         for name, one in found.items():
-            said = [
-                f"{c} {one[c]['error']:+.1%} ({one[c]['posterior_sds']:+.1f}, {one[c]['sds_with_model_error']:+.1f})"
-                for c in ("heave", "pitch")
-                if c in one
-            ]
+            said = [_missed(c, one[c]) for c in ("heave", "pitch") if c in one]
             lines.append(f"  {case:22s} {name:17s} " + (", ".join(said) or "no cycle"))
     return "\n".join(lines)
+
+
+def _missed(channel: str, one: dict[str, float]) -> str:
+    if "posterior_sds" not in one:
+        return f"{channel} {one['error']:+.1%} (few draws have the cycle)"
+    return f"{channel} {one['error']:+.1%} ({one['posterior_sds']:+.1f}, {one['sds_with_model_error']:+.1f})"
 
 
 def _per_cent(one: dict[str, Any]) -> str:

@@ -80,10 +80,10 @@ def generate(seed: int) -> list[Record]:
     The noise gives one cycle, within the harmonics kept, the scatter of the measured records.
     """
     generator = np.random.default_rng(seed)
-    orbits = cycles(RIG | TRUE, {name: kind[0] for name, kind in KINDS.items()})
+    along = cycles(RIG | TRUE)
     time, records = STEP * np.arange(ROWS), []
     for name, (speed, *scatter) in KINDS.items():
-        orbit = orbits[name]
+        orbit = along.at(name, speed)
         phase = orbit.frequency * time + generator.uniform()
         spread = np.sqrt(1.0 / (STEP * orbit.frequency) / (2 * HARMONICS + 1))
         outputs = {

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
 from studies.flutter_questions import contraction, sizes
-from studies.flutter_rig import AUTHORS, RIG, SENSORS, Fitted, branch
+from studies.flutter_rig import AUTHORS, RIG, SENSORS, Fitted, cycles
 
 MEASURED, MODEL, THEIRS = "black", {True: "#0072B2", False: "#D55E00"}, "#999999"
 KIND = {True: "stable", False: "unstable"}
@@ -20,50 +20,55 @@ def all_of(
     experiments: Mapping[str, bp.Experiment],
     speeds: Mapping[str, float],
     fits: Mapping[str, Fitted],
-    stated: bp.Problem,
     fit: bp.MapEstimate,
-    posterior: bp.Posterior,
+    posterior: bp.Posterior | None,
     draws: int,
 ) -> dict[str, Figure]:
-    """Return every figure by its name."""
-    return {
-        "bifurcation": bifurcation(experiments, speeds, stated, fit, posterior, draws),
+    """Return every figure by its name; without a posterior the bands are Laplace's, and there is no corner plot."""
+    names = list(fit.theta)
+    if posterior is None:
+        generator = np.random.default_rng(0)
+        rows = generator.multivariate_normal(list(fit.theta.values()), fit.covariance.to_numpy(), size=draws)
+    else:
+        every = np.stack([posterior.draws(name).ravel() for name in names], axis=-1)
+        rows = every[np.linspace(0, len(every) - 1, draws).astype(int)]
+    chosen = [dict(zip(names, row.tolist(), strict=True)) for row in rows]
+    figures = {
+        "bifurcation": bifurcation(experiments, speeds, fit, chosen),
         "portraits": portraits(experiments, speeds, fit),
-        "corner": bp.plot.corner(posterior, laplace=fit),
         "contraction": contractions(fits, any(e.synthetic for e in experiments.values())),
     }
+    return figures if posterior is None else figures | {"corner": bp.plot.corner(posterior, laplace=fit)}
 
 
 def amplitudes(values: Mapping[str, float]) -> dict[tuple[str, bool], np.ndarray]:
     """Return the amplitude of each channel over the grid of wind speeds, by branch; NaN where there is no cycle."""
-    _, along = branch(values)
-    stable = np.array([orbit.stable for orbit in along])
-    found = {}
-    for channel in ("heave", "pitch"):
-        size = np.array([sizes(orbit.outputs)[channel] for orbit in along])
-        for kind in (True, False):
-            speed, own = along.values[stable == kind], size[stable == kind]
-            order = np.argsort(speed)
-            found[channel, kind] = np.full(GRID.size, np.nan)
-            if speed.size > 1:
-                found[channel, kind] = np.interp(GRID, speed[order], own[order], left=np.nan, right=np.nan)
+    found = {(channel, kind): np.full(GRID.size, np.nan) for channel in ("heave", "pitch") for kind in KIND}
+    try:
+        branches = cycles(values).branches
+    except ValueError:
+        return found
+    orbits = [orbit for along in branches for orbit in along]
+    for kind in KIND:
+        own = sorted((o for o in orbits if o.stable == kind), key=lambda orbit: orbit.parameters["U"])
+        if len(own) > 1:
+            speed = [orbit.parameters["U"] for orbit in own]
+            for channel in ("heave", "pitch"):
+                size = [sizes(orbit.outputs)[channel] for orbit in own]
+                found[channel, kind] = np.interp(GRID, speed, size, left=np.nan, right=np.nan)
     return found
 
 
 def bifurcation(
     experiments: Mapping[str, bp.Experiment],
     speeds: Mapping[str, float],
-    stated: bp.Problem,
     fit: bp.MapEstimate,
-    posterior: bp.Posterior,
-    draws: int,
+    draws: Sequence[Mapping[str, float]],
 ) -> Figure:
     """Draw amplitudes over wind speed: posterior bands of both branches, the authors' values, what was measured."""
     from matplotlib import pyplot as plt
 
-    every = np.stack([posterior.draws(name).ravel() for name in stated.names], axis=-1)
-    chosen = every[np.linspace(0, len(every) - 1, draws).astype(int)]
-    bands = [amplitudes(RIG | dict(zip(stated.names, row.tolist(), strict=True))) for row in chosen]
+    bands = [amplitudes(RIG | dict(values)) for values in draws]
     best, theirs = amplitudes(RIG | fit.theta), amplitudes(RIG | AUTHORS | SENSORS)
     figure = plt.figure(figsize=(9.0, 8.0), layout="constrained")
     for axes, channel in zip(figure.subplots(2, 1, sharex=True), ("heave", "pitch"), strict=True):
@@ -72,14 +77,11 @@ def bifurcation(
             some = np.mean(np.isfinite(stack), axis=0) > 0.5
             low, high = np.full((2, GRID.size), np.nan)
             low[some], high[some] = np.nanquantile(stack[:, some], [0.05, 0.95], axis=0)
-            axes.fill_between(
-                GRID, low, high, color=MODEL[kind], alpha=0.25, lw=0, label=f"{KIND[kind]}, 90 % of draws"
-            )
-            axes.plot(
-                GRID, best[channel, kind], color=MODEL[kind], ls="-" if kind else "--", label=f"{KIND[kind]}, MAP"
-            )
+            colour, style = MODEL[kind], "-" if kind else "--"
+            axes.fill_between(GRID, low, high, color=colour, alpha=0.25, lw=0, label=f"{KIND[kind]}, 90 % of draws")
+            axes.plot(GRID, best[channel, kind], color=colour, ls=style, label=f"{KIND[kind]}, MAP")
             label = "authors' values" if kind else None
-            axes.plot(GRID, theirs[channel, kind], color=THEIRS, lw=1.0, ls="-" if kind else "--", label=label)
+            axes.plot(GRID, theirs[channel, kind], color=THEIRS, lw=1.0, ls=style, label=label)
         for kind in (True, False):
             names = [name for name in experiments if name.startswith("unstable") != kind]
             axes.errorbar(

@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 import bayesperiodic as bp
-from studies.flutter_rig import (
-    AUTHORS,
-    MODEL,
-    PRIORS,
-    RIG,
-    SENSORS,
-    SPRINGS,
-    START,
-    Fitted,
-    branch,
-    estimate,
-    problem,
-)
+from studies.flutter_rig import AUTHORS, PRIORS, RIG, SENSORS, SPRINGS, START, Fitted, cycles, estimate
 
 NEAR = 0.25
-DRAWS = 60
+DRAWS, FEWEST = 20, 4
 FREE_SCALES = ("gain_heave", "gain_pitch")
 CHANNELS = ("heave", "pitch")
 
@@ -49,16 +38,14 @@ def errors(fitted: Fitted, experiments: Mapping[str, bp.Experiment]) -> dict[str
 
 def authors_errors(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float]) -> dict[str, Any]:
     """Return the same for the authors' values and sensor units; None and why where they have no cycle."""
-    point, along = branch(RIG | AUTHORS | SENSORS)
+    along = cycles(RIG | AUTHORS | SENSORS)
     found: dict[str, Any] = {}
     for name, e in experiments.items():
         try:
-            orbits = bp.solutions_at(MODEL, along, speeds[name])
+            orbit = along.at(name, speeds[name])
         except ValueError as error:
-            why = str(error) + f" The Hopf point is at {point.value:.6g} m/s."
-            found[name] = {"amplitude_error": None, "frequency_error": None, "why": why}
+            found[name] = {"amplitude_error": None, "frequency_error": None, "why": str(error)}
             continue
-        orbit = next(o for o in orbits if o.stable == (not name.startswith("unstable")))
         measured = sizes(e.outputs)
         found[name] = {
             "amplitude_error": {c: v / measured[c] - 1.0 for c, v in sizes(orbit.outputs).items()},
@@ -132,27 +119,34 @@ def leave_out(
 ) -> dict[str, Any]:
     """Return how the fit without some cycles predicts them."""
     kept = {name: e for name, e in experiments.items() if name not in left}
-    return predictions(estimate(kept, speeds, start=START | both.fit.theta), both, left)
+    return predictions(estimate(kept, speeds, start=START | both.fit.theta), experiments, speeds, left)
 
 
-def predictions(fitted: Fitted, both: Fitted, left: list[str], seed: int = 0) -> dict[str, Any]:
+def predictions(
+    fitted: Fitted,
+    experiments: Mapping[str, bp.Experiment],
+    speeds: Mapping[str, float],
+    left: Sequence[str],
+    seed: int = 0,
+) -> dict[str, Any]:
     """Return the errors of cycles that were not fitted: in per cent, in posterior sds, and with the model's error.
 
     Parameters
     ----------
     fitted : Fitted
         Without them.
-    both : Fitted
-        With all cycles: its problem follows each orbit on its own branch.
+    experiments : mapping of str to Experiment
+    speeds : mapping of str to float
+        [m/s].
     left : list of str
     seed : int
         Of the draws from the Laplace approximation.
     """
-    fit, whole = fitted.fit, both.problem.anchored(both.problem.vector(both.fit.theta))
-    covariance = fit.covariance.to_numpy()
-    draws = np.random.default_rng(seed).multivariate_normal(fitted.problem.vector(fit.theta), covariance, size=DRAWS)
-    theta = np.vstack([fitted.problem.vector(fit.theta), draws])
-    measured = {e.name: e for e in whole.experiments}
+    fit, names = fitted.fit, list(fitted.fit.theta)
+    generator = np.random.default_rng(seed)
+    draws = generator.multivariate_normal(list(fit.theta.values()), fit.covariance.to_numpy(), size=DRAWS)
+    every = [_sizes_at(dict(zip(names, row.tolist(), strict=True)), speeds, left) for row in draws]
+    best = _sizes_at(fit.theta, speeds, left)
     misses = [
         v / sizes(e.outputs)[c] - 1.0
         for e in fitted.problem.experiments
@@ -160,29 +154,30 @@ def predictions(fitted: Fitted, both: Fitted, left: list[str], seed: int = 0) ->
     ]
     model = float(np.sqrt(np.mean(np.square(misses))))
     found: dict[str, Any] = {}
-    own = {"left": problem([measured[n] for n in left], _speeds(whole), frequency_error=both.frequency_error)}
-    near = own["left"].anchored(both.problem.vector(both.fit.theta), {n: both.fit.solutions[n].states for n in left})
-    # One orbit may be lost where another exists.
     for name in left:
-        single = problem([measured[name]], _speeds(whole), frequency_error=both.frequency_error)
-        single = single.anchored(near.vector(both.fit.theta), {name: both.fit.solutions[name].states})
-        outputs, converged = single.outputs(theta)
-        found[name] = {
-            "draws_with_a_cycle": int(converged[1:].sum()),
-            "draws": DRAWS,
-            "cycle_at_map": bool(converged[0]),
-        }
-        for channel in CHANNELS if converged[0] else ():
-            range_ = 0.5 * np.ptp(outputs[name][channel], axis=-1)
-            size, sd = sizes(measured[name].outputs)[channel], float(range_[1:][converged[1:]].std())
-            off = float(range_[0]) - size
-            found[name][channel] = {
-                "error": off / size,
-                "posterior_sds": off / sd,
-                "sds_with_model_error": off / float(np.hypot(sd, model * size)),
-            }
+        predicted = [there for one in every if (there := one[name]) is not None]
+        found[name] = {"draws_with_a_cycle": len(predicted), "draws": DRAWS, "cycle_at_map": best[name] is not None}
+        for channel, at_map in (best[name] or {}).items():
+            size = sizes(experiments[name].outputs)[channel]
+            off = at_map - size
+            found[name][channel] = {"error": off / size}
+            if len(predicted) >= FEWEST:
+                sd = float(np.std([one[channel] for one in predicted]))
+                with_model = float(np.hypot(sd, model * size))
+                found[name][channel] |= {"posterior_sds": off / sd, "sds_with_model_error": off / with_model}
     return found
 
 
-def _speeds(whole: bp.Problem) -> dict[str, float]:
-    return whole.fixed["U"]
+def _sizes_at(
+    values: Mapping[str, float], speeds: Mapping[str, float], names: Sequence[str]
+) -> dict[str, dict[str, float] | None]:
+    """Return the amplitudes of the cycles of some records by the model, None where it has no such cycle."""
+    found: dict[str, dict[str, float] | None] = dict.fromkeys(names)
+    try:
+        along = cycles(RIG | dict(values))
+    except ValueError:
+        return found
+    for name in names:
+        with suppress(ValueError):
+            found[name] = sizes(along.at(name, speeds[name]).outputs)
+    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -35,7 +36,8 @@ PRIORS: dict[str, Any] = {n: bp.LogNormal(START[n], s) for n, s in SPREADS.items
     "offset_pitch": bp.Normal(SENSORS["offset_pitch"], 0.1),
 }
 SPRINGS = {"k_alpha2 at gain 1": "k_alpha2/gain_pitch", "k_alpha3 at gain 1": "k_alpha3/gain_pitch**2"}
-FIRST_AMPLITUDE, LOWEST_SPEED, LONGEST_STEP = 5e-3, 8.0, 1.0
+FIRST_AMPLITUDE, LONGEST_STEP = 5e-3, 1.0
+LOWEST_SPEED, HIGHEST_SPEED, SEARCHED = 8.0, 19.5, (5.0, 25.0)
 FIRST_SHARE, ROUNDS = 0.01, 2
 
 
@@ -47,31 +49,62 @@ class Fitted(NamedTuple):
     frequency_error: float
 
 
-def branch(values: Mapping[str, float]) -> tuple[bp.HopfPoint, bp.Branch]:
-    """Return the Hopf point and the cycles that start there, unstable and then stable, along the wind speed."""
-    point = bp.hopf_points(MODEL, values, "U", between=(5.0, 25.0))[0]
-    amplitude = {"alpha": FIRST_AMPLITUDE}
-    first = bp.emerging_cycle(MODEL, point, amplitude=amplitude, samples=SAMPLES, scheme=SCHEME)
-    along = bp.continue_periodic(MODEL, first, "U", until=LOWEST_SPEED, step=LONGEST_STEP, progress=False)
-    return point, along
+class Cycles(NamedTuple):
+    """The Hopf point of a set of values, and the cycles that start there, unstable or stable, along the wind speed."""
+
+    hopf: bp.HopfPoint
+    branches: tuple[bp.Branch, ...]
+
+    def at(self, name: str, speed: float) -> bp.PeriodicSolution:
+        """Return the cycle at a speed [m/s] of the kind that a record's name tells: the unstable or the stable one.
+
+        Raises
+        ------
+        ValueError
+            Where there is none; the nearest fold or end of the branch, and the Hopf point, are told.
+        """
+        orbits: list[bp.PeriodicSolution] = []
+        missing = ""
+        for branch in self.branches:
+            try:
+                orbits += bp.solutions_at(MODEL, branch, speed)
+            except ValueError as error:
+                missing = missing or str(error)
+        kind = not name.startswith("unstable")
+        fitting = [orbit for orbit in orbits if orbit.converged and orbit.stable == kind]
+        if not fitting:
+            missing = missing or f"no orbit there is {'stable' if kind else 'unstable'}."
+            raise ValueError(
+                f"speed: {speed:g} m/s is not allowed for {name!r}; {missing} The Hopf point is at "
+                f"{self.hopf.value:.6g} m/s."
+            )
+        return fitting[-1] if kind else fitting[0]
 
 
-def cycles(values: Mapping[str, float], speeds: Mapping[str, float]) -> dict[str, bp.PeriodicSolution]:
-    """Return the cycle of each record at its speed [m/s]: the unstable one, or the stable one, as its name says.
+def cycles(values: Mapping[str, float]) -> Cycles:
+    """Return the cycles of a set of values, followed from its Hopf point through all folds up to the highest speed.
 
     Raises
     ------
     ValueError
-        Where the model has no such cycle; the nearest fold or end of the branch is told.
+        Without a Hopf point.
     """
-    along, found = branch(values)[1], {}
-    for name, speed in speeds.items():
-        orbits = bp.solutions_at(MODEL, along, speed)
-        fitting = [orbit for orbit in orbits if orbit.stable == (not name.startswith("unstable"))]
-        if not fitting:
-            raise ValueError(f"speeds: {name!r} at {speed:g} m/s is not allowed; the model has no such cycle there.")
-        found[name] = fitting[0] if name.startswith("unstable") else fitting[-1]
-    return found
+    points = bp.hopf_points(MODEL, values, "U", between=SEARCHED)
+    if not points:
+        raise ValueError(f"values: {dict(values)} are not allowed; no Hopf point is between {SEARCHED} m/s.")
+    point = points[0]
+    first = bp.emerging_cycle(MODEL, point, amplitude={"alpha": FIRST_AMPLITUDE}, samples=SAMPLES, scheme=SCHEME)
+    if not first.converged:
+        raise ValueError(f"values: {dict(values)} are not allowed; the first cycle is {first.status}.")
+    if first.parameters["U"] > point.value:
+        return Cycles(point, (_along(first, HIGHEST_SPEED),))
+    down = _along(first, LOWEST_SPEED)
+    again = down[-1].parameters["U"] == first.parameters["U"] and len(down) > 1
+    return Cycles(point, (down, _along(down[-1], HIGHEST_SPEED)) if again else (down,))
+
+
+def _along(first: bp.PeriodicSolution, until: float) -> bp.Branch:
+    return bp.continue_periodic(MODEL, first, "U", until=until, step=LONGEST_STEP, progress=False)
 
 
 def problem(
@@ -87,7 +120,7 @@ def problem(
     The delay of the outputs is fixed: τ = 0 is where the fundamental of heave says, in the data and in the model.
     """
     known = dict(known or {})
-    allowed = [replace(e, frequency_se=float(np.hypot(e.frequency_se, frequency_error))) for e in experiments]
+    allowed = [replace(e, frequency_se=math.hypot(e.frequency_se, frequency_error)) for e in experiments]
     fixed: dict[str, Any] = RIG | known | {"U": {e.name: speeds[e.name] for e in experiments}, "shift": 0.0}
     priors = {name: prior for name, prior in PRIORS.items() if name not in known}
     return bp.Problem(MODEL, allowed, priors=priors, fixed=fixed, noise=noise, scheme=SCHEME)
@@ -105,8 +138,8 @@ def estimate(
     the medians of the priors, on orbits of the right branch, and is followed to `start`.
     """
     known = dict(known or {})
-    orbits = cycles(RIG | START | known, {name: speeds[name] for name in experiments})
-    guessed = [replace(e, guess=orbits[name].states) for name, e in experiments.items()]
+    along = cycles(RIG | START | known)
+    guessed = [replace(e, guess=along.at(name, speeds[name]).states) for name, e in experiments.items()]
     error = FIRST_SHARE * float(np.mean([e.frequency for e in guessed]))
     point = {name: value for name, value in start.items() if name in PRIORS and name not in known}
     for _ in range(ROUNDS):
@@ -114,7 +147,7 @@ def estimate(
         fit = bp.map_estimate(stated, start=point, progress=False)
         missed = [fit.solutions[e.name].frequency - e.frequency for e in guessed]
         measured = float(np.sqrt(np.mean([e.frequency_se**2 for e in guessed])))
-        error = float(np.sqrt(max(np.mean(np.square(missed)) - measured**2, 0.0)))
+        error = math.sqrt(max(float(np.mean(np.square(missed))) - measured**2, 0.0))
         point = dict(fit.theta)
     stated = problem(guessed, speeds, frequency_error=error, known=known)
     return Fitted(stated, bp.map_estimate(stated, start=point, progress=False), error)
