@@ -124,15 +124,19 @@ def left_out(
     experiments: dict[str, bp.Experiment], speeds: dict[str, float], fits: dict[str, Fitted], quick: bool
 ) -> dict[str, Any]:
     """Return the predictions of cycles that were not fitted, wind speed by wind speed and kind by kind."""
-    both = fits["both"]
+    both, draws = fits["both"], 4 if quick else 20
     names = {kind: [n for n in experiments if n.startswith("unstable") == (kind == "unstable")] for kind in fits}
     found = {
-        "unstable from stable": flutter_questions.predictions(fits["stable"], experiments, speeds, names["unstable"]),
-        "stable from unstable": flutter_questions.predictions(fits["unstable"], experiments, speeds, names["stable"]),
+        "unstable from stable": flutter_questions.predictions(
+            fits["stable"], experiments, speeds, names["unstable"], draws
+        ),
+        "stable from unstable": flutter_questions.predictions(
+            fits["unstable"], experiments, speeds, names["stable"], draws
+        ),
     }
     for group in flutter_questions.groups(speeds)[: 1 if quick else None]:
         label = " and ".join(sorted({f"{speeds[name]:g}" for name in group}))
-        found[f"without {label} m/s"] = flutter_questions.leave_out(experiments, speeds, both, group)
+        found[f"without {label} m/s"] = flutter_questions.leave_out(experiments, speeds, both, group, draws)
     return found
 
 

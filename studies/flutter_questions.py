@@ -12,7 +12,7 @@ import bayesperiodic as bp
 from studies.flutter_rig import AUTHORS, PRIORS, RIG, SENSORS, SPRINGS, START, Fitted, cycles, estimate
 
 NEAR = 0.25
-DRAWS, FEWEST = 20, 4
+FEWEST = 3
 FREE_SCALES = ("gain_heave", "gain_pitch")
 CHANNELS = ("heave", "pitch")
 
@@ -115,11 +115,11 @@ def groups(speeds: Mapping[str, float]) -> list[list[str]]:
 
 
 def leave_out(
-    experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float], both: Fitted, left: list[str]
+    experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float], both: Fitted, left: list[str], draws: int
 ) -> dict[str, Any]:
     """Return how the fit without some cycles predicts them."""
     kept = {name: e for name, e in experiments.items() if name not in left}
-    return predictions(estimate(kept, speeds, start=START | both.fit.theta), experiments, speeds, left)
+    return predictions(estimate(kept, speeds, start=START | both.fit.theta), experiments, speeds, left, draws)
 
 
 def predictions(
@@ -127,7 +127,7 @@ def predictions(
     experiments: Mapping[str, bp.Experiment],
     speeds: Mapping[str, float],
     left: Sequence[str],
-    seed: int = 0,
+    draws: int,
 ) -> dict[str, Any]:
     """Return the errors of cycles that were not fitted: in per cent, in posterior sds, and with the model's error.
 
@@ -138,15 +138,16 @@ def predictions(
     experiments : mapping of str to Experiment
     speeds : mapping of str to float
         [m/s].
-    left : list of str
-    seed : int
-        Of the draws from the Laplace approximation.
+    left : sequence of str
+    draws : int
+        From the Laplace approximation; there are none where the MAP point itself has no such cycle.
     """
     fit, names = fitted.fit, list(fitted.fit.theta)
-    generator = np.random.default_rng(seed)
-    draws = generator.multivariate_normal(list(fit.theta.values()), fit.covariance.to_numpy(), size=DRAWS)
-    every = [_sizes_at(dict(zip(names, row.tolist(), strict=True)), speeds, left) for row in draws]
     best = _sizes_at(fit.theta, speeds, left)
+    drawn = draws if any(best.values()) else 0
+    generator = np.random.default_rng(0)
+    rows = generator.multivariate_normal(list(fit.theta.values()), fit.covariance.to_numpy(), size=drawn)
+    every = [_sizes_at(dict(zip(names, row.tolist(), strict=True)), speeds, left) for row in rows]
     misses = [
         v / sizes(e.outputs)[c] - 1.0
         for e in fitted.problem.experiments
@@ -156,7 +157,7 @@ def predictions(
     found: dict[str, Any] = {}
     for name in left:
         predicted = [there for one in every if (there := one[name]) is not None]
-        found[name] = {"draws_with_a_cycle": len(predicted), "draws": DRAWS, "cycle_at_map": best[name] is not None}
+        found[name] = {"draws_with_a_cycle": len(predicted), "draws": drawn, "cycle_at_map": best[name] is not None}
         for channel, at_map in (best[name] or {}).items():
             size = sizes(experiments[name].outputs)[channel]
             off = at_map - size
