@@ -17,7 +17,7 @@ FOUR = ("stable_v15_6", "stable_v17_3", "unstable_v14_9", "unstable_v16_5")
 
 
 def run(folder, *arguments):
-    """Run the study on four synthetic cycles in this process, and return what it printed."""
+    """Run the study in this process, synthetic rigs with four kinds of cycles, and return what it printed."""
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
         patch.setattr(common, "find_data", lambda *_: None)
         patch.setattr(common_resumed, "workers", InThisProcess)
@@ -26,53 +26,33 @@ def run(folder, *arguments):
     return printed.getvalue()
 
 
-@pytest.fixture(scope="module")
-def quick(tmp_path_factory):
-    """Return the folder, the results and the printed account of a quick run."""
-    folder = tmp_path_factory.mktemp("flutter")
-    printed = run(folder, "--quick")
-    return folder, json.loads((folder / "results.json").read_text(encoding="utf-8")), printed
-
-
-def test_synthetic_rig_is_called_synthetic_and_fitted_within_its_noise(quick):
-    folder, results, printed = quick
-    assert "SYNTHETIC" in printed and flutter_data.SHA256 in printed
-    assert results["data"] == {"path": "generated", "sha256": None, "synthetic": True}
-    assert results["branches_kept_apart"] and results["status"] == "converged"
-    for one in results["errors"].values():
-        assert max(map(abs, one["amplitude_error"].values())) < 0.01 and abs(one["frequency_error"]) < 1e-3
-    for record in results["records"].values():
-        assert record["frequency_se"] < 0.003 * record["frequency"]
-        assert record["spectral_frequency"] == pytest.approx(record["frequency"], rel=0.003)
-    assert sorted(path.name for path in folder.glob("*.png")) == ["bifurcation.png", "contraction.png", "portraits.png"]
-
-
-def test_scaled_springs_are_found_and_plain_ones_are_the_priors(quick):
-    """Within 5 sds (false-alarm rate 6e-7 each) of the truth in units of the pitch sensor."""
-    _, results, _ = quick
-    table, true = results["contraction"], flutter_rig.TRUE
-    for power, name in enumerate(("k_alpha2", "k_alpha3"), 1):
-        row = table[f"{name} at gain 1"]["both"]
-        assert abs(row["estimate"] - true[name] / true["gain_pitch"] ** power) < 5 * row["sd"]
-        assert row["over_prior"] < 0.1 < table[name]["both"]["over_prior"]
-    assert any("k_alpha3 → k_alpha3·t^2" in text for text in results["undetermined"])
-    assert "k_alpha2 → k_alpha2/t, k_alpha3 → k_alpha3/t**2" in results["structure"]["text"]
-
-
-def test_authors_hopf_point_is_that_of_the_eigenvalues(quick):
-    known = quick[1]["authors_branch"]
+def test_authors_hopf_point_is_that_of_the_eigenvalues_and_a_speed_without_a_cycle_is_told():
+    along = flutter_rig.cycles(flutter_rig.RIG | flutter_rig.AUTHORS | flutter_rig.SENSORS)
     speed, frequency = hopf()
-    assert known["hopf_speed"] == pytest.approx(speed, abs=0.05)
-    assert known["hopf_frequency"] == pytest.approx(frequency, abs=0.005)
-    assert quick[1]["authors_errors"]["unstable_v14_9"]["amplitude_error"] is None
-    assert "fold at 14.936" in quick[1]["authors_errors"]["unstable_v14_9"]["why"]
+    assert along.hopf.value == pytest.approx(speed, abs=0.05)
+    assert along.hopf.frequency == pytest.approx(frequency, abs=0.005)
+    assert along.at("stable", 16.5).stable and not along.at("unstable", 16.5).stable
+    with pytest.raises(ValueError, match="its fold at 14.936.*The Hopf point is at 18.27"):
+        along.at("unstable", 14.9)
+
+
+def test_synthetic_records_are_called_synthetic_and_have_the_cycles_of_the_truth():
+    along = flutter_rig.cycles(flutter_rig.RIG | flutter_rig.TRUE)
+    records = flutter_data.generate(1)
+    admitted, refused = flutter_data.usable(records)
+    assert not refused and set(admitted) == set(flutter_data.KINDS)
+    for record in records:
+        e, orbit = admitted[record.recording.name], along.at(record.recording.name, record.speed)
+        assert e.synthetic and e.frequency_se < 0.003 * e.frequency
+        assert abs(e.frequency - orbit.frequency) < 5 * e.frequency_se
+        assert flutter_questions.sizes(e.outputs) == pytest.approx(flutter_questions.sizes(orbit.outputs), rel=0.05)
 
 
 def test_campaigns_are_resumed(tmp_path):
     printed = run(tmp_path, "--replicates", "1")
     assert "1 to do" in printed and "0 failures" in printed and "kept apart in 1" in printed
     assert "0 to do" in run(tmp_path, "--replicates", "1")
-    (line,) = common_resumed._read(tmp_path / "campaigns" / flutter_campaigns.FILE)
+    (line,) = json.loads((tmp_path / "campaigns" / "results.json").read_text(encoding="utf-8"))["campaigns"]
     assert max(abs(line["pulls"][name]) for name in flutter_campaigns.STIFFNESSES) < 5.0
 
 
