@@ -189,5 +189,5 @@ def test_drift_is_the_growth_of_the_fundamental_over_the_recording():
     assert grown.fold(64, largest_drift=0.25).cycles > 3
     with pytest.raises(ValueError, match="'grown' is not steady; the fundamental of 'y' changes by .19.* most 10.0%"):
         grown.fold(64, largest_drift=0.1)
-    with pytest.raises(ValueError, match="largest_drift: 0 is not allowed"):
+    with pytest.raises(ValueError, match="largest_drift: 0.* is not allowed"):
         grown.fold(64, largest_drift=0.0)
