@@ -1,6 +1,7 @@
 import contextlib
 import io
 import json
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -9,7 +10,6 @@ import bayesperiodic as bp
 from studies import common, common_resumed, flutter_campaigns, flutter_data, flutter_questions, flutter_rig
 from studies.__main__ import main
 from tests.flutter_rig import hopf
-from tests.studies.here import InThisProcess
 
 REAL = common.find_data(None, flutter_data.FILE)
 real_data = pytest.mark.skipif(REAL is None, reason="the measured file is not to be had here, see flutter_data.py")
@@ -20,7 +20,7 @@ def run(folder, *arguments):
     """Run the study in this process, synthetic rigs with four kinds of cycles, and return what it printed."""
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
         patch.setattr(common, "find_data", lambda *_: None)
-        patch.setattr(common_resumed, "workers", InThisProcess)
+        patch.setattr(common_resumed, "workers", lambda: ThreadPoolExecutor(1))
         patch.setattr(flutter_data, "KINDS", {name: flutter_data.KINDS[name] for name in FOUR})
         assert main(["flutter", "--out", str(folder), *arguments]) == 0
     return printed.getvalue()
@@ -48,10 +48,12 @@ def test_synthetic_records_are_called_synthetic_and_have_the_cycles_of_the_truth
         assert flutter_questions.sizes(e.outputs) == pytest.approx(flutter_questions.sizes(orbit.outputs), rel=0.05)
 
 
-def test_campaigns_are_resumed(tmp_path):
+def test_campaigns_are_resumed(tmp_path, monkeypatch):
+    """The second time there is none to do."""
     printed = run(tmp_path, "--replicates", "1")
-    assert "1 to do" in printed and "0 failures" in printed and "kept apart in 1" in printed
-    assert "0 to do" in run(tmp_path, "--replicates", "1")
+    assert "0 failures" in printed and "kept apart in 1" in printed
+    monkeypatch.setattr(flutter_campaigns, "campaign", None)
+    assert "1 campaigns, 0 failures" in run(tmp_path, "--replicates", "1")
     (line,) = json.loads((tmp_path / "campaigns" / "results.json").read_text(encoding="utf-8"))["campaigns"]
     assert max(abs(line["pulls"][name]) for name in flutter_campaigns.STIFFNESSES) < 5.0
 
