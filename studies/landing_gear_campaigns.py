@@ -59,7 +59,7 @@ def _examine(run: Run, truth: str, seed: int) -> dict[str, Any]:
     fitted = estimate([fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)], DISPLACEMENT)
     stated, fit = fitted.problem, fitted.fit
     posterior = bp.sample(stated, fit, seed=seed, **SAMPLING)
-    verdict = judge(Identified(stated, fit, posterior, 0.0, 0.0))
+    verdict = judge(Identified(stated, fit, posterior, 0.0))
     drawn = {name: np.quantile(posterior.draws(name), [0.5 - LEVEL / 2, 0.5 + LEVEL / 2]) for name in stated.names}
     laplace = fit.interval(LEVEL)
     return {

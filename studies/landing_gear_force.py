@@ -60,7 +60,7 @@ def _fitted(experiment: bp.Experiment) -> Identified:
     stated = bp.Problem(
         bp.models.landing_gear(FORCE), [experiment], priors=PRIORS, fixed=FIXED, tied=TIED, scheme=SCHEME
     )
-    return Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0, 0.0)
+    return Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0)
 
 
 def misfit(stated: bp.Problem, fit: bp.MapEstimate) -> float:

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 
 import bayesperiodic as bp
+from studies.common_resumed import workers
 from studies.landing_gear_truth import GEAR
 
 DISPLACEMENT, FORCE = "displacement", "force"
@@ -40,15 +43,14 @@ class Identified:
     fit : MapEstimate
     posterior : Posterior or None
         None where no draws were asked for.
-    seconds, cpu_seconds : float
-        Of the draws.
+    seconds : float
+        That the draws took.
     """
 
     problem: bp.Problem
     fit: bp.MapEstimate
     posterior: bp.Posterior | None
     seconds: float
-    cpu_seconds: float
 
 
 def fold(recording: bp.Recording, drive: str) -> bp.Experiment:
@@ -77,7 +79,7 @@ def problem(experiments: Sequence[bp.Experiment], drive: str, *, one_conduction:
 def estimate(experiments: Sequence[bp.Experiment], drive: str, *, one_conduction: bool = False) -> Identified:
     """Return MAP and Laplace approximation."""
     stated = problem(experiments, drive, one_conduction=one_conduction)
-    return Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0, 0.0)
+    return Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0)
 
 
 def draw(
@@ -85,7 +87,7 @@ def draw(
 ) -> Identified:
     """Return the same with draws of the posterior, the variances integrated out."""
     stated, fit = estimated.problem, estimated.fit
-    wall, cpu = time.perf_counter(), time.process_time()
+    before = time.perf_counter()
     posterior = bp.sample(
         stated,
         fit,
@@ -94,6 +96,13 @@ def draw(
         walkers=max(QUICK_WALKERS if quick else WALKERS, 2 * len(stated.names)),
         max_steps=QUICK_STEPS if quick else max_steps,
         variances="collapsed",
+        executor=None if quick else _pool(),
         progress=False,
     )
-    return Identified(stated, fit, posterior, time.perf_counter() - wall, time.process_time() - cpu)
+    return Identified(stated, fit, posterior, time.perf_counter() - before)
+
+
+@cache
+def _pool() -> ProcessPoolExecutor:
+    """Return processes for all draws of a run, because starting some takes longer than most draws."""
+    return workers()

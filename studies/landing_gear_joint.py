@@ -45,7 +45,7 @@ def given_force(forced: Mapping[str, Verdict], seed: int, *, quick: bool) -> Ide
         local=[CONDUCTION],
         scheme=SCHEME,
     )
-    found = Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0, 0.0)
+    found = Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0)
     return draw(found, seed, quick=quick, ensembles=ENSEMBLES, max_steps=STEPS_WITH_FORCE)
 
 
@@ -69,7 +69,6 @@ def account(identified: Identified) -> dict[str, Any]:
         "log_posterior_calls": posterior.log_posterior_calls,
         "failures": posterior.failures,
         "seconds": identified.seconds,
-        "cpu_seconds": identified.cpu_seconds,
     }
 
 

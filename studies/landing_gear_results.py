@@ -92,7 +92,6 @@ def _posteriors(verdicts: Mapping[str, Verdict]) -> dict[str, Any]:
         "misspecified": [name for name, v in verdicts.items() if v.misspecified],
         "posteriors_converged": sum(p is not None and p.converged for p in posteriors),
         "seconds": sum(v.identified.seconds for v in verdicts.values()),
-        "cpu_seconds": sum(v.identified.cpu_seconds for v in verdicts.values()),
         "log_posterior_calls": sum(p.log_posterior_calls for p in posteriors if p is not None),
     }
 
@@ -126,8 +125,7 @@ def account(truth: str, results: Mapping[str, Any]) -> str:
         f"  called misspecified: {', '.join(results['misspecified']) or 'none'}\n"
         f"  pairs at one frequency that differ in sign: {pairs}\n"
         f"  {results['posteriors_converged']} of {len(results['experiments'])} posteriors converged; "
-        f"{results['log_posterior_calls']} log-posteriors in {results['seconds']:.0f} s, "
-        f"{results['cpu_seconds']:.0f} s of CPU\n"
+        f"{results['log_posterior_calls']} log-posteriors in {results['seconds']:.0f} s\n"
         f"{landing_gear_sensitivity.table(results['others_under_priors'], results['experiments'])}\n{joint}\n"
         f"  force given: {forced_signs}; misspecified: {', '.join(forced['misspecified']) or 'none'}\n"
         f"  {forced['posteriors_converged']} of {len(forced['experiments'])} posteriors converged in "

@@ -82,7 +82,6 @@ def account(verdict: Verdict) -> dict[str, Any]:
         "log_posterior_calls": posterior.log_posterior_calls,
         "failures": posterior.failures,
         "seconds": identified.seconds,
-        "cpu_seconds": identified.cpu_seconds,
     }
 
 
