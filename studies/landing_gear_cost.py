@@ -118,10 +118,16 @@ def _actions(
     }
     for kind in COMPILED:
         contenders = [by_kind[kind] for by_kind in chosen]
-        known = [c.integrate(g.estimate, g.still(g.estimate))[0][0] for g, c in zip(gears, contenders, strict=True)]
+        known = [_steady(*one) for one in zip(gears, contenders, strict=True)]
         actions[f"{kind} {STATIC}"] = partial(_integrate, gears, contenders, None), len(theta)
         actions[f"{kind} {ESTIMATE}"] = partial(_integrate, gears, contenders, known), len(theta)
     return actions
+
+
+def _steady(gear: Gear, contender: Contender) -> np.ndarray:
+    """Return the steady state at the estimate, or static equilibrium where its theta16 ≤ 0 leaves it none."""
+    path, cycles = contender.integrate(gear.estimate, gear.still(gear.estimate))
+    return path[0] if cycles else gear.still(gear.estimate)
 
 
 def _integrate(gears: Sequence[Gear], contenders: Sequence[Contender], starts: Sequence[np.ndarray] | None) -> None:
