@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,10 +28,11 @@ if TYPE_CHECKING:
     from bayesperiodic.models.model import Model
 
 GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
-FUNCTIONS = ("residual_jacobian", "outputs", "derivatives", "transitions")
+FUNCTIONS = ("residual", "residual_jacobian", "outputs", "derivatives", "transitions")
 SECOND_FUNCTIONS = ("jacobian_change",)
 MANY_ZEROS = 30
 PREAMBLE = "import math\n\nfrom numba import njit\n\n\n"
+ELEMENTARY = ("exp", "tanh", "atan")
 
 
 class GridFunction(types.WrapperAddressProtocol):
@@ -66,8 +68,10 @@ class Kernels:
 
     Attributes
     ----------
+    residual : GridFunction
+        Columns: g (states).
     residual_jacobian : GridFunction
-        Columns: g (states), then ∂g/∂(q, q̇, q̈) row by row (states × 3·states).
+        Columns: g, then ∂g/∂(q, q̇, q̈) row by row (states × 3·states).
     outputs : GridFunction
         Columns: ŷ (outputs).
     derivatives : GridFunction
@@ -77,6 +81,7 @@ class Kernels:
         Columns: the arguments of the smooth signs in the equations, which change over within −1 … 1.
     """
 
+    residual: GridFunction
     residual_jacobian: GridFunction
     outputs: GridFunction
     derivatives: GridFunction
@@ -98,6 +103,7 @@ class Kernels:
     ) -> np.ndarray:
         """Return one of the functions on a grid, (points, size)."""
         size = {
+            "residual": self.states,
             "residual_jacobian": self.states * (1 + 3 * self.states),
             "outputs": self.channels,
             "transitions": self.smooth_signs,
@@ -141,6 +147,7 @@ def kernel_source(model: Model) -> str:
     q, u = list(model.state_symbols.values()), list(model.input_symbols.values())
     theta, frequency = list(model.parameter_symbols.values()), [model.time_symbols["frequency"]]
     needs = {
+        "residual": g,
         "residual_jacobian": [*g, *_jacobian(g, q)],
         "outputs": [*f],
         "transitions": [sign.args[0] for sign in model.smooth_signs],
@@ -193,29 +200,34 @@ def _module(
     time: dict[str, sp.Symbol],
 ) -> str:
     arguments = {
-        **{symbol: f"states[i, {column}]" for column, symbol in enumerate(states)},
-        **{symbol: f"inputs[i, {column}]" for column, symbol in enumerate(inputs)},
+        **{symbol: f"flat_states[{len(states)}*i + {column}]" for column, symbol in enumerate(states)},
+        **{symbol: f"flat_inputs[{len(inputs)}*i + {column}]" for column, symbol in enumerate(inputs)},
         **{symbol: f"parameters[{index}]" for index, symbol in enumerate(parameters)},
         time["tau"]: "tau[i]",
         time["frequency"]: "frequency",
     }
-    return PREAMBLE + "\n\n".join(_function(name, expressions, arguments) for name, expressions in needs.items())
+    functions = [_function(name, expressions, arguments) for name, expressions in needs.items()]
+    calls = any(f"{name}(" in function for name in ELEMENTARY for function in functions)
+    elementary = Path(__file__).with_name("elementary.py").read_text(encoding="utf-8") + "\n\n" if calls else ""
+    return (elementary or PREAMBLE) + "\n\n".join(functions)
 
 
 def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str]) -> str:
+    """Return a function that sweeps the grid; strides known at compile time let its loop be vectorised."""
     common, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("common"), order="canonical")
     used = set().union(*(e.free_symbols for e in reduced), *(e.free_symbols for _, e in common))
-    lines = [
-        f"    {s} = {place}" for s, place in arguments.items() if s in used and "[i" not in place and s.name != place
-    ]
+    places = {symbol: place for symbol, place in arguments.items() if symbol in used and symbol.name != place}
+    lines = [f"    flat_{a} = {a}.reshape({a}.size)" for a in ("states", "inputs", "out")]
+    lines += [f"    {s} = {place}" for s, place in places.items() if "[" not in place or "i" not in place.split("[")[1]]
     lines += ["    for i in range(out.shape[0]):"]
-    lines += [f"        {s} = {place}" for s, place in arguments.items() if s in used and "[i" in place]
+    lines += [f"        {s} = {place}" for s, place in places.items() if "[" in place and "i" in place.split("[")[1]]
     lines += [f"        {symbol} = {_code(expression)}" for symbol, expression in common]
+    size = len(reduced)
     zeros = sum(expression == 0 for expression in reduced)
     if zeros > MANY_ZEROS:
-        lines += ["        for column in range(out.shape[1]):", "            out[i, column] = 0.0"]
+        lines += [f"        for column in range({size}):", f"            flat_out[{size}*i + column] = 0.0"]
     lines += [
-        f"        out[i, {column}] = {_code(expression)}"
+        f"        flat_out[{size}*i + {column}] = {_code(expression)}"
         for column, expression in enumerate(reduced)
         if zeros <= MANY_ZEROS or expression != 0
     ]
@@ -234,6 +246,15 @@ class _Printer(PythonCodePrinter):
     def _print_Heaviside(self, expression: sp.Expr) -> str:
         argument = self._print(expression.args[0])
         return f"(0.5*(({argument} > 0.0) + ({argument} >= 0.0)))"
+
+    def _print_exp(self, expression: sp.Expr) -> str:
+        return f"exp({self._print(expression.args[0])})"
+
+    def _print_tanh(self, expression: sp.Expr) -> str:
+        return f"tanh({self._print(expression.args[0])})"
+
+    def _print_atan(self, expression: sp.Expr) -> str:
+        return f"atan({self._print(expression.args[0])})"
 
     def _print_DiracDelta(self, expression: sp.Expr) -> str:
         return "0.0"

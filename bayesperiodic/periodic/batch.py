@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesperiodic.parallel import available_cores, in_threads
 from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
-from bayesperiodic.periodic.sensitivity import Sensitivities, parameter_sensitivities, softest_direction
+from bayesperiodic.periodic.sensitivity import Sensitivities, parameter_sensitivities, softening, softest_direction
 
 SMALLEST_PART, PARTS_EACH = 4, 4
 NO_FACTORS = -1
@@ -103,6 +103,7 @@ class Batch:
         sensitivities = np.zeros((len(sets), len(first.model.parameters), first.grid.points, first.count))
         left = np.zeros((len(sets), first.grid.points, first.count))
         right = np.zeros((len(sets), first.grid.points, 3 * first.count))
+        slopes, amplitude = np.zeros(sensitivities.shape[:2]), np.stack([np.abs(a.z).max(axis=0) for a in anchors])
         for e, (equations, anchor) in enumerate(zip(sets, anchors, strict=True)):
             own = tuple(part[e] for part in self._factors)
             own[5][0] = NO_FACTORS
@@ -112,6 +113,9 @@ class Batch:
                 if not equations.factorise(columns, anchor.z, own):
                     own[5][0] = NO_FACTORS
                 left[e], right[e] = softest_direction(equations, anchor.z, columns)
+                slopes[e] = softening(equations, anchor.z, anchor.parameters, sensitivities[e], left[e], right[e])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            near = first.kernels.FAR * np.nanmin([np.ptp(a.z, axis=0) for a in anchors] / amplitude, axis=1)
         self._shared = (
             first.grid.tau,
             np.array([e.frequency for e in sets]),
@@ -119,6 +123,9 @@ class Batch:
             np.stack([a.parameters for a in anchors]),
             np.stack([a.z for a in anchors]),
             sensitivities,
+            amplitude,
+            slopes,
+            near,
             self._factors,
             left,
             right,
@@ -146,6 +153,7 @@ class Batch:
 
         def part(block: tuple[int, int]) -> None:
             self._first.kernels.solve_many(
+                model.kernels.residual,
                 model.kernels.residual_jacobian,
                 model.kernels.outputs,
                 grid.packed,

@@ -150,19 +150,34 @@ def solve_transposed(band, lower, upper, pivots, right):
 @njit(f"void({MATRIX}, {VECTOR}, {GRID}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
 def differentiate(z, drift, grid, tau, frequency, states):
     """Fill `states` (points, 3·states) with q = z + drift·tau and its time derivatives by the scheme."""
-    first, second, neighbours, _, _, _, _ = grid
+    first, second, neighbours, _, _, _, lead = grid
     points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
     width = REACH + 1 if REACH > 0 else first.size
-    for i in range(points):
+    one, two = first * frequency, second * frequency**2
+    start, inside = (REACH - lead, points - REACH) if REACH > 0 else (0, 0)
+    flat, rest = z.reshape(z.size), tau[start:]
+    here, out = flat[start * count :], states.reshape(states.size)[3 * start * count :]
+    for k in range(inside):
         for s in range(count):
-            rate, acceleration = 0.0, 0.0
+            rate, acceleration = drift[s] * frequency, 0.0
+            for o in range(width):
+                value = flat[(k + o) * count + s]
+                rate += one[o] * value
+                acceleration += two[o] * value
+            out[3 * count * k + s] = here[count * k + s] + drift[s] * rest[k]
+            out[3 * count * k + count + s] = rate
+            out[3 * count * k + 2 * count + s] = acceleration
+    for k in range(points - inside):
+        i = k if k < start else k + inside
+        for s in range(count):
+            rate, acceleration = drift[s] * frequency, 0.0
             for o in range(width):
                 value = z[neighbours[i, o], s]
-                rate += first[o] * value
-                acceleration += second[o] * value
+                rate += one[o] * value
+                acceleration += two[o] * value
             states[i, s] = z[i, s] + drift[s] * tau[i]
-            states[i, count + s] = (rate + drift[s]) * frequency
-            states[i, 2 * count + s] = acceleration * frequency**2
+            states[i, count + s] = rate
+            states[i, 2 * count + s] = acceleration
 
 
 @njit(f"void({MATRIX}, {GRID}, int64, float64, {MATRIX})", **OPTIONS)
@@ -353,10 +368,14 @@ def back_substitute(grid, factors, right):
                 value = 0.0
                 for s in range(count):
                     value += inverses[j, e, s] * right[i, s]
-                for d in range(min(reach, j - start)):
+                forced[j, e] = value
+            # The latest points last: they alone have to be waited for.
+            for d in range(min(reach, j - start) - 1, -1, -1):
+                for e in range(count):
+                    value = forced[j, e]
                     for s in range(count):
                         value += gains[j, d, e, s] * forced[j - 1 - d, s]
-                forced[j, e] = value
+                    forced[j, e] = value
         start = ends[q + 1] + 1
     block = reach * count
     size = segments * block
@@ -531,64 +550,71 @@ def newton(
 
 
 @njit(
-    f"Tuple((boolean, int64))({FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {MATRIX}, {MATRIX}, "
-    f"{MATRIX}, {FACTORS}, {MATRIX}, {MATRIX})",
+    f"Tuple((boolean, int64, float64))({FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR}, "
+    f"float64, {MATRIX}, {MATRIX}, {MATRIX}, {FACTORS}, {MATRIX}, {MATRIX})",
     **OPTIONS,
 )
-def chord(residual_jacobian, grid, inputs, parameters, tau, frequency, drift, z, states, columns, factors, left, right):
-    """Improve z in place with the factors of a nearby solution; return whether that converged, and the steps.
+def chord(
+    residual, grid, inputs, parameters, tau, frequency, drift, amplitude, stiffness, z, states, change, factors, left,
+    right,
+):  # fmt: skip
+    """Improve z in place with the factors of a nearby solution; return whether that converged, the steps, and how far.
 
     `states` are left as they were before the last step. A step above `CHORD_RATE` times the one before ends it.
 
     Where ∂g/∂z is nearly singular, steps with another point's factors say little of what is left in the direction that
     it makes smallest, and after a change of its stiffness there, or of its sign, they go the wrong way. So this
-    direction takes the stiffness of the present ∂g/∂z, and factors whose own is too far from it are not used at all.
+    direction takes the stiffness expected of the present ∂g/∂z, and factors whose own is too far from it are not used.
 
     Parameters
     ----------
+    residual : compiled grid function of the model
+    amplitude : array (states,)
+        Units of the steps.
+    stiffness : float
+        Expected of the present ∂g/∂z in this direction, in units of that of the factors.
+    change : array (points, states)
+        Work array.
     left : array (points, states)
         Weights of the equations that are largest for a residual in this direction.
     right : array (points, 3·states)
         The direction with its time derivatives, so long that its stiffness is 1 for the ∂g/∂z of the factors.
     """
     points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
-    step, previous = np.empty((points, count)), np.inf
-    correction, tolerance = 0.0, STEP_TOLERANCE
+    if not (stiffness > LEAST_STIFFNESS and stiffness < MOST_STIFFNESS):
+        return False, 0, 0.0
+    correction, tolerance = 1.0 / stiffness - 1.0, STEP_TOLERANCE * min(1.0, stiffness)
+    previous, moved = np.inf, 0.0
     for iteration in range(MAX_CHORDS):
         differentiate(z, drift, grid, tau, frequency, states)
-        residual_jacobian(states, inputs, parameters, tau, frequency, columns)
-        if iteration == 0:
-            stiffness = 0.0
-            for i in range(points):
-                for e in range(count):
-                    change = 0.0
-                    for k in range(3 * count):
-                        change += columns[i, count + e * 3 * count + k] * right[i, k]
-                    stiffness += left[i, e] * change
-            if not (stiffness > LEAST_STIFFNESS and stiffness < MOST_STIFFNESS):
-                return False, 0
-            correction = 1.0 / stiffness - 1.0
-            tolerance = STEP_TOLERANCE * min(1.0, stiffness)
+        residual(states, inputs, parameters, tau, frequency, change)
         along = 0.0
-        for i in range(points):
+        if correction != 0.0:
             for s in range(count):
-                step[i, s] = -columns[i, s]
-                along -= left[i, s] * columns[i, s]
-        back_substitute(grid, factors, step)
-        along *= correction
-        for i in range(points):
-            for s in range(count):
-                step[i, s] += along * right[i, s]
-        full = scaled_step(z, step)
+                part = 0.0
+                for i in range(points):
+                    part += left[i, s] * change[i, s]
+                along += correction * part
+        back_substitute(grid, factors, change)
+        full = 0.0
+        for s in range(count):
+            largest_change, total = 0.0, 0.0
+            for i in range(points):
+                step = change[i, s] + along * right[i, s]
+                z[i, s] -= step
+                largest_change = max(largest_change, abs(step))
+                total += step
+            if not abs(total) < np.inf:
+                return False, iteration + 1, moved
+            if largest_change > 0.0:
+                full = max(full, largest_change / amplitude[s])
+        moved += full
         if not full < min(FAR, CHORD_RATE * previous):
-            return False, iteration + 1
-        for i in range(points):
-            for s in range(count):
-                z[i, s] += step[i, s]
+            return False, iteration + 1, moved
         if full <= tolerance or (iteration > 0 and full**2 <= tolerance * previous):
-            return True, iteration + 1
+            return True, iteration + 1, moved
         previous = full
-    return False, MAX_CHORDS
+    return False, MAX_CHORDS, moved
 
 
 @njit(f"void({MATRIX}, {CUBE}, {VECTOR}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
@@ -648,12 +674,13 @@ def repetitions(z, periods):
 
 
 @njit(
-    f"void({FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {CUBE}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, {CUBE}, "
-    f"{GAINS}, Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
+    f"void({FUNCTION}, {FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {CUBE}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, "
+    f"{CUBE}, {GAINS}, {MATRIX}, {MATRIX}, {VECTOR}, Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
     f"{CUBE}, {CUBE}, int64, int64, {GAINS}, {GAINS}, {INDICES}, {INDICES})",
     **OPTIONS,
 )
 def solve_many(
+    residual,
     residual_jacobian,
     outputs,
     grid,
@@ -666,6 +693,9 @@ def solve_many(
     anchor_parameters,
     anchor_z,
     anchor_sensitivities,
+    anchor_amplitude,
+    anchor_softening,
+    anchor_near,
     anchor_factors,
     anchor_left,
     anchor_right,
@@ -691,6 +721,12 @@ def solve_many(
     frequency : array (sets,)
     drift : array (sets, states)
     anchor_parameters, anchor_z, anchor_sensitivities, anchor_factors, anchor_left, anchor_right : arrays (sets, …)
+    anchor_amplitude : array (sets, states)
+        The largest absolute value of each state.
+    anchor_softening : array (sets, parameters)
+        Derivatives of the stiffness that `chord` takes.
+    anchor_near : array (sets,)
+        How far chord steps may lead, in units of the amplitude, without `is_far` being asked.
     kept_z : array (sets, solves, points, states), or without entries if z is not wanted
     y : array (sets, solves, points, channels)
     status, iterations : int arrays (sets, solves)
@@ -700,6 +736,7 @@ def solve_many(
     states, z = np.empty((points, 3 * count)), np.empty((points, count))
     predicted, here, last = np.empty((points, count)), np.empty((points, count)), np.empty((points, count))
     columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MAX_ITERATIONS, 3))
+    change = np.empty((points, count))
     own = (
         np.empty_like(bands[0]), np.empty_like(pivots[0]), np.empty_like(inverses[0]), np.empty_like(gains[0]),
         np.empty_like(transfers[0]), np.empty_like(ends[0]), np.empty_like(reduced[0]),
@@ -713,13 +750,17 @@ def solve_many(
         )  # fmt: skip
         predict(at, anchor_sensitivities[e], anchor_parameters[e], theta, 1.0, predicted)
         z[:] = predicted
-        close, used, code, doubtful = False, 0, CONVERGED, False
+        close, used, code, doubtful, moved = False, 0, CONVERGED, False, np.inf
         if ends[e, 0] >= 0:
-            close, used = chord(
-                residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, states, columns, kept, anchor_left[e],
-                anchor_right[e],
+            stiffness = 1.0
+            for p in range(theta.size):
+                stiffness += anchor_softening[e, p] * (theta[p] - anchor_parameters[e, p])
+            close, used, moved = chord(
+                residual, grid, inputs[e], theta, tau, f, turn, anchor_amplitude[e], stiffness, z, states, change, kept,
+                anchor_left[e], anchor_right[e],
             )  # fmt: skip
         if not close:
+            moved = np.inf
             z[:] = predicted
             code, more = newton(
                 residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, history, states, columns, own
@@ -734,7 +775,8 @@ def solve_many(
                 used += more
                 doubtful = True
         once = repetitions(at, periods)
-        if ends[e, 0] >= 0 and (doubtful or is_far(z, predicted, at) or repetitions(z, periods) > once):
+        far = moved > anchor_near[e] and is_far(z, predicted, at)
+        if ends[e, 0] >= 0 and (doubtful or far or repetitions(z, periods) > once):
             leapt = code == CONVERGED
             done, step, before = 0.0, LARGEST_PART, LARGEST_PART
             here[:], last[:] = at, at

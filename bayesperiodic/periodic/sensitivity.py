@@ -7,6 +7,7 @@ import numpy as np
 from bayesperiodic.periodic.equations import Derivatives, PeriodicEquations
 
 SWEEPS = 3
+SMALL = 1e-4
 
 
 class Sensitivities(NamedTuple):
@@ -137,3 +138,36 @@ def softest_direction(
     change = equations.changes(right[None])[0]
     g_q = columns[:, equations.count :].reshape(len(z), equations.count, -1)
     return left / np.einsum("ne,neq,nq->", left, g_q, change), change
+
+
+def softening(
+    equations: PeriodicEquations,
+    z: np.ndarray,
+    parameters: np.ndarray,
+    sensitivities: np.ndarray,
+    left: np.ndarray,
+    right: np.ndarray,
+) -> np.ndarray:
+    """Return the derivatives (parameters,) of left · (∂g/∂z) · right along the solutions, by central differences.
+
+    Parameters
+    ----------
+    sensitivities : array (parameters, points, states)
+        Of the solution z; a parameter without any counts as one that does not matter.
+    left, right
+        As `softest_direction` returns them.
+    """
+    amplitude, result = np.abs(z).max(axis=0), np.zeros(parameters.size)
+    units = np.where(amplitude > 0.0, amplitude, 1.0)
+    for p in np.flatnonzero(sensitivities.any(axis=(1, 2))):
+        small = SMALL / np.max(np.abs(sensitivities[p]) / units)
+        small = min(small, SMALL * abs(parameters[p])) if parameters[p] != 0.0 else small
+        ends = []
+        for step in (small, -small):
+            moved = parameters.copy()
+            moved[p] += step
+            columns = equations.residual_jacobian(z + step * sensitivities[p], moved)
+            g_q = columns[:, equations.count :].reshape(len(z), equations.count, -1)
+            ends.append(np.einsum("ne,neq,nq->", left, g_q, right))
+        result[p] = (ends[0] - ends[1]) / (2.0 * small)
+    return result
