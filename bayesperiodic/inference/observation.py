@@ -1,6 +1,5 @@
 """From a periodic response to what is compared with one experiment, and the derivatives of that."""
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -122,6 +121,15 @@ class Observation:
         slopes = np.linalg.solve(e.covariance[:size, :size], cross.T).T
         return values, slopes, _whitening(e.covariance[size:, size:] - slopes @ cross.T)
 
+    def data_components(self) -> list[np.ndarray]:
+        """Return the Fourier components (size,) of each measured channel."""
+        return [self._spectral(self._data[:, c], self._harmonics[name]) for c, name in enumerate(self.channels)]
+
+    def components(self, outputs: np.ndarray) -> list[np.ndarray]:
+        """Return the Fourier components (…, size) of each measured channel of outputs (…, points, channels)."""
+        pairs = zip(self._columns, self.channels, strict=True)
+        return [self._spectral(outputs[..., column], self._harmonics[name]) for column, name in pairs]
+
     def residuals(self, response: Response) -> list[np.ndarray]:
         """Return the residual components, one array (…, size) a block."""
         e = self.experiment
@@ -135,7 +143,7 @@ class Observation:
 
     @cached_property
     def layout(self) -> tuple[Any, ...] | None:
-        """What experiments have in common that `residuals_alike` can compare; None where there is more to compare."""
+        """What experiments have in common that are compared all at once; None where there is more to compare."""
         e = self.experiment
         if (
             self._shifted
@@ -322,17 +330,6 @@ class Observation:
         if self._points % 2 == 0:
             spectrum[-1] = 0.0
         return np.fft.irfft(spectrum, n=self._points, axis=0) + trend
-
-
-def residuals_alike(observations: Sequence[Observation], responses: Sequence[Response]) -> list[list[np.ndarray]]:
-    """Return the residual components of experiments of one layout, a list of arrays (…, size) an experiment."""
-    if len(observations) == 1:
-        return [observations[0].residuals(responses[0])]
-    first = observations[0]
-    outputs = [np.moveaxis(response.outputs[..., first._columns], -1, -2) for response in responses]
-    difference = np.stack([o._data.T - y for o, y in zip(observations, outputs, strict=True)])
-    found = [first._spectral(difference[..., c, :], first._harmonics[n]) for c, n in enumerate(first.channels)]
-    return [list(own) for own in zip(*found, strict=True)]
 
 
 def _whitening(covariance: np.ndarray) -> np.ndarray:

@@ -10,16 +10,18 @@ import numpy as np
 from bayesperiodic import checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.inference.all_at_once import all_at_once
+from bayesperiodic.inference.comparisons import Comparisons
 from bayesperiodic.inference.linearisation import Linearisation
 from bayesperiodic.inference.noise.likelihood import Likelihood
 from bayesperiodic.inference.noise.models import Noise, as_noise
-from bayesperiodic.inference.observation import Observation, Response, residuals_alike
+from bayesperiodic.inference.noise.residuals import Residuals
+from bayesperiodic.inference.observation import Observation, Response
 from bayesperiodic.inference.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
 from bayesperiodic.inference.priors.joint import JointPrior
 from bayesperiodic.inference.priors.univariate import Uniform
 from bayesperiodic.inference.responses import Responses
 from bayesperiodic.models.model import Model
-from bayesperiodic.parallel import available_cores, in_threads
+from bayesperiodic.parallel import available_cores
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import PeriodicSolution
@@ -304,13 +306,13 @@ class Problem:
             result[good] = self.likelihood(residuals, noise.reshape(len(flat), -1)[good])
         return result.reshape(theta.shape[:-1]), status.reshape(theta.shape[:-1])
 
-    def residuals(self, theta: np.ndarray, threads: int | None = None) -> tuple[list[np.ndarray], np.ndarray]:
+    def residuals(self, theta: np.ndarray, threads: int | None = None) -> tuple[Residuals, np.ndarray]:
         """Return the residual components at those of many θ (solves, names) whose solves converge, and status codes.
 
         Returns
         -------
-        residuals : list of array (converged, size)
-            One a block.
+        residuals : Residuals
+            An array (converged, size) a block.
         status : int array (solves,)
             The worst of all experiments.
         """
@@ -319,25 +321,23 @@ class Problem:
         good = status == CONVERGED
         kept = slice(None) if good.all() else good
 
-        def compared(names: list[str]) -> list[list[np.ndarray]]:
-            responses = [Response(*(part[kept] for part in solved[name].response)) for name in names]
-            with np.errstate(over="ignore", invalid="ignore"):
-                return residuals_alike([self.observations[name] for name in names], responses)
-
+        responses = {n: Response(*(part[kept] for part in s.response)) for n, s in solved.items()}
         # Shared by experiments, not by θ: the rounding of a matrix product may depend on how many rows it has.
         small = max(s.response.outputs.size for s in solved.values()) < SMALLEST_SHARED
-        groups = self._alike if small else [[name] for name in self.observations]
-        found = in_threads(compared, groups, 1 if small else threads or available_cores())
-        own = {n: r for names, each in zip(groups, found, strict=True) for n, r in zip(names, each, strict=True)}
-        return [residual for name in self.observations for residual in own[name]], status
+        if small:
+            return self._alike.residuals(responses, 1), status
+        return self._each.residuals(responses, threads or available_cores()), status
 
     @cached_property
-    def _alike(self) -> list[list[str]]:
-        """The names of the experiments that are compared alike, group by group."""
-        groups: dict[Any, list[str]] = {}
+    def _each(self) -> Comparisons:
+        return Comparisons([o] for o in self.observations.values())
+
+    @cached_property
+    def _alike(self) -> Comparisons:
+        groups: dict[Any, list[Observation]] = {}
         for name, observation in self.observations.items():
-            groups.setdefault(observation.layout or name, []).append(name)
-        return list(groups.values())
+            groups.setdefault(observation.layout or name, []).append(observation)
+        return Comparisons(groups.values())
 
     def log_posterior(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> np.ndarray:
         """Return log-prior plus log-likelihood, shape (…), a density over (θ, log φ)."""

@@ -675,7 +675,8 @@ def repetitions(z, periods):
 
 @njit(
     f"void({FUNCTION}, {FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {CUBE}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, "
-    f"{CUBE}, {GAINS}, {MATRIX}, {MATRIX}, {VECTOR}, Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
+    f"{CUBE}, {GAINS}, {MATRIX}, {MATRIX}, {VECTOR}, "
+    f"Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
     f"{CUBE}, {CUBE}, int64, int64, {GAINS}, {GAINS}, {INDICES}, {INDICES})",
     **OPTIONS,
 )

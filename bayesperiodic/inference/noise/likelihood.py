@@ -10,6 +10,7 @@ from scipy.linalg import solve_triangular
 from bayesperiodic import checks
 from bayesperiodic.inference.noise.blocks import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
 from bayesperiodic.inference.noise.models import VARIANCE, Noise
+from bayesperiodic.inference.noise.residuals import Residuals
 
 
 class Likelihood:
@@ -73,10 +74,10 @@ class Likelihood:
     def moments(self, residuals: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
         """Return Σ weight·r² (…,) behind each variance (and "scale"), the M of eq. (6), by its name."""
         result: dict[str, np.ndarray] = {}
-        for block, columns, r in zip(self.blocks, self._columns, residuals, strict=True):
+        for block, columns, square in zip(self.blocks, self._columns, Residuals.of(residuals).squares, strict=True):
             if block.counted:
                 name = self.names[columns[0]]
-                result[name] = result.get(name, 0.0) + block.weight * _square(r)
+                result[name] = result.get(name, 0.0) + block.weight * square
         return result
 
     def value_variances(self, values: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
@@ -128,7 +129,7 @@ class Likelihood:
     def _flat(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, columns, sizes, weights, measured = self._levels
-        squares = np.stack([_square(r) for r in residuals], axis=-1)
+        squares = np.moveaxis(Residuals.of(residuals).squares, 0, -1)
         v = self.model.level(values[..., columns], measured)
         terms = weights * (share * sizes * np.log(v) + squares[..., at] / v)
         return -0.5 * (terms.sum(axis=-1) + squares[..., ~at].sum(axis=-1))

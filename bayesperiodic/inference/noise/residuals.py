@@ -1,0 +1,47 @@
+"""Residual components block by block, those of alike blocks side by side."""
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+
+class Residuals(Sequence[np.ndarray]):
+    """One array (…, size) of components a block.
+
+    Parameters
+    ----------
+    stacks : sequence of array (members, …, size)
+    places : sequence of (int, int)
+        Stack and member of each block.
+    """
+
+    def __init__(self, stacks: Sequence[np.ndarray], places: Sequence[tuple[int, int]]):
+        self._stacks, self._places = tuple(stacks), tuple(places)
+
+    @classmethod
+    def of(cls, blocks: Sequence[np.ndarray]) -> "Residuals":
+        """Return the residuals of these blocks, as they are if they are residuals already."""
+        if isinstance(blocks, cls):
+            return blocks
+        return cls([np.asarray(block)[None] for block in blocks], [(b, 0) for b in range(len(blocks))])
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, block: Any) -> Any:
+        stack, member = self._places[block]
+        return self._stacks[stack][member]
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return (self._stacks[stack][member] for stack, member in self._places)
+
+    @cached_property
+    def squares(self) -> np.ndarray:
+        """The sum of the squares of each block, (blocks, …)."""
+        sums = [np.einsum("...i,...i->...", stack, stack) for stack in self._stacks]
+        result = np.empty((len(self._places), *sums[0].shape[1:]))
+        for block, (stack, member) in enumerate(self._places):
+            result[block] = sums[stack][member]
+        return result
