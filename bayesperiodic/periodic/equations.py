@@ -249,7 +249,7 @@ def empty_factors(grid: CyclicGrid, states: int, sets: tuple[int, ...] = ()) -> 
         np.empty((*sets, points * states), dtype=np.int64),
         np.empty((*sets, points, states, states)),
         np.empty((*sets, points, reach, states, states)),
-        np.empty((*sets, points, states, reach * states)),
+        np.empty((*sets, states, reach * states, points)),
         np.empty((*sets, 1 + compiled.MAX_SEGMENTS), dtype=np.int64),
         np.empty((*sets, coupled * (3 * coupled - 2))),
         np.empty((*sets, coupled), dtype=np.int64),

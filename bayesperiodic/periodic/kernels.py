@@ -32,7 +32,7 @@ STEP_TOLERANCE = 1e-9
 MAX_ITERATIONS = 50
 MAX_HALVINGS = 20
 MAX_CHORDS = 6
-CHORD_RATE = 0.2
+CHORD_RATE, PREDICTION_RATE = 0.2, 10.0
 LEAST_STIFFNESS, MOST_STIFFNESS = 0.3, 3.0
 ROUNDING = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
@@ -247,7 +247,7 @@ def march(columns, grid, frequency, amplitude, inverses, gains, transfer, ends):
         Filled: what multiplies the right-hand side at the newest point of each equation.
     gains : array (points, reach, states, states)
         Filled: what multiplies the points before it.
-    transfer : array (points, states, reach·states)
+    transfer : array (states, reach·states, points)
         Filled: what multiplies the start points, the latest first.
     ends : int array (1 + MAX_SEGMENTS,)
         Filled: the number of segments, then the last point of each.
@@ -271,7 +271,7 @@ def march(columns, grid, frequency, amplitude, inverses, gains, transfer, ends):
             for s in range(count):
                 inverses[j, e, s] = inverse[e, s]
             for c in range(reach * count):
-                transfer[j, e, c] = 0.0
+                transfer[e, c, j] = 0.0
         for d in range(reach):
             o, back = reach - 1 - d, j - 1 - d
             for e in range(count):
@@ -287,15 +287,15 @@ def march(columns, grid, frequency, amplitude, inverses, gains, transfer, ends):
                     gains[j, d, e, s] = value
                     if back >= start:
                         for c in range(reach * count):
-                            transfer[j, e, c] += value * transfer[back, s, c]
+                            transfer[e, c, j] += value * transfer[s, c, back]
                     else:
-                        transfer[j, e, (start - 1 - back) * count + s] += value
+                        transfer[e, (start - 1 - back) * count + s, j] += value
         if j % CHECK_EVERY == CHECK_EVERY - 1 or j == points - 1:
             growth = 0.0
             for e in range(count):
                 for d in range(reach):
                     for s in range(count):
-                        growth = max(growth, abs(transfer[j, e, d * count + s]) * amplitude[s] / amplitude[e])
+                        growth = max(growth, abs(transfer[e, d * count + s, j]) * amplitude[s] / amplitude[e])
             if not growth < TOO_MUCH_GROWTH:
                 return False
             if (growth > GROWTH or j == points - 1) and j - start >= reach - 1:
@@ -310,8 +310,8 @@ def march(columns, grid, frequency, amplitude, inverses, gains, transfer, ends):
 @njit(f"boolean({CUBE}, {PLACES}, {VECTOR}, {PLACES})", **OPTIONS)
 def join(transfer, ends, reduced, pivots):
     """Factor the cyclic system that couples the start points of the segments; return False if it is singular."""
-    count = STATES if STATES > 0 else transfer.shape[1]
-    reach, segments = transfer.shape[2] // count, ends[0]
+    count = STATES if STATES > 0 else transfer.shape[0]
+    reach, segments = transfer.shape[1] // count, ends[0]
     block = reach * count
     size = segments * block
     matrix = reduced[: size * (3 * size - 2)].reshape((size, 3 * size - 2))
@@ -323,7 +323,7 @@ def join(transfer, ends, reduced, pivots):
                 i = after * block + d * count + e
                 matrix[i, size - 1] += 1.0
                 for c in range(block):
-                    matrix[i, q * block + c - i + size - 1] -= transfer[ends[q + 1] - d, e, c]
+                    matrix[i, q * block + c - i + size - 1] -= transfer[e, c, ends[q + 1] - d]
     return factor(matrix, size - 1, size - 1, pivots)
 
 
@@ -360,23 +360,33 @@ def back_substitute(grid, factors, right):
                 right[i, s] = folded[0, place[i] * count + s]
         return
     forced = np.empty((points, count))
-    start = 0
+    for k in range(points):
+        j = k + lead if k + lead < points else k + lead - points
+        for e in range(count):
+            value = 0.0
+            for s in range(count):
+                value += inverses[j, e, s] * right[k, s]
+            forced[j, e] = value
+    flat, gain, start = forced.reshape(points * count), gains.reshape(gains.size), 0
     for q in range(segments):
-        for j in range(start, ends[q + 1] + 1):
-            i = j - lead if j >= lead else j - lead + points
-            for e in range(count):
-                value = 0.0
-                for s in range(count):
-                    value += inverses[j, e, s] * right[i, s]
-                forced[j, e] = value
-            # The latest points last: they alone have to be waited for.
-            for d in range(min(reach, j - start) - 1, -1, -1):
+        stop = ends[q + 1] + 1
+        for j in range(start, start + reach):
+            for d in range(j - start):
                 for e in range(count):
-                    value = forced[j, e]
                     for s in range(count):
-                        value += gains[j, d, e, s] * forced[j - 1 - d, s]
-                    forced[j, e] = value
-        start = ends[q + 1] + 1
+                        forced[j, e] += gains[j, d, e, s] * forced[j - 1 - d, s]
+        before, after = flat[start * count :], flat[(start + reach) * count :]
+        rows = gain[(start + reach) * reach * count * count :]
+        for k in range(stop - start - reach):
+            for e in range(count):
+                value = after[k * count + e]
+                # The latest points last: they alone have to be waited for.
+                for d in range(reach - 1, -1, -1):
+                    for s in range(count):
+                        own = ((k * reach + d) * count + e) * count + s
+                        value += rows[own] * before[(k + reach - 1 - d) * count + s]
+                after[k * count + e] = value
+        start = stop
     block = reach * count
     size = segments * block
     x = np.empty((1, size))
@@ -386,14 +396,15 @@ def back_substitute(grid, factors, right):
                 x[0, (q + 1) % segments * block + d * count + e] = forced[ends[q + 1] - d, e]
     matrix = reduced[: size * (3 * size - 2)].reshape((size, 3 * size - 2))
     solve(matrix, size - 1, size - 1, reduced_pivots, x)
-    start = 0
+    start, moved, out = 0, transfer.reshape(transfer.size), right.reshape(points * count)
     for q in range(segments):
-        for j in range(start, ends[q + 1] + 1):
-            for e in range(count):
-                value = forced[j, e]
+        for e in range(count):
+            for k in range(ends[q + 1] + 1 - start):
+                j = np.uint64(start + k)
+                value = flat[j * np.uint64(count) + np.uint64(e)]
                 for c in range(block):
-                    value += transfer[j, e, c] * x[0, q * block + c]
-                right[j, e] = value
+                    value += moved[np.uint64((e * block + c) * points) + j] * x[0, q * block + c]
+                out[j * np.uint64(count) + np.uint64(e)] = value
         start = ends[q + 1] + 1
 
 
@@ -551,16 +562,19 @@ def newton(
 
 @njit(
     f"Tuple((boolean, int64, float64))({FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR}, "
-    f"float64, {MATRIX}, {MATRIX}, {MATRIX}, {FACTORS}, {MATRIX}, {MATRIX})",
+    f"float64, float64, {MATRIX}, {MATRIX}, {MATRIX}, {FACTORS}, {MATRIX}, {MATRIX})",
     **OPTIONS,
 )
 def chord(
-    residual, grid, inputs, parameters, tau, frequency, drift, amplitude, stiffness, z, states, change, factors, left,
-    right,
+    residual, grid, inputs, parameters, tau, frequency, drift, amplitude, stiffness, predicted, z, states, change,
+    factors, left, right,
 ):  # fmt: skip
     """Improve z in place with the factors of a nearby solution; return whether that converged, the steps, and how far.
 
-    `states` are left as they were before the last step. A step above `CHORD_RATE` times the one before ends it.
+    `states` are left as they were before the last step. A step above `CHORD_RATE` times the one before ends it. The
+    ratio of two steps tells how much smaller the next one will be; that of the first step to the prediction tells the
+    order of magnitude, since the prediction is a chord step too, but for terms of second order: `PREDICTION_RATE` times
+    it was above all but a few of a hundred rates found.
 
     Where ∂g/∂z is nearly singular, steps with another point's factors say little of what is left in the direction that
     it makes smallest, and after a change of its stiffness there, or of its sign, they go the wrong way. So this
@@ -573,6 +587,8 @@ def chord(
         Units of the steps.
     stiffness : float
         Expected of the present ∂g/∂z in this direction, in units of that of the factors.
+    predicted : float
+        The change that the prediction made, in these units.
     change : array (points, states)
         Work array.
     left : array (points, states)
@@ -584,7 +600,7 @@ def chord(
     if not (stiffness > LEAST_STIFFNESS and stiffness < MOST_STIFFNESS):
         return False, 0, 0.0
     correction, tolerance = 1.0 / stiffness - 1.0, STEP_TOLERANCE * min(1.0, stiffness)
-    previous, moved = np.inf, 0.0
+    previous, moved, rate = predicted, 0.0, PREDICTION_RATE
     for iteration in range(MAX_CHORDS):
         differentiate(z, drift, grid, tau, frequency, states)
         residual(states, inputs, parameters, tau, frequency, change)
@@ -609,11 +625,11 @@ def chord(
             if largest_change > 0.0:
                 full = max(full, largest_change / amplitude[s])
         moved += full
-        if not full < min(FAR, CHORD_RATE * previous):
+        if not full < FAR or (iteration > 0 and not full < CHORD_RATE * previous):
             return False, iteration + 1, moved
-        if full <= tolerance or (iteration > 0 and full**2 <= tolerance * previous):
+        if full <= tolerance or rate * full**2 <= tolerance * previous:
             return True, iteration + 1, moved
-        previous = full
+        previous, rate = full, 1.0
     return False, MAX_CHORDS, moved
 
 
@@ -733,7 +749,8 @@ def solve_many(
     status, iterations : int arrays (sets, solves)
     """
     bands, pivots, inverses, gains, transfers, ends, reduced, reduced_pivots = anchor_factors
-    points, count, solves = anchor_z.shape[1], anchor_z.shape[2], parameters.shape[1]
+    points, count = anchor_z.shape[1], STATES if STATES > 0 else anchor_z.shape[2]
+    solves = parameters.shape[1]
     states, z = np.empty((points, 3 * count)), np.empty((points, count))
     predicted, here, last = np.empty((points, count)), np.empty((points, count)), np.empty((points, count))
     columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MAX_ITERATIONS, 3))
@@ -756,9 +773,16 @@ def solve_many(
             stiffness = 1.0
             for p in range(theta.size):
                 stiffness += anchor_softening[e, p] * (theta[p] - anchor_parameters[e, p])
+            ahead = 0.0
+            for s in range(count):
+                part = 0.0
+                for i in range(points):
+                    part = max(part, abs(predicted[i, s] - at[i, s]))
+                if part > 0.0:
+                    ahead = max(ahead, part / anchor_amplitude[e, s])
             close, used, moved = chord(
-                residual, grid, inputs[e], theta, tau, f, turn, anchor_amplitude[e], stiffness, z, states, change, kept,
-                anchor_left[e], anchor_right[e],
+                residual, grid, inputs[e], theta, tau, f, turn, anchor_amplitude[e], stiffness, ahead, z, states,
+                change, kept, anchor_left[e], anchor_right[e],
             )  # fmt: skip
         if not close:
             moved = np.inf
