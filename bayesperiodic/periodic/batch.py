@@ -114,8 +114,9 @@ class Batch:
                     own[5][0] = NO_FACTORS
                 left[e], right[e] = softest_direction(equations, anchor.z, columns)
                 slopes[e] = softening(equations, anchor.z, anchor.parameters, sensitivities[e], left[e], right[e])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            near = first.kernels.FAR * np.nanmin([np.ptp(a.z, axis=0) for a in anchors] / amplitude, axis=1)
+        ranges = np.stack([np.ptp(a.z, axis=0) for a in anchors])
+        ratios = np.divide(ranges, amplitude, out=np.full(ranges.shape, np.inf), where=amplitude > 0.0)
+        near = first.kernels.FAR * ratios.min(axis=1)
         self._shared = (
             first.grid.tau,
             np.array([e.frequency for e in sets]),

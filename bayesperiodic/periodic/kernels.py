@@ -153,31 +153,31 @@ def differentiate(z, drift, grid, tau, frequency, states):
     first, second, neighbours, _, _, _, lead = grid
     points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
     width = REACH + 1 if REACH > 0 else first.size
-    one, two = first * frequency, second * frequency**2
     start, inside = (REACH - lead, points - REACH) if REACH > 0 else (0, 0)
+    squared = frequency**2
     flat, rest = z.reshape(z.size), tau[start:]
     here, out = flat[start * count :], states.reshape(states.size)[3 * start * count :]
     for k in range(inside):
         for s in range(count):
-            rate, acceleration = drift[s] * frequency, 0.0
+            rate, acceleration = 0.0, 0.0
             for o in range(width):
                 value = flat[(k + o) * count + s]
-                rate += one[o] * value
-                acceleration += two[o] * value
+                rate += first[o] * value
+                acceleration += second[o] * value
             out[3 * count * k + s] = here[count * k + s] + drift[s] * rest[k]
-            out[3 * count * k + count + s] = rate
-            out[3 * count * k + 2 * count + s] = acceleration
+            out[3 * count * k + count + s] = (rate + drift[s]) * frequency
+            out[3 * count * k + 2 * count + s] = acceleration * squared
     for k in range(points - inside):
         i = k if k < start else k + inside
         for s in range(count):
-            rate, acceleration = drift[s] * frequency, 0.0
+            rate, acceleration = 0.0, 0.0
             for o in range(width):
                 value = z[neighbours[i, o], s]
-                rate += one[o] * value
-                acceleration += two[o] * value
+                rate += first[o] * value
+                acceleration += second[o] * value
             states[i, s] = z[i, s] + drift[s] * tau[i]
-            states[i, count + s] = rate
-            states[i, 2 * count + s] = acceleration
+            states[i, count + s] = (rate + drift[s]) * frequency
+            states[i, 2 * count + s] = acceleration * squared
 
 
 @njit(f"void({MATRIX}, {GRID}, int64, float64, {MATRIX})", **OPTIONS)

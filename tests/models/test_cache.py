@@ -56,7 +56,8 @@ def test_second_start_loads_all_functions_from_the_cache(folder):
 def test_numba_settings_of_the_user_do_not_move_the_files(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(cache.numba.config, "CACHE_DIR", str(tmp_path / "elsewhere"))
     cache.load(kernel_source(LINEAR), FUNCTIONS)
-    assert len(list((entry(folder) / "__pycache__").glob("*.nbi"))) == len(FUNCTIONS)
+    names = {path.name.split("-")[0].split(".")[1] for path in (entry(folder) / "__pycache__").glob("*.nbi")}
+    assert names >= set(FUNCTIONS)
     assert cache.numba.config.CACHE_DIR == str(tmp_path / "elsewhere")
 
 
