@@ -89,7 +89,8 @@ def runge_kutta(residual_jacobian, start, inputs, samples, parameters, frequency
     first = steps - path.shape[0]
     for k in range(steps):
         if k >= first:
-            path[k - first] = y
+            for i in range(size):
+                path[k - first, i] = y[i]
         for stage in range(4):
             half = 2 * k + (stage + 1) // 2
             for i in range(size):
@@ -201,8 +202,8 @@ def dormand_prince(
                 error = used / frequency * high / np.sqrt((high + 0.01 * low) * size)
             if finite and error <= 1.0:
                 now = time[k] if used == remaining else now + used
-                y[:] = trial
-                rates[0] = rates[stages]
+                for i in range(size):
+                    y[i], rates[0, i] = trial[i], rates[stages, i]
                 # A step cut short by an output time says nothing against the longer one.
                 growth = 10.0 if error == 0.0 else min(10.0, 0.9 * error ** (-0.125))
                 step = max(step, used * growth) if used < step and growth >= 1.0 else used * growth
@@ -210,5 +211,6 @@ def dormand_prince(
                 step = used * max(0.2, 0.9 * error ** (-0.125))
             else:
                 step = 0.2 * used
-        path[k] = y
+        for i in range(size):
+            path[k, i] = y[i]
     return time.size

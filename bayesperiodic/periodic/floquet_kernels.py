@@ -96,7 +96,9 @@ def transfer_matrices(matrix, weights, first, step, gauss, sums, result):
                     product[p, q] = 0.0
                     for k in range(size):
                         product[p, q] += total[p, k] * result[point, k, q]
-            result[point] = product
+            for p in range(size):
+                for q in range(size):
+                    result[point, p, q] = product[p, q]
 
 
 @njit("void(complex128[::1])", **OPTIONS)
@@ -116,7 +118,8 @@ def along(steps, at, length, result):
     points, size = result.shape
     for k in range(points):
         if k % length == 0:
-            result[k] = at[k // length]
+            for p in range(size):
+                result[k, p] = at[k // length, p]
         else:
             for p in range(size):
                 result[k, p] = 0.0
@@ -129,12 +132,14 @@ def along(steps, at, length, result):
 def across(steps, at, length, result):
     """Fill an eigenfunction of the adjoint (points, size) likewise, backwards."""
     points, size = result.shape
-    result[0] = at[0]
+    for p in range(size):
+        result[0, p] = at[0, p]
     normalise(result[0])
     for k in range(points - 1, 0, -1):
         after = (k + 1) % points
         if k % length == 0:
-            result[k] = at[k // length]
+            for p in range(size):
+                result[k, p] = at[k // length, p]
         else:
             for p in range(size):
                 result[k, p] = 0.0
@@ -150,7 +155,8 @@ def largest(steps, vector, sweeps, tolerance):
     start, after = np.empty(size), np.empty(size)
     for _ in range(sweeps):
         growth = 0.0
-        start[:] = vector
+        for p in range(size):
+            start[p] = vector[p]
         for k in range(points):
             square = 0.0
             for p in range(size):

@@ -52,6 +52,14 @@ FACTORS = f"Tuple(({MATRIX}, {PLACES}, {CUBE}, {GAINS}, {CUBE}, {PLACES}, {VECTO
 OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
 
 
+@njit(f"void({MATRIX}, {MATRIX})", **OPTIONS)
+def copy(source, target):
+    """Copy one array into another of the same shape; a slice assignment would bring in the text of its error."""
+    for i in range(source.shape[0]):
+        for s in range(source.shape[1]):
+            target[i, s] = source[i, s]
+
+
 @njit(f"boolean({MATRIX}, int64, int64, {PLACES})", **OPTIONS)
 def factor(band, lower, upper, pivots):
     """Factor in place, P·A = L·U, the pivots kept as their inverses; return False for one that is zero or not finite.
@@ -551,7 +559,7 @@ def newton(
         history[iteration, 2] = damping
         if not accepted:
             return STALLED, iteration + 1
-        z[:] = trial
+        copy(trial, z)
         if full <= STEP_TOLERANCE or (damping == 1.0 and norm(columns, rounding) <= 1.0):
             return CONVERGED, iteration + 1
         if damping == 1.0 and full < CHORD_RATE * previous < np.inf and full**2 <= STEP_TOLERANCE * previous:
@@ -636,7 +644,7 @@ def chord(
 @njit(f"void({MATRIX}, {CUBE}, {VECTOR}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
 def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fraction, z):
     """Fill z with the anchor's linear prediction, at a fraction of the way from the anchor's parameters."""
-    z[:] = anchor_z
+    copy(anchor_z, z)
     count = STATES if STATES > 0 else z.shape[1]
     for p in range(parameters.size):
         change = fraction * (parameters[p] - anchor_parameters[p])
@@ -767,7 +775,7 @@ def solve_many(
             bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], reduced[e], reduced_pivots[e]
         )  # fmt: skip
         predict(at, anchor_sensitivities[e], anchor_parameters[e], theta, 1.0, predicted)
-        z[:] = predicted
+        copy(predicted, z)
         close, used, code, doubtful, moved = False, 0, CONVERGED, False, np.inf
         if ends[e, 0] >= 0:
             stiffness = 1.0
@@ -786,14 +794,14 @@ def solve_many(
             )  # fmt: skip
         if not close:
             moved = np.inf
-            z[:] = predicted
+            copy(predicted, z)
             code, more = newton(
                 residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, history, states, columns, own
             )  # fmt: skip
             used += more
             doubtful = was_damped(history, more)
             if code != CONVERGED:
-                z[:] = at
+                copy(at, z)
                 code, more = newton(
                     residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, history, states, columns, own
                 )  # fmt: skip
@@ -804,11 +812,14 @@ def solve_many(
         if ends[e, 0] >= 0 and (doubtful or far or repetitions(z, periods) > once):
             leapt = code == CONVERGED
             done, step, before = 0.0, LARGEST_PART, LARGEST_PART
-            here[:], last[:] = at, at
+            copy(at, here)
+            copy(at, last)
             predict(at, anchor_sensitivities[e], anchor_parameters[e], theta, -before, last)
             while done < 1.0:
-                predicted[:] = here + (here - last) * (step / before)
-                z[:] = predicted
+                for i in range(points):
+                    for s in range(count):
+                        predicted[i, s] = here[i, s] + (here[i, s] - last[i, s]) * (step / before)
+                copy(predicted, z)
                 between = anchor_parameters[e] + (theta - anchor_parameters[e]) * (done + step)
                 code, more = newton(
                     residual_jacobian, grid, inputs[e], between, tau, f, turn, z, history, states, columns, own
@@ -823,11 +834,12 @@ def solve_many(
                     if step < SMALLEST_PART:
                         break
                     continue
-                last[:], here[:] = here, z
+                copy(here, last)
+                copy(z, here)
                 done, before = done + step, step
                 step = min(2.0 * step, LARGEST_PART, 1.0 - done)
         differentiate(z, turn, grid, tau, f, states)
         outputs(states, inputs[e], theta, tau, f, y[e, b])
         if kept_z.size > 0:
-            kept_z[e, b] = z
+            copy(z, kept_z[e, b])
         status[e, b], iterations[e, b] = code, used

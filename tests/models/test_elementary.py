@@ -63,6 +63,8 @@ def test_a_model_on_the_grid_agrees_with_its_expressions():
     found = model.kernels.evaluate("residual", states, inputs, parameters, tau, 1.0)[:, 0]
     both = model.kernels.evaluate("residual_jacobian", states, inputs, parameters, tau, 1.0)
     x, dx, ddx = states.T
-    assert found == pytest.approx(ddx + np.tanh(3 * dx) + np.arctan(x) + np.exp(-x) - inputs[:, 0], rel=1e-14, abs=1e-14)
+    assert found == pytest.approx(
+        ddx + np.tanh(3 * dx) + np.arctan(x) + np.exp(-x) - inputs[:, 0], rel=1e-14, abs=1e-14
+    )
     assert both[:, 0] == pytest.approx(found, rel=1e-14, abs=1e-14)
     assert both[:, 2] == pytest.approx(3.0 / np.cosh(3 * dx) ** 2, rel=1e-12, abs=1e-14)
