@@ -319,9 +319,9 @@ class Problem:
         solved = self.responses.solve(theta, threads)
         status = np.max([s.status for s in solved.values()], axis=0)
         good = status == CONVERGED
-        kept = slice(None) if good.all() else good
-
-        responses = {n: Response(*(part[kept] for part in s.response)) for n, s in solved.items()}
+        responses = {name: s.response for name, s in solved.items()}
+        if not good.all():
+            responses = {name: Response(*(part[good] for part in r)) for name, r in responses.items()}
         # Shared by experiments, not by θ: the rounding of a matrix product may depend on how many rows it has.
         small = max(s.response.outputs.size for s in solved.values()) < SMALLEST_SHARED
         if small:

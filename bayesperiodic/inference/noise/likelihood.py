@@ -104,13 +104,22 @@ class Likelihood:
 
     def _log_prior(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         total, slopes = np.zeros(values.shape[:-1]), np.zeros(values.shape)
+        for kind, columns, measured in self._kinds:
+            value, slopes[..., columns] = self.model.log_prior(kind, values[..., columns], measured)
+            total = total + value.sum(axis=-1)
+        return total, slopes
+
+    @cached_property
+    def _kinds(self) -> list[tuple[str, list[int], np.ndarray]]:
+        """The kinds of free noise parameters, the columns of each and the measured variances that belong to them."""
+        kinds: dict[str, list[int]] = {}
         for i in self._free:
             name = self.names[i]
-            kind = VARIANCE if name.startswith(SCALE) else name.partition("[")[0]
-            measured = self.measured.get(name, np.nan)
-            value, slopes[..., i] = self.model.log_prior(kind, values[..., i], measured)
-            total = total + value
-        return total, slopes
+            kinds.setdefault(VARIANCE if name.startswith(SCALE) else name.partition("[")[0], []).append(i)
+        return [
+            (kind, columns, np.array([self.measured.get(self.names[i], np.nan) for i in columns]))
+            for kind, columns in kinds.items()
+        ]
 
     def __call__(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float = 1.0) -> np.ndarray:
         """Return the log-likelihood (…,) of residuals, one (…, size) a block, at values (…, names).

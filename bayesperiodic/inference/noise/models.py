@@ -116,8 +116,8 @@ class Noise(ABC):
         variances, slopes = self.spectrum(block, values)
         return np.diag(variances), np.stack([np.diag(variances * slope) for slope in slopes.T])
 
-    def log_prior(self, kind: str, value: np.ndarray, measured: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the log-density over ln φ of a noise parameter (…,), and its derivative by ln φ."""
+    def log_prior(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log-density over ln φ of noise parameters of a kind (…,), and its derivative by ln φ."""
         if kind in self.shape_priors:
             return _over_logarithm(self.shape_priors[kind], value)
         if self.prior == JEFFREYS:
@@ -193,11 +193,13 @@ class Measured(Noise):
         """Return V = scatter²/cycles + v."""
         return value + measured
 
-    def log_prior(self, kind: str, value: np.ndarray, measured: float) -> tuple[np.ndarray, np.ndarray]:
+    def log_prior(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the log-density over ln v; Jeffreys' is that of 1/(measured + v)."""
-        if self.prior != JEFFREYS or not measured > 0.0:
+        if self.prior != JEFFREYS:
             return super().log_prior(kind, value, measured)
-        return np.log(value / (measured + value)), measured / (measured + value)
+        known = np.where(np.asarray(measured) > 0.0, measured, 0.0)
+        share = np.where(known > 0.0, value / (known + value), 1.0)
+        return np.log(share), 1.0 - share
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from scipy.stats.distributions import rv_frozen
 from bayesperiodic import checks
 from bayesperiodic.inference.priors.from_scipy import FromScipy, as_written
 from bayesperiodic.inference.priors.multivariate import MultivariateNormal
-from bayesperiodic.inference.priors.univariate import Prior
+from bayesperiodic.inference.priors.univariate import Prior, Univariate
 
 ALLOWED = "a prior such as Normal(mean, sd), or a frozen continuous distribution of scipy.stats"
 
@@ -89,7 +89,24 @@ class JointPrior:
 
     def log_prob(self, theta: np.ndarray) -> np.ndarray:
         """Return Σ ln p over the blocks at θ (…, names), shape (…); −inf outside the support."""
-        return np.sum([self._log_prob(key, theta) for key in self.blocks], axis=0)
+        blocks = [self.blocks[key].log_prob(theta[..., self._columns[key]]) for key in self._alone]
+        alike = [prior.log_prob(theta[..., columns]).sum(axis=-1) for prior, columns in self._alike]
+        return np.sum(blocks + alike, axis=0)
+
+    @cached_property
+    def _alike(self) -> list[tuple[Univariate, list[int]]]:
+        """Priors that several parameters have, with where these are on the last axis of θ."""
+        columns: dict[Univariate, list[int]] = {}
+        for key, prior in self.blocks.items():
+            if isinstance(prior, Univariate):
+                columns.setdefault(prior, []).append(self._columns[key])
+        return [(prior, own) for prior, own in columns.items() if len(own) > 1]
+
+    @cached_property
+    def _alone(self) -> list[str | tuple[str, ...]]:
+        """The blocks whose prior no other has."""
+        shared = {self.names[column] for _, columns in self._alike for column in columns}
+        return [key for key in self.blocks if isinstance(key, tuple) or key not in shared]
 
     def gradient(self, theta: np.ndarray) -> np.ndarray:
         """Return ∂ log p / ∂θ at θ (…, names), shape (…, names)."""
