@@ -31,8 +31,6 @@ GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1
 FUNCTIONS = ("residual", "residual_jacobian", "outputs", "derivatives", "transitions")
 SECOND_FUNCTIONS = ("jacobian_change",)
 MANY_ZEROS = 30
-PREAMBLE = "import math\n\nfrom numba import njit\n\n\n"
-ELEMENTARY = ("exp", "tanh", "atan")
 
 
 class GridFunction(types.WrapperAddressProtocol):
@@ -207,9 +205,17 @@ def _module(
         time["frequency"]: "frequency",
     }
     functions = [_function(name, expressions, arguments) for name, expressions in needs.items()]
-    calls = any(f"{name}(" in function for name in ELEMENTARY for function in functions)
-    elementary = Path(__file__).with_name("elementary.py").read_text(encoding="utf-8") + "\n\n" if calls else ""
-    return (elementary or PREAMBLE) + "\n\n".join(functions)
+    return _with_elementary("\n\n".join(functions))
+
+
+def _with_elementary(functions: str) -> str:
+    """Return the text after the elementary functions that it calls and what these call."""
+    header, *blocks = Path(__file__).with_name("elementary.py").read_text(encoding="utf-8").strip().split("\n\n\n")
+    for block in reversed(blocks):
+        name = block.partition("def ")[2].partition("(")[0]
+        if f"{name}(" in functions:
+            functions = f"{block}\n\n\n{functions}"
+    return f"{header}\n\n\n{functions}"
 
 
 def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str]) -> str:

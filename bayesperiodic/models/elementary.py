@@ -1,6 +1,6 @@
 """Elementary functions as plain arithmetic, so that loops over the grid that call them are vectorised.
 
-This text becomes part of every generated module that calls one of them (see `compile`). A call of the C library's
+What a generated module calls of this text becomes part of it (see `compile`). A call of the C library's
 function keeps such a loop scalar and costs more than all the rest of a model. The rational approximations are those of
 S. L. Moshier, Cephes Mathematical Library (1989): errors are of one or two units in the last place.
 """

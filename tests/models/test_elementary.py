@@ -10,7 +10,7 @@ import bayesperiodic as bp
 from bayesperiodic.models import compile as compilation
 from bayesperiodic.models.cache import load
 
-NAMES = compilation.ELEMENTARY
+NAMES = ("exp", "tanh", "atan")
 EXACT = {"exp": mpmath.exp, "tanh": mpmath.tanh, "atan": mpmath.atan}
 SIZES = np.concatenate([np.geomspace(1e-300, 1e300, 1201), np.linspace(0.01, 40.0, 3001)])
 
