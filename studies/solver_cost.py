@@ -102,7 +102,7 @@ def newton_iteration(drive: str, scheme: str, repeats: int) -> dict[str, Any]:
     for equations in gear_equations(drive, scheme):
         z = equations.solve(theta, equations.static_guess(theta)).z
         newton, iterations = _prepared(equations, theta, z * (1.0 + OFF))
-        band, lower = _lapack_band(equations, equations.residual_jacobian(z, theta))
+        band, lower = lapack_band(equations, equations.residual_jacobian(z, theta))
         working = band.copy(order="F")
         right = np.random.default_rng(1).standard_normal(band.shape[1])
         factored, pivots, _ = lapack.dgbtrf(band, lower, lower)
@@ -345,7 +345,7 @@ def _slope(sizes: Any, times: Any) -> float:
     return float(np.polyfit(np.log(sizes), np.log(times), 1)[0])
 
 
-def _lapack_band(equations: PeriodicEquations, columns: np.ndarray) -> tuple[np.ndarray, int]:
+def lapack_band(equations: PeriodicEquations, columns: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the folded band of ∂g/∂z in LAPACK's storage, with room for pivoting, and its half-width."""
     grid, count = equations.grid, equations.count
     lower = grid.half_width * count + count - 1

@@ -1,0 +1,66 @@
+"""What the benchmark should show, each beside what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from studies.benchmark_contenders import GRADIENT, OWN_GRADIENT
+from studies.benchmark_integration import EQUILIBRIUM, ESTIMATE, STEADY
+from studies.benchmark_problems import DISPLACEMENT, DUFFING, FORCE
+from studies.benchmark_scipy import BVP, INITIAL
+from studies.sampling_rows import Row, row
+
+# Least ratios to one warm log-posterior.
+LEAST = (
+    (f"{STEADY} {EQUILIBRIUM}", 20.0, (DUFFING, FORCE)),
+    (f"{STEADY} {ESTIMATE}", 5.0, (DUFFING, FORCE)),
+    *((f"{method} {start}", 100.0, None) for method in INITIAL for start in (EQUILIBRIUM, ESTIMATE)),
+    *((f"{BVP} {start}", 20.0, None) for start in (EQUILIBRIUM, ESTIMATE)),
+)
+GRADIENT_LEAST, GRADIENT_ERROR = 2.0, 1e-6
+# Largest shares of the floor.
+NEAR, BATCHED, WITH_GRADIENT = 0.35, 0.18, 1.0
+SAME_GRID = 1e-2
+
+
+def rows(found: Mapping[str, Any]) -> list[Row]:
+    """Return all targets whose measurements are there."""
+    result = []
+    for name, problem in found["problems"].items():
+        result += _of_problem(name, problem)
+    if FORCE in found["floor"]:
+        result += _of_floor(found["floor"][FORCE])
+    return result
+
+
+def _of_problem(name: str, problem: Mapping[str, Any]) -> list[Row]:
+    result, by_name = [], {entry["name"]: entry for entry in problem["rows"]}
+    for contender, least, where in LEAST:
+        if contender in by_name and (where is None or name in where):
+            entry = by_name[contender]
+            note = "" if entry["ratio"] else entry["note"]
+            what = f"{name}: {contender} / this package, warm"
+            result.append(row(what, entry["ratio"] and entry["ratio"]["median"], least, None, note))
+    if name in (FORCE, DISPLACEMENT):
+        given = problem["gradient_ratio"]
+        what = f"{name}: {GRADIENT} / this package"
+        result.append(row(what, given and given["median"], GRADIENT_LEAST, None))
+        own = by_name.get(f"{OWN_GRADIENT}, {problem['scheme']}")
+        if own:
+            what = f"{name}: error of this package's gradient, of its largest component"
+            result.append(row(what, own["gradient_error"], 0.0, GRADIENT_ERROR, "against central differences"))
+    return result
+
+
+def _of_floor(floor: Mapping[str, Any]) -> list[Row]:
+    result = []
+    for scheme, entry in floor["schemes"].items():
+        for key, limit, what in (
+            ("near", NEAR, "warm, one core, at draws"), ("far", NEAR, "warm, one core, at three times their spread"),
+            ("batched", BATCHED, "64 walkers, all cores"), ("gradient", WITH_GRADIENT, "value and gradient"),
+        ):  # fmt: skip
+            result.append(row(f"{FORCE}, {scheme}: {what} / floor", entry["ratio"][key]["median"], 0.0, limit))
+        what = f"{FORCE}, {scheme}: |Δ log-posterior| against solves anchored at the draw"
+        result.append(row(what, entry["same_grid_error"], 0.0, SAME_GRID))
+    return result

@@ -1,0 +1,201 @@
+import json
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import bayesperiodic as bp
+from studies import benchmark, benchmark_contenders, benchmark_problems, benchmark_targets, damper
+from studies.__main__ import main
+from studies.benchmark_equations import NUMPY, FirstOrder, table
+from studies.benchmark_integration import EQUILIBRIUM, PREDICTED, SHOOTING, STARTS, STEADY, Discretised, Method
+from studies.benchmark_kernels import dense, eliminate, signals
+from studies.benchmark_problems import DUFFING_TRUTH, Setting, draws, measured
+from studies.benchmark_reference import refer
+from studies.benchmark_timing import Action, interleaved, ratio, slope
+
+MODELS = ("landing_gear force", "landing_gear displacement", "duffing", "dahl", "pendulum", "silverbox")
+
+
+@pytest.fixture(scope="module")
+def setting():
+    # A Duffing oscillator whose motion becomes steady within tens of cycles.
+    samples, truth = 96, DUFFING_TRUTH | {"c": 0.2}
+    wave = np.cos(2 * np.pi * np.arange(samples) / samples)
+    experiments = measured(bp.models.duffing, truth, [(0.1, {"force": 0.4 * wave})], samples, 1)
+    priors = {name: bp.LogNormal(truth[name], 0.5) for name in ("c", "k", "k3")}
+    problem = bp.Problem(bp.models.duffing, experiments, priors=priors, fixed={"m": 1.0}, scheme="central4")
+    fit = bp.map_estimate(problem, progress=False)
+    return Setting("Duffing", problem, fit, draws(problem, fit, 2, 1), True, lambda *_: np.zeros(2))
+
+
+@pytest.mark.parametrize("which", MODELS)
+def test_the_first_order_form_satisfies_the_equations(which):
+    name, _, drive = which.partition(" ")
+    model = bp.models.landing_gear(drive) if drive else getattr(bp.models, name)
+    first, generator = FirstOrder(model, tuple(model.parameters)), np.random.default_rng(3)
+    y, u = generator.uniform(0.5, 1.5, first.size), generator.uniform(0.5, 1.5, 3 * len(model.inputs) + 1)
+    p = generator.uniform(0.5, 1.5, len(model.parameters) + 1)
+    rate, jacobian, shifted = np.empty(first.size), np.empty((first.size, first.size)), np.empty((2, first.size))
+    first.function(NUMPY, first.rates)(y, u, p, rate)
+    known = dict(zip(first.states, y, strict=True)) | dict(zip(model.parameter_symbols.values(), p, strict=False))
+    known |= {model.time_symbols["tau"]: u[-1], model.time_symbols["frequency"]: p[-1]}
+    known |= {model.input_symbols[d + n]: u[3 * i + k] for i, n in enumerate(model.inputs) for k, d in _orders()}
+    for state, order in model.orders.items():
+        below = first.states.index(model.state_symbols["d" * (order - 1) + state])
+        known[model.state_symbols["d" * order + state]] = rate[below]
+    for equation in model.equations:
+        size = max(abs(float(term.subs(known))) for term in equation.as_ordered_terms())
+        assert abs(float(equation.subs(known))) < 1e-12 * max(size, 1.0)
+    first.function(NUMPY, first.by_states(first.rates))(y, u, p, jacobian)
+    for j in range(first.size):
+        step = 1e-5 * np.eye(first.size)[j]
+        for row, sign in enumerate((1.0, -1.0)):
+            first.function(NUMPY, first.rates)(y + sign * step, u, p, shifted[row])
+        size = np.abs(jacobian).max() + np.abs(rate).max()
+        assert jacobian[:, j] == pytest.approx((shifted[0] - shifted[1]) / 2e-5, abs=1e-6 * size)
+
+
+def _orders():
+    return enumerate(("", "d", "dd"))
+
+
+def test_inputs_are_those_of_the_samples_between_them_too():
+    samples, time = 32, np.arange(512) / 512
+    experiment = bp.Experiment(
+        "run", 0.5, {"displacement": np.arange(32.0)}, {"force": _wave(samples)}, samples=samples
+    )
+    values = table(experiment, ["force"], 512)
+    assert values[:, 0] == pytest.approx(np.cos(2 * np.pi * time) + 0.3 * np.sin(4 * np.pi * time), abs=1e-12)
+    exact = np.pi * (-np.sin(2 * np.pi * time) + 0.6 * np.cos(4 * np.pi * time))
+    assert values[:, 1] == pytest.approx(exact, abs=1e-11) and values[:, 3] == pytest.approx(time)
+    found = np.empty(4)
+    signals(values, 7.3, found)
+    assert found[0] == pytest.approx(np.cos(0.6 * np.pi) + 0.3 * np.sin(1.2 * np.pi), abs=1e-8)
+
+
+def _wave(samples):
+    angle = 2 * np.pi * np.arange(samples) / samples
+    return np.cos(angle) + 0.3 * np.sin(2 * angle)
+
+
+def test_elimination_needs_its_pivots():
+    generator = np.random.default_rng(1)
+    matrix, right = generator.standard_normal((3, 3)), generator.standard_normal(3)
+    matrix[0, 0] = 0.0
+    exact = np.linalg.solve(matrix, right)
+    eliminate(matrix, right)
+    assert right == pytest.approx(exact, rel=1e-12)
+
+
+def test_integration_and_shooting_end_on_the_same_orbit_which_is_periodic_for_scipy_too(setting):
+    case = setting.cases[0]
+    p, one = case.estimate, Discretised(case, 400)
+    ends = []
+    for kind in (STEADY, SHOOTING):
+        for start in STARTS:
+            assert Method(one, kind, start, 1e-10).run(p) > 0
+            ends.append(one.orbit)
+    assert np.ptp(ends, axis=0) == pytest.approx(0.0, abs=1e-8)
+    found = solve_ivp(
+        case.compiled.rates_in_time, (0.0, case.period), ends[0], "DOP853", rtol=1e-12, atol=1e-12,
+        args=(p, case.table(16_384), case.period),
+    )  # fmt: skip
+    assert found.y[:, -1] == pytest.approx(ends[0], abs=1e-8)
+
+
+def test_the_runge_kutta_method_and_its_dense_output_are_of_fourth_order(setting):
+    case, orbits, between = setting.cases[0], [], []
+    for steps in (50, 100, 1600):
+        one = Discretised(case, steps)
+        assert one.shoot(case.estimate, PREDICTED, 1e-11)
+        orbits.append(one.orbit)
+        at, out = 2 * np.pi * np.arange(steps + 1) / steps, np.empty((64, 1))
+        dense(np.sin(at)[:, None], np.cos(at)[:, None], 2 * np.pi / steps, out)
+        between.append(np.abs(out[:, 0] - np.sin(2 * np.pi * np.arange(64) / 64)).max())
+    errors = [np.abs(orbit - orbits[2]).max() for orbit in orbits[:2]]
+    assert 3.5 < np.log2(errors[0] / errors[1]) < 4.6
+    assert between[0] < 1e-6 and 3.5 < np.log2(between[0] / between[1]) < 4.6
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_log_posteriors_are_those_of_the_package_where_only_some_harmonics_are_kept():
+    experiment = damper.generate(1).fold(400)
+    problem = bp.Problem(bp.models.dahl, [experiment], priors=damper.PRIORS)
+    fit = bp.map_estimate(problem, progress=False)
+    made = Setting("damper", problem, fit, draws(problem, fit, 2, 1), True, lambda *_: np.zeros(1))
+    outputs, _ = problem.outputs(made.theta)
+    (case,) = made.cases
+    for k, theta in enumerate(made.theta):
+        own = made.log_prior(theta) + case.log_likelihood(outputs[experiment.name]["force"][k][:, None])
+        assert own == pytest.approx(float(problem.log_posterior(theta, made.noise)), abs=1e-8)
+
+
+def test_the_gradient_by_shooting_is_that_of_its_value(setting):
+    case, sd = setting.cases[0], np.array(list(setting.fit.sd.values()))
+    one, theta = Discretised(case, 200), setting.theta[0]
+    _, gradient = one.value_and_gradient(setting.parameters(theta, case)[0], 1e-11)
+    method = Method(one, SHOOTING, PREDICTED, 1e-11)
+    for k in range(theta.size):
+        step = 0.01 * sd[k] * np.eye(theta.size)[k]
+        up, down = (method(setting.parameters(theta + sign * step, case)[0]) for sign in (1.0, -1.0))
+        assert gradient[k] * sd[k] == pytest.approx((up - down) / 0.02, rel=1e-4, abs=1e-4)
+
+
+def test_every_contender_is_right_before_it_is_timed(setting):
+    reference = refer(setting)
+    assert reference.uncertainty < 1e-6
+    contest = benchmark_contenders.Contest(reference)
+    scheme = benchmark_contenders.add_own(contest)
+    compiled = benchmark_contenders.add_compiled(contest)
+    benchmark_contenders.add_scipy(contest, compiled)
+    contest.add("wrong", 0.02, Action(lambda: pytest.fail("timed")))
+    found = benchmark_contenders.measured(contest, scheme, 2)
+    rows = {row["name"]: row for row in found["rows"]}
+    assert rows["wrong"]["milliseconds"] is None and "not right enough" in rows["wrong"]["note"]
+    for row in found["rows"]:
+        assert (row["milliseconds"] is None) == (row["error"] is None or row["error"] > found["allowed"])
+    timed = {name for name, row in rows.items() if row["milliseconds"]}
+    assert {f"{kind} {start}" for kind in (STEADY, SHOOTING) for start in STARTS} < timed
+    assert {f"{name} {EQUILIBRIUM}" for name in ("LSODA", "Radau", "solve_bvp")} < timed
+    assert scheme is not None and rows[f"this package, warm, {scheme}"]["ratio"]["median"] == 1.0
+    assert rows[f"this package, value and gradient, {scheme}"]["gradient_error"] < 1e-6
+    json.dumps(found)
+
+
+def test_actions_take_turns_and_ratios_are_taken_within_a_repeat():
+    order = []
+    actions = {
+        "a": Action(lambda: order.append("a")),
+        "b": Action(lambda: order.append("b") or 6.0, of=3),
+        "once": Action(lambda: order.append("once"), most=1),
+    }
+    times = interleaved(actions, 2)
+    assert order == ["a", "b", "a", "b", "once", "a", "b"]
+    assert times["b"].tolist() == [2.0, 2.0] and np.isnan(times["once"][1])
+    found = ratio(np.array([2.0, 9.0, np.nan]), np.array([1.0, 3.0, 1.0]))
+    assert found == {"median": 2.5, "least": 2.0, "largest": 3.0}
+    assert slope([1, 2, 4], [3, 12, 48]) == pytest.approx(2.0)
+
+
+def test_targets_are_called_met_and_missed_as_measured():
+    def entry(name, value):
+        return {"name": name, "ratio": value and {"median": value}, "note": "never right", "gradient_error": None}
+
+    rows = [entry("LSODA from equilibrium", 101.0), entry("solve_bvp from equilibrium", 19.0)]
+    rows += [entry("Radau from equilibrium", None)]
+    found = {"problems": {"damper": {"rows": rows, "scheme": None, "gradient_ratio": None}}, "floor": {}}
+    met = {row["what"].split()[1]: row["met"] for row in benchmark_targets.rows(found)}
+    assert met == {"LSODA": True, "Radau": None, "solve_bvp": False}
+
+
+def test_a_quick_run_writes_table_and_figure(tmp_path, capsys, setting, monkeypatch):
+    monkeypatch.setattr(benchmark, "problems", lambda options: {benchmark_problems.FORCE: lambda: setting})
+    assert main(["benchmark", "--quick", "--out", str(tmp_path)]) == 0
+    results = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
+    printed = capsys.readouterr().out
+    assert "SYNTHETIC" in printed and "dgbtrf" in printed and "What must show" in printed
+    assert (tmp_path / "benchmark.png").stat().st_size > 1000
+    floor = results["floor"][benchmark_problems.FORCE]["schemes"]["central4"]
+    assert floor["same_grid_error"] < 1e-4 and floor["floor_us"]["sum"]["median"] > 0.0
+    assert {row["what"].split(":")[0] for row in results["checks"]} >= {benchmark_problems.FORCE}
