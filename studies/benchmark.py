@@ -8,17 +8,26 @@ are of times taken side by side in one run. Peers that are not installed are row
 from __future__ import annotations
 
 import argparse
+import json
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from studies import common
 
+# What the guard compares with.
+KEPT = Path("figures/benchmark/results.json")
+
 
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
-    from studies import benchmark_figures, benchmark_tables, benchmark_targets  # compiles
+    from studies import benchmark_figures, benchmark_posteriors, benchmark_tables, benchmark_targets  # compiles
+    from studies.benchmark_problems import DUFFING
     from studies.sampling_rows import table
+
+    if options.guard:
+        options.quick, options.out = True, KEPT.parent.parent / "quick" / "benchmark"
 
     watch = common.Stopwatch()
     found: dict[str, Any] = {"seed": options.seed, "quick": options.quick, "cores": os.cpu_count()}
@@ -27,18 +36,53 @@ def run(options: argparse.Namespace) -> None:
     for name, make in problems(options).items():
         with watch.part(name, f"{name}: one log-posterior by every contender"):
             setting = make()
-            found["problems"][name] = contest(setting, options.quick)
+            found["problems"][name], methods = contest(setting, options.quick)
         print(benchmark_tables.problem(name, found["problems"][name]), flush=True)
+        if name == DUFFING and not options.quick:
+            with watch.part("posterior", "effective samples a second"):
+                found["posterior"] = benchmark_posteriors.measure(
+                    setting, found["problems"][name], methods, options.seed
+                )
+            print(benchmark_tables.posterior(found["posterior"]), flush=True)
         if name.startswith("landing gear"):
             with watch.part(f"floor, {name}", f"{name}: the floor"):
                 found["floor"][name] = floor(setting, options.quick)
             print(benchmark_tables.floor(name, found["floor"][name]), flush=True)
+    if not options.quick:
+        _rest(found, options, watch)
     found["checks"] = benchmark_targets.rows(found)
     print("\nWhat must show\n" + table(found["checks"]) + "\n")
     with watch.part("figure", "drawing"):
         paths = common.save_figures(options.out, {"benchmark": benchmark_figures.draw(found)})
     path = common.write_results(options.out, found | {"seconds": watch.total(), "versions": common.versions()})
     print(f"figures: {', '.join(map(str, paths))}\nresults: {path}")
+    if options.guard:
+        guard(found, KEPT)
+
+
+def _rest(found: dict[str, Any], options: argparse.Namespace, watch: common.Stopwatch) -> None:
+    """Measure the pendulum's unstable orbit and how time and memory grow."""
+    from studies import benchmark_pendulum, benchmark_scaling
+
+    with watch.part("pendulum", "an unstable orbit of the pendulum, by time integration"):
+        found["pendulum"] = benchmark_pendulum.measure(options.seed)
+    print(benchmark_pendulum.account(found["pendulum"]), flush=True)
+    with watch.part("scaling", "growth of time and memory"):
+        found["scaling"] = benchmark_scaling.measure(options.seed)
+    print(benchmark_scaling.account(found["scaling"]), flush=True)
+
+
+def guard(found: dict[str, Any], kept: Path) -> None:
+    """Compare ratios, never seconds, with those kept; raise a RuntimeError if any is worse."""
+    from studies import benchmark_guard
+
+    if not kept.is_file():
+        raise FileNotFoundError(f"--guard: {kept} is not there; run the whole study first.")
+    before = json.loads(kept.read_text(encoding="utf-8"))
+    lines = benchmark_guard.worse(found, before)
+    print(f"guard: {benchmark_guard.compared(found, before)} ratios compared, tolerance {benchmark_guard.TOLERANCE:g}")
+    if lines:
+        raise RuntimeError("ratios are worse than those kept:\n" + "\n".join(lines))
 
 
 def problems(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
@@ -59,16 +103,23 @@ def problems(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
     }
 
 
-def contest(setting: Any, quick: bool) -> dict[str, Any]:
-    """Return what all contenders take of one problem; a quick run leaves out those of SciPy that integrate."""
+def contest(setting: Any, quick: bool) -> tuple[dict[str, Any], Any]:
+    """Return what all contenders take of one problem, and the methods of shooting from the predicted orbit.
+
+    A quick run leaves out other packages and those of SciPy's methods that integrate.
+    """
     from studies import benchmark_contenders as contenders
+    from studies import benchmark_peers
+    from studies.benchmark_integration import PREDICTED, SHOOTING
     from studies.benchmark_reference import refer
 
     contest = contenders.Contest(refer(setting))
     scheme = contenders.add_own(contest)
     compiled = contenders.add_compiled(contest)
     contenders.add_scipy(contest, compiled, quick=quick)
-    return contenders.measured(contest, scheme, 3 if quick else 15)
+    if not quick:
+        benchmark_peers.add_peers(contest, compiled)
+    return contenders.measured(contest, scheme, 3 if quick else 15), compiled.get((SHOOTING, PREDICTED), [])
 
 
 def floor(setting: Any, quick: bool) -> dict[str, Any]:

@@ -75,6 +75,15 @@ class Contest:
         note = note if right else f"{note + '; ' if note else ''}not right enough"
         self.rows.append(Row(name, error, action if right else None, note, gradient_error))
 
+    def gradient_error(self, gradient: np.ndarray) -> float:
+        """Return how far a gradient by θ at the first draw is from this package's, of the largest component.
+
+        Components count in the posterior's standard deviations.
+        """
+        exact = self.setting.problem.gradient(self.setting.theta[0], self.setting.noise)[: gradient.size]
+        sd = np.array(list(self.setting.fit.sd.values()))
+        return float(np.abs((gradient - exact) * sd).max() / np.abs(exact * sd).max())
+
     def refuse(self, name: str, why: str) -> None:
         """Enter a contender that there is nothing to time of."""
         self.rows.append(Row(name, np.inf, None, why))
@@ -152,7 +161,7 @@ def add_compiled(contest: Contest) -> Compiled:
             methods, error = tuned
             slow = kind == STEADY and start != PREDICTED
             count = SLOW_DRAWS if slow else len(contest.setting.theta)
-            action = Action(partial(_integrate, contest, methods, count), count, SLOW_REPEATS if slow else 10_000)
+            action = Action(partial(integrate, contest, methods, count), count, SLOW_REPEATS if slow else 10_000)
             contest.add(name, error, action, _steps(methods))
             found[kind, start] = methods
     if (SHOOTING, PREDICTED) in found:
@@ -166,7 +175,8 @@ def _steps(methods: Sequence[Method]) -> str:
     return f"{between} steps a cycle, {min(sweeps):.3g} … {max(sweeps):.3g} cycles"
 
 
-def _integrate(contest: Contest, methods: Sequence[Callable[[np.ndarray], float]], count: int) -> None:
+def integrate(contest: Contest, methods: Sequence[Callable[[np.ndarray], float]], count: int) -> None:
+    """Compute the log-posteriors of the first so many draws."""
     setting, reference = contest.setting, contest.reference
     for k in range(count):
         setting.log_prior(setting.theta[k])
@@ -186,12 +196,9 @@ def _add_gradient(contest: Contest, methods: Sequence[Method]) -> None:
         return value, gradient
 
     values, gradients = zip(*(both(k) for k in range(len(setting.theta))), strict=True)
-    fine = setting.problem.gradient(setting.theta[0], setting.noise)[: setting.theta.shape[1]]
-    sd = np.array(list(setting.fit.sd.values()))
-    off = float(np.abs((gradients[0] - fine) * sd).max() / np.abs(fine * sd).max())
     contest.add(
         GRADIENT, reference.error(np.array(values)), Action(lambda: [both(k) for k in range(SLOW_DRAWS)], SLOW_DRAWS),
-        "against this package's gradient", off,
+        "against this package's gradient", contest.gradient_error(gradients[0]),
     )  # fmt: skip
 
 
@@ -218,7 +225,7 @@ def add_scipy(contest: Contest, compiled: Compiled, *, quick: bool = False) -> N
             continue
         solved, error = found
         tolerances = [one.boundary.tolerance for one in solved]
-        action = Action(partial(_integrate, contest, solved, SLOW_DRAWS), SLOW_DRAWS, SLOW_REPEATS)
+        action = Action(partial(integrate, contest, solved, SLOW_DRAWS), SLOW_DRAWS, SLOW_REPEATS)
         contest.add(f"{BVP} {start}", error, action, f"tol {min(tolerances):.0e} … {max(tolerances):.0e}")
 
 

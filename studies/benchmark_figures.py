@@ -22,7 +22,12 @@ def draw(found: Mapping[str, Any]) -> Figure:
     """Return the figure: contenders over one warm log-posterior, and the stages of one beside the floor."""
     figure = Figure(SIZE, layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[1.5, 1.0])
-    _contenders(left, found["problems"])
+    if "posterior" in found:
+        place = right.get_subplotspec().subgridspec(2, 1)
+        right.set_subplotspec(place[0])
+        _posterior(figure.add_subplot(place[1]), found["posterior"])
+    if found["problems"]:
+        _contenders(left, found["problems"])
     if FORCE in found["floor"]:
         _floor(right, found["floor"][FORCE])
     return figure
@@ -65,3 +70,12 @@ def _floor(ax: Axes, found: Mapping[str, Any]) -> None:
     ax.set(ylabel="time of one log-posterior [µs]", title=f"{FORCE}: stages")
     ax.set_ylim(0.0, 1.05 * below.max())
     ax.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=3)
+
+
+def _posterior(ax: Axes, found: Mapping[str, Any]) -> None:
+    values = {name: e["ess_per_second"] for name, e in found["samplers"].items() if "ess_per_second" in e}
+    values |= {f"emcee, {name}": entry["ess_per_second"] for name, entry in found["emcee_around"].items()}
+    names = sorted(values, key=lambda name: values[name])
+    ax.barh(range(len(names)), [values[name] for name in names])
+    ax.set_yticks(range(len(names)), names, fontsize=6)
+    ax.set(xscale="log", xlabel="effective samples a second [1/s]", title="Duffing (synthetic): posterior")

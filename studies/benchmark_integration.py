@@ -14,10 +14,11 @@ EQUILIBRIUM, ESTIMATE, PREDICTED = "from equilibrium", "from the estimate's orbi
 STARTS = (EQUILIBRIUM, ESTIMATE, PREDICTED)
 STEPS = (
     20, 25, 32, 40, 50, 64, 80, 100, 128, 160, 200, 256, 320, 400, 512, 640, 800, 1000, 1280, 1600, 2000, 2560, 3200,
-    4000, 5120, 6400, 8000, 10_240, 12_800, 16_000,
+    4000, 5120, 6400, 8000, 10_240, 12_800, 16_000, 20_480, 25_600, 32_000, 40_960, 51_200,
 )  # fmt: skip
 TOLERANCES = tuple(10.0**-k for k in range(1, 13))
-REFERENCE_STEPS = 25_600
+REFERENCE_STEPS = 25_600, 51_200, 102_400, 204_800
+REFERENCE_TOLERANCE, REFERENCE_ERROR = 1e-10, 1e-5
 MOST = 30
 TIGHT, LOOSE = 1e-11, 1e-9
 
@@ -74,10 +75,11 @@ class Discretised:
         y, _, slopes = self.anchor
         if kind == ESTIMATE:
             return y.copy()
-        return y + slopes @ (p[self._columns] - self.case.estimate[self._columns])
+        return y + slopes @ (p[self.columns] - self.case.estimate[self.columns])
 
     @cached_property
-    def _columns(self) -> list[int]:
+    def columns(self) -> list[int]:
+        """Where the moving parameters are in p."""
         return [list(self.case.model.parameters).index(name) for name in self.case.moving]
 
     def settle(self, p: np.ndarray, kind: str, tolerance: float) -> int:
@@ -192,12 +194,16 @@ class Method:
 
 
 def exact(case: Case, parameters: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the log-likelihood at draws by the finest shooting, and by how much twice as long steps change it."""
-    fine, coarse = (
-        np.array([Method(Discretised(case, steps), SHOOTING, PREDICTED, TIGHT)(p) for p in parameters])
-        for steps in (REFERENCE_STEPS, REFERENCE_STEPS // 2)
-    )
-    return fine, float(np.max(np.abs(fine - coarse)))
+    """Return the log-likelihood at draws by fine shooting, and by how much twice as long steps change it."""
+    coarse = np.full(len(parameters), np.nan)
+    for steps in (REFERENCE_STEPS[0] // 2, *REFERENCE_STEPS):
+        one = Discretised(case, steps)
+        fine = np.array([Method(one, SHOOTING, PREDICTED, REFERENCE_TOLERANCE)(p) for p in parameters])
+        off = float(np.max(np.abs(fine - coarse)))
+        if off < REFERENCE_ERROR:
+            break
+        coarse = fine
+    return fine, off
 
 
 def discretise(case: Case, parameters: np.ndarray, exact: np.ndarray, allowed: float) -> Discretised:

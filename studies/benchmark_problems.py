@@ -106,19 +106,34 @@ class Case:
         return np.array([float(self.experiment.independent[c]) for c in self.model.outputs])
 
     @cached_property
-    def _weights(self) -> np.ndarray:
+    def weights(self) -> np.ndarray:
         """Of the squared residuals: independent values per sample, over the variance, halved."""
         return 0.5 * self._counts / (self.experiment.samples * self.variances)
 
     def log_likelihood(self, outputs: np.ndarray) -> float:
         """Return eq. (6)'s part of this experiment, from outputs (samples, channels)."""
-        constant = -0.5 * float(self._counts @ np.log(self.variances))
-        if self._whole:
-            return constant - misfit(self._data, outputs, self._weights)
-        return constant - float(self._weights @ (self._residuals(outputs) ** 2).sum(axis=0))
+        if self.whole:
+            return self.constant - misfit(self._data, outputs, self.weights)
+        return self.constant - float(self.weights @ (self._residuals(outputs) ** 2).sum(axis=0))
 
     @cached_property
-    def _whole(self) -> bool:
+    def spectral_weights(self) -> np.ndarray:
+        """Of the squared Fourier sums of the residuals (samples // 2 + 1, channels), zero beyond the harmonics kept."""
+        samples = self.experiment.samples
+        twice = np.full((samples // 2 + 1, len(self._kept)), 2.0)
+        twice[[0, -1] if samples % 2 == 0 else [0]] = 1.0
+        for i, kept in enumerate(self._kept):
+            twice[samples if kept is None else kept + 1 :, i] = 0.0
+        return twice * self.weights / samples
+
+    @cached_property
+    def constant(self) -> float:
+        """What does not depend on the outputs."""
+        return -0.5 * float(self._counts @ np.log(self.variances))
+
+    @cached_property
+    def whole(self) -> bool:
+        """Whether all harmonics are compared."""
         return all(kept is None for kept in self._kept)
 
     def _residuals(self, outputs: np.ndarray) -> np.ndarray:
@@ -131,8 +146,8 @@ class Case:
 
     def weighted_residuals(self, outputs: np.ndarray) -> np.ndarray:
         """Return the derivatives of the log-likelihood by the outputs (samples, channels)."""
-        residuals = self._data - outputs if self._whole else self._residuals(outputs)
-        return 2.0 * residuals * self._weights
+        residuals = self._data - outputs if self.whole else self._residuals(outputs)
+        return 2.0 * residuals * self.weights
 
 
 @dataclass(frozen=True)

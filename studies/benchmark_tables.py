@@ -29,6 +29,18 @@ def between(values: Mapping[str, float] | None) -> str:
     return "-" if values is None else f"{values['median']:.3g} ({values['least']:.3g} … {values['largest']:.3g})"
 
 
+def posterior(found: Mapping[str, Any]) -> str:
+    """Return samplers, and emcee around the contenders."""
+    lines = ["Effective samples a second, Duffing (SYNTHETIC data), the smallest of any parameter"]
+    for name, entry in found["samplers"].items():
+        value = f"{entry['ess_per_second']:.3g}" if "ess_per_second" in entry else "-"
+        lines.append(f"  {name:60s}{value:>10s}  {entry.get('note', '')}")
+    lines.append(f"  {found['split']['best']} over emcee around:  ratio = sampler × solver")
+    for name, entry in found["split"]["against"].items():
+        lines.append(f"    {name:58s}{entry['ratio']:>10.3g} = {entry['sampler']:.3g} × {entry['solver']:.3g}")
+    return "\n".join(lines)
+
+
 def floor(name: str, found: Mapping[str, Any]) -> str:
     """Return floor and stages of one problem."""
     lines = [f"{name}: the floor, and what a warm log-posterior takes on one core [µs]"]

@@ -7,6 +7,8 @@ from typing import Any
 
 from studies.benchmark_contenders import GRADIENT, OWN_GRADIENT
 from studies.benchmark_integration import EQUILIBRIUM, ESTIMATE, STEADY
+from studies.benchmark_peers import BALANCE, DIFFRAX_ROWS
+from studies.benchmark_posteriors import NUMPYRO
 from studies.benchmark_problems import DISPLACEMENT, DUFFING, FORCE
 from studies.benchmark_scipy import BVP, INITIAL
 from studies.sampling_rows import Row, row
@@ -17,11 +19,19 @@ LEAST = (
     (f"{STEADY} {ESTIMATE}", 5.0, (DUFFING, FORCE)),
     *((f"{method} {start}", 100.0, None) for method in INITIAL for start in (EQUILIBRIUM, ESTIMATE)),
     *((f"{BVP} {start}", 20.0, None) for start in (EQUILIBRIUM, ESTIMATE)),
+    *((name, 50.0, None) for name in DIFFRAX_ROWS[:3]),
+    (BALANCE, 10.0, None),
 )
 GRADIENT_LEAST, GRADIENT_ERROR = 2.0, 1e-6
 # Largest shares of the floor.
 NEAR, BATCHED, WITH_GRADIENT = 0.35, 0.18, 1.0
 SAME_GRID = 1e-2
+FASTEST, AROUND_SCIPY = 3.0, 20.0
+START = (
+    ("import_s", "import [s]", 1.0), ("first_solve_s", "first solve of a new model [s]", 10.0),
+    ("from_cache_s", "first solve from the cache [s]", 1.0),
+    ("peak_mb", "peak of a process, 64 walkers × 14 experiments [MB]", 500.0),
+)  # fmt: skip
 
 
 def rows(found: Mapping[str, Any]) -> list[Row]:
@@ -31,6 +41,10 @@ def rows(found: Mapping[str, Any]) -> list[Row]:
         result += _of_problem(name, problem)
     if FORCE in found["floor"]:
         result += _of_floor(found["floor"][FORCE])
+    if "posterior" in found:
+        result += _of_posterior(found["posterior"])
+    if "scaling" in found:
+        result += _of_scaling(found["scaling"])
     return result
 
 
@@ -64,3 +78,29 @@ def _of_floor(floor: Mapping[str, Any]) -> list[Row]:
         what = f"{FORCE}, {scheme}: |Δ log-posterior| against solves anchored at the draw"
         result.append(row(what, entry["same_grid_error"], 0.0, SAME_GRID))
     return result
+
+
+def _of_posterior(found: Mapping[str, Any]) -> list[Row]:
+    against, best = found["split"]["against"], found["split"]["best"]
+    others = {name: entry["ratio"] for name, entry in against.items() if not name.startswith("this package")}
+    scipy = {name: ratio for name, ratio in others.items() if name.startswith(INITIAL)}
+    result = []
+    for what, ratios, least in (("the fastest", others, FASTEST), ("SciPy's integrators", scipy, AROUND_SCIPY)):
+        if ratios:
+            name = min(ratios, key=lambda n: ratios[n])
+            text = f"effective samples a second: {best} / emcee around {what} ({name})"
+            result.append(row(text, ratios[name], least, None))
+    numpyro, own = found["samplers"][NUMPYRO], found["samplers"][best]
+    there = "ess_per_second" in numpyro
+    value = own["ess_per_second"] / numpyro["ess_per_second"] if there else None
+    text = f"effective samples a second: {best} / {NUMPYRO}"
+    return [*result, row(text, value, FASTEST, None, numpyro.get("note", ""))]
+
+
+def _of_scaling(found: Mapping[str, Any]) -> list[Row]:
+    result = [
+        row(f"exponent of {kind} by {axis}", one[f"{kind}_exponent"], 0.9, 1.1)
+        for axis, one in found["growth"].items()
+        for kind in ("time", "memory")
+    ]
+    return result + [row(what, found["start"][key], 0.0, limit) for key, what, limit in START]

@@ -1,11 +1,27 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
-from studies import benchmark, benchmark_contenders, benchmark_problems, benchmark_targets, damper
+from studies import (
+    benchmark,
+    benchmark_contenders,
+    benchmark_diffrax,
+    benchmark_figures,
+    benchmark_guard,
+    benchmark_harmonic_balance,
+    benchmark_peers,
+    benchmark_pendulum,
+    benchmark_posteriors,
+    benchmark_problems,
+    benchmark_scaling,
+    benchmark_tables,
+    benchmark_targets,
+    damper,
+)
 from studies.__main__ import main
 from studies.benchmark_equations import NUMPY, FirstOrder, table
 from studies.benchmark_integration import EQUILIBRIUM, PREDICTED, SHOOTING, STARTS, STEADY, Discretised, Method
@@ -199,3 +215,106 @@ def test_a_quick_run_writes_table_and_figure(tmp_path, capsys, setting, monkeypa
     floor = results["floor"][benchmark_problems.FORCE]["schemes"]["central4"]
     assert floor["same_grid_error"] < 1e-4 and floor["floor_us"]["sum"]["median"] > 0.0
     assert {row["what"].split(":")[0] for row in results["checks"]} >= {benchmark_problems.FORCE}
+
+
+def test_a_peer_that_is_not_installed_is_a_row_that_says_so(setting, monkeypatch):
+    monkeypatch.setattr(benchmark_diffrax.importlib.util, "find_spec", lambda name: None)
+    contest = benchmark_contenders.Contest(refer(replace(setting, name=benchmark_problems.DUFFING)))
+    compiled = benchmark_contenders.add_compiled(contest)
+    contest.rows.clear()
+    benchmark_peers.add_peers(contest, compiled)
+    rows = benchmark_contenders.measured(contest, None, 1)["rows"]
+    assert [row["name"] for row in rows] == [*benchmark_peers.DIFFRAX_ROWS, benchmark_peers.BALANCE]
+    for row in rows:
+        assert row["milliseconds"] is None and "is not installed (pip install" in row["note"]
+
+
+@pytest.mark.parametrize("peer", ["diffrax", "harmonicbalance"])
+def test_peers_are_right(setting, peer):
+    pytest.importorskip(peer)
+    case = setting.cases[0]
+    one, p = Discretised(case, 800), setting.parameters(setting.theta, case)
+    exact = np.array([Method(one, SHOOTING, PREDICTED, 1e-10)(row) for row in p])
+    tune = {"diffrax": benchmark_diffrax.tune_diffrax, "harmonicbalance": benchmark_harmonic_balance.tune_balanced}
+    found = tune[peer](one, p, exact, 1e-3)
+    assert found is not None and [found(row) for row in p] == pytest.approx(exact, abs=2e-3)
+
+
+def test_the_density_of_the_peers_is_the_posterior_with_the_variance_integrated_out(setting):
+    """∫ p(θ, log v) d log v is proportional to p(θ) M^(−n/2): compared by quadrature of the package's density."""
+    methods = [Method(Discretised(case, 400), SHOOTING, PREDICTED, 1e-9) for case in setting.cases]
+    density, warm = benchmark_posteriors.collapsed(setting, methods), setting.problem.anchored(setting.fit.theta)
+    logs = np.log(setting.noise) + np.linspace(-1.5, 1.5, 301)[:, None]
+    found = []
+    for theta in setting.theta:
+        values = warm.log_posterior(np.tile(theta, (len(logs), 1)), np.exp(logs))
+        found.append(np.log(np.exp(values - values.max()).sum()) + values.max() - density(theta))
+    assert np.ptp(found) < 1e-3
+    assert density(-setting.theta[0]) == -np.inf
+
+
+def test_the_potential_of_jax_is_that_density(setting):
+    jax = pytest.importorskip("jax")
+    pytest.importorskip("diffrax")
+    methods = [Method(Discretised(case, 800), SHOOTING, PREDICTED, 1e-9) for case in setting.cases]
+    tuned = [benchmark_diffrax.Integrated(method.discretised, 1e-9) for method in methods]
+    density = benchmark_posteriors.collapsed(setting, methods)
+    middle, factor = np.log(setting.estimate), benchmark_posteriors._axes(setting)
+    potential = jax.jit(benchmark_posteriors._potential(setting, tuned, middle, factor))
+    off = []
+    for z in (np.zeros(3), np.array([0.5, -1.0, 0.3])):
+        theta = np.exp(middle + factor @ z)
+        off.append(float(potential(z)) + density(theta) + np.log(theta).sum())
+    assert off[0] == pytest.approx(off[1], abs=1e-3)
+
+
+def test_integration_leaves_an_unstable_orbit_at_the_rate_of_its_multiplier():
+    """The upright equilibrium's perturbation grows; hanging at rest stays."""
+    hanging = benchmark_pendulum.distances(np.zeros(2))
+    assert max(hanging) == 0.0
+    upright = benchmark_pendulum.distances(np.array([np.pi, 1e-9]))
+    assert upright[0] > 1e-8 and max(upright) > benchmark_pendulum.LEFT
+
+
+def test_the_guard_compares_ratios_only_and_names_those_that_are_worse(tmp_path, monkeypatch):
+    def results(contender, over_floor):
+        row = {"name": "shooting", "ratio": {"median": contender}, "milliseconds": {"median": 1e9}}
+        floor = {"schemes": {"central4": {"ratio": {"near": {"median": over_floor}}}}}
+        own = {"name": "this package, cold", "ratio": {"median": 9.0}}
+        return {"problems": {"damper": {"rows": [row, own]}}, "floor": {"gear": floor}}
+
+    assert benchmark_guard.worse(results(1.0, 0.5), results(1.5, 0.4)) == []
+    lines = benchmark_guard.worse(results(1.0, 0.5), results(2.0, 0.2))
+    assert len(lines) == 2 and "shooting" in lines[0] and "floor" in lines[1]
+    kept = tmp_path / "results.json"
+    with pytest.raises(FileNotFoundError, match="run the whole study first"):
+        benchmark.guard(results(1.0, 0.5), kept)
+    kept.write_text(json.dumps(results(2.0, 0.5)), encoding="utf-8")
+    with pytest.raises(RuntimeError, match="shooting"):
+        benchmark.guard(results(1.0, 0.5), kept)
+
+
+def test_memory_of_the_batched_call_grows_with_the_walkers():
+    calls = [benchmark_scaling._batched(samples=200, experiments=2, walkers=walkers) for walkers in (64, 256)]
+    peaks = [benchmark_scaling._peak(call) for call in calls]
+    assert 0.8 < slope([64, 256], peaks) < 1.2
+
+
+def test_posterior_and_scaling_are_told_and_judged():
+    walked = {"ess_per_log_posterior": 0.02}
+    own = {"ess_per_second": 100.0, "ess_per_log_posterior": 0.05, "seconds": 10.0, "log_posteriors": 20_000}
+    samplers = {"sample, default": own, benchmark_posteriors.NUMPYRO: {"note": "jax is not installed"}}
+    around = {
+        "shooting from equilibrium": {"ess_per_second": 50.0, "milliseconds": 0.4},
+        "LSODA from equilibrium": {"ess_per_second": 0.02, "milliseconds": 1000.0},
+    }
+    split = benchmark_posteriors._split(samplers, walked, around)
+    assert split["against"]["shooting from equilibrium"] == pytest.approx({"ratio": 2.0, "sampler": 2.5, "solver": 0.8})
+    posterior = {"samplers": samplers, "emcee": walked, "emcee_around": around, "split": split}
+    growth = {"samples": {"time_exponent": 1.05, "memory_exponent": 1.3}}
+    start = {"import_s": 0.5, "first_solve_s": 4.0, "from_cache_s": 0.2, "peak_mb": 600.0}
+    found = {"problems": {}, "floor": {}, "posterior": posterior, "scaling": {"growth": growth, "start": start}}
+    assert [row["met"] for row in benchmark_targets.rows(found)] == [False, True, None, True, False, *3 * [True], False]
+    assert "jax is not installed" in benchmark_tables.posterior(posterior)
+    assert "600 MB" in benchmark_scaling.account(found["scaling"])
+    assert len(benchmark_figures.draw(found).axes) == 3

@@ -1,0 +1,47 @@
+"""Regression guard: the ratios of a quick run against those kept. Seconds are never compared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+# By which factor a ratio may be worse; on a shared machine medians of a quick run stray by a third.
+TOLERANCE = 1.6
+OWN = "this package"
+
+
+def worse(now: Mapping[str, Any], kept: Mapping[str, Any], tolerance: float = TOLERANCE) -> list[str]:
+    """Return a line for every ratio that both runs have and that is worse now by more than the tolerance.
+
+    Contenders are compared by their time over this package's, which must not fall, and this package by its time over
+    the floor, which must not rise.
+    """
+    lines = []
+    for name, (new, old) in _pairs(now, kept).items():
+        factor = old / new if "/ floor" not in name else new / old
+        if factor > tolerance:
+            lines.append(f"{name}: {new:.3g}, kept {old:.3g}, worse by a factor {factor:.2f}")
+    return lines
+
+
+def _pairs(now: Mapping[str, Any], kept: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    new, old = _ratios(now), _ratios(kept)
+    return {name: (value, old[name]) for name, value in new.items() if name in old}
+
+
+def _ratios(found: Mapping[str, Any]) -> dict[str, float]:
+    result = {
+        f"{problem}: {row['name']} / {OWN}": row["ratio"]["median"]
+        for problem, entry in found["problems"].items()
+        for row in entry["rows"]
+        if row["ratio"] and not row["name"].startswith(OWN)
+    }
+    for problem, floor in found["floor"].items():
+        for scheme, entry in floor["schemes"].items():
+            result |= {f"{problem}, {scheme}: {what} / floor": v["median"] for what, v in entry["ratio"].items()}
+    return result
+
+
+def compared(now: Mapping[str, Any], kept: Mapping[str, Any]) -> int:
+    """Return how many ratios both runs have."""
+    return len(_pairs(now, kept))

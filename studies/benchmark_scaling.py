@@ -1,0 +1,130 @@
+"""How time and memory grow with samples, experiments, walkers and parameters; what starting takes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import tracemalloc
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+
+import bayesperiodic as bp
+from studies.benchmark_problems import NOISE, gear_problem
+from studies.benchmark_timing import Action, interleaved, slope
+from studies.solver_cost import GEAR
+
+SIZES = {"samples": (800, 1600, 3200), "experiments": (2, 4, 7, 14), "walkers": (16, 32, 64, 128)}
+FREE = (1, 3, 7, 15)
+WALKERS = 64
+REPEATS = 5
+
+IMPORT = "import time; t = time.perf_counter(); import bayesperiodic; print(time.perf_counter() - t)"
+FIRST = """
+import time, numpy as np, bayesperiodic as bp
+model = bp.Model("first", states=["x"], inputs=["force"], parameters={"c": "N s/m", "k3": "N/m^3"},
+    equations=lambda s, p, u: [s.ddx + p.c * s.dx + s.x + p.k3 * s.x**3 - u.force],
+    outputs=lambda s, p, u: {"displacement": s.x})
+force = {"force": 0.1 * np.cos(2 * np.pi * np.arange(100) / 100)}
+t = time.perf_counter()
+bp.solve_periodic(model, {"c": 0.1, "k3": 0.5}, force, frequency=0.1, samples=100)
+print(time.perf_counter() - t)
+"""
+MEMORY = """
+import resource, sys
+from studies.benchmark_scaling import at_truth
+problem, theta, noise = at_truth("force", 800, 14)
+import numpy as np
+assert np.isfinite(problem.log_posterior(np.tile(theta, (64, 1)), noise)).all()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+"""
+
+
+def measure(seed: int) -> dict[str, Any]:
+    """Return times and peaks of the batched call of the force-driven landing gear, with their exponents."""
+    found = {}
+    for axis, sizes in SIZES.items():
+        calls = [_batched(**{axis: size}, seed=seed) for size in sizes]
+        found[axis] = _fitted(sizes, calls, REPEATS)
+    found["parameters"] = _fitted(FREE, [_gradient(free, seed) for free in FREE], REPEATS)
+    return {"growth": found, "start": start()}
+
+
+def _fitted(sizes: tuple[int, ...], calls: list[Callable[[], Any]], repeats: int) -> dict[str, Any]:
+    times = interleaved({str(size): Action(call) for size, call in zip(sizes, calls, strict=True)}, repeats)
+    seconds = [float(np.median(values)) for values in times.values()]
+    peaks = [_peak(call) for call in calls]
+    return {
+        "sizes": list(sizes), "seconds": seconds, "bytes": peaks, "time_exponent": slope(sizes, seconds),
+        "memory_exponent": slope(sizes, peaks),
+    }  # fmt: skip
+
+
+def _peak(call: Callable[[], Any]) -> int:
+    """Return the largest memory that NumPy's arrays take within a call that is not the first [bytes]."""
+    call()
+    tracemalloc.start()
+    call()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak
+
+
+@cache
+def at_truth(drive: str, samples: int, experiments: int, *, free: int = 3, seed: int = 1) -> Any:
+    """Return the landing gear anchored at its true parameters, these, and variances of the noise's size."""
+    problem = gear_problem(drive, seed, free=free, samples=samples, runs=experiments)
+    theta = np.array([GEAR[name] for name in problem.names])
+    spans = {c: np.mean([np.ptp(e.outputs[c]) for e in problem.experiments]) for c in problem.channels}
+    noise = np.array([(NOISE * spans[channel]) ** 2 for channel in problem.channels])
+    return problem.anchored(theta), theta, noise
+
+
+def _batched(samples: int = 800, experiments: int = 14, walkers: int = WALKERS, seed: int = 1) -> Callable[[], Any]:
+    problem, theta, noise = at_truth("force", samples, experiments, seed=seed)
+    many = np.tile(theta, (walkers, 1)) * (1.0 + 1e-6 * np.random.default_rng(seed).standard_normal((walkers, 1)))
+    return partial(problem.log_posterior, many, noise)
+
+
+def _gradient(free: int, seed: int) -> Callable[[], Any]:
+    """Return a gradient by so many parameters."""
+    problem, _, noise = at_truth("force", 800, 14, free=15, seed=seed)
+    kept = dict(list(problem.priors.items())[:free])
+    fixed = {name: GEAR[name] for name in problem.names if name not in kept}
+    fewer = bp.Problem(problem.model, problem.experiments, priors=kept, fixed=fixed, scheme=problem.scheme)
+    theta = np.array([GEAR[name] for name in fewer.names])
+    return partial(fewer.anchored(theta).gradient, theta, noise)
+
+
+def start() -> dict[str, float]:
+    """Return the seconds of importing, of a first solve (compiled, from the cache), and the peak of a process [MB]."""
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"BAYESPERIODIC_CACHE": cache}
+        found = {"import_s": min(_run(IMPORT, environment) for _ in range(3))}
+        found["first_solve_s"] = _run(FIRST, environment)
+        found["from_cache_s"] = _run(FIRST, environment)
+    return found | {"peak_mb": _run(MEMORY, dict(os.environ))}
+
+
+def _run(text: str, environment: dict[str, str]) -> float:
+    """Return the number that a fresh process prints last."""
+    done = subprocess.run([sys.executable, "-c", text], env=environment, capture_output=True, text=True, check=True)
+    return float(done.stdout.split()[-1])
+
+
+def account(found: dict[str, Any]) -> str:
+    """Return what is printed."""
+    lines = [
+        f"  {axis}: time ∝ {axis}^{one['time_exponent']:.2f}, memory ∝ {axis}^{one['memory_exponent']:.2f}"
+        for axis, one in found["growth"].items()
+    ]
+    began = found["start"]
+    return "\n".join([
+        *lines,
+        f"  import {began['import_s']:.2f} s; first solve of a new model {began['first_solve_s']:.1f} s, from the "
+        f"cache {began['from_cache_s']:.2f} s; 64 walkers × 14 experiments: {began['peak_mb']:.0f} MB at the peak",
+    ])  # fmt: skip
