@@ -26,6 +26,7 @@ def run(options: argparse.Namespace) -> None:
     from studies.benchmark_problems import DUFFING
     from studies.sampling_rows import table
 
+    before = read_kept(KEPT) if options.guard else None
     if options.guard:
         options.quick, options.out = True, KEPT.parent.parent / "quick" / "benchmark"
 
@@ -56,8 +57,8 @@ def run(options: argparse.Namespace) -> None:
         paths = common.save_figures(options.out, {"benchmark": benchmark_figures.draw(found)})
     path = common.write_results(options.out, found | {"seconds": watch.total(), "versions": common.versions()})
     print(f"figures: {', '.join(map(str, paths))}\nresults: {path}")
-    if options.guard:
-        guard(found, KEPT)
+    if before is not None:
+        guard(found, before)
 
 
 def _rest(found: dict[str, Any], options: argparse.Namespace, watch: common.Stopwatch) -> None:
@@ -72,13 +73,17 @@ def _rest(found: dict[str, Any], options: argparse.Namespace, watch: common.Stop
     print(benchmark_scaling.account(found["scaling"]), flush=True)
 
 
-def guard(found: dict[str, Any], kept: Path) -> None:
+def read_kept(path: Path) -> dict[str, Any]:
+    """Return the results that the guard compares with."""
+    if not path.is_file():
+        raise FileNotFoundError(f"--guard: {path} is not there; run the whole study first.")
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def guard(found: dict[str, Any], before: dict[str, Any]) -> None:
     """Compare ratios, never seconds, with those kept; raise a RuntimeError if any is worse."""
     from studies import benchmark_guard
 
-    if not kept.is_file():
-        raise FileNotFoundError(f"--guard: {kept} is not there; run the whole study first.")
-    before = json.loads(kept.read_text(encoding="utf-8"))
     lines = benchmark_guard.worse(found, before)
     print(f"guard: {benchmark_guard.compared(found, before)} ratios compared, tolerance {benchmark_guard.TOLERANCE:g}")
     if lines:

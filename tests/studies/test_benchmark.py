@@ -276,7 +276,7 @@ def test_integration_leaves_an_unstable_orbit_at_the_rate_of_its_multiplier():
     assert upright[0] > 1e-8 and max(upright) > benchmark_pendulum.LEFT
 
 
-def test_the_guard_compares_ratios_only_and_names_those_that_are_worse(tmp_path, monkeypatch):
+def test_the_guard_compares_ratios_only_and_names_those_that_are_worse(tmp_path):
     def results(contender, over_floor):
         row = {"name": "shooting", "ratio": {"median": contender}, "milliseconds": {"median": 1e9}}
         floor = {"schemes": {"central4": {"ratio": {"near": {"median": over_floor}}}}}
@@ -288,10 +288,10 @@ def test_the_guard_compares_ratios_only_and_names_those_that_are_worse(tmp_path,
     assert len(lines) == 2 and "shooting" in lines[0] and "floor" in lines[1]
     kept = tmp_path / "results.json"
     with pytest.raises(FileNotFoundError, match="run the whole study first"):
-        benchmark.guard(results(1.0, 0.5), kept)
+        benchmark.read_kept(kept)
     kept.write_text(json.dumps(results(2.0, 0.5)), encoding="utf-8")
     with pytest.raises(RuntimeError, match="shooting"):
-        benchmark.guard(results(1.0, 0.5), kept)
+        benchmark.guard(results(1.0, 0.5), benchmark.read_kept(kept))
 
 
 def test_memory_of_the_batched_call_grows_with_the_walkers():
