@@ -69,7 +69,7 @@ def _floor(ax: Axes, found: Mapping[str, Any]) -> None:
     ax.set_xticks(range(len(bars)), list(bars), fontsize=8)
     ax.set(ylabel="time of one log-posterior [µs]", title=f"{FORCE}: stages")
     ax.set_ylim(0.0, 1.05 * below.max())
-    ax.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=3)
+    ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.45, -0.1), ncols=3)
 
 
 def _posterior(ax: Axes, found: Mapping[str, Any]) -> None:

@@ -130,7 +130,7 @@ def account(found: dict[str, Any]) -> str:
     began = found["start"]
     return "\n".join([
         *lines,
-        f"  import {began['import_s']:.2f} s; first solve of a new model {began['first_solve_s']:.1f} s, from the cache "
-        f"{began['from_cache_s']:.2f} s, the first of all {began['empty_cache_s']:.1f} s",
+        f"  import {began['import_s']:.2f} s; first solve of a new model {began['first_solve_s']:.1f} s, from the "
+        f"cache {began['from_cache_s']:.2f} s, the first of all {began['empty_cache_s']:.1f} s",
         f"  64 walkers × 14 experiments: {began['peak_mb']:.0f} MB at the peak",
     ])  # fmt: skip
