@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from studies.benchmark_floor import STAGES
 from studies.benchmark_problems import FORCE
 
-SIZE = (15.0, 9.0)
+SIZE = (18.0, 10.0)
 MARKERS = "osD^vP*X"
 COLOURS = [colormaps["tab20"](k) for k in range(20)]
 
@@ -21,15 +21,15 @@ COLOURS = [colormaps["tab20"](k) for k in range(20)]
 def draw(found: Mapping[str, Any]) -> Figure:
     """Return the figure: contenders over one warm log-posterior, and the stages of one beside the floor."""
     figure = Figure(SIZE, layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=[1.5, 1.0])
-    if "posterior" in found:
-        place = right.get_subplotspec().subgridspec(2, 1)
-        right.set_subplotspec(place[0])
-        _posterior(figure.add_subplot(place[1]), found["posterior"])
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.15, 1.0])[0]
     if found["problems"]:
-        _contenders(left, found["problems"])
+        _contenders(left.subplots(), found["problems"])
+    drawn = [part for part in ("floor", "posterior") if found.get(part)]
+    places = dict(zip(drawn, right.subplots(max(len(drawn), 1), 1, squeeze=False)[:, 0], strict=False))
     if FORCE in found["floor"]:
-        _floor(right, found["floor"][FORCE])
+        _floor(places["floor"], found["floor"][FORCE])
+    if "posterior" in places:
+        _posterior(places["posterior"], found["posterior"])
     return figure
 
 
@@ -48,7 +48,7 @@ def _contenders(ax: Axes, problems: Mapping[str, Any]) -> None:
     ax.set_yticklabels(names, fontsize=8)
     ax.invert_yaxis()
     ax.grid(axis="x", alpha=0.3)
-    ax.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=3)
+    ax.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=2)
     ax.set_title("One log-posterior, equally right: median and range over the repeats")
 
 
@@ -69,7 +69,7 @@ def _floor(ax: Axes, found: Mapping[str, Any]) -> None:
     ax.set_xticks(range(len(bars)), list(bars), fontsize=8)
     ax.set(ylabel="time of one log-posterior [µs]", title=f"{FORCE}: stages")
     ax.set_ylim(0.0, 1.05 * below.max())
-    ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.45, -0.1), ncols=3)
+    ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _posterior(ax: Axes, found: Mapping[str, Any]) -> None:

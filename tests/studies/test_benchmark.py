@@ -317,4 +317,4 @@ def test_posterior_and_scaling_are_told_and_judged():
     assert [row["met"] for row in benchmark_targets.rows(found)] == [False, True, None, True, False, *3 * [True], False]
     assert "jax is not installed" in benchmark_tables.posterior(posterior)
     assert "600 MB" in benchmark_scaling.account(found["scaling"])
-    assert len(benchmark_figures.draw(found).axes) == 3
+    assert len(benchmark_figures.draw(found).axes) == 1
