@@ -19,7 +19,7 @@ from studies.flutter_data import ADDRESS, LARGEST_DRIFT, RULE, SHA256, Record, r
 from studies.flutter_questions import FREE_SCALES
 from studies.flutter_rig import AUTHORS, MODEL, RIG, SENSORS, TRUE, Fitted, cycles, estimate, problem
 
-SAMPLING: dict[str, Any] = {"ensembles": 2, "walkers": 24, "max_steps": 250, "executor": 2, "progress": False}
+SAMPLING: dict[str, Any] = {"ensembles": 2, "walkers": 24, "max_steps": 12_000, "executor": 2, "progress": False}
 
 
 def run(options: argparse.Namespace) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from studies.flutter_questions import contraction, sizes
+from studies.flutter_questions import closed, contraction, sizes
 from studies.flutter_rig import AUTHORS, RIG, SENSORS, Fitted, cycles
 
 MEASURED, MODEL, THEIRS = "black", {True: "#0072B2", False: "#D55E00"}, "#999999"
@@ -109,7 +109,7 @@ def portraits(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, flo
         orbit = fit.solutions[name]
         kind = not name.startswith("unstable")
         for values, colour, label in ((e.outputs, MEASURED, "measured"), (orbit.outputs, MODEL[kind], "fitted")):
-            smooth = {c: _smooth(values[c]) for c in ("heave", "pitch")}
+            smooth = {c: closed(values[c]) for c in ("heave", "pitch")}
             axes.plot(smooth["heave"], smooth["pitch"], color=colour, lw=1.4, label=f"{label}, {KIND[kind]}")
         axes.set_title(f"{speeds[name]:g} m/s, {KIND[kind]}", fontsize=10)
         axes.legend(frameon=False, fontsize=7, loc="lower right")
@@ -140,13 +140,6 @@ def contractions(fits: Mapping[str, Fitted], synthetic: bool) -> Figure:
     figure.legend(frameon=False, ncols=4, loc="outside lower center")
     figure.suptitle(f"Flutter rig{', synthetic data' if synthetic else ''}: what the cycles tell of each parameter")
     return figure
-
-
-def _smooth(values: np.ndarray) -> np.ndarray:
-    """Return a closed curve through the samples of a cycle, by its Fourier series."""
-    amplitudes = np.fft.rfft(values)
-    curve = np.fft.irfft(amplitudes, 256) * 256 / values.size
-    return np.append(curve, curve[0])
 
 
 def _kind(experiments: Mapping[str, bp.Experiment]) -> str:

@@ -15,11 +15,18 @@ NEAR = 0.25
 FEWEST = 3
 FREE_SCALES = ("gain_heave", "gain_pitch")
 CHANNELS = ("heave", "pitch")
+CURVE = 240
+
+
+def closed(values: np.ndarray) -> np.ndarray:
+    """Return a closed curve through the samples of a cycle, by its Fourier series."""
+    curve = np.fft.irfft(np.fft.rfft(values), CURVE) * CURVE / values.size
+    return np.append(curve, curve[0])
 
 
 def sizes(outputs: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Return half the range of each channel over the cycle, in sensor units."""
-    return {channel: 0.5 * float(np.ptp(outputs[channel])) for channel in CHANNELS}
+    return {channel: 0.5 * float(np.ptp(closed(outputs[channel]))) for channel in CHANNELS}
 
 
 def errors(fitted: Fitted, experiments: Mapping[str, bp.Experiment]) -> dict[str, Any]:

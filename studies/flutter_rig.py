@@ -12,7 +12,7 @@ import numpy as np
 import bayesperiodic as bp
 
 MODEL = bp.models.flutter
-SAMPLES, SCHEME = 16, "fourier"
+SAMPLES, SCHEME = 12, "fourier"
 # As published with the data, in SI units.
 RIG = {
     "b": 0.15, "span": 1.0, "a": -0.5, "rho": 1.204, "x_alpha": 0.234, "m": 5.3, "m_T": 16.9, "I_alpha": 0.1726,

@@ -316,7 +316,7 @@ class Problem:
         status : int array (solves,)
             The worst of all experiments.
         """
-        solved = self.responses.solve(theta, threads)
+        solved = self.responses.solve(theta, threads, whole=True)
         status = np.max([s.status for s in solved.values()], axis=0)
         good = status == CONVERGED
         responses = {name: s.response for name, s in solved.items()}

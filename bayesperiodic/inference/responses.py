@@ -143,17 +143,29 @@ class Responses:
             for group in groups.values()
         ]
 
-    def solve(self, theta: np.ndarray, threads: int | None = None, *, keep: bool = False) -> dict[str, SolvedResponse]:
+    def solve(
+        self, theta: np.ndarray, threads: int | None = None, *, keep: bool = False, whole: bool = False
+    ) -> dict[str, SolvedResponse]:
         """Solve every experiment for θ (solves, names); the result does not depend on the number of threads.
 
-        The periodic parts z are there if they are asked for.
+        Parameters
+        ----------
+        theta : array (solves, names)
+        threads : int, optional
+        keep : bool
+            Return the periodic parts z too.
+        whole : bool
+            A θ counts only if every solve converges; others may then be left out where one has failed.
         """
         result = {}
         for experiments, maps, batch in self._batches:
             values = maps.values(theta)
             parameters = values[..., :-1]
             wanted = keep or any(e.multipliers is not None for e in experiments)
-            solved = batch.solve(parameters, threads, keep=wanted)
+            if isinstance(batch, AutonomousBatch):
+                solved = batch.solve(parameters, threads, keep=wanted, whole=whole)
+            else:
+                solved = batch.solve(parameters, threads, keep=wanted)
             for i, e in enumerate(experiments):
                 status = solved.status[i].copy()
                 logarithms = self._log_multipliers(e, solved.z[i], solved.frequency[i], parameters[i], status)

@@ -1,5 +1,6 @@
 """What `kernels` defines, compiled or loaded from the kernel cache, its loops unrolled for small models."""
 
+import ast
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,11 +9,12 @@ from bayesperiodic.models.cache import load
 
 NAMES = (
     "CONVERGED", "STALLED", "SINGULAR", "NOT_FINITE", "OTHER_ORBIT", "MAX_ITERATIONS", "MAX_SEGMENTS", "MAX_HALVINGS",
-    "STEP_TOLERANCE", "MAX_CHORDS", "CHORD_RATE", "FAR", "LARGEST_PART", "SMALLEST_PART", "factor", "solve",
-    "solve_transposed", "differentiate", "assemble", "factorise", "back_substitute", "scales", "norm", "scaled_step",
-    "newton", "repetitions", "solve_many",
+    "STEP_TOLERANCE", "CHORD_RATE", "factor", "solve", "solve_transposed", "differentiate", "assemble", "factorise",
+    "back_substitute", "scales", "norm", "scaled_step", "newton", "repetitions", "solve_many",
 )  # fmt: skip
+FREE_NAMES = ("orient", "bordered_solve", "chord_free", "has_shrunk", "has_shorter_period", "follow_many")
 GENERIC = "STATES, REACH = 0, 0"
+KERNELS = "bayesperiodic.periodic.kernels"
 UNROLLED_STATES, UNROLLED_REACH = 3, (2, 3)
 
 STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit")
@@ -28,7 +30,22 @@ def kernels(states: int, reach: int) -> SimpleNamespace:
 
 @cache
 def _specialised(states: int, reach: int) -> SimpleNamespace:
-    source = Path(__file__).with_name("kernels.py").read_text(encoding="utf-8")
-    if GENERIC not in source:
-        raise RuntimeError(f"kernels.py does not contain {GENERIC!r}.")
-    return SimpleNamespace(**load(source.replace(GENERIC, f"STATES, REACH = {states}, {reach}"), NAMES))
+    return SimpleNamespace(**load(_text("kernels.py", states, reach), NAMES))
+
+
+@cache
+def autonomous_kernels() -> SimpleNamespace:
+    """Return the compiled functions of `autonomous_kernels`; of `kernels` only what they import is compiled too."""
+    own, shared = ast.parse(_text("autonomous_kernels.py")), ast.parse(_text("kernels.py"))
+    needed = {a.name for n in own.body if isinstance(n, ast.ImportFrom) and n.module == KERNELS for a in n.names}
+    shared.body = [n for n in shared.body if not isinstance(n, ast.FunctionDef) or n.name in needed]
+    own.body = [n for n in own.body if not isinstance(n, ast.Import | ast.ImportFrom)]
+    return SimpleNamespace(**load(f"{ast.unparse(shared)}\n{ast.unparse(own)}\n", FREE_NAMES))
+
+
+def _text(name: str, states: int = 0, reach: int = 0) -> str:
+    """Return the text of a file of kernels, specialised where it can be."""
+    source = Path(__file__).with_name(name).read_text(encoding="utf-8")
+    if (states, reach) != (0, 0) and GENERIC not in source:
+        raise RuntimeError(f"{name} does not contain {GENERIC!r}.")
+    return source.replace(GENERIC, f"STATES, REACH = {states}, {reach}")

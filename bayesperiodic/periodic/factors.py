@@ -71,55 +71,27 @@ class CyclicFactors:
         """
         if not self._complete:
             return None
+        size, row = self._deflate()
+        unit = np.zeros((1, self._grid.points, self._states))
+        unit[0, row // self._states, row % self._states] = size
         borders, sides = len(columns), len(right)
-        x, small = self._eliminated(columns, rows, corner, right)
+        x = self._substitute(self._compiled.solve, np.concatenate([right, columns, unit]), deflated=True)
         plain, bordering, undone = x[:sides], x[sides : sides + borders], x[-1]
+        last = (*np.argwhere(self._grid.place == self._grid.points - 1)[0], self._states - 1)
+        small = np.empty((borders + 1, borders + 1))
+        small[:borders, :borders] = corner - np.einsum("cps,bps->cb", rows, bordering)
+        small[:borders, borders] = np.einsum("cps,ps->c", rows, undone)
+        small[borders, :borders] = -bordering[:, last[0], last[1]]
+        small[borders, borders] = undone[last] - 1.0
         known = np.empty((sides, borders + 1))
         known[:, :borders] = below - np.einsum("cps,rps->rc", rows, plain)
-        known[:, borders] = -plain[:, self._last[0], self._last[1]]
+        known[:, borders] = -plain[:, last[0], last[1]]
         try:
             y = np.linalg.solve(small, known.T).T
         except np.linalg.LinAlgError:
             return None
         x = plain - np.einsum("rb,bps->rps", y[:, :borders], bordering) + y[:, borders, None, None] * undone
         return (x, y[:, :borders]) if np.isfinite(x).all() else None
-
-    def orientation(self, columns: np.ndarray, rows: np.ndarray, corner: np.ndarray) -> float:
-        """Return the sign of the determinant of [∂g/∂z, B; C, D], 0 where it is singular.
-
-        Along a branch of solutions it changes at folds alone.
-        """
-        if not self._complete:
-            return 0.0
-        _, small = self._eliminated(columns, rows, corner, np.empty((0, *rows.shape[1:])))
-        pivots = np.sign(self._band[:, self._lower]).prod()
-        swaps = np.count_nonzero(self._pivots != np.arange(self._pivots.size))
-        return float(-pivots * (-1.0) ** swaps * np.sign(np.linalg.det(small)))
-
-    def _eliminated(
-        self, columns: np.ndarray, rows: np.ndarray, corner: np.ndarray, right: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the deflated solutions for right, columns and what undoes the deflation, and the system that is left.
-
-        The deflated factors stay in place.
-        """
-        size, row = self._deflate()
-        unit = np.zeros((1, self._grid.points, self._states))
-        unit[0, row // self._states, row % self._states] = size
-        borders = len(columns)
-        x = self._substitute(self._compiled.solve, np.concatenate([right, columns, unit]), deflated=True)
-        bordering, undone, last = x[len(right) : len(right) + borders], x[-1], self._last
-        small = np.empty((borders + 1, borders + 1))
-        small[:borders, :borders] = corner - np.einsum("cps,bps->cb", rows, bordering)
-        small[:borders, borders] = np.einsum("cps,ps->c", rows, undone)
-        small[borders, :borders] = -bordering[:, last[0], last[1]]
-        small[borders, borders] = undone[last] - 1.0
-        return x, small
-
-    @property
-    def _last(self) -> tuple[int, int]:
-        """Where the last pivot is in natural order: the point and the state."""
-        return int(np.flatnonzero(self._grid.place == self._grid.points - 1)[0]), self._states - 1
 
     def null_vector(self) -> np.ndarray:
         """Return the vector (points, states) of unit length that ∂g/∂z makes smallest, where it is nearly singular."""

@@ -84,7 +84,6 @@ def solve_family(
     corner: np.ndarray,
     targets: np.ndarray,
     value_scales: np.ndarray,
-    damped: bool = True,
 ) -> Found:
     """Solve g(z, values) = 0 and rows·z + corner·values = targets by a damped Newton method with step halving.
 
@@ -100,8 +99,6 @@ def solve_family(
     targets : array (scalars,)
     value_scales : array (scalars,)
         Steps of the scalars are judged against these, or their size if that is larger.
-    damped : bool
-        Halve steps that do not bring the equations nearer; else give up, "stalled", at the first of them.
     """
     kernels = family.equations.kernels
     count, previous = family.equations.count, np.inf
@@ -125,7 +122,7 @@ def solve_family(
             kernels.scaled_step(z, z_step), float(np.max(abs(value_step) / np.maximum(value_scales, abs(values))))
         )
         damping, accepted = 1.0, False
-        for _ in range(kernels.MAX_HALVINGS if damped else 1):
+        for _ in range(kernels.MAX_HALVINGS):
             trial, trial_values = z + damping * z_step, values + damping * value_step
             if FREQUENCY not in family.free or trial_values[family.free.index(FREQUENCY)] > 0.0:
                 equations, parameters = family.at(trial_values)
@@ -152,12 +149,12 @@ def solve_family(
     return Found(z, values, STALLED, np.array(history))
 
 
-def solve_autonomous(family: Family, z: np.ndarray, frequency: float, damped: bool = True) -> Found:
+def solve_autonomous(family: Family, z: np.ndarray, frequency: float) -> Found:
     """Solve for an orbit of unknown frequency, its phase the one that stays closest to the guess.
 
-    The phase condition is ∫ q_guess'·(q − q_guess) dτ = 0. `damped` as in `solve_family`.
+    The phase condition is ∫ q_guess'·(q − q_guess) dτ = 0.
     """
     row = family.equations.phase_row(z)
     target = np.array([np.sum(row * z)])
     start = np.array([frequency])
-    return solve_family(family, z, start, row[None], np.zeros((1, 1)), target, start, damped)
+    return solve_family(family, z, start, row[None], np.zeros((1, 1)), target, start)

@@ -3,15 +3,14 @@
 from functools import cache
 
 import numpy as np
-import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.periodic.autonomous_batch import Chord
+from bayesperiodic.periodic.autonomous_batch import Bordered
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT
-from bayesperiodic.periodic.family import Found
+from bayesperiodic.periodic.reach import ARRIVED
 from tests.flutter_rig import RIG, SENSORS, hopf
 
-SPEED, SAMPLES = 15.0, 32
+SPEED, SAMPLES = 15.0, 16
 FREE = ("k_alpha", "c_alpha", "c_h", "k_alpha2")
 KINDS = {"stable": True, "unstable": False}
 
@@ -41,32 +40,33 @@ def problem():
 
 
 def test_neither_branch_is_ever_taken_for_the_other():
-    """Draws of 12 %: half have their fold above 15 m/s and no cycle; the fate of the others is told by multipliers."""
-    stated = problem()
-    generator = np.random.default_rng(1)
-    theta = np.array([RIG[name] for name in stated.names]) * np.exp(0.12 * generator.standard_normal((25, len(FREE))))
-    lost = 0
-    for name, solved in stated.responses.solve(theta).items():
-        assert set(np.unique(solved.status)) <= {CONVERGED, OTHER_ORBIT}
-        lost += int(np.sum(solved.status == OTHER_ORBIT))
-        for i in np.flatnonzero(solved.status == CONVERGED):
-            orbit = stated.anchored(theta[i]).solve(theta[i])[name]
-            again = np.ptp(solved.response.outputs[i], axis=0)
-            assert np.ptp(orbit.outputs["pitch"]) == pytest.approx(again[1], rel=1e-6)
-            assert orbit.stable == KINDS[name]
-    assert lost > 0
+    """Draws of 12 %: half have their fold above 15 m/s, some no unstable cycle; by continuation, and by multipliers."""
+    stated, generator = problem(), np.random.default_rng(1)
+    theta = np.array([RIG[name] for name in stated.names]) * np.exp(0.12 * generator.standard_normal((600, len(FREE))))
+    solved = stated.responses.solve(theta)
+    statuses = np.array([solved[name].status for name in KINDS])
+    stable, unstable = (np.ptp(solved[name].response.outputs[..., 1], axis=1) for name in KINDS)
+    assert set(np.unique(statuses)) == {CONVERGED, OTHER_ORBIT}
+    both = np.all(statuses == CONVERGED, axis=0)
+    assert 200 < both.sum() < 400 and np.all(unstable[both] < 0.99 * stable[both])
+    for i in (*np.flatnonzero(both)[:5], *np.flatnonzero(~both)[:15]):
+        for name, kind in KINDS.items():
+            ending = stated.responses.reach(theta[i], name)
+            assert (ending == ARRIVED) == (solved[name].status[i] == CONVERGED), ending
+            if ending == ARRIVED:
+                alone = stated.responses.solve(theta[i : i + 1], keep=True)[name]
+                assert (stated.responses.largest_multipliers(theta[i : i + 1], name, alone)[0] < 1.0) == kind
 
 
 def test_a_fold_between_two_cycles_is_seen():
-    stated = problem().anchored({name: RIG[name] for name in FREE})
-    orbits = {}
+    """The unstable cycle has one real multiplier above 1 more, so that the determinant has the other sign."""
+    stated = problem()
+    parameters = np.array([(RIG | SENSORS | {"U": SPEED})[n] for n in bp.models.flutter.parameters])
+    found = []
     for name, cycle in cycles().items():
         z = np.stack([cycle.states[state] for state in bp.models.flutter.states], axis=-1)
-        orbits[name] = Found(z, np.array([cycle.frequency]), CONVERGED, np.empty((0, 3)))
-    parameters = np.array([(RIG | SENSORS | {"U": SPEED})[n] for n in bp.models.flutter.parameters])
-    for name in KINDS:
-        here = Chord(stated.responses.equations[name], stated.responses._anchors[name])
-        assert [here.is_beyond_fold(parameters, orbits[other]) for other in KINDS] == [other != name for other in KINDS]
+        found.append(Bordered(stated.responses.equations[name], parameters, z, cycle.frequency).orientation)
+    assert found[0] * found[1] == -1.0
 
 
 def test_without_a_cycle_there_is_no_posterior():

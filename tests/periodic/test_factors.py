@@ -148,19 +148,3 @@ def test_status_codes_of_the_compiled_code_are_those_of_the_package():
     kernels = compiled.kernels(1, 2)
     assert [getattr(kernels, name) for name in names] == [getattr(compiled, name) for name in names]
     assert len(compiled.STATUSES) == 5
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_orientation_is_the_sign_of_the_bordered_determinant(scheme):
-    model, generator = growing(3), np.random.default_rng(2)
-    equations = equations_of(model, scheme, 12)
-    signs = set()
-    for rate in np.linspace(-2.0, 2.0, 8):
-        z = generator.standard_normal((12, 3))
-        columns = equations.residual_jacobian(z, np.array([rate]))
-        border, row = generator.standard_normal((2, 1, 12, 3))
-        whole = np.block([[dense(equations, columns), border.reshape(-1, 1)], [row.reshape(1, -1), np.zeros((1, 1))]])
-        sign = np.linalg.slogdet(whole)[0]
-        assert equations.factors(columns).orientation(border, row, np.zeros((1, 1))) == sign
-        signs.add(sign)
-    assert signs == {-1.0, 1.0}
