@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from studies.flutter_questions import closed, contraction, sizes
+from studies.flutter_questions import CHANNELS, closed, contraction, drawn_sizes, laplace_draws, sizes
 from studies.flutter_rig import AUTHORS, RIG, SENSORS, Fitted, cycles
 
 MEASURED, MODEL, THEIRS = "black", {True: "#0072B2", False: "#D55E00"}, "#999999"
 KIND = {True: "stable", False: "unstable"}
-GRID = np.linspace(13.0, 19.0, 241)
+GRID, COARSE = np.linspace(13.0, 19.0, 241), np.linspace(13.0, 19.0, 41)
 
 
 def all_of(
@@ -25,14 +25,11 @@ def all_of(
     draws: int,
 ) -> dict[str, Figure]:
     """Return every figure by its name; without a posterior the bands are Laplace's, and there is no corner plot."""
-    names = list(fit.theta)
     if posterior is None:
-        generator = np.random.default_rng(0)
-        rows = generator.multivariate_normal(list(fit.theta.values()), fit.covariance.to_numpy(), size=draws)
+        chosen = laplace_draws(fit, draws)
     else:
-        every = np.stack([posterior.draws(name).ravel() for name in names], axis=-1)
-        rows = every[np.linspace(0, len(every) - 1, draws).astype(int)]
-    chosen = [dict(zip(names, row.tolist(), strict=True)) for row in rows]
+        every = {name: posterior.draws(name).ravel() for name in fit.theta}
+        chosen = {name: v[np.linspace(0, v.size - 1, draws).astype(int)] for name, v in every.items()}
     figures = {
         "bifurcation": bifurcation(experiments, speeds, fit, chosen),
         "portraits": portraits(experiments, speeds, fit),
@@ -59,26 +56,42 @@ def amplitudes(values: Mapping[str, float]) -> dict[tuple[str, bool], np.ndarray
     return found
 
 
+def bands(theta: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> dict[tuple[str, bool], np.ndarray]:
+    """Return wind speeds and the 5 and 95 % quantiles of the draws' amplitudes (3, speeds), by channel and branch.
+
+    Where fewer than half of the draws have the cycle, or θ itself has none, there is no band.
+    """
+    along = cycles(RIG | dict(theta))
+    found: dict[tuple[str, bool], list[tuple[float, float, float]]] = {(c, k): [] for c in CHANNELS for k in KIND}
+    for speed in COARSE:
+        for kind in KIND:
+            try:
+                orbit = along.at(KIND[kind], speed)
+            except ValueError:
+                continue
+            for channel, size in drawn_sizes(orbit, theta, draws).items():
+                if np.mean(np.isfinite(size)) > 0.5:
+                    found[channel, kind].append((speed, *np.nanquantile(size, [0.05, 0.95])))
+    return {key: np.array(rows).reshape(-1, 3).T for key, rows in found.items()}
+
+
 def bifurcation(
     experiments: Mapping[str, bp.Experiment],
     speeds: Mapping[str, float],
     fit: bp.MapEstimate,
-    draws: Sequence[Mapping[str, float]],
+    draws: Mapping[str, np.ndarray],
 ) -> Figure:
     """Draw amplitudes over wind speed: posterior bands of both branches, the authors' values, what was measured."""
     from matplotlib import pyplot as plt
 
-    bands = [amplitudes(RIG | dict(values)) for values in draws]
+    drawn = bands(fit.theta, draws)
     best, theirs = amplitudes(RIG | fit.theta), amplitudes(RIG | AUTHORS | SENSORS)
     figure = plt.figure(figsize=(9.0, 8.0), layout="constrained")
     for axes, channel in zip(figure.subplots(2, 1, sharex=True), ("heave", "pitch"), strict=True):
         for kind in (True, False):
-            stack = np.array([band[channel, kind] for band in bands])
-            some = np.mean(np.isfinite(stack), axis=0) > 0.5
-            low, high = np.full((2, GRID.size), np.nan)
-            low[some], high[some] = np.nanquantile(stack[:, some], [0.05, 0.95], axis=0)
             colour, style = MODEL[kind], "-" if kind else "--"
-            axes.fill_between(GRID, low, high, color=colour, alpha=0.25, lw=0, label=f"{KIND[kind]}, 90 % of draws")
+            at, low, high = drawn[channel, kind]
+            axes.fill_between(at, low, high, color=colour, alpha=0.25, lw=0, label=f"{KIND[kind]}, 90 % of draws")
             axes.plot(GRID, best[channel, kind], color=colour, ls=style, label=f"{KIND[kind]}, MAP")
             label = "authors' values" if kind else None
             axes.plot(GRID, theirs[channel, kind], color=THEIRS, lw=1.0, ls=style, label=label)

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 import bayesperiodic as bp
-from studies.flutter_rig import AUTHORS, PRIORS, RIG, SENSORS, SPRINGS, START, Fitted, cycles, estimate
+from studies.flutter_rig import (
+    AUTHORS,
+    PRIORS,
+    RIG,
+    SENSORS,
+    SPREADS,
+    SPRINGS,
+    START,
+    Fitted,
+    cycles,
+    estimate,
+    problem,
+)
 
 NEAR = 0.25
 FEWEST = 3
@@ -149,12 +160,8 @@ def predictions(
     draws : int
         From the Laplace approximation; there are none where the MAP point itself has no such cycle.
     """
-    fit, names = fitted.fit, list(fitted.fit.theta)
-    best = _sizes_at(fit.theta, speeds, left)
-    drawn = draws if any(best.values()) else 0
-    generator = np.random.default_rng(0)
-    rows = generator.multivariate_normal(list(fit.theta.values()), fit.covariance.to_numpy(), size=drawn)
-    every = [_sizes_at(dict(zip(names, row.tolist(), strict=True)), speeds, left) for row in rows]
+    fit, along = fitted.fit, cycles(RIG | fitted.fit.theta)
+    every = laplace_draws(fit, draws)
     misses = [
         v / sizes(e.outputs)[c] - 1.0
         for e in fitted.problem.experiments
@@ -163,29 +170,49 @@ def predictions(
     model = float(np.sqrt(np.mean(np.square(misses))))
     found: dict[str, Any] = {}
     for name in left:
-        predicted = [there for one in every if (there := one[name]) is not None]
-        found[name] = {"draws_with_a_cycle": len(predicted), "draws": drawn, "cycle_at_map": best[name] is not None}
-        for channel, at_map in (best[name] or {}).items():
+        try:
+            orbit = along.at(name, speeds[name])
+        except ValueError as error:
+            found[name] = {"cycle_at_map": False, "why": str(error)}
+            continue
+        drawn, best = drawn_sizes(orbit, fit.theta, every), sizes(orbit.outputs)
+        there = np.isfinite(drawn["heave"])
+        found[name] = {"draws_with_a_cycle": int(there.sum()), "draws": draws, "cycle_at_map": True}
+        for channel in CHANNELS:
             size = sizes(experiments[name].outputs)[channel]
-            off = at_map - size
+            off = best[channel] - size
             found[name][channel] = {"error": off / size}
-            if len(predicted) >= FEWEST:
-                sd = float(np.std([one[channel] for one in predicted]))
+            if there.sum() >= FEWEST:
+                sd = float(np.std(drawn[channel][there]))
                 with_model = float(np.hypot(sd, model * size))
                 found[name][channel] |= {"posterior_sds": off / sd, "sds_with_model_error": off / with_model}
     return found
 
 
-def _sizes_at(
-    values: Mapping[str, float], speeds: Mapping[str, float], names: Sequence[str]
-) -> dict[str, dict[str, float] | None]:
-    """Return the amplitudes of the cycles of some records by the model, None where it has no such cycle."""
-    found: dict[str, dict[str, float] | None] = dict.fromkeys(names)
-    try:
-        along = cycles(RIG | dict(values))
-    except ValueError:
-        return found
-    for name in names:
-        with suppress(ValueError):
-            found[name] = sizes(along.at(name, speeds[name]).outputs)
-    return found
+def laplace_draws(fit: bp.MapEstimate, draws: int) -> dict[str, np.ndarray]:
+    """Return draws (draws,) of each parameter from the Laplace approximation, in logarithms of what is positive.
+
+    There the ridges of products, such as a stiffness and a sensor's scale, are straight.
+    """
+    values = np.array(list(fit.theta.values()))
+    positive = np.array([name in SPREADS for name in fit.theta])
+    slopes = np.where(positive, values, 1.0)
+    covariance = fit.covariance.to_numpy() / np.outer(slopes, slopes)
+    changes = np.random.default_rng(0).multivariate_normal(np.zeros(values.size), covariance, size=draws)
+    rows = np.where(positive, values * np.exp(np.where(positive, changes, 0.0)), values + changes)
+    return dict(zip(fit.theta, rows.T, strict=True))
+
+
+def drawn_sizes(
+    orbit: bp.PeriodicSolution, theta: Mapping[str, float], draws: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Return the amplitudes (draws,) of the cycle that continues one at θ, by channel; NaN where there is none."""
+    like = bp.Experiment(
+        "cycle", orbit.frequency, orbit.outputs, samples=orbit.samples, frequency_se=1e-3, guess=orbit.states
+    )
+    stated = problem([like], {"cycle": orbit.parameters["U"]}, frequency_error=0.0, noise="independent")
+    rows = np.stack([draws[name] for name in stated.names], axis=-1)
+    outputs, there = stated.anchored(theta, {"cycle": orbit.states}).outputs(rows)
+    curves = {channel: outputs["cycle"][channel] for channel in CHANNELS}
+    found = [sizes({c: curves[c][i] for c in CHANNELS}) if there[i] else None for i in range(there.size)]
+    return {c: np.array([np.nan if one is None else one[c] for one in found]) for c in CHANNELS}

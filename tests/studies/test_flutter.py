@@ -2,8 +2,10 @@ import contextlib
 import io
 import json
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import bayesperiodic as bp
@@ -71,6 +73,35 @@ def test_records_that_drift_or_are_too_short_are_left_out_with_the_reason():
     admitted, refused = flutter_data.usable(records)
     assert list(admitted) == ["steady"]
     assert "is not steady" in refused["growing"] and "at least 3 cycles are needed" in refused["short"]
+
+
+def test_amplitudes_of_draws_are_those_of_the_branch_continued_at_their_values():
+    along = flutter_rig.cycles(flutter_rig.RIG | flutter_rig.TRUE)
+    changed = flutter_rig.TRUE | {"k_alpha2": 650.0, "c_h": 7.5, "gain_pitch": 0.8}
+    other = flutter_rig.cycles(flutter_rig.RIG | changed)
+    draws = {n: np.array([flutter_rig.TRUE[n], changed[n], flutter_rig.TRUE[n]]) for n in flutter_rig.TRUE}
+    draws["k_alpha2"][2] = 250.0  # there is no cycle below the Hopf point then
+    for name in ("stable", "unstable"):
+        orbit = along.at(name, 16.5)
+        found = flutter_questions.drawn_sizes(orbit, flutter_rig.TRUE, draws)
+        here, there = (flutter_questions.sizes(o.outputs) for o in (orbit, other.at(name, 16.5)))
+        for channel, size in found.items():
+            assert size[:2] == pytest.approx([here[channel], there[channel]], rel=1e-4)
+            assert np.isnan(size[2])
+
+
+def test_draws_of_laplace_are_normal_in_the_logarithms_of_what_is_positive():
+    """Sample moments of 20 000 draws, within five standard errors: false alarm below 1e-5."""
+    names = ["k_alpha2", "gain_pitch", "offset_pitch"]
+    spread = np.array([[0.04, 0.06, 0.0], [0.06, 0.1, 0.0], [0.0, 0.0, 0.25]])
+    scale = np.array([600.0, 0.7, 1.0])
+    covariance = pd.DataFrame(spread * np.outer(scale, scale), index=names, columns=names)
+    fit = SimpleNamespace(theta={"k_alpha2": 600.0, "gain_pitch": 0.7, "offset_pitch": -0.2}, covariance=covariance)
+    drawn = flutter_questions.laplace_draws(fit, 20_000)
+    rows = np.stack([np.log(drawn["k_alpha2"] / 600.0), np.log(drawn["gain_pitch"] / 0.7), drawn["offset_pitch"] + 0.2])
+    sds = np.sqrt(np.diag(spread))
+    assert np.all(np.abs(rows.mean(axis=1)) < 5 * sds / np.sqrt(20_000))
+    assert np.all(np.abs(np.cov(rows) - spread) < 5 * np.outer(sds, sds) * np.sqrt(2 / 20_000))
 
 
 def test_speeds_within_a_quarter_are_left_out_together():
