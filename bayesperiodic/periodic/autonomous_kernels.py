@@ -32,6 +32,7 @@ from bayesperiodic.periodic.kernels import (
     STEP_TOLERANCE,
     VECTOR,
     assemble,
+    copy,
     differentiate,
     factor,
     is_far,
@@ -244,7 +245,7 @@ def newton_free(
         after, rounded = norm(columns, size), norm(columns, rounding) <= 1.0
         if not (after < before or full <= STEP_TOLERANCE or rounded):
             return STALLED, iteration + 1, frequency, orientation
-        z[:] = trial
+        copy(trial, z)
         frequency += faster
         if full <= STEP_TOLERANCE or rounded:
             return CONVERGED, iteration + 1, frequency, orientation
@@ -372,7 +373,8 @@ def creep(
     points, count = anchor_z.shape
     here, last, predicted = np.empty((points, count)), np.empty((points, count)), np.empty((points, count))
     between, done, step, before, failed, used = np.empty(parameters.size), 0.0, 1.0, 1.0, np.inf, 0
-    here[:], now = anchor_z, anchor_frequency
+    copy(anchor_z, here)
+    now = anchor_frequency
     predict(anchor_z, sensitivities, anchor_parameters, parameters, -1.0, last)
     earlier = predicted_frequency(now, slopes, anchor_parameters, parameters, -1.0)
     while done < 1.0:
@@ -384,7 +386,7 @@ def creep(
             between[p] = anchor_parameters[p] + (done + step) * (parameters[p] - anchor_parameters[p])
         expected = now + ratio * (now - earlier)
         expected = expected if expected > 0.0 else now
-        z[:] = predicted
+        copy(predicted, z)
         code, more, frequency, side = newton_free(
             residual_jacobian, derivatives, explicit, grid, inputs, between, tau, expected, drift, z, work
         )  # fmt: skip
@@ -394,7 +396,9 @@ def creep(
                 return OTHER_ORBIT if code == CONVERGED or code == STALLED else code, used, now
             failed, step = done + step, 0.5 * step
             continue
-        last[:], here[:], earlier, now = here, z, now, frequency
+        copy(here, last)
+        copy(z, here)
+        earlier, now = now, frequency
         done, before = done + step, step
         if done >= failed:
             failed = np.inf
@@ -485,7 +489,7 @@ def follow_many(
             anchor = (anchors[0][e], anchors[1][e], anchors[2][e], anchors[3][e], anchors[4][e])
             predict(anchor[1], anchor[3], anchor[0], theta, 1.0, predicted)
             expected = predicted_frequency(anchor[2], anchor[4], anchor[0], theta, 1.0)
-            z[:] = predicted
+            copy(predicted, z)
             close, used, f, code = False, 0, expected, lost
             if orientations[e] != 0.0 and not (whole and lost != CONVERGED):
                 close, used, f = chord_free(
@@ -506,5 +510,5 @@ def follow_many(
             differentiate(z, drift[e], grid, tau, f, work[0])
             outputs(work[0], own, theta, tau, f, y[e, b])
             if kept_z.size > 0:
-                kept_z[e, b] = z
+                copy(z, kept_z[e, b])
             frequency[e, b], status[e, b], iterations[e, b] = f, code, used
