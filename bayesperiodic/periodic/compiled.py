@@ -9,8 +9,8 @@ from bayesperiodic.models.cache import load
 
 NAMES = (
     "CONVERGED", "STALLED", "SINGULAR", "NOT_FINITE", "OTHER_ORBIT", "MAX_ITERATIONS", "MAX_SEGMENTS", "MAX_HALVINGS",
-    "STEP_TOLERANCE", "CHORD_RATE", "FAR", "factor", "solve", "solve_transposed", "differentiate", "assemble", "factorise",
-    "back_substitute", "scales", "norm", "scaled_step", "newton", "repetitions", "solve_many",
+    "STEP_TOLERANCE", "CHORD_RATE", "FAR", "factor", "solve", "solve_transposed", "differentiate", "assemble",
+    "factorise", "back_substitute", "scales", "norm", "scaled_step", "newton", "repetitions", "solve_many",
 )  # fmt: skip
 FREE_NAMES = ("orient", "bordered_solve", "chord_free", "has_shrunk", "has_shorter_period", "follow_many")
 GENERIC = "STATES, REACH = 0, 0"
