@@ -80,7 +80,8 @@ class Contest:
 
         Components count in the posterior's standard deviations.
         """
-        exact = self.setting.problem.gradient(self.setting.theta[0], self.setting.noise)[: gradient.size]
+        problem, theta = self.setting.problem, self.setting.theta[0]
+        exact = problem.gradient(theta, self.setting.noise, method="forward")[: gradient.size]
         sd = np.array(list(self.setting.fit.sd.values()))
         return float(np.abs((gradient - exact) * sd).max() / np.abs(exact * sd).max())
 

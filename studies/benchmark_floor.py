@@ -124,8 +124,7 @@ def _calls(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
 
 
 def _gradient(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
-    warm.log_posterior(theta, noise)
-    warm.gradient(theta, noise)
+    warm.value_and_gradient(theta, noise)
 
 
 def _stages(setting: Setting, warm: bp.Problem, theta: np.ndarray) -> dict[str, Callable[[], Any]]:

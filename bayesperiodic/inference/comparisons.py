@@ -19,6 +19,7 @@ class Comparisons:
 
     def __init__(self, groups: Iterable[Sequence[Observation]]):
         self._groups = [tuple(group) for group in groups]
+        self.observations = {o.experiment.name: o for group in self._groups for o in group}
         self._data = [_data(group) for group in self._groups]
         self._places, first = [], 0
         for group in self._groups:
@@ -30,9 +31,34 @@ class Comparisons:
         """Return the residual components of responses by experiment, in the order of the mapping."""
         with np.errstate(over="ignore", invalid="ignore"):
             found = in_threads(lambda g: self._compared(g, responses), range(len(self._groups)), threads)
-        order = {o.experiment.name: n for n, o in enumerate(o for group in self._groups for o in group)}
-        places = [place for name in responses for place in self._places[order[name]]]
-        return Residuals([stack for stacks in found for stack in stacks], places)
+        own = dict(zip(self.observations, self._places, strict=True))
+        return Residuals(
+            [stack for stacks in found for stack in stacks], [place for name in responses for place in own[name]]
+        )
+
+    def pulled(self, responses: Mapping[str, Response], weights: Residuals) -> dict[str, Response]:
+        """Return the derivatives of Σ weights · predicted components by everything in one response an experiment.
+
+        Parameters
+        ----------
+        responses : mapping of str to Response
+            Without leading axes; in the same order as those that led to the residuals.
+        weights : Residuals
+            Of the same places as these.
+        """
+        result, first = {}, 0
+        for group, data in zip(self._groups, self._data, strict=True):
+            stacks = weights.stacks()[first : first + len(group[0].blocks)]
+            first += len(stacks)
+            if data is None:
+                (alone,) = group
+                name = alone.experiment.name
+                result[name] = alone.pulled(responses[name], [stack[0] for stack in stacks])
+                continue
+            outputs = group[0].spread(stacks, responses[group[0].experiment.name].outputs.shape)
+            for o, own in zip(group, outputs, strict=True):
+                result[o.experiment.name] = Response(own, np.zeros(()), np.zeros(0), np.zeros(()))
+        return {name: result[name] for name in responses}
 
     def _compared(self, group: int, responses: Mapping[str, Response]) -> list[np.ndarray]:
         """Return the residual components of a group, an array (experiments, solves, size) a block."""

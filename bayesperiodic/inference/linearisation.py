@@ -1,10 +1,12 @@
 """A problem at one θ: residuals, their derivatives forward and backward (de Kraker et al. 1997, eq. 4-5)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
 
+from bayesperiodic.inference.comparisons import Comparisons
+from bayesperiodic.inference.noise.residuals import Residuals
 from bayesperiodic.inference.observation import Observation, Response
 from bayesperiodic.inference.responses import Responses
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
@@ -18,12 +20,17 @@ class Linearisation:
     theta : array (names,)
     responses : Responses
         Anchored at θ.
-    observations : mapping of str to Observation
-        By experiment.
+    comparisons : Comparisons
+        With the experiments.
     """
 
-    def __init__(self, theta: np.ndarray, responses: Responses, observations: Mapping[str, Observation]):
-        self.theta, self.responses, self.observations = theta, responses, observations
+    def __init__(self, theta: np.ndarray, responses: Responses, comparisons: Comparisons):
+        self.theta, self.responses, self._comparisons = theta, responses, comparisons
+
+    @property
+    def _observations(self) -> dict[str, Observation]:
+        """Of every experiment, in the order of the problem."""
+        return {name: self._comparisons.observations[name] for name in self._solves}
 
     @cached_property
     def _solved(self) -> dict[str, tuple[Response, np.ndarray]]:
@@ -44,15 +51,16 @@ class Linearisation:
         return all(solved.status[0] == CONVERGED for solved in self._solves.values())
 
     @cached_property
-    def residuals(self) -> list[np.ndarray]:
+    def residuals(self) -> Residuals:
         """Residual components, one array (size,) a block."""
-        return [r for name, o in self.observations.items() for r in o.residuals(self._solved[name][0])]
+        responses = {name: solved.response for name, solved in self._solves.items()}
+        return self._comparisons.residuals(responses, 1).at(0)
 
     @cached_property
     def changes(self) -> list[np.ndarray]:
         """Derivatives of the predicted components by θ, one array (names, size) a block; NaN where singular."""
         result = []
-        for name, observation in self.observations.items():
+        for name, observation in self._observations.items():
             response, z = self._solved[name]
             directions = self.responses.changes(self.theta, name, response, z)
             if directions is None:
@@ -63,7 +71,7 @@ class Linearisation:
 
     def compared(self) -> dict[str, dict[str, np.ndarray]]:
         """Return y − ŷ (points,) by experiment and channel, within the harmonics kept."""
-        return {name: o.compared(self._solved[name][0]) for name, o in self.observations.items()}
+        return {name: o.compared(self._solved[name][0]) for name, o in self._observations.items()}
 
     def forward(self, by_residual: Sequence[np.ndarray]) -> np.ndarray:
         """Return Σ (derivatives by the residuals) · ∂residual/∂θ, (names,), from `changes`."""
@@ -75,15 +83,15 @@ class Linearisation:
 
     def by_experiment(self, by_residual: Sequence[np.ndarray], *, adjoint: bool) -> dict[str, np.ndarray]:
         """Return each experiment's part of the sum; NaN where its derivatives do not exist."""
-        result, start = {}, 0
-        for name, observation in self.observations.items():
+        if adjoint:
+            responses = {name: response for name, (response, _) in self._solved.items()}
+            weights = self._comparisons.pulled(responses, self.residuals.like(by_residual))
+            pulled = self.responses.pulled(self.theta, self._solved, weights)
+            return {name: -pulled[name] for name in self._solved}
+        result, start, blocks = {}, 0, list(by_residual)
+        for name, observation in self._observations.items():
             stop = start + len(observation.blocks)
-            own = list(by_residual[start:stop])
-            if adjoint:
-                response, z = self._solved[name]
-                pulled = self.responses.pulled(self.theta, name, response, z, observation.pulled(response, own))
-                result[name] = np.full(self.theta.size, np.nan) if pulled is None else -pulled
-            else:
-                result[name] = -np.sum([s @ w for s, w in zip(self.changes[start:stop], own, strict=True)], axis=0)
+            pairs = zip(self.changes[start:stop], blocks[start:stop], strict=True)
+            result[name] = -np.sum([s @ w for s, w in pairs], axis=0)
             start = stop
         return result

@@ -1,5 +1,6 @@
 """From a periodic response to what is compared with one experiment, and the derivatives of that."""
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -129,6 +130,13 @@ class Observation:
         """Return the Fourier components (…, size) of each measured channel of outputs (…, points, channels)."""
         pairs = zip(self._columns, self.channels, strict=True)
         return [self._spectral(outputs[..., column], self._harmonics[name]) for column, name in pairs]
+
+    def spread(self, weights: Sequence[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
+        """Return the transpose of `components` applied to weights (…, size) a channel: (…, points, channels)."""
+        total = np.zeros((*weights[0].shape[:-1], *shape))
+        for own, column, name in zip(weights, self._columns, self.channels, strict=True):
+            total[..., column] = self._spread(own, self._harmonics[name])
+        return total
 
     def residuals(self, response: Response) -> list[np.ndarray]:
         """Return the residual components, one array (…, size) a block."""

@@ -159,6 +159,19 @@ class ParameterMaps:
                 known[name][:] = expression.value(known)
         return result
 
+    def pulled(self, theta: np.ndarray, by_parameter: np.ndarray) -> np.ndarray:
+        """Return derivatives by θ, (maps, names), from those by all parameters (maps, parameters + 1) at one θ."""
+        left, result = by_parameter.copy(), np.zeros((len(by_parameter), theta.size))
+        place = {name: i for i, name in enumerate(self._parameters)}
+        if self._tied:
+            values = self.values(theta[None])[:, 0]
+            known = {name: values[:, i] for name, i in place.items()}
+            for name, expression in reversed(self._tied.items()):
+                for argument, slope in expression.gradient(known).items():
+                    left[:, place[argument]] += slope * left[:, place[name]]
+        np.put_along_axis(result, self._columns, left[:, self._places], axis=1)
+        return result
+
 
 def _ordered(expressions: dict[str, Expression]) -> dict[str, Expression]:
     """Return the expressions such that each comes after those that it names."""

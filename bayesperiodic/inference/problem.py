@@ -325,7 +325,7 @@ class Problem:
         # Shared by experiments, not by θ: the rounding of a matrix product may depend on how many rows it has.
         small = max(s.response.outputs.size for s in solved.values()) < SMALLEST_SHARED
         if small:
-            return self._alike.residuals(responses, 1), status
+            return self.comparisons.residuals(responses, 1), status
         return self._each.residuals(responses, threads or available_cores()), status
 
     @cached_property
@@ -333,7 +333,8 @@ class Problem:
         return Comparisons([o] for o in self.observations.values())
 
     @cached_property
-    def _alike(self) -> Comparisons:
+    def comparisons(self) -> Comparisons:
+        """The comparisons with the experiments, those of one layout at once."""
         groups: dict[Any, list[Observation]] = {}
         for name, observation in self.observations.items():
             groups.setdefault(observation.layout or name, []).append(observation)
@@ -375,20 +376,61 @@ class Problem:
         """
         checks.one_of("method", method, METHODS)
         values, noise = self.vector(theta), self.noise_values(variances)
-        here = self.linearised(values)
-        if not np.isfinite(self.log_prior(values)) or not here.converged:
+        value, gradient = self._value_and_gradient(values, noise, forward=method == "forward")
+        if not np.isfinite(value):
             given = dict(zip(self.names, values.tolist(), strict=True))
             raise ValueError(f"theta: {given} is not allowed; the log-posterior is not finite there.")
+        return gradient
+
+    def value_and_gradient(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> tuple[float, np.ndarray]:
+        """Return `log_posterior` at one θ and its `gradient`; −inf and zeros where it is not finite.
+
+        One periodic solve and one transposed solve an experiment, shared among the cores.
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (names,)
+        variances : mapping of str to float, or array (noise_names,)
+
+        Returns
+        -------
+        value : float
+        gradient : array (names + free_noise,)
+        """
+        return self._value_and_gradient(self.vector(theta), self.noise_values(variances), forward=False)
+
+    def _value_and_gradient(self, values: np.ndarray, noise: np.ndarray, *, forward: bool) -> tuple[float, np.ndarray]:
+        nothing = -np.inf, np.zeros(len(self.names) + len(self.free_noise))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            value = float(self.log_prior(values) + self.likelihood.log_prior(noise))
+        if not np.isfinite(value):
+            return nothing
+        here = Linearisation(values, self.responses, self.comparisons)
+        if not here.converged:
+            return nothing
+        value += float(self.likelihood(here.residuals, noise))
+        if not np.isfinite(value):
+            return nothing
         by_residual, by_noise = self.likelihood.gradients(here.residuals, noise)
-        forward = method == "forward" or self.model.autonomous
-        by_theta = here.forward(by_residual) if forward else here.adjoint(by_residual)
+        by_theta = self.pulled(here, by_residual, forward=forward)
         free = [self.noise_names.index(name) for name in self.free_noise]
-        return np.concatenate([by_theta + self.joint_prior.gradient(values), by_noise[free]])
+        return value, np.concatenate([by_theta + self.joint_prior.gradient(values), by_noise[free]])
+
+    def pulled(self, here: Linearisation, by_residual: Sequence[np.ndarray], *, forward: bool = False) -> np.ndarray:
+        """Return the derivatives by θ (names,) from those by the residuals, one array (size,) a block.
+
+        Those of an autonomous model and of multipliers need anchors there.
+        """
+        if forward or self.model.autonomous:
+            return self.linearised(here.theta).forward(by_residual)
+        if any(e.multipliers is not None for e in self.experiments):
+            here = self.linearised(here.theta)
+        return here.adjoint(by_residual)
 
     def linearised(self, theta: Mapping[str, float] | np.ndarray) -> Linearisation:
         """Solve at one θ from the present anchors, and compare with the data (eq. 4-5)."""
         values = self.vector(theta)
-        return Linearisation(values, self.responses.anchored(values), self.observations)
+        return Linearisation(values, self.responses.anchored(values), self.comparisons)
 
     def outputs(self, theta: Mapping[str, float] | np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
         """Return ŷ of many θ (draws, names), by experiment and channel (draws, points), and which solves converged."""

@@ -17,7 +17,7 @@ from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.floquet import first_order_matrix, largest_multiplier
 from bayesperiodic.periodic.reach import LOST, reach
 from bayesperiodic.periodic.schemes import Scheme
-from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities, output_gradient
+from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, describe
 from bayesperiodic.periodic.solve import solve_forced, solve_free
 from bayesperiodic.periodic.stability import logarithmic_changes
@@ -257,18 +257,33 @@ class Responses:
         return np.array([_without_trivial(solution, row)[:count] for row in every])
 
     def pulled(
-        self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray, weights: Response
-    ) -> np.ndarray | None:
-        """Return Σ weights · derivatives of the response by θ (names,), the outputs' part by one transposed solve."""
-        equations, slopes = self.equations[experiment], self.maps[experiment].slopes(theta)
-        parameters = self.parameters(theta[None], experiment)[0]
-        by_parameter = output_gradient(equations, z, parameters, weights.outputs)
-        if by_parameter is None:
-            return None
-        by_theta = slopes[:-1].T @ by_parameter + slopes[-1] * weights.delay
-        if response.log_multipliers.size:
-            by_theta += self._multiplier_changes(theta, experiment, z, response) @ weights.log_multipliers
-        return by_theta
+        self, theta: np.ndarray, solved: Mapping[str, tuple[Response, np.ndarray]], weights: Mapping[str, Response]
+    ) -> dict[str, np.ndarray]:
+        """Return Σ weights · derivatives of a forced model's responses by θ (names,), NaN where they do not exist.
+
+        That of the outputs takes one transposed solve an experiment.
+
+        Parameters
+        ----------
+        theta : array (names,)
+        solved : mapping of str to (Response, array (points, states))
+            Of every experiment, there.
+        weights : mapping of str to Response
+        """
+        result: dict[str, np.ndarray] = {}
+        for experiments, maps, batch in self._batches:
+            assert isinstance(batch, Batch)
+            names = [e.name for e in experiments]
+            values = maps.values(theta[None])[:, 0]
+            z, outputs = np.stack([solved[n][1] for n in names]), np.stack([weights[n].outputs for n in names])
+            values[:, :-1] = batch.pull(values[:, :-1], z, outputs)
+            values[:, -1] = [weights[n].delay for n in names]
+            result |= dict(zip(names, maps.pulled(theta, values), strict=True))
+        for name, (response, z) in solved.items():
+            if response.log_multipliers.size:
+                changes = self._multiplier_changes(theta, name, z, response)
+                result[name] = result[name] + changes @ weights[name].log_multipliers
+        return result
 
 
 def leading_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int) -> np.ndarray:

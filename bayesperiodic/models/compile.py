@@ -105,11 +105,16 @@ class Kernels:
             "residual_jacobian": self.states * (1 + 3 * self.states),
             "outputs": self.channels,
             "transitions": self.smooth_signs,
-            "derivatives": sum(rows * columns for rows, columns in self._derivative_shapes()),
+            "derivatives": self.derivative_columns,
         }[name]
         out = np.empty((tau.size, size))
         getattr(self, name)(states, inputs, parameters, tau, frequency, out)
         return out
+
+    @property
+    def derivative_columns(self) -> int:
+        """The number of columns of `derivatives`."""
+        return sum(rows * columns for rows, columns in self._derivative_shapes())
 
     def split_derivatives(self, columns: np.ndarray) -> list[np.ndarray]:
         """Return g_θ, g_u, g_f, f_q, f_θ, f_u, f_f as arrays (points, rows, columns); g_f is to the frequency."""

@@ -149,7 +149,7 @@ class Model:
                 return order
         raise ValueError(f"states: {state!r} has no derivative in any equation; eliminate it or add its equation.")
 
-    @property
+    @cached_property
     def autonomous(self) -> bool:
         """True if neither inputs nor the time appear in the equations, so that the period is part of the solution."""
         forcing = {*self.input_symbols.values(), self.time_symbols["tau"]}

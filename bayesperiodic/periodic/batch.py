@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesperiodic.parallel import available_cores, in_threads
+from bayesperiodic.periodic.compiled import adjoint_kernels
 from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
 from bayesperiodic.periodic.sensitivity import Sensitivities, parameter_sensitivities, softening, softest_direction
 
@@ -142,7 +143,7 @@ class Batch:
         threads : int, optional
             By default as many as there are cores.
         keep : bool
-            Return z too.
+            Return z too, polished by further chord steps, so that what is derived from it is as exact as it can be.
         """
         model, grid = self._first.model, self._first.grid
         solves = parameters.shape[-2]
@@ -175,3 +176,42 @@ class Batch:
         in_threads(part, list(pairwise([total * k // parts for k in range(parts + 1)])), workers)
         frequency = np.repeat(self._shared[1][:, None], solves, axis=1)
         return BatchSolution(z, y, frequency, status, iterations)
+
+    def pull(
+        self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, threads: int | None = None
+    ) -> np.ndarray:
+        """Return Σ weights · ∂ŷ/∂θ (sets, parameters) at one solution of every input set; NaN where it is singular.
+
+        Parameters
+        ----------
+        parameters : array (sets, parameters)
+        z : array (sets, points, states)
+        weights : array (sets, points, channels)
+        threads : int, optional
+        """
+        model, grid = self._first.model, self._first.grid
+        frequency, drift = self._shared[1:3]
+        gradients = np.empty((self._size, parameters.shape[-1]))
+        compiled = adjoint_kernels(self._first.count, grid.reach)
+
+        def part(block: tuple[int, int]) -> None:
+            compiled.pull_many(
+                model.kernels.residual_jacobian,
+                model.kernels.derivatives,
+                grid.packed,
+                model.kernels.derivative_columns,
+                self._inputs,
+                np.ascontiguousarray(parameters),
+                grid.tau,
+                frequency,
+                drift,
+                np.ascontiguousarray(z),
+                np.ascontiguousarray(weights),
+                empty_factors(grid, self._first.count),
+                *block,
+                gradients,
+            )
+
+        workers = max(1, min(threads or available_cores(), self._size // SMALLEST_PART))
+        in_threads(part, list(pairwise([self._size * k // workers for k in range(workers + 1)])), workers)
+        return gradients

@@ -13,6 +13,7 @@ NAMES = (
     "factorise", "back_substitute", "scales", "norm", "scaled_step", "newton", "repetitions", "solve_many",
 )  # fmt: skip
 FREE_NAMES = ("orient", "bordered_solve", "chord_free", "has_shrunk", "has_shorter_period", "follow_many")
+ADJOINT_NAMES = ("back_substitute_transposed", "pull_many")
 GENERIC = "STATES, REACH = 0, 0"
 KERNELS = "bayesperiodic.periodic.kernels"
 UNROLLED_STATES, UNROLLED_REACH = 3, (2, 3)
@@ -35,12 +36,37 @@ def _specialised(states: int, reach: int) -> SimpleNamespace:
 
 @cache
 def autonomous_kernels() -> SimpleNamespace:
-    """Return the compiled functions of `autonomous_kernels`; of `kernels` only what they import is compiled too."""
-    own, shared = ast.parse(_text("autonomous_kernels.py")), ast.parse(_text("kernels.py"))
-    needed = {a.name for n in own.body if isinstance(n, ast.ImportFrom) and n.module == KERNELS for a in n.names}
+    """Return the compiled functions of `autonomous_kernels`."""
+    return SimpleNamespace(**load(_joined("autonomous_kernels.py", 0, 0), FREE_NAMES))
+
+
+def adjoint_kernels(states: int, reach: int) -> SimpleNamespace:
+    """Return the compiled functions of `adjoint_kernels`, specialised as those of `kernels` are."""
+    unrolled = states <= UNROLLED_STATES and reach in UNROLLED_REACH
+    return _adjoint(states, reach) if unrolled else _adjoint(0, 0)
+
+
+@cache
+def _adjoint(states: int, reach: int) -> SimpleNamespace:
+    return SimpleNamespace(**load(_joined("adjoint_kernels.py", states, reach), ADJOINT_NAMES))
+
+
+def _joined(name: str, states: int, reach: int) -> str:
+    """Return the text of a file of kernels after what it needs of `kernels`, directly and in turn."""
+    own, shared = ast.parse(_text(name)), ast.parse(_text("kernels.py", states, reach))
+    functions = {node.name: node for node in shared.body if isinstance(node, ast.FunctionDef)}
+    imported = [node for node in own.body if isinstance(node, ast.ImportFrom) and node.module == KERNELS]
+    waiting = [alias.name for node in imported for alias in node.names if alias.name in functions]
+    needed: set[str] = set()
+    while waiting:
+        function = waiting.pop()
+        if function not in needed:
+            needed.add(function)
+            names = {node.id for node in ast.walk(functions[function]) if isinstance(node, ast.Name)}
+            waiting += sorted(names & functions.keys())
     shared.body = [n for n in shared.body if not isinstance(n, ast.FunctionDef) or n.name in needed]
     own.body = [n for n in own.body if not isinstance(n, ast.Import | ast.ImportFrom)]
-    return SimpleNamespace(**load(f"{ast.unparse(shared)}\n{ast.unparse(own)}\n", FREE_NAMES))
+    return f"{ast.unparse(shared)}\n{ast.unparse(own)}\n"
 
 
 def _text(name: str, states: int = 0, reach: int = 0) -> str:

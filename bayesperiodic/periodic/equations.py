@@ -174,15 +174,6 @@ class PeriodicEquations:
             result[direction] = self.states(np.ascontiguousarray(change), still)
         return result
 
-    def changes_transposed(self, weights: np.ndarray) -> np.ndarray:
-        """Return the transpose of `changes` applied to weights (points, 3·states), (points, states)."""
-        still, rates, accelerations = np.split(weights, 3, axis=1)
-        result = still.copy()
-        for offset, one, two in zip(self.grid.offsets, self.grid.first, self.grid.second, strict=True):
-            here = one * self.frequency * rates + two * self.frequency**2 * accelerations
-            result += np.roll(here, offset, axis=0)
-        return result
-
     def outputs(self, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return ŷ, (points, channels)."""
         return self.evaluate("outputs", z, parameters)

@@ -26,23 +26,6 @@ class Sensitivities(NamedTuple):
     frequency: np.ndarray
 
 
-def output_gradient(
-    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray, weights: np.ndarray
-) -> np.ndarray | None:
-    """Return Σ weights · ∂ŷ/∂θ (parameters,) of a forced model by one transposed solve; None if singular.
-
-    Parameters
-    ----------
-    weights : array (points, channels)
-    """
-    d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
-    factors = equations.factors(columns)
-    if not factors.regular:
-        return None
-    adjoint = factors.solve_transposed(equations.changes_transposed(np.einsum("nc,ncq->nq", weights, d.f_q)))
-    return np.einsum("nc,ncp->p", weights, d.f_theta) - np.einsum("ne,nep->p", adjoint, d.g_theta)
-
-
 def directional_sensitivities(
     equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
 ) -> Sensitivities | None:

@@ -82,6 +82,24 @@ def test_segments_agree_with_the_folded_band_and_are_used(scheme, states, expone
     assert np.max(np.abs(solved - expected) / np.abs(expected).max(axis=0)) < 1e-8  # some 10 roundings of 1/h²
 
 
+@pytest.mark.parametrize("exponent", [-40.0, 1.0, 40.0])
+@pytest.mark.parametrize("scheme", ["backward2", "central2", "central4"])
+def test_transposed_solves_by_segments_and_by_the_band_match_dense_algebra(scheme, exponent):
+    states = 2
+    equations = equations_of(growing(states), scheme, 120)
+    z = np.random.default_rng(1).standard_normal((120, states))
+    columns = equations.residual_jacobian(z, np.array([exponent]))
+    factors = empty_factors(equations.grid, states)
+    assert equations.factorise(columns, z, factors)
+    assert (factors[5][0] > 0) == (scheme != "central4")
+    right = np.random.default_rng(2).standard_normal((120, states))
+    solved = right.copy()
+    adjoint = compiled.adjoint_kernels(states, equations.grid.reach)
+    adjoint.back_substitute_transposed(equations.grid.packed, factors, solved)
+    expected = np.linalg.solve(dense(equations, columns).T, right.ravel())
+    assert solved.ravel() == pytest.approx(expected, rel=1e-8, abs=1e-8 * np.abs(expected).max())
+
+
 def test_a_march_that_grows_too_fast_is_left_for_the_folded_band():
     equations = equations_of(growing(1), "central2", 200)
     theta = np.array([-2000.0])  # the leapfrog's parasitic solution grows by e^2000 in a period

@@ -61,7 +61,7 @@ class Objective:
         if not np.isfinite(prior):
             return None
         problem = self.problem if near is None else self.problem.with_responses(near.responses)
-        trial = Linearisation(theta, problem.responses, problem.observations)
+        trial = Linearisation(theta, problem.responses, problem.comparisons)
         if not trial.converged or not all(np.isfinite(r).all() for r in trial.residuals):
             return None
         likelihood = problem.likelihood

@@ -113,7 +113,7 @@ def _gradients(problem: Problem, theta: np.ndarray, mode: Iterate) -> dict[str, 
     there = (
         near.linearised(theta)
         if problem.model.autonomous
-        else Linearisation(theta, mode.here.responses, problem.observations)
+        else Linearisation(theta, mode.here.responses, problem.comparisons)
     )
     if not there.converged:
         return dict.fromkeys(problem.observations, np.full(theta.size, np.nan))

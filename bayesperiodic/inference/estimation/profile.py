@@ -257,7 +257,7 @@ def _at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate
     theta = problem.vector(fit.theta)
     responses = problem.anchored(theta, {name: s.states for name, s in fit.solutions.items()}).responses
     objective = Objective(problem, bias_correction(problem), np.zeros(theta.size, dtype=bool))
-    near = Linearisation(theta, responses, problem.observations)
+    near = Linearisation(theta, responses, problem.comparisons)
     peak = objective.at(theta, near, np.array([fit.noise[name] for name in problem.noise_names]))
     if peak is None:
         raise ValueError(

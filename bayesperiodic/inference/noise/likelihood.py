@@ -198,9 +198,11 @@ class Likelihood:
 
     def gradients(
         self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float = 1.0
-    ) -> tuple[list[np.ndarray], np.ndarray]:
+    ) -> tuple[Sequence[np.ndarray], np.ndarray]:
         """Return the gradients of log-likelihood plus log-prior of φ, by each block's residual and by ln φ (names,)."""
         slopes = self._log_prior(values)[1]
+        if self.model.flat:
+            return self._flat_gradients(residuals, values, share, slopes)
         by_residual = []
         for block, columns, r in zip(self.blocks, self._columns, residuals, strict=True):
             if block.kind == KNOWN:
@@ -215,6 +217,20 @@ class Likelihood:
             by_residual.append(by_r)
             slopes[columns] += by_phi
         return by_residual, slopes
+
+    def _flat_gradients(
+        self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float, slopes: np.ndarray
+    ) -> tuple[Residuals, np.ndarray]:
+        """Return the same of all blocks under errors whose spectrum is flat, from the gradient of the log-prior."""
+        own = Residuals.of(residuals)
+        at, columns, sizes, weights, measured = self._levels
+        v = self.model.level(values[columns], measured)
+        factors = np.full(len(self.blocks), -1.0)
+        factors[at] = -weights / v
+        # V is v plus what is measured, so that ∂ ln V/∂ ln v = v/V.
+        by_level = 0.5 * weights * (own.squares[at] / v - share * sizes) * values[columns] / v
+        np.add.at(slopes, columns, by_level)
+        return own.scaled(factors), slopes
 
     def whitened(self, vectors: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
         """Return vectors (…, size), one a block, in units of the noise: their squares sum to −2 log-likelihood."""

@@ -37,6 +37,30 @@ class Residuals(Sequence[np.ndarray]):
     def __iter__(self) -> Iterator[np.ndarray]:
         return (self._stacks[stack][member] for stack, member in self._places)
 
+    def at(self, index: int) -> "Residuals":
+        """Return the components (size,) at one place of the middle axis (…,)."""
+        return Residuals([stack[:, index] for stack in self._stacks], self._places)
+
+    def like(self, blocks: Sequence[np.ndarray]) -> "Residuals":
+        """Return other arrays, one a block, side by side as these are."""
+        if isinstance(blocks, Residuals) and blocks._places == self._places:
+            return blocks
+        members: list[dict[int, np.ndarray]] = [{} for _ in self._stacks]
+        for (stack, member), block in zip(self._places, blocks, strict=True):
+            members[stack][member] = block
+        return Residuals([np.stack([own[m] for m in range(len(own))]) for own in members], self._places)
+
+    def scaled(self, factors: np.ndarray) -> "Residuals":
+        """Return the components (size,) of each block times its factor, factors (blocks,)."""
+        own = [np.empty((len(stack), 1)) for stack in self._stacks]
+        for (stack, member), factor in zip(self._places, factors, strict=True):
+            own[stack][member] = factor
+        return Residuals([stack * factor for stack, factor in zip(self._stacks, own, strict=True)], self._places)
+
+    def stacks(self) -> tuple[np.ndarray, ...]:
+        """Return the arrays (members, …, size)."""
+        return self._stacks
+
     @cached_property
     def squares(self) -> np.ndarray:
         """The sum of the squares of each block, (blocks, …)."""

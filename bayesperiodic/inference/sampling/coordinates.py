@@ -142,7 +142,7 @@ class SamplingDensity:
             value += float(point[: theta.size][self.logarithmic].sum())
             if not np.isfinite(value):
                 return nothing
-            here = Linearisation(theta, self.problem.responses, self.problem.observations)
+            here = Linearisation(theta, self.problem.responses, self.problem.comparisons)
             if not here.converged:
                 self.failures[max(here.statuses.values(), key=STATUSES.index)] += 1
                 return nothing
@@ -150,11 +150,7 @@ class SamplingDensity:
             if not np.isfinite(value):
                 return nothing
             by_residual, by_noise = likelihood.gradients(here.residuals, noise)
-            if self.problem.model.autonomous:
-                by_theta = self.problem.linearised(theta).forward(by_residual)
-            else:
-                by_theta = here.adjoint(by_residual)
-            by_theta += self.problem.joint_prior.gradient(theta)
+            by_theta = self.problem.pulled(here, by_residual) + self.problem.joint_prior.gradient(theta)
         by_theta[self.logarithmic] = by_theta[self.logarithmic] * theta[self.logarithmic] + 1.0
         free = [self.problem.noise_names.index(name) for name in self.free]
         gradient = np.concatenate([by_theta, by_noise[free]])

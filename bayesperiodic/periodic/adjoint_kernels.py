@@ -1,0 +1,175 @@
+"""The compiled code of gradients: transposed solves, and what they pull back to the parameters.
+
+Loaded through the kernel cache together with the functions of `kernels` that it imports (see `compiled`).
+
+The adjoint state λ of weights w on the outputs solves (∂g/∂z)ᵀ·λ = (∂ŷ/∂z)ᵀ·w; then Σ w·dŷ/dθ = Σ w·∂ŷ/∂θ − Σ λ·∂g/∂θ,
+the implicit function theorem (de Kraker et al. 1997, eq. 4) read backwards.
+"""
+
+import numpy as np
+from numba import njit
+
+from bayesperiodic.periodic.kernels import (
+    CUBE,
+    FACTORS,
+    FUNCTION,
+    GRID,
+    MATRIX,
+    OPTIONS,
+    REACH,
+    STATES,
+    VECTOR,
+    differentiate,
+    factorise,
+    largest,
+    solve_transposed,
+)
+
+
+@njit(f"void({GRID}, {FACTORS}, {MATRIX})", **OPTIONS)
+def back_substitute_transposed(grid, factors, right):
+    """Solve (∂g/∂z)ᵀ·x = b in place, b (points, states), with the factors of `factorise`."""
+    band, pivots, inverses, gains, transfer, ends, reduced, reduced_pivots = factors
+    place, half_width, lead = grid[4], grid[5], grid[6]
+    points, count = right.shape[0], STATES if STATES > 0 else right.shape[1]
+    reach, segments = REACH if REACH > 0 else gains.shape[1], ends[0]
+    if segments == 0:
+        lower = half_width * count + count - 1
+        folded = np.empty((1, points * count))
+        for i in range(points):
+            for s in range(count):
+                folded[0, place[i] * count + s] = right[i, s]
+        solve_transposed(band, lower, lower, pivots, folded)
+        for i in range(points):
+            for s in range(count):
+                right[i, s] = folded[0, place[i] * count + s]
+        return
+    block = reach * count
+    size = segments * block
+    x = np.zeros((1, size))
+    start = 0
+    for q in range(segments):
+        stop = ends[q + 1] + 1
+        for c in range(block):
+            total = 0.0
+            for e in range(count):
+                for j in range(start, stop):
+                    total += transfer[e, c, j] * right[j, e]
+            x[0, q * block + c] = total
+        start = stop
+    matrix = reduced[: size * (3 * size - 2)].reshape((size, 3 * size - 2))
+    solve_transposed(matrix, size - 1, size - 1, reduced_pivots, x)
+    forced = right.copy()
+    for q in range(segments):
+        for d in range(reach):
+            for e in range(count):
+                forced[ends[q + 1] - d, e] += x[0, (q + 1) % segments * block + d * count + e]
+    start = 0
+    for q in range(segments):
+        stop = ends[q + 1] + 1
+        for j in range(stop - 1, start, -1):
+            for d in range(min(reach, j - start)):
+                for s in range(count):
+                    value = forced[j - 1 - d, s]
+                    for e in range(count):
+                        value += gains[j, d, e, s] * forced[j, e]
+                    forced[j - 1 - d, s] = value
+        start = stop
+    for k in range(points):
+        j = k + lead if k + lead < points else k + lead - points
+        for s in range(count):
+            value = 0.0
+            for e in range(count):
+                value += inverses[j, e, s] * forced[j, e]
+            right[k, s] = value
+
+
+@njit(
+    f"boolean({FUNCTION}, {FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {MATRIX}, {MATRIX}, "
+    f"Tuple(({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX})), {FACTORS}, {VECTOR})",
+    **OPTIONS,
+)
+def pull(
+    residual_jacobian, derivatives, grid, inputs, parameters, tau, frequency, drift, z, weights, work, factors, gradient
+):  # fmt: skip
+    """Fill Σ weights · ∂ŷ/∂θ (parameters,) at a solution z; return False where ∂g/∂z is singular."""
+    first, second, neighbours = grid[0], grid[1], grid[2]
+    states, columns, partial, adjoint = work
+    points, count, channels = z.shape[0], STATES if STATES > 0 else z.shape[1], weights.shape[1]
+    number, squared = parameters.size, frequency**2
+    f_q = count * (number + inputs.shape[1] + 1)
+    f_theta = f_q + channels * 3 * count
+    differentiate(z, drift, grid, tau, frequency, states)
+    residual_jacobian(states, inputs, parameters, tau, frequency, columns)
+    derivatives(states, inputs, parameters, tau, frequency, partial)
+    amplitude = np.empty(count)
+    largest(z, amplitude)
+    for s in range(count):
+        amplitude[s] = amplitude[s] if amplitude[s] > 0.0 else 1.0
+    if not factorise(columns, grid, frequency, amplitude, factors):
+        return False
+    for i in range(points):
+        for s in range(count):
+            adjoint[i, s] = 0.0
+    for i in range(points):
+        for s in range(count):
+            still, rate, acceleration = 0.0, 0.0, 0.0
+            for c in range(channels):
+                at = f_q + c * 3 * count + s
+                still += weights[i, c] * partial[i, at]
+                rate += weights[i, c] * partial[i, at + count]
+                acceleration += weights[i, c] * partial[i, at + 2 * count]
+            adjoint[i, s] += still
+            if rate != 0.0 or acceleration != 0.0:
+                rate, acceleration = rate * frequency, acceleration * squared
+                for o in range(first.size):
+                    adjoint[neighbours[i, o], s] += first[o] * rate + second[o] * acceleration
+    back_substitute_transposed(grid, factors, adjoint)
+    for p in range(number):
+        gradient[p] = 0.0
+    for i in range(points):
+        for c in range(channels):
+            for p in range(number):
+                gradient[p] += weights[i, c] * partial[i, f_theta + c * number + p]
+        for e in range(count):
+            for p in range(number):
+                gradient[p] -= adjoint[i, e] * partial[i, e * number + p]
+    return True
+
+
+@njit(
+    f"void({FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {CUBE}, {CUBE}, "
+    f"{FACTORS}, int64, int64, {MATRIX})",
+    **OPTIONS,
+)
+def pull_many(
+    residual_jacobian, derivatives, grid, width, inputs, parameters, tau, frequency, drift, z, weights, factors, start,
+    stop, gradients,
+):  # fmt: skip
+    """Fill the gradients (sets, parameters) of the input sets start … stop at one solution each; NaN where singular.
+
+    Parameters
+    ----------
+    width : int
+        Columns of `derivatives`, see `models.compile.Kernels`.
+    inputs : array (sets, points, 3·inputs)
+    parameters : array (sets, parameters)
+    frequency : array (sets,)
+    drift : array (sets, states)
+    z : array (sets, points, states)
+    weights : array (sets, points, channels)
+    factors : work arrays, see `equations.empty_factors`
+    """
+    points, count = z.shape[1], z.shape[2]
+    work = (
+        np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count))), np.empty((points, width)),
+        np.empty((points, count)),
+    )  # fmt: skip
+    for k in range(start, stop):
+        regular = pull(
+            residual_jacobian, derivatives, grid, inputs[k], parameters[k], tau, frequency[k], drift[k], z[k],
+            weights[k], work, factors, gradients[k],
+        )  # fmt: skip
+        if not regular:
+            for p in range(parameters.shape[1]):
+                gradients[k, p] = np.nan
