@@ -122,8 +122,7 @@ def _calls(setting: Setting, warm: bp.Problem) -> None:
 
 def _gradients(setting: Setting, warm: bp.Problem, count: int) -> None:
     for theta in setting.theta[:count]:
-        warm.log_posterior(theta, setting.noise)
-        warm.gradient(theta, setting.noise)
+        warm.value_and_gradient(theta, setting.noise)
 
 
 def _cold(setting: Setting, scheme: str) -> None:
