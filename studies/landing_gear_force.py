@@ -100,7 +100,7 @@ def with_noise_of_the_input(experiment: bp.Experiment, theta: Mapping[str, float
     for c, channel in enumerate(model.outputs):
         own = amplitudes(experiment, channel)[at]
         covariance[c :: len(model.outputs), c :: len(model.outputs)] += own @ own.T
-    return replace(experiment, mask=at, covariance=covariance, independent={}, harmonics={}, guess=centre.states)
+    return replace(experiment, mask=at, covariance=covariance, independent={}, harmonics={})
 
 
 def amplitudes(experiment: bp.Experiment, channel: str) -> np.ndarray:

@@ -34,7 +34,7 @@ def given_displacement(recordings: Iterable[bp.Recording], seed: int, *, quick: 
 def given_force(forced: Mapping[str, Verdict], seed: int, *, quick: bool) -> Identified | None:
     """Return estimate and draws with the force given, its noise carried along as by the single fits.
 
-    None for one experiment, and where the orbits and the parameters cannot be brought together, which is said.
+    None for one experiment.
     """
     experiments = [verdict.identified.problem.experiments[0] for verdict in forced.values()]
     if len(experiments) < 2:
@@ -48,12 +48,7 @@ def given_force(forced: Mapping[str, Verdict], seed: int, *, quick: bool) -> Ide
         local=[CONDUCTION],
         scheme=SCHEME,
     )
-    try:
-        fit = bp.map_estimate(stated, progress=False)
-    except ValueError as refused:
-        print(f"  jointly, force given: no estimate; {refused}")
-        return None
-    found = Identified(stated, fit, None, 0.0)
+    found = Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0)
     return draw(found, seed, quick=quick, ensembles=ENSEMBLES, max_steps=STEPS_WITH_FORCE)
 
 
