@@ -16,6 +16,7 @@ from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from bayesperiodic import checks
+from bayesperiodic.blas import in_one_thread
 
 Item = TypeVar("Item")
 Value = TypeVar("Value")
@@ -242,6 +243,7 @@ _OPENED: OrderedDict[str, Any] = OrderedDict()
 _OPENING = threading.Lock()
 
 
+@in_one_thread
 def _call(function: Callable[[Any, Any], Any], task: Any, key: str, content: Any) -> Any:
     """Do one task; the shared data come as they are (without a key), pickled, or have come before (None)."""
     shared = _opened(key, content) if key else content

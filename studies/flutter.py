@@ -12,7 +12,7 @@ import argparse
 from typing import Any, NamedTuple
 
 import bayesperiodic as bp
-from studies import common, flutter_campaigns, flutter_figures, flutter_questions, flutter_results
+from studies import common, common_resumed, flutter_campaigns, flutter_figures, flutter_questions, flutter_results
 from studies.flutter_data import read_records, usable
 from studies.flutter_rig import AUTHORS, MODEL, RIG, SENSORS, Fitted, cycles, estimate, problem
 
@@ -77,10 +77,8 @@ def answers(
         branch = hopf_and_fold()
     with watch.part("map", "estimating from all cycles"):
         both = estimate(experiments, speeds)
-    with watch.part("subsets", "estimating from the stable cycles alone, and from the unstable ones alone"):
-        fits = flutter_questions.subsets(experiments, speeds, both)
-    with watch.part("left out", "leaving wind speeds out"):
-        left = left_out(experiments, speeds, fits, quick)
+    with watch.part("parts", "estimating from stable or unstable cycles alone, and with wind speeds left out"):
+        fits, left = parts(experiments, speeds, both, quick)
     with watch.part("structure", "asking what the equations leave open"):
         structure = bp.structure(MODEL, fixed=[n for n in MODEL.parameters if n in RIG or n in ("U", "c_h", "c_alpha")])
     return Answers(authors, branch, fits, left, structure)
@@ -101,6 +99,7 @@ def sample(
         return Sampled(fit)
     with watch.part("sample", "sampling the posterior"):
         posterior = bp.sample(stated, fit, seed=options.seed, **SAMPLING)
+    with watch.part("verdicts", "asking what the data determine, and where Laplace and the draws differ"):
         return Sampled(fit, posterior, bp.identifiability(stated, fit, posterior), bp.compare(stated, fit, posterior))
 
 
@@ -116,24 +115,27 @@ def hopf_and_fold() -> dict[str, float]:
     }
 
 
-def left_out(
-    experiments: dict[str, bp.Experiment], speeds: dict[str, float], fits: dict[str, Fitted], quick: bool
-) -> dict[str, Any]:
-    """Return the predictions of cycles that were not fitted, wind speed by wind speed and kind by kind."""
-    both, draws = fits["both"], 20 if quick else 200
-    names = {kind: [n for n in experiments if n.startswith("unstable") == (kind == "unstable")] for kind in fits}
-    found = {
-        "unstable from stable": flutter_questions.predictions(
-            fits["stable"], experiments, speeds, names["unstable"], draws
-        ),
-        "stable from unstable": flutter_questions.predictions(
-            fits["unstable"], experiments, speeds, names["stable"], draws
-        ),
-    }
-    for group in flutter_questions.groups(speeds)[: 1 if quick else None]:
-        label = " and ".join(sorted({f"{speeds[name]:g}" for name in group}))
-        found[f"without {label} m/s"] = flutter_questions.leave_out(experiments, speeds, both, group, draws)
-    return found
+def parts(
+    experiments: dict[str, bp.Experiment], speeds: dict[str, float], both: Fitted, quick: bool
+) -> tuple[dict[str, Fitted], dict[str, Any]]:
+    """Return the fits by kind of cycle, and how cycles that were not fitted are predicted: by speed and by kind.
+
+    Other processes leave the wind speeds out meanwhile.
+    """
+    draws, theta = 20 if quick else 200, dict(both.fit.theta)
+    with common_resumed.workers() as pool:
+        running = {}
+        for group in flutter_questions.groups(speeds)[: 1 if quick else None]:
+            label = " and ".join(sorted({f"{speeds[name]:g}" for name in group}))
+            running[f"without {label} m/s"] = pool.submit(
+                flutter_questions.leave_out, experiments, speeds, theta, group, draws
+            )
+        fits = flutter_questions.subsets(experiments, speeds, both)
+        left = {}
+        for kind, other in (("stable", "unstable"), ("unstable", "stable")):
+            names = [name for name in experiments if name.startswith("unstable") == (other == "unstable")]
+            left[f"{other} from {kind}"] = flutter_questions.predictions(fits[kind], experiments, speeds, names, draws)
+        return fits, left | {label: one.result() for label, one in running.items()}
 
 
 def with_known_noise(both: Fitted, experiments: dict[str, bp.Experiment], speeds: dict[str, float]) -> bp.Problem:

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from bayesperiodic import checks
+from bayesperiodic.blas import in_one_thread
 from bayesperiodic.diagnosis.campaigns import APART, DONE, LAPLACE, MCMC, METHODS, Campaign, refuse, replicate
 from bayesperiodic.diagnosis.discrepancy import holm
 from bayesperiodic.diagnosis.uniformity import chi_square_test, dispersion_test, ecdf_test, normal_scores
@@ -84,6 +85,7 @@ class Calibration(Result):
         return f"{head}\n{self.table.to_string(float_format='{:.3g}'.format, index=False)}"
 
 
+@in_one_thread
 def calibrate(
     problem: Problem,
     *,

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 
 from bayesperiodic import checks
+from bayesperiodic.blas import in_one_thread
 from bayesperiodic.diagnosis.approximation import SAMPLING, approximation
 from bayesperiodic.diagnosis.scores import Scores, joint_row, row, scores
 from bayesperiodic.diagnosis.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, WIDE
@@ -121,6 +122,7 @@ def _coloured(verdict: str) -> str:
     return f'<span style="background:{colour};color:#000;padding:1px 4px">{html.escape(verdict)}</span>'
 
 
+@in_one_thread
 def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordinates: str = NATURAL) -> Comparison:
     """Compare the Laplace approximation with the posterior draws, parameter by parameter and jointly.
 

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import ndtr
 
+from bayesperiodic.blas import in_one_thread
 from bayesperiodic.diagnosis.design import Candidate, default_candidates, rank_candidates
 from bayesperiodic.diagnosis.information import Information
 from bayesperiodic.diagnosis.power_scaling import power_scaling
@@ -87,6 +88,7 @@ class Identifiability(Result):
         return "\n".join(lines)
 
 
+@in_one_thread
 def identifiability(
     problem: Problem,
     fit: MapEstimate,

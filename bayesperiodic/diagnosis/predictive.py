@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 
 from bayesperiodic import checks
+from bayesperiodic.blas import in_one_thread
 from bayesperiodic.diagnosis.adequacy import ALL, LEVEL, TESTS, UNTESTED, adequacy, adjusted_p
 from bayesperiodic.diagnosis.bands import Bands, bands
 from bayesperiodic.diagnosis.transients import Run, Transient, transient
@@ -74,6 +75,7 @@ class Prediction(Bands):
         return "\n".join([*lines, self.table.to_string(float_format="{:.2g}".format, na_rep="-")])
 
 
+@in_one_thread
 def predict(
     problem: Problem,
     posterior: Posterior,

@@ -8,6 +8,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from bayesperiodic import checks
+from bayesperiodic.blas import in_one_thread
 from bayesperiodic.diagnosis.bands import Bands, bands
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.periodic import reach
@@ -54,6 +55,7 @@ class PriorPredictive(Result):
         return f"PriorPredictive of {self.draws} draws\n{table}" + (f"\nfailed solves:{causes}" if causes else "")
 
 
+@in_one_thread
 def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progress: bool = True) -> PriorPredictive:
     """Solve every experiment for draws from the prior, and find out why some solves fail.
 

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from bayesperiodic import checks
+from bayesperiodic.blas import in_one_thread
 from bayesperiodic.orbits.angles import wrapped
 from bayesperiodic.orbits.atlas import Atlas
 from bayesperiodic.orbits.boxes import box_orbits
@@ -55,6 +56,7 @@ class _Scaled:
     quality_count: int
 
 
+@in_one_thread
 def find_orbits(
     section: PoincareSection,
     *,

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from bayesperiodic.blas import in_one_thread
 from bayesperiodic.models.model import Model
 from bayesperiodic.orbits.identity import nearest_shift
 from bayesperiodic.orbits.orbit import Orbit, Orbits
@@ -14,6 +15,7 @@ from bayesperiodic.periodic.schemes import Scheme
 SAME = 1e-5
 
 
+@in_one_thread
 def polish_orbits(
     model: Model,
     orbits: Orbits | Sequence[Orbit],

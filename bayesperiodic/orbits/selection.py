@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from bayesperiodic import checks
+from bayesperiodic.blas import in_one_thread
 from bayesperiodic.models.model import Model
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.periodic.stability import multiplier_sensitivities
@@ -13,6 +14,7 @@ from bayesperiodic.periodic.stability import multiplier_sensitivities
 DIRECTIONS = 1e-10
 
 
+@in_one_thread
 def select_orbits(
     orbits: Orbits,
     parameters: Iterable[str],

@@ -11,6 +11,7 @@ from scipy.optimize import brentq
 from tqdm import tqdm
 
 from bayesperiodic import checks
+from bayesperiodic.blas import in_one_thread
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
@@ -117,6 +118,7 @@ class Branch(Result, Sequence):
         )
 
 
+@in_one_thread
 def continue_periodic(
     model: Model,
     solution: PeriodicSolution,

@@ -8,6 +8,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from bayesperiodic import checks
+from bayesperiodic.blas import in_one_thread
 from bayesperiodic.inference.all_at_once import all_at_once
 from bayesperiodic.inference.estimation.doubling import doubling_shift
 from bayesperiodic.inference.estimation.estimate import MapEstimate
@@ -34,6 +35,7 @@ SHOWN = 3
 LOST = 1e-6
 
 
+@in_one_thread
 def map_estimate(
     problem: Problem,
     *,

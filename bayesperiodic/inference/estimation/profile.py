@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtri
 
 from bayesperiodic import checks
+from bayesperiodic.blas import in_one_thread
 from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.estimation.gauss_newton import Iterate, Objective, bias_correction
 from bayesperiodic.inference.estimation.ridge import Point, Ridge
@@ -148,6 +149,7 @@ def _crossing(values: np.ndarray, roots: np.ndarray, level: float, limit: float)
     return float(brentq(lambda x: float(curve(x)) - level, values[last], values[last + 1], xtol=1e-300, rtol=1e-14))
 
 
+@in_one_thread
 def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = None, *, executor: Any = None) -> Profile:
     """Follow the best log-density from the estimate along every parameter, outwards and back again.
 

@@ -10,6 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from bayesperiodic import checks
+from bayesperiodic.blas import in_one_thread
 from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.inference.sampling import chains
@@ -29,6 +30,7 @@ PASSES = 2
 FEWEST_STEPS = 50
 
 
+@in_one_thread
 def sample(
     problem: Problem,
     fit: MapEstimate,
