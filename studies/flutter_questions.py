@@ -135,7 +135,7 @@ def groups(speeds: Mapping[str, float]) -> list[list[str]]:
 def leave_out(
     experiments: Mapping[str, bp.Experiment],
     speeds: Mapping[str, float],
-    theta: Mapping[str, float],
+    theta: dict[str, float],
     left: list[str],
     draws: int,
 ) -> dict[str, Any]:

@@ -129,8 +129,9 @@ def test_noise_of_differentiated_inputs_is_carried_to_the_output():
         samples=200,
         amplitude_variance={"x": variance},
     )
-    with pytest.warns(UserWarning, match="noise of the measured inputs, differentiated, brings"):
+    with pytest.warns(UserWarning, match="noise of the measured inputs, differentiated, brings") as caught:
         fit = bp.map_estimate(bp.Problem(model, [experiment], priors={"c": bp.Normal(0, 10)}))
+    assert caught[0].filename == __file__
     gain = fit.theta["c"] * rate + 1 / (1 + rate)
     expected = np.sqrt(np.sum(0.5 * np.abs(gain) ** 2 * variance))
     assert fit.input_noise["force"] == pytest.approx(expected, rel=2e-3)

@@ -175,8 +175,9 @@ def test_an_end_lifted_by_another_branch_is_followed_further():
     wave, priors = WAVE * np.sqrt(2 / 40), {"a": bp.Normal(0.0, 5.0), "b": bp.Normal(-1.0, 2.0)}
     problem = posed(model, wave, 0.3, priors, wave=wave)
     fit = fitted(problem, {"a": 0.0, "b": 1.0})
-    with pytest.warns(UserWarning, match="The log-density is higher by 0.49"):
+    with pytest.warns(UserWarning, match="The log-density is higher by 0.49") as caught:
         profile = bp.profile(problem, fit, ["a"])
+    assert caught[0].filename == __file__
     assert profile.values["a"][0] < -3.0 < -0.5 < fit.theta["a"] - 3 * fit.sd["a"]
     b = np.linspace(-4.0, 4.0, 20_001)
     every = np.array([problem.log_posterior({"a": a, "b": b}, {}).max() for a in profile.values["a"]])

@@ -237,7 +237,7 @@ def _warn(problem: Problem, fit: MapEstimate) -> None:
 
 
 def _say(text: str) -> None:
-    warnings.warn(text, UserWarning, stacklevel=4)
+    warnings.warn(text, UserWarning, stacklevel=5)
 
 
 def _short(name: str) -> str:

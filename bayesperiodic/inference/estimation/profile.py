@@ -236,7 +236,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
             f"The log-density is higher by {result.improvement:.3g} than at the estimate where "
             f"{_written(result.best)}; start there, map_estimate(problem, start=profile.best), and profile again.",
             UserWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
     return result
 

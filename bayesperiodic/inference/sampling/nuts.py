@@ -267,5 +267,5 @@ class _Run:
             f"{diverged} of {total} trajectories diverged: they ran into points where the log-posterior is not finite, "
             "such as the ends of a prior's support or failed solves, or where it bends too sharply. The draws may miss "
             "what lies behind; compare them with those of sampler='emcee'.",
-            stacklevel=5,
+            stacklevel=6,
         )
