@@ -383,7 +383,7 @@ class Problem:
         return gradient
 
     def value_and_gradient(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> tuple[float, np.ndarray]:
-        """Return `log_posterior` at one θ and its `gradient`; −inf and zeros where it is not finite.
+        """Return `log_posterior` at one θ and its `gradient`; −inf and zeros where one of them is not finite.
 
         One periodic solve and one transposed solve an experiment, shared among the cores.
 
@@ -413,6 +413,8 @@ class Problem:
             return nothing
         by_residual, by_noise = self.likelihood.gradients(here.residuals, noise)
         by_theta = self.pulled(here, by_residual, forward=forward)
+        if not np.isfinite(by_theta).all():
+            return nothing
         free = [self.noise_names.index(name) for name in self.free_noise]
         return value, np.concatenate([by_theta + self.joint_prior.gradient(values), by_noise[free]])
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.periodic.batch import Batch
 from tests.inference.observed import (
     DUFFING_PRIORS,
     PENDULUM_PRIORS,
@@ -135,6 +136,16 @@ def test_value_and_gradient_outside_the_support():
     value, gradient = duffing(duffing_run()).value_and_gradient(
         {"c": -1.0, "k": 1.0, "k3": 0.5}, {"displacement": 0.01}
     )
+    assert value == -np.inf
+    assert gradient.tolist() == [0.0] * 4
+
+
+def test_value_and_gradient_where_the_transposed_solve_is_singular(monkeypatch):
+    problem = duffing(duffing_run())
+    theta, noise = {"c": 0.2, "k": 1.0, "k3": 0.5}, {"displacement": 0.01}
+    assert np.isfinite(problem.value_and_gradient(theta, noise)[0])
+    monkeypatch.setattr(Batch, "pull", lambda self, parameters, z, weights: np.full(parameters.shape, np.nan))
+    value, gradient = problem.value_and_gradient(theta, noise)
     assert value == -np.inf
     assert gradient.tolist() == [0.0] * 4
 

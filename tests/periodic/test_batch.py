@@ -64,6 +64,17 @@ def test_batch_equals_single_solves(equations, batch):
         assert y[:, 0] == pytest.approx(alone(equations, theta), abs=1e-9 * np.ptp(y))
 
 
+def test_solutions_that_are_kept_are_solved_to_rounding(equations, batch):
+    """Those that are not end where the next chord step would be below 1e-9 of the amplitude."""
+    parameters = spread(20, sd=0.005)
+    (kept,), *_, (status,), _ = batch.solve(parameters, keep=True)
+    assert not status.any()
+    for theta, z in zip(parameters, kept, strict=True):
+        columns = equations.residual_jacobian(z, theta)
+        (newton,) = equations.factors(columns).solve(columns[None, :, : equations.count])
+        assert np.abs(newton).max() < 1e-13 * np.ptp(z)
+
+
 def test_input_sets_times_parameter_vectors():
     tau = grid(200)
     sets = [build(f * np.cos(2 * np.pi * tau), nu) for f, nu in ((20.0, 5.0), (5.0, 3.0), (10.0, 12.0))]
