@@ -103,7 +103,7 @@ def _linearised(
 
 
 def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
-    """Return the fundamental frequency [Hz] that the autocorrelation suggests, None where it has no peak.
+    """Return the fundamental frequency [Hz] that the autocorrelation suggests, None where it has no positive peak.
 
     The smallest lag whose peak reaches 90 % of the highest is taken, then multiples of its frequency are preferred
     where they explain the signals as well.
@@ -123,7 +123,7 @@ def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
         return None
     inside = correlation[1:-1]
     peaks = 1 + np.flatnonzero((inside >= correlation[:-2]) & (inside > correlation[2:]))
-    peaks = peaks[peaks > negative[0]]
+    peaks = peaks[(peaks > negative[0]) & (correlation[peaks] > 0.0)]
     if peaks.size == 0:
         return None
     lag = peaks[np.flatnonzero(correlation[peaks] >= 0.9 * correlation[peaks].max())[0]]

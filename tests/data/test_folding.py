@@ -156,6 +156,14 @@ def test_signal_that_is_not_periodic_is_refused_with_its_measure():
         bp.Recording.from_arrays(np.arange(4000) / 100, {"y": noise}).fold()
 
 
+@pytest.mark.parametrize("seed", [0, 1, 7])
+def test_random_walks_are_refused(seed):
+    """Of some the autocorrelation has no positive peak."""
+    walk = np.cumsum(np.random.default_rng(seed).standard_normal(2000))
+    with pytest.raises(ValueError, match=r"'recording' (is not periodic|is not steady|of .* s is not allowed)"):
+        bp.Recording.from_arrays(np.arange(2000) / 500, {"y": walk, "z": np.roll(walk, 9)}).fold()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
