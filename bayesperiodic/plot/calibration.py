@@ -11,6 +11,8 @@ from bayesperiodic.diagnosis.uniformity import bin_count, binomial_band, ecdf_ba
 from bayesperiodic.plot.style import COLOURS, wrapped_label
 
 LEVEL = 0.99
+# Of the histograms' axes, for the legend.
+HEADROOM = 1.45
 COLUMNS = {
     "truths in each bin / expected": "position of the truth in the posterior",
     "distribution function − diagonal": "position of the truth in the posterior",
@@ -49,9 +51,9 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
             _histogram(row[0], values, COLOURS[method], said, method == METHODS[0])
             _distribution(row[1], values, COLOURS[method], method == METHODS[0])
             _coverage(row[2], values, COLOURS[method], method == METHODS[0])
-        row[0].set_ylim(bottom=0.0)
+        row[0].set_ylim(0.0, HEADROOM * row[0].get_ylim()[1])
         row[0].set_ylabel(wrapped_label(name, ""))
-        row[0].legend(framealpha=0.8, edgecolor="none", fontsize="small", loc="lower center")
+        row[0].legend(frameon=False, fontsize="small", loc="upper center")
     for top, bottom, (title, label) in zip(panels[0], panels[-1], COLUMNS.items(), strict=True):
         top.set_title(title, fontsize="medium")
         bottom.set_xlabel(label)
