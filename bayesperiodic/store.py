@@ -21,6 +21,18 @@ class Result:
         """Write the result to an HDF5 file, replacing an older one only when the new one is complete.
 
         A result that holds draws is a netCDF file whose groups xarray and ArviZ open directly.
+
+        Parameters
+        ----------
+        path : path
+            In a folder that exists.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written there.
+        TypeError
+            If the result holds what is no plain data, such as a function.
         """
         import h5py
 
@@ -43,11 +55,16 @@ class Result:
 
 
 def load(path: str | Path) -> Any:
-    """Return a saved result.
+    """Return a saved result, without the model and without evaluating anything in the file.
 
     Parameters
     ----------
     path : path
+
+    Returns
+    -------
+    Result
+        Of the class that was saved: an `Experiment`, a `PeriodicSolution`, a `MapEstimate`, a `Posterior`, …
 
     Raises
     ------
@@ -55,6 +72,14 @@ def load(path: str | Path) -> Any:
         If there is no such file.
     ValueError
         If the file is not one that a result was saved to.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile, bayesperiodic as bp
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.h5"
+    >>> bp.Experiment("run", 2.0, {"x": [0.0, 1.0, 0.0, -1.0]}, samples=4).save(path)
+    >>> bp.load(path).outputs["x"].tolist()
+    [0.0, 1.0, 0.0, -1.0]
     """
     import h5py
 

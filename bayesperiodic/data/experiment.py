@@ -70,6 +70,18 @@ class Experiment(Result):
         For arrays of a wrong length, NaN where something was measured, a frequency ≤ 0, an unknown channel, a name with
         ``/``, ``[`` or ``]``, a mask without points, a covariance that is not symmetric and positive definite,
         multipliers that are zero or without an error.
+
+    Examples
+    --------
+    A force measured over 20 cycles, of which the fold kept five harmonics:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> tau = np.arange(64) / 64
+    >>> force, stroke = 30.0 * np.sin(2 * np.pi * tau), 0.01 * np.cos(2 * np.pi * tau)
+    >>> run = bp.Experiment("run 1", 2.0, {"force": force}, {"stroke": stroke}, samples=64,
+    ...                     harmonics={"force": 5}, scatter={"force": 0.8}, cycles=20)
+    >>> run.independent, round(float(run.time[-1]), 4)
+    ({'force': 11}, 0.4922)
     """
 
     name: str
@@ -240,7 +252,18 @@ class Experiment(Result):
         return self.tau / self.frequency
 
     def project(self, channel: str, values: np.ndarray) -> np.ndarray:
-        """Return signals (…, points) with the harmonics removed that the measured channel did not keep."""
+        """Return signals with the harmonics removed that the measured channel did not keep.
+
+        Parameters
+        ----------
+        channel : str
+        values : array (…, samples·periods)
+            In the channel's unit.
+
+        Returns
+        -------
+        array (…, samples·periods)
+        """
         if channel not in self.harmonics:
             return values
         return fourier.project(values, self.harmonics[channel])

@@ -50,46 +50,7 @@ def fold(
     largest_drift: float | None = None,
     name: str | None = None,
 ) -> Experiment:
-    """Fold the steady part of a recording into its mean period on an equidistant grid.
-
-    The fundamental frequency is found by least squares over the whole steady part, the mean period is a least-squares
-    Fourier series (the sampling rate need not divide the period), and only whole cycles after the transient are used.
-
-    Parameters
-    ----------
-    recording : Recording
-    samples : int
-        Grid points per forcing period.
-    frequency : float, optional
-        Forcing frequency [Hz], taken as exact; by default it is estimated, with a standard error.
-    periods : int
-        Forcing periods per response period.
-    harmonics : int or mapping of str to int, optional
-        Harmonics of the response period to keep, for all channels or by channel. By default each channel keeps all up
-        to the last one that stands out of the cycle-to-cycle scatter: an F-test on its squared amplitude with a
-        false-alarm rate of 1 % over all harmonics tested.
-    origin : float or "crossing"
-        Time [s] at which τ = 0; or, for a free-running system whose phase means nothing, where the fundamental of the
-        first output crosses its mean upwards, for the first time after time 0.
-    largest_drift : float, optional
-        How far the fundamental of a channel may grow or shrink over the whole recording, as a fraction of its mean (a
-        straight line through the amplitudes of the cycles). A free-running system that is held on a cycle, or settles
-        on one, has none.
-    name : str, optional
-        By default the recording's name.
-
-    Returns
-    -------
-    Experiment
-        With `.frequency_se`, `.cycles` (how many were used), `.scatter`, `.independent` (2·harmonics + 1, at most the
-        number of samples), `.harmonics`, `.periodicity` and `.drift`.
-
-    Raises
-    ------
-    ValueError
-        For fewer than three cycles, a constant channel, a signal that is not periodic (its periodicity is told),
-        more harmonics than the samples resolve, an unknown channel in `harmonics`, a drift beyond the largest.
-    """
+    """Fold the steady part of a recording into its mean period on an equidistant grid; see `Recording.fold`."""
     periods = checks.integer("periods", periods, 1)
     samples = checks.integer("samples", samples, 4)
     start = 0.0 if origin == CROSSING else checks.finite_number("origin", origin)

@@ -30,6 +30,23 @@ class Recording(Result):
     name : str
     synthetic : bool
         True if the recording was simulated.
+
+    Raises
+    ------
+    ValueError
+        For fewer than two samples, samples that are NaN or infinite, lengths that differ, a time that does not
+        increase, no output, names that are no identifiers or come twice.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> t = np.arange(0, 60, 0.01)
+    >>> recording = bp.Recording.from_arrays(t, {"angle": np.sin(2 * np.pi * 1.3 * t)}, name="swing")
+    >>> recording.between(10, 50)
+    Recording('swing': recording of 4001 samples at 100 Hz, inputs [], outputs ['angle'])
+    >>> experiment = recording.fold(samples=64)
+    >>> print(f"{experiment.cycles} cycles at {experiment.frequency:.6f} Hz")
+    78 cycles at 1.300000 Hz
     """
 
     time: np.ndarray
@@ -72,7 +89,13 @@ class Recording(Result):
         time : array (samples,)
             Strictly increasing [s].
         outputs, inputs : mapping of str to array (samples,)
+            In the units of the model's channels.
         name : str, optional
+            By default "recording".
+
+        Returns
+        -------
+        Recording
 
         Raises
         ------
@@ -122,6 +145,10 @@ class Recording(Result):
         name : str, optional
             By default the file's name without its ending.
 
+        Returns
+        -------
+        Recording
+
         Raises
         ------
         FileNotFoundError
@@ -129,6 +156,16 @@ class Recording(Result):
         ValueError
             For a missing column, a cell that is no number, NaN or infinite samples, a time that does not increase,
             both or neither of `time` and `sampling_rate`, an unknown unit.
+
+        Examples
+        --------
+        >>> import pathlib, tempfile, numpy as np, pandas as pd, bayesperiodic as bp
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
+        >>> t = np.arange(500) / 50
+        >>> pd.DataFrame({"t": t, "x_mm": 25 * np.sin(2 * np.pi * t)}).to_csv(path, index=False)
+        >>> run = bp.Recording.from_csv(path, time="t", outputs={"x": "x_mm"}, units={"x": ("mm", "m")})
+        >>> run.name, round(float(run.outputs["x"].max()), 3)
+        ('run', 0.025)
         """
         return cls._from_file(reading.read_csv, path, outputs, inputs, time, sampling_rate, units, name)
 
@@ -144,7 +181,32 @@ class Recording(Result):
         units: Units | None = None,
         name: str | None = None,
     ) -> "Recording":
-        """Read a recording from the arrays of an NPZ file; the arguments are those of `from_csv`."""
+        """Read a recording from the arrays of an NPZ file; see `from_csv`.
+
+        Parameters
+        ----------
+        path : path
+        outputs, inputs : mapping of str to str
+            Array by channel.
+        time : str, optional
+            Array of times [s].
+        sampling_rate : float, optional
+            [Hz], where the file has no times.
+        units : mapping of str to float or (from, to), optional
+        name : str, optional
+            By default the file's name without its ending.
+
+        Returns
+        -------
+        Recording
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is no such file.
+        ValueError
+            As `from_csv` does, and for an array of objects, which would have to be unpickled.
+        """
         return cls._from_file(reading.read_npz, path, outputs, inputs, time, sampling_rate, units, name)
 
     @classmethod
@@ -159,7 +221,32 @@ class Recording(Result):
         units: Units | None = None,
         name: str | None = None,
     ) -> "Recording":
-        """Read a recording from a MAT file, version 5 or 7.3; the arguments are those of `from_csv`."""
+        """Read a recording from a MAT file, version 5 or 7.3; see `from_csv`.
+
+        Parameters
+        ----------
+        path : path
+        outputs, inputs : mapping of str to str
+            Variable by channel.
+        time : str, optional
+            Variable of times [s].
+        sampling_rate : float, optional
+            [Hz], where the file has no times.
+        units : mapping of str to float or (from, to), optional
+        name : str, optional
+            By default the file's name without its ending.
+
+        Returns
+        -------
+        Recording
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is no such file.
+        ValueError
+            As `from_csv` does, and for a variable that is no vector of real numbers.
+        """
         return cls._from_file(reading.read_mat, path, outputs, inputs, time, sampling_rate, units, name)
 
     @classmethod
@@ -200,7 +287,22 @@ class Recording(Result):
         )
 
     def between(self, start: float, stop: float) -> "Recording":
-        """Return the part with start ≤ time ≤ stop [s]; raise a ValueError if fewer than two samples are left."""
+        """Return the part with start ≤ time ≤ stop.
+
+        Parameters
+        ----------
+        start, stop : float
+            [s].
+
+        Returns
+        -------
+        Recording
+
+        Raises
+        ------
+        ValueError
+            If fewer than two samples are left.
+        """
         keep = (self.time >= start) & (self.time <= stop)
         if keep.sum() < 2:
             raise ValueError(
@@ -225,7 +327,58 @@ class Recording(Result):
         largest_drift: float | None = None,
         name: str | None = None,
     ) -> "Experiment":
-        """Fold the steady part of the recording into its mean period; see `folding.fold`."""
+        """Fold the steady part of the recording into its mean period on an equidistant grid.
+
+        The fundamental frequency is found by least squares over the whole steady part, the mean period is a
+        least-squares Fourier series (the sampling rate need not divide the period), and only whole cycles after the
+        transient are used.
+
+        Parameters
+        ----------
+        samples : int
+            Grid points per forcing period.
+        frequency : float, optional
+            Forcing frequency [Hz], taken as exact; by default it is estimated, with a standard error.
+        periods : int
+            Forcing periods per response period.
+        harmonics : int or mapping of str to int, optional
+            Harmonics of the response period to keep, for all channels or by channel. By default each channel keeps all
+            up to the last one that stands out of the cycle-to-cycle scatter: an F-test on its squared amplitude with a
+            false-alarm rate of 1 % over all harmonics tested.
+        origin : float or "crossing"
+            Time [s] at which τ = 0; or, for a free-running system whose phase means nothing, where the fundamental of
+            the first output crosses its mean upwards, for the first time after time 0.
+        largest_drift : float, optional
+            How far the fundamental of a channel may grow or shrink over the whole recording, as a fraction of its mean
+            (a straight line through the amplitudes of the cycles). A free-running system that is held on a cycle, or
+            settles on one, has none.
+        name : str, optional
+            By default the recording's name.
+
+        Returns
+        -------
+        Experiment
+            With `.frequency_se`, `.cycles` (how many were used), `.scatter`, `.independent` (2·harmonics + 1, at most
+            the number of samples), `.harmonics`, `.periodicity` and `.drift`.
+
+        Raises
+        ------
+        ValueError
+            For fewer than three cycles, a constant channel, a signal that is not periodic (its periodicity is told),
+            more harmonics than the samples resolve, an unknown channel in `harmonics`, a drift beyond the largest.
+
+        Examples
+        --------
+        Noise of 0.1 mm on the recorded displacement of an oscillator, drive and sampling rate incommensurate:
+
+        >>> import numpy as np, bayesperiodic as bp
+        >>> force = {"force": np.cos(2 * np.pi * np.arange(64) / 64)}
+        >>> recording = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1,
+        ...                         duration=400, sampling_rate=9.7, noise={"displacement": 1e-4}, seed=1)
+        >>> run = recording.fold(samples=64, harmonics={"displacement": 9}, name="run 1")
+        >>> print(f"{run.frequency:.4f} Hz, {run.independent['displacement']} independent values")
+        0.1000 Hz, 19 independent values
+        """
         from bayesperiodic.data.folding import fold
 
         return fold(

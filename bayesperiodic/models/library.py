@@ -25,6 +25,8 @@ duffing = Model(
     Schwingungen bei veränderlicher Eigenfrequenz, Vieweg, 1918). For a first try, and for structures near a resonance,
     whose bent peak has up to three periodic solutions at one frequency.
 
+    Examples
+    --------
     >>> import numpy as np, bayesperiodic as bp
     >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": np.ones(8)},
     ...                   frequency=0.2, duration=100, sampling_rate=10)
@@ -45,6 +47,18 @@ dahl = Model(
     value to the other, −Kw and Kw, within a few 1/rho of travel, at any speed (P. R. Dahl, Solid friction damping of
     mechanical vibrations, AIAA Journal 14, 1976, 1675-1682; exponent 1). Viscous damping Kx, a stiffness K and an
     offset F0 act beside it. For dampers and joints whose displacement is imposed.
+
+    Examples
+    --------
+    A stroke of 10 mm is many times 1/rho, so the friction slides most of the time and dissipates about 4·Kw·10 mm a
+    period:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> x = 0.01 * np.cos(2 * np.pi * np.arange(800) / 800)
+    >>> theta = {"Kx": 0, "K": 0, "F0": 0, "Kw": 50.0, "rho": 5e3}
+    >>> solution = bp.solve_periodic(bp.models.dahl, theta, {"displacement": x}, frequency=1.0)
+    >>> float(-(solution.outputs["force"] * np.gradient(x)).sum().round(2))
+    0.0
     """,
 )
 
@@ -77,14 +91,17 @@ pendulum = Model(
     description="""The parametrically driven pendulum of de Kraker, Verbeek & van de Wouw (1997), eq. (10).
 
     A point mass m on an arm l, at the angle φ (state phi) from hanging down, whose pivot is at the height −a cos ωt,
-    ω = 2π·frequency. Seen from the pivot, gravity is g + a ω² cos ωt, and the torques divided by the inertia m l² are
+    ω = 2π·frequency. Seen from the pivot, gravity is g + a ω² cos ωt, and the torques divided by the inertia m l² are::
 
         φ̈ + [k1 tanh(φ̇/v0) + k2 φ̇ + k3 φ̇|φ̇|]/(m l²) + (g + a ω² cos ωt)/l · sin φ = 0
 
     with Coulomb friction of the bearing (the paper's sgn φ̇, smoothed below the speed v0), viscous damping and air
     resistance. Of m, only k1/m, k2/m and k3/m can be told. For stable and unstable periodic orbits, of rotating and
-    chaotic motion too: φ may wind. A set that behaves as the paper tells, locked at ω = 13 rad/s, chaotic at 9.09:
+    chaotic motion too: φ may wind. A set that behaves as the paper tells, locked at ω = 13 rad/s, chaotic at 9.09, is
+    in the example.
 
+    Examples
+    --------
     >>> import bayesperiodic as bp
     >>> theta = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
     >>> run = bp.simulate(bp.models.pendulum, theta, frequency=1.4467, duration=7, sampling_rate=100, start={"phi": 1})
@@ -109,6 +126,8 @@ silverbox = Model(
     with c halved and the others quartered, it gives the same response; so fix it. An offset of the response is left
     out, because other k1, k2 and u0 do the same.
 
+    Examples
+    --------
     >>> import numpy as np, bayesperiodic as bp
     >>> theta = {"w0": 408.4, "c": 0.1, "k1": 1.1, "k2": 0, "k3": 4.4, "g": 1.1, "u0": 0}
     >>> run = bp.simulate(bp.models.silverbox, theta, {"drive": 0.1 * np.cos(2 * np.pi * np.arange(16) / 16)},
@@ -130,6 +149,8 @@ van_der_pol = Model(
     small mu, of period (2π/omega)(1 + mu²/16 + …). The displacement is relative to the one where the damping vanishes.
     For autonomous systems, where the frequency is part of the answer and the phase is free.
 
+    Examples
+    --------
     >>> import bayesperiodic as bp
     >>> bp.models.van_der_pol.autonomous
     True

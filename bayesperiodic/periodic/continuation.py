@@ -41,13 +41,28 @@ class Branch(Result, Sequence):
     units : dict of str to str
         Of what was varied (under its own name), and of the model's parameters, states, inputs and outputs, if known.
     values : array (points,)
-        Of what was varied.
+        Of what was varied, in its unit.
     solutions : tuple of PeriodicSolution
         Without sensitivities.
     kinds : tuple of str
         "fold", "period doubling" or "" for each.
     complete : bool
         True if the branch got to the end wanted, or back to its start value, and did not get stuck.
+
+    Examples
+    --------
+    The frequency response of a hardening spring, whose bent peak ends in two folds:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = np.cos(2 * np.pi * np.arange(100) / 100)
+    >>> start = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
+    ...                           frequency=0.1, samples=100)
+    >>> branch = bp.continue_periodic(bp.models.duffing, start, "frequency", until=0.4, progress=False)
+    >>> upper, lower = branch.folds
+    >>> print(f"folds at {upper.frequency:.3f} and {lower.frequency:.3f} Hz")
+    folds at 0.304 and 0.242 Hz
+    >>> branch[-1].stable, dict(branch.data.sizes)["tau"]
+    (True, 100)
     """
 
     vary: str
@@ -198,6 +213,11 @@ def iterate_periodic(
     solution : PeriodicSolution
     kind : str
         "fold", "period doubling" or "".
+
+    Raises
+    ------
+    ValueError
+        As `continue_periodic` does, at the first point.
 
     Examples
     --------

@@ -41,6 +41,13 @@ class HopfPoint(Result):
         The states there.
     mode : complex array (states,)
         Amplitudes of the states in the oscillation, in the model's order, the largest of them 1.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> point, = bp.hopf_points(bp.models.van_der_pol, {"mu": 0.0, "omega": 6.0}, "mu", between=(-1.0, 1.5))
+    >>> point.vary, point.equilibrium, round(point.frequency, 4)
+    ('mu', {'x': 0.0}, 0.9549)
     """
 
     model: str

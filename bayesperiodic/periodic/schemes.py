@@ -57,7 +57,18 @@ class Scheme:
         return max((abs(offset) for offset in (*self.first, *self.second)), default=1)
 
     def weights(self, points: int) -> tuple[Mapping[int, float], Mapping[int, float]]:
-        """Return the weights of the first and the second derivative on a cyclic grid of that many points."""
+        """Return the weights of the first and the second derivative on a cyclic grid.
+
+        Parameters
+        ----------
+        points : int
+            Of the grid, which a trigonometric scheme uses all.
+
+        Returns
+        -------
+        first, second : mapping of int to float
+            Weight by offset, for unit step.
+        """
         return self.first, self.second
 
 

@@ -48,7 +48,7 @@ class PeriodicSolution(Result):
         Time in forcing periods, end point excluded; points = samples · periods.
     states, inputs, outputs : dict of str to array (points,)
     sensitivities : dict of str to dict of str to array (points,)
-        ∂output/∂parameter, ``sensitivities[output][parameter]`` (de Kraker et al. 1997, eq. 4), and for a forced model
+        ∂output/∂parameter, ``sensitivities[output][parameter]`` ([1]_, eq. 4), and for a forced model
         ``sensitivities[output]["frequency"]`` [per Hz; −frequency² times that is per second of period], inputs held as
         functions of tau; empty unless converged. For an autonomous model the phase moves so that the change stays
         orthogonal to the flow, states in units of their range.
@@ -64,6 +64,26 @@ class PeriodicSolution(Result):
         Largest residual, in units of the size of its equation's terms.
     history : array (iterations, 3)
         Scaled residual before each iteration, scaled full Newton step, damping factor.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = np.cos(2 * np.pi * np.arange(200) / 200)
+    >>> solution = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0}, {"force": force},
+    ...                              frequency=0.1, samples=200, scheme="fourier")
+    >>> solution.converged, solution.stable, solution.period
+    (True, True, 10.0)
+
+    This spring is linear, so the amplitude is |1/(1 − ω² + 0.2iω)|, and disturbances decay by exp(−0.1·10) a period:
+
+    >>> omega, amplitude = 0.2 * np.pi, np.sqrt(2) * solution.states["x"].std()
+    >>> round(float(amplitude * np.hypot(1 - omega**2, 0.2 * omega)), 9), abs(solution.multipliers).round(4).tolist()
+    (1.0, [0.3679, 0.3679])
     """
 
     model: str
@@ -123,16 +143,16 @@ class PeriodicSolution(Result):
 
     @property
     def multipliers(self) -> np.ndarray:
-        """Floquet multipliers over the response period, complex, largest modulus first; empty unless converged.
+        """Floquet multipliers over the response period, complex (multipliers,), largest modulus first.
 
-        They are those of the linearised differential equations. An autonomous model's trivial 1 is among them.
+        Empty unless converged. They are those of the linearised differential equations. An autonomous model's trivial 1 is among them.
         """
         with np.errstate(over="ignore"):
             return np.exp(self.floquet.exponents) if self.floquet is not None else np.empty(0, dtype=complex)
 
     @property
     def exponents(self) -> np.ndarray:
-        """Floquet exponents log(multiplier)/period [1/s], complex; finite where a multiplier would overflow."""
+        """Floquet exponents log(multiplier)/period [1/s], complex (multipliers,); finite where a multiplier overflows."""
         return self.floquet.exponents / self.period if self.floquet is not None else np.empty(0, dtype=complex)
 
     @property

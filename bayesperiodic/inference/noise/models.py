@@ -18,6 +18,8 @@ from bayesperiodic.inference.noise.blocks import CORRELATED, KNOWN, POINTS, SCAL
 from bayesperiodic.inference.priors.joint import as_prior
 from bayesperiodic.inference.priors.univariate import LogNormal, Prior
 
+__all__ = ["Circulant", "Independent", "Measured", "Noise"]
+
 CHANNEL, EXPERIMENT = "channel", "experiment"
 JEFFREYS, FLAT = "jeffreys", "flat"
 VARIANCE = "variance"
@@ -37,6 +39,20 @@ class Noise(ABC):
         Whether a channel has the same noise parameters in all experiments, or its own in each.
     prior : "jeffreys", "flat", a prior with positive support, or a frozen scipy.stats distribution
         Of each variance: Jeffreys' 1/v, a constant density of v, or a proper one.
+
+    Raises
+    ------
+    ValueError
+        For another `per`, or a prior that is none of these.
+
+    Examples
+    --------
+    Every noise model has a name, which a `Problem` takes in its place, and a prior of its variances:
+
+    >>> import bayesperiodic as bp
+    >>> models = bp.noise.Independent(), bp.noise.Measured(), bp.noise.Circulant(prior=bp.InverseGamma(3, 2))
+    >>> {noise.name: noise.prior_text for noise in models if isinstance(noise, bp.noise.Noise)}["circulant"]
+    'prior InverseGamma(shape=3.0, scale=2.0)'
     """
 
     per: str = field(default=CHANNEL, kw_only=True)
@@ -76,7 +92,18 @@ class Noise(ABC):
         return {JEFFREYS: "Jeffreys prior 1/v", FLAT: "flat prior"}.get(self.prior, f"prior {self.prior!r}")
 
     def check(self, blocks: Sequence[Block]) -> None:
-        """Raise a ValueError for channels whose scatter is needed and not known, or grids that cannot be mixed."""
+        """Refuse data that this noise model cannot be used for.
+
+        Parameters
+        ----------
+        blocks : sequence of Block
+            The residual components of all channels of all experiments.
+
+        Raises
+        ------
+        ValueError
+            For channels whose scatter is needed and not known, or grids that cannot be mixed.
+        """
         points: dict[str, int] = {}
         for block in (b for b in blocks if b.kind in (SPECTRAL, POINTS)):
             if self.needs_scatter and not block.measured > 0.0:
@@ -92,11 +119,31 @@ class Noise(ABC):
                 )
 
     def label(self, block: Block) -> str:
-        """Return what stands in the brackets of a block's noise parameters."""
+        """Return what stands in the brackets of a block's noise parameters.
+
+        Parameters
+        ----------
+        block : Block
+
+        Returns
+        -------
+        str
+            The channel, followed by the experiment where each has its own.
+        """
         return block.channel if self.per == CHANNEL else f"{block.channel}, {block.experiment}"
 
     def parameter_names(self, block: Block) -> tuple[str, ...]:
-        """Return the names of the noise parameters of a block, the variance first."""
+        """Return the names of the noise parameters of a block.
+
+        Parameters
+        ----------
+        block : Block
+
+        Returns
+        -------
+        tuple of str
+            The variance first; none where the errors are known.
+        """
         if block.kind == KNOWN:
             return ()
         if block.kind == CORRELATED:
@@ -104,20 +151,75 @@ class Noise(ABC):
         return tuple(f"{kind}[{self.label(block)}]" for kind in (VARIANCE, *self.shape_priors))
 
     def level(self, value: np.ndarray, measured: Any) -> np.ndarray:
-        """Return V of errors whose spectrum is flat, at a variance v; `measured` is what the scatter explains of it."""
+        """Return V of errors whose spectrum is flat.
+
+        Parameters
+        ----------
+        value : array (…)
+            The variance v [channel's unit squared].
+        measured : float or array (…)
+            What the scatter of the cycles explains of the variance of the mean period.
+
+        Returns
+        -------
+        array (…)
+        """
         return value
 
     @abstractmethod
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return V (…, size) and ∂ ln V/∂ ln φ (…, size, parameters) of a spectral block at values (…, parameters)."""
+        """Return the variances of the residual components of a block, and their derivatives.
+
+        Parameters
+        ----------
+        block : Block
+        values : array (…, parameters)
+            Of the block's noise parameters, the variance first.
+
+        Returns
+        -------
+        variances : array (…, size)
+            V_j of the residual components.
+        slopes : array (…, size, parameters)
+            ∂ ln V_j/∂ ln φ.
+        """
 
     def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the covariance of a block of points (size, size), and its derivatives by ln φ (parameters, …)."""
+        """Return the covariance of the residuals at the points of a mask, and its derivatives.
+
+        Parameters
+        ----------
+        block : Block
+        values : array (parameters,)
+            Of the block's noise parameters, the variance first.
+
+        Returns
+        -------
+        covariance : array (size, size)
+        slopes : array (parameters, size, size)
+            By ln φ.
+        """
         variances, slopes = self.spectrum(block, values)
         return np.diag(variances), np.stack([np.diag(variances * slope) for slope in slopes.T])
 
     def log_prior(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the log-density over ln φ of noise parameters of a kind (…,), and its derivative by ln φ."""
+        """Return the log-density of noise parameters over their logarithms, and its derivative.
+
+        Parameters
+        ----------
+        kind : str
+            "variance", "lengthscale" or "floor".
+        value : array (…)
+        measured : float or array (…)
+            As in `level`.
+
+        Returns
+        -------
+        log_density : array (…)
+            Over ln φ; improper ones up to a constant.
+        slope : array (…)
+            By ln φ.
+        """
         if kind in self.shape_priors:
             return _over_logarithm(self.shape_priors[kind], value)
         if self.prior == JEFFREYS:
@@ -221,6 +323,11 @@ class Circulant(Noise):
     prior : "jeffreys", "flat" or a prior
         Of the variance. The correlation length ℓ, as a fraction of the response period, has the prior
         LogNormal(0.03, 1.5); the floor, as a multiple of the correlated part's variance, LogNormal(0.01, 2).
+
+    Raises
+    ------
+    ValueError
+        For another `kernel` or `per`, or a prior that is none of these.
 
     References
     ----------

@@ -23,6 +23,12 @@ class MultivariateNormal:
         Symmetric, positive definite. A table of an estimate must have its rows in the order of the names that the
         prior is given for.
 
+    Raises
+    ------
+    ValueError
+        For a mean or a covariance that is not finite, or a covariance of another size than the mean, not symmetric or
+        not positive definite.
+
     Examples
     --------
     >>> import bayesperiodic as bp
@@ -68,7 +74,22 @@ class MultivariateNormal:
         return self._whitening.T @ self._whitening
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
-        """Return the normalised log-density of points (…, n), shape (…)."""
+        """Return the normalised log-density.
+
+        Parameters
+        ----------
+        x : array (…, n)
+            Points, each value in its parameter's unit.
+
+        Returns
+        -------
+        array (…)
+
+        Raises
+        ------
+        ValueError
+            For another last axis.
+        """
         x = self._points(x)
         finite = np.isfinite(x).all(axis=-1)
         offset = np.where(finite[..., None], x, self.mean) - self.mean
@@ -77,20 +98,70 @@ class MultivariateNormal:
         return np.where(finite, -0.5 * np.sum(score**2, axis=-1) - constant, -np.inf)[()]
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
-        """Return ∂ log p / ∂x at points (…, n), shape (…, n)."""
+        """Return ∂ log p / ∂x.
+
+        Parameters
+        ----------
+        x : array (…, n)
+            Points, each value in its parameter's unit.
+
+        Returns
+        -------
+        array (…, n)
+
+        Raises
+        ------
+        ValueError
+            For another last axis.
+        """
         return (self.mean - self._points(x)) @ self._precision
 
     def curvature(self, x: np.ndarray) -> np.ndarray:
-        """Return −∂² log p / ∂x², the inverse of the covariance, at points (…, n), shape (…, n, n)."""
+        """Return −∂² log p / ∂x², the inverse of the covariance.
+
+        Parameters
+        ----------
+        x : array (…, n)
+            Points, each value in its parameter's unit.
+
+        Returns
+        -------
+        array (…, n, n)
+
+        Raises
+        ------
+        ValueError
+            For another last axis.
+        """
         x = self._points(x)
         return np.broadcast_to(self._precision, (*x.shape[:-1], self.dimension, self.dimension)).copy()
 
     def sample(self, size: int, generator: np.random.Generator) -> np.ndarray:
-        """Return independent draws, (size, n)."""
+        """Return independent draws.
+
+        Parameters
+        ----------
+        size : int
+        generator : numpy.random.Generator
+
+        Returns
+        -------
+        array (size, n)
+        """
         return self.mean + generator.standard_normal((size, self.dimension)) @ self._cholesky.T
 
     def marginal(self, index: int) -> Normal:
-        """Return the distribution of one parameter by itself."""
+        """Return the distribution of one parameter by itself.
+
+        Parameters
+        ----------
+        index : int
+            Its place among the parameters, from 0.
+
+        Returns
+        -------
+        Normal
+        """
         return Normal(self.mean[index], math.sqrt(self.covariance[index, index]))
 
     def _points(self, x: np.ndarray) -> np.ndarray:

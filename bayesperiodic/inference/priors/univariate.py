@@ -56,19 +56,59 @@ class Univariate(ABC):
         return -math.inf, math.inf
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
-        """Return the normalised log-density, −inf outside the support."""
+        """Return the normalised log-density, −inf outside the support.
+
+        Parameters
+        ----------
+        x : array (…)
+            Values of the parameter, in its unit.
+
+        Returns
+        -------
+        array (…)
+        """
         return self._where_inside(self._log_density, x, -np.inf)
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
-        """Return d log p / dx, NaN outside the support."""
+        """Return d log p / dx, NaN outside the support.
+
+        Parameters
+        ----------
+        x : array (…)
+            Values of the parameter, in its unit.
+
+        Returns
+        -------
+        array (…)
+        """
         return self._where_inside(self._gradient, x, np.nan)
 
     def curvature(self, x: np.ndarray) -> np.ndarray:
-        """Return −d² log p / dx², NaN outside the support; negative where the log-density is convex."""
+        """Return −d² log p / dx², NaN outside the support; negative where the log-density is convex.
+
+        Parameters
+        ----------
+        x : array (…)
+            Values of the parameter, in its unit.
+
+        Returns
+        -------
+        array (…)
+        """
         return self._where_inside(self._curvature, x, np.nan)
 
     def quantile(self, probability: np.ndarray) -> np.ndarray:
-        """Return the inverse of the distribution function; NaN unless the probability is between 0 and 1."""
+        """Return the inverse of the distribution function.
+
+        Parameters
+        ----------
+        probability : array (…)
+
+        Returns
+        -------
+        array (…)
+            In the parameter's unit; NaN unless the probability is between 0 and 1.
+        """
         p = np.asarray(probability, dtype=float)
         low, high = self.support
         result = np.full(p.shape, np.nan)
@@ -78,7 +118,18 @@ class Univariate(ABC):
         return result[()]
 
     def sample(self, size: int, generator: np.random.Generator) -> np.ndarray:
-        """Return independent draws, (size,)."""
+        """Return independent draws.
+
+        Parameters
+        ----------
+        size : int
+        generator : numpy.random.Generator
+
+        Returns
+        -------
+        array (size,)
+            In the parameter's unit.
+        """
         return self.quantile(generator.uniform(size=size))
 
     def _where_inside(self, function: Callable[[np.ndarray], Any], x: np.ndarray, outside: float) -> np.ndarray:
@@ -121,8 +172,14 @@ class Normal(Univariate):
     Parameters
     ----------
     mean : float
+        In the parameter's unit.
     sd : float
-        > 0.
+        > 0, in the same unit.
+
+    Raises
+    ------
+    ValueError
+        If the mean is not finite, or sd not finite and > 0.
 
     Examples
     --------
@@ -157,9 +214,14 @@ class LogNormal(_Positive):
     Parameters
     ----------
     median : float
-        > 0.
+        > 0, in the parameter's unit.
     spread : float
         Standard deviation of the logarithm, > 0.
+
+    Raises
+    ------
+    ValueError
+        If median or spread is not finite and > 0.
 
     Examples
     --------
@@ -200,11 +262,16 @@ class TruncatedNormal(Univariate):
     Parameters
     ----------
     mean : float
-        Of the normal distribution; it may lie outside the interval.
+        Of the normal distribution, in the parameter's unit; it may lie outside the interval.
     sd : float
-        Of the normal distribution, > 0.
+        Of the normal distribution, > 0, in the same unit.
     low, high : float
-        low < high; either may be infinite.
+        low < high, in the same unit; either may be infinite.
+
+    Raises
+    ------
+    ValueError
+        If the mean is not finite, sd not finite and > 0, an end NaN, or low not below high.
 
     Examples
     --------
@@ -290,7 +357,12 @@ class HalfNormal(_Positive):
     Parameters
     ----------
     scale : float
-        Standard deviation of the normal number, > 0.
+        Standard deviation of the normal number, > 0, in the parameter's unit.
+
+    Raises
+    ------
+    ValueError
+        If the scale is not finite and > 0.
 
     Examples
     --------
@@ -324,7 +396,12 @@ class Uniform(Univariate):
     Parameters
     ----------
     low, high : float
-        low < high.
+        low < high, in the parameter's unit.
+
+    Raises
+    ------
+    ValueError
+        If an end is not finite, or low not below high.
 
     Examples
     --------
@@ -367,7 +444,12 @@ class LogUniform(Univariate):
     Parameters
     ----------
     low, high : float
-        0 < low < high.
+        0 < low < high, in the parameter's unit.
+
+    Raises
+    ------
+    ValueError
+        If an end is not finite and > 0, or low not below high.
 
     Examples
     --------
@@ -414,11 +496,16 @@ class StudentT(Univariate):
     Parameters
     ----------
     mean : float
-        The centre, also where dof ≤ 1 leaves it no mean.
+        The centre, in the parameter's unit, also where dof ≤ 1 leaves it no mean.
     scale : float
-        > 0; the standard deviation is scale · √(dof/(dof − 2)) where dof > 2.
+        > 0, in the same unit; the standard deviation is scale · √(dof/(dof − 2)) where dof > 2.
     dof : float
         Degrees of freedom, > 0.
+
+    Raises
+    ------
+    ValueError
+        If the mean is not finite, or scale or dof not finite and > 0.
 
     Examples
     --------
@@ -463,7 +550,12 @@ class InverseGamma(_Positive):
     shape : float
         > 0; the mean is scale/(shape − 1) where shape > 1.
     scale : float
-        > 0; the mode is scale/(shape + 1).
+        > 0, in the parameter's unit; the mode is scale/(shape + 1).
+
+    Raises
+    ------
+    ValueError
+        If shape or scale is not finite and > 0.
 
     Examples
     --------

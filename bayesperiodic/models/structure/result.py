@@ -77,6 +77,16 @@ class Structure(Result):
         Number of these random values.
     unexplained : tuple of str
         Parameters in directions that no output reacted to and that no symmetry found explains.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> found = bp.structure(bp.models.duffing, fixed=["k"])
+    >>> found.complete, found.table["verdict"].to_dict()
+    (True, {'m': 'determined', 'c': 'determined', 'k3': 'determined'})
+    >>> swing = bp.structure(bp.models.pendulum, fixed=["a", "g", "v0"])
+    >>> swing.symmetries
+    (scaling: m → m*t, k1 → k1*t, k2 → k2*t, k3 → k3*t,)
     """
 
     model: str
