@@ -45,7 +45,9 @@ class Comparison(Result):
         Laplace as an importance proposal, its error that of fitting the tail; efficiency, the effective share of such
         draws; verdict and recommendation.
     coordinates : str
+        "natural" or "sampling".
     probabilities : array (probabilities,)
+        Of the quantiles and of the ellipsoids.
     quantiles : dict of str to array (probabilities,)
         Of the draws.
     edges, densities : dict of str to array (bins + 1,) and (bins,)
@@ -56,6 +58,22 @@ class Comparison(Result):
         Of the natural values.
     synthetic, converged : bool
         Of the data, and of the draws.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
+    >>> scorecard = bp.compare(problem, fit, posterior)
+    >>> scorecard.converged, scorecard.table["verdict"].to_dict()
+    (False, {'c': 'not converged', 'k': 'not converged'})
+    >>> scorecard.table.loc["k", ["coordinate", "recommendation"]].tolist(), scorecard.joint["dimension"]
+    (['k', 'sample longer'], 2)
     """
 
     table: pd.DataFrame

@@ -63,6 +63,22 @@ class Identifiability(Result):
         What the equations and the measured channels could determine at all, of the free parameters.
     converged : bool
         False if the draws, where there are any, have not converged.
+
+    Examples
+    --------
+    With the mass free too, a weak motion at one frequency tells k − m·ω² and little more:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": 0.3 * np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.03}, seed=1).fold(32, harmonics=3)
+    >>> priors = {"m": bp.LogNormal(1, 0.5), "c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)}
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors=priors, scheme="fourier", fixed={"k3": 0.5})
+    >>> found = bp.identifiability(problem, bp.map_estimate(problem, progress=False), profile=False)
+    >>> found.verdicts
+    {'m': 'only in combination', 'c': 'determined', 'k': 'determined'}
+    >>> found.table.loc["m", "remedy"]
+    'fix one of m, k'
     """
 
     table: pd.DataFrame
@@ -122,6 +138,29 @@ def identifiability(
     Returns
     -------
     Identifiability
+
+    Raises
+    ------
+    ValueError
+        For an estimate of another problem, or a candidate of an unknown run.
+
+    References
+    ----------
+    A. Raue, C. Kreutz, T. Maiwald, J. Bachmann, M. Schilling, U. Klingmüller, J. Timmer, Structural and practical
+    identifiability analysis of partially observed dynamical models by exploiting the profile likelihood,
+    Bioinformatics 25 (2009) 1923-1929.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> bp.identifiability(problem, fit, profile=False).verdicts
+    {'c': 'determined', 'k': 'determined'}
     """
     information = Information.of(problem, fit)
     profiles = profile_of(problem, fit) if profile is True else (profile or None)

@@ -33,6 +33,14 @@ class Prediction(Bands):
 
     Attributes
     ----------
+    median, low, high : dict of str to dict of str to array (points,)
+        By experiment and channel, in the channel's unit: the median and the central 90 % band of the mean period,
+        residual variance included and taken as normal at each point, within the harmonics kept. Section values with a
+        covariance of their own have the band of the model alone.
+    probability : float
+        Of the band.
+    draws, failed : int
+        Draws used, and how many of these had no periodic solution.
     table : DataFrame
         A row for every experiment and channel, and the row "all". p-values, NaN where a test is not possible:
         ``whiteness`` and ``harmonics`` of the residual along the period, in units of the noise model; ``size``, the
@@ -46,6 +54,22 @@ class Prediction(Bands):
         Bands on the recordings that `run` makes.
     note : str
         What the noise model hides from the tests, and whether the draws have not converged; "" if nothing.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
+    >>> found = bp.predict(problem, posterior, draws=50)
+    >>> found.verdict, found.failed, found.median["synthetic duffing"]["displacement"].shape
+    ('adequate', 0, (32,))
+    >>> bool(found.table.loc["all", "p"] > 0.01)
+    True
     """
 
     table: pd.DataFrame
@@ -126,6 +150,21 @@ def predict(
     A. Gelman, X.-L. Meng, H. Stern, Posterior predictive assessment of model fitness via realized discrepancies,
     Statistica Sinica 6 (1996) 733-807.
     X.-L. Meng, Posterior predictive p-values, Annals of Statistics 22 (1994) 1142-1160.
+
+    Examples
+    --------
+    A spring that hardens, and a model without that term:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
+    >>> bp.predict(problem, posterior, draws=50).verdict
+    'misspecified'
     """
     count = checks.integer("draws", draws, 20)
     if experiment is not None and run is None:

@@ -42,6 +42,24 @@ class PriorPredictive(Result):
     outputs : Bands
         Median and central 90 % band of the outputs over the draws, without noise.
     draws : int
+
+    Examples
+    --------
+    With a prior of k this wide, one draw in 25 belongs to another branch of the resonance:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.2, duration=200,
+    ...                   sampling_rate=8, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 1.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> expected = bp.prior_predictive(problem, draws=50, progress=False)
+    >>> expected.table.loc["all", ["converged", "other orbit", "no orbit"]].to_dict()
+    {'converged': 0.96, 'other orbit': 0.04, 'no orbit': 0.0}
+    >>> list(expected.causes)
+    ['other orbit (stalled): the branch folds and comes back, another orbit of it exists']
+    >>> expected.outputs.low["synthetic duffing"]["displacement"].shape
+    (32,)
     """
 
     table: pd.DataFrame
@@ -80,8 +98,24 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
 
     Raises
     ------
+    ValueError
+        For fewer than 20 draws, or a negative seed.
     RuntimeError
         If no draw has a periodic solution.
+
+    Examples
+    --------
+    Priors that are wide enough to hold the measured period:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> expected = bp.prior_predictive(problem, draws=50, progress=False)
+    >>> float(expected.table.loc["synthetic duffing", "inside"])
+    1.0
     """
     count = checks.integer("draws", draws, 20)
     theta = problem.joint_prior.sample(count, np.random.default_rng(checks.integer("seed", seed, 0)))

@@ -78,6 +78,22 @@ class Problem:
     ----------
     .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
        equilibrium states, 1997.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> problem
+    Problem('duffing', 1 experiments, free: c, k, channels: displacement with 11 independent values, independent noise)
+    >>> at = {"c": 0.2, "k": 1.0}, {"displacement": 1e-6}
+    >>> bool(problem.log_posterior(*at) > problem.log_posterior({"c": 0.2, "k": 1.1}, at[1]))
+    True
+    >>> problem.gradient(*at).shape, problem.solve(at[0])["synthetic duffing"].status
+    ((3,), 'converged')
     """
 
     def __init__(
@@ -210,6 +226,15 @@ class Problem:
         theta : mapping of str to float, or array (names,)
         guesses : mapping of str to mapping of str to array (points,), optional
             States of every experiment, turns included, from which to solve; by default the present anchors.
+
+        Returns
+        -------
+        Problem
+
+        Raises
+        ------
+        ValueError
+            For unknown or missing names, or arrays of another length.
         """
         if guesses is None:
             return self.with_responses(self.responses.anchored(self.vector(theta)))
@@ -219,14 +244,39 @@ class Problem:
         return self.with_responses(responses.anchored(self.vector(theta)))
 
     def with_responses(self, responses: Responses) -> "Problem":
-        """Return the same problem with other anchors."""
+        """Return the same problem with other anchors.
+
+        Parameters
+        ----------
+        responses : Responses
+            Those of another problem of the same kind.
+
+        Returns
+        -------
+        Problem
+        """
         other = object.__new__(Problem)
         other.__dict__.update(self.__dict__)
         other._responses = responses
         return other
 
     def with_experiments(self, experiments: Iterable[Experiment]) -> "Problem":
-        """Return the same problem with other data; experiments keep their names."""
+        """Return the same problem with other data.
+
+        Parameters
+        ----------
+        experiments : iterable of Experiment
+            Of the same names.
+
+        Returns
+        -------
+        Problem
+
+        Raises
+        ------
+        ValueError
+            As `Problem` does.
+        """
         return Problem(
             self.model,
             experiments,
@@ -254,7 +304,22 @@ class Problem:
         return self.joint_prior.median()
 
     def vector(self, theta: Mapping[str, float] | np.ndarray | Sequence[float]) -> np.ndarray:
-        """Return θ as an array (…, names) from a mapping or an array."""
+        """Return θ as an array from a mapping or an array.
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (…, names)
+            Natural values, in the parameters' units.
+
+        Returns
+        -------
+        array (…, names)
+
+        Raises
+        ------
+        ValueError
+            For unknown or missing names, or another last axis.
+        """
         if isinstance(theta, Mapping):
             checks.same_names("theta", theta, self.names)
             theta = np.stack(np.broadcast_arrays(*(np.asarray(theta[name], dtype=float) for name in self.names)), -1)
@@ -264,9 +329,22 @@ class Problem:
         return values
 
     def noise_values(self, variances: Mapping[str, Any] | np.ndarray) -> np.ndarray:
-        """Return the noise parameters as an array (…, noise_names) from a mapping or an array.
+        """Return the noise parameters as an array from a mapping or an array.
 
-        In a mapping a channel's name stands for its variance, and those with a known value may be left out.
+        Parameters
+        ----------
+        variances : mapping of str to float, or array (…, noise_names)
+            In a mapping a channel's name stands for its variance [channel's unit squared], and those with a known value
+            may be left out.
+
+        Returns
+        -------
+        array (…, noise_names)
+
+        Raises
+        ------
+        ValueError
+            For unknown or missing names, or another last axis.
         """
         names = self.noise_names
         if isinstance(variances, Mapping):
@@ -281,15 +359,49 @@ class Problem:
         return values
 
     def log_prior(self, theta: Mapping[str, float] | np.ndarray) -> np.ndarray:
-        """Return Σ ln p(θ_α), shape (…); −inf outside the support."""
+        """Return Σ ln p(θ_α).
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (…, names)
+            Natural values, in the parameters' units.
+
+        Returns
+        -------
+        array (…)
+            −inf outside the support.
+
+        Raises
+        ------
+        ValueError
+            For unknown or missing names, or another last axis.
+        """
         return self.joint_prior.log_prob(self.vector(theta))
 
     def log_likelihood(
         self, theta: Mapping[str, float] | np.ndarray, variances: Any, threads: int | None = None
     ) -> np.ndarray:
-        """Return the log-likelihood, shape (…); −inf where a periodic solve fails.
+        """Return the log-likelihood.
 
-        Its value does not depend on the number of threads.
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (…, names)
+            Natural values, in the parameters' units.
+        variances : mapping of str to float, or array (…, noise_names)
+            In a mapping a channel's name stands for its variance [channel's unit squared], and those with a known value
+            may be left out.
+        threads : int, optional
+            By default one a core. The value does not depend on it.
+
+        Returns
+        -------
+        array (…)
+            −inf where a periodic solve fails.
+
+        Raises
+        ------
+        ValueError
+            For unknown or missing names, or another last axis.
         """
         values = self.vector(theta)
         noise = np.broadcast_to(self.noise_values(variances), (*values.shape[:-1], len(self.noise_names)))
@@ -298,7 +410,22 @@ class Problem:
     def likelihood_and_status(
         self, theta: np.ndarray, noise: np.ndarray, threads: int | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the log-likelihood and the worst status code of the solves, both (…,)."""
+        """Return the log-likelihood, and how the periodic solves ended.
+
+        Parameters
+        ----------
+        theta : array (…, names)
+        noise : array (…, noise_names)
+        threads : int, optional
+            By default one a core.
+
+        Returns
+        -------
+        log_likelihood : array (…)
+            −inf where a periodic solve fails.
+        status : int array (…)
+            The worst status code of the experiments, 0 where all have converged.
+        """
         flat = theta.reshape(-1, len(self.names))
         residuals, status = self.residuals(flat, threads)
         good, result = status == CONVERGED, np.full(len(flat), -np.inf)
@@ -307,7 +434,13 @@ class Problem:
         return result.reshape(theta.shape[:-1]), status.reshape(theta.shape[:-1])
 
     def residuals(self, theta: np.ndarray, threads: int | None = None) -> tuple[Residuals, np.ndarray]:
-        """Return the residual components at those of many θ (solves, names) whose solves converge, and status codes.
+        """Return the residual components at those of many θ whose solves converge, and how all solves ended.
+
+        Parameters
+        ----------
+        theta : array (solves, names)
+        threads : int, optional
+            By default one a core.
 
         Returns
         -------
@@ -341,7 +474,26 @@ class Problem:
         return Comparisons(groups.values())
 
     def log_posterior(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> np.ndarray:
-        """Return log-prior plus log-likelihood, shape (…), a density over (θ, log φ)."""
+        """Return log-prior plus log-likelihood, a density over (θ, log φ) ([1]_, eq. 6).
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (…, names)
+            Natural values, in the parameters' units.
+        variances : mapping of str to float, or array (…, noise_names)
+            In a mapping a channel's name stands for its variance [channel's unit squared], and those with a known value
+            may be left out.
+
+        Returns
+        -------
+        array (…)
+            −inf outside the priors' support and where a periodic solve fails.
+
+        Raises
+        ------
+        ValueError
+            For unknown or missing names, or another last axis.
+        """
         values = self.vector(theta)
         noise = np.broadcast_to(self.noise_values(variances), (*values.shape[:-1], len(self.noise_names)))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -419,9 +571,21 @@ class Problem:
         return value, np.concatenate([by_theta + self.joint_prior.gradient(values), by_noise[free]])
 
     def pulled(self, here: Linearisation, by_residual: Sequence[np.ndarray], *, forward: bool = False) -> np.ndarray:
-        """Return the derivatives by θ (names,) from those by the residuals, one array (size,) a block.
+        """Return the derivatives by θ from those by the residuals.
 
         Those of an autonomous model and of multipliers need anchors there.
+
+        Parameters
+        ----------
+        here : Linearisation
+        by_residual : sequence of array (size,)
+            One a block.
+        forward : bool
+            Take one solve a parameter instead of one transposed solve.
+
+        Returns
+        -------
+        array (names,)
         """
         if forward or self.model.autonomous:
             return self.linearised(here.theta).forward(by_residual)
@@ -430,27 +594,81 @@ class Problem:
         return here.adjoint(by_residual)
 
     def linearised(self, theta: Mapping[str, float] | np.ndarray) -> Linearisation:
-        """Solve at one θ from the present anchors, and compare with the data (eq. 4-5)."""
+        """Solve at one θ from the present anchors, and compare with the data (eq. 4-5).
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (names,)
+
+        Returns
+        -------
+        Linearisation
+            Residuals, and their derivatives by θ.
+        """
         values = self.vector(theta)
         return Linearisation(values, self.responses.anchored(values), self.comparisons)
 
     def outputs(self, theta: Mapping[str, float] | np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
-        """Return ŷ of many θ (draws, names), by experiment and channel (draws, points), and which solves converged."""
+        """Return the outputs ŷ at many θ.
+
+        Parameters
+        ----------
+        theta : mapping of str to array (draws,), or array (draws, names)
+
+        Returns
+        -------
+        outputs : dict of str to dict of str to array (draws, points)
+            By experiment and channel, in the channel's unit.
+        converged : bool array (draws,)
+            Where the solves of all experiments have converged.
+        """
         values = self.vector(theta)
         solved = self.responses.solve(values)
         converged = np.all([s.status == CONVERGED for s in solved.values()], axis=0)
         return {name: o.predicted(solved[name].response) for name, o in self.observations.items()}, converged
 
     def solve(self, theta: Mapping[str, float] | np.ndarray) -> dict[str, PeriodicSolution]:
-        """Return the periodic solution of every experiment at one θ."""
+        """Return the periodic solution of every experiment at one θ.
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (names,)
+
+        Returns
+        -------
+        dict of str to PeriodicSolution
+            By experiment; a solve that fails has another status than "converged".
+        """
         return self.responses.solutions(self.vector(theta))
 
     def parameters(self, theta: np.ndarray, experiment: str) -> np.ndarray:
-        """Return every parameter of the model (points, parameters) in an experiment from θ (points, names)."""
+        """Return every parameter of the model in an experiment, free, fixed and tied.
+
+        Parameters
+        ----------
+        theta : array (draws, names)
+        experiment : str
+
+        Returns
+        -------
+        array (draws, parameters)
+            In the order of the model.
+        """
         return self._responses.parameters(theta, experiment)
 
     def sample_prior(self, size: int, seed: int) -> dict[str, np.ndarray]:
-        """Return independent draws of every free parameter from its prior, (size,) each."""
+        """Return independent draws of every free parameter from its prior.
+
+        Parameters
+        ----------
+        size : int
+        seed : int
+
+        Returns
+        -------
+        dict of str to array (size,)
+            By name.
+        """
         draws = self.joint_prior.sample(size, np.random.default_rng(seed))
         return dict(zip(self.names, draws.T.copy(), strict=True))
 

@@ -80,14 +80,14 @@ flutter = Model(
     Heave h and pitch α (state alpha) of a section of half chord b, with unsteady aerodynamics of one lag state w, as
     published with measured stable and unstable limit cycles by K. H. Lee, D. A. W. Barton and L. Renson (Modelling of
     physical systems with a Hopf bifurcation using mechanistic models and machine learning, Mechanical Systems and
-    Signal Processing 191, 2023, 110173). With q = (h, α, w), M q̈ + D(U) q̇ + K(U) q + (0, k_alpha2 α² + k_alpha3 α³, 0)
-    = 0: the air (density rho, wing of length span) adds mass, damping and stiffness, lift grows with the wind speed U, and the wake, Wagner's function in
-    Jones's approximation, remembers past motion. The spring in pitch hardens, so that cycles exist below the speed at
-    which the equilibrium loses its stability: an unstable one inside a stable one. The wing, of mass m, pitches about
-    an axis a half chords behind the middle of the chord, x_alpha half chords ahead of its centre of mass, with the
-    inertia I_alpha; all that heaves weighs m_T. Its springs and dampers are k_h, c_h in heave and k_alpha, k_alpha2,
-    k_alpha3, c_alpha in pitch. The sensors' readings are linear: heave = offset_heave + gain_heave h, pitch =
-    offset_pitch + gain_pitch α. For self-excited systems whose unstable cycles are measured too.
+    Signal Processing 191, 2023, 110173). With q = (h, α, w), M q̈ + D(U) q̇ + K(U) q + (0, k_alpha2 α² + k_alpha3 α³,
+    0) = 0: the air (density rho, wing of length span) adds mass, damping and stiffness, lift grows with the wind speed
+    U, and the wake, Wagner's function in Jones's approximation, remembers past motion. The spring in pitch hardens, so
+    that cycles exist below the speed at which the equilibrium loses its stability: an unstable one inside a stable one.
+    The wing, of mass m, pitches about an axis that lies a·b behind the middle of the chord and x_alpha·b ahead of its
+    centre of mass, with the inertia I_alpha; all that heaves weighs m_T. Its springs and dampers are k_h, c_h in
+    heave and k_alpha, k_alpha2, k_alpha3, c_alpha in pitch. The sensors' readings are linear: heave = offset_heave +
+    gain_heave h, pitch = offset_pitch + gain_pitch α. For self-excited systems whose unstable cycles are measured too.
 
     Examples
     --------

@@ -62,6 +62,19 @@ class Orbit(Result):
         Whether it is a state of rest, which says little of the parameters.
     synthetic : bool
         True if the data were simulated.
+
+    Examples
+    --------
+    The fixed point of the Hénon map, x = (√6.09 − 0.7)/2.8; its multipliers are the roots of μ² + 2.8 x μ = 0.3:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> x = np.zeros((2000, 2))
+    >>> for k in range(1999):
+    ...     x[k + 1] = 1 - 1.4 * x[k, 0] ** 2 + x[k, 1], 0.3 * x[k, 0]
+    >>> section = bp.PoincareSection.from_points(x[100:], ("x", "y"), frequency=1.0)
+    >>> orbit = bp.find_orbits(section, periods=[1])[0]
+    >>> orbit.points.round(4).tolist(), orbit.eigenvalues.round(3).tolist()
+    ([[0.6314, 0.1894]], [-1.924, 0.156])
     """
 
     name: str
@@ -159,6 +172,22 @@ class Orbits(Result):
     values : int
         Numbers in the recording or section from which they were found.
     method : str
+        "chained" or "boxes", see `find_orbits`.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> x = np.zeros((2000, 2))
+    >>> for k in range(1999):
+    ...     x[k + 1] = 1 - 1.4 * x[k, 0] ** 2 + x[k, 1], 0.3 * x[k, 0]
+    >>> section = bp.PoincareSection.from_points(x[100:], ("x", "y"), frequency=1.0)
+    >>> orbits = bp.find_orbits(section, periods=[1, 2])
+    >>> len(orbits), orbits[1].name, orbits.rejected
+    (2, 'period 2, winding 0, orbit 1', ())
+    >>> orbits.table[["period", "modulus"]].round(3)
+       period  modulus
+    0       1    1.924
+    1       2    3.010
     """
 
     orbits: tuple[Orbit, ...]

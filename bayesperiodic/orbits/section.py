@@ -43,6 +43,20 @@ class PoincareSection(Result):
         Numbers that were measured.
     synthetic : bool
         True if the data were simulated.
+
+    Examples
+    --------
+    The driven pendulum in chaotic motion, once a forcing period:
+
+    >>> import bayesperiodic as bp
+    >>> theta = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
+    >>> recording = bp.simulate(bp.models.pendulum, theta, frequency=1.4467, duration=200, sampling_rate=60,
+    ...                         start={"phi": 1})
+    >>> section = bp.PoincareSection.from_recording(recording, ("angle", "rate"), frequency=1.4467, angles=["angle"])
+    >>> section
+    PoincareSection(290 points of angle, rate at 1.4467 Hz from a recording of 12001 samples)
+    >>> section.cycle(index=0, period=2, samples=32)["angle"].shape
+    (64,)
     """
 
     points: np.ndarray
@@ -85,6 +99,10 @@ class PoincareSection(Result):
             Time at which tau = 0 [s].
         angles : sequence of str
             The coordinates that are angles [rad], running on or folded at any whole turn.
+
+        Returns
+        -------
+        PoincareSection
 
         Raises
         ------
@@ -177,6 +195,10 @@ class PoincareSection(Result):
         angles : sequence of str
             The coordinates that are angles.
 
+        Returns
+        -------
+        PoincareSection
+
         Raises
         ------
         ValueError
@@ -234,11 +256,13 @@ class PoincareSection(Result):
         index : int
             Position of the point where it begins.
         period : int
+            In returns.
         samples : int
+            Per return.
 
         Returns
         -------
-        dict of str to array (samples·period,)
+        dict of str to array (samples·period,), or None
             By coordinate; angles run on from the point's own in (−π, π].
         """
         if self.instants is None or self.time is None or self.signals is None:

@@ -145,14 +145,15 @@ class PeriodicSolution(Result):
     def multipliers(self) -> np.ndarray:
         """Floquet multipliers over the response period, complex (multipliers,), largest modulus first.
 
-        Empty unless converged. They are those of the linearised differential equations. An autonomous model's trivial 1 is among them.
+        Empty unless converged. They are those of the linearised differential equations. An autonomous model's trivial 1
+        is among them.
         """
         with np.errstate(over="ignore"):
             return np.exp(self.floquet.exponents) if self.floquet is not None else np.empty(0, dtype=complex)
 
     @property
     def exponents(self) -> np.ndarray:
-        """Floquet exponents log(multiplier)/period [1/s], complex (multipliers,); finite where a multiplier overflows."""
+        """Floquet exponents log(multiplier)/period [1/s], complex (multipliers,); finite where multipliers overflow."""
         return self.floquet.exponents / self.period if self.floquet is not None else np.empty(0, dtype=complex)
 
     @property

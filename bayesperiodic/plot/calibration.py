@@ -38,6 +38,18 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
     Returns
     -------
     Figure
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = np.cos(2 * np.pi * np.arange(32) / 32)
+    >>> run = bp.Experiment("run", 0.1, {"displacement": force}, {"force": force}, samples=32, cycles=4,
+    ...                     harmonics={"displacement": 5, "force": 5})
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"k": bp.LogNormal(1, 0.1)}, scheme="fourier",
+    ...                      fixed={"m": 1, "c": 0.2, "k3": 0.5, "variance[displacement]": 1e-4})
+    >>> found = bp.calibrate(problem, replicates=2, seed=1, max_steps=250, progress=False)
+    >>> [axes.get_title() for axes in bp.plot.ranks(found).axes]
+    ['truths in each bin / expected', 'distribution function − diagonal', 'coverage − probability']
     """
     names = calibration.names
     figure = figure or plt.figure(figsize=(10.5, 2.1 * len(names) + 1.0), layout="constrained")

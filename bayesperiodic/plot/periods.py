@@ -27,6 +27,19 @@ def fit(
     Returns
     -------
     Figure
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> figure = bp.plot.fit(problem, fit)
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['displacement [m]', 'residual [m]']
     """
     shown = [(e, channel) for e in problem.experiments for channel in e.outputs]
     figure = figure or plt.figure(figsize=(7.0, 4.6 * len(shown)), layout="constrained")
@@ -80,6 +93,19 @@ def loops(
     ------
     ValueError
         For an unknown name, or a model without inputs.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> figure = bp.plot.loops(problem, fit)
+    >>> [axes.get_xlabel() for axes in figure.axes]
+    ['force [N]', 'rate of force [N/s]']
     """
     output = problem.channels[0] if output is None else output
     checks.one_of("output", output, problem.channels)

@@ -101,6 +101,17 @@ def orbits(
     ------
     ValueError
         Without orbits.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> x = np.zeros((2000, 2))
+    >>> for k in range(1999):
+    ...     x[k + 1] = 1 - 1.4 * x[k, 0] ** 2 + x[k, 1], 0.3 * x[k, 0]
+    >>> section = bp.PoincareSection.from_points(x[100:], ("x", "y"), frequency=1.0)
+    >>> figure = bp.plot.orbits(bp.find_orbits(section, periods=[1, 2]))
+    >>> [axes.get_title().splitlines()[0] for axes in figure.axes]
+    ['period 1, winding 0', 'period 2, winding 0']
     """
     if not len(orbits):
         raise ValueError("orbits: none is not allowed; at least one must be given.")

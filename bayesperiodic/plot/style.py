@@ -8,6 +8,7 @@ import textwrap
 from bayesperiodic.inference import labels
 from bayesperiodic.inference.sampling.posterior import Posterior
 
+#: The colour of what was measured, of the MAP point, of the Laplace approximation and of MCMC, in all figures.
 COLOURS = {"measured": "#000000", "map": "#0072B2", "laplace": "#D55E00", "mcmc": "#56B4E9"}
 ENSEMBLES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 LABEL_LENGTH = 24

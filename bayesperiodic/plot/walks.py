@@ -22,6 +22,25 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
     Returns
     -------
     Figure
+
+    Raises
+    ------
+    ValueError
+        For less than one walker.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
+    >>> figure = bp.plot.traces(posterior, walkers=2)
+    >>> [axes.get_ylabel().splitlines()[0] for axes in figure.axes]
+    ['c', 'k', 'variance[displacement]']
     """
     checks.integer("walkers", walkers, 1)
     names = posterior.names

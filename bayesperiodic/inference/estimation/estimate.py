@@ -32,7 +32,7 @@ class MapEstimate(Result):
         Standard deviations that hold although the residuals are not as the noise model says (sandwich with the
         residual's smoothed spectrum); far from `sd`, the noise model is too sure of itself or not sure enough.
     variances : dict of str to float
-        Variance of the mean period of each channel (or "channel, experiment"), and "scale", eq. (7) or as fixed.
+        Variance of the mean period of each channel (or "channel, experiment"), and "scale", eq. (7) ([1]_) or as fixed.
     noise : dict of str to float
         All noise parameters by their full names.
     noise_prior : str
@@ -75,6 +75,28 @@ class MapEstimate(Result):
         Of every start, the objective it led to (−inf: none) under "objective", and the estimates.
     tied : dict of str to dict of str to float
         Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> for name, value in fit.theta.items():
+    ...     print(f"{name} = {value:.3f} ± {fit.sd[name]:.3f}")
+    c = 0.200 ± 0.001
+    k = 1.000 ± 0.001
+    >>> low, high = fit.interval(0.9)["k"]
+    >>> low < 1.0 < high, fit.whiteness["displacement"].p > 0.01
+    (True, True)
     """
 
     status: str
@@ -125,6 +147,11 @@ class MapEstimate(Result):
             Between 0 and 1.
         robust : bool
             Take `robust_sd` instead of `sd`.
+
+        Returns
+        -------
+        dict of str to (float, float)
+            In the parameters' units.
 
         Raises
         ------
@@ -204,6 +231,25 @@ class MapEstimate(Result):
         """Return the normal approximation of these parameters, as the prior of the next problem.
 
         See `Posterior.as_prior`; the mean is the maximum, and the covariance is taken from `covariance`.
+
+        Parameters
+        ----------
+        names : tuple of str
+            Free parameters, local ones as ``theta16[run 7]``, in the order of the prior's.
+
+        Returns
+        -------
+        MultivariateNormal
+
+        Raises
+        ------
+        ValueError
+            For anything else than a tuple of different free parameters.
+
+        Warns
+        -----
+        UserWarning
+            If the estimate has not converged.
 
         Examples
         --------

@@ -88,6 +88,20 @@ def map_estimate(
     ----------
     .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
        equilibrium states, 1997.
+
+    Examples
+    --------
+    The spring of an oscillator from 40 noisy periods, its mass known:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(2, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> fit.status, abs(fit.theta["k"] - 1.0) < 3 * fit.sd["k"]
+    ('converged', True)
     """
     theta = problem.median() if start is None else problem.vector(start)
     checks.integer("starts", starts, 1)

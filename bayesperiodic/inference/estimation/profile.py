@@ -50,6 +50,22 @@ class Profile(Result):
         By how much the log-density is higher there than at the estimate.
     units : dict of str to str
         Of all free parameters.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> found = bp.profile(problem, fit, ["k"])
+    >>> found.shape, found.failed
+    ({'k': 'closed'}, {'k': 0})
+    >>> low, high = found.interval(0.95)["k"]
+    >>> low < found.map["k"] < high
+    True
     """
 
     map: dict[str, float]

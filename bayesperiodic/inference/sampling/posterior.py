@@ -51,7 +51,30 @@ class Posterior(Result):
     failures : dict of str to float
         Fraction of proposals whose periodic solve failed, by status.
     log_posterior_calls : int
+        Proposals, each with one solve of every experiment.
     seed : int
+
+    Examples
+    --------
+    A short run, which the stop rule does not pass:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
+    >>> posterior.converged, posterior.names
+    (False, ('c', 'k', 'variance[displacement]'))
+    >>> summary = posterior.summary()
+    >>> bool(summary.loc["k", "q05"] < 1.0 < summary.loc["k", "q95"])
+    True
+    >>> posterior.data["posterior"]["k"].dims, posterior.draws("k").size == 16 * 200
+    (('chain', 'draw'), True)
+    >>> list(posterior.derive({"damping_ratio": "c/(2*sqrt(k))"}).index)
+    ['damping_ratio']
     """
 
     data: xr.DataTree
@@ -71,7 +94,17 @@ class Posterior(Result):
         return tuple(self.tau)
 
     def draws(self, name: str) -> np.ndarray:
-        """Return all draws of what has this full name, (chains·draws,), chains one after the other.
+        """Return all draws of what has this full name, chains one after the other.
+
+        Parameters
+        ----------
+        name : str
+            Such as "k", "theta16[run 7]" or "variance[force]"; see `names`.
+
+        Returns
+        -------
+        array (chains·draws,)
+            In its unit.
 
         Raises
         ------
@@ -81,7 +114,18 @@ class Posterior(Result):
         return labels.column(self._group, name).ravel()
 
     def guesses(self, experiments: Iterable[str], states: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
-        """Return the states at the draw with the highest density, by experiment, from which to solve again."""
+        """Return the states at the draw with the highest density, from which to solve again.
+
+        Parameters
+        ----------
+        experiments : iterable of str
+        states : iterable of str
+
+        Returns
+        -------
+        dict of str to dict of str to array (samples·periods,)
+            By experiment and state, turns of angles included.
+        """
         group, states = self.data["orbits"].to_dataset(), tuple(states)
         return {run: {state: group[f"{run} {state}"].to_numpy() for state in states} for run in experiments}
 
@@ -163,6 +207,10 @@ class Posterior(Result):
         ----------
         names : tuple of str
             Free parameters, local ones as ``theta16[run 7]``, in the order of the prior's.
+
+        Returns
+        -------
+        MultivariateNormal
 
         Raises
         ------

@@ -132,6 +132,22 @@ def sample(
     and Computing 16 (2006) 239-249.
     M. D. Hoffman, A. Gelman, The no-U-turn sampler: adaptively setting path lengths in Hamiltonian Monte Carlo,
     Journal of Machine Learning Research 15 (2014) 1593-1623.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
+    >>> posterior.reason.split(" with ")[0], posterior.failures
+    ('max_steps = 250 reached', {})
+
+    Without `max_steps` it goes on until the stop rule is passed; with ``checkpoint="run.h5"`` the same line resumes a
+    run that was killed.
     """
     checks.integer("ensembles", ensembles, 2)
     checks.integer("max_steps", max_steps, BLOCK)
