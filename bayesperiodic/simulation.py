@@ -41,7 +41,7 @@ def simulate(
     model : Model
     parameters : mapping of str to float
         A value for every parameter.
-    inputs : mapping of str to array or callable
+    inputs : mapping of str to array (samples,) or callable
         One forcing period on an equidistant grid (end point excluded, repeated and differentiated spectrally), or a
         function of time [s] that takes arrays; its derivatives are taken by sixth-order differences at 0.2 % of the
         forcing period, so it must be smooth.
