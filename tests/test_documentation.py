@@ -21,6 +21,7 @@ import re
 import textwrap
 from collections.abc import Iterator
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -200,3 +201,8 @@ def test_models(name):
     missing = [n for n in (*model.parameters, *model.inputs) if not re.search(rf"\b{n}\b", documented[""])]
     assert not missing
     assert_example(documented, name)
+
+
+def test_every_name_is_in_the_reference_once():
+    listed = (Path(__file__).parents[1] / "docs" / "api.rst").read_text("utf-8").split()
+    assert [name for name in NAMES if listed.count(name) != 1] == []

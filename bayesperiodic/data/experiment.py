@@ -55,11 +55,11 @@ class Experiment(Result):
         elsewhere is not looked at.
     covariance : array (values, values) or (values + multipliers, values + multipliers), optional
         Covariance of the outputs at the points of the mask, point by point, within a point in the order of `outputs`,
-        up to one unknown factor ("scale"); then that of the logarithms of `multipliers`, if it has rows for them.
+        up to one unknown factor ("scale"); then that of the logarithms of ``multipliers``, if it has rows for them.
     multipliers : array (multipliers,), optional
         Measured Floquet multipliers, real and signed, largest modulus first; they are compared as log|μ|.
     multiplier_sd : array (multipliers,), optional
-        Standard deviations of log|μ|, where `covariance` has no rows for them.
+        Standard deviations of log|μ|, where ``covariance`` has no rows for them.
     guess : mapping of str to array (samples·periods,), optional
         States of the model, turns of angles included, from which the first periodic solve starts; without it that is
         the equilibrium. An unstable orbit needs one.
@@ -201,7 +201,7 @@ class Experiment(Result):
             Of harmonic 1, the forcing frequency [Hz].
         outputs, inputs : mapping of str to complex array (harmonics + 1,)
             Amplitudes c of harmonics 0, 1, 2, …: the signal is Re Σ c[h] exp(2πi h τ), so that c[0] is the mean (real),
-            |c[h]| the amplitude and a cosine has a real, positive one.
+            ``|c[h]|`` the amplitude and a cosine has a real, positive one.
         samples : int
             Grid points per period; more than twice the highest harmonic.
 

@@ -155,7 +155,7 @@ class Recording(Result):
             If there is no such file.
         ValueError
             For a missing column, a cell that is no number, NaN or infinite samples, a time that does not increase,
-            both or neither of `time` and `sampling_rate`, an unknown unit.
+            both or neither of ``time`` and ``sampling_rate``, an unknown unit.
 
         Examples
         --------

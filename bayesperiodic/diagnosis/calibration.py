@@ -130,8 +130,8 @@ def calibrate(
     Parameters
     ----------
     problem : Problem
-        Forced, with whole histories of one forcing period, `noise.Independent` with a proper prior or known variances.
-        Of its data only the settings count.
+        Forced, with whole histories of one forcing period, `bayesperiodic.noise.Independent` with a proper prior or
+        known variances. Of its data only the settings count.
     replicates : int
     seed : int
         Replicate k depends on the seed and k alone, whoever computes it.

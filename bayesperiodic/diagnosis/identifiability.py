@@ -117,12 +117,12 @@ def identifiability(
 
     Widths are those of the draws, or of the Laplace approximation where there are none, relative to the prior. In this
     order: a signed parameter whose size is determined and whose sign is not (probability of either above 2.5 %, by more
-    than three Monte Carlo errors) has its "sign undetermined". One whose profile ends at the prior's support on one
-    side, and not because of other parameters, is determined "only with the prior". Where the data, with all else known,
-    have less than 1 % of the prior's information, it is "not determined". One that the equations themselves let change
-    together with others unseen, see `structure`, is determined "only in combination". Where the data alone, the others
-    unknown, leave less than a third of the prior's sd, it is "determined". For the rest, it is so "only in combination"
-    if the other parameters make it at least five times wider, else "only with the prior".
+    than three Monte Carlo errors) has its "sign undetermined". One whose profile ([1]_) ends at the prior's support on
+    one side, and not because of other parameters, is determined "only with the prior". Where the data, with all else
+    known, have less than 1 % of the prior's information, it is "not determined". One that the equations themselves let
+    change together with others unseen, see `structure`, is determined "only in combination". Where the data alone, the
+    others unknown, leave less than a third of the prior's sd, it is "determined". For the rest, it is so "only in
+    combination" if the other parameters make it at least five times wider, else "only with the prior".
 
     Parameters
     ----------
@@ -146,9 +146,9 @@ def identifiability(
 
     References
     ----------
-    A. Raue, C. Kreutz, T. Maiwald, J. Bachmann, M. Schilling, U. Klingmüller, J. Timmer, Structural and practical
-    identifiability analysis of partially observed dynamical models by exploiting the profile likelihood,
-    Bioinformatics 25 (2009) 1923-1929.
+    .. [1] A. Raue, C. Kreutz, T. Maiwald, J. Bachmann, M. Schilling, U. Klingmüller, J. Timmer, Structural and
+       practical identifiability analysis of partially observed dynamical models by exploiting the profile likelihood,
+       Bioinformatics 25 (2009) 1923-1929.
 
     Examples
     --------

@@ -113,7 +113,7 @@ def predict(
     The tests are made where their p-values are known: on the residual at the draw with the highest density, without all
     that a change of the parameters, in that experiment and channel alone, could explain. They are exact for models
     linear in the parameters, whatever the priors, and do not depend on how well the data determine the parameters. The
-    amplitude is compared with replicates, whose parameters were fitted to the data: its p is conservative.
+    amplitude is compared with replicates [1]_, whose parameters were fitted to the data: its p is conservative [2]_.
 
     What is meant by noise decides what can be seen. Noise of unknown variance takes a misfit of any size as noise, so
     only its shape along the period, or the scatter of the measured cycles, gives it away. Circulant noise takes a
@@ -147,9 +147,9 @@ def predict(
 
     References
     ----------
-    A. Gelman, X.-L. Meng, H. Stern, Posterior predictive assessment of model fitness via realized discrepancies,
-    Statistica Sinica 6 (1996) 733-807.
-    X.-L. Meng, Posterior predictive p-values, Annals of Statistics 22 (1994) 1142-1160.
+    .. [1] A. Gelman, X.-L. Meng, H. Stern, Posterior predictive assessment of model fitness via realized discrepancies,
+       Statistica Sinica 6 (1996) 733-807.
+    .. [2] X.-L. Meng, Posterior predictive p-values, Annals of Statistics 22 (1994) 1142-1160.
 
     Examples
     --------

@@ -31,12 +31,15 @@ SMALLEST_SHARED = 10_000
 
 
 class Problem:
-    """What the estimator and the samplers work on ([1]_, eq. 5-6).
+    r"""What the estimator and the samplers work on ([1]_, eq. 5-6).
 
     The density is over (θ, log φ), φ the noise parameters. With independent errors, the paper's model, φ is the
     variance of each channel with Jeffreys' prior 1/v, and the density is
 
-        −½ Σ_β [ n_β ln v_β + M_β / v_β ] + Σ_α ln p(θ_α),
+    .. math::
+
+        -\frac{1}{2} \sum_\beta \left[ n_\beta \ln v_\beta + \frac{M_\beta}{v_\beta} \right]
+        + \sum_\alpha \ln p(\theta_\alpha),
 
     where n_β counts the independent values behind the samples of channel β, and M_β weighs each squared residual by
     independent values per sample. It is eq. (6) where every sample is independent. Outputs are projected onto the
@@ -474,7 +477,7 @@ class Problem:
         return Comparisons(groups.values())
 
     def log_posterior(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> np.ndarray:
-        """Return log-prior plus log-likelihood, a density over (θ, log φ) ([1]_, eq. 6).
+        """Return log-prior plus log-likelihood, a density over (θ, log φ) (de Kraker et al. 1997, eq. 6).
 
         Parameters
         ----------
@@ -514,8 +517,8 @@ class Problem:
         theta : mapping of str to float, or array (names,)
         variances : mapping of str to float, or array (noise_names,)
         method : "adjoint" or "forward"
-            One transposed solve an experiment, whatever the number of parameters, or one solve a parameter ([1]_, eq.
-            4). An autonomous model always takes the second.
+            One transposed solve an experiment, whatever the number of parameters, or one solve a parameter (eq. 4 of
+            the paper). An autonomous model always takes the second.
 
         Returns
         -------

@@ -41,7 +41,7 @@ dahl = Model(
     units={"displacement": "m", "force": "N", "w": "1"},
     equations=lambda s, p, u: [s.dw - p.rho * (u.ddisplacement - abs(u.ddisplacement) * s.w)],
     outputs=lambda s, p, u: {"force": p.Kx * u.ddisplacement + p.K * u.displacement + p.F0 + p.Kw * s.w},
-    description="""A damper with Dahl friction: force = Kx v + K x + F0 + Kw w, ẇ = rho (v − |v| w), x given and v = ẋ.
+    description="""A damper with Dahl friction: force = Kx v + K x + F0 + Kw w, ẇ = rho (v − ``|v|`` w), x given, v = ẋ.
 
     Before it slides, friction is a spring: dw/dx = rho (1 − w sgn v) takes the friction force Kw w from one sliding
     value to the other, −Kw and Kw, within a few 1/rho of travel, at any speed (P. R. Dahl, Solid friction damping of
@@ -145,7 +145,7 @@ van_der_pol = Model(
     description="""A self-excited oscillator without any input: ẍ − mu omega (1 − x²) ẋ + omega² x = 0.
 
     Van der Pol's equation (Philosophical Magazine 2, 1926, 978-992) with time scaled by omega. The damping is negative
-    for |x| < 1 and positive beyond, so that every motion but rest ends on one cycle, of amplitude about 2 and, for
+    for ``|x|`` < 1 and positive beyond, so that every motion but rest ends on one cycle, of amplitude about 2 and, for
     small mu, of period (2π/omega)(1 + mu²/16 + …). The displacement is relative to the one where the damping vanishes.
     For autonomous systems, where the frequency is part of the answer and the phase is free.
 
@@ -178,15 +178,18 @@ _GEAR_CHANNELS = {"displacement": "m", "force": "N", "pressure": "Pa", "q": "m",
 
 
 def landing_gear(drive: str = "force") -> Model:
-    """Return the nose landing gear damper of [1]_, eq. (9), driven by a force or by a displacement.
+    r"""Return the nose landing gear damper of [1]_, eq. (9), driven by a force or by a displacement.
 
     q is the compression and T the absolute temperature of the gas. The force on the axle balances inertia, oil damping
     with the velocity squared, the gas on the area theta4, Coulomb friction (partly growing with the pressure) smoothed
-    by an arctan, and a constant, which with theta11 = −theta4 · ambient pressure is the air outside::
+    by an arctan, and a constant, which with theta11 = −theta4 · ambient pressure is the air outside:
 
-        theta1 (q̈ + theta2) + theta3 q̇|q̇| + theta4 p + (theta8 + theta9 p) arctan(theta10 q̇) + theta11 = force
-        theta15 Ṫ + theta16 (1 + theta6 q)(T + theta17) − (theta4 p + theta11) q̇ = 0
-        p = theta5 T / (1 + theta6 q + theta7 T),    displacement = q + theta12
+    .. math::
+
+        \theta_1 (\ddot q + \theta_2) + \theta_3 \dot q |\dot q| + \theta_4 p
+        + (\theta_8 + \theta_9 p) \arctan(\theta_{10} \dot q) + \theta_{11} &= \mathrm{force} \\
+        \theta_{15} \dot T + \theta_{16} (1 + \theta_6 q)(T + \theta_{17}) - (\theta_4 p + \theta_{11}) \dot q &= 0 \\
+        p = \frac{\theta_5 T}{1 + \theta_6 q + \theta_7 T}, \qquad \mathrm{displacement} &= q + \theta_{12}
 
     The second row is the energy of the gas: its heat capacity theta15, conduction theta16 through the wall to the
     surroundings at −theta17, and the work of compression. p is the absolute pressure of an ideal gas, whose volume
@@ -270,11 +273,14 @@ def _landing_gear(drive: str) -> Model:
 
 
 def chain(masses: int) -> Model:
-    """Return a row of equal masses on nonlinear springs, the first one tied to the ground, a force on the last one.
+    r"""Return a row of equal masses on nonlinear springs, the first one tied to the ground, a force on the last one.
 
-    Newton's law for mass i between its springs, with the elongations e_i = x_i − x_(i−1) and x_0 = 0::
+    Newton's law for mass i between its springs, with the elongations e_i = x_i − x_(i−1) and x_0 = 0,
 
-        m ẍ_i + R(e_i, ė_i) − R(e_(i+1), ė_(i+1)) = 0,    R(e, ė) = c ė + k e + k3 e³
+    .. math::
+
+        m \ddot x_i + R(e_i, \dot e_i) - R(e_{i+1}, \dot e_{i+1}) = 0,
+        \qquad R(e, \dot e) = c \dot e + k e + k_3 e^3,
 
     and the force in the place of R beyond the last mass. One mass is the Duffing oscillator. For several modes with
     few parameters: internal resonances, what one measured channel can tell, how the effort grows with the states.

@@ -12,7 +12,7 @@ def smooth_sign(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
     ----------
     x : sympy expression
     width : number > 0 or sympy expression, in the units of `x`
-        At |x| = width the value is 0.76, at 3 width 0.995. A transition crossed in only a few grid steps is
+        At ``|x|`` = width the value is 0.76, at 3 width 0.995. A transition crossed in only a few grid steps is
         not resolved by any difference scheme.
 
     Returns
@@ -45,7 +45,7 @@ def smooth_abs(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
     ----------
     x : sympy expression
     width : number > 0 or sympy expression, in the units of `x`
-        Far from zero the value is |x| − width; the curvature at zero is 1 / width.
+        Far from zero the value is ``|x|`` − width; the curvature at zero is 1 / width.
 
     Returns
     -------

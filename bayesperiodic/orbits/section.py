@@ -159,7 +159,7 @@ class PoincareSection(Result):
         Returns
         -------
         PoincareSection
-            `frequency` is that of the returns on average; the times between them follow from `instants`.
+            `frequency` is that of the returns on average; the times between them follow from ``instants``.
 
         Raises
         ------

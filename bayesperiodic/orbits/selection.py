@@ -27,9 +27,9 @@ def select_orbits(
     """Choose polished orbits as data for the estimation of some parameters.
 
     Left out are states of rest, orbits that their own returns speak against, and orbits so unstable that nothing near
-    them is linear any more: a return map that stretches by |μ| = 50 takes points from 1 % of the attractor's size half
-    across it within one period, so that closer and ever fewer returns must tell the points, and their error bars are
-    not to be trusted. Of the others, those go that tell hardly anything: the information of an orbit about the
+    them is linear any more: a return map that stretches by ``|μ|`` = 50 takes points from 1 % of the attractor's size
+    half across it within one period, so that closer and ever fewer returns must tell the points, and their error bars
+    are not to be trusted. Of the others, those go that tell hardly anything: the information of an orbit about the
     parameters is SᵀC⁻¹S, with the sensitivities S of its section points (and unstable eigenvalues) and their covariance
     C; one by one the least informative is dropped, as long as without all those dropped the standard deviation of no
     combination of the parameters rises by more than `least_gain`. Both of a pair of symmetric partners may stay, for

@@ -79,7 +79,7 @@ class PeriodicSolution(Result):
     >>> solution.converged, solution.stable, solution.period
     (True, True, 10.0)
 
-    This spring is linear, so the amplitude is |1/(1 − ω² + 0.2iω)|, and disturbances decay by exp(−0.1·10) a period:
+    This spring is linear, so the amplitude is ``1/|1 − ω² + 0.2iω|``, and disturbances decay by exp(−0.1·10) a period:
 
     >>> omega, amplitude = 0.2 * np.pi, np.sqrt(2) * solution.states["x"].std()
     >>> round(float(amplitude * np.hypot(1 - omega**2, 0.2 * omega)), 9), abs(solution.multipliers).round(4).tolist()

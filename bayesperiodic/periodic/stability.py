@@ -10,10 +10,14 @@ from bayesperiodic.periodic.solution import PeriodicSolution, equations_of
 
 
 def multiplier_sensitivities(model: Model, solution: PeriodicSolution) -> dict[str, np.ndarray]:
-    """Return ∂multiplier/∂parameter, and for a forced model ∂multiplier/∂frequency [per Hz].
+    r"""Return ∂multiplier/∂parameter, and for a forced model ∂multiplier/∂frequency [per Hz].
 
-    d log μ = ∫ wᵀ dA v / (wᵀ v) dt over the response period, with the eigenfunctions v of the linearised equations
-    ẏ = A y and w of their adjoint; dA holds the direct change and that through the orbit. A multiplier that occurs
+    .. math::
+
+        \mathrm{d} \log \mu = \int \frac{w^T \, \mathrm{d}A \, v}{w^T v} \, \mathrm{d}t
+
+    over the response period, with the eigenfunctions v of the linearised equations ẏ = A y and w of their adjoint; dA
+    holds the direct change and that through the orbit. A multiplier that occurs
     twice has no derivative, and the result is not finite or large there.
 
     Parameters

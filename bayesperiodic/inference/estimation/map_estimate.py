@@ -44,14 +44,19 @@ def map_estimate(
     seed: int = 0,
     progress: bool = True,
 ) -> MapEstimate:
-    """Find the MAP point by staged Gauss-Newton and the Laplace covariance there ([1]_, eq. 7-8).
+    r"""Find the MAP point by staged Gauss-Newton and the Laplace covariance there ([1]_, eq. 7-8).
 
-    Each iteration solves the channel variances from eq. (7) with its bias correction, v_β = M_β / [n_β (1 − l/Σn)],
-    which is s·Σe²/(nNs − l) for equal counts, and then updates θ by eq. (8). Printed there, the right-hand side lacks
-    the prior's gradient (θ̄ − θ)/σ², without which the iteration would not end at a maximum of eq. (6); it is added.
-    Other noise models have their parameters in place of the variances, found by maximising the same objective. Steps
-    are halved until the objective, eq. (6) with nN replaced by nN − l/s, rises; it never falls. Where convex log-priors
-    outweigh the data, steps (not the covariance) take their curvature with the opposite sign.
+    Each iteration solves the channel variances from eq. (7) with its bias correction,
+
+    .. math::
+
+        v_\beta = \frac{M_\beta}{n_\beta \, (1 - l / \sum_\beta n_\beta)},
+
+    for l parameters, which is s·Σe²/(nNs − l) for equal counts, and then updates θ by eq. (8). Printed there, the
+    right-hand side lacks the prior's gradient (θ̄ − θ)/σ², without which the iteration would not end at a maximum of
+    eq. (6); it is added. Other noise models have their parameters in place of the variances, found by maximising the
+    same objective. Steps are halved until the objective, eq. (6) with nN replaced by nN − l/s, rises; it never falls.
+    Where convex log-priors outweigh the data, steps (not the covariance) take their curvature with the opposite sign.
 
     Where every experiment of a forced model has a guess of its orbit, orbits and parameters are first found together,
     from these guesses and `start`: the orbits need not exist at the start, and none is lost or swapped on the way.

@@ -43,7 +43,7 @@ class Noise(ABC):
     Raises
     ------
     ValueError
-        For another `per`, or a prior that is none of these.
+        For another ``per``, or a prior that is none of these.
 
     Examples
     --------
@@ -316,9 +316,9 @@ class Circulant(Noise):
     Parameters
     ----------
     kernel : "matern" or "exponential"
-        "matern": once differentiable errors (Matérn, ν = 3/2) over a white floor, S ∝ (3 + (2πhℓ)²)⁻² + floor; for
-        smooth model errors under measurement noise. "exponential": a first-order autoregressive process in continuous
-        time, S ∝ 1/(1 + (2πhℓ)²).
+        "matern": once differentiable errors (Matérn, ν = 3/2, [1]_) over a white floor, S ∝ (3 + (2πhℓ)²)⁻² + floor;
+        for smooth model errors under measurement noise. "exponential": a first-order autoregressive process in
+        continuous time, S ∝ 1/(1 + (2πhℓ)²).
     per : "channel" or "experiment"
     prior : "jeffreys", "flat" or a prior
         Of the variance. The correlation length ℓ, as a fraction of the response period, has the prior
@@ -327,11 +327,11 @@ class Circulant(Noise):
     Raises
     ------
     ValueError
-        For another `kernel` or `per`, or a prior that is none of these.
+        For another ``kernel`` or ``per``, or a prior that is none of these.
 
     References
     ----------
-    C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press, 2006, section 4.2.
+    .. [1] C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press, 2006, section 4.2.
 
     Examples
     --------

@@ -47,14 +47,14 @@ def sample(
     executor: Any = None,
     progress: bool = True,
 ) -> Posterior:
-    """Sample the posterior of θ and the free noise parameters with emcee's affine-invariant ensembles.
+    """Sample the posterior of θ and the free noise parameters with emcee's affine-invariant ensembles ([1]_).
 
     Several independent ensembles start from draws of the Laplace approximation with doubled standard deviations.
     Parameters with positive support and the noise parameters are sampled in their logarithms, where products become
     straight ridges; Jeffreys' prior 1/v is flat there. The eigenvectors of the Laplace approximation in these
-    coordinates are the axes of the walk. Seven steps in ten are differential-evolution moves, which mix three times
-    faster than stretch moves on a normal target of six dimensions (tau 21 against 67), two are stretch moves, and one
-    is a differential-evolution move of full length, which can jump between modes.
+    coordinates are the axes of the walk. Seven steps in ten are differential-evolution moves [2]_, which mix three
+    times faster than stretch moves on a normal target of six dimensions (tau 21 against 67), two are stretch moves, and
+    one is a differential-evolution move of full length, which can jump between modes.
 
     Sampling stops when the chain is 50 autocorrelation times long after a fifth of it was dropped, that time has
     changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and 95 % quantiles agree
@@ -62,8 +62,9 @@ def sample(
     so does the loss of the executor's workers.
 
     A second sampler checks the first: ``sampler="nuts"`` samples the same density by its gradient, with the no-U-turn
-    sampler of nutpie. Each ensemble is then a single chain, which tunes itself over 300 draws that are dropped, and has
-    to be 500 autocorrelation times long; the rest of the stop rule is the same, and so are start, axes and Ctrl-C.
+    sampler [3]_ of nutpie. Each ensemble is then a single chain, which tunes itself over 300 draws that are dropped,
+    and has to be 500 autocorrelation times long; the rest of the stop rule is the same, and so are start, axes and
+    Ctrl-C.
 
     Parameters
     ----------
@@ -127,11 +128,11 @@ def sample(
 
     References
     ----------
-    D. Foreman-Mackey, D. W. Hogg, D. Lang, J. Goodman, emcee: the MCMC hammer, PASP 125 (2013) 306-312.
-    C. J. F. ter Braak, A Markov chain Monte Carlo version of the genetic algorithm differential evolution, Statistics
-    and Computing 16 (2006) 239-249.
-    M. D. Hoffman, A. Gelman, The no-U-turn sampler: adaptively setting path lengths in Hamiltonian Monte Carlo,
-    Journal of Machine Learning Research 15 (2014) 1593-1623.
+    .. [1] D. Foreman-Mackey, D. W. Hogg, D. Lang, J. Goodman, emcee: the MCMC hammer, PASP 125 (2013) 306-312.
+    .. [2] C. J. F. ter Braak, A Markov chain Monte Carlo version of the genetic algorithm differential evolution,
+       Statistics and Computing 16 (2006) 239-249.
+    .. [3] M. D. Hoffman, A. Gelman, The no-U-turn sampler: adaptively setting path lengths in Hamiltonian Monte Carlo,
+       Journal of Machine Learning Research 15 (2014) 1593-1623.
 
     Examples
     --------
