@@ -34,7 +34,10 @@ def identifiers(argument: str, names: Iterable[str], reserved: Iterable[str] = (
     taken = set(reserved)
     for name in result:
         if not isinstance(name, str) or not name.isidentifier() or name.startswith("_"):
-            raise ValueError(f"{argument}: {name!r} is not allowed; names are Python identifiers such as 'force'.")
+            raise ValueError(
+                f"{argument}: {name!r} is not allowed; names are Python identifiers such as 'force', without a leading "
+                "underscore."
+            )
         if name in taken:
             raise ValueError(f"{argument}: {name!r} is reserved or used twice; choose another name.")
         taken.add(name)
@@ -67,8 +70,11 @@ def integer(argument: str, value: Any, minimum: int) -> int:
     return int(value)
 
 
-def finite_vector(argument: str, values: Any, length: int | None = None) -> np.ndarray:
-    """Return `values` as a 1-d float array; raise a ValueError for text, a wrong length, NaN or infinity."""
+def finite_vector(argument: str, values: Any, length: int | None = None, meaning: str = "") -> np.ndarray:
+    """Return `values` as a 1-d float array; raise a ValueError for text, a wrong length, NaN or infinity.
+
+    `meaning` tells in the message what the length is, such as "samples·periods".
+    """
     try:
         array = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
@@ -76,7 +82,8 @@ def finite_vector(argument: str, values: Any, length: int | None = None) -> np.n
     if array.ndim != 1:
         raise ValueError(f"{argument}: shape {array.shape} is not allowed; it must be one-dimensional.")
     if length is not None and array.size != length:
-        raise ValueError(f"{argument}: {array.size} values are not allowed; there must be {length}.")
+        told = f" ({meaning})" if meaning else ""
+        raise ValueError(f"{argument}: {array.size} values are not allowed; there must be {length}{told}.")
     bad = np.flatnonzero(~np.isfinite(array))
     if bad.size:
         raise ValueError(

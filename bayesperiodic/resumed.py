@@ -83,7 +83,9 @@ def _alone(path: Path) -> Any:
     try:
         return FileLock(path.with_name(f".{path.name}.lock")).acquire(timeout=0.0)
     except Timeout:
-        raise ValueError(f"{str(path)!r} is in use by another run; wait for it, or name another folder.") from None
+        raise ValueError(
+            f"folder: {str(path.parent)!r} is in use by another run; wait for it, or name another folder."
+        ) from None
 
 
 def _read(path: Path | None) -> list[Line]:

@@ -19,6 +19,8 @@ DIFFERENCE_STEP = 2e-3
 # In forcing periods.
 LONGEST_STEP, TRIAL = 0.05, 3.0
 
+REMEDY = "Check the parameters' signs and units, and the start: the motion may grow without bounds."
+
 Signal = np.ndarray | Callable[[np.ndarray], np.ndarray]
 
 
@@ -179,7 +181,7 @@ def _integrate(system: FirstOrder, start: np.ndarray, time: np.ndarray) -> np.nd
         max_step=step,
     )
     if not result.success or not np.isfinite(result.y).all():
-        raise RuntimeError(f"The time integration of {system.model.name!r} failed: {result.message}")
+        raise RuntimeError(f"The time integration of {system.model.name!r} failed: {result.message} {REMEDY}")
     return result.y.T
 
 
@@ -208,7 +210,7 @@ def integrate_periodic(system: FirstOrder, start: np.ndarray, time: np.ndarray) 
     if len(found) < time.size or not np.isfinite(found).all():
         raise RuntimeError(
             f"The time integration of {system.model.name!r} failed after {time[len(found) - 1]:.6g} s: the step became "
-            "too small."
+            f"too small. {REMEDY}"
         )
     return found
 

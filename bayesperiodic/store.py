@@ -118,7 +118,7 @@ def _encode(value: Any, arrays: dict[str, Any], trees: list[Any]) -> Any:
     if type(value).__name__ == "DataTree":
         trees.append(value)
         return {"tree": True}
-    raise TypeError(f"A {type(value).__name__} cannot be saved.")
+    raise TypeError(f"A {type(value).__name__} cannot be saved; numbers, texts, arrays, tables and draws can.")
 
 
 def _decode(value: Any, arrays: dict[str, Any], path: str | Path) -> Any:
@@ -156,5 +156,5 @@ def _result_class(name: str) -> Any:
     module, _, qualname = name.partition(":")
     found = getattr(import_module(module), qualname, None) if module.startswith("bayesperiodic.") else None
     if not is_dataclass(found):
-        raise ValueError(f"path: a saved {name!r} is not known to this version.")
+        raise ValueError(f"path: a saved {name!r} is not known to this version; read it with the one that wrote it.")
     return found

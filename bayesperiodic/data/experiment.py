@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike
 from bayesperiodic import checks, fourier
 from bayesperiodic.store import Result
 
+MEANING = "samples·periods"
+
 
 @dataclass(frozen=True)
 class Experiment(Result):
@@ -109,19 +111,22 @@ class Experiment(Result):
 
     def __post_init__(self) -> None:
         if not self.name or any(c in self.name for c in "/[]"):
-            raise ValueError(f"name: {self.name!r} is not allowed; any text without '/', '[' and ']' is.")
+            raise ValueError(f"name: {self.name!r} is not allowed; any other text without '/', '[' and ']' is.")
         checks.positive("frequency", self.frequency)
         points = checks.integer("samples", self.samples, 4) * checks.integer("periods", self.periods, 1)
         if self.mask is not None:
             object.__setattr__(self, "mask", _checked_mask(self.mask, points))
         for kind in ("outputs", "inputs"):
             channels = {
-                key: checks.finite_vector(f"{kind}[{key!r}]", self._measured(kind, values), points)
+                key: checks.finite_vector(f"{kind}[{key!r}]", self._measured(kind, values), points, MEANING)
                 for key, values in getattr(self, kind).items()
             }
             checks.identifiers(kind, channels)
             object.__setattr__(self, kind, channels)
-        guess = {key: checks.finite_vector(f"guess[{key!r}]", v, points) for key, v in (self.guess or {}).items()}
+        guess = {
+            key: checks.finite_vector(f"guess[{key!r}]", values, points, MEANING)
+            for key, values in (self.guess or {}).items()
+        }
         object.__setattr__(self, "guess", guess)
         for argument in ("scatter", "independent", "harmonics", "amplitude_variance", "drift"):
             given = dict(getattr(self, argument) or {})
@@ -174,12 +179,15 @@ class Experiment(Result):
                 f"measured values{f' and {logarithms} multipliers' if size > values else ''}."
             )
         if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-8):
-            raise ValueError("covariance: it must be finite and symmetric.")
+            bad = np.count_nonzero(~np.isfinite(matrix))
+            raise ValueError(f"covariance: it must be finite and symmetric; {bad} of its entries are not finite.")
         scale = np.sqrt(np.abs(np.diag(matrix)))
         try:
             np.linalg.cholesky(matrix / np.outer(scale, scale))
         except np.linalg.LinAlgError:
-            raise ValueError("covariance: it must be positive definite.") from None
+            raise ValueError(
+                "covariance: it must be positive definite; every combination of the values needs an error of its own."
+            ) from None
         object.__setattr__(self, "covariance", matrix)
 
     @classmethod

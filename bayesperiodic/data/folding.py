@@ -59,7 +59,9 @@ def fold(
     for channel, values in zip(names, signals, strict=True):
         if np.ptp(values) == 0.0:
             kind = "inputs" if channel in recording.inputs else "outputs"
-            raise ValueError(f"{kind}[{channel!r}]: the constant {values[0]:g} is not allowed; a channel must vary.")
+            raise ValueError(
+                f"{kind}[{channel!r}]: the constant {values[0]:g} is not allowed; a channel must vary, so leave it out."
+            )
     time = recording.time - start
 
     fundamental = _first_guess(recording, time, signals, frequency, periods)
@@ -155,7 +157,7 @@ def _resolved(time: np.ndarray, fundamental: float, points: int) -> int:
     if resolved < 1:
         raise ValueError(
             f"recording: {per_cycle:.1f} samples a cycle are not allowed; at least 3 are needed to resolve the "
-            "fundamental."
+            "fundamental. Sample faster, or check the frequency."
         )
     return resolved
 

@@ -41,7 +41,9 @@ def read_npz(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
         raise ValueError(f"path: {str(path)!r} cannot be read as NPZ ({error}).") from None
     except ValueError as error:
         if "allow_pickle" in str(error):
-            raise ValueError(f"path: {str(path)!r} holds pickled objects; only plain arrays are read.") from None
+            raise ValueError(
+                f"path: {str(path)!r} holds pickled objects; only plain arrays are read, save it with such."
+            ) from None
         raise
 
 

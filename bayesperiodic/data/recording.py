@@ -71,7 +71,7 @@ class Recording(Result):
         checks.identifiers("outputs and inputs", (*self.outputs, *self.inputs))
         for kind, channels in (("outputs", self.outputs), ("inputs", self.inputs)):
             for name, values in channels.items():
-                checks.finite_vector(f"{kind}[{name!r}]", values, self.time.size)
+                checks.finite_vector(f"{kind}[{name!r}]", values, self.time.size, "one a time")
 
     @property
     def sampling_rate(self) -> float:

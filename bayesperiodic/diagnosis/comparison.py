@@ -204,7 +204,8 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     if laplace is None:
         raise ValueError(
             "coordinates: 'sampling' is not allowed; this estimate has no joint Laplace approximation, because the "
-            f"density has no maximum with finite curvature ({'; '.join(fit.undetermined) or fit.status})."
+            f"density has no maximum with finite curvature ({'; '.join(fit.undetermined) or fit.status}). Take "
+            "'natural'."
         )
     scored = scores(problem, fit, posterior, laplace, coordinates)
     other = both[SAMPLING] if coordinates == NATURAL and posterior.converged and not scored.fine else None

@@ -183,7 +183,10 @@ def predict(
     solved = anchored.responses.solve(points)
     converged = np.all([s.status == CONVERGED for s in solved.values()], axis=0)
     if not converged.any():
-        raise RuntimeError("posterior: none of its draws has a periodic solution, so nothing can be predicted.")
+        raise RuntimeError(
+            "posterior: none of its draws has a periodic solution, so nothing can be predicted. Give draws of this "
+            "problem."
+        )
     outputs = {name: o.predicted(solved[name].response) for name, o in problem.observations.items()}
     predicted = bands(problem, outputs, converged, problem.likelihood.value_variances(noise))
     components = problem.likelihood.simulate(noise, np.random.default_rng(posterior.seed))
@@ -195,7 +198,10 @@ def predict(
             replicates[e.name, channel] = values[converged]
     here = anchored.linearised(peak)
     if not here.converged:
-        raise RuntimeError("posterior: its draw of the highest density has no periodic solution, so nothing is tested.")
+        raise RuntimeError(
+            "posterior: its draw of the highest density has no periodic solution, so nothing is tested. Give draws of "
+            "this problem."
+        )
     table = adequacy(problem, here, noise, replicates)
     recorded = None if run is None else transient(problem, points, run, experiment)
     given = {f.name: getattr(predicted, f.name) for f in fields(predicted)}

@@ -130,7 +130,8 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     outputs, converged = problem.outputs(theta)
     if not converged.any():
         raise RuntimeError(
-            f"problem: none of {count} draws from its priors has a periodic solution in all experiments."
+            f"problem: none of {count} draws from its priors has a periodic solution in all experiments. Narrow the "
+            "priors about values at which problem.solve(theta) converges."
         )
     prediction = bands(problem, outputs, converged, {})
     order = [STATUSES[CONVERGED], OTHER, NO_ORBIT, FAILED]

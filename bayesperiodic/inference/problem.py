@@ -534,7 +534,10 @@ class Problem:
         value, gradient = self._value_and_gradient(values, noise, forward=method == "forward")
         if not np.isfinite(value):
             given = dict(zip(self.names, values.tolist(), strict=True))
-            raise ValueError(f"theta: {given} is not allowed; the log-posterior is not finite there.")
+            raise ValueError(
+                f"theta: {given} is not allowed; the log-posterior is not finite there. A prior excludes it, or a solve "
+                "fails: see log_prior(theta) and solve(theta)."
+            )
         return gradient
 
     def value_and_gradient(self, theta: Mapping[str, float] | np.ndarray, variances: Any) -> tuple[float, np.ndarray]:

@@ -81,7 +81,7 @@ def _with_multipliers(orbit: Orbit, experiment: Experiment) -> Experiment:
 def _whole(orbit: Orbit, samples: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return the measured cycle on the grid, and the points at which it was measured."""
     if orbit.cycle is None:
-        raise ValueError(f"whole: True is not allowed; {orbit.name!r} has no measured cycle.")
+        raise ValueError(f"whole: True is not allowed; {orbit.name!r} has no measured cycle, so leave it out.")
     measured = len(orbit.cycle[orbit.coordinates[0]]) // orbit.period
     if samples % measured:
         raise ValueError(
@@ -108,7 +108,9 @@ def _guess(orbit: Orbit, samples: int, winding: int, states: Mapping[str, str] |
     """Return the states from which the first solve starts: of the solution, or named coordinates of the cycle."""
     if states is not None:
         if orbit.cycle is None:
-            raise ValueError(f"states: they are not allowed; {orbit.name!r} has no measured cycle.")
+            raise ValueError(
+                f"states: they are not allowed; {orbit.name!r} has no measured cycle. Polish it with a model first."
+            )
         cycle = resampled_cycle(orbit, winding, samples)
         for name in states.values():
             checks.one_of("states", name, orbit.coordinates)

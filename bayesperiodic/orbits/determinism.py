@@ -47,7 +47,7 @@ def check_chaos(maps: LocalMaps, section: np.ndarray) -> None:
     if later < PARTED * now:
         raise ValueError(
             "section: a quasi-periodic motion is not allowed; neighbouring points stay together, so that it is not "
-            "chaotic and shows no periodic orbits."
+            "chaotic and shows no periodic orbits. Record it where it is chaotic."
         )
 
 

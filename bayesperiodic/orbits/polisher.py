@@ -48,7 +48,7 @@ class Polisher:
             checks.positive(f"parameter_sd[{name!r}]", sd)
         checks.same_names("inputs", self.inputs, self.model.inputs)
         for name, values in self.inputs.items():
-            checks.finite_vector(f"inputs[{name!r}]", values, self.samples)
+            checks.finite_vector(f"inputs[{name!r}]", values, self.samples, "samples")
         for orbit in self.orbits:
             for name in orbit.coordinates:
                 checks.one_of("coordinates", name, self.model.outputs)

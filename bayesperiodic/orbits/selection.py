@@ -98,7 +98,7 @@ def orbit_information(orbit: Orbit, parameters: list[str], model: Model | None =
     """Return SᵀC⁻¹S (parameters, parameters), the derivatives S taken by relative changes of the parameters."""
     solution = orbit.solution
     if solution is None:
-        raise ValueError(f"orbits: {orbit.name!r} is not allowed; it is not polished.")
+        raise ValueError(f"orbits: {orbit.name!r} is not allowed; it is not polished, see polish_orbits.")
     for name in parameters:
         checks.one_of("parameters", name, solution.parameters)
     columns = []
@@ -119,7 +119,7 @@ def orbit_information(orbit: Orbit, parameters: list[str], model: Model | None =
 def _unfit(orbit: Orbit, largest_multiplier: float, least_quality: float) -> str:
     """Return why an orbit is no data at all; nothing if it is."""
     if orbit.solution is None:
-        raise ValueError(f"orbits: {orbit.name!r} is not allowed; it is not polished.")
+        raise ValueError(f"orbits: {orbit.name!r} is not allowed; it is not polished, see polish_orbits.")
     if orbit.equilibrium:
         return "a state of rest"
     if orbit.quality < least_quality:

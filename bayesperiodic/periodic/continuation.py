@@ -231,13 +231,16 @@ def iterate_periodic(
     """
     equations, parameters, z = equations_of(model, solution)
     if not solution.converged:
-        raise ValueError(f"solution: status {solution.status!r} is not allowed; it must have converged.")
+        raise ValueError(
+            f"solution: status {solution.status!r} is not allowed; it must have converged. Solve again from another "
+            "guess."
+        )
     family, values = _family(equations, parameters, vary)
     until = checks.finite_number("until", until)
     if vary == FREQUENCY:
         checks.positive("until", until)
     if until == values[0]:
-        raise ValueError(f"until: {until!r} is not allowed; {vary} has that value at the start.")
+        raise ValueError(f"until: {until!r} is not allowed; {vary} has that value at the start, give another.")
     step = abs(until - values[0]) / STEPS if step is None else checks.positive("step", step)
     for point in trace(family, z, values, until=until, step=step, refine=_special_points):
         yield float(point.values[0]), _solution(family, point), point.kind
@@ -279,7 +282,10 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
     """
     equations, parameters, z = equations_of(model, solution)
     if not solution.converged or np.min(abs(solution.multipliers + 1.0)) > 0.1:
-        raise ValueError(f"solution: multipliers {solution.multipliers} are not allowed; one must be near -1.")
+        raise ValueError(
+            f"solution: multipliers {solution.multipliers} are not allowed; one must be near -1. Take one of "
+            "branch.period_doublings."
+        )
     twice = PeriodicEquations.build(
         model,
         {name: np.tile(values, 2) for name, values in solution.inputs.items()},

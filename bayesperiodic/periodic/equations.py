@@ -80,12 +80,12 @@ class PeriodicEquations:
         if model.autonomous and grid.periods > 1:
             raise ValueError(
                 f"periods: {periods!r} is not allowed; {model.name!r} is autonomous, there is no forcing period to "
-                "count."
+                "count. Give the frequency of the whole orbit."
             )
         checks.same_names("inputs", inputs or {}, model.inputs)
         columns: list[list[np.ndarray]] = [[], [], []]
         for name in model.inputs:
-            values = checks.finite_vector(f"inputs[{name!r}]", (inputs or {})[name], grid.points)
+            values = checks.finite_vector(f"inputs[{name!r}]", (inputs or {})[name], grid.points, "samples·periods")
             amplitudes = fourier.coefficients(values)
             columns[0].append(values)
             for order in (1, 2):
@@ -257,10 +257,14 @@ def winding_numbers(model: Model, winding: int | Mapping[str, int]) -> dict[str,
     angles = [state for state in model.states if state in model.angles]
     if not isinstance(winding, Mapping):
         turns = checks.integer("winding", winding, -(10**6))
-        if turns and len(angles) != 1:
+        if turns and not angles:
+            raise ValueError(
+                f"winding: {winding!r} is not allowed; no state of {model.name!r} is an angle, see Model(angles=…)."
+            )
+        if turns and len(angles) > 1:
             raise ValueError(
                 f"winding: {winding!r} is not allowed; the model {model.name!r} has the angles {angles} among its "
-                "states, so name them: winding={'phi': 1}."
+                f"states, so name them: winding={{{angles[0]!r}: {turns}}}."
             )
         return dict.fromkeys(angles, turns)
     for name, turns in winding.items():

@@ -96,7 +96,9 @@ def hopf_points(
     (True, 0.95493)
     """
     if not model.autonomous:
-        raise ValueError(f"model: {model.name!r} is not allowed; it is driven and never at rest.")
+        raise ValueError(
+            f"model: {model.name!r} is not allowed; it is driven and never at rest. Give an autonomous one."
+        )
     checks.one_of("vary", vary, model.parameters)
     low, high = (checks.finite_number(f"between[{i}]", value) for i, value in enumerate(between))
     if not low < high:
@@ -159,13 +161,17 @@ def emerging_cycle(
     if point.model != model.name:
         raise ValueError(f"model: {model.name!r} is not allowed; the point is one of {point.model!r}.")
     if len(amplitude) != 1:
-        raise ValueError(f"amplitude: {dict(amplitude)!r} is not allowed; give that of one state.")
+        raise ValueError(
+            f"amplitude: {dict(amplitude)!r} is not allowed; give that of one state, such as "
+            f"{{{model.states[0]!r}: 0.01}}."
+        )
     ((state, size),) = amplitude.items()
     checks.one_of("amplitude", state, model.states)
     size = checks.positive(f"amplitude[{state!r}]", size)
     own = point.mode[model.states.index(state)]
     if not abs(own) > OSCILLATING:
-        raise ValueError(f"amplitude: {state!r} is not allowed; it does not move in the oscillation.")
+        moving = [name for name, part in zip(model.states, point.mode, strict=True) if abs(part) > OSCILLATING]
+        raise ValueError(f"amplitude: {state!r} is not allowed; it does not move in the oscillation, {moving} do.")
     equations = _equations(model, point.frequency, samples, scheme)
     theta = np.array([point.parameters[n] for n in model.parameters])
     shape = point.mode * size / own

@@ -45,10 +45,11 @@ class Scheme:
         for argument, weights, derivative in (("first", self.first, 1), ("second", self.second, 2)):
             for power in range(derivative + 1):
                 moment = sum(weight * offset**power for offset, weight in weights.items())
-                if weights and not abs(moment - (math.factorial(power) if power == derivative else 0.0)) < 1e-9:
+                wanted = math.factorial(power) if power == derivative else 0
+                if weights and not abs(moment - wanted) < 1e-9:
                     raise ValueError(
                         f"{argument}: {dict(weights)!r} is not allowed; it gives {moment:.6g} for the derivative of "
-                        f"t**{power} at 0."
+                        f"t**{power} at 0, which is {wanted}."
                     )
 
     @property

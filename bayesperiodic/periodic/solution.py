@@ -259,7 +259,8 @@ def periodic_part(equations: PeriodicEquations, states: Mapping[str, np.ndarray]
     """Return z (points, states) from named states that carry their turns."""
     model, grid = equations.model, equations.grid
     checks.same_names("guess", states, model.states)
-    z = np.stack([checks.finite_vector(f"guess[{n!r}]", states[n], grid.points) for n in model.states], axis=-1)
+    given = [checks.finite_vector(f"guess[{n!r}]", states[n], grid.points, "samples·periods") for n in model.states]
+    z = np.stack(given, axis=-1)
     return z - equations.drift * grid.tau[:, None]
 
 

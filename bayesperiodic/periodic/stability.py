@@ -51,7 +51,10 @@ def multiplier_sensitivities(model: Model, solution: PeriodicSolution) -> dict[s
     equations, theta, z = equations_of(model, solution)
     derivative = parameter_sensitivities(equations, z, theta) if solution.converged else None
     if solution.floquet is None or derivative is None:
-        raise ValueError(f"solution: status {solution.status!r} is not allowed; it must have converged and be regular.")
+        raise ValueError(
+            f"solution: status {solution.status!r} is not allowed; it must have converged and be regular. Solve again "
+            "from another guess."
+        )
     names = [*model.parameters, FREQUENCY][: len(derivative.frequency)]
     directions = np.eye(len(names), theta.size)
     frequency = derivative.frequency if model.autonomous else np.eye(len(names))[-1]

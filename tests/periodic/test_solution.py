@@ -261,11 +261,11 @@ def test_a_solution_on_another_grid_or_of_fewer_periods_is_a_guess():
     ("changes", "message"),
     [
         ({"samples": 3}, "samples: 3 is not allowed"),
-        ({"inputs": {"force": np.zeros(99)}}, r"inputs\['force'\]: 99 values are not allowed; there must be 100"),
+        ({"inputs": {"force": np.zeros(99)}}, r"inputs\['force'\]: 99 values .* there must be 100 .samples·periods"),
         ({"inputs": {"force": np.full(100, np.nan)}}, r"inputs\['force'\]: nan at index 0"),
         ({"inputs": {"forse": np.zeros(100)}}, "inputs: 'forse' is not known.*Did you mean 'force'"),
         ({"frequency": 0.0}, "frequency: 0.0 is not allowed; it must be > 0"),
-        ({"winding": 1}, "winding: 1 is not allowed; the model 'duffing' has the angles"),
+        ({"winding": 1}, "winding: 1 is not allowed; no state of 'duffing' is an angle"),
         ({"winding": {"x": 1}}, "winding: 'x' is not known"),
         ({"scheme": "central3"}, "scheme: 'central3' is not known.*Did you mean 'central4'"),
         ({"parameters": {"m": 1.0, "c": 1.0, "k": 1.0}}, "parameters: missing 'k3'"),
@@ -290,7 +290,7 @@ def test_bad_arguments_are_named(changes, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"first": {-1: -1.0, 1: 1.0}}, "first: .* it gives 2 for the derivative of t"),
+        ({"first": {-1: -1.0, 1: 1.0}}, "first: .* it gives 2 for the derivative of t\\*\\*1 at 0, which is 1"),
         ({"second": {0: 1.0, 1: -2.0}}, "second: .* it gives -1 for the derivative of t"),
         ({"order": 0}, "order: 0 is not allowed"),
     ],

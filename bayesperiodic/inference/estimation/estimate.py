@@ -268,7 +268,11 @@ class MapEstimate(Result):
         """
         key = labels.checked_key(names, self.theta, self.noise)
         if not self.converged:
-            warnings.warn(f"The estimate has not converged ({self.status}), nor has this prior.", stacklevel=2)
+            warnings.warn(
+                f"The estimate has not converged ({self.status}), nor has this prior. Try map_estimate from another "
+                "start, or from several.",
+                stacklevel=2,
+            )
         mean = np.array([self.theta[name] for name in key])
         return MultivariateNormal(mean, self.covariance.loc[[*key], [*key]].to_numpy())
 

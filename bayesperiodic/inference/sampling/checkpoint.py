@@ -73,7 +73,7 @@ class Checkpoint:
                 f"checkpoint: {str(self._path)!r} is in use by another run; wait for it, or name another file."
             ) from None
         except OSError as error:
-            raise ValueError(f"checkpoint: {str(self._path)!r} cannot be used ({error}).") from None
+            raise ValueError(f"checkpoint: {str(self._path)!r} cannot be used ({error}); name another file.") from None
         return self
 
     def __exit__(self, *_: object) -> None:

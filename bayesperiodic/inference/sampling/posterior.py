@@ -225,7 +225,10 @@ class Posterior(Result):
         noise = self._noise
         key = labels.checked_key(names, [name for name in self.names if name not in noise], noise)
         if not self.converged:
-            warnings.warn(f"The draws have not converged ({self.reason}), nor has this prior.", stacklevel=2)
+            warnings.warn(
+                f"The draws have not converged ({self.reason}), nor has this prior. Sample longer, see max_steps.",
+                stacklevel=2,
+            )
         draws = np.stack([self.draws(name) for name in key])
         return MultivariateNormal(draws.mean(axis=1), np.cov(draws).reshape(len(key), len(key)))
 

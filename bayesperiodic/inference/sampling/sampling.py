@@ -162,7 +162,7 @@ def sample(
     if variances == COLLAPSED and not plain.collapsed:
         raise ValueError(
             "variances: 'collapsed' is not allowed; there is no unknown variance of independent errors with the prior "
-            "1/v or a flat one."
+            "1/v or a flat one. Take variances='sampled'."
         )
     if sampler == NUTS:
         refuse_for_nuts(walkers, variances, checkpoint, executor)
