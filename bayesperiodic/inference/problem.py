@@ -535,8 +535,8 @@ class Problem:
         if not np.isfinite(value):
             given = dict(zip(self.names, values.tolist(), strict=True))
             raise ValueError(
-                f"theta: {given} is not allowed; the log-posterior is not finite there. A prior excludes it, or a solve "
-                "fails: see log_prior(theta) and solve(theta)."
+                f"theta: {given} is not allowed; the log-posterior is not finite there. A prior excludes it, or a "
+                "solve fails: see log_prior(theta) and solve(theta)."
             )
         return gradient
 
