@@ -116,13 +116,13 @@ def calibrate(
     max_steps: int = 500,
     progress: bool = True,
 ) -> Calibration:
-    """Simulate campaigns with truths from the prior, analyse each, and test where the truths lie ([1]_).
+    """Simulate campaigns with truths from the prior, analyse each, and test where the truths lie.
 
-    Each replicate draws θ and the variances, integrates the model in time until it is steady, records as many cycles as
-    the experiment has (three at least) with as many samples a cycle as its grid, adds white noise, folds with the
-    experiment's harmonics and frequency, and finds the MAP point, the Laplace approximation and draws of emcee. The
-    periodic solver has no part in the recording, so that its errors show. Inputs are recorded without noise, as the
-    likelihood takes them.
+    This is simulation-based calibration [1]_. Each replicate draws θ and the variances, integrates the model in time
+    until it is steady, records as many cycles as the experiment has (three at least) with as many samples a cycle as
+    its grid, adds white noise, folds with the experiment's harmonics and frequency, and finds the MAP point, the
+    Laplace approximation and draws of emcee. The periodic solver has no part in the recording, so that its errors show.
+    Inputs are recorded without noise, as the likelihood takes them.
 
     A likelihood that counts more independent values than the harmonics have, or a grid that is too coarse, comes out
     as "too narrow" or "not uniform". A wrong model does not: truths are drawn from the model.

@@ -31,10 +31,10 @@ SMALLEST_SHARED = 10_000
 
 
 class Problem:
-    r"""What the estimator and the samplers work on ([1]_, eq. 5-6).
+    r"""What the estimator and the samplers work on: the posterior density of a model's parameters.
 
-    The density is over (θ, log φ), φ the noise parameters. With independent errors, the paper's model, φ is the
-    variance of each channel with Jeffreys' prior 1/v, and the density is
+    The density ([1]_, eq. 5-6) is over (θ, log φ), φ the noise parameters. With independent errors, the paper's model,
+    φ is the variance of each channel with Jeffreys' prior 1/v, and the density is
 
     .. math::
 

@@ -88,7 +88,7 @@ pendulum = Model(
     units={"phi": "rad", "angle": "rad", "rate": "rad/s"},
     equations=_pendulum,
     outputs=lambda s, p, u: {"angle": s.phi, "rate": s.dphi},
-    description="""The parametrically driven pendulum of de Kraker, Verbeek & van de Wouw (1997), eq. (10).
+    description="""The parametrically driven pendulum of de Kraker, Verbeek & van de Wouw (1997), equation 10.
 
     A point mass m on an arm l, at the angle φ (state phi) from hanging down, whose pivot is at the height −a cos ωt,
     ω = 2π·frequency. Seen from the pivot, gravity is g + a ω² cos ωt, and the torques divided by the inertia m l² are::
@@ -178,11 +178,12 @@ _GEAR_CHANNELS = {"displacement": "m", "force": "N", "pressure": "Pa", "q": "m",
 
 
 def landing_gear(drive: str = "force") -> Model:
-    r"""Return the nose landing gear damper of [1]_, eq. (9), driven by a force or by a displacement.
+    r"""Return the nose landing gear damper of the paper, driven by a force or by a displacement.
 
-    q is the compression and T the absolute temperature of the gas. The force on the axle balances inertia, oil damping
-    with the velocity squared, the gas on the area theta4, Coulomb friction (partly growing with the pressure) smoothed
-    by an arctan, and a constant, which with theta11 = −theta4 · ambient pressure is the air outside:
+    These are eq. (9) of [1]_. q is the compression and T the absolute temperature of the gas. The force on the axle
+    balances inertia, oil damping with the velocity squared, the gas on the area theta4, Coulomb friction (partly
+    growing with the pressure) smoothed by an arctan, and a constant, which with theta11 = −theta4 · ambient pressure is
+    the air outside:
 
     .. math::
 

@@ -30,7 +30,9 @@ class Names:
 
 
 class Model:
-    """A nonlinear model, g(q, q̇, q̈, u, τ, θ) = 0 with outputs ŷ = f(q, q̇, q̈, u, τ, θ) ([1]_, eq. 1).
+    """A nonlinear model, g(q, q̇, q̈, u, τ, θ) = 0 with outputs ŷ = f(q, q̇, q̈, u, τ, θ).
+
+    It is eq. (1) of [1]_, written once; residuals, all derivatives and compiled code follow from it.
 
     Parameters
     ----------

@@ -20,6 +20,8 @@ CYCLE_SAMPLES = 64
 class PoincareSection(Result):
     """Points of a motion in a Poincaré section, in the order in which they came.
 
+    What section 5 of [1]_ starts from.
+
     Attributes
     ----------
     points : array (count, 2)
@@ -43,6 +45,11 @@ class PoincareSection(Result):
         Numbers that were measured.
     synthetic : bool
         True if the data were simulated.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
 
     Examples
     --------

@@ -145,7 +145,7 @@ def continue_periodic(
 ) -> Branch:
     """Follow a periodic solution, stable or unstable, along a parameter, the frequency or an input's scale.
 
-    Pseudo-arclength continuation with steps adapted to the curvature passes folds; folds and period doublings are
+    Pseudo-arclength continuation [1]_ with steps adapted to the curvature passes folds; folds and period doublings are
     located to 1e-9 of a step. It ends where the quantity gets to `until`, or back to its start value, or where the
     steps get too small (then the branch is not `complete`; nor is it if the start is a fold that turns away from
     `until`).
@@ -173,6 +173,11 @@ def continue_periodic(
     ValueError
         If the solution has not converged or is of another model, for an unknown `vary`, the frequency of an autonomous
         model, `until` equal to the start value, a step ≤ 0.
+
+    References
+    ----------
+    .. [1] H. B. Keller, Numerical solution of bifurcation and nonlinear eigenvalue problems, in: P. H. Rabinowitz
+       (Ed.), Applications of Bifurcation Theory, Academic Press, 1977, 359-384.
 
     Examples
     --------

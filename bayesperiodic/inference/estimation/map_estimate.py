@@ -44,9 +44,9 @@ def map_estimate(
     seed: int = 0,
     progress: bool = True,
 ) -> MapEstimate:
-    r"""Find the MAP point by staged Gauss-Newton and the Laplace covariance there ([1]_, eq. 7-8).
+    r"""Find the MAP point by staged Gauss-Newton, and the Laplace covariance there.
 
-    Each iteration solves the channel variances from eq. (7) with its bias correction,
+    Each iteration solves the channel variances from eq. (7) of [1]_ with its bias correction,
 
     .. math::
 

@@ -235,16 +235,26 @@ class Noise(ABC):
 
 @dataclass(frozen=True)
 class Independent(Noise):
-    """Independent, identically distributed errors of unknown variance, the paper's model (eq. 6-7).
+    """Independent, identically distributed errors of unknown variance, the paper's model.
 
-    Each channel has one unknown variance v, that of one independent value of the mean period. With whole periods the
-    independent values are 2·harmonics + 1, not the grid points.
+    Each channel has one unknown variance v ([1]_, eq. 6-7), that of one independent value of the mean period. With
+    whole periods the independent values are 2·harmonics + 1, not the grid points.
 
     Parameters
     ----------
     per : "channel" or "experiment"
     prior : "jeffreys", "flat" or a prior
         See `Noise`.
+
+    Raises
+    ------
+    ValueError
+        For another ``per``, or a prior that is none of these.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
 
     Examples
     --------
@@ -274,6 +284,11 @@ class Measured(Noise):
     per : "channel" or "experiment"
     prior : "jeffreys", "flat" or a prior
         Of the model error's variance.
+
+    Raises
+    ------
+    ValueError
+        For another ``per``, or a prior that is none of these.
 
     Examples
     --------

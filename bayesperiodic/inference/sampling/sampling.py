@@ -47,9 +47,9 @@ def sample(
     executor: Any = None,
     progress: bool = True,
 ) -> Posterior:
-    """Sample the posterior of θ and the free noise parameters with emcee's affine-invariant ensembles ([1]_).
+    """Sample the posterior of θ and the free noise parameters with emcee's affine-invariant ensembles.
 
-    Several independent ensembles start from draws of the Laplace approximation with doubled standard deviations.
+    Several independent ensembles [1]_ start from draws of the Laplace approximation with doubled standard deviations.
     Parameters with positive support and the noise parameters are sampled in their logarithms, where products become
     straight ridges; Jeffreys' prior 1/v is flat there. The eigenvectors of the Laplace approximation in these
     coordinates are the axes of the walk. Seven steps in ten are differential-evolution moves [2]_, which mix three
