@@ -1,5 +1,7 @@
 """Hopf points, cycles that start there, and what is on a branch at one value."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -89,5 +91,8 @@ def test_bad_amplitudes_are_refused():
     for amplitude, message in (({"beta": 1.0}, "'beta' is not known"), ({}, "give that of one state")):
         with pytest.raises(ValueError, match=message):
             bp.emerging_cycle(bp.models.flutter, point, amplitude=amplitude)
+    still = replace(point, mode=np.array([1.0, 0.0, 0.5j]))
+    with pytest.raises(ValueError, match=r"'alpha' is not allowed; it does not move .*, \['h', 'w'\] do"):
+        bp.emerging_cycle(bp.models.flutter, still, amplitude={"alpha": 0.01})
     with pytest.raises(ValueError, match="the point is one of 'flutter'"):
         bp.emerging_cycle(bp.models.van_der_pol, point, amplitude={"x": 1.0})

@@ -287,6 +287,19 @@ def test_bad_arguments_are_named(changes, message):
         bp.solve_periodic(**(arguments | changes))
 
 
+def test_windings_of_two_angles_are_told_by_name():
+    twin = bp.Model(
+        "twin",
+        states=["a", "b"],
+        angles=["a", "b"],
+        parameters=["k"],
+        equations=lambda s, p, u: [s.dda + p.k * sp.sin(s.a - s.b), s.ddb + sp.cos(2 * sp.pi * s.tau)],
+        outputs=lambda s, p, u: {"difference": s.a - s.b},
+    )
+    with pytest.raises(ValueError, match=r"so name them: winding=\{'a': 2\}"):
+        bp.solve_periodic(twin, {"k": 1.0}, frequency=1.0, samples=20, winding=2)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
