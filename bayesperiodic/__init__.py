@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from bayesperiodic.periodic.solution import PeriodicSolution
     from bayesperiodic.periodic.solve import solve_periodic
     from bayesperiodic.periodic.stability import multiplier_sensitivities
+    from bayesperiodic.reporting.report import report
     from bayesperiodic.simulation import simulate
     from bayesperiodic.store import load
 
@@ -96,6 +97,7 @@ _HOMES = {
     "bayesperiodic.periodic.solution": ["PeriodicSolution"],
     "bayesperiodic.periodic.solve": ["solve_periodic"],
     "bayesperiodic.periodic.stability": ["multiplier_sensitivities"],
+    "bayesperiodic.reporting.report": ["report"],
     "bayesperiodic.simulation": ["simulate"],
     "bayesperiodic.store": ["load"],
 }
@@ -113,8 +115,8 @@ __all__ = [  # noqa: PLE0604
     "Profile", "Recording", "Scheme", "Structure", "StudentT", "TruncatedNormal", "Uniform", "calibrate", "compare",
     "continue_periodic", "double_period", "emerging_cycle", "find_orbits", "hopf_points", "identifiability",
     "iterate_periodic", "load", "map_estimate", "models", "multiplier_sensitivities", "noise", "plot",
-    "polish_orbits", "predict", "prior_predictive", "profile", "sample", "select_orbits", "simulate", "smooth_abs",
-    "smooth_sign", "solutions_at", "solve_periodic", "structure",
+    "polish_orbits", "predict", "prior_predictive", "profile", "report", "sample", "select_orbits", "simulate",
+    "smooth_abs", "smooth_sign", "solutions_at", "solve_periodic", "structure",
 ]  # fmt: skip
 
 

@@ -3,6 +3,8 @@
 import json
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -36,22 +38,26 @@ class Result:
         """
         import h5py
 
-        target = Path(path)
         arrays: dict[str, Any] = {}
         trees: list[Any] = []
         header = json.dumps(_encode(self, arrays, trees))
-        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-        os.close(handle)
-        try:
+        with written_whole(path) as draft:
             if trees:
-                trees[0].to_netcdf(name, engine="h5netcdf")
-            with h5py.File(name, "a" if trees else "w") as file:
+                trees[0].to_netcdf(draft, engine="h5netcdf")
+            with h5py.File(draft, "a" if trees else "w") as file:
                 file.attrs[HEADER] = header
                 for key, values in arrays.items():
                     file.create_dataset(f"{ARRAYS}/{key}", data=values)
-            os.replace(name, target)
-        finally:
-            Path(name).unlink(missing_ok=True)
+
+
+@contextmanager
+def written_whole(path: str | Path) -> Iterator[Path]:
+    """Give a path to write to, whose file takes the place of `path` only when the block ends without an error."""
+    target = Path(path)
+    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
+        draft = Path(folder) / target.name
+        yield draft
+        os.replace(draft, target)
 
 
 def load(path: str | Path) -> Any:

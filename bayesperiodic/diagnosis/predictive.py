@@ -81,19 +81,27 @@ class Prediction(Bands):
         """The verdict on the model as a whole."""
         return str(self.table.loc[ALL, "verdict"])
 
+    @property
+    def findings(self) -> dict[str, str]:
+        """What the tests found, in words, by the rows of the table; without those that found nothing."""
+        found = {}
+        for (label, row), small in zip(self.table.iterrows(), adjusted_p(self.table) < LEVEL, strict=True):
+            said = [
+                f"{SAID[test]} (p = {row[test]:.2g})" for test, is_small in zip(TESTS, small, strict=True) if is_small
+            ]
+            if said:
+                share = row["model_error_share"]
+                error = "" if np.isnan(share) else f"; {share:.1%} of its variance is model error"
+                found[str(label)] = f"{', '.join(said)}{error}"
+        return found
+
     def __repr__(self) -> str:
         head = f"Prediction from {self.draws} draws, {self.failed} without a periodic solution: "
         if self.verdict == UNTESTED:
             head += "too few values to test the model."
         else:
             head += f"the model is {self.verdict} (all tests together give a false alarm in {LEVEL:.0%})."
-        lines = [head]
-        for (label, row), small in zip(self.table.iterrows(), adjusted_p(self.table) < LEVEL, strict=True):
-            said = [f"{SAID[test]} (p = {row[test]:.2g})" for test, found in zip(TESTS, small, strict=True) if found]
-            if said:
-                share = row["model_error_share"]
-                error = "" if np.isnan(share) else f"; {share:.1%} of its variance is model error"
-                lines.append(f"  {label}: {', '.join(said)}{error}")
+        lines = [head, *(f"  {label}: {text}" for label, text in self.findings.items())]
         lines += [self.note] if self.note else []
         lines += [repr(self.transient)] if self.transient else []
         return "\n".join([*lines, self.table.to_string(float_format="{:.2g}".format, na_rep="-")])

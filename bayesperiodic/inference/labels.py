@@ -84,6 +84,18 @@ def unit(group: xr.Dataset, name: str) -> str:
     return str(group[variable].attrs.get(key, ""))
 
 
+def squared(unit: str) -> str:
+    """Return the unit of a variance.
+
+    Examples
+    --------
+    >>> from bayesperiodic.inference.labels import squared
+    >>> squared("N"), squared("m/s")
+    ('N²', '(m/s)²')
+    """
+    return f"{unit}²" if unit.isalpha() else f"({unit})²"
+
+
 def is_noise(group: xr.Dataset, variable: str) -> bool:
     """Return whether a variable is one of the noise model's."""
     return NOISE in group[variable].attrs

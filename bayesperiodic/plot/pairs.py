@@ -121,16 +121,18 @@ def _corner_legend(figure: Figure, posterior: Posterior, laplace: bool, fontsize
     )
 
 
-def chosen(names: Sequence[str] | None, every: tuple[str, ...]) -> tuple[str, ...]:
+def chosen(names: Sequence[str] | None, every: tuple[str, ...], argument: str = "names") -> tuple[str, ...]:
     """Return the names to draw, checked."""
     if names is None:
         return every
     if isinstance(names, str) or not len(names):
-        raise ValueError(f"names: {names!r} is not allowed; it must be a sequence of names, such as [{every[0]!r}].")
+        raise ValueError(
+            f"{argument}: {names!r} is not allowed; it must be a sequence of names, such as [{every[0]!r}]."
+        )
     for name in names:
-        checks.one_of("names", name, every)
+        checks.one_of(argument, name, every)
     if len(set(names)) < len(names):
-        raise ValueError(f"names: {list(names)} is not allowed; a name is in it twice.")
+        raise ValueError(f"{argument}: {list(names)} is not allowed; a name is in it twice.")
     return tuple(names)
 
 

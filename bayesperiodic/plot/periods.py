@@ -1,5 +1,7 @@
 """Measured and fitted periods: over time, and as loops of an output against an input."""
 
+from collections.abc import Sequence
+
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
@@ -8,11 +10,17 @@ from bayesperiodic import checks, fourier
 from bayesperiodic.diagnosis.predictive import Prediction
 from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.problem import Problem
+from bayesperiodic.plot.pairs import chosen
 from bayesperiodic.plot.style import COLOURS, axis_label
 
 
 def fit(
-    problem: Problem, estimate: MapEstimate, prediction: Prediction | None = None, *, figure: Figure | None = None
+    problem: Problem,
+    estimate: MapEstimate,
+    prediction: Prediction | None = None,
+    *,
+    experiments: Sequence[str] | None = None,
+    figure: Figure | None = None,
 ) -> Figure:
     """Draw each measured mean period with the fitted one, a predictive band and the residual below.
 
@@ -21,12 +29,19 @@ def fit(
     problem : Problem
     estimate : MapEstimate
     prediction : Prediction, optional
+    experiments : sequence of str, optional
+        Names of those to draw; by default all.
     figure : Figure, optional
         An empty figure to draw into.
 
     Returns
     -------
     Figure
+
+    Raises
+    ------
+    ValueError
+        For an unknown name.
 
     Examples
     --------
@@ -41,7 +56,8 @@ def fit(
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['displacement [m]', 'residual [m]']
     """
-    shown = [(e, channel) for e in problem.experiments for channel in e.outputs]
+    runs = chosen(experiments, tuple(e.name for e in problem.experiments), "experiments")
+    shown = [(e, channel) for e in problem.experiments if e.name in runs for channel in e.outputs]
     figure = figure or plt.figure(figsize=(7.0, 4.6 * len(shown)), layout="constrained")
     grid = figure.add_gridspec(2 * len(shown), 1, height_ratios=[3, 1] * len(shown))
     for row, (e, channel) in enumerate(shown):
@@ -62,7 +78,7 @@ def fit(
         below.set_ylabel(axis_label("residual", unit))
         below.set_xlabel("time in the period [s]")
         top.tick_params(labelbottom=False)
-        top.set_title(e.name)
+        top.set_title(axis_label(e.name, ""))
         top.legend(frameon=False)
     return figure
 

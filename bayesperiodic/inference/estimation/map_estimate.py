@@ -1,7 +1,7 @@
 """The paper's Bayesian estimator: staged Gauss-Newton to the MAP point, and its Laplace covariance."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pandas as pd
@@ -126,7 +126,8 @@ def map_estimate(
         if end.objective > best.objective:
             best, status, history = end, other_status, other_history
     result = _describe(objective, best, status, history, tuple(found))
-    _warn(problem, result)
+    for text in remarks(problem, result):
+        warnings.warn(text, UserWarning, stacklevel=3)
     return result
 
 
@@ -225,10 +226,11 @@ def _inverse(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return inverse, np.any(np.abs(vectors[:, ~curved]) > LOST, axis=1)
 
 
-def _warn(problem: Problem, fit: MapEstimate) -> None:
+def remarks(problem: Problem, fit: MapEstimate) -> Iterator[str]:
+    """Give what must be said of an estimate: what it may not be trusted for, and what to do about it."""
     for channel, noise in fit.input_noise.items():
         if noise > NOISE_SHARE * fit.rms[channel]:
-            _say(
+            yield (
                 f"The noise of the measured inputs, differentiated, brings {noise:.3g} to {channel!r}, "
                 f"{noise / fit.rms[channel]:.0%} of the residual's {fit.rms[channel]:.3g}; keep fewer input harmonics "
                 "(fold(harmonics=…)) or measure the derivative."
@@ -236,27 +238,23 @@ def _warn(problem: Problem, fit: MapEstimate) -> None:
     shifts = {name: shift for name, shift in fit.doubling_shift.items() if abs(shift) > LARGEST_SHIFT}
     if shifts:
         worst = max(shifts, key=lambda name: abs(shifts[name]))
-        _say(
+        yield (
             f"Twice as many points would move {worst!r} by {shifts[worst]:.2g} of its standard deviation; take more "
             f"samples than {max(e.samples for e in problem.experiments)}, or a scheme of higher order."
         )
     for name in fit.at_ends:
         low, high = problem.joint_prior.supports[name]
-        _say(
+        yield (
             f"The estimate of {name!r}, {fit.theta[name]:.6g}, lies at the end of its prior's support ({low:g}, "
             f"{high:g}); standard deviations do not describe the posterior there. Sample it, or widen the prior."
         )
     if fit.undetermined:
         more = len(fit.undetermined) - SHOWN
         shown = "; or under ".join(fit.undetermined[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
-        _say(
+        yield (
             f"The data do not change under {shown}. What is said of these is the prior's; fix one of them, or report "
             "the combination that stays."
         )
-
-
-def _say(text: str) -> None:
-    warnings.warn(text, UserWarning, stacklevel=5)
 
 
 def _short(name: str) -> str:

@@ -7,7 +7,17 @@ import numpy as np
 import xarray as xr
 
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.inference.labels import CHAIN, CHANNEL, DRAW, EXPERIMENT, NOISE, full_name, local_names, pack
+from bayesperiodic.inference.labels import (
+    CHAIN,
+    CHANNEL,
+    DRAW,
+    EXPERIMENT,
+    NOISE,
+    full_name,
+    local_names,
+    pack,
+    squared,
+)
 from bayesperiodic.inference.noise.blocks import SCALE
 from bayesperiodic.inference.parameters import SHIFT
 from bayesperiodic.inference.problem import Problem
@@ -161,12 +171,8 @@ def _unit(problem: Problem, parameter: str) -> dict[str, str]:
 def _noise_attributes(problem: Problem, variable: str) -> dict[str, str]:
     """Return the noise model's name, and the unit of each channel's variance."""
     units = problem.model.units if variable == "variance" else {}
-    squared = {
-        f"units of {channel}": f"{units[channel]}²" if units[channel].isalpha() else f"({units[channel]})²"
-        for channel in problem.channels
-        if channel in units
-    }
-    return {NOISE: problem.noise.name} | squared
+    each = {f"units of {channel}": squared(units[channel]) for channel in problem.channels if channel in units}
+    return {NOISE: problem.noise.name} | each
 
 
 def _signals(problem: Problem, kind: str) -> xr.Dataset:

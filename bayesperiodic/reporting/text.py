@@ -1,0 +1,118 @@
+"""Numbers and units as they are read."""
+
+import re
+from dataclasses import dataclass
+from math import floor, isfinite, isinf, isnan, log10
+
+NOTHING = "–"
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+SMALLEST, LARGEST = 1e-3, 1e6
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits, powers of ten raised.
+
+    Examples
+    --------
+    >>> from bayesperiodic.reporting.text import number
+    >>> number(-0.5), number(1.2345e-9), number(float("nan"))
+    ('−0.5', '1.23×10⁻⁹', '–')
+    """
+    if isnan(value):
+        return NOTHING
+    if isinf(value):
+        return "∞" if value > 0 else "−∞"
+    mantissa, _, exponent = f"{value:.{digits}g}".partition("e")
+    return mantissa.replace("-", "−") + (power_of_ten(int(exponent)) if exponent else "")
+
+
+def power_of_ten(exponent: int) -> str:
+    """Return "×10⁻³" and the like."""
+    return f"×10{str(exponent).translate(RAISED)}"
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent, with three significant digits."""
+    return NOTHING if isnan(share) else f"{number(100.0 * share)}\u00a0%"
+
+
+def p_value(p: float) -> str:
+    """Return a p-value; what is below 10⁻³⁰⁰ is said to be so.
+
+    Examples
+    --------
+    >>> from bayesperiodic.reporting.text import p_value
+    >>> p_value(0.0), p_value(0.0312)
+    ('< 10⁻³⁰⁰', '0.031')
+    """
+    return "< 10⁻³⁰⁰" if p < 1e-300 else number(p, 2)
+
+
+def counted(what: str, count: int) -> str:
+    """Return a number of things in words."""
+    return f"{count} {what}{'s' if count != 1 else ''}"
+
+
+def sentence(words: str) -> str:
+    """Return words with a capital letter at their beginning."""
+    return words[:1].upper() + words[1:]
+
+
+def unit(text: str) -> str:
+    """Return a unit with its powers raised, on one line.
+
+    Examples
+    --------
+    >>> from bayesperiodic.reporting.text import unit
+    >>> unit("m/s^2"), unit("")
+    ('m/s²', '–')
+    """
+    return re.sub(r"\^(-?\d+)", lambda found: found[1].translate(RAISED), text).replace(" ", "\u00a0") or NOTHING
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """How the numbers of one quantity are rounded, so that all of them can be compared.
+
+    Attributes
+    ----------
+    exponent : int
+        Of the power of ten that is written behind.
+    decimals : int
+    """
+
+    exponent: int
+    decimals: int
+
+    @classmethod
+    def of(cls, value: float, sd: float) -> "Rounding":
+        """Return the rounding that shows three significant digits of the standard deviation.
+
+        Examples
+        --------
+        >>> from bayesperiodic.reporting.text import Rounding
+        >>> rounding = Rounding.of(768.123, 4.5678)
+        >>> rounding.text(768.123), rounding.text(-4.5678)
+        ('768.12', '−4.57')
+        >>> Rounding.of(5e-3, 2e-6).text(5e-3)
+        '5.00000×10⁻³'
+        """
+        known = [abs(x) for x in (value, sd) if isfinite(x) and x != 0.0]
+        if not known:
+            return cls(0, 3)
+        size, step = max(known), abs(sd) if isfinite(sd) and sd != 0.0 else 1e-2 * max(known)
+        exponent = 0 if 10.0 * SMALLEST <= size < LARGEST else floor(log10(size))
+        return cls(exponent, max(0, 2 - floor(log10(step)) + exponent))
+
+    def text(self, value: float) -> str:
+        """Return one number."""
+        if not isfinite(value):
+            return number(value)
+        shown = f"{value / 10.0**self.exponent:.{self.decimals}f}".replace("-", "−")
+        return shown + (power_of_ten(self.exponent) if self.exponent else "")
+
+    def interval(self, low: float, high: float) -> str:
+        """Return the two ends of an interval."""
+        if not isfinite(low) and not isfinite(high):
+            return NOTHING
+        return f"{self.text(low)} … {self.text(high)}"
