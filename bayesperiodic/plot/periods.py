@@ -1,12 +1,15 @@
 """Measured and fitted periods: over time, and as loops of an output against an input."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bayesperiodic import checks, fourier
+from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.diagnosis.predictive import Prediction
 from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.problem import Problem
@@ -63,16 +66,17 @@ def fit(
     for row, (e, channel) in enumerate(shown):
         top = figure.add_subplot(grid[2 * row])
         below = figure.add_subplot(grid[2 * row + 1], sharex=top)
-        predicted = e.outputs[channel] - estimate.residuals[e.name][channel]
+        residual = estimate.residuals[e.name][channel]
+        predicted = e.outputs[channel] - residual
         if prediction is not None:
-            band = f"{prediction.probability:.0%} predictive band"
             low, high = prediction.low[e.name][channel], prediction.high[e.name][channel]
-            top.fill_between(e.time, low, high, color=COLOURS["mcmc"], alpha=0.45, lw=0, label=band)
-            below.fill_between(e.time, low - predicted, high - predicted, color=COLOURS["mcmc"], alpha=0.45, lw=0)
-        top.plot(e.time, e.outputs[channel], color=COLOURS["measured"], lw=1.6, label=_measured(problem, e.cycles))
-        top.plot(e.time, predicted, color=COLOURS["map"], lw=1.2, ls="--", label="MAP")
-        below.plot(e.time, estimate.residuals[e.name][channel], color=COLOURS["measured"], lw=1.0)
-        below.axhline(0.0, color=COLOURS["map"], lw=1.0, ls="--")
+            _band(top, e, low, high, f"{prediction.probability:.0%} predictive band")
+            _band(below, e, low - predicted, high - predicted, None)
+        measured, fitted = {"color": COLOURS["measured"]}, {"color": COLOURS["map"], "ls": "--"}
+        _line(top, e, e.outputs[channel], "o", lw=1.6, label=_measured(problem, e.cycles), **measured)
+        _line(top, e, predicted, "x", lw=1.2, label="MAP", **fitted)
+        _line(below, e, residual, "o", lw=1.0, **measured)
+        below.axhline(0.0, lw=1.0, **fitted)
         unit = problem.model.units.get(channel, "")
         top.set_ylabel(axis_label(channel, unit))
         below.set_ylabel(axis_label("residual", unit))
@@ -81,6 +85,21 @@ def fit(
         top.set_title(axis_label(e.name, ""))
         top.legend(frameon=False)
     return figure
+
+
+def _line(axes: Axes, e: Experiment, values: np.ndarray, marker: str, **look: Any) -> None:
+    """Draw values over time; single points where only these were measured."""
+    if e.mask is None:
+        axes.plot(e.time, values, **look)
+    else:
+        axes.plot(e.time[e.mask], values[e.mask], **look | {"ls": "none", "marker": marker})
+
+
+def _band(axes: Axes, e: Experiment, low: np.ndarray, high: np.ndarray, label: str | None) -> None:
+    if e.mask is None:
+        axes.fill_between(e.time, low, high, color=COLOURS["mcmc"], alpha=0.45, lw=0, label=label)
+    else:
+        axes.vlines(e.time[e.mask], low[e.mask], high[e.mask], color=COLOURS["mcmc"], alpha=0.45, lw=8, label=label)
 
 
 def loops(

@@ -12,7 +12,7 @@ from bayesperiodic.diagnosis.comparison import Comparison
 from bayesperiodic.diagnosis.verdicts import END_SHIFT, ERRORS, FINE, LEVELS
 from bayesperiodic.plot.marginal import draw_marginal, panel_grid
 from bayesperiodic.plot.pairs import chosen
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, said_of, wrapped_label
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, said_of, wrapped_label
 
 # Those of several lines that mean nothing else.
 LOOKS = [(colour, style) for style in ("-", "-.") for colour in ENSEMBLES if colour not in COLOURS.values()]
@@ -101,7 +101,7 @@ def _quantiles(axes: Axes, comparison: Comparison, names: Sequence[str]) -> None
         up = (comparison.quantiles[name] - line["map"]) / line["sd"]
         if name in wrong:
             colour, style = LOOKS[int(np.flatnonzero(wrong == name)[0])]
-            axes.plot(across, up, color=colour, ls=style, lw=2.0, label=f"{name}: {line['verdict']}")
+            axes.plot(across, up, color=colour, ls=style, lw=2.0, label=axis_label(f"{name}: {line['verdict']}", ""))
         else:
             axes.plot(across, up, color="black", lw=0.8, label=unnamed)
     axes.set_xlim(-LIMIT, LIMIT)

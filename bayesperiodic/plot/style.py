@@ -36,5 +36,5 @@ def wrapped_label(name: str, unit: str) -> str:
 
 def axis_label(name: str, unit: str) -> str:
     """Return a name with its unit, as matplotlib shows it."""
-    text = name.replace("$", r"\$")
-    return f"{text} [{unit}]" if unit else text
+    text = f"{name} [{unit}]" if unit else name
+    return text.replace("$", r"\$")

@@ -1,0 +1,196 @@
+import os
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from tests.known import LINEAR, linear_experiment
+from tests.reporting.conftest import ATTACK, NAME
+from tests.reporting.reading import Page, value
+
+
+def test_estimates_are_those_of_fit_and_posterior(solved, page):
+    """All that is shown is rounded to a hundredth of a standard deviation, at least."""
+    _, fit, posterior = solved
+    rows, summary, intervals = page.rows("table-estimates"), posterior.summary(), fit.interval(0.9)
+    assert list(rows) == list(fit.theta)
+    for name, (unit, at, sd, interval, robust, mean, spread, drawn) in rows.items():
+        assert unit == LINEAR.units[name]
+        low, high = interval.split(" … ")
+        shown = [value(cell) for cell in (at, sd, low, high, robust, mean, spread, *drawn.split(" … "))]
+        found = summary.loc[name]
+        expected = [fit.theta[name], fit.sd[name], *intervals[name], fit.robust_sd[name], *found[["mean", "sd"]]]
+        assert shown == pytest.approx([*expected, *found[["q05", "q95"]]], abs=0.006 * fit.sd[name])
+    unit, independent, at, _, mean, spread, _ = page.rows("table-noise")["variance[force]"]
+    assert (unit, independent) == ("N²", "40")
+    assert value(at) == pytest.approx(fit.noise["variance[force]"], rel=0.01)
+    assert [value(mean), value(spread)] == pytest.approx(list(summary.loc["variance[force]"][["mean", "sd"]]), rel=0.01)
+
+
+def test_data_residual_and_draws_are_told_in_numbers(solved, page):
+    problem, fit, posterior = solved
+    (run,) = problem.experiments
+    assert page.rows("table-experiments") == {"run": ["measured", "2", "–", "1", "1", "40", "1"]}
+    channels = page.rows("table-channels")
+    assert channels["x"][:5] == ["run", "input", "m", "−0.05", "0.05"]
+    assert value(channels["force"][4]) == pytest.approx(run.outputs["force"].max(), rel=1e-3)
+    residual = page.rows("table-residuals")["force"]
+    assert value(residual[1]) == pytest.approx(fit.rms["force"], rel=0.005)
+    assert value(residual[2].removesuffix(" %")) == pytest.approx(100 * fit.fvu["force"], rel=0.005)
+    assert value(residual[6]) == pytest.approx(fit.whiteness["force"].p, rel=0.05)
+    for name, (size, tau, rhat) in page.rows("table-sampling").items():
+        assert float(size) == pytest.approx(posterior.ess[name], abs=0.5)
+        assert [float(tau), float(rhat)] == pytest.approx([posterior.tau[name], posterior.rhat[name]], rel=0.005)
+
+
+def test_verdicts_are_told_in_words(solved, scored, page):
+    problem, fit, posterior = solved
+    found = bp.identifiability(problem, fit, posterior, profile=False)
+    for name, cells in page.rows("table-identifiability").items():
+        assert cells == [f"✓ {found.table.loc[name, 'verdict']}", found.table.loc[name, "evidence"], "–"]
+    verdicts = {name: cells[0].split(" ", 1)[1] for name, cells in page.rows("table-laplace").items()}
+    assert verdicts == scored.table["verdict"].to_dict()
+    assert page.rows("table-adequacy")["all"][0] == "✓ adequate"
+    answers = page.text[page.text.index("In short") : page.text.index("Data Experiments")]
+    for words in ("3 of 3", "No test contradicts the model", "Every free parameter is determined by the data"):
+        assert words in answers
+
+
+def test_settings_seed_and_versions_are_kept(solved, page):
+    settings, versions = page.rows("table-settings"), page.rows("table-versions")
+    assert settings["Seed"] == [str(solved[2].seed)]
+    assert settings["Difference scheme"] == ["central2"]
+    assert "4 ensembles, 32 chains each" in settings["Draws"][0]
+    assert versions["numpy"] == [np.__version__]
+
+
+def test_verdicts_that_are_given_are_not_computed_again(solved, scored, tmp_path, monkeypatch):
+    problem, fit, posterior = solved
+    found, predicted = bp.identifiability(problem, fit, profile=False), bp.predict(problem, posterior, draws=20)
+    for name in ("compare", "identifiability", "predict"):
+        monkeypatch.setattr(f"bayesperiodic.reporting.evidence.{name}", None)
+    given = {"comparison": replace(scored, coordinates="sampling"), "identifiability": found, "prediction": predicted}
+    written = Page(bp.report(problem, fit, posterior, tmp_path / "r.html", **given).read_text(encoding="utf-8"))
+    assert "Laplace against MCMC in sampling coordinates" in written.text
+
+
+def test_a_fit_alone_has_no_draws_and_says_so(solved, tmp_path):
+    problem, fit, _ = solved
+    written = Page(bp.report(problem, fit, None, tmp_path / "r.html").read_text(encoding="utf-8"))
+    assert len(written.rows("table-estimates")["k"]) == 5
+    assert "There are no draws (MCMC)" in written.text and "table-sampling" not in written.tables
+    assert {e.attributes["id"] for e in written.all("figure")} == {"figure-fit-1", "figure-loops"}
+
+
+def test_a_prediction_that_fails_is_told(solved, scored, tmp_path, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("posterior: none of its draws has a periodic solution.")
+
+    monkeypatch.setattr("bayesperiodic.reporting.evidence.predict", fail)
+    written = Page(bp.report(*solved, tmp_path / "r.html", comparison=scored).read_text(encoding="utf-8"))
+    assert written.text.count("none of its draws has a periodic solution") == 2
+
+
+def test_a_fit_that_cannot_be_trusted_is_said_to_be_so(solved, tmp_path):
+    """Synthetic data, a search that stalled, an estimate at its end, a residual that is not white."""
+    problem, fit, _ = solved
+    problem = problem.with_experiments([replace(problem.experiments[0], synthetic=True)])
+    white = {"force": replace(fit.whiteness["force"], p=1e-5)}
+    wider = {name: 3.0 * sd for name, sd in fit.sd.items()}
+    fit = replace(fit, status="stalled", at_ends=("k",), whiteness=white, robust_sd=wider)
+    text = Page(bp.report(problem, fit, None, tmp_path / "r.html").read_text(encoding="utf-8")).text
+    for words in ("! synthetic data", "✕ stalled", "lies at the end of its prior's support", "3 times as large (k)"):
+        assert words in text
+    assert "robust 90 % interval" in text
+
+
+def test_single_points_are_told_as_such(solved, tmp_path):
+    problem, _, _ = solved
+    run = problem.experiments[0]
+    masked = replace(run, mask=np.arange(40) % 4 == 1, independent={})
+    problem = problem.with_experiments([masked])
+    written = bp.report(problem, bp.map_estimate(problem, progress=False), None, tmp_path / "r.html")
+    assert Page(written.read_text(encoding="utf-8")).rows("table-channels")["force"][1] == "output, at 10 points"
+
+
+def test_no_text_becomes_markup(hostile):
+    source = hostile.read_text(encoding="utf-8")
+    page = Page(source)
+    assert not page.all("script", "b", "iframe", "object", "link", "base")
+    assert all(e.attributes["src"].startswith("data:image/svg+xml;base64,") for e in page.all("img"))
+    assert not [name for e in page.elements for name in e.attributes if name.startswith("on")]
+    assert [e.text for e in page.all("h1")] == [ATTACK]
+    assert ATTACK in next(e.text for e in page.all("title"))
+    assert f"k[{NAME} again]" in page.rows("table-estimates")
+    assert page.rows("table-channels")["force"][2] == "<b>N</b>"
+    assert "NOT CONVERGED" in page.text
+
+
+def test_nothing_is_fetched(written, hostile):
+    for path in (written, hostile):
+        source = path.read_text(encoding="utf-8")
+        page = Page(source)
+        sources = [
+            e.attributes[a] for e in page.elements for a in ("src", "srcset", "data", "poster") if a in e.attributes
+        ]
+        assert sources and all(s.startswith("data:") for s in sources)
+        assert all(e.attributes["href"].startswith("#") for e in page.all("a"))
+        assert not re.search(r"@import|url\(", source)
+
+
+def test_equations_are_typeset_and_symbols_match(page):
+    equations = [e for e in page.all("math") if e.attributes.get("display") == "block"]
+    assert [e.text for e in equations] == ["w˙+w=x", "force=c\u2062x˙+coulomb\u2062tanh(10\u2062x˙)+k\u2062x"]
+    assert page.rows("table-parameters")["coulomb"][:3] == ["coulomb", "N", "free"]
+
+
+def test_headings_are_in_order_and_links_lead_somewhere(page):
+    levels = [int(e.tag[1]) for e in page.all("h1", "h2", "h3", "h4")]
+    assert levels[0] == 1 and levels.count(1) == 1
+    assert all(after - before <= 1 for before, after in zip(levels, levels[1:], strict=False))
+    ids = [e.attributes["id"] for e in page.elements if "id" in e.attributes]
+    assert len(set(ids)) == len(ids)
+    targets = [e.attributes["href"][1:] for e in page.all("a")]
+    targets += [label for e in page.elements for label in e.attributes.get("aria-labelledby", "").split()]
+    assert set(targets) <= set(ids)
+
+
+def test_who_cannot_see_is_told_what_there_is(solved, page):
+    (html,) = page.all("html")
+    assert html.attributes["lang"] == "en"
+    assert {e.tag for e in page.elements} >= {"title", "header", "nav", "main", "footer"}
+    alts = [e.attributes["alt"] for e in page.all("img")]
+    assert len(set(alts)) == len(alts) == 5 and min(map(len, alts)) > 60
+    strongest = f"{solved[1].rms['force']:.3g}"
+    assert any(f"root mean square is {strongest} N" in alt for alt in alts)
+    assert all(e.attributes.get("scope") in ("row", "col", "colgroup") for e in page.all("th"))
+    assert all(len({cell.tag for cell in row[1:]} - {"th", "td"}) == 0 for rows in page.tables.values() for row in rows)
+
+
+def test_a_write_that_fails_leaves_the_old_page(solved, tmp_path, monkeypatch):
+    problem, fit, _ = solved
+    target = tmp_path / "report.html"
+    target.write_text("old")
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        bp.report(problem, fit, None, target)
+    assert target.read_text() == "old" and os.listdir(tmp_path) == ["report.html"]
+
+
+def test_what_belongs_to_another_problem_is_refused(solved, tmp_path):
+    problem, fit, posterior = solved
+    other = problem.with_experiments([linear_experiment(np.array([900.0, 40.0, 25.0]), 3.0, seed=2)])
+    path = tmp_path / "report.html"
+    with pytest.raises(ValueError, match="posterior: it is not allowed; it is of other parameters or data"):
+        bp.report(other, fit, posterior, path)
+    with pytest.raises(ValueError, match="fit: missing 'k'"):
+        bp.report(problem, replace(fit, theta={}), None, path)
+    with pytest.raises(FileNotFoundError, match="path: .* there is no folder"):
+        bp.report(problem, fit, None, tmp_path / "nowhere" / "report.html")
+    assert not os.listdir(tmp_path)
