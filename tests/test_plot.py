@@ -22,6 +22,25 @@ def test_fit_shows_units_the_band_and_the_residual(solved):
     assert legend == ["90% predictive band", "measured, mean of 1 cycles", "MAP"]
 
 
+def test_fit_draws_the_experiments_asked_for_and_single_points_as_such(solved):
+    problem, fit, _ = solved
+    run = problem.experiments[0]
+    mask = np.arange(40) % 4 == 1
+    both = problem.with_experiments([run, replace(run, name="$x^$", mask=mask, independent={})])
+    fit = replace(fit, residuals={e.name: fit.residuals["run"] for e in both.experiments})
+    assert len(bp.plot.fit(both, fit).axes) == 4
+    top, below = bp.plot.fit(both, fit, experiments=["$x^$"]).axes
+    assert top.get_title() == r"\$x^\$"
+    top.figure.canvas.draw()
+    for line, values in ((top.lines[0], run.outputs["force"]), (below.lines[0], fit.residuals["run"]["force"])):
+        assert (line.get_linestyle(), line.get_marker()) == ("None", "o")
+        assert np.array_equal(line.get_xydata(), np.stack([run.time, values], axis=-1)[mask])
+    points = bp.plot.loops(both, fit).axes[0].lines[2]
+    assert np.array_equal(points.get_xydata(), np.stack([run.inputs["x"], run.outputs["force"]], axis=-1)[mask])
+    with pytest.raises(ValueError, match="experiments: 'walk' is not known"):
+        bp.plot.fit(problem, fit, experiments=["walk"])
+
+
 def test_loops_are_closed_and_against_displacement_and_velocity(solved):
     problem, fit, _ = solved
     figure = bp.plot.loops(problem, fit)

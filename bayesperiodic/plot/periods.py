@@ -71,8 +71,9 @@ def fit(
         if prediction is not None:
             low, high = prediction.low[e.name][channel], prediction.high[e.name][channel]
             _band(top, e, low, high, f"{prediction.probability:.0%} predictive band")
-            _band(below, e, low - predicted, high - predicted, None)
-        measured, fitted = {"color": COLOURS["measured"]}, {"color": COLOURS["map"], "ls": "--"}
+            _band(below, e, low - predicted, high - predicted, "_")
+        measured: dict[str, Any] = {"color": COLOURS["measured"]}
+        fitted: dict[str, Any] = {"color": COLOURS["map"], "ls": "--"}
         _line(top, e, e.outputs[channel], "o", lw=1.6, label=_measured(problem, e.cycles), **measured)
         _line(top, e, predicted, "x", lw=1.2, label="MAP", **fitted)
         _line(below, e, residual, "o", lw=1.0, **measured)
@@ -95,7 +96,7 @@ def _line(axes: Axes, e: Experiment, values: np.ndarray, marker: str, **look: An
         axes.plot(e.time[e.mask], values[e.mask], **look | {"ls": "none", "marker": marker})
 
 
-def _band(axes: Axes, e: Experiment, low: np.ndarray, high: np.ndarray, label: str | None) -> None:
+def _band(axes: Axes, e: Experiment, low: np.ndarray, high: np.ndarray, label: str) -> None:
     if e.mask is None:
         axes.fill_between(e.time, low, high, color=COLOURS["mcmc"], alpha=0.45, lw=0, label=label)
     else:
@@ -155,27 +156,24 @@ def loops(
         rate = fourier.on_grid(fourier.derivative(amplitudes, e.frequency / e.periods), measured.size)
         for axes, across in ((left, e.inputs[input]), (right, rate)):
             first = number == 0
-            axes.plot(
-                _closed(across),
-                _closed(measured),
-                color=COLOURS["measured"],
-                lw=1.6,
-                label=_measured(problem, e.cycles) if first else None,
-            )
-            axes.plot(
-                _closed(across),
-                _closed(predicted),
-                color=COLOURS["map"],
-                lw=1.2,
-                ls="--",
-                label="MAP" if first else None,
-            )
+            label = _measured(problem, e.cycles) if first else None
+            _loop(axes, e, across, measured, "o", color=COLOURS["measured"], lw=1.6, label=label)
+            label = "MAP" if first else None
+            _loop(axes, e, across, predicted, "x", color=COLOURS["map"], lw=1.2, ls="--", label=label)
     unit = problem.model.units.get(input, "")
     left.set_xlabel(axis_label(input, unit))
     right.set_xlabel(axis_label(f"rate of {input}", f"{unit}/s" if unit else ""))
     left.set_ylabel(axis_label(output, problem.model.units.get(output, "")))
     left.legend(frameon=False)
     return figure
+
+
+def _loop(axes: Axes, e: Experiment, across: np.ndarray, values: np.ndarray, marker: str, **look: Any) -> None:
+    """Draw a closed curve; single points where only these were measured."""
+    if e.mask is None:
+        axes.plot(_closed(across), _closed(values), **look)
+    else:
+        axes.plot(across[e.mask], values[e.mask], **look | {"ls": "none", "marker": marker})
 
 
 def _closed(values: np.ndarray) -> np.ndarray:

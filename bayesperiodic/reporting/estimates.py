@@ -46,9 +46,9 @@ def _parameters(evidence: Evidence) -> Table:
                 code(name),
                 evidence.unit(name),
                 rounding.text(value),
-                rounding.text(fit.sd[name]),
+                rounding.sd(fit.sd[name]),
                 rounding.interval(*intervals[name]),
-                rounding.text(fit.robust_sd[name]),
+                rounding.sd(fit.robust_sd[name]),
                 *mcmc_cells(evidence, name, rounding),
             )
         )
@@ -102,4 +102,4 @@ def mcmc_cells(evidence: Evidence, name: str, rounding: text.Rounding) -> tuple[
         return (text.NOTHING,) * 3
     draws = evidence.posterior.draws(name)
     low, high = np.quantile(draws, [0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY])
-    return rounding.text(draws.mean()), rounding.text(draws.std(ddof=1)), rounding.interval(low, high)
+    return rounding.text(draws.mean()), rounding.sd(draws.std(ddof=1)), rounding.interval(low, high)

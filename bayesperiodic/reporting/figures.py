@@ -54,7 +54,7 @@ def loops(evidence: Evidence) -> Figure:
         "figure-loops",
         embedded(plot.loops(problem, evidence.fit), "loops"),
         f"Closed curves of {what}, measured and fitted, for {len(problem.experiments)} experiments.",
-        f"{text.sentence(what)}, measured and fitted.",
+        f"Measured and fitted: {what}.",
         wide=True,
     )
 

@@ -28,21 +28,19 @@ def section(evidence: Evidence) -> Section:
 
 
 def too_sure(evidence: Evidence) -> str:
-    """Return what a residual that is not white does to the standard deviations; nothing if all are white."""
+    """Return by how much standard deviations are too small where a residual is not white; nothing if they are not."""
     fit = evidence.fit
     colours = [channel for channel, white in fit.whiteness.items() if white.p < NOT_WHITE]
     ratios = {name: fit.robust_sd[name] / sd for name, sd in fit.sd.items() if sd > 0.0}
     wider = {name: ratio for name, ratio in ratios.items() if np.isfinite(ratio) and ratio > MUCH}
-    if not colours:
+    if not colours or not wider:
         return ""
-    said = f"The residual of {', '.join(colours)} is not white: neighbouring values repeat each other."
-    if wider:
-        worst = max(wider, key=lambda name: wider[name])
-        said += (
-            f" So the standard deviations of {', '.join(wider)} are too small; the robust ones are up to "
-            f"{text.number(wider[worst], 2)} times as large ({worst})."
-        )
-    return said
+    worst = max(wider, key=lambda name: wider[name])
+    return (
+        f"The residual of {', '.join(colours)} is not white, so the standard deviations and intervals of "
+        f"{', '.join(wider)} are too small; the robust ones are up to {text.number(wider[worst], 2)} times as large "
+        f"({worst})."
+    )
 
 
 def _channels(evidence: Evidence) -> Table:

@@ -15,7 +15,7 @@ def section(posterior: Posterior) -> Section:
     failed = ", ".join(f"{status} {text.percent(share)}" for status, share in posterior.failures.items() if share)
     blocks.append(
         Paragraph(
-            f"{text.sentence(posterior.reason)}; {posterior.log_posterior_calls} evaluations of the "
+            f"Stopped: {posterior.reason}; {posterior.log_posterior_calls} evaluations of the "
             f"posterior, {text.percent(posterior.acceptance)} of the proposals accepted. Periodic solves that failed, "
             f"of all proposals: {failed or 'none'}."
         )

@@ -59,7 +59,7 @@ def _draws(evidence: Evidence) -> Answer:
     return Answer(
         question,
         Badge(GOOD, "converged") if posterior.converged else Badge(BAD, "not converged"),
-        f"{text.sentence(posterior.reason)}; at least {min(posterior.ess.values()):.0f} effective draws, R-hat at most "
+        f"Stopped: {posterior.reason}; at least {min(posterior.ess.values()):.0f} effective draws, R-hat at most "
         f"{max(posterior.rhat.values()):.4f}, {text.percent(failed) if failed else 'none'} of the proposals failed.",
     )
 

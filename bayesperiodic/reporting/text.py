@@ -53,11 +53,6 @@ def counted(what: str, count: int) -> str:
     return f"{count} {what}{'s' if count != 1 else ''}"
 
 
-def sentence(words: str) -> str:
-    """Return words with a capital letter at their beginning."""
-    return words[:1].upper() + words[1:]
-
-
 def unit(text: str) -> str:
     """Return a unit with its powers raised, on one line.
 
@@ -111,8 +106,21 @@ class Rounding:
         shown = f"{value / 10.0**self.exponent:.{self.decimals}f}".replace("-", "−")
         return shown + (power_of_ten(self.exponent) if self.exponent else "")
 
+    def sd(self, value: float) -> str:
+        """Return a standard deviation; beside numbers with a power of ten it has its own."""
+        return number(value) if self.exponent else self.text(value)
+
     def interval(self, low: float, high: float) -> str:
-        """Return the two ends of an interval."""
-        if not isfinite(low) and not isfinite(high):
+        """Return the two ends of an interval.
+
+        Examples
+        --------
+        >>> from bayesperiodic.reporting.text import Rounding
+        >>> Rounding(-3, 1).interval(4e-3, 5.1e-3), Rounding(0, 1).interval(-1.0, 2.0)
+        ('(4.0 … 5.1)×10⁻³', '−1.0 … 2.0')
+        """
+        if not isfinite(low) or not isfinite(high):
             return NOTHING
-        return f"{self.text(low)} … {self.text(high)}"
+        plain = Rounding(0, self.decimals)
+        ends = f"{plain.text(low / 10.0**self.exponent)} … {plain.text(high / 10.0**self.exponent)}"
+        return f"({ends}){power_of_ten(self.exponent)}" if self.exponent else ends
