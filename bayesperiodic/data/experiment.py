@@ -112,7 +112,7 @@ class Experiment(Result):
     def __post_init__(self) -> None:
         if not self.name or any(c in self.name for c in "/[]"):
             raise ValueError(f"name: {self.name!r} is not allowed; any other text without '/', '[' and ']' is.")
-        checks.positive("frequency", self.frequency)
+        object.__setattr__(self, "frequency", checks.positive("frequency", self.frequency))
         points = checks.integer("samples", self.samples, 4) * checks.integer("periods", self.periods, 1)
         if self.mask is not None:
             object.__setattr__(self, "mask", _checked_mask(self.mask, points))

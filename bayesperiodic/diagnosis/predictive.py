@@ -148,8 +148,8 @@ def predict(
     Raises
     ------
     ValueError
-        For too few draws, an `experiment` that is needed and not given, or without `run`, recordings that differ in
-        their times or outputs.
+        For too few draws, a posterior of another problem, an `experiment` that is needed and not given, or without
+        `run`, recordings that differ in their times or outputs.
     RuntimeError
         If no draw, or not the one with the highest density, has a periodic solution, or no run succeeds.
 
@@ -177,6 +177,8 @@ def predict(
     count = checks.integer("draws", draws, 20)
     if experiment is not None and run is None:
         raise ValueError(f"experiment: {experiment!r} is not allowed without run, whose parameters it chooses.")
+    for name in (*problem.names, *problem.free_noise):
+        checks.one_of("posterior", name, posterior.names)
     columns = {name: posterior.draws(name) for name in posterior.names}
     chosen = np.linspace(0, next(iter(columns.values())).size - 1, count).astype(int)
     best = int(np.argmax(posterior.data["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()))

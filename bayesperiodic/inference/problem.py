@@ -718,6 +718,8 @@ def _constant(name: str, given: Any, runs: list[str], local: bool) -> dict[str, 
 
 
 def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tuple[Experiment, ...]:
+    if isinstance(experiments, Experiment):
+        raise ValueError(f"experiments: {experiments.name!r} alone is not allowed; give a list of one, [experiment].")
     result = tuple(experiments)
     if not result:
         raise ValueError("experiments: () is not allowed; at least one experiment is needed.")

@@ -56,6 +56,13 @@ def test_too_few_draws_are_refused(solved):
         bp.predict(problem, posterior, draws=5)
 
 
+def test_draws_of_another_problem_are_refused(solved):
+    problem, _, posterior = solved
+    other = bp.Problem(PRODUCT, [replace(problem.experiments[0])], priors={n: bp.Normal(1.0, 1.0) for n in "ab"})
+    with pytest.raises(ValueError, match="posterior: 'a' is not known"):
+        bp.predict(other, posterior)
+
+
 def test_draws_that_have_not_converged_are_told(solved):
     problem, _, posterior = solved
     assert bp.predict(problem, posterior, draws=20).note == ""

@@ -287,3 +287,21 @@ def test_start_outside_a_joint_block_is_named(experiment):
         bp.map_estimate(problem, start={"k": 800.0, "c": 30.0, "coulomb": -1.0})
     with pytest.raises(ValueError, match=r"start: c = 30, k = inf is not allowed; the log-posterior is not finite"):
         bp.map_estimate(problem, start={"k": np.inf, "c": 30.0, "coulomb": 1.0})
+
+
+def test_an_experiment_that_is_not_in_a_list_is_refused():
+    experiment = linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)
+    with pytest.raises(ValueError, match=r"experiments: '.*' alone is not allowed; give a list of one, \[experiment\]"):
+        bp.Problem(LINEAR, experiment, priors={"k": bp.Normal(900.0, 1e5)}, fixed={"c": 40.0, "coulomb": 25.0})
+
+
+def test_a_problem_of_a_saved_experiment_is_the_same(tmp_path):
+    """So that a checkpoint goes on with an experiment that was loaded."""
+    time = np.arange(400) / 40
+    run = bp.Recording.from_arrays(time, {"displacement": np.sin(6 * time)}, {"force": np.cos(6 * time)}).fold(32)
+    run.save(tmp_path / "run.h5")
+    problems = [
+        bp.Problem(bp.models.duffing, [e], priors={"c": bp.LogNormal(0.2, 0.5)}, fixed={"m": 1, "k": 1, "k3": 0.5})
+        for e in (run, bp.load(tmp_path / "run.h5"))
+    ]
+    assert fingerprint(problems[0]) == fingerprint(problems[1])
