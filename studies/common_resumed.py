@@ -1,18 +1,22 @@
-"""Many tasks on all cores whose results are kept one by one in a file."""
+"""Long runs that go on where they were ended: results of tasks, line by line in a file, and parts of a study."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import cloudpickle
 
 from bayesperiodic import resumed as kept
 
 Task = tuple[Any, ...]
 Line = dict[str, Any]
+Part = TypeVar("Part")
 
 
 def resumed(
@@ -38,6 +42,28 @@ def resumed(
 
 def _do(work: Callable[[Task], Line], task: Task) -> Line:
     return work(task)
+
+
+def remembered(path: Path, source: str, make: Callable[[], Part]) -> Part:
+    """Return a part of a study from the file of an earlier run, or make it and keep it there.
+
+    Parameters
+    ----------
+    path : Path
+    source : str
+        Tells parts of another version, or with other settings, apart.
+    make : callable
+    """
+    if path.is_file():
+        saved, part = pickle.loads(path.read_bytes())
+        if saved == source:
+            return part
+    part = make()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".unfinished")
+    unfinished.write_bytes(cloudpickle.dumps((source, part)))
+    unfinished.replace(path)
+    return part
 
 
 def workers() -> ProcessPoolExecutor:

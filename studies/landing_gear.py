@@ -8,23 +8,30 @@ effects that it lacks (truth B). Is a negative theta16 what the data cannot tell
 from __future__ import annotations
 
 import argparse
+import shutil
 from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import bayesperiodic as bp
 from studies import (
     common,
+    common_resumed,
     landing_gear_campaigns,
     landing_gear_cost,
     landing_gear_drop,
     landing_gear_figures,
     landing_gear_force,
+    landing_gear_identification,
     landing_gear_joint,
     landing_gear_quality,
     landing_gear_repair,
     landing_gear_results,
+    landing_gear_rig,
     landing_gear_sensitivity,
     landing_gear_slope,
+    landing_gear_truth,
     landing_gear_verdicts,
 )
 from studies.landing_gear_identification import DISPLACEMENT, FORCE, PRIORS, Identified, draw, estimate, fold
@@ -33,6 +40,8 @@ from studies.landing_gear_rig import RUNS, Run, measure
 from studies.landing_gear_truth import TRUTHS
 from studies.landing_gear_verdicts import Verdict, judge
 
+# What each truth led to is kept here until the study ends.
+PARTS = "parts"
 LARGE, SMALL, FIGURE_1 = "0.2 Hz 80 mm", "3 Hz 4 mm", "1 Hz 18 mm"
 QUICK = tuple(run for run in RUNS if run.name in (FIGURE_1, SMALL))
 DROPS, QUICK_DROPS = 200, 20
@@ -53,7 +62,9 @@ def run(options: argparse.Namespace) -> None:
     every: dict[str, OfTruth] = {}
     results: dict[str, Any] = {}
     for truth in truths:
-        every[truth] = _of_truth(truth, runs, options, watch)
+        path, source = options.out / PARTS / f"{truth}.pkl", _source(options, truth)
+        every[truth], seconds = common_resumed.remembered(path, source, partial(_of_truth, truth, runs, options))
+        watch.seconds |= seconds
         results[truth] = landing_gear_results.collect(runs, every[truth])
         print(landing_gear_results.account(truth, results[truth]))
     if "A" in every:
@@ -65,11 +76,23 @@ def run(options: argparse.Namespace) -> None:
     results |= {"study": {"synthetic": True, "seed": options.seed, "quick": options.quick}}
     results |= {"seconds": watch.total(), "versions": common.versions()}
     path = common.write_results(options.out, results)
+    shutil.rmtree(options.out / PARTS, ignore_errors=True)
     print(f"figures (synthetic data): {', '.join(map(str, paths))}\nresults: {path}")
 
 
-def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace, watch: common.Stopwatch) -> OfTruth:
-    seed, quick = options.seed, options.quick
+def _source(options: argparse.Namespace, truth: str) -> str:
+    """Return what tells kept posteriors of another version, or with other settings, apart."""
+    modules = (
+        landing_gear_drop, landing_gear_force, landing_gear_identification, landing_gear_joint, landing_gear_results,
+        landing_gear_rig, landing_gear_sensitivity, landing_gear_truth, landing_gear_verdicts,
+    )  # fmt: skip
+    files = [common.sha256(Path(str(module.__file__))) for module in modules]
+    return " ".join([common.versions()["bayesperiodic"], truth, str(options.seed), str(options.quick), *files])
+
+
+def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace) -> tuple[OfTruth, dict[str, float]]:
+    """Return everything that one truth leads to, and the seconds of its parts."""
+    seed, quick, watch = options.seed, options.quick, common.Stopwatch()
     with watch.part(f"rig {truth}", f"truth {truth}: simulating and recording {len(runs)} experiments"):
         recordings = {r.name: measure(r, TRUTHS[truth], seed) for r in runs}
     with watch.part(f"posteriors {truth}", f"truth {truth}: displacement given, one posterior an experiment"):
@@ -88,7 +111,7 @@ def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace, watc
     with watch.part(f"drop {truth}", f"truth {truth}: the drop test, predicted from all experiments"):
         gear = landing_gear_drop.identify(recordings.values(), seed, quick=quick)
         dropped = landing_gear_drop.predict(gear, TRUTHS[truth], QUICK_DROPS if quick else DROPS)
-    return OfTruth(recordings, verdicts, joint, sensitivity, exact, forced, dropped)
+    return OfTruth(recordings, verdicts, joint, sensitivity, exact, forced, dropped), watch.seconds
 
 
 def _cost(joint: Mapping[str, Identified], options: argparse.Namespace, watch: common.Stopwatch) -> dict[str, Any]:

@@ -114,6 +114,12 @@ class Gear:
         """Steady state at the start of a cycle, and outputs of a cycle, of every draw, by the finest integration."""
         return [self._exact(parameters) for parameters in self.parameters]
 
+    @property
+    def steady(self) -> bool:
+        """Whether the finest integration becomes steady at every draw."""
+        integrate = self.integrator(CONTROLLED, *FINEST)
+        return all(integrate(parameters, self.still(parameters))[1] for parameters in self.parameters)
+
     def _exact(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         path, cycles = self.integrator(CONTROLLED, *FINEST)(parameters, self.still(parameters))
         if not cycles:

@@ -25,7 +25,7 @@ from studies.landing_gear_contenders import (
     error,
 )
 from studies.landing_gear_identification import DISPLACEMENT, FORCE, SAMPLES, Identified
-from studies.landing_gear_integrators import NAMES
+from studies.landing_gear_integrators import MAX_CYCLES, NAMES
 from studies.landing_gear_verdicts import CONDUCTION
 
 DRAWS, QUICK_DRAWS = 10, 2
@@ -40,9 +40,13 @@ TIMED_CYCLES = 3
 
 def measure(drive: str, identified: Identified, seed: int, *, quick: bool) -> dict[str, Any]:
     """Return times and their ratios for one direction, from the joint posterior of all experiments."""
-    theta, left_out = draws(identified, QUICK_DRAWS if quick else DRAWS, seed)
     fit = identified.fit
     warm = identified.problem.anchored(fit.theta)
+
+    def steady(theta: np.ndarray) -> bool:
+        return all(_gear(drive, experiment, identified, theta).steady for experiment in warm.experiments)
+
+    theta, left_out = draws(identified, QUICK_DRAWS if quick else DRAWS, seed, steady)
     gears = [_gear(drive, experiment, identified, theta) for experiment in warm.experiments]
     own = _own_errors(warm, theta, gears)
     chosen = [{k: choose(gear, k, allowed) for k in COMPILED} for gear, allowed in zip(gears, own, strict=True)]
@@ -68,17 +72,35 @@ def _settings(found: Contender) -> dict[str, float]:
     return {name: getattr(found, name) for name in ("fineness", "tolerance", "error", "cycles")}
 
 
-def draws(identified: Identified, count: int, seed: int) -> tuple[np.ndarray, dict[str, int]]:
-    """Return draws (count, names) with every theta16 positive, and of how many draws how many have one that is not.
+def draws(
+    identified: Identified, count: int, seed: int, steady: Callable[[np.ndarray], bool]
+) -> tuple[np.ndarray, dict[str, int]]:
+    """Return draws (count, names) from which time integration becomes steady, and how many were left out.
 
-    At theta16 ≤ 0 the gas has no steady state that an integration could reach.
+    At theta16 ≤ 0 the gas has no steady state that an integration could reach. Of those with every theta16 positive
+    some need more cycles than anybody would wait for.
+
+    Parameters
+    ----------
+    identified : Identified
+    count, seed : int
+    steady : callable
+        Of a draw (1, names).
     """
     posterior, names = identified.posterior, identified.problem.names
     assert posterior is not None
     every = np.stack([posterior.draws(name) for name in names], axis=-1)
     able = (every[:, [name.startswith(CONDUCTION) for name in names]] > 0.0).all(axis=1)
-    picked = np.random.default_rng(seed).choice(np.flatnonzero(able), count, replace=False)
-    return every[picked], {"not_positive": int((~able).sum()), "draws": able.size}
+    found: list[np.ndarray] = []
+    tried = 0
+    for row in np.random.default_rng(seed).permutation(np.flatnonzero(able)):
+        tried += 1
+        if steady(every[row : row + 1]):
+            found.append(every[row])
+        if len(found) == count:
+            break
+    left_out = {"not_positive": int((~able).sum()), "draws": able.size, "too_slow": tried - len(found), "tried": tried}
+    return np.array(found), left_out
 
 
 def _gear(drive: str, experiment: bp.Experiment, identified: Identified, theta: np.ndarray) -> Gear:
@@ -189,7 +211,8 @@ def table(drive: str, found: Mapping[str, Any]) -> str:
     """Return what is printed."""
     lines = [
         f"  {drive} given: {found['milliseconds'][WARM]['median']:.2f} ms a log-posterior of all experiments; "
-        f"{found['left_out']['not_positive']} of {found['left_out']['draws']} draws left out, having no steady state"
+        f"{found['left_out']['not_positive']} of {found['left_out']['draws']} draws left out, having no steady state, "
+        f"{found['left_out']['too_slow']} of {found['left_out']['tried']} others, not steady after {MAX_CYCLES} cycles"
     ]
     for name, ratio in found["ratios"].items():
         lines.append(f"    {name}: {ratio['median']:.0f} ({ratio['least']:.0f} … {ratio['largest']:.0f})")
