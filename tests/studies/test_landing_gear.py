@@ -202,9 +202,8 @@ def test_errors_with_the_force_given_have_the_covariance_of_all_noise():
     errors = []
     for experiment in experiments:
         exact = bp.solve_periodic(
-            bp.models.landing_gear("force"), GEAR, experiment.inputs, frequency=run.frequency, samples=800,
-            guess=carried.guess,
-        )  # fmt: skip
+            bp.models.landing_gear("force"), GEAR, experiment.inputs, frequency=run.frequency, samples=800
+        )
         error = [experiment.outputs[c] - experiment.project(c, exact.outputs[c]) for c in channels]
         errors.append(np.stack(error, axis=-1)[carried.mask].ravel())
     own = np.zeros_like(carried.covariance)
