@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import ScalarFormatter
 
 from bayesperiodic import checks
 from bayesperiodic.inference.estimation.estimate import MapEstimate
@@ -87,6 +88,7 @@ def corner(
         labelpad=0.12,
         fig=figure or plt.figure(figsize=(size, size)),
     )
+    _without_offsets(figure)
     if laplace is not None:
         mean, covariance = normal_approximation(names, laplace)
         _laplace_on_corner(np.array(figure.axes).reshape(len(names), len(names)), mean, covariance)
@@ -104,6 +106,15 @@ def _bins(draws: np.ndarray) -> int:
     across = np.sqrt(1.0 - np.nanmax(correlation**2, initial=0.0))
     # The range holds 6.6 standard deviations, of which three bins should span one across the ridge.
     return int(np.clip(20.0 / max(across, 1e-9), BINS, MOST_BINS))
+
+
+def _without_offsets(figure: Figure) -> None:
+    """Let ticks have whole values: a number to be added to them would stand where nobody looks for it."""
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            formatter = axis.get_major_formatter()
+            if isinstance(formatter, ScalarFormatter):
+                formatter.set_useOffset(False)
 
 
 def _corner_legend(figure: Figure, posterior: Posterior, laplace: bool, fontsize: int) -> None:

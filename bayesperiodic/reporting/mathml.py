@@ -133,9 +133,9 @@ class _Printer(MathMLPresentationPrinter):
     def _print_Piecewise(self, expr: sp.Piecewise) -> Any:
         rows = []
         for value, condition in expr.args:
-            when = [self.node("mtext", "otherwise")] if condition == True else [  # noqa: E712
-                self.node("mtext", "if\u00a0"), self._print(condition)
-            ]  # fmt: skip
+            when = [self.node("mtext", "if\u00a0"), self._print(condition)]
+            if condition is sp.true:
+                when = [self.node("mtext", "otherwise")]
             rows.append(self.node("mtr", self.node("mtd", self._print(value)), self.node("mtd", *when)))
         return self.node("mrow", self.node("mo", "{"), self.node("mtable", *rows))
 
