@@ -63,7 +63,9 @@ def fold(recording: bp.Recording, drive: str) -> bp.Experiment:
     return turned.fold(SAMPLES, harmonics=KEPT[drive])
 
 
-def problem(experiments: Sequence[bp.Experiment], drive: str, *, one_conduction: bool = False) -> bp.Problem:
+def problem(
+    experiments: Sequence[bp.Experiment], drive: str, *, one_conduction: bool = False, scheme: str = "central2"
+) -> bp.Problem:
     """Return the problem of one experiment, or of several that share theta4 and theta6, and theta16 if it is one."""
     return bp.Problem(
         bp.models.landing_gear(drive),
@@ -73,6 +75,7 @@ def problem(experiments: Sequence[bp.Experiment], drive: str, *, one_conduction:
         tied=TIED,
         local=[] if one_conduction or len(experiments) == 1 else ["theta16"],
         noise=bp.noise.Independent(per="experiment"),
+        scheme=scheme,
     )
 
 
