@@ -20,6 +20,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="folder for results.json and figures (default figures/NAME)")
     parser.add_argument("--seed", type=int, default=1, help="of everything random (default 1)")
     parser.add_argument("--quick", action="store_true", help="short chains, into figures/quick/NAME; not for quoting")
+    parser.add_argument("--format", choices=("png", "pdf", "svg"), default="png", help="figures as pdf or svg too")
     parser.add_argument("--noise", type=float, default=1e-3, help="pendulum: fraction of the attractor (default 0.001)")
     parser.add_argument(
         "--replicates",
@@ -44,6 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: name: {options.name!r} is not a study; known: {', '.join(sorted(known))}.", file=sys.stderr)
         return 2
     matplotlib.use("Agg")
+    matplotlib.rcParams["savefig.format"] = options.format
     options.out = options.out or Path("figures", *(["quick"] if options.quick else []), known[options.name])
     try:
         importlib.import_module(f"studies.{known[options.name]}").run(options)

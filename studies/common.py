@@ -12,12 +12,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 from matplotlib.figure import Figure
 from PIL import Image
 
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "corner", "matplotlib", "xarray")
 DOTS_PER_INCH = 100
 COLOURS = 64
+WITHOUT_TIME = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 
 def find_data(given: Path | None, relative: str) -> tuple[Path, str] | None:
@@ -79,14 +81,24 @@ def write_results(folder: Path, results: dict[str, Any]) -> Path:
 
 
 def save_figures(folder: Path, figures: dict[str, Figure]) -> list[Path]:
-    """Save figures as small PNG files, without time stamps, each whole or not at all; return their paths."""
+    """Save figures as small PNG files, and as what matplotlib's "savefig.format" says; return the paths.
+
+    Without time stamps, each whole or not at all.
+    """
     folder.mkdir(parents=True, exist_ok=True)
+    wanted = matplotlib.rcParams["savefig.format"]
     paths = []
     for name, figure in figures.items():
-        target, draft = folder / f"{name}.png", folder / f".{name}.part.png"
-        figure.savefig(draft, dpi=DOTS_PER_INCH)
-        with Image.open(draft) as picture:
-            picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(draft, optimize=True)
-        draft.replace(target)
-        paths.append(target)
+        for suffix in dict.fromkeys(("png", wanted)):
+            target, draft = folder / f"{name}.{suffix}", folder / f".{name}.part.{suffix}"
+            figure.savefig(draft, dpi=DOTS_PER_INCH, metadata=WITHOUT_TIME.get(suffix))
+            if suffix == "png":
+                _shrink(draft)
+            draft.replace(target)
+            paths.append(target)
     return paths
+
+
+def _shrink(path: Path) -> None:
+    with Image.open(path) as picture:
+        picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)

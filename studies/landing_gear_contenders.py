@@ -196,11 +196,11 @@ def _judge(gear: Gear, integrate: Integrate) -> tuple[float, float]:
     return worst, float(np.mean(count)) if count else 0.0
 
 
-def choose_scipy(gear: Gear, method: str, allowed: float) -> float:
-    """Return the loosest relative tolerance with which a cycle from the first draw's steady state is right."""
+def choose_scipy(gear: Gear, method: str, allowed: float) -> float | None:
+    """Return the loosest relative tolerance with which a cycle from the first draw's steady state is right, or None."""
     parameters, (steady, exact) = gear.parameters[0], gear.exact[0]
     for relative in RELATIVE:
         path = gear.scipy(method, relative, 1)(parameters, steady)
         if error(gear.outputs(parameters, path), exact) <= allowed:
             return relative
-    raise RuntimeError(f"{gear.experiment.name}: {method} does not become as accurate as {allowed:.1e}.")
+    return None

@@ -36,7 +36,7 @@ SCHEMES = {DISPLACEMENT: ("central2", "central4"), FORCE: ("central4",)}
 OUTPUTS = {DISPLACEMENT: ("force", "pressure"), FORCE: ("displacement", "pressure")}
 STATIC, ESTIMATE = "from static equilibrium", "from the steady state at the estimate"
 WARM, BATCHED, COLD = "warm", "batched", "cold"
-# Cycles of SciPy's that are timed; the others cost the same.
+# Of SciPy's integrators.
 TIMED_CYCLES = 3
 
 
@@ -70,10 +70,10 @@ def _by_scheme(
     chosen = [{k: choose(gear, k, allowed) for k in COMPILED} for gear, allowed in zip(gears, own, strict=True)]
     noise = np.array(list(fit.noise.values()))
     times = _interleaved(_actions(warm, scheme, noise, theta, gears, chosen), QUICK_REPEATS if quick else REPEATS)
-    scipy = {method: sum(_scipy(*one, method) for one in zip(gears, own, chosen, strict=True)) for method in SCIPY}
+    scipy = {method: _scipy(gears, own, chosen, method) for method in SCIPY}
     return {
         "milliseconds": {name: _spread(1e3 * values) for name, values in times.items()},
-        "scipy_milliseconds": {method: 1e3 * seconds for method, seconds in scipy.items()},
+        "scipy_milliseconds": {method: seconds and 1e3 * seconds for method, seconds in scipy.items()},
         "ratios": _ratios(times, scipy),
         "experiments": {
             gear.experiment.name: {"error": allowed}
@@ -185,16 +185,29 @@ def _cold(gear: Gear, scheme: str) -> bp.PeriodicSolution:
     )
 
 
-def _scipy(gear: Gear, allowed: float, chosen: Mapping[str, Contender], method: str) -> float:
-    """Return the seconds of one integration until steady: those of a few cycles, times as many as it takes."""
-    integrate = gear.scipy(method, choose_scipy(gear, method, allowed), TIMED_CYCLES)
-    parameters = gear.parameters[0]
+def _scipy(
+    gears: Sequence[Gear], own: Sequence[float], chosen: Sequence[Mapping[str, Contender]], method: str
+) -> float | None:
+    """Return the seconds of one integration of all until steady, None where no tolerance is accurate enough."""
+    relative = [choose_scipy(gear, method, allowed) for gear, allowed in zip(gears, own, strict=True)]
+    total = 0.0
+    for gear, tolerance, by_kind in zip(gears, relative, chosen, strict=True):
+        if tolerance is None:
+            return None
+        cycles = min(contender.cycles for contender in by_kind.values())
+        total += _few_cycles(gear, method, tolerance) * cycles / TIMED_CYCLES
+    return total
+
+
+def _few_cycles(gear: Gear, method: str, relative: float) -> float:
+    """Return the seconds of `TIMED_CYCLES`; all the others cost the same."""
+    integrate, parameters = gear.scipy(method, relative, TIMED_CYCLES), gear.parameters[0]
     start, times = gear.still(parameters), []
     for _ in range(2):
         before = time.perf_counter()
         integrate(parameters, start)
         times.append(time.perf_counter() - before)
-    return min(times) * min(contender.cycles for contender in chosen.values()) / TIMED_CYCLES
+    return min(times)
 
 
 def _interleaved(actions: Mapping[str, tuple[Callable[[], Any], int]], repeats: int) -> dict[str, np.ndarray]:
@@ -209,13 +222,13 @@ def _interleaved(actions: Mapping[str, tuple[Callable[[], Any], int]], repeats: 
     return {name: np.array(values) for name, values in found.items()}
 
 
-def _ratios(times: Mapping[str, np.ndarray], scipy: Mapping[str, float]) -> dict[str, Any]:
+def _ratios(times: Mapping[str, np.ndarray], scipy: Mapping[str, float | None]) -> dict[str, Any]:
     """Return by how much time integration is dearer; the compiled ones by the quicker of the two in each repeat."""
     quickest = {start: np.min([times[f"{kind} {start}"] for kind in COMPILED], axis=0) for start in (STATIC, ESTIMATE)}
     found = {f"compiled {start} / {WARM}": values / times[WARM] for start, values in quickest.items()}
     found |= {f"compiled {STATIC} / {BATCHED}": quickest[STATIC] / times[BATCHED]}
     found |= {f"compiled {STATIC} / {COLD}": quickest[STATIC] / times[COLD]}
-    found |= {f"{method} {STATIC} / {WARM}": seconds / times[WARM] for method, seconds in scipy.items()}
+    found |= {f"{method} {STATIC} / {WARM}": seconds / times[WARM] for method, seconds in scipy.items() if seconds}
     return {name: _spread(values) for name, values in found.items()}
 
 
@@ -238,4 +251,6 @@ def table(drive: str, found: Mapping[str, Any]) -> str:
         )
         for name, ratio in one["ratios"].items():
             lines.append(f"      {name}: {ratio['median']:.1f} ({ratio['least']:.1f} … {ratio['largest']:.1f})")
+        for method, milliseconds in one["scipy_milliseconds"].items():
+            lines += [] if milliseconds else [f"      {method}: not that accurate at any tolerance"]
     return "\n".join(lines)

@@ -65,11 +65,12 @@ def test_corner_draws_laplace_ellipses_where_the_draws_are(solved):
     assert axes[3, 0].get_xlabel() == "k\n[N/m]"
 
 
-def test_corner_has_whole_values_at_its_ticks(solved):
-    """Also where they differ in the last digits alone, which matplotlib would shorten by an offset."""
+@pytest.mark.parametrize(("middle", "spread"), [(-2.5, 1e-4), (4e7, 3e4)])
+def test_corner_has_whole_values_at_its_ticks(solved, middle, spread):
+    """Also where they differ in the last digits alone or are large, which matplotlib would shorten."""
     _, _, posterior = solved
     data = posterior.data.copy()
-    data["posterior"] = data["posterior"].to_dataset().map(lambda values: -2.5 + 1e-4 * values / values.std())
+    data["posterior"] = data["posterior"].to_dataset().map(lambda values: middle + spread * values / values.std())
     figure = bp.plot.corner(replace(posterior, data=data), names=["k", "c"])
     figure.canvas.draw()
     assert not [
@@ -79,7 +80,7 @@ def test_corner_has_whole_values_at_its_ticks(solved):
         if axis.get_offset_text().get_text()
     ]
     shown = [float(tick.get_text().replace("−", "-")) for tick in figure.axes[2].get_xticklabels() if tick.get_text()]
-    assert shown and all(abs(value + 2.5) < 0.1 for value in shown)
+    assert shown and all(abs(value - middle) < 1000 * spread for value in shown)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.99])

@@ -1,5 +1,6 @@
 """Which further experiment would tell most: the information of candidates, from the sensitivities at the estimate."""
 
+import warnings
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -75,17 +76,20 @@ def _added(
     parameter_map = problem.parameter_maps[run.name]
     values = parameter_map.values(theta[None])[0]
     inputs = {name: u.mean() + candidate.scale * (u - u.mean()) for name, u in run.inputs.items()}
-    solution = solve_periodic(
-        problem.model,
-        dict(zip(problem.model.parameters, values.tolist(), strict=False)),
-        inputs,
-        frequency=candidate.frequency,
-        samples=run.samples,
-        scheme=problem.scheme,
-        periods=run.periods,
-        winding=run.winding,
-        guess=fit.solutions[run.name].states,
-    )
+    with warnings.catch_warnings():
+        # The grid is the run's, and how fine it is has been said of the run.
+        warnings.simplefilter("ignore", UserWarning)
+        solution = solve_periodic(
+            problem.model,
+            dict(zip(problem.model.parameters, values.tolist(), strict=False)),
+            inputs,
+            frequency=candidate.frequency,
+            samples=run.samples,
+            scheme=problem.scheme,
+            periods=run.periods,
+            winding=run.winding,
+            guess=fit.solutions[run.name].states,
+        )
     if not solution.converged:
         return np.full((theta.size, theta.size), np.nan)
     slopes = parameter_map.slopes(theta)[:-1] * np.where(information.logarithmic, information.theta, 1.0)

@@ -119,6 +119,7 @@ class Problem:
         if not isinstance(priors, Mapping):
             raise ValueError(f"priors: {priors!r} is not allowed; it must be a mapping of names to priors.")
         fixed, tied, every = dict(fixed or {}), dict(tied or {}), (*model.parameters, SHIFT)
+        self._given_priors, self._given_fixed = dict(priors), fixed
         self.local = _checked_local(local, every, priors, tied)
         self.fixed = {n: _constant(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
         given = expand_priors(priors, self.local, runs, self.fixed) | self._free_phases(priors, fixed, tied)
@@ -264,12 +265,13 @@ class Problem:
         return other
 
     def with_experiments(self, experiments: Iterable[Experiment]) -> "Problem":
-        """Return the same problem with other data.
+        """Return the same problem with other data, or with some of its experiments.
 
         Parameters
         ----------
         experiments : iterable of Experiment
-            Of the same names.
+            What was said of single experiments, such as values that differ, goes by their names, and is left out with
+            them.
 
         Returns
         -------
@@ -280,11 +282,21 @@ class Problem:
         ValueError
             As `Problem` does.
         """
+        chosen = tuple(experiments)
+        gone = {e.name for e in self.experiments} - {getattr(e, "name", None) for e in chosen}
+        ends = tuple(local_name("", name) for name in gone)
+        priors, fixed = (
+            {key: value for key, value in given.items() if not (isinstance(key, str) and key.endswith(ends))}
+            for given in (self._given_priors, self._given_fixed)
+        )
+        for name, value in fixed.items():
+            if isinstance(value, Mapping):
+                fixed[name] = {run: number for run, number in value.items() if run not in gone}
         return Problem(
             self.model,
-            experiments,
-            priors=self.priors,
-            fixed={**self.fixed, **self.likelihood.fixed},
+            chosen,
+            priors=priors,
+            fixed=fixed,
             tied=self.tied,
             local=self.local,
             noise=self.noise,

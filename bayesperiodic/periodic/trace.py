@@ -42,7 +42,8 @@ class Tracer:
     def __init__(self, family: Family, size: np.ndarray, values: np.ndarray, until: float):
         self.family = family
         points = family.equations.grid.points
-        self._weights = 1.0 / (np.where(size > 0, size, 1.0) ** 2 * points * len(size))
+        self._size = np.where(size > 0, size, 1.0)
+        self._weights = 1.0 / (self._size**2 * points * len(size))
         self._value_scales = np.maximum(np.abs(values), 1e-12)
         self._value_scales[0] = abs(until - values[0])
 
@@ -93,6 +94,12 @@ class Tracer:
     def length(self, change: tuple[np.ndarray, np.ndarray]) -> float:
         """Return the length of a change of z and the scalars."""
         return float(np.sqrt(self._product(change, change)))
+
+    def longest(self, point: Point, largest: float) -> float:
+        """Return how long a step may be: longer for a larger orbit, but never above the largest in the first scalar."""
+        grown = max(1.0, float((np.ptp(point.z, axis=0) / self._size).max()))
+        share = abs(point.tangent[1][0]) / self._value_scales[0]
+        return largest * min(grown, 1.0 / max(share, 1e-12))
 
     def _solve(
         self, start: Point, z: np.ndarray, values: np.ndarray, rows: np.ndarray, corner: np.ndarray, step: float
@@ -186,7 +193,7 @@ def trace(
             return
         here = after
         if iterations <= FEW_ITERATIONS:
-            length = min(length * GROWTH, largest)
+            length = min(length * GROWTH, tracer.longest(here, largest))
         elif iterations > MANY_ITERATIONS:
             length /= 2
 

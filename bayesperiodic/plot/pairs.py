@@ -16,6 +16,8 @@ from bayesperiodic.plot.style import COLOURS, caveats, unit_of, wrapped_label
 
 LEVELS = (0.5, 0.9)
 BINS, MOST_BINS = 35, 200
+# Powers of ten from and to which ticks are written out.
+WHOLE = (-5, 10)
 
 
 def corner(
@@ -88,7 +90,7 @@ def corner(
         labelpad=0.12,
         fig=figure or plt.figure(figsize=(size, size)),
     )
-    _without_offsets(figure)
+    _with_whole_values(figure)
     if laplace is not None:
         mean, covariance = normal_approximation(names, laplace)
         _laplace_on_corner(np.array(figure.axes).reshape(len(names), len(names)), mean, covariance)
@@ -108,13 +110,14 @@ def _bins(draws: np.ndarray) -> int:
     return int(np.clip(20.0 / max(across, 1e-9), BINS, MOST_BINS))
 
 
-def _without_offsets(figure: Figure) -> None:
-    """Let ticks have whole values: a number to be added to them would stand where nobody looks for it."""
+def _with_whole_values(figure: Figure) -> None:
+    """Let ticks have whole values: what they are to be added to or multiplied by would stand on another panel."""
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             formatter = axis.get_major_formatter()
             if isinstance(formatter, ScalarFormatter):
                 formatter.set_useOffset(False)
+                formatter.set_powerlimits(WHOLE)
 
 
 def _corner_legend(figure: Figure, posterior: Posterior, laplace: bool, fontsize: int) -> None:

@@ -1,5 +1,7 @@
 """Fixed parameters that differ between experiments."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -81,3 +83,23 @@ def test_one_value_for_all_is_as_before():
 def test_bad_constants_are_named(coulomb, message):
     with pytest.raises(ValueError, match=message):
         problem(coulomb)
+
+
+def test_some_of_the_experiments_make_a_problem_of_their_own():
+    """What was said of the others goes with them; constants without a name hold for new data too."""
+    runs = [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=i, name=f"run {i}") for i in (1, 2)]
+    k, c, other = bp.Normal(800.0, 60.0), bp.LogNormal(30.0, 0.5), bp.LogNormal(50.0, 0.5)
+    whole = bp.Problem(
+        LINEAR, runs, priors={"k": k, "c": c, "c[run 2]": other}, fixed={"coulomb": {"run 1": 20.0, "run 2": 25.0}},
+        local=["c"],
+    )  # fmt: skip
+    alone = whole.with_experiments(runs[:1])
+    stated = bp.Problem(LINEAR, runs[:1], priors={"k": k, "c": c}, fixed={"coulomb": 20.0}, local=["c"])
+    at = {"k": 850.0, "c[run 1]": 35.0}, {"force": 9.0}
+    assert alone.names == stated.names == ("k", "c[run 1]")
+    assert alone.log_posterior(*at) == stated.log_posterior(*at)
+    renamed = stated.with_experiments([replace(runs[0], name="run 3")])
+    assert renamed.names == ("k", "c[run 3]")
+    assert renamed.log_posterior({"k": 850.0, "c[run 3]": 35.0}, at[1]) == stated.log_posterior(*at)
+    with pytest.raises(ValueError, match="'run 3'"):
+        whole.with_experiments([replace(runs[0], name="run 3")])

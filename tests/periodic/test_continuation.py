@@ -404,3 +404,20 @@ def test_a_fold_that_turns_away_from_the_end_wanted_is_told():
     assert len(away) == 1 and not away.complete and "stuck" in repr(away)
     back = bp.continue_periodic(bp.models.duffing, fold, "frequency", until=0.25, progress=False)
     assert back.complete and back[-1].frequency == pytest.approx(0.25)
+
+
+def test_a_branch_whose_orbit_grows_a_thousandfold_gets_to_its_end():
+    """Through a linear resonance from far above it, whose amplitudes are known in closed form."""
+    tau = np.arange(16) / 16
+    values = {"m": 1.0, "c": 0.02, "k": 1.0, "k3": 0.0}
+    start = bp.solve_periodic(
+        bp.models.duffing, values, {"force": np.cos(2 * np.pi * tau)}, frequency=8 / (2 * np.pi), samples=16,
+        scheme="fourier",
+    )  # fmt: skip
+    branch = bp.continue_periodic(bp.models.duffing, start, "frequency", until=0.5 / (2 * np.pi), progress=False)
+    assert branch.complete and not branch.folds and len(branch) < 1000
+    omega = 2 * np.pi * branch.values
+    amplitude = np.array([np.sqrt(2.0) * s.states["x"].std() for s in branch])
+    assert np.allclose(amplitude, 1.0 / np.abs(1.0 - omega**2 + 0.02j * omega), rtol=1e-6)
+    assert amplitude.max() > 1000 * amplitude[0]
+    assert np.diff(branch.values).min() > -1.0001 * abs(branch.values[-1] - branch.values[0]) / 50
