@@ -60,22 +60,6 @@ def test_campaigns_are_resumed(tmp_path, monkeypatch):
     assert max(abs(line["pulls"][name]) for name in flutter_campaigns.STIFFNESSES) < 5.0
 
 
-def test_quick_run_finds_a_truth_from_both_kinds_of_cycles_and_predicts_those_left_out(tmp_path):
-    """The springs' bounds are four standard deviations; the model is right, so that it misses next to nothing."""
-    printed = run(tmp_path, "--quick")
-    found = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
-    assert found["data"]["synthetic"] and "SYNTHETIC" in printed and found["branches_kept_apart"]
-    assert found["errors_rms"] < 0.02 < 0.1 < found["authors_errors_rms_where_a_cycle_exists"]
-    for power, name in enumerate(("k_alpha2", "k_alpha3"), 1):
-        true = flutter_rig.TRUE[name] / flutter_rig.TRUE["gain_pitch"] ** power
-        told = found["contraction"][f"{name} at gain 1"]["both"]
-        assert abs(told["estimate"] - true) < 4 * told["sd"] < 0.5 * true
-    predicted = [one for part in found["predictions"].values() for one in part.values() if one["cycle_at_map"]]
-    assert len(predicted) >= len(FOUR)
-    assert all(abs(one["heave"]["error"]) < 0.15 for one in predicted)
-    assert found["posterior"] is None and found["verdicts"] is None
-
-
 def test_records_that_drift_or_are_too_short_are_left_out_with_the_reason():
     time = flutter_data.STEP * np.arange(2000)
     still = np.cos(2 * np.pi * 2.45 * time)
