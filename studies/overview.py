@@ -16,7 +16,7 @@ import bayesperiodic as bp
 from studies import common, pendulum_recording
 from studies.verdicts_cases import scaling_symmetry
 
-PERIODS, QUICK_PERIODS = 20_000, 2_000
+PERIODS, QUICK_PERIODS = 15_000, 2_000
 LONGEST = 3
 SAMPLES = 200
 MASS, AIR = "m", "k3"
@@ -62,7 +62,7 @@ def find(ax: Axes, periods: int, seed: int) -> dict[str, int]:
     legend = ax.get_legend()
     assert legend is not None
     ax.set_ylim(top=ROOM)
-    ax.legend(handles=legend.legend_handles, loc="upper right", fontsize=8, ncols=2)
+    ax.legend(handles=legend.legend_handles, loc="upper right", fontsize=7.5, ncols=2, columnspacing=1.0)
     ax.set_title("find unstable orbits in chaos, without a model")
     return {str(p): sum(o.period == p for o in orbits) for p in range(1, LONGEST + 1)}
 
