@@ -63,9 +63,9 @@ def gear():
     return {"bp": bp, "model": model, "experiments": found, "known": known}
 
 
-def linear():
+def linear(noise="independent"):
     priors = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}
-    problem = bp.Problem(LINEAR, [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)], priors=priors)
+    problem = bp.Problem(LINEAR, [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)], priors=priors, noise=noise)
     return {"bp": bp, "problem": problem, "fit": bp.map_estimate(problem, progress=False)}
 
 
@@ -86,7 +86,7 @@ BEFORE = {
     "More than one experiment, and more than histories": gear,
     "Draws that can be trusted": linear,
     "What the data cannot tell you": linear_draws,
-    "Are the intervals what they say?": linear,
+    "Are the intervals what they say?": lambda: linear(bp.noise.Independent(prior=bp.InverseGamma(3.0, 20.0))),
 }  # fmt: skip
 SHORTER = {"replicates=1000": "replicates=2", "range(1, 6)": "range(1, 3)"}
 
