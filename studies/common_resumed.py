@@ -1,11 +1,11 @@
-"""Long runs that go on where they were ended: results of tasks, line by line in a file, and parts of a study."""
+"""Tasks for all cores, and long runs that go on where they were ended: by tasks, line by line in a file, and by parts."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,10 +13,12 @@ from typing import Any, TypeVar
 import cloudpickle
 
 from bayesperiodic import resumed as kept
+from bayesperiodic.parallel import team
 
 Task = tuple[Any, ...]
 Line = dict[str, Any]
 Part = TypeVar("Part")
+Value = TypeVar("Value")
 
 
 def resumed(
@@ -64,6 +66,34 @@ def remembered(path: Path, source: str, make: Callable[[], Part]) -> Part:
     unfinished.write_bytes(cloudpickle.dumps((source, part)))
     unfinished.replace(path)
     return part
+
+
+def each(work: Callable[..., Value], tasks: Sequence[Task], *, here: bool = False) -> Iterator[Value]:
+    """Yield work(*task) of every task, in their order.
+
+    Parameters
+    ----------
+    work : callable
+        Of a module.
+    tasks : sequence of tuple
+    here : bool
+        One after the other in this process; else in processes, each task on one core.
+    """
+    if here:
+        yield from (work(*task) for task in tasks)
+        return
+    done: dict[int, bytes] = {}
+    with workers() as pool, team(pool, work) as crew:
+        following = 0
+        for number, result in crew.run(_one, tasks):
+            done[number] = result
+            while following in done:
+                yield cloudpickle.loads(done.pop(following))
+                following += 1
+
+
+def _one(work: Callable[..., Value], task: Task) -> bytes:
+    return cloudpickle.dumps(work(*task))
 
 
 def workers() -> ProcessPoolExecutor:

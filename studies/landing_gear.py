@@ -96,7 +96,7 @@ def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace) -> t
     with watch.part(f"rig {truth}", f"truth {truth}: simulating and recording {len(runs)} experiments"):
         recordings = {r.name: measure(r, TRUTHS[truth], seed) for r in runs}
     with watch.part(f"posteriors {truth}", f"truth {truth}: displacement given, one posterior an experiment"):
-        verdicts = {name: _verdict(recording, seed, quick) for name, recording in recordings.items()}
+        verdicts = _with_displacement_given(recordings, seed, quick)
     with watch.part(f"joint {truth}", f"truth {truth}: all experiments at once, theta4 and theta6 in common"):
         joint = {DISPLACEMENT: landing_gear_joint.given_displacement(recordings.values(), seed, quick=quick)}
     with watch.part(f"sensitivity {truth}", f"truth {truth}: the other parameters under priors"):
@@ -160,18 +160,26 @@ def _campaigns(options: argparse.Namespace) -> None:
     print(f"results: {common.write_results(folder, found)}")
 
 
+def _with_displacement_given(recordings: Mapping[str, bp.Recording], seed: int, quick: bool) -> dict[str, Verdict]:
+    verdicts = {}
+    tasks = [(recording, seed, quick) for recording in recordings.values()]
+    for name, verdict in zip(recordings, common_resumed.each(_verdict, tasks, here=quick), strict=True):
+        verdicts[name] = verdict
+        print(landing_gear_verdicts.line(name, verdict), flush=True)
+    return verdicts
+
+
 def _verdict(recording: bp.Recording, seed: int, quick: bool) -> Verdict:
-    verdict = judge(draw(estimate([fold(recording, DISPLACEMENT)], DISPLACEMENT), seed, quick=quick))
-    print(landing_gear_verdicts.line(recording.name, verdict), flush=True)
-    return verdict
+    return judge(draw(estimate([fold(recording, DISPLACEMENT)], DISPLACEMENT), seed, quick=quick))
 
 
 def _with_force_given(
     recordings: Mapping[str, bp.Recording], seed: int, quick: bool
 ) -> tuple[dict[str, Identified], dict[str, Verdict]]:
     exact, verdicts = {}, {}
-    for name, recording in recordings.items():
-        exact[name], verdicts[name] = landing_gear_force.judge(recording, seed, quick=quick)
+    tasks = [(recording, seed, quick) for recording in recordings.values()]
+    for name, found in zip(recordings, common_resumed.each(landing_gear_force.judge, tasks, here=quick), strict=True):
+        exact[name], verdicts[name] = found
         print(landing_gear_verdicts.line(name, verdicts[name]), flush=True)
     return exact, verdicts
 

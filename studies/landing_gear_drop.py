@@ -18,7 +18,7 @@ import numpy as np
 import sympy as sp
 
 import bayesperiodic as bp
-from studies.landing_gear_identification import DISPLACEMENT, Identified, draw, estimate, fold
+from studies.landing_gear_identification import DISPLACEMENT, ENSEMBLES, Identified, draw, estimate, fold
 from studies.landing_gear_truth import parameters
 
 FRAME, HEIGHT, WIDTH = 2.02, 1.16, 0.58
@@ -122,7 +122,7 @@ def drop(values: Mapping[str, float], effects: Iterable[str] = (), duration: flo
 def identify(recordings: Iterable[bp.Recording], seed: int, *, quick: bool) -> Identified:
     """Return what all shaker experiments say of the one gear that is dropped."""
     experiments = [fold(recording, DISPLACEMENT) for recording in recordings]
-    return draw(estimate(experiments, DISPLACEMENT, one_conduction=True), seed, quick=quick)
+    return draw(estimate(experiments, DISPLACEMENT, one_conduction=True), seed, quick=quick, executor=ENSEMBLES)
 
 
 def predict(identified: Identified, effects: Iterable[str], draws: int) -> Dropped:

@@ -42,7 +42,7 @@ ROUNDS = 2
 SCHEME = "central4"
 
 
-def judge(recording: bp.Recording, seed: int, *, quick: bool) -> tuple[Identified, Verdict]:
+def judge(recording: bp.Recording, seed: int, quick: bool) -> tuple[Identified, Verdict]:
     """Return what a fit says that takes the force for exact, and the verdict with its noise carried along."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The noise of the measured inputs")

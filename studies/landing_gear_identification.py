@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 
 import bayesperiodic as bp
-from studies.common_resumed import workers
 from studies.landing_gear_truth import GEAR
 
 DISPLACEMENT, FORCE = "displacement", "force"
@@ -28,8 +25,8 @@ KEPT = {
 PRIORS = {"theta4": bp.LogNormal(5.2e-3, 0.1), "theta6": bp.Normal(-2.3, 0.3), "theta16": bp.Normal(3.0, 20.0)}
 FIXED = {name: value for name, value in GEAR.items() if name not in (*PRIORS, "theta11")}
 TIED = {"theta11": "-1e5*theta4"}
-ENSEMBLES, QUICK_ENSEMBLES = 4, 2
-WALKERS, QUICK_WALKERS = 16, 8
+ENSEMBLES = 2
+WALKERS, QUICK_WALKERS = 32, 8
 MAX_STEPS, QUICK_STEPS = 20_000, 250
 
 
@@ -86,7 +83,7 @@ def estimate(experiments: Sequence[bp.Experiment], drive: str, *, one_conduction
 
 
 def draw(
-    estimated: Identified, seed: int, *, quick: bool, ensembles: int = ENSEMBLES, max_steps: int = MAX_STEPS
+    estimated: Identified, seed: int, *, quick: bool, max_steps: int = MAX_STEPS, executor: int | None = None
 ) -> Identified:
     """Return the same with draws of the posterior, the variances integrated out."""
     stated, fit = estimated.problem, estimated.fit
@@ -95,17 +92,11 @@ def draw(
         stated,
         fit,
         seed=seed,
-        ensembles=QUICK_ENSEMBLES if quick else ensembles,
+        ensembles=ENSEMBLES,
         walkers=max(QUICK_WALKERS if quick else WALKERS, 2 * len(stated.names)),
         max_steps=QUICK_STEPS if quick else max_steps,
         variances="collapsed",
-        executor=None if quick else _pool(),
+        executor=None if quick else executor,
         progress=False,
     )
     return Identified(stated, fit, posterior, time.perf_counter() - before)
-
-
-@cache
-def _pool() -> ProcessPoolExecutor:
-    """Return processes for all draws of a run, because starting some takes longer than most draws."""
-    return workers()

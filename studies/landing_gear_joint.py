@@ -9,6 +9,7 @@ import bayesperiodic as bp
 from studies.landing_gear_force import SCHEME
 from studies.landing_gear_identification import (
     DISPLACEMENT,
+    ENSEMBLES,
     FIXED,
     FORCE,
     PRIORS,
@@ -22,13 +23,12 @@ from studies.landing_gear_verdicts import CONDUCTION, Verdict, laplace
 
 # With the force given a log-posterior costs more, and the draws are fewer than the stop rule asks for.
 STEPS_WITH_FORCE = 1000
-ENSEMBLES = 2
 
 
 def given_displacement(recordings: Iterable[bp.Recording], seed: int, *, quick: bool) -> Identified:
     """Return estimate and draws with the displacement given."""
     found = estimate([fold(recording, DISPLACEMENT) for recording in recordings], DISPLACEMENT)
-    return draw(found, seed, quick=quick, ensembles=ENSEMBLES)
+    return draw(found, seed, quick=quick, executor=ENSEMBLES)
 
 
 def given_force(forced: Mapping[str, Verdict], seed: int, *, quick: bool) -> Identified | None:
@@ -49,7 +49,7 @@ def given_force(forced: Mapping[str, Verdict], seed: int, *, quick: bool) -> Ide
         scheme=SCHEME,
     )
     found = Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0)
-    return draw(found, seed, quick=quick, ensembles=ENSEMBLES, max_steps=STEPS_WITH_FORCE)
+    return draw(found, seed, quick=quick, max_steps=STEPS_WITH_FORCE, executor=ENSEMBLES)
 
 
 def account(identified: Identified) -> dict[str, Any]:

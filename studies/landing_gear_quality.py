@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import binom, norm
 
 import bayesperiodic as bp
-from studies.common_resumed import workers
+from studies.common_resumed import each
 from studies.landing_gear_identification import DISPLACEMENT, fold
 from studies.landing_gear_rig import RUNS, SAME, Changed, measure
 from studies.landing_gear_truth import GEAR
@@ -100,11 +100,7 @@ def examine_all(references: int, each: int, seed: int) -> tuple[Unit, list[Unit]
     """Return the reference, measured so many times, and so many units of each kind."""
     tasks = [(GOOD, REFERENCE_SEED * (seed + 1) + k) for k in range(references)]
     tasks += [(kind, FIRST_UNIT * (seed + 1) + k) for k, kind in enumerate(np.repeat(list(FAULTS), each).tolist())]
-    if len(tasks) <= SERIALLY:
-        found = [examine(*task) for task in tasks]
-    else:
-        with workers() as pool:
-            found = list(pool.map(examine, *zip(*tasks, strict=True), chunksize=5))
+    found = list(each(examine, tasks, here=len(tasks) <= SERIALLY))
     return _together(found[:references]), found[references:]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import ndtr
 
 import bayesperiodic as bp
-from studies.common_resumed import workers
+from studies.common_resumed import each
 from studies.landing_gear_identification import DISPLACEMENT, FIXED, KEPT, PRIORS, TIED, fold
 from studies.landing_gear_rig import NOISE, RECORDED, RUNS, measure
 from studies.landing_gear_truth import STRENGTHS, TRUTHS, damper
@@ -99,8 +99,7 @@ def repair(names: Sequence[str], truth: str, seed: int, *, quick: bool) -> list[
         return [fit(task) for task in tasks]
     # The longest first.
     tasks = [Task(model, tuple(names), (), truth, seed) for model in (BEST, PAPER)] + tasks[::-1]
-    with workers() as pool:
-        return list(pool.map(fit, tasks))
+    return list(each(fit, [(task,) for task in tasks]))
 
 
 def fit(task: Task) -> Fitted:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 import bayesperiodic as bp
-from studies.common_resumed import workers
+from studies.common_resumed import each
 from studies.landing_gear_identification import DISPLACEMENT, FIXED, PRIORS, TIED, fold
 from studies.landing_gear_rig import Run, measure
 from studies.landing_gear_truth import GEAR, TRUTHS
@@ -33,10 +33,7 @@ STEPS, QUICK_STEPS = 2000, 250
 def examine_all(runs: Sequence[Run], truth: str, seed: int, *, quick: bool) -> dict[str, dict[str, Any]]:
     """Return what every experiment says with the other parameters under priors."""
     tasks = [(run, truth, seed, quick) for run in runs]
-    if quick:
-        return {run.name: examine(*task) for run, task in zip(runs, tasks, strict=True)}
-    with workers() as pool:
-        return dict(zip([run.name for run in runs], pool.map(examine, *zip(*tasks, strict=True)), strict=True))
+    return dict(zip([run.name for run in runs], each(examine, tasks, here=quick), strict=True))
 
 
 def examine(run: Run, truth: str, seed: int, quick: bool) -> dict[str, Any]:
