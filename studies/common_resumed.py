@@ -1,4 +1,4 @@
-"""Tasks for all cores, and long runs that go on where they were ended: by tasks, line by line in a file, and by parts."""
+"""Tasks for all cores, and long runs that go on where they were ended, by tasks (a line each in a file) or by parts."""
 
 from __future__ import annotations
 

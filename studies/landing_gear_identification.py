@@ -26,7 +26,7 @@ PRIORS = {"theta4": bp.LogNormal(5.2e-3, 0.1), "theta6": bp.Normal(-2.3, 0.3), "
 FIXED = {name: value for name, value in GEAR.items() if name not in (*PRIORS, "theta11")}
 TIED = {"theta11": "-1e5*theta4"}
 ENSEMBLES = 2
-WALKERS, QUICK_WALKERS = 32, 8
+WALKERS, QUICK_WALKERS = 16, 8
 MAX_STEPS, QUICK_STEPS = 20_000, 250
 
 

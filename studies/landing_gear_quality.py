@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import binom, norm
 
 import bayesperiodic as bp
-from studies.common_resumed import each
+from studies import common_resumed
 from studies.landing_gear_identification import DISPLACEMENT, fold
 from studies.landing_gear_rig import RUNS, SAME, Changed, measure
 from studies.landing_gear_truth import GEAR
@@ -100,7 +100,7 @@ def examine_all(references: int, each: int, seed: int) -> tuple[Unit, list[Unit]
     """Return the reference, measured so many times, and so many units of each kind."""
     tasks = [(GOOD, REFERENCE_SEED * (seed + 1) + k) for k in range(references)]
     tasks += [(kind, FIRST_UNIT * (seed + 1) + k) for k, kind in enumerate(np.repeat(list(FAULTS), each).tolist())]
-    found = list(each(examine, tasks, here=len(tasks) <= SERIALLY))
+    found = list(common_resumed.each(examine, tasks, here=len(tasks) <= SERIALLY))
     return _together(found[:references]), found[references:]
 
 

@@ -244,15 +244,15 @@ class Observation:
         picked = values if e.mask is None else values[..., e.mask, :]
         flat = picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
         if e.covariance is not None:
-            found.append(flat @ self._joint[0].T)
+            found.append(_times(self._joint[0], flat))
         else:
             for c, channel in enumerate(self.channels):
                 column = picked[..., c]
                 found.append(column if e.mask is not None else self._spectral(column, self._harmonics[channel]))
         for logarithms in multipliers:
             _, slopes, whitening = self._joint
-            explained = flat @ slopes.T if slopes.shape[1] else 0.0
-            found.append((logarithms - explained) @ whitening.T)
+            explained = _times(slopes, flat) if slopes.shape[1] else 0.0
+            found.append(_times(whitening, logarithms - explained))
         found += [np.asarray(difference)[..., None] / e.frequency_se for difference in frequency]
         return found
 
@@ -264,7 +264,7 @@ class Observation:
         parts = [amplitudes.real, amplitudes.imag[..., 1:]]
         if harmonic.size % 2 == 0:
             alternating = np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0) / self._points
-            parts.append((signal @ alternating)[..., None] * np.sqrt(harmonic.size))
+            parts.append(np.sum(signal * alternating, axis=-1, keepdims=True) * np.sqrt(harmonic.size))
         return np.concatenate(parts, axis=-1)
 
     def _signal(self, components: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
@@ -338,6 +338,11 @@ class Observation:
         if self._points % 2 == 0:
             spectrum[-1] = 0.0
         return np.fft.irfft(spectrum, n=self._points, axis=0) + trend
+
+
+def _times(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return matrix · row of rows (…, size), row by row: the rounding of one product may depend on their number."""
+    return (matrix @ rows[..., None])[..., 0]
 
 
 def _whitening(covariance: np.ndarray) -> np.ndarray:

@@ -470,7 +470,6 @@ class Problem:
         responses = {name: s.response for name, s in solved.items()}
         if not good.all():
             responses = {name: Response(*(part[good] for part in r)) for name, r in responses.items()}
-        # Shared by experiments, not by θ: the rounding of a matrix product may depend on how many rows it has.
         small = max(s.response.outputs.size for s in solved.values()) < SMALLEST_SHARED
         if small:
             return self.comparisons.residuals(responses, 1), status

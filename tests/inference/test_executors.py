@@ -19,9 +19,11 @@ from tqdm import tqdm
 import bayesperiodic as bp
 from bayesperiodic.inference import problem as problem_module
 from bayesperiodic.inference.sampling import ensemble, sampling
+from bayesperiodic.inference.sampling.coordinates import SamplingDensity
 from tests.inference.observed import (
     DUFFING,
     DUFFING_PRIORS,
+    SAMPLES,
     cycle_run,
     duffing_run,
     pendulum_problem,
@@ -192,6 +194,13 @@ def test_bad_executors_are_refused(posed):
             call(*posed, executor=0, **arguments)
 
 
+def correlated_points() -> bp.Experiment:
+    """Return the rotation at every fourth sample, all errors correlated."""
+    mask = np.arange(SAMPLES) % 4 == 0
+    distance = np.abs(np.subtract.outer(np.arange(2 * mask.sum()), np.arange(2 * mask.sum())))
+    return pendulum_run(mask=mask, covariance=1e-3 * np.exp(-distance / 5.0))
+
+
 def problems() -> dict[str, bp.Problem]:
     """Return problems of every kind."""
     two = [duffing_run(), duffing_run("run 2", 0.15, 2)]
@@ -217,6 +226,7 @@ def problems() -> dict[str, bp.Problem]:
         "measured": duffing([scatter], noise="measured"),
         "variances of each experiment": duffing(noise=bp.noise.Independent(per="experiment", prior="flat")),
         "angles": pendulum_problem([pendulum_run()]),
+        "points": pendulum_problem([correlated_points()]),
         "section": pendulum_problem([section_run()], noise=bp.noise.Independent(prior=bp.InverseGamma(2.0, 1.0))),
         "autonomous": bp.Problem(
             bp.models.van_der_pol, [cycle_run()], priors=cycles, fixed={"omega": 1.0}, scheme="central4"
@@ -236,6 +246,20 @@ def test_a_pickled_problem_has_the_same_density_to_the_last_bit(kind):
     assert np.array_equal(other.log_posterior(theta, noise), expected)
     assert np.array_equal(pickle.loads(pickle.dumps(problem)).median(), problem.median())
     assert other.names == problem.names and other.tied == problem.tied and repr(other) == repr(problem)
+
+
+@pytest.mark.parametrize("kind", problems())
+def test_the_density_of_a_point_does_not_depend_on_the_others_to_the_last_bit(kind):
+    problem = problems()[kind]
+    density = SamplingDensity(problem.anchored(problem.median()), threads=2)
+    theta = problem.median() * (1.0 + 0.01 * np.random.default_rng(1).standard_normal((37, len(problem.names))))
+    points = density.from_natural(theta, np.full((37, len(problem.noise_names)), 0.01))
+    values, status = density.evaluate(points)
+    assert np.isfinite(values).sum() > 30
+    for size in (1, 4, 16):
+        parts = [density.evaluate(points[k : k + size]) for k in range(0, 37, size)]
+        assert np.array_equal(np.concatenate([value for value, _ in parts]), values)
+        assert np.array_equal(np.concatenate([ended for _, ended in parts]), status)
 
 
 SCRIPT = """

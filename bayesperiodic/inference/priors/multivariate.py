@@ -93,7 +93,8 @@ class MultivariateNormal:
         x = self._points(x)
         finite = np.isfinite(x).all(axis=-1)
         offset = np.where(finite[..., None], x, self.mean) - self.mean
-        score = offset @ self._whitening.T
+        # Point by point: the rounding of one product for all may depend on how many there are.
+        score = (self._whitening @ offset[..., None])[..., 0]
         constant = np.log(np.diag(self._cholesky)).sum() + self.dimension * LOG_ROOT_TWO_PI
         return np.where(finite, -0.5 * np.sum(score**2, axis=-1) - constant, -np.inf)[()]
 

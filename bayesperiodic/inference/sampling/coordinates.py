@@ -103,20 +103,35 @@ class SamplingDensity:
         return np.where(logs, np.log(np.where(logs, mode, 1.0)), mode), covariance
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Return the log-density (points,) of coordinates (points, dimension); −inf where a solve fails.
+        """Return the log-density as `evaluate` does, and count points and failures."""
+        values, status = self.evaluate(points)
+        self.calls += len(points)
+        self.failures.update(counted(status))
+        return values
 
-        With variances integrated out the result is (points, 1 + collapsed): the log-density, then M of each of them.
+    def evaluate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log-density and how the solves ended, each of its point alone.
+
+        Parameters
+        ----------
+        points : array (points, dimension)
+
+        Returns
+        -------
+        values : array (points,), or (points, 1 + collapsed)
+            The log-density, −inf where a solve fails; then, with variances integrated out, M of each of them.
+        status : int array (points,)
+            The worst of all experiments; converged where nothing was solved.
         """
         theta, noise = self.to_natural(points)
-        self.calls += len(points)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             values = np.asarray(self.problem.log_prior(theta)) + self.problem.likelihood.log_prior(noise)
         values = values + points[:, : len(self.problem.names)][:, self.logarithmic].sum(axis=1)
         inside, moments = np.isfinite(values), np.full((len(points), len(self.collapsed)), np.nan)
+        ended = np.full(len(points), CONVERGED)
         if inside.any():
             residuals, status = self.problem.residuals(theta[inside], self.threads)
-            for code in status[status != CONVERGED]:
-                self.failures[STATUSES[code]] += 1
+            ended[inside] = status
             good = np.flatnonzero(inside)[status == CONVERGED]
             values[inside] = np.where(status == CONVERGED, values[inside], -np.inf)
             if good.size:
@@ -126,7 +141,7 @@ class SamplingDensity:
                     moments[good] = np.stack([by_name[name] for name in self.collapsed], axis=-1)
                     values[good] += np.sum(0.5 * moments[good] + self._integrals(moments[good]), axis=-1)
         values = np.where(inside & np.isfinite(values), values, -np.inf)
-        return np.concatenate([values[:, None], moments], axis=1) if self.collapsed else values
+        return (np.concatenate([values[:, None], moments], axis=1) if self.collapsed else values), ended
 
     def value_and_gradient(self, point: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the log-density of one point (dimension,) and its gradient there, variances not integrated out.
@@ -193,6 +208,11 @@ class SamplingDensity:
         columns |= {name: np.log(variances[..., i]) for i, name in enumerate(self.collapsed)}
         noise = np.stack([columns[name] for name in self.problem.free_noise], axis=-1)
         return np.concatenate([points[..., :count], noise], axis=-1), log_density
+
+
+def counted(status: np.ndarray) -> Counter[str]:
+    """Return how many solves ended in each of the ways that are failures."""
+    return Counter(STATUSES[code] for code in status[status != CONVERGED])
 
 
 def collapsible(problem: Problem) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """One ensemble of walkers, walked in pieces: a piece is a pure function of what it is given, wherever it is done."""
 
 from collections import Counter
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -8,15 +9,16 @@ from typing import NamedTuple
 import emcee
 import numpy as np
 
-from bayesperiodic.inference.sampling.coordinates import RidgeMap, SamplingDensity
+from bayesperiodic.inference.sampling.coordinates import RidgeMap, SamplingDensity, counted
 
 PIECE, ROOM = 25, 250
+Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Ground(NamedTuple):
-    """What all ensembles walk on: the density, and the map to its coordinates."""
+    """What all ensembles walk on: the density (`SamplingDensity.evaluate`), and the map to its coordinates."""
 
-    density: SamplingDensity
+    evaluate: Evaluate
     map: RidgeMap
 
 
@@ -49,16 +51,21 @@ class Walked(NamedTuple):
 
 def walk(ground: Ground, piece: tuple[emcee.State, int]) -> Walked:
     """Walk a number of steps on from a state."""
-    (state, steps), density = piece, copy(ground.density)
-    density.calls, density.failures = 0, Counter()
+    (state, steps), calls, failures = piece, 0, Counter[str]()
+
+    def density(u: np.ndarray) -> np.ndarray:
+        nonlocal calls
+        values, status = ground.evaluate(ground.map.outwards(u))
+        calls += len(u)
+        failures.update(counted(status))
+        return values
+
     np.random.RandomState().set_state(state.random_state)  # raises where emcee would go on with another one
     moves = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)]
-    sampler = emcee.EnsembleSampler(
-        *state.coords.shape, lambda u: density(ground.map.outwards(u)), moves=moves, vectorize=True
-    )
+    sampler = emcee.EnsembleSampler(*state.coords.shape, density, moves=moves, vectorize=True)
     sampler.run_mcmc(state, steps, skip_initial_state_check=True, progress=False)
     end = sampler.backend
-    return Walked(end.chain, end.log_prob, end.blobs, end.accepted, end.random_state, density.calls, density.failures)
+    return Walked(end.chain, end.log_prob, end.blobs, end.accepted, end.random_state, calls, failures)
 
 
 @dataclass(frozen=True)

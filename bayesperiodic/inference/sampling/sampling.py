@@ -18,6 +18,7 @@ from bayesperiodic.inference.sampling.checkpoint import Checkpoint, Saved
 from bayesperiodic.inference.sampling.coordinates import COLLAPSED, NATURAL, RIDGE, SAMPLED, RidgeMap, SamplingDensity
 from bayesperiodic.inference.sampling.draws import gather
 from bayesperiodic.inference.sampling.ensemble import Ensemble, Ground, Walked, walk
+from bayesperiodic.inference.sampling.in_step import InStep
 from bayesperiodic.inference.sampling.nuts import refuse_for_nuts, sample_nuts
 from bayesperiodic.inference.sampling.posterior import Posterior
 from bayesperiodic.inference.sampling.starts import LAPLACE, STARTS, start_points, walking_axes
@@ -96,8 +97,8 @@ def sample(
         one returns at once. emcee's HDFBackend reads it, in coordinates in which the Laplace approximation is a unit
         sphere. A run may go on with another executor.
     executor : None, int, Dask Client, or executor with the interface of concurrent.futures
-        Who walks. By default the cores of this machine share walkers and experiments of vectorised calls in this
-        process, which is fastest where there is one machine and calls are not tiny. A number means that many processes,
+        Who walks. By default all ensembles walk in step in this process, and the cores share the solves of calls with
+        what all of them propose, which is fastest where there is one machine. A number means that many processes,
         for which a script must keep its calls below ``if __name__ == "__main__":``. ``mpi4py.futures.MPIPoolExecutor``
         and Dask reach the nodes of a cluster, which should be alike: other processors may round differently. A worker
         takes an ensemble some steps on, so that at most `ensembles` of them are busy; it uses one core. The problem is
@@ -209,8 +210,7 @@ class _Run:
         anchor = np.array(state["anchor"]) if saved else problem.vector(fit.theta)
         guesses = state["guesses"] if saved else {name: s.states for name, s in fit.solutions.items()}
         anchored = problem.anchored(anchor, guesses)
-        threads = max(1, available_cores() // ensembles)
-        densities = [self._density(anchored, threads) for _ in range(ensembles)]
+        densities = [self._density(anchored, available_cores()) for _ in range(ensembles)]
         self.map = (
             RidgeMap(np.array(state["origin"]), np.array(state["axes"]))
             if saved
@@ -252,9 +252,12 @@ class _Run:
         """Walk until the stop rule is passed twice in succession, `max_steps` are reached, Ctrl-C, or workers die."""
         if self.state["converged"]:
             return
-        density = self.density if executor is None else self._density(self.density.problem, 1)
         try:
-            with team(executor, Ground(density, self.map)) as crew:
+            if executor is None:
+                self._walk(max_steps, store, InStep(Ground(self.density.evaluate, self.map)), progress)
+                return
+            alone = self._density(self.density.problem, 1)
+            with team(executor, Ground(alone.evaluate, self.map)) as crew:
                 self._walk(max_steps, store, crew, progress)
         except KeyboardInterrupt:
             if not self._stopped("interrupted", store):
@@ -278,7 +281,7 @@ class _Run:
             self._save(store, now=True)
         return enough
 
-    def _walk(self, max_steps: int, store: Checkpoint | None, crew: Team, progress: bool) -> None:
+    def _walk(self, max_steps: int, store: Checkpoint | None, crew: Team | InStep, progress: bool) -> None:
         state = self.state
         with tqdm(total=max_steps, unit="step", desc="sampling", disable=not progress) as bar:
             for steps in range(state["checked"] + BLOCK, max_steps + 1, BLOCK):
@@ -299,7 +302,7 @@ class _Run:
         left = ", ".join(state["missing"]) or "the stop rule passed only once"
         state |= {"steps": state["checked"], "reason": f"max_steps = {max_steps} reached with {left}"}
 
-    def _advance(self, steps: int, crew: Team, bar: tqdm) -> None:
+    def _advance(self, steps: int, crew: Team | InStep, bar: tqdm) -> None:
         """Walk all ensembles to a number of steps, each piece by piece."""
         behind = [number for number, ensemble in enumerate(self.ensembles) if ensemble.steps < steps]
 
