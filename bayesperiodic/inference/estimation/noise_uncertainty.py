@@ -3,7 +3,7 @@
 import numpy as np
 
 from bayesperiodic.inference.estimation.gauss_newton import Iterate, information
-from bayesperiodic.inference.noise.blocks import SPECTRAL
+from bayesperiodic.inference.noise.blocks import SPECTRAL, Block
 from bayesperiodic.inference.problem import Problem
 
 # Quantiles of the priors of a spectrum's shape that are tried: many of the first parameter, few of any other.
@@ -67,13 +67,14 @@ def _mixture(
     r = np.concatenate([estimate.here.residuals[b] for b in members])
     weight = np.concatenate([np.full(block.size, block.weight) for block in blocks])
     here = estimate.noise[[likelihood.names.index(name) for name in group]]
-    now = weight / np.concatenate([problem.noise.spectrum(block, here)[0] for block in blocks])
+    now = weight / _spectra(problem, blocks, here)
     others = hessian * np.outer(scale, scale) - (s * now) @ s.T + RIDGE * np.eye(scale.size)
     pull, freedom = -(s * now) @ r, max(float(weight.sum()) - len(problem.names), 1.0)
     points, log_prior = _points(problem)
     log_posterior, found = np.empty(len(points)), np.empty((len(points), *covariance.shape))
-    for i, point in enumerate(points):
-        shape = np.concatenate([problem.noise.spectrum(block, np.array([1.0, *point]))[0] for block in blocks])
+    spectra = _spectra(problem, blocks, np.column_stack([np.ones(len(points)), points]))
+    for i in range(len(points)):
+        shape = spectra[i]
         own = weight / shape
         left, variance = r, float(np.sum(own * r**2)) / freedom
         for _ in range(ROUNDS):
@@ -87,6 +88,11 @@ def _mixture(
         found[i] = np.linalg.inv(total) + np.outer(step, step)
     posterior = np.exp(log_posterior - log_posterior.max())
     return np.tensordot(posterior / posterior.sum(), found, 1) * np.outer(scale, scale)
+
+
+def _spectra(problem: Problem, blocks: list[Block], values: np.ndarray) -> np.ndarray:
+    """Return the variances of the components of all blocks one after the other, (…, components)."""
+    return np.concatenate([problem.noise.spectrum(block, values)[0] for block in blocks], axis=-1)
 
 
 def _points(problem: Problem) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -131,8 +132,9 @@ class Likelihood:
             if self.model.flat:
                 total = self._flat(residuals, values, share)
                 return np.where(np.isfinite(total), total, -np.inf)
-            for block, columns, r in zip(self.blocks, self._columns, residuals, strict=True):
-                total = total + self._block(block, r, values[..., columns], share)
+            for members in self._alike:
+                own = values[..., self._columns[members[0]]]
+                total = total + self._together([residuals[b] for b in members], self.blocks[members[0]], own, share)
         return np.where(np.isfinite(total), total, -np.inf)
 
     def _flat(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
@@ -156,7 +158,26 @@ class Likelihood:
             np.array([0.0 if block.kind == CORRELATED else block.measured for block, _ in own]),
         )
 
-    def _block(self, block: Block, r: np.ndarray, values: np.ndarray, share: float) -> np.ndarray:
+    @cached_property
+    def _alike(self) -> list[list[int]]:
+        """The indices of blocks whose components have the same variances: whole periods, their harmonics the same."""
+        groups: dict[Any, list[int]] = {}
+        for b, (block, columns) in enumerate(zip(self.blocks, self._columns, strict=True)):
+            measured = block.measured if self.model.needs_scatter else None
+            key = (tuple(columns), block.weight, measured, block.harmonic.tobytes())
+            groups.setdefault(key if block.kind == SPECTRAL else b, []).append(b)
+        return list(groups.values())
+
+    def _together(self, residuals: list[np.ndarray], block: Block, values: np.ndarray, share: float) -> np.ndarray:
+        """Return the log-likelihood (…,) of blocks like this one, the logarithms multiplied by `share`."""
+        if block.kind != SPECTRAL:
+            return self._alone(block, residuals[0], values, share)
+        variances = self._variances(block, values)[0]
+        squares = sum(r**2 for r in residuals)
+        terms = len(residuals) * share * np.log(variances) + squares / variances
+        return -0.5 * block.weight * np.sum(terms, axis=-1)
+
+    def _alone(self, block: Block, r: np.ndarray, values: np.ndarray, share: float) -> np.ndarray:
         """Return the log-likelihood (…,) of one block, the logarithms of the variances multiplied by `share`."""
         if block.kind == KNOWN:
             return -0.5 * _square(r)
@@ -203,18 +224,20 @@ class Likelihood:
         slopes = self._log_prior(values)[1]
         if self.model.flat:
             return self._flat_gradients(residuals, values, share, slopes)
-        by_residual = []
-        for block, columns, r in zip(self.blocks, self._columns, residuals, strict=True):
+        by_residual: list[np.ndarray] = [np.empty(0)] * len(self.blocks)
+        for members in self._alike:
+            block, columns = self.blocks[members[0]], self._columns[members[0]]
+            own = np.stack([residuals[b] for b in members])
             if block.kind == KNOWN:
-                by_residual.append(-r)
+                by_residual[members[0]] = -own[0]
                 continue
             if self._is_dense(block):
-                _, by_r, by_phi = self._dense(block, r, values[columns], share)
+                _, by_residual[members[0]], by_phi = self._dense(block, own[0], values[columns], share)
             else:
                 variances, change = self._variances(block, values[columns])
-                by_r = -block.weight * r / variances
-                by_phi = 0.5 * block.weight * (r**2 / variances - share) @ change
-            by_residual.append(by_r)
+                for b, r in zip(members, own, strict=True):
+                    by_residual[b] = -block.weight * r / variances
+                by_phi = 0.5 * block.weight * np.sum(own**2 / variances - share, axis=0) @ change
             slopes[columns] += by_phi
         return by_residual, slopes
 
@@ -234,17 +257,20 @@ class Likelihood:
 
     def whitened(self, vectors: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
         """Return vectors (…, size), one a block, in units of the noise: their squares sum to −2 log-likelihood."""
-        result = []
-        for block, columns, r in zip(self.blocks, self._columns, vectors, strict=True):
+        result = list(vectors)
+        for members in self._alike:
+            block, columns, first = self.blocks[members[0]], self._columns[members[0]], members[0]
             if block.kind == KNOWN:
-                result.append(r)
                 continue
             if self._is_dense(block):
                 covariance, _ = self.model.covariance(block, values[columns])
-                white = solve_triangular(np.linalg.cholesky(covariance), r.reshape(-1, block.size).T, lower=True)
-                result.append(np.sqrt(block.weight) * white.T.reshape(r.shape))
+                rows = vectors[first].reshape(-1, block.size)
+                white = solve_triangular(np.linalg.cholesky(covariance), rows.T, lower=True)
+                result[first] = np.sqrt(block.weight) * white.T.reshape(vectors[first].shape)
             else:
-                result.append(r * np.sqrt(block.weight / self._variances(block, values[columns])[0]))
+                scale = np.sqrt(block.weight / self._variances(block, values[columns])[0])
+                for b in members:
+                    result[b] = vectors[b] * scale
         return result
 
     def simulate(self, values: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:
