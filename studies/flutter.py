@@ -16,7 +16,8 @@ from studies import common, common_resumed, flutter_campaigns, flutter_figures, 
 from studies.flutter_data import read_records, usable
 from studies.flutter_rig import AUTHORS, MODEL, RIG, SENSORS, Fitted, cycles, estimate, problem
 
-SAMPLING: dict[str, Any] = {"ensembles": 2, "walkers": 24, "max_steps": 12_000, "executor": 2, "progress": False}
+SAMPLING: dict[str, Any] = {"ensembles": 2, "walkers": 24, "max_steps": 12_000, "progress": False}
+KINDS = ("stable", "unstable")
 
 
 class Answers(NamedTuple):
@@ -100,7 +101,8 @@ def sample(
     with watch.part("sample", "sampling the posterior"):
         posterior = bp.sample(stated, fit, seed=options.seed, **SAMPLING)
     with watch.part("verdicts", "asking what the data determine, and where Laplace and the draws differ"):
-        return Sampled(fit, posterior, bp.identifiability(stated, fit, posterior), bp.compare(stated, fit, posterior))
+        verdict = bp.identifiability(stated, fit, posterior, profile=False, candidates=[])
+        return Sampled(fit, posterior, verdict, bp.compare(stated, fit, posterior))
 
 
 def hopf_and_fold() -> dict[str, float]:
@@ -118,24 +120,17 @@ def hopf_and_fold() -> dict[str, float]:
 def parts(
     experiments: dict[str, bp.Experiment], speeds: dict[str, float], both: Fitted, quick: bool
 ) -> tuple[dict[str, Fitted], dict[str, Any]]:
-    """Return the fits by kind of cycle, and how cycles that were not fitted are predicted: by speed and by kind.
-
-    Other processes leave the wind speeds out meanwhile.
-    """
+    """Return the fits by kind of cycle, and how cycles that were not fitted are predicted: by speed and by kind."""
+    kinds = {kind: [name for name in experiments if flutter_questions.kind_of(name) != kind] for kind in KINDS}
+    left_out = {f"{other} from {kind}": kinds[kind] for kind, other in zip(KINDS, KINDS[::-1], strict=True)}
+    for group in flutter_questions.groups(speeds)[: 1 if quick else None]:
+        label = " and ".join(sorted({f"{speeds[name]:g}" for name in group}))
+        left_out[f"without {label} m/s"] = group
     draws, theta = 20 if quick else 200, dict(both.fit.theta)
-    with common_resumed.workers() as pool:
-        running = {}
-        for group in flutter_questions.groups(speeds)[: 1 if quick else None]:
-            label = " and ".join(sorted({f"{speeds[name]:g}" for name in group}))
-            running[f"without {label} m/s"] = pool.submit(
-                flutter_questions.leave_out, experiments, speeds, theta, group, draws
-            )
-        fits = flutter_questions.subsets(experiments, speeds, both)
-        left = {}
-        for kind, other in (("stable", "unstable"), ("unstable", "stable")):
-            names = [name for name in experiments if name.startswith("unstable") == (other == "unstable")]
-            left[f"{other} from {kind}"] = flutter_questions.predictions(fits[kind], experiments, speeds, names, draws)
-        return fits, left | {label: one.result() for label, one in running.items()}
+    tasks = [(experiments, speeds, theta, names, draws) for names in left_out.values()]
+    found = dict(zip(left_out, common_resumed.each(flutter_questions.leave_out, tasks), strict=True))
+    fits = dict(zip(KINDS, (fitted for fitted, _ in found.values()), strict=False)) | {"both": both}
+    return fits, {label: predicted for label, (_, predicted) in found.items()}
 
 
 def with_known_noise(both: Fitted, experiments: dict[str, bp.Experiment], speeds: dict[str, float]) -> bp.Problem:

@@ -78,13 +78,9 @@ def mean_size(found: Mapping[str, Any]) -> float | None:
     return float(np.sqrt(np.mean(np.square(each)))) if each else None
 
 
-def subsets(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float], both: Fitted) -> dict[str, Fitted]:
-    """Return the fits to the stable cycles alone, to the unstable ones alone, and to both."""
-    found = {"both": both}
-    for kind in ("stable", "unstable"):
-        own = {name: e for name, e in experiments.items() if name.startswith("unstable") == (kind == "unstable")}
-        found[kind] = estimate(own, speeds, start=START | both.fit.theta)
-    return {kind: found[kind] for kind in ("stable", "unstable", "both")}
+def kind_of(name: str) -> str:
+    """Return "stable" or "unstable", what a record's name tells of its cycle."""
+    return "unstable" if name.startswith("unstable") else "stable"
 
 
 def contraction(fits: Mapping[str, Fitted]) -> dict[str, dict[str, dict[str, float]]]:
@@ -138,10 +134,11 @@ def leave_out(
     theta: dict[str, float],
     left: list[str],
     draws: int,
-) -> dict[str, Any]:
-    """Return how the fit without some cycles predicts them; its way starts at the estimate θ from all."""
+) -> tuple[Fitted, dict[str, Any]]:
+    """Return the fit without some cycles, whose way starts at the estimate θ from all, and how it predicts them."""
     kept = {name: e for name, e in experiments.items() if name not in left}
-    return predictions(estimate(kept, speeds, start=START | theta), experiments, speeds, left, draws)
+    fitted = estimate(kept, speeds, start=START | theta)
+    return fitted, predictions(fitted, experiments, speeds, left, draws)
 
 
 def predictions(

@@ -20,7 +20,6 @@ from bayesperiodic.periodic.kernels import (
     GRID,
     INDICES,
     MATRIX,
-    MAX_CHORDS,
     MAX_ITERATIONS,
     NOT_FINITE,
     OPTIONS,
@@ -45,6 +44,7 @@ from bayesperiodic.periodic.kernels import (
 )
 
 SHRUNK, ABSENT = 1e-6, 1e-6
+MAX_SECANTS, SECANT_RATE = 12, 0.5
 BORDERED = f"Tuple(({MATRIX}, {PLACES}, {VECTOR}, {MATRIX}, {VECTOR}))"
 ANCHOR = f"Tuple(({VECTOR}, {MATRIX}, float64, {CUBE}, {VECTOR}))"
 WORK = f"Tuple(({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {BORDERED}))"
@@ -255,38 +255,72 @@ def newton_free(
     return STALLED, MAX_ITERATIONS, frequency, orientation
 
 
+@njit(f"float64({VECTOR}, {VECTOR})", **OPTIONS)
+def dot(one, other):
+    """Return the sum of products."""
+    total = 0.0
+    for i in range(one.size):
+        total += one[i] * other[i]
+    return total
+
+
 @njit(
     f"Tuple((boolean, int64, float64))({FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {MATRIX}, "
     f"{BORDERED}, float64, {WORK})",
     **OPTIONS,
 )
-def chord_free(
+def secant(
     residual_jacobian, grid, inputs, parameters, tau, frequency, drift, z, kept, target, work
 ):  # fmt: skip
     """Improve z in place with the factors at an anchor; return whether that converged, the steps, and the frequency.
 
-    A step above `CHORD_RATE` times the one before ends it.
+    Broyden's method: a step with the anchor's factors is corrected by what the steps before it have shown of the
+    present matrix. What such a step is without corrections must always be less than `SECANT_RATE` times the step
+    before. So every direction in which the orbit is still to be improved has a stiffness of the sign that it has at the
+    anchor, and no fold is crossed. (C. G. Broyden, Mathematics of Computation 19 (1965) 577-593; without matrices:
+    C. T. Kelley, Iterative Methods for Linear and Nonlinear Equations, SIAM, 1995, section 7.3.)
     """
     states, columns, _, right, _ = work
     points, count = z.shape[0], z.shape[1]
-    step, previous = np.empty((points, count)), np.inf
-    for iteration in range(MAX_CHORDS):
+    step, unit, first = np.empty((points, count)), np.empty(count), frequency
+    taken, squares, previous = np.empty((MAX_SECANTS, points * count + 1)), np.empty(MAX_SECANTS), np.inf
+    largest(z, unit)
+    for s in range(count):
+        unit[s] = unit[s] if unit[s] > 0.0 else 1.0
+    for iteration in range(MAX_SECANTS):
         differentiate(z, drift, grid, tau, frequency, states)
         residual_jacobian(states, inputs, parameters, tau, frequency, columns)
         negative(columns, grid, right)
-        faster = bordered_solve(kept, target - along(z, grid, kept[2]), right)
+        own = taken[iteration]
+        own[points * count] = bordered_solve(kept, target - along(z, grid, kept[2]), right) / first
         unfold(right, grid, step)
-        full = max(scaled_step(z, step), abs(faster) / frequency)
-        if not full < min(FAR, CHORD_RATE * previous) or not frequency + faster > 0.0:
-            return False, iteration + 1, frequency
         for i in range(points):
             for s in range(count):
-                z[i, s] += step[i, s]
-        frequency += faster
+                own[i * count + s] = step[i, s] / unit[s]
+        if iteration > 0 and not dot(own, own) < SECANT_RATE**2 * squares[iteration - 1]:
+            return False, iteration + 1, frequency
+        for k in range(iteration):
+            share = dot(taken[k], own) / squares[k]
+            if k < iteration - 1:
+                for i in range(own.size):
+                    own[i] += share * taken[k + 1, i]
+            else:
+                for i in range(own.size):
+                    own[i] /= 1.0 - share
+        squares[iteration] = dot(own, own)
+        full = 0.0
+        for i in range(own.size):
+            full = max(full, abs(own[i]))
+        if not (full < FAR and squares[iteration] > 0.0) or not frequency + own[points * count] * first > 0.0:
+            return full == 0.0, iteration + 1, frequency
+        for i in range(points):
+            for s in range(count):
+                z[i, s] += own[i * count + s] * unit[s]
+        frequency += own[points * count] * first
         if full <= STEP_TOLERANCE or (iteration > 0 and full**2 <= STEP_TOLERANCE * previous):
             return True, iteration + 1, frequency
         previous = full
-    return False, MAX_CHORDS, frequency
+    return False, MAX_SECANTS, frequency
 
 
 @njit(f"float64(float64, {VECTOR}, {VECTOR}, {VECTOR}, float64)", **OPTIONS)
@@ -449,7 +483,7 @@ def follow_many(
     status,
     iterations,
 ):
-    """Follow every orbit to its parameter vectors start … stop: by chord steps, or else as `creep` does.
+    """Follow every orbit to its parameter vectors start … stop: by secant steps, or else as `creep` does.
 
     Nothing depends on the order of the solves.
 
@@ -492,7 +526,7 @@ def follow_many(
             copy(predicted, z)
             close, used, f, code = False, 0, expected, lost
             if orientations[e] != 0.0 and not (whole and lost != CONVERGED):
-                close, used, f = chord_free(
+                close, used, f = secant(
                     residual_jacobian, grid, inputs[e], theta, tau, expected, drift[e], z,
                     (bands[e], pivots[e], rows[e], sides[e], small[e]), targets[e], work,
                 )  # fmt: skip

@@ -12,7 +12,7 @@ NAMES = (
     "STEP_TOLERANCE", "CHORD_RATE", "FAR", "factor", "solve", "solve_transposed", "differentiate", "assemble",
     "factorise", "back_substitute", "scales", "norm", "scaled_step", "newton", "repetitions", "solve_many",
 )  # fmt: skip
-FREE_NAMES = ("orient", "bordered_solve", "chord_free", "has_shrunk", "has_shorter_period", "follow_many")
+FREE_NAMES = ("orient", "bordered_solve", "secant", "has_shrunk", "has_shorter_period", "follow_many")
 ADJOINT_NAMES = ("back_substitute_transposed", "pull_many")
 GENERIC = "STATES, REACH = 0, 0"
 KERNELS = "bayesperiodic.periodic.kernels"

@@ -77,12 +77,12 @@ def test_bordered_solve_and_orientation_are_those_of_dense_algebra(scheme):
     assert signs == {-1.0, 1.0}
 
 
-def test_chord_steps_near_an_anchor_converge_with_its_factors_alone():
+def test_steps_near_an_anchor_converge_with_its_factors_alone():
     equations, anchor = anchor_of(solved(1.0))
     bordered = Bordered(equations, anchor.parameters, anchor.z, anchor.frequency)
     other = Bordered(equations, anchor.parameters, anchor.z, anchor.frequency)
     target, theta, z = bordered.row @ anchor.z.ravel(), anchor.parameters + np.array([0.01, 0.0]), anchor.z.copy()
-    close, steps, frequency = autonomous_kernels().chord_free(
+    close, steps, frequency = autonomous_kernels().secant(
         ODD.kernels.residual_jacobian, equations.grid.packed, equations.inputs, theta, equations.grid.tau,
         anchor.frequency, equations.drift, z, bordered.parts, target, other.work,
     )  # fmt: skip
