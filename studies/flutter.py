@@ -16,7 +16,13 @@ from studies import common, common_resumed, flutter_campaigns, flutter_figures, 
 from studies.flutter_data import read_records, usable
 from studies.flutter_rig import AUTHORS, MODEL, RIG, SENSORS, Fitted, cycles, estimate, problem
 
-SAMPLING: dict[str, Any] = {"ensembles": 2, "walkers": 24, "max_steps": 12_000, "progress": False}
+SAMPLING: dict[str, Any] = {
+    "ensembles": 2,
+    "walkers": 20,
+    "max_steps": 12_000,
+    "variances": "collapsed",
+    "progress": False,
+}
 KINDS = ("stable", "unstable")
 
 

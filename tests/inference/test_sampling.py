@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.inference.sampling import chains, sampling, stopping
+from bayesperiodic.inference.sampling.coordinates import SamplingDensity
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])
@@ -61,6 +64,35 @@ def test_unknown_variance_follows_its_closed_form(variances, prior, lost):
     ]
     lp = posterior.data["sample_stats"]["lp"].transpose("chain", "draw").to_numpy().ravel()[[0, 7]]
     assert values[0] - values[1] == pytest.approx(lp[0] - lp[1], abs=1e-8)
+
+
+@pytest.mark.parametrize("prior", ["jeffreys", "flat"])
+@pytest.mark.parametrize("two", [False, True])
+def test_collapsed_density_of_errors_with_a_known_spectrum_is_the_integral_over_the_variance(prior, two):
+    """By quadrature over ln v, of one experiment and of two that share the variance."""
+    runs = [linear_experiment(TRUTH, 3.0, seed=2)] + [
+        replace(linear_experiment(TRUTH, 3.0, seed=3), name="other")
+    ] * two
+    shape = {"lengthscale[force]": 0.05, "floor[force]": 0.1}
+    noise = bp.noise.Circulant(prior=prior)
+    problem = bp.Problem(LINEAR, runs, priors=PRIORS, fixed=shape, noise=noise)
+    problem = problem.anchored(TRUTH)
+    whole, collapsed = (SamplingDensity(problem, variances=v) for v in ("sampled", "collapsed"))
+    assert collapsed.labels == problem.names and collapsed.collapsed == ("variance[force]",)
+    points = TRUTH * (1.0 + 0.02 * np.random.default_rng(1).standard_normal((4, 3)))
+    found = collapsed(points)[:, 0]
+    logarithms = np.linspace(-6.0, 16.0, 4001)
+    for point, value in zip(points, found, strict=True):
+        every = whole(np.column_stack([np.tile(point, (logarithms.size, 1)), logarithms]))
+        integral = np.log(np.trapezoid(np.exp(every - every.max()), logarithms)) + every.max()
+        assert value == pytest.approx(integral, abs=1e-8)
+
+
+def test_variances_of_a_spectrum_of_unknown_shape_cannot_be_collapsed():
+    noise = bp.noise.Circulant()
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=2)], priors=PRIORS, noise=noise)
+    with pytest.raises(ValueError, match="or of circulant ones with a fixed shape"):
+        bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, variances="collapsed", **QUIET)
 
 
 def regressors() -> np.ndarray:

@@ -73,12 +73,28 @@ class Likelihood:
         return {name: value / self.counts[name] for name, value in total.items()}
 
     def moments(self, residuals: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-        """Return Σ weight·r² (…,) behind each variance (and "scale"), the M of eq. (6), by its name."""
+        """Return Σ weight·r²/S (…,) behind each variance (and "scale"), the M of eq. (6), by its name.
+
+        S, the spectrum for a variance of 1, is 1 for errors whose spectrum is flat; all else has to be known.
+        """
         result: dict[str, np.ndarray] = {}
-        for block, columns, square in zip(self.blocks, self._columns, Residuals.of(residuals).squares, strict=True):
+        own = residuals if self.model.flat else self._unit(residuals)
+        for block, columns, square in zip(self.blocks, self._columns, Residuals.of(own).squares, strict=True):
             if block.counted:
                 name = self.names[columns[0]]
                 result[name] = result.get(name, 0.0) + block.weight * square
+        return result
+
+    def _unit(self, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return the residuals over the square roots of the spectra for variances of 1."""
+        values = np.array([self.fixed.get(name, 1.0) for name in self.names])
+        result = list(residuals)
+        for members in self._alike:
+            block, columns = self.blocks[members[0]], self._columns[members[0]]
+            if block.kind == SPECTRAL:
+                scale = np.sqrt(self._variances(block, np.array([1.0, *values[columns[1:]]]))[0])
+                for b in members:
+                    result[b] = residuals[b] / scale
         return result
 
     def value_variances(self, values: np.ndarray) -> dict[tuple[str, str], np.ndarray]:

@@ -9,7 +9,8 @@ from scipy.special import gammaln
 from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.estimation.joint_laplace import logarithmic
 from bayesperiodic.inference.linearisation import Linearisation
-from bayesperiodic.inference.noise.models import FLAT, JEFFREYS, Independent
+from bayesperiodic.inference.noise.blocks import KNOWN, SPECTRAL
+from bayesperiodic.inference.noise.models import FLAT, JEFFREYS, Circulant, Independent
 from bayesperiodic.inference.problem import Problem
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
 
@@ -216,9 +217,15 @@ def counted(status: np.ndarray) -> Counter[str]:
 
 
 def collapsible(problem: Problem) -> tuple[str, ...]:
-    """Return the free variances that can be integrated out in closed form: independent errors, prior 1/v or flat."""
-    closed = isinstance(problem.noise, Independent) and problem.noise.prior in (JEFFREYS, FLAT)
-    return tuple(name for name in problem.free_noise if closed and name in problem.likelihood.counts)
+    """Return the free variances that can be integrated out in closed form, those with the prior 1/v or a flat one.
+
+    The errors are independent, or of whole periods with a spectrum of known shape.
+    """
+    noise, counts = problem.noise, problem.likelihood.counts
+    shaped = isinstance(noise, Circulant) and all(b.kind in (SPECTRAL, KNOWN) for b in problem.likelihood.blocks)
+    closed = (isinstance(noise, Independent) or shaped) and noise.prior in (JEFFREYS, FLAT)
+    known = all(name in counts for name in problem.free_noise)
+    return tuple(name for name in problem.free_noise if closed and name in counts and (known or not shaped))
 
 
 @dataclass(frozen=True)

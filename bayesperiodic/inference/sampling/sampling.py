@@ -87,7 +87,8 @@ def sample(
         "natural" takes no logarithms of parameters.
     variances : "sampled" or "collapsed"
         "collapsed" integrates the unknown variances out and draws them exactly afterwards: the same posterior in fewer
-        dimensions. Only for independent errors with the prior 1/v or a flat one.
+        dimensions. Only with the prior 1/v or a flat one, for independent errors or circulant ones whose length scale
+        and floor are fixed.
     sampler : "emcee" or "nuts"
         "nuts" takes ``pip install "bayesperiodic[nuts]"``; no walkers, checkpoint, executor or collapsed variances;
         `max_steps` does not count its tuning, `acceptance` is that of its trajectories, and ``sample_stats`` tells more
@@ -162,8 +163,8 @@ def sample(
     plain = SamplingDensity(problem, coordinates=coordinates, variances=variances)
     if variances == COLLAPSED and not plain.collapsed:
         raise ValueError(
-            "variances: 'collapsed' is not allowed; there is no unknown variance of independent errors with the prior "
-            "1/v or a flat one. Take variances='sampled'."
+            "variances: 'collapsed' is not allowed; there is no unknown variance with the prior 1/v or a flat one, of "
+            "independent errors or of circulant ones with a fixed shape. Take variances='sampled'."
         )
     if sampler == NUTS:
         refuse_for_nuts(walkers, variances, checkpoint, executor)
