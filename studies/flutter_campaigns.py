@@ -1,7 +1,8 @@
 """Synthetic flutter rigs again and again: do the intervals of the nonlinear stiffnesses cover, are branches kept apart.
 
 Each campaign has the eight kinds of cycles of the true model, with noise of its own as large as that of the measured
-records, folded and fitted as these are. The sensors' scales are known, since they and the stiffnesses are one.
+records, folded and fitted as these are, but for the noise: with a true model the scatter of the cycles tells how much
+there is in each record (`bp.noise.Measured`). The sensors' scales are known, since they and the stiffnesses are one.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 
 from scipy.stats import binom
 
+import bayesperiodic as bp
 from studies import common, flutter_data, flutter_rig
 from studies.common_resumed import resumed
 from studies.flutter_questions import FREE_SCALES, errors
@@ -58,7 +60,8 @@ def campaign(task: Task) -> dict[str, Any]:
         experiments, refused = flutter_data.usable(records)
         speeds = {record.recording.name: record.speed for record in records}
         try:
-            fitted = estimate(experiments, speeds, start=TRUE, known={name: TRUE[name] for name in FREE_SCALES})
+            known = {name: TRUE[name] for name in FREE_SCALES}
+            fitted = estimate(experiments, speeds, start=TRUE, known=known, noise=bp.noise.Measured())
         except ValueError as error:
             return {"seed": task[0], "source": source(), "refused": refused, "failure": str(error)}
     fit, intervals = fitted.fit, fitted.fit.interval(LEVEL)

@@ -117,7 +117,8 @@ def problem(
 ) -> bp.Problem:
     """Return the problem of some cycles, the model's frequency allowed an error [Hz] beside the measured one's.
 
-    The delay of the outputs is fixed: τ = 0 is where the fundamental of heave says, in the data and in the model.
+    The delay of the outputs is fixed: cycles are compared at the phase at which the fundamentals of both sensors agree
+    best.
     """
     known = dict(known or {})
     allowed = [replace(e, frequency_se=math.hypot(e.frequency_se, frequency_error)) for e in experiments]
@@ -131,6 +132,7 @@ def estimate(
     speeds: Mapping[str, float],
     start: Mapping[str, float] = START,
     known: Mapping[str, float] | None = None,
+    noise: Any = "circulant",
 ) -> Fitted:
     """Return the MAP point; the frequency's error is what the last fit but one left, root mean square.
 
@@ -143,11 +145,11 @@ def estimate(
     error = FIRST_SHARE * float(np.mean([e.frequency for e in guessed]))
     point = {name: value for name, value in start.items() if name in PRIORS and name not in known}
     for _ in range(ROUNDS):
-        stated = problem(guessed, speeds, frequency_error=error, known=known)
+        stated = problem(guessed, speeds, frequency_error=error, known=known, noise=noise)
         fit = bp.map_estimate(stated, start=point, progress=False)
         missed = [fit.solutions[e.name].frequency - e.frequency for e in guessed]
         measured = float(np.sqrt(np.mean([e.frequency_se**2 for e in guessed])))
         error = math.sqrt(max(float(np.mean(np.square(missed))) - measured**2, 0.0))
         point = dict(fit.theta)
-    stated = problem(guessed, speeds, frequency_error=error, known=known)
+    stated = problem(guessed, speeds, frequency_error=error, known=known, noise=noise)
     return Fitted(stated, bp.map_estimate(stated, start=point, progress=False), error)

@@ -39,7 +39,7 @@ class Observation:
 
     Outputs are delayed, compared with the data (angles modulo 2π), and taken at the points of the mask or as Fourier
     components within the harmonics kept. The orbit of an autonomous model, whose phase is free, is first turned until
-    the first harmonic of its first measured output has the phase of the data.
+    the first harmonics of its measured outputs agree best with those of the data.
 
     Parameters
     ----------
@@ -293,23 +293,42 @@ class Observation:
         """Return by what fraction of the response period the outputs are shifted, (…,)."""
         fraction = np.asarray(response.delay) * response.frequency / self.experiment.periods
         if self._free_phase:
-            model = fourier.coefficients(response.outputs[..., self._columns[0]], 1)[..., 1]
-            data = fourier.coefficients(self._data[:, 0], 1)[1]
-            fraction = fraction + np.angle(model / data) / (2 * np.pi)
+            agreement = np.sum(self._fundamentals(response.outputs) * self._reference, axis=-1)
+            fraction = fraction + np.angle(agreement) / (2 * np.pi)
         return fraction
+
+    def _fundamentals(self, outputs: np.ndarray) -> np.ndarray:
+        """Return the complex amplitude of the first harmonic of each channel, (…, channels)."""
+        return fourier.coefficients(np.moveaxis(outputs[..., self._columns], -1, -2), 1)[..., 1]
+
+    @cached_property
+    def _reference(self) -> np.ndarray:
+        """What multiplies the channels' fundamentals, so that the angle of the sum is by how much they are behind.
+
+        With the variances of the measurement, where they are known, it is the likeliest phase; one channel's phase
+        alone would bring its noise into all others. Angles, which may wind, have no part in it unless there is nothing
+        else.
+        """
+        noise = np.array([_measured_variance(self.experiment, channel) for channel in self.channels])
+        known = bool(np.all(np.isfinite(noise) & (noise > 0.0)))
+        weights = 1.0 / (noise if known else self._data.var(axis=0))
+        angles = np.array(self._angles)
+        weights[angles & ~angles.all()] = 0.0
+        return weights * np.conj(fourier.coefficients(self._data.T, 1)[:, 1])
 
     def _fraction_changes(self, response: Response, directions: Response) -> np.ndarray:
         delays = directions.delay * response.frequency + response.delay * directions.frequency
         changes = delays / self.experiment.periods
         if self._free_phase:
-            changes = changes + directions.outputs[..., self._columns[0]] @ self._phase_gradient(response)
+            moved = directions.outputs[..., self._columns]
+            changes = changes + np.einsum("...pc,pc->...", moved, self._phase_gradient(response))
         return changes
 
     def _phase_gradient(self, response: Response) -> np.ndarray:
-        """Return the derivative (points,) of the first output's phase [turns] by its values."""
-        amplitude = fourier.coefficients(response.outputs[:, self._columns[0]], 1)[1]
+        """Return the derivatives (points, channels) of the outputs' phase [turns] by their values."""
+        agreement = np.sum(self._fundamentals(response.outputs) * self._reference)
         wave = np.exp(-2j * np.pi * np.arange(self._points) / self._points) * 2.0 / self._points
-        return np.imag(wave / amplitude) / (2 * np.pi)
+        return np.imag(np.outer(wave, self._reference) / agreement) / (2 * np.pi)
 
     def _shift(self, signals: np.ndarray, fraction: np.ndarray, turning: bool = False) -> np.ndarray:
         """Return signals (…, points, channels) that come a fraction of the response period later."""

@@ -246,6 +246,32 @@ def test_an_autonomous_cycle_is_identified_whatever_its_phase():
     assert fits[0].theta["mu"] == pytest.approx(fits[1].theta["mu"], abs=2 * fits[0].sd["mu"])
 
 
+def test_the_phase_of_a_cycle_is_the_likeliest_one_of_all_channels():
+    """Within a standard deviation, for the fundamentals tell it; the phase of the noisy channel is ten off."""
+    model = bp.Model(
+        "two_sensors",
+        states=["x"],
+        parameters=["mu"],
+        equations=lambda s, p, u: [s.ddx - p.mu * (1 - s.x**2) * s.dx + s.x],
+        outputs=lambda s, p, u: {"position": s.x, "rate": s.dx},
+    )
+    truth = bp.solve_periodic(model, {"mu": 0.3}, frequency=0.16, samples=SAMPLES, scheme="central4")
+    sds = {"position": 0.1, "rate": 0.005}
+    for seed in range(3):
+        generator = np.random.default_rng(seed)
+        outputs = {c: truth.outputs[c] + sd * generator.standard_normal(SAMPLES) for c, sd in sds.items()}
+        run = bp.Experiment(
+            "run", truth.frequency, outputs, samples=SAMPLES, frequency_se=1e-4, guess=truth.states, scatter=sds
+        )
+        fixed = {f"variance[{c}]": sd**2 for c, sd in sds.items()}
+        priors = {"mu": bp.LogNormal(0.3, 0.5), "shift": bp.Normal(0.0, 1.0)}
+        problem = bp.Problem(model, [run], priors=priors, fixed=fixed, scheme="central4")
+        shifts = np.linspace(-2e-3, 2e-3, 9)
+        theta = np.stack([np.full(9, 0.3), shifts], axis=-1)
+        curve = np.polyfit(shifts, problem.anchored(theta[4]).log_likelihood(theta, {}), 2)
+        assert abs(curve[1] / (2.0 * curve[0])) < 1.0 / np.sqrt(-2.0 * curve[0])
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
