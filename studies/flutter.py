@@ -12,7 +12,15 @@ import argparse
 from typing import Any, NamedTuple
 
 import bayesperiodic as bp
-from studies import common, common_resumed, flutter_campaigns, flutter_figures, flutter_questions, flutter_results
+from studies import (
+    common,
+    common_resumed,
+    flutter_campaigns,
+    flutter_checks,
+    flutter_figures,
+    flutter_questions,
+    flutter_results,
+)
 from studies.flutter_data import read_records, usable
 from studies.flutter_rig import AUTHORS, MODEL, RIG, SENSORS, Fitted, cycles, estimate, problem
 
@@ -29,6 +37,7 @@ KINDS = ("stable", "unstable")
 class Answers(NamedTuple):
     """What was asked of the cycles, and what came out."""
 
+    checks: dict[str, Any]
     authors: dict[str, Any]
     authors_branch: dict[str, float]
     fits: dict[str, Fitted]
@@ -66,7 +75,7 @@ def run(options: argparse.Namespace) -> None:
     results = {"data": data, "seed": options.seed, "quick": options.quick}
     results |= flutter_results.of_records(records, experiments, refused)
     results |= flutter_results.of_fits(found.fits, experiments, found.authors)
-    results |= {"authors_branch": found.authors_branch, "predictions": found.left_out}
+    results |= {"checks": found.checks, "authors_branch": found.authors_branch, "predictions": found.left_out}
     results |= flutter_results.of_posterior(found.structure, sampled.fit, *sampled[1:])
     results |= {"seconds": watch.total(), "versions": common.versions()}
     print("\n" + flutter_results.tables(results) + f"\n{found.structure}\n{sampled.verdict or ''}")
@@ -80,6 +89,8 @@ def answers(
 ) -> Answers:
     """Return what the fits say: of the authors' values, to all cycles, to some of them, and of those left out."""
     with watch.part("authors", "following the cycles of the authors' values from the Hopf point"):
+        checks = flutter_checks.account()
+        print(flutter_checks.line(checks), flush=True)
         authors = flutter_questions.authors_errors(experiments, speeds)
         branch = hopf_and_fold()
     with watch.part("map", "estimating from all cycles"):
@@ -88,7 +99,7 @@ def answers(
         fits, left = parts(experiments, speeds, both, quick)
     with watch.part("structure", "asking what the equations leave open"):
         structure = bp.structure(MODEL, fixed=[n for n in MODEL.parameters if n in RIG or n in ("U", "c_h", "c_alpha")])
-    return Answers(authors, branch, fits, left, structure)
+    return Answers(checks, authors, branch, fits, left, structure)
 
 
 def sample(

@@ -81,7 +81,7 @@ class Cycles(NamedTuple):
         return fitting[-1] if kind else fitting[0]
 
 
-def cycles(values: Mapping[str, float]) -> Cycles:
+def cycles(values: Mapping[str, float], samples: int = SAMPLES) -> Cycles:
     """Return the cycles of a set of values, followed from its Hopf point through all folds up to the highest speed.
 
     Raises
@@ -93,7 +93,7 @@ def cycles(values: Mapping[str, float]) -> Cycles:
     if not points:
         raise ValueError(f"values: {dict(values)} are not allowed; no Hopf point is between {SEARCHED} m/s.")
     point = points[0]
-    first = bp.emerging_cycle(MODEL, point, amplitude={"alpha": FIRST_AMPLITUDE}, samples=SAMPLES, scheme=SCHEME)
+    first = bp.emerging_cycle(MODEL, point, amplitude={"alpha": FIRST_AMPLITUDE}, samples=samples, scheme=SCHEME)
     if not first.converged:
         raise ValueError(f"values: {dict(values)} are not allowed; the first cycle is {first.status}.")
     if first.parameters["U"] > point.value:

@@ -7,7 +7,7 @@ import pint
 import pytest
 
 import bayesperiodic as bp
-from tests.flutter_rig import RIG, flutter_matrices
+from studies.flutter_reference import RIG, flutter_matrices
 
 LIBRARY = {
     "duffing": lambda: bp.models.duffing,

@@ -9,9 +9,17 @@ import pandas as pd
 import pytest
 
 import bayesperiodic as bp
-from studies import common, common_resumed, flutter_campaigns, flutter_data, flutter_questions, flutter_rig
+from studies import (
+    common,
+    common_resumed,
+    flutter_campaigns,
+    flutter_checks,
+    flutter_data,
+    flutter_questions,
+    flutter_rig,
+)
 from studies.__main__ import main
-from tests.flutter_rig import hopf
+from studies.flutter_reference import hopf
 
 REAL = common.find_data(None, flutter_data.FILE)
 real_data = pytest.mark.skipif(REAL is None, reason="the measured file is not to be had here, see flutter_data.py")
@@ -36,6 +44,22 @@ def test_authors_hopf_point_is_that_of_the_eigenvalues_and_a_speed_without_a_cyc
     assert along.at("stable", 16.5).stable and not along.at("unstable", 16.5).stable
     with pytest.raises(ValueError, match="its fold at 14.936.*The Hopf point is at 18.27"):
         along.at("unstable", 14.9)
+
+
+def test_half_a_range_is_that_of_the_signal_and_not_of_its_samples():
+    tau = (np.arange(12) + 0.3) / 12
+    assert flutter_checks.half_range(0.2 + np.cos(2 * np.pi * tau)) == pytest.approx(1.0, rel=1e-6)
+
+
+def test_a_quick_run_tells_what_was_asked_and_says_synthetic(tmp_path):
+    printed = run(tmp_path, "--quick")
+    assert "SYNTHETIC records" in printed
+    results = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
+    assert results["data"]["synthetic"] and results["quick"] and results["branches_kept_apart"]
+    for by_speed in results["checks"]["stable_cycles"]["24 points"].values():
+        assert max(map(abs, by_speed.values())) < 1e-6
+    assert set(results["predictions"]) >= {"unstable from stable", "stable from unstable"}
+    assert {path.stem for path in tmp_path.glob("*.png")} == {"bifurcation", "portraits", "contraction"}
 
 
 def test_synthetic_records_are_called_synthetic_and_have_the_cycles_of_the_truth():

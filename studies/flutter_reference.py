@@ -1,5 +1,8 @@
 """The flutter rig by other means: matrices in numbers, eigenvalues, time integration; nothing of the package."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
@@ -14,7 +17,7 @@ RIG = {
 SENSORS = {"gain_heave": 1 / 0.18, "gain_pitch": 1.0, "offset_heave": 3.37, "offset_pitch": 0.71}
 
 
-def flutter_matrices(p):
+def flutter_matrices(p: Mapping[str, float]) -> tuple[np.ndarray, ...]:
     """Return mass, damping and stiffness at p["U"], written out entry by entry as they were published."""
     b, a, rho, U, pi = p["b"], p["a"], p["rho"] * p["span"], p["U"], np.pi
     c0, c1, c2, c3, c4 = 1.0, 0.165, 0.0455, 0.335, 0.3
@@ -49,18 +52,18 @@ def flutter_matrices(p):
     return tuple(np.array(matrix, dtype=float) for matrix in (mass, damping, stiffness))
 
 
-def first_order(speed, rig):
+def first_order(speed: float, rig: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
     """Return A of ẏ = A y for small motion, y = (q, q̇), and what the spring's moment does to ẏ."""
-    mass, damping, stiffness = flutter_matrices(rig | {"U": speed})
+    mass, damping, stiffness = flutter_matrices({**rig, "U": speed})
     inverse = np.linalg.inv(mass)
     below = np.hstack([-inverse @ stiffness, -inverse @ damping])
     return np.vstack([np.hstack([np.zeros((3, 3)), np.eye(3)]), below]), -inverse[:, 1]
 
 
-def hopf(rig=RIG):
+def hopf(rig: Mapping[str, float] = RIG) -> tuple[float, float]:
     """Return speed [m/s] and frequency [Hz] at which the equilibrium loses its stability."""
 
-    def leading(speed):
+    def leading(speed: float) -> complex:
         values = np.linalg.eigvals(first_order(speed, rig)[0])
         return values[np.argmax(np.where(values.imag > 0.0, values.real, -np.inf))]
 
@@ -69,20 +72,21 @@ def hopf(rig=RIG):
 
 
 @cache
-def settled(speed, seconds=120.0):
+def settled(speed: float, seconds: float = 120.0) -> tuple[float, np.ndarray]:
     """Return frequency [Hz] and states (3, 2000) of the stable cycle, by time integration from a large deflection."""
     matrix, moment = first_order(speed, RIG)
 
-    def rate(t, y):
+    def rate(t: float, y: np.ndarray) -> np.ndarray:
         change = matrix @ y
         change[3:] += moment * (RIG["k_alpha2"] * y[1] ** 2 + RIG["k_alpha3"] * y[1] ** 3)
         return change
 
-    def top(t, y):
-        return y[3]
+    def top(t: float, y: np.ndarray) -> float:
+        return float(y[3])
 
-    top.direction = -1.0
+    top.direction = -1.0  # type: ignore[attr-defined]
     start = solve_ivp(rate, (0.0, seconds), [0.05, 0.1, 0, 0, 0, 0], method="DOP853", rtol=1e-9, atol=1e-11).y[:, -1]
     last = solve_ivp(rate, (0.0, 1.5), start, method="DOP853", rtol=1e-11, atol=1e-13, events=top, dense_output=True)
+    assert last.t_events is not None and last.sol is not None
     first, second = last.t_events[0][:2]
     return 1.0 / (second - first), last.sol(np.linspace(first, second, 2000, endpoint=False))[:3]
