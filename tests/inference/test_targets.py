@@ -143,3 +143,18 @@ def test_ridge_with_a_far_second_branch_is_not_called_converged_without_it():
     posterior = bp.sample(problem, fit, seed=1, max_steps=3000, **QUIET)
     negative = float(np.mean(posterior.draws("a") < 0.0))
     assert not posterior.converged or abs(negative - 0.012) < 0.006
+
+
+@pytest.mark.filterwarnings("ignore:The data do not change under")
+def test_mode_over_the_logarithms_on_a_narrow_ridge():
+    """a²·b = 1 to 1e-6; with ln a ~ N(0, ½²) and ln b ~ N(ln 3, 1) the mode over ln a, ln b is at ln a = −ln(3)/4."""
+    problem = bp.Problem(
+        model("square_times_other", ["a", "b"], lambda p: {"y": p.a**2 * p.b}),
+        [run(y=1.0)],
+        priors={"a": bp.LogNormal(1.0, 0.5), "b": bp.LogNormal(3.0, 1.0)},
+        fixed=known(y=1e-6),
+    )
+    fit = bp.map_estimate(problem, progress=False)
+    assert np.log(fit.joint_mode["a"]) == pytest.approx(-np.log(3.0) / 4.0, abs=1e-4)
+    assert 2.0 * np.log(fit.joint_mode["a"]) + np.log(fit.joint_mode["b"]) == pytest.approx(0.0, abs=1e-5)
+    assert np.log(fit.theta["a"]) > -np.log(3.0) / 4.0 + 0.1

@@ -75,6 +75,16 @@ class Objective:
         here = self.problem.with_responses(iterate.here.responses).linearised(iterate.theta)
         return Iterate(iterate.theta, here, iterate.noise, iterate.objective)
 
+    def moved(self, theta: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Return θ after a step, along which parameters whose density is over the logarithm grow exponentially.
+
+        So the step stays on the ridge of a product, which is straight in logarithms.
+        """
+        result, logs = theta + step, self.logarithmic
+        with np.errstate(over="ignore"):
+            result[logs] = theta[logs] * np.exp(step[logs] / theta[logs])
+        return result
+
     def hessian_and_gradient(self, iterate: Iterate) -> tuple[np.ndarray, np.ndarray]:
         """Return H of eq. (8) and the gradient of the objective, the prior's part included in both."""
         hessian, gradient = information(self.problem, iterate)
@@ -167,7 +177,7 @@ def _ascend(
             return now, "converged", history
         damping = 1.0
         for _ in range(MAX_HALVINGS):
-            trial = objective.at(now.theta + damping * step, now.here, now.noise)
+            trial = objective.at(objective.moved(now.theta, damping * step), now.here, now.noise)
             if trial is not None and trial.objective > now.objective:
                 break
             damping, trial = 0.5 * damping, None
