@@ -66,6 +66,11 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(_cores(), thread_name_prefix="bayesperiodic")
 
 
+if hasattr(os, "register_at_fork"):
+    # A forked process has the pool without its threads, and would wait for them for ever.
+    os.register_at_fork(after_in_child=_threads.cache_clear)
+
+
 def checked_executor(executor: Any) -> Any:
     """Return what was given as `executor`; raise a ValueError unless tasks can be handed to it."""
     if executor is None or (callable(getattr(executor, "submit", None)) and not isinstance(executor, type)):

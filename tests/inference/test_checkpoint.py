@@ -148,7 +148,7 @@ def test_interrupted_runs_give_what_they_have_and_can_go_on(problem, uninterrupt
     def interrupted(self, *arguments, **named):
         nonlocal calls
         calls += 1
-        if calls == 450:
+        if calls == 225:
             signal.raise_signal(signal.SIGINT)
         return original(self, *arguments, **named)
 
