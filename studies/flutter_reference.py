@@ -84,6 +84,7 @@ def settled(speed: float, seconds: float = 120.0) -> tuple[float, np.ndarray]:
     def top(t: float, y: np.ndarray) -> float:
         return float(y[3])
 
+    # solve_ivp reads an event's direction off the function, which has no such attribute by its type.
     top.direction = -1.0  # type: ignore[attr-defined]
     start = solve_ivp(rate, (0.0, seconds), [0.05, 0.1, 0, 0, 0, 0], method="DOP853", rtol=1e-9, atol=1e-11).y[:, -1]
     last = solve_ivp(rate, (0.0, 1.5), start, method="DOP853", rtol=1e-11, atol=1e-13, events=top, dense_output=True)
