@@ -47,17 +47,25 @@ class Observation:
     model : Model
     delayed : bool
         Whether the delay is a parameter; without it outputs are not shifted at all, unless the phase is free.
+
+    Attributes
+    ----------
+    channels : tuple of str
+        Those measured, in the order of the model's outputs.
+    columns : list of int
+        Where these are among the model's outputs.
+    data : array (points, channels)
     """
 
     def __init__(self, experiment: Experiment, model: Model, delayed: bool):
         self.experiment = experiment
         self.channels = tuple(channel for channel in model.outputs if channel in experiment.outputs)
-        self._columns = [model.outputs.index(channel) for channel in self.channels]
+        self.columns = [model.outputs.index(channel) for channel in self.channels]
         self._angles = [channel in model.angles for channel in self.channels]
         self._free_phase = model.autonomous
         self._shifted = delayed or model.autonomous
-        self._data = np.stack([experiment.outputs[channel] for channel in self.channels], axis=-1)
-        self._points = len(self._data)
+        self.data = np.stack([experiment.outputs[channel] for channel in self.channels], axis=-1)
+        self._points = len(self.data)
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
@@ -124,24 +132,24 @@ class Observation:
 
     def data_components(self) -> list[np.ndarray]:
         """Return the Fourier components (size,) of each measured channel."""
-        return [self._spectral(self._data[:, c], self._harmonics[name]) for c, name in enumerate(self.channels)]
+        return [self._spectral(self.data[:, c], self._harmonics[name]) for c, name in enumerate(self.channels)]
 
     def components(self, outputs: np.ndarray) -> list[np.ndarray]:
         """Return the Fourier components (…, size) of each measured channel of outputs (…, points, channels)."""
-        pairs = zip(self._columns, self.channels, strict=True)
+        pairs = zip(self.columns, self.channels, strict=True)
         return [self._spectral(outputs[..., column], self._harmonics[name]) for column, name in pairs]
 
     def spread(self, weights: Sequence[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
         """Return the transpose of `components` applied to weights (…, size) a channel: (…, points, channels)."""
         total = np.zeros((*weights[0].shape[:-1], *shape))
-        for own, column, name in zip(weights, self._columns, self.channels, strict=True):
+        for own, column, name in zip(weights, self.columns, self.channels, strict=True):
             total[..., column] = self._spread(own, self._harmonics[name])
         return total
 
     def residuals(self, response: Response) -> list[np.ndarray]:
         """Return the residual components, one array (…, size) a block."""
         e = self.experiment
-        difference = self._data - self._predicted(response)
+        difference = self.data - self._predicted(response)
         for c, angle in enumerate(self._angles):
             if angle:
                 difference[..., c] = np.mod(difference[..., c] + np.pi, 2 * np.pi) - np.pi
@@ -164,7 +172,7 @@ class Observation:
     def changes(self, response: Response, directions: Response) -> list[np.ndarray]:
         """Return the derivatives of the predicted components along directions, one array (directions, size) a block."""
         e = self.experiment
-        moved = directions.outputs[..., self._columns]
+        moved = directions.outputs[..., self.columns]
         if self._shifted:
             moved = self._shift(moved, self._fraction(response))
             moved = moved - self._rate(response) * self._fraction_changes(response, directions)[:, None, None]
@@ -173,7 +181,7 @@ class Observation:
 
     def pulled(self, response: Response, weights: list[np.ndarray]) -> Response:
         """Return the derivatives of Σ weights · predicted components by everything in a forced model's response."""
-        e, total, joint = self.experiment, np.zeros_like(self._data), np.zeros(0)
+        e, total, joint = self.experiment, np.zeros_like(self.data), np.zeros(0)
         if e.multipliers is not None:
             joint = weights[-1] @ self._joint[2]
         if e.covariance is not None:
@@ -191,7 +199,7 @@ class Observation:
             by_delay = -float(np.sum(total * self._rate(response))) * float(response.frequency) / e.periods
             total = self._shift(total, -self._fraction(response))
         outputs = np.zeros_like(response.outputs)
-        outputs[:, self._columns] = total
+        outputs[:, self.columns] = total
         return Response(outputs, np.zeros(()), joint, np.array(by_delay))
 
     def predicted(self, response: Response) -> dict[str, np.ndarray]:
@@ -210,7 +218,7 @@ class Observation:
         components : list of array (draws, size)
             Of the noise, one array a block.
         """
-        e, noise = self.experiment, np.full((len(components[0]), *self._data.shape), np.nan)
+        e, noise = self.experiment, np.full((len(components[0]), *self.data.shape), np.nan)
         if e.covariance is not None:
             values = solve_triangular(self._joint[0], components[0].T, lower=True).T
             mask = np.ones(self._points, dtype=bool) if e.mask is None else e.mask
@@ -222,12 +230,12 @@ class Observation:
                 else:
                     noise[:, e.mask, c] = components[c]
         values = self._predicted(response) + noise
-        turned = self._data - (np.mod(self._data - values + np.pi, 2 * np.pi) - np.pi)
+        turned = self.data - (np.mod(self.data - values + np.pi, 2 * np.pi) - np.pi)
         return {n: (turned if self._angles[c] else values)[..., c] for c, n in enumerate(self.channels)}
 
     def compared(self, response: Response) -> dict[str, np.ndarray]:
         """Return y − ŷ (points,) of each channel, within the harmonics kept and zero where nothing was measured."""
-        difference = self._data - self._predicted(response)
+        difference = self.data - self._predicted(response)
         result = {}
         for c, channel in enumerate(self.channels):
             e = difference[:, c]
@@ -286,7 +294,7 @@ class Observation:
 
     def _predicted(self, response: Response) -> np.ndarray:
         """Return the model's outputs (…, points, channels), turned and delayed."""
-        outputs = response.outputs[..., self._columns]
+        outputs = response.outputs[..., self.columns]
         return self._shift(outputs, self._fraction(response), turning=True) if self._shifted else outputs
 
     def _fraction(self, response: Response) -> np.ndarray:
@@ -299,7 +307,7 @@ class Observation:
 
     def _fundamentals(self, outputs: np.ndarray) -> np.ndarray:
         """Return the complex amplitude of the first harmonic of each channel, (…, channels)."""
-        return fourier.coefficients(np.moveaxis(outputs[..., self._columns], -1, -2), 1)[..., 1]
+        return fourier.coefficients(np.moveaxis(outputs[..., self.columns], -1, -2), 1)[..., 1]
 
     @cached_property
     def _reference(self) -> np.ndarray:
@@ -311,16 +319,16 @@ class Observation:
         """
         noise = np.array([_measured_variance(self.experiment, channel) for channel in self.channels])
         known = bool(np.all(np.isfinite(noise) & (noise > 0.0)))
-        weights = 1.0 / (noise if known else self._data.var(axis=0))
+        weights = 1.0 / (noise if known else self.data.var(axis=0))
         angles = np.array(self._angles)
         weights[angles & ~angles.all()] = 0.0
-        return weights * np.conj(fourier.coefficients(self._data.T, 1)[:, 1])
+        return weights * np.conj(fourier.coefficients(self.data.T, 1)[:, 1])
 
     def _fraction_changes(self, response: Response, directions: Response) -> np.ndarray:
         delays = directions.delay * response.frequency + response.delay * directions.frequency
         changes = delays / self.experiment.periods
         if self._free_phase:
-            moved = directions.outputs[..., self._columns]
+            moved = directions.outputs[..., self.columns]
             changes = changes + np.einsum("...pc,pc->...", moved, self._phase_gradient(response))
         return changes
 

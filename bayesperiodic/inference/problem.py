@@ -12,9 +12,10 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.inference.all_at_once import all_at_once
 from bayesperiodic.inference.comparisons import Comparisons
 from bayesperiodic.inference.linearisation import Linearisation
+from bayesperiodic.inference.misfits import Misfits
 from bayesperiodic.inference.noise.likelihood import Likelihood
 from bayesperiodic.inference.noise.models import Noise, as_noise
-from bayesperiodic.inference.noise.residuals import Residuals
+from bayesperiodic.inference.noise.residuals import Residuals, Squares
 from bayesperiodic.inference.observation import Observation, Response
 from bayesperiodic.inference.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
 from bayesperiodic.inference.priors.joint import JointPrior
@@ -442,11 +443,49 @@ class Problem:
             The worst status code of the experiments, 0 where all have converged.
         """
         flat = theta.reshape(-1, len(self.names))
-        residuals, status = self.residuals(flat, threads)
+        residuals, status = self.compared(flat, threads)
         good, result = status == CONVERGED, np.full(len(flat), -np.inf)
         if good.any():
             result[good] = self.likelihood(residuals, noise.reshape(len(flat), -1)[good])
         return result.reshape(theta.shape[:-1]), status.reshape(theta.shape[:-1])
+
+    def compared(self, theta: np.ndarray, threads: int | None = None) -> tuple[Residuals | Squares, np.ndarray]:
+        """Return as much of `residuals` as the likelihood needs, and how all solves ended.
+
+        Parameters
+        ----------
+        theta : array (solves, names)
+        threads : int, optional
+            By default one a core.
+
+        Returns
+        -------
+        residuals : Residuals, or Squares where these are enough
+        status : int array (solves,)
+        """
+        if not self._misfits:
+            return self.residuals(theta, threads)
+        outputs, status = self.responses.outputs(theta, threads)
+        good = status == CONVERGED
+        if not good.all():
+            outputs = [own[:, good] for own in outputs]
+        small = max(own.size for own in outputs) < 10 * SMALLEST_SHARED
+        shared = 1 if small else threads or available_cores()
+        squares = [m.squares(own, shared) for m, own in zip(self._misfits, outputs, strict=True)]
+        return Squares(np.concatenate(squares)[self._places]), status
+
+    @cached_property
+    def _misfits(self) -> list[Misfits]:
+        """Those of the groups that are solved together; nothing where the likelihood needs more."""
+        groups = [[self.observations[e.name] for e in group] for group in self._responses.groups]
+        enough = self.likelihood.model.flat and all(map(Misfits.possible, groups))
+        return [Misfits(group) for group in groups] if enough else []
+
+    @cached_property
+    def _places(self) -> np.ndarray:
+        """Where the blocks are in the misfits of all groups, one after the other."""
+        order = [(e.name, c) for group in self._responses.groups for e in group for c in self.observations[e.name].channels]
+        return np.array([order.index((block.experiment, block.channel)) for block in self.likelihood.blocks])
 
     def residuals(self, theta: np.ndarray, threads: int | None = None) -> tuple[Residuals, np.ndarray]:
         """Return the residual components at those of many θ whose solves converge, and how all solves ended.

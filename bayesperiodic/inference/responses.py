@@ -126,21 +126,25 @@ class Responses:
         return equations, solve_forced(equations, parameters, guess)[0]
 
     @cached_property
-    def _batches(self) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch]]:
-        """Experiments on the same grid and with the same parameters free, with what solves them together."""
-        assert self._anchors is not None
+    def groups(self) -> list[tuple[Experiment, ...]]:
+        """Experiments on the same grid and with the same parameters free, which are solved together."""
         groups: dict[tuple[Any, ...], list[Experiment]] = {}
         for e in self.experiments:
-            own = self.maps[e.name]
-            groups.setdefault((e.samples, e.periods, *own.columns), []).append(e)
+            groups.setdefault((e.samples, e.periods, *self.maps[e.name].columns), []).append(e)
+        return [tuple(group) for group in groups.values()]
+
+    @cached_property
+    def _batches(self) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch]]:
+        """The groups with what solves them."""
+        assert self._anchors is not None
         kind = AutonomousBatch if self.model.autonomous else Batch
         return [
             (
-                tuple(group),
+                group,
                 ParameterMaps([self.maps[e.name] for e in group]),
                 kind([self.equations[e.name] for e in group], [self._anchors[e.name] for e in group]),
             )
-            for group in groups.values()
+            for group in self.groups
         ]
 
     def solve(
@@ -172,6 +176,25 @@ class Responses:
                 response = Response(solved.outputs[i], solved.frequency[i], logarithms, values[i, :, -1])
                 result[e.name] = SolvedResponse(response, solved.z[i], status)
         return {e.name: result[e.name] for e in self.experiments}
+
+    def outputs(self, theta: np.ndarray, threads: int | None = None) -> tuple[list[np.ndarray], np.ndarray]:
+        """Return the outputs (experiments, solves, points, channels) of each of `groups`, and how all solves ended.
+
+        For a forced model without measured multipliers.
+
+        Parameters
+        ----------
+        theta : array (solves, names)
+        threads : int, optional
+
+        Returns
+        -------
+        outputs : list of array
+        status : int array (solves,)
+            The worst of all experiments.
+        """
+        solved = [batch.solve(maps.values(theta)[..., :-1], threads) for _, maps, batch in self._batches]
+        return [s.outputs for s in solved], np.max([s.status.max(axis=0) for s in solved], axis=0)
 
     def reach(self, theta: np.ndarray, experiment: str) -> str:
         """Return how the branch through an experiment's anchor ends on the way to a θ (names,), see `reach.reach`."""

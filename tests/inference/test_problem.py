@@ -72,6 +72,32 @@ def test_projection_removes_what_the_fold_did_not_keep():
     assert np.sum((clean - kept) ** 2) > 1.0
 
 
+@pytest.mark.parametrize("kept", [{40: [None, None]}, {40: [3, None, 19]}, {41: [5, 20]}, {40: [None, 4], 63: [8]}])
+def test_each_experiment_counts_with_the_harmonics_that_it_keeps(kept):
+    """The squares behind eq. (6), against projections onto cosines and sines by least squares."""
+    generator, experiments, expected = np.random.default_rng(4), [], 0.0
+    theta, v = np.array([870.0, 37.0, 22.0]), 7.0
+    for samples, highest in kept.items():
+        tau = grid(samples)
+        for count in highest:
+            waves = np.arange(1 + (samples // 2 if count is None else count))
+            basis = np.column_stack([f(2 * np.pi * np.outer(tau, waves)) for f in (np.cos, np.sin)])
+            values = basis @ np.linalg.lstsq(basis, 1e3 * generator.standard_normal(samples), rcond=None)[0]
+            difference = values - linear_regressors(0.05, 2.0, tau) @ theta
+            projected = basis @ np.linalg.lstsq(basis, difference, rcond=None)[0]
+            independent = samples if count is None else 2 * count + 1
+            expected -= 0.5 * independent * (np.log(v) + np.mean(projected**2) / v)
+            harmonics = {} if count is None else {"force": count}
+            x, name = 0.05 * np.sin(2 * np.pi * tau), f"run {len(experiments)}"
+            experiments.append(
+                bp.Experiment(name, 2.0, {"force": values}, {"x": x}, samples=samples, harmonics=harmonics)
+            )
+    problem = bp.Problem(LINEAR, experiments, priors=PRIORS)
+    assert problem.log_likelihood(theta, {"force": v}) == pytest.approx(expected, rel=1e-9)
+    many = problem.log_likelihood(np.tile(theta, (3, 1)), np.full((3, 1), v))
+    assert (many == problem.log_likelihood(theta, {"force": v})).all()
+
+
 def test_prior_samples_have_the_names(problem):
     draws = problem.sample_prior(1000, seed=3)
     assert list(draws) == ["k", "c", "coulomb"]

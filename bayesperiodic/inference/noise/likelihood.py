@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular
 from bayesperiodic import checks
 from bayesperiodic.inference.noise.blocks import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
 from bayesperiodic.inference.noise.models import VARIANCE, Noise
-from bayesperiodic.inference.noise.residuals import Residuals
+from bayesperiodic.inference.noise.residuals import Residuals, Squares, squares_of
 
 
 class Likelihood:
@@ -72,14 +72,14 @@ class Likelihood:
                 total[name] = total.get(name, 0.0) + block.count * block.measured
         return {name: value / self.counts[name] for name, value in total.items()}
 
-    def moments(self, residuals: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    def moments(self, residuals: Sequence[np.ndarray] | Squares) -> dict[str, np.ndarray]:
         """Return Σ weight·r²/S (…,) behind each variance (and "scale"), the M of eq. (6), by its name.
 
         S, the spectrum for a variance of 1, is 1 for errors whose spectrum is flat; all else has to be known.
         """
         result: dict[str, np.ndarray] = {}
-        own = residuals if self.model.flat else self._unit(residuals)
-        for block, columns, square in zip(self.blocks, self._columns, Residuals.of(own).squares, strict=True):
+        own = residuals if isinstance(residuals, Squares) or self.model.flat else self._unit(residuals)
+        for block, columns, square in zip(self.blocks, self._columns, squares_of(own), strict=True):
             if block.counted:
                 name = self.names[columns[0]]
                 result[name] = result.get(name, 0.0) + block.weight * square
@@ -138,14 +138,17 @@ class Likelihood:
             for kind, columns in kinds.items()
         ]
 
-    def __call__(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float = 1.0) -> np.ndarray:
+    def __call__(
+        self, residuals: Sequence[np.ndarray] | Squares, values: np.ndarray, share: float = 1.0
+    ) -> np.ndarray:
         """Return the log-likelihood (…,) of residuals, one (…, size) a block, at values (…, names).
 
+        The sums of their squares are enough where the errors have a flat spectrum.
         The logarithms of the variances are multiplied by `share`: 1 − l/Σn for the bias correction of eq. (7).
         """
         total = np.zeros(values.shape[:-1])
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            if self.model.flat:
+            if isinstance(residuals, Squares) or self.model.flat:
                 total = self._flat(residuals, values, share)
                 return np.where(np.isfinite(total), total, -np.inf)
             for members in self._alike:
@@ -153,10 +156,10 @@ class Likelihood:
                 total = total + self._together([residuals[b] for b in members], self.blocks[members[0]], own, share)
         return np.where(np.isfinite(total), total, -np.inf)
 
-    def _flat(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
+    def _flat(self, residuals: Sequence[np.ndarray] | Squares, values: np.ndarray, share: float) -> np.ndarray:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, columns, sizes, weights, measured = self._levels
-        squares = np.moveaxis(Residuals.of(residuals).squares, 0, -1)
+        squares = np.moveaxis(squares_of(residuals), 0, -1)
         v = self.model.level(values[..., columns], measured)
         terms = weights * (share * sizes * np.log(v) + squares[..., at] / v)
         return -0.5 * (terms.sum(axis=-1) + squares[..., ~at].sum(axis=-1))

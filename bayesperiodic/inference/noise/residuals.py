@@ -1,10 +1,22 @@
-"""Residual components block by block, those of alike blocks side by side."""
+"""Residual components block by block, those of alike blocks side by side, or the sums of their squares alone."""
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+
+
+class Squares(NamedTuple):
+    """What the likelihood needs of residual components whose errors have a flat spectrum.
+
+    Attributes
+    ----------
+    squares : array (blocks, …)
+        The sum of the squares of each block.
+    """
+
+    squares: np.ndarray
 
 
 class Residuals(Sequence[np.ndarray]):
@@ -69,3 +81,8 @@ class Residuals(Sequence[np.ndarray]):
         for block, (stack, member) in enumerate(self._places):
             result[block] = sums[stack][member]
         return result
+
+
+def squares_of(residuals: Sequence[np.ndarray] | Squares) -> np.ndarray:
+    """Return the sum of the squares of each block, (blocks, …)."""
+    return residuals.squares if isinstance(residuals, Squares) else Residuals.of(residuals).squares
