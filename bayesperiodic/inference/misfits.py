@@ -1,0 +1,67 @@
+"""Sums of squared residual components straight from a model's outputs: all that errors with a flat spectrum need."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bayesperiodic.inference.observation import Observation
+from bayesperiodic.parallel import in_threads
+
+
+class Misfits:
+    """Experiments that are solved together and have their channels, whole periods, in common.
+
+    Parameters
+    ----------
+    observations : sequence of Observation
+        For which `possible` is true.
+    """
+
+    def __init__(self, observations: Sequence[Observation]):
+        self._columns = observations[0].columns
+        self._data = [np.stack([o.data[:, c] for o in observations]) for c in range(len(self._columns))]
+        self._kept = [[o.layout[2 + c] for o in observations if o.layout] for c in range(len(self._columns))]
+        self._points = self._data[0].shape[1]
+
+    @staticmethod
+    def possible(observations: Sequence[Observation]) -> bool:
+        """Return whether nothing but whole periods of the same channels is compared."""
+        layouts = [o.layout for o in observations]
+        return None not in layouts and len({layout[:2] for layout in layouts if layout}) == 1
+
+    def squares(self, outputs: np.ndarray, threads: int) -> np.ndarray:
+        """Return the sums of squares (experiments · channels, solves), channels running fastest.
+
+        Parameters
+        ----------
+        outputs : array (experiments, solves, points, channels)
+            In the order of the model's outputs.
+        threads : int
+        """
+        experiments, channels = len(outputs), len(self._columns)
+        result = np.empty((experiments, channels, outputs.shape[1]))
+
+        def one(part: slice) -> None:
+            for c, column in enumerate(self._columns):
+                difference = outputs[part, :, :, column] - self._data[c][part, None]
+                result[part, c] = self._squares(difference, self._kept[c][part])
+
+        shares = np.linspace(0, experiments, 1 + min(threads, experiments)).astype(int)
+        with np.errstate(over="ignore", invalid="ignore"):
+            in_threads(one, [slice(a, b) for a, b in zip(shares, shares[1:], strict=False)], threads)
+        return result.reshape(experiments * channels, -1)
+
+    def _squares(self, difference: np.ndarray, kept: Sequence[int]) -> np.ndarray:
+        """Return the sums of squares (experiments, solves) of so many real components, by Parseval's theorem."""
+        if all(size == self._points for size in kept):
+            return np.einsum("ebi,ebi->eb", difference, difference)
+        amplitudes = np.fft.rfft(difference, axis=-1)[..., : max(kept) // 2 + 1]
+        weights = np.full((len(kept), amplitudes.shape[-1]), 2.0)
+        weights[:, 0] = 1.0
+        for own, size in zip(weights, kept, strict=True):
+            own[(size + 1) // 2 :] = 0.0
+            if size % 2 == 0:
+                own[size // 2] = 1.0
+            own *= size / self._points**2
+        squares = amplitudes.real**2 + amplitudes.imag**2
+        return np.einsum("ebh,eh->eb", squares, weights)
