@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 import bayesperiodic as bp
+from studies.benchmark_gradient import gradient_error
 from studies.benchmark_integration import EQUILIBRIUM, ESTIMATE, PREDICTED, SHOOTING, STARTS, STEADY, Method, tune
 from studies.benchmark_problems import SCHEMES, Setting
 from studies.benchmark_reference import ALLOWED, Reference
@@ -106,7 +107,8 @@ def add_own(contest: Contest) -> str | None:
             contest.add(f"{name}, {scheme}", error, action)
         contest.add(f"{OWN_COLD}, {scheme}", error, Action(partial(_cold, setting, scheme), 1, SLOW_REPEATS))
         gradient = Action(partial(_gradients, setting, warm, SLOW_DRAWS), SLOW_DRAWS)
-        contest.add(f"{OWN_GRADIENT}, {scheme}", error, gradient, gradient_error=_own_gradient_error(setting, warm))
+        off = gradient_error(warm, setting.theta[0], setting.noise)
+        contest.add(f"{OWN_GRADIENT}, {scheme}", error, gradient, gradient_error=off)
     return best
 
 
@@ -136,16 +138,6 @@ def _cold(setting: Setting, scheme: str) -> None:
         )  # fmt: skip
         outputs = np.stack([solution.outputs[channel] for channel in case.model.outputs], axis=-1)
         case.log_likelihood(np.ascontiguousarray(outputs))
-
-
-def _own_gradient_error(setting: Setting, warm: bp.Problem) -> float:
-    """Return the error of the gradient by θ against central differences of log-posteriors, of its largest component."""
-    theta, sd = setting.theta[0], np.array(list(setting.fit.sd.values()))
-    given = warm.gradient(theta, setting.noise)[: theta.size] * sd
-    shifts = np.concatenate([np.diag(k * 0.05 * sd) for k in (-2.0, -1.0, 1.0, 2.0)])
-    two, one, minus_one, minus_two = warm.anchored(theta).log_posterior(theta - shifts, setting.noise).reshape(4, -1)
-    differences = (minus_two - 8.0 * minus_one + 8.0 * one - two) / (12.0 * 0.05)
-    return float(np.abs(given - differences).max() / np.abs(given).max())
 
 
 def add_compiled(contest: Contest) -> Compiled:

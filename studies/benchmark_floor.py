@@ -16,7 +16,8 @@ import numpy as np
 from scipy.linalg import lapack
 
 import bayesperiodic as bp
-from studies.benchmark_problems import SCHEMES, Setting
+from studies.benchmark_gradient import gradient_error
+from studies.benchmark_problems import SCHEMES, Setting, gear_priors
 from studies.benchmark_timing import Action, interleaved, ratio, spread
 from studies.solver_cost import lapack_band
 
@@ -24,6 +25,7 @@ WALKERS = 64
 COPIED = 64 * 2**20
 EMCEE_STEPS = 200
 SWEEP, FACTOR, SOLVE = "sweep", "dgbtrf", "dgbtrs"
+ALL_FREE = "gradient, 15 parameters"
 STAGES = ("priors", "periodic solves", "comparison with the data", "likelihood", "the rest of the call")
 
 
@@ -89,6 +91,7 @@ def measure(setting: Setting, repeats: int) -> dict[str, Any]:
 def _of_scheme(setting: Setting, scheme: str, repeats: int) -> dict[str, Any]:
     warm, noise, theta = setting.schemed(scheme), setting.noise, setting.theta
     floor, half = Floor(warm, setting.estimate), len(theta) // 2
+    all_free, at = with_all_free(setting, scheme)
     many = np.resize(theta[:half], (WALKERS, theta.shape[1]))
     stages = _stages(setting, warm, theta[:half])
     actions = {
@@ -98,10 +101,11 @@ def _of_scheme(setting: Setting, scheme: str, repeats: int) -> dict[str, Any]:
         "call": Action(partial(_calls, warm, theta[:half], noise), half),
         "batched": Action(partial(warm.log_posterior, many, noise), WALKERS),
         "gradient": Action(partial(_gradient, warm, theta[0], noise)),
+        ALL_FREE: Action(partial(_gradient, all_free, at, noise)),
     } | {f"stage {name}": Action(run, half) for name, run in stages.items()}  # fmt: skip
     times = interleaved(actions, repeats)
     under = times[SWEEP] + times[FACTOR] + times[SOLVE]
-    names = ("near", "far", "call", "batched", "gradient")
+    names = ("near", "far", "call", "batched", "gradient", ALL_FREE)
     return {
         "floor_us": {name: spread(1e6 * times[name]) for name in (SWEEP, FACTOR, SOLVE)} | {"sum": spread(1e6 * under)},
         "us": {name: spread(1e6 * times[name]) for name in names},
@@ -109,7 +113,19 @@ def _of_scheme(setting: Setting, scheme: str, repeats: int) -> dict[str, Any]:
         "stages_us": _differences({name: float(np.nanmedian(times[f"stage {name}"])) * 1e6 for name in stages}),
         "bytes": floor.bytes,
         "same_grid_error": same_grid_error(setting, warm),
-    }
+        "gradient_error": {
+            "gradient": gradient_error(warm, theta[0], noise), ALL_FREE: gradient_error(all_free, at, noise)
+        },
+    }  # fmt: skip
+
+
+def with_all_free(setting: Setting, scheme: str) -> tuple[bp.Problem, np.ndarray]:
+    """Return the problem of all 15 parameters, anchored at the estimate of the three, and these at the first draw."""
+    stated = setting.problem
+    other = bp.Problem(stated.model, stated.experiments, **gear_priors(15), scheme=scheme)
+    both = stated.parameters(np.stack([setting.estimate, setting.theta[0]]), stated.experiments[0].name)
+    estimate, at = (other.vector(dict(zip(stated.model.parameters, row, strict=True))) for row in both)
+    return other.anchored(estimate), at
 
 
 def _walk(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
@@ -130,11 +146,11 @@ def _gradient(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
 def _stages(setting: Setting, warm: bp.Problem, theta: np.ndarray) -> dict[str, Callable[[], Any]]:
     """Return the call's parts, each with all that comes before it but for the priors."""
     noise, points = setting.noise, [one[None] for one in theta]
-    residuals = [warm.residuals(one, 1)[0] for one in points]
+    residuals = [warm.compared(one, 1)[0] for one in points]
     return {
         "priors": lambda: [warm.log_prior(one) for one in theta],
-        "solves": lambda: [warm.responses.solve(one, 1) for one in points],
-        "residuals": lambda: [warm.residuals(one, 1) for one in points],
+        "solves": lambda: [warm.responses.outputs(one, 1) for one in points],
+        "residuals": lambda: [warm.compared(one, 1) for one in points],
         "likelihood": lambda: [warm.likelihood(one, noise[None]) for one in residuals],
         "whole": lambda: _walk(warm, theta, noise),
     }

@@ -268,23 +268,26 @@ def gear_runs(drive: str, samples: int = SAMPLES) -> list[tuple[float, dict[str,
     ]
 
 
-def gear_problem(drive: str, seed: int, *, free: int = 3, samples: int = SAMPLES, runs: int = 14) -> bp.Problem:
-    """Return the problem of theta4, theta6 and theta16, or of all 15 parameters under priors."""
-    priors: dict[str, Any] = {
+def gear_priors(free: int) -> dict[str, Any]:
+    """Return priors, ties and fixed values of theta4, theta6 and theta16, or of all 15 parameters."""
+    if free == 15:
+        scale = GEAR | {"theta2": 9.81, "theta7": 1 / 293, "theta12": 0.1}
+        return {"priors": {name: bp.Normal(value, 0.01 * abs(scale[name])) for name, value in GEAR.items()}}
+    priors = {
         "theta4": bp.LogNormal(GEAR["theta4"], 1.0),
         "theta6": bp.Normal(GEAR["theta6"], 2.5),
         "theta16": bp.Normal(GEAR["theta16"], 4.0),
     }
     tied = {"theta11": "-1e5*theta4"}
-    if free == 15:
-        tied = {}
-        spread = {n: 0.01 * abs(v) or 0.01 * {"theta2": 9.81, "theta7": 1 / 293, "theta12": 0.1}[n]
-                  for n, v in GEAR.items()}  # fmt: skip
-        priors = {name: bp.Normal(value, spread[name]) for name, value in GEAR.items()}
     fixed = {name: value for name, value in GEAR.items() if name not in (*priors, *tied)}
+    return {"priors": priors, "tied": tied, "fixed": fixed}
+
+
+def gear_problem(drive: str, seed: int, *, free: int = 3, samples: int = SAMPLES, runs: int = 14) -> bp.Problem:
+    """Return the problem of theta4, theta6 and theta16, or of all 15 parameters under priors."""
     model = bp.models.landing_gear(drive)
     experiments = measured(model, GEAR, gear_runs(drive, samples)[:runs], samples, seed)
-    return bp.Problem(model, experiments, priors=priors, fixed=fixed, tied=tied, scheme=FINE)
+    return bp.Problem(model, experiments, **gear_priors(free), scheme=FINE)
 
 
 def gear(drive: str, count: int, seed: int, **other: Any) -> Setting:

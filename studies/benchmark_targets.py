@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from studies.benchmark_contenders import GRADIENT, OWN_GRADIENT
+from studies.benchmark_floor import ALL_FREE
 from studies.benchmark_integration import EQUILIBRIUM, ESTIMATE, STEADY
 from studies.benchmark_peers import BALANCE, DIFFRAX_ROWS
 from studies.benchmark_posteriors import NUMPYRO
@@ -72,9 +73,13 @@ def _of_floor(floor: Mapping[str, Any]) -> list[Row]:
     for scheme, entry in floor["schemes"].items():
         for key, limit, what in (
             ("near", NEAR, "warm, one core, at draws"), ("far", NEAR, "warm, one core, at three times their spread"),
-            ("batched", BATCHED, "64 walkers, all cores"), ("gradient", WITH_GRADIENT, "value and gradient"),
+            ("call", NEAR, "warm, all cores, at draws"), ("batched", BATCHED, "64 walkers, all cores"),
+            ("gradient", WITH_GRADIENT, "value and gradient, 3 parameters"),
+            (ALL_FREE, WITH_GRADIENT, "value and gradient, 15 parameters"),
         ):  # fmt: skip
             result.append(row(f"{FORCE}, {scheme}: {what} / floor", entry["ratio"][key]["median"], 0.0, limit))
+        what = f"{FORCE}, {scheme}: error of the gradient by 15 parameters, of its largest component"
+        result.append(row(what, entry["gradient_error"][ALL_FREE], 0.0, GRADIENT_ERROR, "against central differences"))
         what = f"{FORCE}, {scheme}: |Δ log-posterior| against solves anchored at the draw"
         result.append(row(what, entry["same_grid_error"], 0.0, SAME_GRID))
     return result

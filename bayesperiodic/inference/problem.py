@@ -484,8 +484,10 @@ class Problem:
     @cached_property
     def _places(self) -> np.ndarray:
         """Where the blocks are in the misfits of all groups, one after the other."""
-        order = [(e.name, c) for group in self._responses.groups for e in group for c in self.observations[e.name].channels]
-        return np.array([order.index((block.experiment, block.channel)) for block in self.likelihood.blocks])
+        every = [self.observations[e.name] for group in self._responses.groups for e in group]
+        order = [(o.experiment.name, channel) for o in every for channel in o.channels]
+        places = {key: i for i, key in enumerate(order)}
+        return np.array([places[block.experiment, block.channel] for block in self.likelihood.blocks])
 
     def residuals(self, theta: np.ndarray, threads: int | None = None) -> tuple[Residuals, np.ndarray]:
         """Return the residual components at those of many θ whose solves converge, and how all solves ended.

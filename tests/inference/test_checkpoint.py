@@ -143,7 +143,7 @@ def test_killed_at_twenty_random_moments(problem, uninterrupted, tmp_path, monke
 def test_interrupted_runs_give_what_they_have_and_can_go_on(problem, uninterrupted, tmp_path, monkeypatch):
     """Ctrl-C in the third block: a partial result that says so, and the same chain in the end."""
     path, calls = tmp_path / "run.h5", 0
-    original = bp.Problem.residuals
+    original = bp.Problem.compared
 
     def interrupted(self, *arguments, **named):
         nonlocal calls
@@ -153,7 +153,7 @@ def test_interrupted_runs_give_what_they_have_and_can_go_on(problem, uninterrupt
         return original(self, *arguments, **named)
 
     with monkeypatch.context() as patch:
-        patch.setattr(bp.Problem, "residuals", interrupted)
+        patch.setattr(bp.Problem, "compared", interrupted)
         partial = bp.sample(*problem, checkpoint=path, **RUN)
     assert not partial.converged and partial.reason.startswith("interrupted after ")
     assert "NOT CONVERGED" in repr(partial)

@@ -138,9 +138,7 @@ class Likelihood:
             for kind, columns in kinds.items()
         ]
 
-    def __call__(
-        self, residuals: Sequence[np.ndarray] | Squares, values: np.ndarray, share: float = 1.0
-    ) -> np.ndarray:
+    def __call__(self, residuals: Sequence[np.ndarray] | Squares, values: np.ndarray, share: float = 1.0) -> np.ndarray:
         """Return the log-likelihood (…,) of residuals, one (…, size) a block, at values (…, names).
 
         The sums of their squares are enough where the errors have a flat spectrum.
