@@ -146,11 +146,11 @@ def _gradient(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
 def _stages(setting: Setting, warm: bp.Problem, theta: np.ndarray) -> dict[str, Callable[[], Any]]:
     """Return the call's parts, each with all that comes before it but for the priors."""
     noise, points = setting.noise, [one[None] for one in theta]
-    residuals = [warm.compared(one, 1)[0] for one in points]
+    residuals = [warm.misfits(one, 1)[0] for one in points]
     return {
         "priors": lambda: [warm.log_prior(one) for one in theta],
         "solves": lambda: [warm.responses.outputs(one, 1) for one in points],
-        "residuals": lambda: [warm.compared(one, 1) for one in points],
+        "residuals": lambda: [warm.misfits(one, 1) for one in points],
         "likelihood": lambda: [warm.likelihood(one, noise[None]) for one in residuals],
         "whole": lambda: _walk(warm, theta, noise),
     }

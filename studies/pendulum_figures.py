@@ -115,7 +115,7 @@ def errors(lines: Sequence[Mapping[str, Any]]) -> Figure:
             box = axes.boxplot([values], positions=[place + 0.28 * (number - 0.5 * (len(noises) - 1))], widths=0.2,
                                whis=(5, 95), patch_artist=True, manage_ticks=False, medianprops={"color": "black"},
                                flierprops={"ms": 4})  # fmt: skip
-            box["boxes"][0].set_facecolor(("#56B4E9", "#E69F00")[number % 2])
+            box["boxes"][0].set(facecolor=("#56B4E9", "#E69F00")[number % 2], hatch=("", "///")[number % 2])
             if place == 0:
                 box["boxes"][0].set_label(f"noise {noise:.1%} of the attractor")
     for place, error in enumerate(PAPER_ERRORS.values()):

@@ -19,6 +19,7 @@ import bayesperiodic as bp
 from studies import common
 
 SCHEMES = {"backward2": "#D55E00", "central2": "#E69F00", "central4": "#009E73", "fourier": "#0072B2"}
+LINES = {"central2": "--", "central4": "-", "backward2": ":", "fourier": "-."}
 TURN = 2 * np.pi
 
 DUFFING = {"m": 0.45, "c": 1.3, "k": 900.0, "k3": 4e5}
@@ -458,25 +459,27 @@ def draw_orders(forced: dict[str, Any], periods: dict[str, Any]) -> Figure:
     for scheme, colour in SCHEMES.items():
         entry = forced[scheme]
         order = "" if entry["order"] is None else f", fitted order {entry['order']:.2f}"
-        left.loglog(entry["samples"], entry["errors"], "o-", color=colour, ms=4, lw=1.4, label=scheme + order)
+        left.loglog(
+            entry["samples"], entry["errors"], "o" + LINES[scheme], color=colour, ms=4, lw=1.4, label=scheme + order
+        )
     for mu, marker in SHOWN.items():
         for scheme in ("central4", "fourier"):
             entry = periods[str(mu)][scheme]
             right.loglog(
                 entry["samples"],
                 entry["relative_errors"],
-                marker + "-",
+                marker + LINES[scheme],
                 color=SCHEMES[scheme],
                 ms=4,
                 lw=1.4,
                 label=f"{scheme}, mu = {mu:g}",
             )
     for axes in (left, right):
-        axes.set_xlabel("points per period n")
+        axes.set_xlabel("points per period n [1]")
         axes.legend(frameon=False, fontsize=9)
-    left.set_ylabel("largest error / largest displacement")
+    left.set_ylabel("largest error / largest displacement [1]")
     left.set_title("Duffing, smooth forcing: displacement")
-    right.set_ylabel("relative error of the period")
+    right.set_ylabel("relative error of the period [1]")
     right.set_ylim(top=1.0)
     right.set_title("van der Pol: period of the free oscillation")
     return figure

@@ -78,7 +78,7 @@ def refine_frequency(
         step = float(np.sum(weights * np.sum(slope * fit.residuals, axis=1))) / information
         limit = 0.25 / np.ptp(time)
         frequency += np.clip(step, -limit, limit)
-        if abs(step) < 1e-6 / np.sqrt(information):
+        if abs(step) < max(1e-6 / np.sqrt(information), np.finfo(float).eps * frequency):
             break
     fit, slope, weights = _linearised(time, channels, frequency, harmonics)
     cycle = np.floor((time - time[0]) * frequency).astype(int)

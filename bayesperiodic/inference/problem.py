@@ -443,13 +443,13 @@ class Problem:
             The worst status code of the experiments, 0 where all have converged.
         """
         flat = theta.reshape(-1, len(self.names))
-        residuals, status = self.compared(flat, threads)
+        residuals, status = self.misfits(flat, threads)
         good, result = status == CONVERGED, np.full(len(flat), -np.inf)
         if good.any():
             result[good] = self.likelihood(residuals, noise.reshape(len(flat), -1)[good])
         return result.reshape(theta.shape[:-1]), status.reshape(theta.shape[:-1])
 
-    def compared(self, theta: np.ndarray, threads: int | None = None) -> tuple[Residuals | Squares, np.ndarray]:
+    def misfits(self, theta: np.ndarray, threads: int | None = None) -> tuple[Residuals | Squares, np.ndarray]:
         """Return as much of `residuals` as the likelihood needs, and how all solves ended.
 
         Parameters
@@ -463,7 +463,7 @@ class Problem:
         residuals : Residuals, or Squares where these are enough
         status : int array (solves,)
         """
-        if not self._misfits:
+        if not self._squared:
             return self.residuals(theta, threads)
         outputs, status = self.responses.outputs(theta, threads)
         good = status == CONVERGED
@@ -471,11 +471,11 @@ class Problem:
             outputs = [own[:, good] for own in outputs]
         small = max(own.size for own in outputs) < 10 * SMALLEST_SHARED
         shared = 1 if small else threads or available_cores()
-        squares = [m.squares(own, shared) for m, own in zip(self._misfits, outputs, strict=True)]
+        squares = [m.squares(own, shared) for m, own in zip(self._squared, outputs, strict=True)]
         return Squares(np.concatenate(squares)[self._places]), status
 
     @cached_property
-    def _misfits(self) -> list[Misfits]:
+    def _squared(self) -> list[Misfits]:
         """Those of the groups that are solved together; nothing where the likelihood needs more."""
         groups = [[self.observations[e.name] for e in group] for group in self._responses.groups]
         enough = self.likelihood.model.flat and all(map(Misfits.possible, groups))

@@ -19,6 +19,7 @@ COLUMNS = {
     "coverage − probability": "probability of the interval",
 }
 LABELS = {"mcmc": "MCMC", "laplace": "Laplace"}
+LINES = {"mcmc": "-", "laplace": "--"}
 
 
 def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
@@ -60,9 +61,9 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
             values = calibration.positions[method][name]
             values = np.sort(values[np.isfinite(values)])
             said = f"{LABELS[method]}: {verdicts[method, name]}"
-            _histogram(row[0], values, COLOURS[method], said, method == METHODS[0])
-            _distribution(row[1], values, COLOURS[method], method == METHODS[0])
-            _coverage(row[2], values, COLOURS[method], method == METHODS[0])
+            _histogram(row[0], values, method, said)
+            _distribution(row[1], values, method)
+            _coverage(row[2], values, method)
         row[0].set_ylim(0.0, HEADROOM * row[0].get_ylim()[1])
         row[0].set_ylabel(wrapped_label(name, ""))
         row[0].legend(frameon=False, fontsize="small", loc="upper center")
@@ -73,31 +74,33 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
     return figure
 
 
-def _histogram(axes: Axes, values: np.ndarray, colour: str, label: str, banded: bool) -> None:
+def _histogram(axes: Axes, values: np.ndarray, method: str, label: str) -> None:
     bins = bin_count(values.size)
     counts, edges = np.histogram(values, bins, (0.0, 1.0))
     expected = max(values.size, 1) / bins
-    if banded and values.size:
+    if method == METHODS[0] and values.size:
         low, high = binomial_band(values.size, np.array(1.0 / bins), 1.0 - LEVEL)
         axes.axhspan(float(low) * bins, float(high) * bins, color="grey", alpha=0.25, lw=0)
-    axes.stairs(counts / expected, edges, color=colour, lw=1.6, label=label)
+    axes.stairs(counts / expected, edges, color=COLOURS[method], ls=LINES[method], lw=1.6, label=label)
     axes.set_xlim(0.0, 1.0)
 
 
-def _distribution(axes: Axes, values: np.ndarray, colour: str, banded: bool) -> None:
+def _distribution(axes: Axes, values: np.ndarray, method: str) -> None:
     points = evaluation_points()
-    if banded and values.size:
+    if method == METHODS[0] and values.size:
         low, high = ecdf_band(values.size, LEVEL)
         axes.fill_between(points, low - points, high - points, color="grey", alpha=0.25, lw=0)
     steps = np.searchsorted(values, points, side="right") / max(values.size, 1)
-    axes.plot(points, steps - points, color=colour, lw=1.4)
+    axes.plot(points, steps - points, color=COLOURS[method], ls=LINES[method], lw=1.4)
     axes.set_xlim(0.0, 1.0)
 
 
-def _coverage(axes: Axes, values: np.ndarray, colour: str, banded: bool) -> None:
+def _coverage(axes: Axes, values: np.ndarray, method: str) -> None:
     levels = evaluation_points()
-    if banded and values.size:
+    if method == METHODS[0] and values.size:
         low, high = binomial_band(values.size, levels, 1.0 - LEVEL)
         axes.fill_between(levels, low - levels, high - levels, color="grey", alpha=0.25, lw=0)
-    axes.plot(levels, [coverage(values, level) - level for level in levels], color=colour, lw=1.4)
+    axes.plot(
+        levels, [coverage(values, level) - level for level in levels], color=COLOURS[method], ls=LINES[method], lw=1.4
+    )
     axes.set_xlim(0.0, 1.0)

@@ -22,6 +22,7 @@ def mean_period(angle):
     return 0.7 + np.cos(angle + 0.3) + 0.3 * np.sin(2 * angle) + 0.1 * np.cos(5 * angle)
 
 
+@pytest.mark.slow
 def test_frequency_and_its_standard_error():
     """400 recordings: z-scores have unit variance or, the larger of two estimates being taken, up to a quarter less.
 

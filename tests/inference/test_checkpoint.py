@@ -86,6 +86,7 @@ def die_at(monkeypatch: pytest.MonkeyPatch, write: int) -> None:
         monkeypatch.setattr(owner, name, counted(getattr(owner, name)))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_killed_between_any_two_writes_of_a_save(problem, uninterrupted, tmp_path, monkeypatch):
@@ -121,6 +122,7 @@ def test_killed_between_any_two_writes_of_a_save(problem, uninterrupted, tmp_pat
         assert same(content(path), uninterrupted[1])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_killed_at_twenty_random_moments(problem, uninterrupted, tmp_path, monkeypatch):
@@ -143,7 +145,7 @@ def test_killed_at_twenty_random_moments(problem, uninterrupted, tmp_path, monke
 def test_interrupted_runs_give_what_they_have_and_can_go_on(problem, uninterrupted, tmp_path, monkeypatch):
     """Ctrl-C in the third block: a partial result that says so, and the same chain in the end."""
     path, calls = tmp_path / "run.h5", 0
-    original = bp.Problem.compared
+    original = bp.Problem.misfits
 
     def interrupted(self, *arguments, **named):
         nonlocal calls
@@ -153,7 +155,7 @@ def test_interrupted_runs_give_what_they_have_and_can_go_on(problem, uninterrupt
         return original(self, *arguments, **named)
 
     with monkeypatch.context() as patch:
-        patch.setattr(bp.Problem, "compared", interrupted)
+        patch.setattr(bp.Problem, "misfits", interrupted)
         partial = bp.sample(*problem, checkpoint=path, **RUN)
     assert not partial.converged and partial.reason.startswith("interrupted after ")
     assert "NOT CONVERGED" in repr(partial)

@@ -71,6 +71,7 @@ def test_robust_intervals_cover_where_errors_are_correlated(name):
     assert BAND[0] <= all_fitted(CORRELATION, 20)[0][name, True] <= BAND[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(TRUTH))
 @pytest.mark.parametrize("robust", [False, True])
 def test_circulant_noise_covers_where_errors_are_correlated(name, robust):

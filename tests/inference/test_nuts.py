@@ -122,6 +122,7 @@ def test_nuts_matches_the_closed_form_within_monte_carlo_error(monkeypatch):
             assert abs(found - expected) < 4 * error
 
 
+@pytest.mark.slow
 @needs_nutpie
 @pytest.mark.filterwarnings("ignore:The noise of the measured inputs", "ignore:Twice as many points")
 def test_nuts_and_emcee_agree_on_the_damper():

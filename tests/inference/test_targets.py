@@ -64,7 +64,7 @@ def check(
 
 
 @pytest.mark.filterwarnings("ignore:The data do not change under")
-@pytest.mark.parametrize("dimension", [2, 10, 20])
+@pytest.mark.parametrize("dimension", [2, 10, pytest.param(20, marks=pytest.mark.slow)])
 def test_correlated_normal(dimension):
     """A joint prior that the data do not change, correlations of 0.9 between neighbours, scales from 1e-6 to 1."""
     names = [f"p{i}" for i in range(dimension)]
@@ -81,6 +81,7 @@ def test_correlated_normal(dimension):
     assert np.corrcoef(draws)[0, 1] == pytest.approx(0.9, abs=ERRORS * 0.19 / np.sqrt(min(posterior.ess.values())))
 
 
+@pytest.mark.slow
 def test_banana():
     """Rosenbrock's: a ~ N(1, 0.5), b = a² + N(0, 0.1)."""
     banana = model("banana", ["a", "b"], lambda p: {"first": p.a, "second": p.b - p.a**2})
@@ -136,6 +137,7 @@ def test_ridge_of_a_product():
     assert not natural.converged and "max_steps = 1500 reached with" in natural.reason
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The data do not change under")
 def test_ridge_with_a_far_second_branch_is_not_called_converged_without_it():
     """Uncut priors leave 1.2 % of the mass with both signs negative: found, or not converged."""

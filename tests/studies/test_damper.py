@@ -84,6 +84,7 @@ def test_what_it_cannot_do_is_one_line_and_a_status(tmp_path, capsys):
     assert capsys.readouterr().err.count("\n") == 2
 
 
+@pytest.mark.slow
 @real_data
 def test_the_measured_damper(tmp_path, capsys):
     results = run(tmp_path)

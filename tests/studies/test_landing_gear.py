@@ -163,6 +163,7 @@ def quick(tmp_path_factory):
     return drawn, json.loads((folder / "results.json").read_text(encoding="utf-8")), printed.getvalue()
 
 
+@pytest.mark.slow
 def test_a_quick_run_tells_right_model_from_wrong_one(quick):
     _, results, printed = quick
     assert "SYNTHETIC" in printed and results["study"]["synthetic"] and results["study"]["quick"]
@@ -177,6 +178,7 @@ def test_a_quick_run_tells_right_model_from_wrong_one(quick):
     assert small < results["A"]["experiments"][landing_gear.SMALL]["map"]["theta16"] - 4.0
 
 
+@pytest.mark.slow
 def test_the_force_given_its_noise_leaves_the_sign_open(quick):
     _, results, _ = quick
     given = results["A"]["force_given"]
@@ -188,6 +190,7 @@ def test_the_force_given_its_noise_leaves_the_sign_open(quick):
     assert exact["laplace_sd"]["theta16"] < 0.4 * sd
 
 
+@pytest.mark.slow
 def test_errors_with_the_force_given_have_the_covariance_of_all_noise():
     """Squares of 40 campaigns' errors at the truth, in its units: all, and where the force's noise is most of it.
 
@@ -217,6 +220,7 @@ def test_errors_with_the_force_given_have_the_covariance_of_all_noise():
         assert abs(values.mean() - 1.0) < stats.norm.isf(0.005) * np.sqrt(2.0 / values.size + 2.0 / (40 * 39 * 81))
 
 
+@pytest.mark.slow
 def test_quality_control_names_what_is_faulty(quick):
     """One unit of each kind; a false alarm comes in 1 % of units, the faults are 70 standard deviations and more."""
     _, results, printed = quick
@@ -230,6 +234,7 @@ def test_quality_control_names_what_is_faulty(quick):
     assert "quality control" in printed
 
 
+@pytest.mark.slow
 def test_a_model_with_the_lost_motion_predicts_better_what_it_was_not_fitted_to(quick):
     """Each of the two experiments from the other; the score's gain is the fall of ln(rms) times independent values."""
     _, results, printed = quick
@@ -257,6 +262,7 @@ def test_a_faulty_gear_has_the_gas_law_of_its_fault():
     assert mean_pressure("worn friction") / mean_pressure("good") == pytest.approx(1.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_every_figure_is_drawn_and_says_synthetic(quick):
     drawn, _, _ = quick
     corners = {f"corner_{stroke}_{truth}" for stroke in ("large", "small") for truth in "AB"}

@@ -20,6 +20,7 @@ def quick(tmp_path_factory):
     return json.loads((folder / "results.json").read_text(encoding="utf-8")), printed.getvalue(), folder
 
 
+@pytest.mark.slow
 def test_what_is_found_without_noise_is_confirmed_by_shooting(quick):
     results, _, _ = quick
     found = results["found_without_noise"]
@@ -28,6 +29,7 @@ def test_what_is_found_without_noise_is_confirmed_by_shooting(quick):
     assert found["states_of_rest"] >= 1
 
 
+@pytest.mark.slow
 def test_chained_fits_find_more_orbits_than_boxes(quick):
     results, _, _ = quick
     for methods in results["eigenvalues"].values():
@@ -35,6 +37,7 @@ def test_chained_fits_find_more_orbits_than_boxes(quick):
         assert chained > boxes > 0
 
 
+@pytest.mark.slow
 def test_estimates_are_better_than_the_paper_s_by_far(quick):
     """The paper's errors are 9.6, 0.3 and 11.6 %, on its own experiment; targets at 0.1 % noise 1, 0.25 and 1 %."""
     results, printed, _ = quick
@@ -47,6 +50,7 @@ def test_estimates_are_better_than_the_paper_s_by_far(quick):
     assert "SYNTHETIC" in printed
 
 
+@pytest.mark.slow
 def test_all_five_get_the_verdict_of_the_structural_analysis(quick):
     results, _, _ = quick
     verdicts = results["all_five"]["verdicts"]
@@ -57,6 +61,7 @@ def test_all_five_get_the_verdict_of_the_structural_analysis(quick):
     assert not results["all_five"]["converged"]
 
 
+@pytest.mark.slow
 def test_figures_are_drawn(quick):
     _, _, folder = quick
     assert {path.stem for path in folder.glob("*.png")} == {"section", "orbits", "corner", "ridge", "eigenvalues"}

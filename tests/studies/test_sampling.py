@@ -28,6 +28,7 @@ def found(results: dict, what: str) -> list[dict]:
     return [check for check in results["checks"] if what in check["what"]]
 
 
+@pytest.mark.slow
 def test_ridge_shows_all_that_it_must_even_in_a_quick_run(done):
     _, results, printed = done
     cut = found(results, "ridge, default") + found(results, "ridge, natural") + found(results, "by quadrature")
@@ -37,6 +38,7 @@ def test_ridge_shows_all_that_it_must_even_in_a_quick_run(done):
     assert "What must show" in printed and "quadrature" in printed
 
 
+@pytest.mark.slow
 def test_every_row_has_a_value_or_says_why_not(done):
     _, results, _ = done
     for check in results["checks"]:
@@ -48,6 +50,7 @@ def test_every_row_has_a_value_or_says_why_not(done):
     assert {check["value"] for check in found(results, "wall time of a pool")} == {None}
 
 
+@pytest.mark.slow
 def test_samplers_are_compared_in_every_mean_and_sd(done):
     damper = done[1]["damper"]
     samplers, parameters = len(damper["samplers"]), 6
@@ -148,6 +151,7 @@ def test_rows_keep_their_limits():
     assert "≥ 0.9" in text and "(2) because" in text
 
 
+@pytest.mark.slow
 def test_figures_are_there_small_and_not_empty(done):
     folder, _, printed = done
     figures = sorted(folder.glob("*.png"))

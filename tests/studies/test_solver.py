@@ -20,6 +20,7 @@ def done(tmp_path_factory):
     return folder, json.loads((folder / "results.json").read_text(encoding="utf-8")), printed.getvalue()
 
 
+@pytest.mark.slow
 def test_all_that_must_show_does(done):
     _, results, printed = done
     assert len(results["checks"]) >= 20
@@ -31,6 +32,7 @@ def test_all_that_must_show_does(done):
     assert set(results["seconds"]) > {"orders", "pendulum", "total"} and "numba" in results["versions"]
 
 
+@pytest.mark.slow
 def test_orders_are_those_of_the_schemes(done):
     forced = done[1]["orders"]["forced"]
     assert forced["backward2"]["order"] == pytest.approx(2.0, abs=0.05)
@@ -56,6 +58,7 @@ def test_the_copied_references_are_those_of_the_shooting_tables():
     assert {name: shooting.PENDULUM[name] for name in c} == pytest.approx(c)
 
 
+@pytest.mark.slow
 def test_the_pendulum_follows_its_cascade_and_comes_back_as_the_other_rotation(done):
     pendulum = done[1]["pendulum"]
     for periods, known in zip((1, 2, 4), shooting.DOUBLINGS, strict=True):
@@ -68,6 +71,7 @@ def test_the_pendulum_follows_its_cascade_and_comes_back_as_the_other_rotation(d
     assert second["section"] == pytest.approx(shooting.UNSTABLE[3].section[0], rel=1e-8)
 
 
+@pytest.mark.slow
 def test_duffing_folds_lie_where_one_harmonic_puts_them(done):
     """(k − mω² + ¾k3A²)²A² + (cωA)² = F² has vertical tangents there, but for the third harmonic."""
     m, c, k, k3 = (solver.DUFFING[name] for name in ("m", "c", "k", "k3"))
@@ -88,6 +92,7 @@ def test_duffing_folds_lie_where_one_harmonic_puts_them(done):
         assert entry["complete"]
 
 
+@pytest.mark.slow
 def test_figures_are_there_small_and_not_empty(done):
     folder, _, printed = done
     figures = sorted(folder.glob("*.png"))

@@ -24,6 +24,7 @@ def quick(tmp_path_factory):
     return folder, *run(folder)
 
 
+@pytest.mark.slow
 def test_every_verdict_of_the_quick_gallery_is_right(quick):
     _, results, printed = quick
     assert set(results) == {*verdicts.QUICK, "study"}
@@ -36,6 +37,7 @@ def test_every_verdict_of_the_quick_gallery_is_right(quick):
     assert results["linear"]["numbers"]["joint"]["pareto_k"][0] < 0.5
 
 
+@pytest.mark.slow
 def test_a_prior_that_dominates_contracts_as_it_must(quick):
     """Data ± 7.1 and prior ± 3 N s/m: contraction 1/(1 + 7.1²/3²) = 0.15, the variance estimated (± 40 %)."""
     _, results, _ = quick
@@ -44,6 +46,7 @@ def test_a_prior_that_dominates_contracts_as_it_must(quick):
     assert value == pytest.approx(0.15, abs=0.06 + 4 * error)
 
 
+@pytest.mark.slow
 def test_figures_are_drawn(quick):
     folder, _, _ = quick
     found = {path.name: path.stat().st_size for path in folder.glob("*.png")}
@@ -78,6 +81,7 @@ def test_replicates_are_saved_one_by_one_and_resumed(tmp_path, monkeypatch):
     assert len(path.read_text().splitlines()) == 5
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The data do not change under")
 def test_counts_tell_what_is_wrong_and_what_flips(quick):
     folder, results, _ = quick

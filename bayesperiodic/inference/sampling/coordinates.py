@@ -131,7 +131,7 @@ class SamplingDensity:
         inside, moments = np.isfinite(values), np.full((len(points), len(self.collapsed)), np.nan)
         ended = np.full(len(points), CONVERGED)
         if inside.any():
-            residuals, status = self.problem.compared(theta[inside], self.threads)
+            residuals, status = self.problem.misfits(theta[inside], self.threads)
             ended[inside] = status
             good = np.flatnonzero(inside)[status == CONVERGED]
             values[inside] = np.where(status == CONVERGED, values[inside], -np.inf)
