@@ -2,7 +2,8 @@
 
 Every contender has to be right before its time counts: |Δ log-posterior| ≤ 0.01 at draws of the posterior and at three
 times their spread, against fully converged, fine shooting; each at its own cheapest step count or tolerance. Ratios
-are of times taken side by side in one run. Peers that are not installed are rows that say so.
+are of times taken side by side in one run, with linear algebra in one thread. Peers that are not installed are rows
+that say so.
 """
 
 from __future__ import annotations
@@ -10,45 +11,47 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from studies import common
+from bayesperiodic.blas import in_one_thread
+from studies import common, common_resumed
 
 # What the guard compares with.
 KEPT = Path("figures/benchmark/results.json")
+# What each problem led to is kept here until the study ends.
+PARTS = "parts"
 
 
+@in_one_thread
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
-    from studies import benchmark_figures, benchmark_posteriors, benchmark_tables, benchmark_targets  # compiles
-    from studies.benchmark_problems import DUFFING
+    from studies import benchmark_figures, benchmark_tables, benchmark_targets  # compiles
     from studies.sampling_rows import table
 
     before = read_kept(KEPT) if options.guard else None
     if options.guard:
         options.quick, options.out = True, KEPT.parent.parent / "quick" / "benchmark"
 
-    watch = common.Stopwatch()
+    watch, kept = common.Stopwatch(), options.out / PARTS
     found: dict[str, Any] = {"seed": options.seed, "quick": options.quick, "cores": os.cpu_count()}
     found["load_average"] = [*os.getloadavg()] if hasattr(os, "getloadavg") else None
     found |= {"problems": {}, "floor": {}}
-    for name, make in problems(options).items():
-        with watch.part(name, f"{name}: one log-posterior by every contender"):
-            setting = make()
-            found["problems"][name], methods = contest(setting, options.quick)
-        print(benchmark_tables.problem(name, found["problems"][name]), flush=True)
-        if name == DUFFING and not options.quick:
-            with watch.part("posterior", "effective samples a second"):
-                found["posterior"] = benchmark_posteriors.measure(
-                    setting, found["problems"][name], methods, options.seed
-                )
-            print(benchmark_tables.posterior(found["posterior"]), flush=True)
-        if name.startswith("landing gear"):
-            with watch.part(f"floor, {name}", f"{name}: the floor"):
-                found["floor"][name] = floor(setting, options.quick)
-            print(benchmark_tables.floor(name, found["floor"][name]), flush=True)
+    for number, (name, make) in enumerate(problems(options).items()):
+        with watch.part(name, f"{name}: every contender"):
+            work = partial(_of_problem, name, make, options)
+            one = common_resumed.remembered(kept / f"{number}.pkl", _source(options, name), work)
+        found["problems"][name] = one["contest"]
+        print(benchmark_tables.problem(name, one["contest"]), flush=True)
+        if "posterior" in one:
+            found["posterior"] = one["posterior"]
+            print(benchmark_tables.posterior(one["posterior"]), flush=True)
+        if "floor" in one:
+            found["floor"][name] = one["floor"]
+            print(benchmark_tables.floor(name, one["floor"]), flush=True)
     if not options.quick:
         _rest(found, options, watch)
     found["checks"] = benchmark_targets.rows(found)
@@ -57,8 +60,31 @@ def run(options: argparse.Namespace) -> None:
         paths = common.save_figures(options.out, {"benchmark": benchmark_figures.draw(found)})
     path = common.write_results(options.out, found | {"seconds": watch.total(), "versions": common.versions()})
     print(f"figures: {', '.join(map(str, paths))}\nresults: {path}")
+    shutil.rmtree(kept, ignore_errors=True)
     if before is not None:
         guard(found, before)
+
+
+def _of_problem(name: str, make: Callable[[], Any], options: argparse.Namespace) -> dict[str, Any]:
+    """Return the contest of one problem, and what is measured on this one alone."""
+    from studies import benchmark_posteriors
+    from studies.benchmark_problems import DUFFING
+
+    setting = make()
+    result: dict[str, Any] = {}
+    result["contest"], methods = contest(setting, options.quick)
+    if name == DUFFING and not options.quick:
+        result["posterior"] = benchmark_posteriors.measure(setting, result["contest"], methods, options.seed)
+    if name.startswith("landing gear"):
+        result["floor"] = floor(setting, options.quick)
+    return result
+
+
+def _source(options: argparse.Namespace, name: str) -> str:
+    """Return what tells kept parts of another version, or with other settings, apart."""
+    files = sorted(Path(__file__).parent.glob("benchmark*.py"))
+    own = [common.sha256(path) for path in files]
+    return " ".join([common.versions()["bayesperiodic"], name, str(options.seed), str(options.quick), *own])
 
 
 def _rest(found: dict[str, Any], options: argparse.Namespace, watch: common.Stopwatch) -> None:
