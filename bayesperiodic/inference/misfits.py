@@ -20,8 +20,13 @@ class Misfits:
     def __init__(self, observations: Sequence[Observation]):
         self._columns = observations[0].columns
         self._data = [np.stack([o.data[:, c] for o in observations]) for c in range(len(self._columns))]
-        self._kept = [[o.layout[2 + c] for o in observations if o.layout] for c in range(len(self._columns))]
+        self._kept = [np.array([o.layout[2 + c] for o in observations if o.layout]) for c in range(len(self._columns))]
         self._points = self._data[0].shape[1]
+
+    @property
+    def blocks(self) -> int:
+        """The number of sums."""
+        return len(self._data[0]) * len(self._columns)
 
     @staticmethod
     def possible(observations: Sequence[Observation]) -> bool:
@@ -51,11 +56,36 @@ class Misfits:
             in_threads(one, [slice(a, b) for a, b in zip(shares, shares[1:], strict=False)], threads)
         return result.reshape(experiments * channels, -1)
 
-    def _squares(self, difference: np.ndarray, kept: Sequence[int]) -> np.ndarray:
+    def pulled(self, outputs: np.ndarray, by_square: np.ndarray) -> np.ndarray:
+        """Return the derivatives of Σ by_square · squares by the outputs, (experiments, points, channels).
+
+        Parameters
+        ----------
+        outputs : array (experiments, points, channels)
+        by_square : array (experiments · channels,)
+            In the order of `squares`.
+        """
+        result, factors = np.zeros(outputs.shape), by_square.reshape(len(outputs), -1)
+        for c, column in enumerate(self._columns):
+            kept = self._kept[c]
+            difference = self._within(outputs[..., column] - self._data[c], kept)
+            result[..., column] = (2.0 * factors[:, c] * kept / self._points)[:, None] * difference
+        return result
+
+    def _within(self, signals: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        """Return signals (experiments, points) within as many real components."""
+        if (kept == self._points).all():
+            return signals
+        amplitudes = np.fft.rfft(signals, axis=-1)
+        for own, size in zip(amplitudes, kept, strict=True):
+            own[size // 2 + 1 :] = 0.0
+        return np.fft.irfft(amplitudes, self._points, axis=-1)
+
+    def _squares(self, difference: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Return the sums of squares (experiments, solves) of so many real components, by Parseval's theorem."""
-        if all(size == self._points for size in kept):
+        if (kept == self._points).all():
             return np.einsum("ebi,ebi->eb", difference, difference)
-        amplitudes = np.fft.rfft(difference, axis=-1)[..., : max(kept) // 2 + 1]
+        amplitudes = np.fft.rfft(difference, axis=-1)[..., : kept.max() // 2 + 1]
         weights = np.full((len(kept), amplitudes.shape[-1]), 2.0)
         weights[:, 0] = 1.0
         for own, size in zip(weights, kept, strict=True):

@@ -11,6 +11,7 @@ from bayesperiodic import checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.inference.all_at_once import all_at_once
 from bayesperiodic.inference.comparisons import Comparisons
+from bayesperiodic.inference.likelihood_slope import likelihood_slope
 from bayesperiodic.inference.linearisation import Linearisation
 from bayesperiodic.inference.misfits import Misfits
 from bayesperiodic.inference.noise.likelihood import Likelihood
@@ -463,7 +464,7 @@ class Problem:
         residuals : Residuals, or Squares where these are enough
         status : int array (solves,)
         """
-        if not self._squared:
+        if not self.flat_misfits:
             return self.residuals(theta, threads)
         outputs, status = self.responses.outputs(theta, threads)
         good = status == CONVERGED
@@ -471,18 +472,18 @@ class Problem:
             outputs = [own[:, good] for own in outputs]
         small = max(own.size for own in outputs) < 10 * SMALLEST_SHARED
         shared = 1 if small else threads or available_cores()
-        squares = [m.squares(own, shared) for m, own in zip(self._squared, outputs, strict=True)]
-        return Squares(np.concatenate(squares)[self._places]), status
+        squares = [m.squares(own, shared) for m, own in zip(self.flat_misfits, outputs, strict=True)]
+        return Squares(np.concatenate(squares)[self.flat_places]), status
 
     @cached_property
-    def _squared(self) -> list[Misfits]:
-        """Those of the groups that are solved together; nothing where the likelihood needs more."""
+    def flat_misfits(self) -> list[Misfits]:
+        """The comparisons of experiments that are solved together, where sums of squares are enough; else none."""
         groups = [[self.observations[e.name] for e in group] for group in self._responses.groups]
         enough = self.likelihood.model.flat and all(map(Misfits.possible, groups))
         return [Misfits(group) for group in groups] if enough else []
 
     @cached_property
-    def _places(self) -> np.ndarray:
+    def flat_places(self) -> np.ndarray:
         """Where the blocks are in the misfits of all groups, one after the other."""
         every = [self.observations[e.name] for group in self._responses.groups for e in group]
         order = [(o.experiment.name, channel) for o in every for channel in o.channels]
@@ -615,18 +616,12 @@ class Problem:
             value = float(self.log_prior(values) + self.likelihood.log_prior(noise))
         if not np.isfinite(value):
             return nothing
-        here = Linearisation(values, self.responses, self.comparisons)
-        if not here.converged:
-            return nothing
-        value += float(self.likelihood(here.residuals, noise))
-        if not np.isfinite(value):
-            return nothing
-        by_residual, by_noise = self.likelihood.gradients(here.residuals, noise)
-        by_theta = self.pulled(here, by_residual, forward=forward)
-        if not np.isfinite(by_theta).all():
+        slope = likelihood_slope(self, values, noise, forward=forward)
+        if not np.isfinite(value + slope.value) or not np.isfinite(slope.by_theta).all():
             return nothing
         free = [self.noise_names.index(name) for name in self.free_noise]
-        return value, np.concatenate([by_theta + self.joint_prior.gradient(values), by_noise[free]])
+        by_theta = slope.by_theta + self.joint_prior.gradient(values)
+        return value + slope.value, np.concatenate([by_theta, slope.by_noise[free]])
 
     def pulled(self, here: Linearisation, by_residual: Sequence[np.ndarray], *, forward: bool = False) -> np.ndarray:
         """Return the derivatives by θ from those by the residuals.

@@ -1,6 +1,6 @@
 """The periodic solves behind a problem: every experiment, for many parameter vectors, from anchors."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -42,6 +42,19 @@ class SolvedResponse(NamedTuple):
     def one(self, index: int) -> tuple[Response, np.ndarray]:
         """Return the response to a single θ, and its z."""
         return Response(*(part[index] for part in self.response)), self.z[index]
+
+
+class Orbits(NamedTuple):
+    """Solutions of experiments that are solved together, at one θ.
+
+    Attributes
+    ----------
+    z : array (experiments, points, states)
+    outputs : array (experiments, points, channels)
+    """
+
+    z: np.ndarray
+    outputs: np.ndarray
 
 
 class Responses:
@@ -195,6 +208,38 @@ class Responses:
         """
         solved = [batch.solve(maps.values(theta)[..., :-1], threads) for _, maps, batch in self._batches]
         return [s.outputs for s in solved], np.max([s.status.max(axis=0) for s in solved], axis=0)
+
+    def orbits(self, theta: np.ndarray) -> tuple[list[Orbits], int]:
+        """Return the solutions of each of `groups` at one θ (names,), polished, and the worst status.
+
+        For a forced model without measured multipliers.
+        """
+        result, worst = [], CONVERGED
+        for _, maps, batch in self._batches:
+            solved = batch.solve(maps.values(theta[None])[..., :-1], keep=True)
+            result.append(Orbits(solved.z[:, 0], solved.outputs[:, 0]))
+            worst = max(worst, int(solved.status.max()))
+        return result, worst
+
+    def pulled_outputs(self, theta: np.ndarray, orbits: Sequence[Orbits], weights: Sequence[np.ndarray]) -> np.ndarray:
+        """Return Σ weights · ∂outputs/∂θ over all experiments, (names,), by one transposed solve each.
+
+        Parameters
+        ----------
+        theta : array (names,)
+        orbits : sequence of Orbits
+            There.
+        weights : sequence of array (experiments, points, channels)
+            One of each of `groups`.
+        """
+        total = np.zeros(theta.size)
+        for (_, maps, batch), orbit, own in zip(self._batches, orbits, weights, strict=True):
+            assert isinstance(batch, Batch)
+            values = maps.values(theta[None])[:, 0]
+            values[:, :-1] = batch.pull(values[:, :-1], orbit.z, own)
+            values[:, -1] = 0.0
+            total += maps.pulled(theta, values).sum(axis=0)
+        return total
 
     def reach(self, theta: np.ndarray, experiment: str) -> str:
         """Return how the branch through an experiment's anchor ends on the way to a θ (names,), see `reach.reach`."""

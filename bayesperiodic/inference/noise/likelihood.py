@@ -238,9 +238,11 @@ class Likelihood:
         self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float = 1.0
     ) -> tuple[Sequence[np.ndarray], np.ndarray]:
         """Return the gradients of log-likelihood plus log-prior of φ, by each block's residual and by ln φ (names,)."""
-        slopes = self._log_prior(values)[1]
         if self.model.flat:
-            return self._flat_gradients(residuals, values, share, slopes)
+            own = Residuals.of(residuals)
+            by_square, by_value = self.square_slopes(own.squares, values, share)
+            return own.scaled(2.0 * by_square), by_value
+        slopes = self._log_prior(values)[1]
         by_residual: list[np.ndarray] = [np.empty(0)] * len(self.blocks)
         for members in self._alike:
             block, columns = self.blocks[members[0]], self._columns[members[0]]
@@ -258,19 +260,22 @@ class Likelihood:
             slopes[columns] += by_phi
         return by_residual, slopes
 
-    def _flat_gradients(
-        self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float, slopes: np.ndarray
-    ) -> tuple[Residuals, np.ndarray]:
-        """Return the same of all blocks under errors whose spectrum is flat, from the gradient of the log-prior."""
-        own = Residuals.of(residuals)
+    def square_slopes(
+        self, squares: np.ndarray, values: np.ndarray, share: float = 1.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of the same by each block's sum of squares (blocks,) and by ln φ (names,).
+
+        For errors whose spectrum is flat.
+        """
+        by_value = self._log_prior(values)[1]
         at, columns, sizes, weights, measured = self._levels
         v = self.model.level(values[columns], measured)
-        factors = np.full(len(self.blocks), -1.0)
-        factors[at] = -weights / v
+        by_square = np.full(len(self.blocks), -0.5)
+        by_square[at] = -0.5 * weights / v
         # V is v plus what is measured, so that ∂ ln V/∂ ln v = v/V.
-        by_level = 0.5 * weights * (own.squares[at] / v - share * sizes) * values[columns] / v
-        np.add.at(slopes, columns, by_level)
-        return own.scaled(factors), slopes
+        by_level = 0.5 * weights * (squares[at] / v - share * sizes) * values[columns] / v
+        np.add.at(by_value, columns, by_level)
+        return by_square, by_value
 
     def whitened(self, vectors: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
         """Return vectors (…, size), one a block, in units of the noise: their squares sum to −2 log-likelihood."""

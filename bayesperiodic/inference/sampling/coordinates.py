@@ -8,7 +8,7 @@ from scipy.special import gammaln
 
 from bayesperiodic.inference.estimation.estimate import MapEstimate
 from bayesperiodic.inference.estimation.joint_laplace import logarithmic
-from bayesperiodic.inference.linearisation import Linearisation
+from bayesperiodic.inference.likelihood_slope import likelihood_slope
 from bayesperiodic.inference.noise.blocks import KNOWN, SPECTRAL
 from bayesperiodic.inference.noise.models import FLAT, JEFFREYS, Circulant, Independent
 from bayesperiodic.inference.problem import Problem
@@ -158,18 +158,16 @@ class SamplingDensity:
             value += float(point[: theta.size][self.logarithmic].sum())
             if not np.isfinite(value):
                 return nothing
-            here = Linearisation(theta, self.problem.responses, self.problem.comparisons)
-            if not here.converged:
-                self.failures[max(here.statuses.values(), key=STATUSES.index)] += 1
-                return nothing
-            value += float(likelihood(here.residuals, noise))
+            slope = likelihood_slope(self.problem, theta, noise)
+            if slope.status != STATUSES[CONVERGED]:
+                self.failures[slope.status] += 1
+            value += slope.value
             if not np.isfinite(value):
                 return nothing
-            by_residual, by_noise = likelihood.gradients(here.residuals, noise)
-            by_theta = self.problem.pulled(here, by_residual) + self.problem.joint_prior.gradient(theta)
+            by_theta = slope.by_theta + self.problem.joint_prior.gradient(theta)
         by_theta[self.logarithmic] = by_theta[self.logarithmic] * theta[self.logarithmic] + 1.0
         free = [self.problem.noise_names.index(name) for name in self.free]
-        gradient = np.concatenate([by_theta, by_noise[free]])
+        gradient = np.concatenate([by_theta, slope.by_noise[free]])
         if not np.isfinite(gradient).all():
             self.failures[STATUSES[SINGULAR]] += 1
             return nothing
