@@ -125,15 +125,19 @@ def pull(
                 for o in range(first.size):
                     adjoint[neighbours[i, o], s] += first[o] * rate + second[o] * acceleration
     back_substitute_transposed(grid, factors, adjoint)
-    for p in range(number):
-        gradient[p] = 0.0
+    total, flat, width = np.zeros(number), partial.reshape(partial.size), np.uint64(partial.shape[1])
     for i in range(points):
+        row = np.uint64(i) * width
         for c in range(channels):
-            for p in range(number):
-                gradient[p] += weights[i, c] * partial[i, f_theta + c * number + p]
+            weight, start = weights[i, c], row + np.uint64(f_theta + c * number)
+            for p in range(np.uint64(number)):
+                total[p] += weight * flat[start + p]
         for e in range(count):
-            for p in range(number):
-                gradient[p] -= adjoint[i, e] * partial[i, e * number + p]
+            weight, start = adjoint[i, e], row + np.uint64(e * number)
+            for p in range(np.uint64(number)):
+                total[p] -= weight * flat[start + p]
+    for p in range(number):
+        gradient[p] = total[p]
     return True
 
 
