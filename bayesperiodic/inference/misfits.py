@@ -5,7 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from bayesperiodic.inference.observation import Observation
-from bayesperiodic.parallel import in_threads
+from bayesperiodic.parallel import available_cores, in_threads
+from bayesperiodic.periodic.batch import Batch
+
+SMALLEST_SHARED = 100_000
 
 
 class Misfits:
@@ -18,21 +21,46 @@ class Misfits:
     """
 
     def __init__(self, observations: Sequence[Observation]):
-        self._columns = observations[0].columns
-        self._data = [np.stack([o.data[:, c] for o in observations]) for c in range(len(self._columns))]
+        self._columns = np.array(observations[0].columns)
+        self._data = np.stack([o.data for o in observations])
         self._kept = [np.array([o.layout[2 + c] for o in observations if o.layout]) for c in range(len(self._columns))]
-        self._points = self._data[0].shape[1]
+        self._points = self._data.shape[1]
+        self._every = all((kept == self._points).all() for kept in self._kept)
 
     @property
     def blocks(self) -> int:
         """The number of sums."""
-        return len(self._data[0]) * len(self._columns)
+        return len(self._data) * len(self._columns)
 
     @staticmethod
     def possible(observations: Sequence[Observation]) -> bool:
         """Return whether nothing but whole periods of the same channels is compared."""
         layouts = [o.layout for o in observations]
         return None not in layouts and len({layout[:2] for layout in layouts if layout}) == 1
+
+    def solved(self, batch: Batch, parameters: np.ndarray, threads: int | None) -> tuple[np.ndarray, np.ndarray]:
+        """Solve the experiments for many parameter vectors, and return sums of squares and how the solves ended.
+
+        Parameters
+        ----------
+        batch : Batch
+            Of these experiments.
+        parameters : array (experiments, solves, parameters)
+        threads : int or None
+            By default one a core.
+
+        Returns
+        -------
+        squares : array (experiments · channels, solves)
+            Channels run fastest.
+        status : int array (experiments, solves)
+        """
+        if self._every:
+            squares, status = batch.squares(parameters, self._data, self._columns, threads)
+            return np.moveaxis(squares, -1, 1).reshape(self.blocks, -1), status
+        found = batch.solve(parameters, threads)
+        small = found.outputs.size < SMALLEST_SHARED
+        return self.squares(found.outputs, 1 if small else threads or available_cores()), found.status
 
     def squares(self, outputs: np.ndarray, threads: int) -> np.ndarray:
         """Return the sums of squares (experiments · channels, solves), channels running fastest.
@@ -48,7 +76,7 @@ class Misfits:
 
         def one(part: slice) -> None:
             for c, column in enumerate(self._columns):
-                difference = outputs[part, :, :, column] - self._data[c][part, None]
+                difference = outputs[part, :, :, column] - self._data[part, None, :, c]
                 result[part, c] = self._squares(difference, self._kept[c][part])
 
         shares = np.linspace(0, experiments, 1 + min(threads, experiments)).astype(int)
@@ -68,7 +96,7 @@ class Misfits:
         result, factors = np.zeros(outputs.shape), by_square.reshape(len(outputs), -1)
         for c, column in enumerate(self._columns):
             kept = self._kept[c]
-            difference = self._within(outputs[..., column] - self._data[c], kept)
+            difference = self._within(outputs[..., column] - self._data[..., c], kept)
             result[..., column] = (2.0 * factors[:, c] * kept / self._points)[:, None] * difference
         return result
 

@@ -466,14 +466,9 @@ class Problem:
         """
         if not self.flat_misfits:
             return self.residuals(theta, threads)
-        outputs, status = self.responses.outputs(theta, threads)
+        squares, status = self.responses.squares(theta, self.flat_misfits, threads)
         good = status == CONVERGED
-        if not good.all():
-            outputs = [own[:, good] for own in outputs]
-        small = max(own.size for own in outputs) < 10 * SMALLEST_SHARED
-        shared = 1 if small else threads or available_cores()
-        squares = [m.squares(own, shared) for m, own in zip(self.flat_misfits, outputs, strict=True)]
-        return Squares(np.concatenate(squares)[self.flat_places]), status
+        return Squares(squares[self.flat_places] if good.all() else squares[self.flat_places][:, good]), status
 
     @cached_property
     def flat_misfits(self) -> list[Misfits]:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.inference.misfits import Misfits
 from bayesperiodic.inference.observation import Response
 from bayesperiodic.inference.parameters import ParameterMap, ParameterMaps
 from bayesperiodic.models.model import Model
@@ -190,24 +191,26 @@ class Responses:
                 result[e.name] = SolvedResponse(response, solved.z[i], status)
         return {e.name: result[e.name] for e in self.experiments}
 
-    def outputs(self, theta: np.ndarray, threads: int | None = None) -> tuple[list[np.ndarray], np.ndarray]:
-        """Return the outputs (experiments, solves, points, channels) of each of `groups`, and how all solves ended.
+    def squares(
+        self, theta: np.ndarray, misfits: Sequence[Misfits], threads: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sums of squares (blocks, solves) of each of `groups`, one below the other, and the worst status.
 
         For a forced model without measured multipliers.
 
         Parameters
         ----------
         theta : array (solves, names)
+        misfits : sequence of Misfits
+            One of each of `groups`.
         threads : int, optional
-
-        Returns
-        -------
-        outputs : list of array
-        status : int array (solves,)
-            The worst of all experiments.
         """
-        solved = [batch.solve(maps.values(theta)[..., :-1], threads) for _, maps, batch in self._batches]
-        return [s.outputs for s in solved], np.max([s.status.max(axis=0) for s in solved], axis=0)
+        found = []
+        for (_, maps, batch), own in zip(self._batches, misfits, strict=True):
+            assert isinstance(batch, Batch)
+            found.append(own.solved(batch, maps.values(theta)[..., :-1], threads))
+        squares, status = zip(*found, strict=True)
+        return np.concatenate(squares), np.concatenate(status).max(axis=0)
 
     def orbits(self, theta: np.ndarray) -> tuple[list[Orbits], int]:
         """Return the solutions of each of `groups` at one θ (names,), polished, and the worst status.

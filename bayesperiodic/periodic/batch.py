@@ -147,10 +147,49 @@ class Batch:
         """
         model, grid = self._first.model, self._first.grid
         solves = parameters.shape[-2]
-        every = np.empty((self._size, solves, parameters.shape[-1]))
-        every[:] = parameters
         z = np.empty((self._size, solves, grid.points if keep else 0, self._first.count))
         y = np.empty((self._size, solves, grid.points, model.kernels.channels))
+        nothing = np.empty((self._size, grid.points, 0)), np.empty(0, dtype=np.int64)
+        _, status, iterations = self._solve(parameters, *nothing, z, y, threads)
+        frequency = np.repeat(self._shared[1][:, None], solves, axis=1)
+        return BatchSolution(z, y, frequency, status, iterations)
+
+    def squares(
+        self, parameters: np.ndarray, data: np.ndarray, measured: np.ndarray, threads: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Solve likewise, and return no more than the sums of squares of data minus outputs, and the status.
+
+        Parameters
+        ----------
+        parameters : array (sets, solves, parameters)
+        data : array (sets, points, measured)
+        measured : int array (measured,)
+            The channels that the data are of.
+        threads : int, optional
+
+        Returns
+        -------
+        squares : array (sets, solves, measured)
+        status : int array (sets, solves)
+        """
+        solves, channels = parameters.shape[-2], self._first.model.kernels.channels
+        z, y = np.empty((self._size, solves, 0, self._first.count)), np.empty((self._size, solves, 0, channels))
+        return self._solve(parameters, data, measured, z, y, threads)[:2]
+
+    def _solve(
+        self,
+        parameters: np.ndarray,
+        data: np.ndarray,
+        measured: np.ndarray,
+        z: np.ndarray,
+        y: np.ndarray,
+        threads: int | None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Fill z and y where they have entries; return sums of squares, status and iterations."""
+        model, grid, solves = self._first.model, self._first.grid, z.shape[1]
+        every = np.empty((self._size, solves, parameters.shape[-1]))
+        every[:] = parameters
+        squares = np.empty((self._size, solves, measured.size))
         status, iterations = np.empty((2, self._size, solves), dtype=np.int64)
 
         def part(block: tuple[int, int]) -> None:
@@ -163,9 +202,12 @@ class Batch:
                 self._inputs,
                 every,
                 *self._shared,
+                data,
+                measured,
                 *block,
                 z,
                 y,
+                squares,
                 status,
                 iterations,
             )
@@ -174,8 +216,7 @@ class Batch:
         workers = max(1, min(threads or available_cores(), total // SMALLEST_PART))
         parts = 1 if workers == 1 else max(workers, min(workers * PARTS_EACH, total // SMALLEST_PART))
         in_threads(part, list(pairwise([total * k // parts for k in range(parts + 1)])), workers)
-        frequency = np.repeat(self._shared[1][:, None], solves, axis=1)
-        return BatchSolution(z, y, frequency, status, iterations)
+        return squares, status, iterations
 
     def pull(
         self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, threads: int | None = None

@@ -706,7 +706,7 @@ def repetitions(z, periods):
     f"void({FUNCTION}, {FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {CUBE}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, "
     f"{CUBE}, {GAINS}, {MATRIX}, {MATRIX}, {VECTOR}, "
     f"Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
-    f"{CUBE}, {CUBE}, int64, int64, {GAINS}, {GAINS}, {INDICES}, {INDICES})",
+    f"{CUBE}, {CUBE}, {CUBE}, {PLACES}, int64, int64, {GAINS}, {GAINS}, {CUBE}, {INDICES}, {INDICES})",
     **OPTIONS,
 )
 def solve_many(
@@ -729,10 +729,13 @@ def solve_many(
     anchor_factors,
     anchor_left,
     anchor_right,
+    data,
+    measured,
     start,
     stop,
     kept_z,
     y,
+    squares,
     status,
     iterations,
 ):
@@ -757,9 +760,14 @@ def solve_many(
         Derivatives of the stiffness that `chord` takes.
     anchor_near : array (sets,)
         How far chord steps may lead, in units of the amplitude, without `is_far` being asked.
+    data : array (sets, points, measured)
+    measured : int array (measured,)
+        The channels that the data are of.
     kept_z : array (sets, solves, points, states), or without entries if z is not wanted
         Where it is, the solutions that chord steps lead to are polished.
-    y : array (sets, solves, points, channels)
+    y : array (sets, solves, points, channels), or without entries if the outputs are not wanted
+    squares : array (sets, solves, measured)
+        Filled with the sums of squares of data minus outputs.
     status, iterations : int arrays (sets, solves)
     """
     bands, pivots, inverses, gains, transfers, ends, reduced, reduced_pivots = anchor_factors
@@ -768,7 +776,7 @@ def solve_many(
     states, z = np.empty((points, 3 * count)), np.empty((points, count))
     predicted, here, last = np.empty((points, count)), np.empty((points, count)), np.empty((points, count))
     columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MAX_ITERATIONS, 3))
-    change = np.empty((points, count))
+    change, room = np.empty((points, count)), np.empty((points, y.shape[3]))
     own = (
         np.empty_like(bands[0]), np.empty_like(pivots[0]), np.empty_like(inverses[0]), np.empty_like(gains[0]),
         np.empty_like(transfers[0]), np.empty_like(ends[0]), np.empty_like(reduced[0]),
@@ -845,7 +853,13 @@ def solve_many(
                 done, before = done + step, step
                 step = min(2.0 * step, LARGEST_PART, 1.0 - done)
         differentiate(z, turn, grid, tau, f, states)
-        outputs(states, inputs[e], theta, tau, f, y[e, b])
+        out = y[e, b] if y.size > 0 else room
+        outputs(states, inputs[e], theta, tau, f, out)
+        for m in range(measured.size):
+            total = 0.0
+            for i in range(points):
+                total += (out[i, measured[m]] - data[e, i, m]) ** 2
+            squares[e, b, m] = total
         if kept_z.size > 0:
             copy(z, kept_z[e, b])
         status[e, b], iterations[e, b] = code, used
