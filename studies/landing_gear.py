@@ -25,6 +25,7 @@ from studies import (
     landing_gear_force,
     landing_gear_identification,
     landing_gear_joint,
+    landing_gear_loops,
     landing_gear_quality,
     landing_gear_repair,
     landing_gear_results,
@@ -197,7 +198,11 @@ def figures(runs: Sequence[Run], every: Mapping[str, OfTruth], quick: bool) -> d
         ),
         "drop": landing_gear_figures.drops({truth: found.dropped for truth, found in every.items()}),
     }
-    for stroke, name in (("large", FIGURE_1 if quick else LARGE), ("small", SMALL)):
+    chosen = {"large": FIGURE_1 if quick else LARGE, "small": SMALL}
+    drawn["loops"] = landing_gear_loops.loops(
+        {truth: [by_run[name].identified for name in chosen.values()] for truth, by_run in verdicts.items()}
+    )
+    for stroke, name in chosen.items():
         for truth in verdicts:
             identified = verdicts[truth][name].identified
             assert identified.posterior is not None

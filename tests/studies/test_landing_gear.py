@@ -266,7 +266,7 @@ def test_a_faulty_gear_has_the_gas_law_of_its_fault():
 def test_every_figure_is_drawn_and_says_synthetic(quick):
     drawn, _, _ = quick
     corners = {f"corner_{stroke}_{truth}" for stroke in ("large", "small") for truth in "AB"}
-    assert set(drawn) == {"histories", "theta16", "theta16_force", "drop", "quality", "repair"} | corners
+    assert set(drawn) == {"histories", "theta16", "theta16_force", "drop", "loops", "quality", "repair"} | corners
     for figure in drawn.values():
         assert any("synthetic" in text.get_text().lower() for text in figure.findobj(Text))
 
