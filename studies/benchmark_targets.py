@@ -104,8 +104,8 @@ def _of_posterior(found: Mapping[str, Any]) -> list[Row]:
 
 def _of_scaling(found: Mapping[str, Any]) -> list[Row]:
     result = [
-        row(f"exponent of {kind} by {axis}", one[f"{kind}_exponent"], 0.9, 1.1)
+        row(f"exponent of {kind} by {axis}", one[f"{kind}_exponent"], least, 1.1)
         for axis, one in found["growth"].items()
-        for kind in ("time", "memory")
+        for kind, least in (("time", 0.9), ("memory", 0.0))
     ]
     return result + [row(what, found["start"][key], 0.0, limit) for key, what, limit in START]

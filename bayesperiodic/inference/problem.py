@@ -479,7 +479,7 @@ class Problem:
 
     @cached_property
     def flat_places(self) -> np.ndarray:
-        """Where the blocks are in the misfits of all groups, one after the other."""
+        """Where the blocks are in the misfits of all groups, one after the other, (blocks,)."""
         every = [self.observations[e.name] for group in self._responses.groups for e in group]
         order = [(o.experiment.name, channel) for o in every for channel in o.channels]
         places = {key: i for i, key in enumerate(order)}
