@@ -39,6 +39,8 @@ def _contenders(ax: Axes, problems: Mapping[str, Any]) -> None:
     ))  # fmt: skip
     for marker, (problem, found) in zip(MARKERS, problems.items(), strict=False):
         entries = [e for e in found["rows"] if e["ratio"]]
+        if not entries:
+            continue
         y = [names.index(e["name"]) for e in entries]
         x = np.array([[e["ratio"][key] for key in ("median", "least", "largest")] for e in entries]).T
         kind = " (synthetic)" if found["synthetic"] else ""

@@ -32,7 +32,7 @@ DUFFING_TRUTH = {"m": 1.0, "c": 0.01, "k": 1.0, "k3": 0.5}
 # [Hz] and [N]: below the resonance, where only one motion is stable.
 DUFFING_RUNS = ((0.075, 0.2), (0.1, 0.15), (0.125, 0.1))
 DUFFING_SAMPLES = 160
-SILVERBOX_SAMPLES = 16_384
+SILVERBOX_SAMPLES = 20_480
 # At 800 points, and at 8192 of the Silverbox, the scheme is too coarse for the accuracy asked for.
 DAMPER_SAMPLES = 1600
 

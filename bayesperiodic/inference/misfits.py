@@ -25,7 +25,7 @@ class Misfits:
         self._data = np.stack([o.data for o in observations])
         self._kept = [np.array([o.layout[2 + c] for o in observations if o.layout]) for c in range(len(self._columns))]
         self._points = self._data.shape[1]
-        self._every = all((kept == self._points).all() for kept in self._kept)
+        self._weights = [self._parseval(kept) for kept in self._kept]
 
     @property
     def blocks(self) -> int:
@@ -55,9 +55,9 @@ class Misfits:
             Channels run fastest.
         status : int array (experiments, solves)
         """
-        if self._every:
+        if all(weights is None for weights in self._weights):
             squares, status = batch.squares(parameters, self._data, self._columns, threads)
-            return np.moveaxis(squares, -1, 1).reshape(self.blocks, -1), status
+            return squares.transpose(0, 2, 1).reshape(self.blocks, -1), status
         found = batch.solve(parameters, threads)
         small = found.outputs.size < SMALLEST_SHARED
         return self.squares(found.outputs, 1 if small else threads or available_cores()), found.status
@@ -77,11 +77,13 @@ class Misfits:
         def one(part: slice) -> None:
             for c, column in enumerate(self._columns):
                 difference = outputs[part, :, :, column] - self._data[part, None, :, c]
-                result[part, c] = self._squares(difference, self._kept[c][part])
+                result[part, c] = self._sums(difference, c, part)
 
-        shares = np.linspace(0, experiments, 1 + min(threads, experiments)).astype(int)
+        parts = min(threads, experiments)
         with np.errstate(over="ignore", invalid="ignore"):
-            in_threads(one, [slice(a, b) for a, b in zip(shares, shares[1:], strict=False)], threads)
+            in_threads(
+                one, [slice(experiments * k // parts, experiments * (k + 1) // parts) for k in range(parts)], threads
+            )
         return result.reshape(experiments * channels, -1)
 
     def pulled(self, outputs: np.ndarray, by_square: np.ndarray) -> np.ndarray:
@@ -109,17 +111,23 @@ class Misfits:
             own[size // 2 + 1 :] = 0.0
         return np.fft.irfft(amplitudes, self._points, axis=-1)
 
-    def _squares(self, difference: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    def _sums(self, difference: np.ndarray, channel: int, part: slice) -> np.ndarray:
         """Return the sums of squares (experiments, solves) of so many real components, by Parseval's theorem."""
-        if (kept == self._points).all():
+        weights = self._weights[channel]
+        if weights is None:
             return np.einsum("ebi,ebi->eb", difference, difference)
-        amplitudes = np.fft.rfft(difference, axis=-1)[..., : kept.max() // 2 + 1]
-        weights = np.full((len(kept), amplitudes.shape[-1]), 2.0)
+        amplitudes = np.fft.rfft(difference, axis=-1)[..., : weights.shape[1]]
+        return np.einsum("ebh,eh->eb", amplitudes.real**2 + amplitudes.imag**2, weights[part])
+
+    def _parseval(self, kept: np.ndarray) -> np.ndarray | None:
+        """Return the weights (experiments, harmonics) of squared Fourier sums; None where all components are kept."""
+        if (kept == self._points).all():
+            return None
+        weights = np.full((len(kept), kept.max() // 2 + 1), 2.0)
         weights[:, 0] = 1.0
         for own, size in zip(weights, kept, strict=True):
             own[(size + 1) // 2 :] = 0.0
             if size % 2 == 0:
                 own[size // 2] = 1.0
             own *= size / self._points**2
-        squares = amplitudes.real**2 + amplitudes.imag**2
-        return np.einsum("ebh,eh->eb", squares, weights)
+        return weights

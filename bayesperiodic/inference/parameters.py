@@ -152,7 +152,7 @@ class ParameterMaps:
     def values(self, theta: np.ndarray) -> np.ndarray:
         """Return all parameters (maps, points, parameters + 1), the delay last, of θ (points, names)."""
         result = np.repeat(self._fixed[:, None], len(theta), axis=1)
-        result[:, :, self._places] = np.moveaxis(theta[:, self._columns], 1, 0)
+        result[:, :, self._places] = theta[:, self._columns].transpose(1, 0, 2)
         if self._tied:
             known = {name: result[..., i] for i, name in enumerate(self._parameters)}
             for name, expression in self._tied.items():

@@ -157,7 +157,8 @@ class Likelihood:
     def _flat(self, residuals: Sequence[np.ndarray] | Squares, values: np.ndarray, share: float) -> np.ndarray:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, columns, sizes, weights, measured = self._levels
-        squares = np.moveaxis(squares_of(residuals), 0, -1)
+        squares = squares_of(residuals)
+        squares = squares.transpose(*range(1, squares.ndim), 0)
         v = self.model.level(values[..., columns], measured)
         terms = weights * (share * sizes * np.log(v) + squares[..., at] / v)
         return -0.5 * (terms.sum(axis=-1) + squares[..., ~at].sum(axis=-1))
