@@ -145,7 +145,7 @@ def account(found: dict[str, Any]) -> str:
     return "\n".join([
         *lines,
         f"  import {began['import_s']:.2f} s, with all that an identification uses {began['names_s']:.2f} s",
-        f"  first solve of a new model {began['first_solve_s']:.1f} s, from the cache {began['from_cache_s']:.2f} s, the "
-        f"first of all {began['empty_cache_s']:.1f} s",
+        f"  first solve of a new model {began['first_solve_s']:.1f} s, from the cache {began['from_cache_s']:.2f} s",
+        f"  first solve of all {began['empty_cache_s']:.1f} s",
         f"  64 walkers × 14 experiments: {began['peak_mb']:.0f} MB at the peak",
     ])  # fmt: skip
