@@ -3,6 +3,7 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
+from bayesperiodic.data import harmonic_fit
 from tests.known import grid
 
 FREQUENCY = 2.317
@@ -42,6 +43,16 @@ def test_mean_period_is_recovered_on_a_grid_that_the_sampling_does_not_share():
     assert e.outputs["y"] == pytest.approx(mean_period(2 * np.pi * grid(800)), abs=1e-9)
     assert e.frequency == pytest.approx(FREQUENCY, rel=1e-12)
     assert e.cycles == 20
+
+
+def test_an_input_without_noise_does_not_keep_the_refinement_going(monkeypatch):
+    """Its frequency is known to rounding, long before a step is small against its standard error."""
+    calls, original = [], harmonic_fit._linearised
+    monkeypatch.setattr(harmonic_fit, "_linearised", lambda *given: calls.append(given) or original(*given))
+    time = np.arange(716) / (119.37 * 2.0)
+    x, y = np.sin(4 * np.pi * time), np.cos(4 * np.pi * time) + 0.1 * np.random.default_rng(1).standard_normal(716)
+    assert bp.Recording.from_arrays(time, {"y": y}, {"x": x}).fold(100).frequency == pytest.approx(2.0, rel=1e-12)
+    assert len(calls) < 20
 
 
 def test_harmonics_kept_are_those_that_stand_out():
