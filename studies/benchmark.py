@@ -17,7 +17,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bayesperiodic.blas import in_one_thread
+from threadpoolctl import threadpool_limits
+
 from studies import common, common_resumed
 
 # What the guard compares with.
@@ -26,7 +27,7 @@ KEPT = Path("figures/benchmark/results.json")
 PARTS = "parts"
 
 
-@in_one_thread
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
     from studies import benchmark_figures, benchmark_tables, benchmark_targets  # compiles

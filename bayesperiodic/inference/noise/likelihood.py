@@ -240,9 +240,9 @@ class Likelihood:
     ) -> tuple[Sequence[np.ndarray], np.ndarray]:
         """Return the gradients of log-likelihood plus log-prior of φ, by each block's residual and by ln φ (names,)."""
         if self.model.flat:
-            own = Residuals.of(residuals)
-            by_square, by_value = self.square_slopes(own.squares, values, share)
-            return own.scaled(2.0 * by_square), by_value
+            components = Residuals.of(residuals)
+            by_square, by_value = self.square_slopes(components.squares, values, share)
+            return components.scaled(2.0 * by_square), by_value
         slopes = self._log_prior(values)[1]
         by_residual: list[np.ndarray] = [np.empty(0)] * len(self.blocks)
         for members in self._alike:
