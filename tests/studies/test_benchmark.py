@@ -208,8 +208,7 @@ def test_targets_are_called_met_and_missed_as_measured():
 
 def test_a_quick_run_writes_table_and_figure(tmp_path, capsys, setting, monkeypatch):
     monkeypatch.setattr(benchmark, "problems", lambda options: {benchmark_problems.FORCE: lambda: setting})
-    same = lambda setting, scheme: (setting.schemed(scheme), setting.theta[0])  # noqa: E731
-    monkeypatch.setattr(benchmark_floor, "with_all_free", same)
+    monkeypatch.setattr(benchmark_floor, "with_all_free", lambda one, scheme: (one.schemed(scheme), one.theta[0]))
     assert main(["benchmark", "--quick", "--out", str(tmp_path)]) == 0
     results = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     printed = capsys.readouterr().out
