@@ -233,7 +233,7 @@ class Batch:
         model, grid = self._first.model, self._first.grid
         frequency, drift = self._shared[1:3]
         gradients = np.empty((self._size, parameters.shape[-1]))
-        compiled = adjoint_kernels(self._first.count, grid.reach)
+        compiled = adjoint_kernels(self._first.count, grid.stencil)
 
         def part(block: tuple[int, int]) -> None:
             compiled.pull_many(

@@ -14,46 +14,50 @@ NAMES = (
 )  # fmt: skip
 FREE_NAMES = ("orient", "bordered_solve", "secant", "has_shrunk", "has_shorter_period", "follow_many")
 ADJOINT_NAMES = ("back_substitute_transposed", "pull_many")
-GENERIC = "STATES, REACH = 0, 0"
+GENERIC = "STATES, REACH, WIDTH, HALF = 0, 0, 0, 0"
 KERNELS = "bayesperiodic.periodic.kernels"
-UNROLLED_STATES, UNROLLED_REACH = 3, (2, 3)
+UNROLLED_STATES = 3
+ANY = 0, 0, 0, 0
 
 STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit")
 CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT = range(len(STATUSES))
 MAX_SEGMENTS = 12
 
 
-def kernels(states: int, reach: int) -> SimpleNamespace:
-    """Return the compiled functions for a number of states and, if the scheme marches, of start points (else 0)."""
-    unrolled = states <= UNROLLED_STATES and reach in UNROLLED_REACH
-    return _specialised(states, reach) if unrolled else _specialised(0, 0)
+def kernels(states: int, stencil: tuple[int, int, int]) -> SimpleNamespace:
+    """Return the compiled functions for a number of states and the stencil of a grid, see `schemes.CyclicGrid`."""
+    return _kernels(_unrolled(states, stencil))
 
 
 @cache
-def _specialised(states: int, reach: int) -> SimpleNamespace:
-    return SimpleNamespace(**load(_text("kernels.py", states, reach), NAMES))
+def _kernels(sizes: tuple[int, ...]) -> SimpleNamespace:
+    return SimpleNamespace(**load(_text("kernels.py", sizes), NAMES))
+
+
+def _unrolled(states: int, stencil: tuple[int, int, int]) -> tuple[int, ...]:
+    """Return the sizes for which loops are unrolled, zeros where they are not."""
+    return (states, *stencil) if states <= UNROLLED_STATES and any(stencil) else ANY
 
 
 @cache
 def autonomous_kernels() -> SimpleNamespace:
     """Return the compiled functions of `autonomous_kernels`."""
-    return SimpleNamespace(**load(_joined("autonomous_kernels.py", 0, 0), FREE_NAMES))
+    return SimpleNamespace(**load(_joined("autonomous_kernels.py", ANY), FREE_NAMES))
 
 
-def adjoint_kernels(states: int, reach: int) -> SimpleNamespace:
+def adjoint_kernels(states: int, stencil: tuple[int, int, int]) -> SimpleNamespace:
     """Return the compiled functions of `adjoint_kernels`, specialised as those of `kernels` are."""
-    unrolled = states <= UNROLLED_STATES and reach in UNROLLED_REACH
-    return _adjoint(states, reach) if unrolled else _adjoint(0, 0)
+    return _adjoint(_unrolled(states, stencil))
 
 
 @cache
-def _adjoint(states: int, reach: int) -> SimpleNamespace:
-    return SimpleNamespace(**load(_joined("adjoint_kernels.py", states, reach), ADJOINT_NAMES))
+def _adjoint(sizes: tuple[int, ...]) -> SimpleNamespace:
+    return SimpleNamespace(**load(_joined("adjoint_kernels.py", sizes), ADJOINT_NAMES))
 
 
-def _joined(name: str, states: int, reach: int) -> str:
+def _joined(name: str, sizes: tuple[int, ...]) -> str:
     """Return the text of a file of kernels after what it needs of `kernels`, directly and in turn."""
-    own, shared = ast.parse(_text(name)), ast.parse(_text("kernels.py", states, reach))
+    own, shared = ast.parse(_text(name)), ast.parse(_text("kernels.py", sizes))
     functions = {node.name: node for node in shared.body if isinstance(node, ast.FunctionDef)}
     imported = [node for node in own.body if isinstance(node, ast.ImportFrom) and node.module == KERNELS]
     waiting = [alias.name for node in imported for alias in node.names if alias.name in functions]
@@ -69,9 +73,9 @@ def _joined(name: str, states: int, reach: int) -> str:
     return f"{ast.unparse(shared)}\n{ast.unparse(own)}\n"
 
 
-def _text(name: str, states: int = 0, reach: int = 0) -> str:
+def _text(name: str, sizes: tuple[int, ...] = ANY) -> str:
     """Return the text of a file of kernels, specialised where it can be."""
     source = Path(__file__).with_name(name).read_text(encoding="utf-8")
-    if (states, reach) != (0, 0) and GENERIC not in source:
+    if sizes != ANY and GENERIC not in source:
         raise RuntimeError(f"{name} does not contain {GENERIC!r}.")
-    return source.replace(GENERIC, f"STATES, REACH = {states}, {reach}")
+    return source.replace(GENERIC, f"STATES, REACH, WIDTH, HALF = {', '.join(map(str, sizes))}")

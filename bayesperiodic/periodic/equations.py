@@ -102,7 +102,7 @@ class PeriodicEquations:
     @cached_property
     def kernels(self) -> SimpleNamespace:
         """The compiled functions of the solver."""
-        return compiled.kernels(self.count, self.grid.reach)
+        return compiled.kernels(self.count, self.grid.stencil)
 
     @cached_property
     def winding(self) -> dict[str, int]:

@@ -29,7 +29,7 @@ class CyclicFactors:
 
     def __init__(self, grid: CyclicGrid, columns: np.ndarray, states: int, frequency: float):
         self._grid, self._states = grid, states
-        self._compiled: SimpleNamespace = kernels(states, grid.reach)
+        self._compiled: SimpleNamespace = kernels(states, grid.stencil)
         self._lower = grid.half_width * states + states - 1
         size = grid.points * states
         self._band = np.empty((size, 3 * self._lower + 1))

@@ -24,7 +24,8 @@ from numba import njit
 
 from bayesperiodic.models.compile import GRID_SIGNATURE
 
-STATES, REACH = 0, 0  # 0: any number, taken from the arrays
+STATES, REACH, WIDTH, HALF = 0, 0, 0, 0  # 0: any number, taken from the arrays
+LOWER = HALF * STATES + STATES - 1 if HALF > 0 else 0  # half-width of the folded band
 
 CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT = range(5)
 
@@ -105,63 +106,110 @@ def factor(band, lower, upper, pivots):
     return True
 
 
+@njit(inline="always")
+def substitute(flat, pivots, below, reach, x):
+    """Solve A·x = b in place for one right-hand side (size,)."""
+    size, one = np.uint64(x.size), np.uint64(1)
+    next_row = below + reach
+    inside, known, half = size - min(below, size), min(reach, size), reach // np.uint64(2)
+    for j in range(size):
+        pivot = np.uint64(pivots[j])
+        value = x[pivot]
+        x[pivot] = x[j]
+        x[j] = value
+        diagonal = j * (next_row + one) + below
+        if j < inside:
+            for m in range(one, below + one):
+                x[j + m] -= flat[diagonal + m * next_row] * value
+        else:
+            for m in range(one, size - j):
+                x[j + m] -= flat[diagonal + m * next_row] * value
+    for back in range(known):
+        i = size - one - back
+        diagonal = i * (next_row + one) + below
+        value = x[i]
+        for k in range(back):
+            value -= flat[diagonal + back - k] * x[i + back - k]
+        x[i] = value * flat[diagonal]
+    for back in range(known, size):
+        i = size - one - back
+        diagonal = i * (next_row + one) + below
+        value, far = x[i], 0.0
+        # The latest unknowns last: they alone have to be waited for.
+        for k in range(half):
+            far += flat[diagonal + reach - k] * x[i + reach - k]
+        value -= far
+        for k in range(half, reach):
+            value -= flat[diagonal + reach - k] * x[i + reach - k]
+        x[i] = value * flat[diagonal]
+
+
+@njit(inline="always")
+def substitute_transposed(flat, pivots, below, reach, x):
+    """Solve Aᵀ·x = b in place for one right-hand side (size,)."""
+    size, one = np.uint64(x.size), np.uint64(1)
+    next_row = below + reach
+    inside, known, half = size - min(below, size), min(reach, size), reach // np.uint64(2)
+    for i in range(known):
+        diagonal = i * (next_row + one) + below
+        value = x[i]
+        for k in range(i):
+            value -= flat[diagonal - (i - k) * next_row] * x[k]
+        x[i] = value * flat[diagonal]
+    for i in range(known, size):
+        diagonal = i * (next_row + one) + below
+        value, far = x[i], 0.0
+        for k in range(half):
+            far += flat[diagonal - (reach - k) * next_row] * x[i - (reach - k)]
+        value -= far
+        for k in range(half, reach):
+            value -= flat[diagonal - (reach - k) * next_row] * x[i - (reach - k)]
+        x[i] = value * flat[diagonal]
+    for back in range(size):
+        j = size - one - back
+        diagonal = j * (next_row + one) + below
+        value = x[j]
+        if j < inside:
+            for k in range(below):
+                value -= flat[diagonal + (below - k) * next_row] * x[j + below - k]
+        else:
+            for k in range(back):
+                value -= flat[diagonal + (back - k) * next_row] * x[j + back - k]
+        pivot = np.uint64(pivots[j])
+        x[j] = x[pivot]
+        x[pivot] = value
+
+
 @njit(f"void({MATRIX}, int64, int64, {PLACES}, {MATRIX})", **OPTIONS)
 def solve(band, lower, upper, pivots, right):
     """Solve A·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
     flat = band.reshape(band.size)
-    size, one, below = np.uint64(right.shape[1]), np.uint64(1), np.uint64(lower)
-    reach, next_row = np.uint64(lower + upper), np.uint64(band.shape[1]) - np.uint64(1)
     for c in range(right.shape[0]):
-        x = right[c]
-        for j in range(size):
-            pivot = np.uint64(pivots[j])
-            value = x[pivot]
-            x[pivot] = x[j]
-            x[j] = value
-            diagonal = j * (next_row + one) + below
-            for m in range(one, min(below, size - one - j) + one):
-                x[j + m] -= flat[diagonal + m * next_row] * value
-        for back in range(size):
-            i = size - one - back
-            diagonal = i * (next_row + one) + below
-            value = x[i]
-            for k in range(one, min(reach, back) + one):
-                value -= flat[diagonal + k] * x[i + k]
-            x[i] = value * flat[diagonal]
+        if LOWER > 0 and lower == LOWER and upper == LOWER:
+            substitute(flat, pivots, np.uint64(LOWER), np.uint64(2 * LOWER), right[c])
+        else:
+            substitute(flat, pivots, np.uint64(lower), np.uint64(lower + upper), right[c])
 
 
 @njit(f"void({MATRIX}, int64, int64, {PLACES}, {MATRIX})", **OPTIONS)
 def solve_transposed(band, lower, upper, pivots, right):
     """Solve Aᵀ·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
     flat = band.reshape(band.size)
-    size, one, below = np.uint64(right.shape[1]), np.uint64(1), np.uint64(lower)
-    reach, next_row = np.uint64(lower + upper), np.uint64(band.shape[1]) - np.uint64(1)
     for c in range(right.shape[0]):
-        x = right[c]
-        for i in range(size):
-            diagonal = i * (next_row + one) + below
-            value = x[i] * flat[diagonal]
-            x[i] = value
-            for k in range(one, min(reach, size - one - i) + one):
-                x[i + k] -= flat[diagonal + k] * value
-        for back in range(size):
-            j = size - one - back
-            diagonal = j * (next_row + one) + below
-            value = x[j]
-            for m in range(one, min(below, back) + one):
-                value -= flat[diagonal + m * next_row] * x[j + m]
-            pivot = np.uint64(pivots[j])
-            x[j] = x[pivot]
-            x[pivot] = value
+        if LOWER > 0 and lower == LOWER and upper == LOWER:
+            substitute_transposed(flat, pivots, np.uint64(LOWER), np.uint64(2 * LOWER), right[c])
+        else:
+            substitute_transposed(flat, pivots, np.uint64(lower), np.uint64(lower + upper), right[c])
 
 
 @njit(f"void({MATRIX}, {VECTOR}, {GRID}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
 def differentiate(z, drift, grid, tau, frequency, states):
     """Fill `states` (points, 3·states) with q = z + drift·tau and its time derivatives by the scheme."""
-    first, second, neighbours, _, _, _, lead = grid
+    first, second, neighbours, _, _, _, _ = grid
     points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
-    width = REACH + 1 if REACH > 0 else first.size
-    start, inside = (REACH - lead, points - REACH) if REACH > 0 else (0, 0)
+    width = WIDTH if WIDTH > 0 else first.size
+    # Offsets in a row, as they are where their number is known, start with the lowest; in the middle none is cyclic.
+    start, inside = ((points - neighbours[0, 0]) % points, points - WIDTH + 1) if WIDTH > 0 else (0, 0)
     squared = frequency**2
     flat, rest = z.reshape(z.size), tau[start:]
     here, out = flat[start * count :], states.reshape(states.size)[3 * start * count :]

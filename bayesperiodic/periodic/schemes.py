@@ -9,6 +9,8 @@ import numpy as np
 
 from bayesperiodic import checks
 
+UNROLLED_OFFSETS = 5
+
 
 @dataclass(frozen=True)
 class Scheme:
@@ -204,13 +206,23 @@ class CyclicGrid:
         if len(self.offsets) > self.points // 2:
             return -1
         roots = np.concatenate([np.roots(self.first[::-1]), np.roots(self.second[::-1])])
-        consecutive = np.all(np.diff(self.offsets) == 1)
-        return int(self.offsets[-1]) if consecutive and self.offsets[-1] >= 0 and np.all(abs(roots) < 1.001) else -1
+        marches = self._in_a_row and self.offsets[-1] >= 0 and np.all(abs(roots) < 1.001)
+        return int(self.offsets[-1]) if marches else -1
 
     @cached_property
     def reach(self) -> int:
         """Number of start points of a march, 0 where the scheme cannot be marched."""
         return len(self.offsets) - 1 if self.lead >= 0 else 0
+
+    @property
+    def stencil(self) -> tuple[int, int, int]:
+        """Reach, number of offsets and half-width, or zeros if the offsets have gaps or are many."""
+        few = len(self.offsets) <= UNROLLED_OFFSETS < self.points
+        return (self.reach, len(self.offsets), self.half_width) if few and self._in_a_row else (0, 0, 0)
+
+    @property
+    def _in_a_row(self) -> bool:
+        return bool(np.all(np.diff(self.offsets) == 1))
 
     @cached_property
     def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, int, int]:

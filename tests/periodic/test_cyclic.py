@@ -4,7 +4,7 @@ import pytest
 from bayesperiodic.periodic.compiled import kernels
 from bayesperiodic.periodic.schemes import CyclicGrid, backward2, central2
 
-factor, solve = kernels(1, 2).factor, kernels(1, 2).solve
+factor, solve = kernels(1, (2, 3, 2)).factor, kernels(1, (2, 3, 2)).solve
 
 
 def banded(matrix: np.ndarray, half: int) -> np.ndarray:

@@ -94,7 +94,7 @@ def test_transposed_solves_by_segments_and_by_the_band_match_dense_algebra(schem
     assert (factors[5][0] > 0) == (scheme != "central4")
     right = np.random.default_rng(2).standard_normal((120, states))
     solved = right.copy()
-    adjoint = compiled.adjoint_kernels(states, equations.grid.reach)
+    adjoint = compiled.adjoint_kernels(states, equations.grid.stencil)
     adjoint.back_substitute_transposed(equations.grid.packed, factors, solved)
     expected = np.linalg.solve(dense(equations, columns).T, right.ravel())
     assert solved.ravel() == pytest.approx(expected, rel=1e-8, abs=1e-8 * np.abs(expected).max())
@@ -163,6 +163,6 @@ def test_plain_solves_are_not_changed_by_bordered_ones():
 
 def test_status_codes_of_the_compiled_code_are_those_of_the_package():
     names = ("CONVERGED", "STALLED", "SINGULAR", "NOT_FINITE", "OTHER_ORBIT", "MAX_SEGMENTS")
-    kernels = compiled.kernels(1, 2)
+    kernels = compiled.kernels(1, (2, 3, 2))
     assert [getattr(kernels, name) for name in names] == [getattr(compiled, name) for name in names]
     assert len(compiled.STATUSES) == 5
