@@ -97,7 +97,9 @@ class Expression:
                     stack.append(step.value(*operands))
                 else:
                     stack.append(given[step] if isinstance(step, str) else step)
-        return np.array(np.broadcast_to(stack[0], shape))
+        result = np.empty(shape)
+        result[...] = stack[0]
+        return result
 
     def gradient(self, values: Mapping[str, Any], by: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """Return the exact derivatives by the names `by`, by default those that appear.
@@ -124,14 +126,18 @@ class Expression:
                 else:
                     stack.append((step, {}))
         partials = stack[0][1]
-        return {name: np.array(np.broadcast_to(partials.get(name, 0.0), shape), dtype=float) for name in wanted}
+        result = {name: np.empty(shape) for name in wanted}
+        for name, slopes in result.items():
+            slopes[...] = partials.get(name, 0.0)
+        return result
 
     def _given(self, values: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
         """Return the values of the names that appear, and the shape of the result."""
         if missing := [name for name in self.names if name not in values]:
             raise ValueError(f"values: missing {', '.join(map(repr, missing))}; {self.text!r} needs them.")
         given = {name: np.asarray(values[name], dtype=float) for name in self.names}
-        return given, np.broadcast_shapes(*(value.shape for value in given.values()))
+        shapes = {value.shape for value in given.values()}
+        return given, shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
 
 
 def parse(argument: str, text: Any, names: Iterable[str], note: str = "") -> Expression:

@@ -75,7 +75,7 @@ def _from_squares(problem: "Problem", theta: np.ndarray, noise: np.ndarray) -> L
     for group, orbit in zip(misfits, orbits, strict=True):
         weights.append(group.pulled(orbit.outputs, own[first : first + group.blocks]))
         first += group.blocks
-    by_theta = problem.responses.pulled_outputs(theta, orbits, weights)
+    by_theta = problem.responses.pulled_outputs(orbits, weights)
     return LikelihoodSlope(STATUSES[CONVERGED], value, by_theta, by_noise)
 
 

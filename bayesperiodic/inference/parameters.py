@@ -144,7 +144,7 @@ class ParameterMaps:
         first = maps[0]
         if any(m.columns.keys() != first.columns.keys() or m.tied.keys() != first.tied.keys() for m in maps):
             raise ValueError("maps: the same parameters must be free, and the same tied.")
-        self._parameters, self._tied = first.parameters, first.tied
+        self._parameters, self._tied, self._size = first.parameters, first.tied, first.size
         self._fixed = np.array([[m.fixed.get(name, np.nan) for name in first.parameters] for m in maps])
         self._places = [first.parameters.index(name) for name in first.columns]
         self._columns = np.array([[m.columns[name] for name in first.columns] for m in maps], dtype=int)
@@ -159,12 +159,17 @@ class ParameterMaps:
                 known[name][:] = expression.value(known)
         return result
 
-    def pulled(self, theta: np.ndarray, by_parameter: np.ndarray) -> np.ndarray:
-        """Return derivatives by θ, (maps, names), from those by all parameters (maps, parameters + 1) at one θ."""
-        left, result = by_parameter.copy(), np.zeros((len(by_parameter), theta.size))
-        place = {name: i for i, name in enumerate(self._parameters)}
+    def pulled(self, values: np.ndarray, by_parameter: np.ndarray) -> np.ndarray:
+        """Return derivatives by θ, (maps, names), from those by all parameters at their values (maps, parameters + 1).
+
+        Parameters
+        ----------
+        values, by_parameter : array (maps, parameters + 1)
+            The delay last.
+        """
+        left, result = by_parameter.copy(), np.zeros((len(by_parameter), self._size))
         if self._tied:
-            values = self.values(theta[None])[:, 0]
+            place = {name: i for i, name in enumerate(self._parameters)}
             known = {name: values[:, i] for name, i in place.items()}
             for name, expression in reversed(self._tied.items()):
                 for argument, slope in expression.gradient(known).items():

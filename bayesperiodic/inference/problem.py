@@ -375,6 +375,11 @@ class Problem:
             raise ValueError(f"variances: shape {values.shape} is not allowed; the last axis must be {list(names)}.")
         return values
 
+    def _noise_at(self, theta: np.ndarray, variances: Mapping[str, Any] | np.ndarray) -> np.ndarray:
+        """Return the noise parameters (…, noise_names) of θ (…, names), the same for each unless given otherwise."""
+        values, shape = self.noise_values(variances), (*theta.shape[:-1], len(self.noise_names))
+        return values if values.shape == shape else np.broadcast_to(values, shape)
+
     def log_prior(self, theta: Mapping[str, float] | np.ndarray) -> np.ndarray:
         """Return Σ ln p(θ_α).
 
@@ -421,7 +426,7 @@ class Problem:
             For unknown or missing names, or another last axis.
         """
         values = self.vector(theta)
-        noise = np.broadcast_to(self.noise_values(variances), (*values.shape[:-1], len(self.noise_names)))
+        noise = self._noise_at(values, variances)
         return self.likelihood_and_status(values, noise, threads)[0]
 
     def likelihood_and_status(
@@ -445,9 +450,12 @@ class Problem:
         """
         flat = theta.reshape(-1, len(self.names))
         residuals, status = self.misfits(flat, threads)
-        good, result = status == CONVERGED, np.full(len(flat), -np.inf)
+        good, noise = status == CONVERGED, noise.reshape(len(flat), -1)
+        if good.all():
+            return self.likelihood(residuals, noise).reshape(theta.shape[:-1]), status.reshape(theta.shape[:-1])
+        result = np.full(len(flat), -np.inf)
         if good.any():
-            result[good] = self.likelihood(residuals, noise.reshape(len(flat), -1)[good])
+            result[good] = self.likelihood(residuals, noise[good])
         return result.reshape(theta.shape[:-1]), status.reshape(theta.shape[:-1])
 
     def misfits(self, theta: np.ndarray, threads: int | None = None) -> tuple[Residuals | Squares, np.ndarray]:
@@ -467,8 +475,8 @@ class Problem:
         if not self.flat_misfits:
             return self.residuals(theta, threads)
         squares, status = self.responses.squares(theta, self.flat_misfits, threads)
-        good = status == CONVERGED
-        return Squares(squares[self.flat_places] if good.all() else squares[self.flat_places][:, good]), status
+        own, good = squares[self.flat_places], status == CONVERGED
+        return Squares(own if good.all() else own[:, good]), status
 
     @cached_property
     def flat_misfits(self) -> list[Misfits]:
@@ -546,7 +554,7 @@ class Problem:
             For unknown or missing names, or another last axis.
         """
         values = self.vector(theta)
-        noise = np.broadcast_to(self.noise_values(variances), (*values.shape[:-1], len(self.noise_names)))
+        noise = self._noise_at(values, variances)
         with np.errstate(divide="ignore", invalid="ignore"):
             prior = np.asarray(self.log_prior(values) + self.likelihood.log_prior(noise))
         result = np.full(prior.shape, -np.inf)

@@ -50,10 +50,13 @@ class Orbits(NamedTuple):
 
     Attributes
     ----------
+    values : array (experiments, parameters + 1)
+        All parameters, the delay last.
     z : array (experiments, points, states)
     outputs : array (experiments, points, channels)
     """
 
+    values: np.ndarray
     z: np.ndarray
     outputs: np.ndarray
 
@@ -210,39 +213,40 @@ class Responses:
             assert isinstance(batch, Batch)
             found.append(own.solved(batch, maps.values(theta)[..., :-1], threads))
         squares, status = zip(*found, strict=True)
+        if len(found) == 1:
+            return squares[0], status[0].max(axis=0)
         return np.concatenate(squares), np.concatenate(status).max(axis=0)
 
     def orbits(self, theta: np.ndarray) -> tuple[list[Orbits], int]:
-        """Return the solutions of each of `groups` at one θ (names,), polished, and the worst status.
+        """Return the solutions of each of `groups` at one θ (names,), and the worst status.
 
         For a forced model without measured multipliers.
         """
         result, worst = [], CONVERGED
         for _, maps, batch in self._batches:
-            solved = batch.solve(maps.values(theta[None])[..., :-1], keep=True)
-            result.append(Orbits(solved.z[:, 0], solved.outputs[:, 0]))
+            assert isinstance(batch, Batch)
+            values = maps.values(theta[None])
+            solved = batch.solve(values[..., :-1], keep=True, polish=False)
+            result.append(Orbits(values[:, 0], solved.z[:, 0], solved.outputs[:, 0]))
             worst = max(worst, int(solved.status.max()))
         return result, worst
 
-    def pulled_outputs(self, theta: np.ndarray, orbits: Sequence[Orbits], weights: Sequence[np.ndarray]) -> np.ndarray:
+    def pulled_outputs(self, orbits: Sequence[Orbits], weights: Sequence[np.ndarray]) -> np.ndarray:
         """Return Σ weights · ∂outputs/∂θ over all experiments, (names,), by one transposed solve each.
 
         Parameters
         ----------
-        theta : array (names,)
         orbits : sequence of Orbits
-            There.
         weights : sequence of array (experiments, points, channels)
             One of each of `groups`.
         """
-        total = np.zeros(theta.size)
+        parts = []
         for (_, maps, batch), orbit, own in zip(self._batches, orbits, weights, strict=True):
             assert isinstance(batch, Batch)
-            values = maps.values(theta[None])[:, 0]
-            values[:, :-1] = batch.pull(values[:, :-1], orbit.z, own)
-            values[:, -1] = 0.0
-            total += maps.pulled(theta, values).sum(axis=0)
-        return total
+            by_parameter = np.zeros(orbit.values.shape)
+            by_parameter[:, :-1] = batch.pull(orbit.values[:, :-1], orbit.z, own)
+            parts.append(maps.pulled(orbit.values, by_parameter))
+        return np.concatenate(parts).sum(axis=0)
 
     def reach(self, theta: np.ndarray, experiment: str) -> str:
         """Return how the branch through an experiment's anchor ends on the way to a θ (names,), see `reach.reach`."""
@@ -347,9 +351,10 @@ class Responses:
             names = [e.name for e in experiments]
             values = maps.values(theta[None])[:, 0]
             z, outputs = np.stack([solved[n][1] for n in names]), np.stack([weights[n].outputs for n in names])
-            values[:, :-1] = batch.pull(values[:, :-1], z, outputs)
-            values[:, -1] = [weights[n].delay for n in names]
-            result |= dict(zip(names, maps.pulled(theta, values), strict=True))
+            by_parameter = np.empty(values.shape)
+            by_parameter[:, :-1] = batch.pull(values[:, :-1], z, outputs)
+            by_parameter[:, -1] = [weights[n].delay for n in names]
+            result |= dict(zip(names, maps.pulled(values, by_parameter), strict=True))
         for name, (response, z) in solved.items():
             if response.log_multipliers.size:
                 changes = self._multiplier_changes(theta, name, z, response)

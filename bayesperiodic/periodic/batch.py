@@ -134,7 +134,9 @@ class Batch:
         )
         self._inputs = np.stack([e.inputs for e in sets])
 
-    def solve(self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False) -> BatchSolution:
+    def solve(
+        self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False, polish: bool = True
+    ) -> BatchSolution:
         """Solve every input set for every parameter vector; the result does not depend on the number of threads.
 
         Parameters
@@ -143,14 +145,16 @@ class Batch:
         threads : int, optional
             By default as many as there are cores.
         keep : bool
-            Return z too, polished by further chord steps, so that what is derived from it is as exact as it can be.
+            Return z too.
+        polish : bool
+            Take further chord steps to a z that is kept, so that what is derived from it is as exact as it can be.
         """
         model, grid = self._first.model, self._first.grid
         solves = parameters.shape[-2]
         z = np.empty((self._size, solves, grid.points if keep else 0, self._first.count))
         y = np.empty((self._size, solves, grid.points, model.kernels.channels))
         nothing = np.empty((self._size, grid.points, 0)), np.empty(0, dtype=np.int64)
-        _, status, iterations = self._solve(parameters, *nothing, z, y, threads)
+        _, status, iterations = self._solve(parameters, *nothing, z, y, threads, keep and polish)
         frequency = np.repeat(self._shared[1][:, None], solves, axis=1)
         return BatchSolution(z, y, frequency, status, iterations)
 
@@ -184,6 +188,7 @@ class Batch:
         z: np.ndarray,
         y: np.ndarray,
         threads: int | None,
+        polish: bool = False,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Fill z and y where they have entries; return sums of squares, status and iterations."""
         model, grid, solves = self._first.model, self._first.grid, z.shape[1]
@@ -205,6 +210,7 @@ class Batch:
                 data,
                 measured,
                 *block,
+                polish,
                 z,
                 y,
                 squares,
@@ -214,7 +220,7 @@ class Batch:
 
         total = self._size * solves
         workers = max(1, min(threads or available_cores(), total // SMALLEST_PART))
-        parts = 1 if workers == 1 else max(workers, min(workers * PARTS_EACH, total // SMALLEST_PART))
+        parts = 1 if workers == 1 else workers * min(PARTS_EACH, max(1, total // (workers * SMALLEST_PART)))
         in_threads(part, list(pairwise([total * k // parts for k in range(parts + 1)])), workers)
         return squares, status, iterations
 

@@ -754,7 +754,7 @@ def repetitions(z, periods):
     f"void({FUNCTION}, {FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {CUBE}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, "
     f"{CUBE}, {GAINS}, {MATRIX}, {MATRIX}, {VECTOR}, "
     f"Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
-    f"{CUBE}, {CUBE}, {CUBE}, {PLACES}, int64, int64, {GAINS}, {GAINS}, {CUBE}, {INDICES}, {INDICES})",
+    f"{CUBE}, {CUBE}, {CUBE}, {PLACES}, int64, int64, boolean, {GAINS}, {GAINS}, {CUBE}, {INDICES}, {INDICES})",
     **OPTIONS,
 )
 def solve_many(
@@ -781,6 +781,7 @@ def solve_many(
     measured,
     start,
     stop,
+    polish,
     kept_z,
     y,
     squares,
@@ -811,8 +812,9 @@ def solve_many(
     data : array (sets, points, measured)
     measured : int array (measured,)
         The channels that the data are of.
+    polish : bool
+        As `chord` takes it.
     kept_z : array (sets, solves, points, states), or without entries if z is not wanted
-        Where it is, the solutions that chord steps lead to are polished.
     y : array (sets, solves, points, channels), or without entries if the outputs are not wanted
     squares : array (sets, solves, measured)
         Filled with the sums of squares of data minus outputs.
@@ -852,7 +854,7 @@ def solve_many(
                     ahead = max(ahead, part / anchor_amplitude[e, s])
             close, used, moved = chord(
                 residual, grid, inputs[e], theta, tau, f, turn, anchor_amplitude[e], stiffness, ahead,
-                kept_z.size > 0, z, states, change, kept, anchor_left[e], anchor_right[e],
+                polish, z, states, change, kept, anchor_left[e], anchor_right[e],
             )  # fmt: skip
         if not close:
             moved = np.inf

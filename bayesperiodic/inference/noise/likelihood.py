@@ -144,15 +144,17 @@ class Likelihood:
         The sums of their squares are enough where the errors have a flat spectrum.
         The logarithms of the variances are multiplied by `share`: 1 − l/Σn for the bias correction of eq. (7).
         """
-        total = np.zeros(values.shape[:-1])
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            if isinstance(residuals, Squares) or self.model.flat:
-                total = self._flat(residuals, values, share)
-                return np.where(np.isfinite(total), total, -np.inf)
-            for members in self._alike:
-                own = values[..., self._columns[members[0]]]
-                total = total + self._together([residuals[b] for b in members], self.blocks[members[0]], own, share)
+            total = (self._flat if self.model.flat else self._by_kind)(residuals, values, share)
         return np.where(np.isfinite(total), total, -np.inf)
+
+    def _by_kind(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
+        """Return the log-likelihood (…,), alike blocks together."""
+        total = np.zeros(values.shape[:-1])
+        for members in self._alike:
+            own = values[..., self._columns[members[0]]]
+            total = total + self._together([residuals[b] for b in members], self.blocks[members[0]], own, share)
+        return total
 
     def _flat(self, residuals: Sequence[np.ndarray] | Squares, values: np.ndarray, share: float) -> np.ndarray:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
@@ -160,8 +162,10 @@ class Likelihood:
         squares = squares_of(residuals)
         squares = squares.transpose(*range(1, squares.ndim), 0)
         v = self.model.level(values[..., columns], measured)
-        terms = weights * (share * sizes * np.log(v) + squares[..., at] / v)
-        return -0.5 * (terms.sum(axis=-1) + squares[..., ~at].sum(axis=-1))
+        if at.all():
+            return -0.5 * np.dot(share * sizes * np.log(v) + squares / v, weights)
+        terms = share * sizes * np.log(v) + squares[..., at] / v
+        return -0.5 * (np.dot(terms, weights) + squares[..., ~at].sum(axis=-1))
 
     @cached_property
     def _levels(self) -> tuple[np.ndarray, list[int], np.ndarray, np.ndarray, np.ndarray]:

@@ -101,17 +101,17 @@ def as_written(distribution: Any) -> str:
 def _derivatives(
     function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, step: np.ndarray, levels: int = 8
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return first and second derivative at points (n,) by Richardson's extrapolation of central differences.
+    """Return first and second derivative at points (…) by Richardson's extrapolation of central differences.
 
     Of all extrapolations the one that differs least from its neighbours is taken (Ridders 1982).
     """
-    h = step * 0.5 ** np.arange(levels)[:, None]
-    values = function(np.concatenate([x[None], x + h, x - h]))
+    h = np.ravel(step) * 0.5 ** np.arange(levels)[:, None]
+    values = function(np.concatenate([x.reshape(1, -1), x.ravel() + h, x.ravel() - h]))
     middle, above, below = values[0], values[1 : levels + 1], values[levels + 1 :]
     with np.errstate(all="ignore"):
         first = _extrapolate((above - below) / (2.0 * h))
         second = _extrapolate(((above - middle) - (middle - below)) / h**2)
-    return first, second
+    return first.reshape(x.shape), second.reshape(x.shape)
 
 
 def _extrapolate(differences: np.ndarray) -> np.ndarray:

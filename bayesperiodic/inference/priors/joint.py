@@ -89,9 +89,12 @@ class JointPrior:
 
     def log_prob(self, theta: np.ndarray) -> np.ndarray:
         """Return Σ ln p over the blocks at θ (…, names), shape (…); −inf outside the support."""
-        blocks = [self.blocks[key].log_prob(theta[..., self._columns[key]]) for key in self._alone]
-        alike = [prior.log_prob(theta[..., columns]).sum(axis=-1) for prior, columns in self._alike]
-        return np.sum(blocks + alike, axis=0)
+        total: Any = 0.0
+        for key in self._alone:
+            total = total + self._log_prob(key, theta)
+        for prior, columns in self._alike:
+            total = total + prior.log_prob(theta[..., columns]).sum(axis=-1)
+        return total
 
     @cached_property
     def _alike(self) -> list[tuple[Univariate, list[int]]]:

@@ -135,10 +135,12 @@ class Univariate(ABC):
     def _where_inside(self, function: Callable[[np.ndarray], Any], x: np.ndarray, outside: float) -> np.ndarray:
         x = np.asarray(x, dtype=float)
         low, high = self.support
+        if x.ndim == 0:
+            return np.asarray(function(x) if low < x < high else outside, dtype=float)[()]
         inside = (x > low) & (x < high)
         result = np.full(x.shape, outside)
         result[inside] = function(x[inside])
-        return result[()]
+        return result
 
     def _store(self, **values: float) -> None:
         """Keep arguments as the plain floats they were checked to be, so that equal priors print alike."""
