@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
 FUNCTIONS = ("residual", "residual_jacobian", "outputs", "derivatives", "transitions")
 SECOND_FUNCTIONS = ("jacobian_change",)
+PULLED_FUNCTIONS = ("output_jacobian", "pulled")
 MANY_ZEROS = 30
 
 
@@ -105,16 +106,11 @@ class Kernels:
             "residual_jacobian": self.states * (1 + 3 * self.states),
             "outputs": self.channels,
             "transitions": self.smooth_signs,
-            "derivatives": self.derivative_columns,
+            "derivatives": sum(rows * columns for rows, columns in self._derivative_shapes()),
         }[name]
         out = np.empty((tau.size, size))
         getattr(self, name)(states, inputs, parameters, tau, frequency, out)
         return out
-
-    @property
-    def derivative_columns(self) -> int:
-        """The number of columns of `derivatives`."""
-        return sum(rows * columns for rows, columns in self._derivative_shapes())
 
     def split_derivatives(self, columns: np.ndarray) -> list[np.ndarray]:
         """Return g_θ, g_u, g_f, f_q, f_θ, f_u, f_f as arrays (points, rows, columns); g_f is to the frequency."""
@@ -160,7 +156,7 @@ def kernel_source(model: Model) -> str:
             for entry in _jacobian(rows, columns)
         ],
     }
-    return _module(needs, q, u, theta, model.time_symbols)
+    return _with_elementary(_functions(needs, q, u, theta, model.time_symbols))
 
 
 def compile_second(model: Model) -> GridFunction:
@@ -181,13 +177,55 @@ def second_source(model: Model) -> str:
     changes = [
         sum((sp.diff(e, x) * dx for x, dx in change.items() if x in e.free_symbols), sp.S.Zero) for e in jacobian
     ]
-    return _module(
+    text = _functions(
         {"jacobian_change": changes},
         q + [change[x] for x in q],
         u + [change[x] for x in u],
         theta + [change[x] for x in (*theta, frequency)],
         model.time_symbols,
     )
+    return _with_elementary(text)
+
+
+@dataclass(frozen=True)
+class PullingKernels:
+    """The compiled grid functions that gradients need of one model.
+
+    Attributes
+    ----------
+    output_jacobian : GridFunction
+        Columns: ∂f/∂(q, q̇, q̈), row by row (outputs × 3·states).
+    pulled : GridFunction
+        Of states (q, q̇, q̈, an adjoint state λ and weights w of the outputs); columns: Σ w·∂f/∂θ − Σ λ·∂g/∂θ.
+    """
+
+    output_jacobian: GridFunction
+    pulled: GridFunction
+
+
+def compile_pulling(model: Model) -> PullingKernels:
+    """Return the compiled functions that gradients need of a model."""
+    functions = load(pulling_source(model), PULLED_FUNCTIONS)
+    return PullingKernels(**{name: GridFunction(compiled) for name, compiled in functions.items()})
+
+
+def pulling_source(model: Model) -> str:
+    """Return the generated module of `PullingKernels` as text."""
+    g, f = list(model.equations), list(model.output_expressions)
+    q, u = list(model.state_symbols.values()), list(model.input_symbols.values())
+    theta = list(model.parameter_symbols.values())
+    weighed = [*zip(_weights("l", g), (-e for e in g), strict=True), *zip(_weights("w", f), f, strict=True)]
+    pulled = [sum((weight * sp.diff(e, x) for weight, e in weighed if x in e.free_symbols), sp.S.Zero) for x in theta]
+    # The functions' states are not of the same length.
+    modules = [
+        _functions({"output_jacobian": _jacobian(f, q)}, q, u, theta, model.time_symbols),
+        _functions({"pulled": pulled}, [*q, *_weights("l", g), *_weights("w", f)], u, theta, model.time_symbols),
+    ]
+    return _with_elementary("\n\n".join(modules))
+
+
+def _weights(letter: str, expressions: list[sp.Expr]) -> list[sp.Symbol]:
+    return [sp.Symbol(f"{letter}_{i}", real=True) for i in range(len(expressions))]
 
 
 def _jacobian(rows: list[sp.Expr], columns: list[sp.Symbol]) -> list[sp.Expr]:
@@ -195,7 +233,7 @@ def _jacobian(rows: list[sp.Expr], columns: list[sp.Symbol]) -> list[sp.Expr]:
     return [sp.diff(row, x) if x in row.free_symbols else sp.S.Zero for row in rows for x in columns]
 
 
-def _module(
+def _functions(
     needs: dict[str, list[sp.Expr]],
     states: list[sp.Symbol],
     inputs: list[sp.Symbol],
@@ -209,8 +247,7 @@ def _module(
         time["tau"]: "tau[i]",
         time["frequency"]: "frequency",
     }
-    functions = [_function(name, expressions, arguments) for name, expressions in needs.items()]
-    return _with_elementary("\n\n".join(functions))
+    return "\n\n".join(_function(name, expressions, arguments) for name, expressions in needs.items())
 
 
 def _with_elementary(functions: str) -> str:

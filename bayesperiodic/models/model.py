@@ -7,7 +7,14 @@ from typing import Any
 import sympy as sp
 
 from bayesperiodic import checks
-from bayesperiodic.models.compile import GridFunction, Kernels, compile_kernels, compile_second
+from bayesperiodic.models.compile import (
+    GridFunction,
+    Kernels,
+    PullingKernels,
+    compile_kernels,
+    compile_pulling,
+    compile_second,
+)
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
 
@@ -181,6 +188,11 @@ class Model:
         return compile_second(self)
 
     @cached_property
+    def pulling_kernels(self) -> PullingKernels:
+        """The compiled grid functions that gradients need."""
+        return compile_pulling(self)
+
+    @cached_property
     def kernels(self) -> Kernels:
         """The compiled grid functions; loaded from the user's cache folder or compiled at the first use."""
         return compile_kernels(self)
@@ -214,7 +226,7 @@ class Model:
         return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
 
     def __getstate__(self) -> dict[str, Any]:
-        compiled = ("kernels", "jacobian_change", "smooth_signs")
+        compiled = ("kernels", "pulling_kernels", "jacobian_change", "smooth_signs")
         return {key: value for key, value in self.__dict__.items() if key not in compiled}
 
     def __repr__(self) -> str:

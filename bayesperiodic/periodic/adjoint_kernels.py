@@ -85,23 +85,22 @@ def back_substitute_transposed(grid, factors, right):
 
 
 @njit(
-    f"boolean({FUNCTION}, {FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {MATRIX}, {MATRIX}, "
-    f"Tuple(({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX})), {FACTORS}, {VECTOR})",
+    f"boolean({FUNCTION}, {FUNCTION}, {FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {MATRIX}, "
+    f"{MATRIX}, Tuple(({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX})), {FACTORS}, {VECTOR})",
     **OPTIONS,
 )
 def pull(
-    residual_jacobian, derivatives, grid, inputs, parameters, tau, frequency, drift, z, weights, work, factors, gradient
+    residual_jacobian, output_jacobian, pulled, grid, inputs, parameters, tau, frequency, drift, z, weights, work,
+    factors, gradient,
 ):  # fmt: skip
     """Fill Σ weights · ∂ŷ/∂θ (parameters,) at a solution z; return False where ∂g/∂z is singular."""
     first, second, neighbours = grid[0], grid[1], grid[2]
-    states, columns, partial, adjoint = work
+    states, columns, slopes, adjoint, weighed, parts = work
     points, count, channels = z.shape[0], STATES if STATES > 0 else z.shape[1], weights.shape[1]
-    number, squared = parameters.size, frequency**2
-    f_q = count * (number + inputs.shape[1] + 1)
-    f_theta = f_q + channels * 3 * count
+    squared = frequency**2
     differentiate(z, drift, grid, tau, frequency, states)
     residual_jacobian(states, inputs, parameters, tau, frequency, columns)
-    derivatives(states, inputs, parameters, tau, frequency, partial)
+    output_jacobian(states, inputs, parameters, tau, frequency, slopes)
     amplitude = np.empty(count)
     largest(z, amplitude)
     for s in range(count):
@@ -115,47 +114,45 @@ def pull(
         for s in range(count):
             still, rate, acceleration = 0.0, 0.0, 0.0
             for c in range(channels):
-                at = f_q + c * 3 * count + s
-                still += weights[i, c] * partial[i, at]
-                rate += weights[i, c] * partial[i, at + count]
-                acceleration += weights[i, c] * partial[i, at + 2 * count]
+                at = c * 3 * count + s
+                still += weights[i, c] * slopes[i, at]
+                rate += weights[i, c] * slopes[i, at + count]
+                acceleration += weights[i, c] * slopes[i, at + 2 * count]
             adjoint[i, s] += still
             if rate != 0.0 or acceleration != 0.0:
                 rate, acceleration = rate * frequency, acceleration * squared
                 for o in range(first.size):
                     adjoint[neighbours[i, o], s] += first[o] * rate + second[o] * acceleration
     back_substitute_transposed(grid, factors, adjoint)
-    total, flat, width = np.zeros(number), partial.reshape(partial.size), np.uint64(partial.shape[1])
     for i in range(points):
-        row = np.uint64(i) * width
+        for s in range(3 * count):
+            weighed[i, s] = states[i, s]
+        for s in range(count):
+            weighed[i, 3 * count + s] = adjoint[i, s]
         for c in range(channels):
-            weight, start = weights[i, c], row + np.uint64(f_theta + c * number)
-            for p in range(np.uint64(number)):
-                total[p] += weight * flat[start + p]
-        for e in range(count):
-            weight, start = adjoint[i, e], row + np.uint64(e * number)
-            for p in range(np.uint64(number)):
-                total[p] -= weight * flat[start + p]
-    for p in range(number):
-        gradient[p] = total[p]
+            weighed[i, 4 * count + c] = weights[i, c]
+    pulled(weighed, inputs, parameters, tau, frequency, parts)
+    for p in range(gradient.size):
+        gradient[p] = 0.0
+    for i in range(points):
+        for p in range(gradient.size):
+            gradient[p] += parts[i, p]
     return True
 
 
 @njit(
-    f"void({FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {CUBE}, {CUBE}, "
+    f"void({FUNCTION}, {FUNCTION}, {FUNCTION}, {GRID}, {CUBE}, {MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {CUBE}, {CUBE}, "
     f"{FACTORS}, int64, int64, {MATRIX})",
     **OPTIONS,
 )
 def pull_many(
-    residual_jacobian, derivatives, grid, width, inputs, parameters, tau, frequency, drift, z, weights, factors, start,
-    stop, gradients,
+    residual_jacobian, output_jacobian, pulled, grid, inputs, parameters, tau, frequency, drift, z, weights, factors,
+    start, stop, gradients,
 ):  # fmt: skip
     """Fill the gradients (sets, parameters) of the input sets start … stop at one solution each; NaN where singular.
 
     Parameters
     ----------
-    width : int
-        Columns of `derivatives`, see `models.compile.Kernels`.
     inputs : array (sets, points, 3·inputs)
     parameters : array (sets, parameters)
     frequency : array (sets,)
@@ -164,15 +161,16 @@ def pull_many(
     weights : array (sets, points, channels)
     factors : work arrays, see `equations.empty_factors`
     """
-    points, count = z.shape[1], z.shape[2]
+    points, count, channels = z.shape[1], z.shape[2], weights.shape[2]
     work = (
-        np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count))), np.empty((points, width)),
-        np.empty((points, count)),
+        np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count))),
+        np.empty((points, channels * 3 * count)), np.empty((points, count)), np.empty((points, 4 * count + channels)),
+        np.empty((points, parameters.shape[1])),
     )  # fmt: skip
     for k in range(start, stop):
         regular = pull(
-            residual_jacobian, derivatives, grid, inputs[k], parameters[k], tau, frequency[k], drift[k], z[k],
-            weights[k], work, factors, gradients[k],
+            residual_jacobian, output_jacobian, pulled, grid, inputs[k], parameters[k], tau, frequency[k], drift[k],
+            z[k], weights[k], work, factors, gradients[k],
         )  # fmt: skip
         if not regular:
             for p in range(parameters.shape[1]):

@@ -237,16 +237,16 @@ class Batch:
         threads : int, optional
         """
         model, grid = self._first.model, self._first.grid
-        frequency, drift = self._shared[1:3]
+        pulling, (frequency, drift) = model.pulling_kernels, self._shared[1:3]
         gradients = np.empty((self._size, parameters.shape[-1]))
         compiled = adjoint_kernels(self._first.count, grid.stencil)
 
         def part(block: tuple[int, int]) -> None:
             compiled.pull_many(
                 model.kernels.residual_jacobian,
-                model.kernels.derivatives,
+                pulling.output_jacobian,
+                pulling.pulled,
                 grid.packed,
-                model.kernels.derivative_columns,
                 self._inputs,
                 np.ascontiguousarray(parameters),
                 grid.tau,
