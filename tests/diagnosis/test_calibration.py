@@ -54,6 +54,7 @@ def without_draws(monkeypatch):
     monkeypatch.setattr(campaigns, "sample", fails)
 
 
+@pytest.mark.slow
 def test_exact_posteriors_hold_the_truth_uniformly_and_a_likelihood_that_is_wrong_is_caught(without_draws):
     """120 linear problems with known variance: Laplace is exact. Counted twice, every θ is called too narrow.
 

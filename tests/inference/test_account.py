@@ -104,6 +104,7 @@ def test_doubling_tells_what_twice_as_many_points_do():
     assert list(fits[0].doubling_shift.values()) == pytest.approx(moved, rel=0.1, abs=2e-2)
 
 
+@pytest.mark.slow
 def test_a_grid_too_coarse_for_the_posterior_is_announced():
     run = duffing_run(harmonics={"displacement": 9})
     quiet = replace(run, outputs={"displacement": run.outputs["displacement"]})

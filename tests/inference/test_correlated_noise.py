@@ -61,6 +61,7 @@ def all_fitted(correlation: float, cycles: int, model="independent") -> tuple[di
     return count, p
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(TRUTH))
 def test_independent_noise_covers_far_too_little_where_errors_are_correlated(name):
     assert all_fitted(CORRELATION, 20)[0][name, False] < 0.6 * RECORDINGS
@@ -79,6 +80,7 @@ def test_circulant_noise_covers_where_errors_are_correlated(name, robust):
     assert BAND[0] <= all_fitted(CORRELATION, 20, noise.Circulant(kernel="exponential"))[0][name, robust] <= BAND[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(TRUTH))
 @pytest.mark.parametrize("robust", [False, True])
 def test_both_intervals_cover_where_errors_are_white(name, robust):

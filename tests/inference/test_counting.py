@@ -51,10 +51,12 @@ def test_the_interval_of_a_friction_like_regressor_covers_its_truth(harmonics):
     assert BAND[0] <= covered(folded(harmonics)) <= BAND[1]
 
 
+@pytest.mark.slow
 def test_without_projection_the_interval_fails():
     assert not BAND[0] <= covered([replace(e, harmonics={}) for e in folded(5)]) <= BAND[1]
 
 
+@pytest.mark.slow
 def test_counting_every_sample_makes_the_interval_fail():
     naive = [replace(e, independent={"force": 800}) for e in folded(20)]
     assert covered(naive) < BAND[0]

@@ -64,7 +64,7 @@ def check(
 
 
 @pytest.mark.filterwarnings("ignore:The data do not change under")
-@pytest.mark.parametrize("dimension", [2, 10, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dimension", [2, *(pytest.param(d, marks=pytest.mark.slow) for d in (10, 20))])
 def test_correlated_normal(dimension):
     """A joint prior that the data do not change, correlations of 0.9 between neighbours, scales from 1e-6 to 1."""
     names = [f"p{i}" for i in range(dimension)]
@@ -119,6 +119,7 @@ def ridge(priors: dict) -> tuple[bp.Problem, bp.MapEstimate]:
     return problem, bp.map_estimate(problem, **QUIET)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The data do not change under")
 def test_ridge_of_a_product():
     """Priors N(1, 1) cut at zero: sd(a) = 0.595 by quadrature; the stop rule sees through a short natural chain."""

@@ -10,12 +10,13 @@ SCHEMES = ["backward2", "central2", "central4", "fourier"]
 
 
 def growing(states: int) -> bp.Model:
-    """Return ẇ = λ w + u with as many copies as wanted, the others decaying or turning: multipliers e^λ, e^−3, e^±i."""
-    names = ["w", "x", "y"][:states]
+    """Return ẇ = λ w + u with as many copies as wanted, the others decaying or turning: multipliers e^λ, e^−3, e^±i√2, e^−2."""
+    names = ["w", "x", "y", "z"][:states]
     rows = {
         "w": lambda s, p, u: s.dw - p.rate * s.w - u.u,
         "x": lambda s, p, u: s.dx + 3 * s.x - s.w / 10 - u.u,
         "y": lambda s, p, u: s.ddy + 2 * s.y + s.dx / 50 - u.u,
+        "z": lambda s, p, u: s.dz + 2 * s.z - s.y / 20 - u.u,
     }
     return bp.Model(
         f"growing{states}",
@@ -64,7 +65,7 @@ def test_linear_solves_are_right_however_stable_or_unstable_the_orbit(scheme, ex
 
 
 @pytest.mark.parametrize("exponent", [-40.0, 40.0])
-@pytest.mark.parametrize("states", [1, 2, 3])
+@pytest.mark.parametrize("states", [1, 2, 4])
 @pytest.mark.parametrize("scheme", ["backward2", "central2"])
 def test_segments_agree_with_the_folded_band_and_are_used(scheme, states, exponent):
     equations = equations_of(growing(states), scheme, 800)
@@ -114,7 +115,7 @@ def test_a_march_that_grows_too_fast_is_left_for_the_folded_band():
     assert solved.ravel() == pytest.approx(np.linalg.solve(dense(equations, columns), right.ravel()), rel=1e-9)
 
 
-@pytest.mark.parametrize("states", [1, 2, 3])
+@pytest.mark.parametrize("states", [1, 2, 4])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_many_sides_and_the_transpose_match_dense_algebra(scheme, states):
     equations = equations_of(growing(states), scheme, 30)

@@ -60,6 +60,7 @@ def test_synthetic_data_are_called_synthetic_and_the_truth_is_found(quick):
     assert all(name in printed.splitlines()[-2] for name in figures)
 
 
+@pytest.mark.slow
 def test_same_seed_same_results_but_for_seconds_and_versions(quick, synthetic, tmp_path):
     folder, first, _ = quick
     kept = [{k: v for k, v in r.items() if k not in ("seconds", "versions")} for r in (first, run(tmp_path, "--quick"))]

@@ -51,6 +51,7 @@ def test_half_a_range_is_that_of_the_signal_and_not_of_its_samples():
     assert flutter_checks.half_range(0.2 + np.cos(2 * np.pi * tau)) == pytest.approx(1.0, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_quick_run_tells_what_was_asked_and_says_synthetic(tmp_path):
     printed = run(tmp_path, "--quick")
     assert "SYNTHETIC records" in printed

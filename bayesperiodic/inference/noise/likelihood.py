@@ -160,12 +160,13 @@ class Likelihood:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, columns, sizes, weights, measured = self._levels
         squares = squares_of(residuals)
-        squares = squares.transpose(*range(1, squares.ndim), 0)
+        # Each row by itself in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
+        squares = np.ascontiguousarray(squares.transpose(*range(1, squares.ndim), 0))
         v = self.model.level(values[..., columns], measured)
         if at.all():
-            return -0.5 * np.dot(share * sizes * np.log(v) + squares / v, weights)
-        terms = share * sizes * np.log(v) + squares[..., at] / v
-        return -0.5 * (np.dot(terms, weights) + squares[..., ~at].sum(axis=-1))
+            return -0.5 * (weights * (share * sizes * np.log(v) + squares / v)).sum(axis=-1)
+        terms = weights * (share * sizes * np.log(v) + squares[..., at] / v)
+        return -0.5 * (terms.sum(axis=-1) + squares[..., ~at].sum(axis=-1))
 
     @cached_property
     def _levels(self) -> tuple[np.ndarray, list[int], np.ndarray, np.ndarray, np.ndarray]:
