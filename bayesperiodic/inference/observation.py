@@ -301,8 +301,11 @@ class Observation:
         """Return by what fraction of the response period the outputs are shifted, (…,)."""
         fraction = np.asarray(response.delay) * response.frequency / self.experiment.periods
         if self._free_phase:
-            agreement = np.sum(self._fundamentals(response.outputs) * self._reference, axis=-1)
-            fraction = fraction + np.angle(agreement) / (2 * np.pi)
+            own, reference = self._fundamentals(response.outputs), self._reference
+            # In real numbers: the rounding of NumPy's complex products depends on how many there are.
+            cosine = np.sum(own.real * reference.real - own.imag * reference.imag, axis=-1)
+            sine = np.sum(own.real * reference.imag + own.imag * reference.real, axis=-1)
+            fraction = fraction + np.arctan2(sine, cosine) / (2 * np.pi)
         return fraction
 
     def _fundamentals(self, outputs: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ SCHEMES = ["backward2", "central2", "central4", "fourier"]
 
 
 def growing(states: int) -> bp.Model:
-    """Return ẇ = λ w + u with as many copies as wanted, the others decaying or turning: multipliers e^λ, e^−3, e^±i√2, e^−2."""
+    """Return ẇ = λ w + u with other states that decay or turn: multipliers e^λ, e^−3, e^±i√2, e^−2."""
     names = ["w", "x", "y", "z"][:states]
     rows = {
         "w": lambda s, p, u: s.dw - p.rate * s.w - u.u,

@@ -160,7 +160,7 @@ class Likelihood:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, columns, sizes, weights, measured = self._levels
         squares = squares_of(residuals)
-        # Each row by itself in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
+        # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
         squares = np.ascontiguousarray(squares.transpose(*range(1, squares.ndim), 0))
         v = self.model.level(values[..., columns], measured)
         if at.all():
