@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.integrate import DOP853
 
 from bayesperiodic.models.cache import load
 from bayesperiodic.models.model import Model
@@ -22,6 +21,8 @@ def _kernels() -> dict[str, Any]:
 @cache
 def _tableau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return stages, nodes and error weights of the method of order 8, with the step's end as the last stage."""
+    from scipy.integrate import DOP853  # takes half a second, which no periodic solve should wait for
+
     a = np.vstack([DOP853.A, DOP853.B])
     return a, np.append(DOP853.C, 1.0), np.stack([DOP853.E5, DOP853.E3])
 
