@@ -2,7 +2,7 @@
 
 This text is compiled through the kernel cache as one module (see `compiled`), because code compiled from one file goes
 stale when a function of another file that it calls has changed. Import the functions from `compiled`, which puts in the
-numbers of states and of start points for which loops are unrolled.
+sizes for which loops are unrolled: the numbers of states, start points and offsets, and the band's half-width.
 
 **Linear systems** with the cyclic block band ∂g/∂z are factored in one of two ways, both right however stable or
 unstable the orbit is, which one march through the period would not be:

@@ -7,6 +7,9 @@ from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
 from tests.known import grid
 
 SCHEMES = ["backward2", "central2", "central4", "fourier"]
+# Offsets with gaps, and none before the point: what loops over a known number of offsets must not take for granted.
+GAPS = bp.Scheme("gaps", 2, first={-3: -1 / 6, 3: 1 / 6}, second={-3: 1 / 9, 0: -2 / 9, 3: 1 / 9})
+FORWARD = bp.Scheme("forward", 1, first={0: -1.0, 1: 1.0}, second={0: 1.0, 1: -2.0, 2: 1.0})
 
 
 def growing(states: int) -> bp.Model:
@@ -83,6 +86,18 @@ def test_segments_agree_with_the_folded_band_and_are_used(scheme, states, expone
     assert np.max(np.abs(solved - expected) / np.abs(expected).max(axis=0)) < 1e-8  # some 10 roundings of 1/h²
 
 
+@pytest.mark.parametrize("scheme", [*SCHEMES, GAPS, FORWARD], ids=str)
+@pytest.mark.parametrize("states", [1, 4])
+def test_derivatives_are_weighted_sums_of_neighbours(scheme, states):
+    equations = equations_of(growing(states), scheme, 40)
+    z = np.random.default_rng(7).standard_normal((40, states))
+    drift = np.arange(1.0, states + 1.0)
+    first, second = equations.grid.scheme.weights(40)
+    rate, acceleration = (sum(w * np.roll(z, -o, axis=0) for o, w in own.items()) for own in (first, second))
+    expected = [z + drift * equations.grid.tau[:, None], 40 * rate + drift, 40**2 * acceleration]
+    assert equations.states(z, drift) == pytest.approx(np.concatenate(expected, axis=1), rel=1e-12, abs=1e-9)
+
+
 @pytest.mark.parametrize("exponent", [-40.0, 1.0, 40.0])
 @pytest.mark.parametrize("scheme", ["backward2", "central2", "central4"])
 def test_transposed_solves_by_segments_and_by_the_band_match_dense_algebra(scheme, exponent):
@@ -116,7 +131,7 @@ def test_a_march_that_grows_too_fast_is_left_for_the_folded_band():
 
 
 @pytest.mark.parametrize("states", [1, 2, 4])
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("scheme", [*SCHEMES, GAPS], ids=str)
 def test_many_sides_and_the_transpose_match_dense_algebra(scheme, states):
     equations = equations_of(growing(states), scheme, 30)
     z = np.ones((30, states))
