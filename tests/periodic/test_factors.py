@@ -86,7 +86,7 @@ def test_segments_agree_with_the_folded_band_and_are_used(scheme, states, expone
     assert np.max(np.abs(solved - expected) / np.abs(expected).max(axis=0)) < 1e-8  # some 10 roundings of 1/h²
 
 
-@pytest.mark.parametrize("scheme", [*SCHEMES, GAPS, FORWARD], ids=str)
+@pytest.mark.parametrize("scheme", [*SCHEMES, GAPS, FORWARD], ids=lambda s: getattr(s, "name", s))
 @pytest.mark.parametrize("states", [1, 4])
 def test_derivatives_are_weighted_sums_of_neighbours(scheme, states):
     equations = equations_of(growing(states), scheme, 40)
@@ -131,7 +131,7 @@ def test_a_march_that_grows_too_fast_is_left_for_the_folded_band():
 
 
 @pytest.mark.parametrize("states", [1, 2, 4])
-@pytest.mark.parametrize("scheme", [*SCHEMES, GAPS], ids=str)
+@pytest.mark.parametrize("scheme", [*SCHEMES, GAPS], ids=lambda s: getattr(s, "name", s))
 def test_many_sides_and_the_transpose_match_dense_algebra(scheme, states):
     equations = equations_of(growing(states), scheme, 30)
     z = np.ones((30, states))
