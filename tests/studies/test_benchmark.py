@@ -279,15 +279,19 @@ def test_integration_leaves_an_unstable_orbit_at_the_rate_of_its_multiplier():
 
 
 def test_the_guard_compares_ratios_only_and_names_those_that_are_worse(tmp_path):
-    def results(contender, over_floor):
-        row = {"name": "shooting", "ratio": {"median": contender}, "milliseconds": {"median": 1e9}}
-        floor = {"schemes": {"central4": {"ratio": {"near": {"median": over_floor}}}}}
+    def spread(median, share):
+        return {"median": median, "least": median * (1.0 - share), "largest": median * (1.0 + share)}
+
+    def results(contender, over_floor, share=0.1):
+        row = {"name": "shooting", "ratio": spread(contender, share), "milliseconds": {"median": 1e9}}
+        floor = {"schemes": {"central4": {"ratio": {"near": spread(over_floor, share)}}}}
         own = {"name": "this package, cold", "ratio": {"median": 9.0}}
         return {"problems": {"damper": {"rows": [row, own]}}, "floor": {"gear": floor}}
 
     assert benchmark_guard.worse(results(1.0, 0.5), results(1.5, 0.4)) == []
     lines = benchmark_guard.worse(results(1.0, 0.5), results(2.0, 0.2))
     assert len(lines) == 2 and "shooting" in lines[0] and "floor" in lines[1]
+    assert benchmark_guard.worse(results(1.0, 0.5, 0.5), results(2.0, 0.2, 0.5)) == []
     kept = tmp_path / "results.json"
     with pytest.raises(FileNotFoundError, match="run the whole study first"):
         benchmark.read_kept(kept)
