@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 import bayesperiodic as bp
 from bayesperiodic.inference import problem as problem_module
+from bayesperiodic.inference.noise.residuals import Squares
 from bayesperiodic.inference.sampling import ensemble, sampling
 from bayesperiodic.inference.sampling.coordinates import SamplingDensity
 from tests.inference.observed import (
@@ -246,6 +247,15 @@ def test_a_pickled_problem_has_the_same_density_to_the_last_bit(kind):
     assert np.array_equal(other.log_posterior(theta, noise), expected)
     assert np.array_equal(pickle.loads(pickle.dumps(problem)).median(), problem.median())
     assert other.names == problem.names and other.tied == problem.tied and repr(other) == repr(problem)
+
+
+def test_the_sum_over_many_experiments_does_not_depend_on_how_many_points_to_the_last_bit():
+    runs = [duffing_run(f"run {n}") for n in range(20)]
+    likelihood = bp.Problem(bp.models.duffing, runs, priors=DUFFING_PRIORS, fixed={"m": 1.0}).likelihood
+    generator = np.random.default_rng(1)
+    squares, values = generator.uniform(size=(20, 37)), generator.uniform(0.1, 1.0, (37, 1))
+    alone = [likelihood(Squares(squares[:, k]), values[k]) for k in range(37)]
+    assert np.array_equal(likelihood(Squares(squares), values), alone)
 
 
 @pytest.mark.parametrize("kind", problems())

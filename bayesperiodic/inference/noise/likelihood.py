@@ -160,13 +160,11 @@ class Likelihood:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, columns, sizes, weights, measured = self._levels
         squares = squares_of(residuals)
-        # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
-        squares = np.ascontiguousarray(squares.transpose(*range(1, squares.ndim), 0))
+        squares = squares.transpose(*range(1, squares.ndim), 0)
         v = self.model.level(values[..., columns], measured)
-        if at.all():
-            return -0.5 * (weights * (share * sizes * np.log(v) + squares / v)).sum(axis=-1)
         terms = weights * (share * sizes * np.log(v) + squares[..., at] / v)
-        return -0.5 * (terms.sum(axis=-1) + squares[..., ~at].sum(axis=-1))
+        # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
+        return -0.5 * sum(np.ascontiguousarray(part).sum(axis=-1) for part in (terms, squares[..., ~at]))
 
     @cached_property
     def _levels(self) -> tuple[np.ndarray, list[int], np.ndarray, np.ndarray, np.ndarray]:
