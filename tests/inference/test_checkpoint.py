@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 from filelock import FileLock
+from tqdm import tqdm
 
 import bayesperiodic as bp
 from bayesperiodic.inference.sampling import checkpoint, sampling
@@ -27,6 +29,12 @@ def short_blocks():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sampling, "BLOCK", 50)
         yield
+
+
+@pytest.fixture(autouse=True)
+def lock_of_this_process(monkeypatch):
+    """Keep tqdm's lock, a semaphore, from forked children: one that is killed with it would stop this process too."""
+    monkeypatch.setattr(tqdm, "_lock", threading.RLock(), raising=False)
 
 
 @pytest.fixture(scope="module")
