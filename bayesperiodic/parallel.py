@@ -47,6 +47,8 @@ def _cores() -> int:
 
 def in_threads(function: Callable[[Item], Value], items: Sequence[Item], threads: int) -> list[Value]:
     """Return function(item) of every item, in order, worked off by this thread and `threads` − 1 others."""
+    if min(threads, len(items)) <= 1:
+        return [function(item) for item in items]
     results: list[Any] = [None] * len(items)
     waiting = iter(list(enumerate(items)))
 

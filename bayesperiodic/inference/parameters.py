@@ -144,17 +144,19 @@ class ParameterMaps:
         first = maps[0]
         if any(m.columns.keys() != first.columns.keys() or m.tied.keys() != first.tied.keys() for m in maps):
             raise ValueError("maps: the same parameters must be free, and the same tied.")
-        self._parameters, self._tied, self._size = first.parameters, first.tied, first.size
+        self._tied, self._size = first.tied, first.size
         self._fixed = np.array([[m.fixed.get(name, np.nan) for name in first.parameters] for m in maps])
         self._places = [first.parameters.index(name) for name in first.columns]
         self._columns = np.array([[m.columns[name] for name in first.columns] for m in maps], dtype=int)
+        named = {name for expression in self._tied.values() for name in expression.names} | self._tied.keys()
+        self._named = {name: i for i, name in enumerate(first.parameters) if name in named}
 
     def values(self, theta: np.ndarray) -> np.ndarray:
         """Return all parameters (maps, points, parameters + 1), the delay last, of θ (points, names)."""
         result = np.repeat(self._fixed[:, None], len(theta), axis=1)
         result[:, :, self._places] = theta[:, self._columns].transpose(1, 0, 2)
         if self._tied:
-            known = {name: result[..., i] for i, name in enumerate(self._parameters)}
+            known = {name: result[..., i] for name, i in self._named.items()}
             for name, expression in self._tied.items():
                 known[name][:] = expression.value(known)
         return result
@@ -169,11 +171,10 @@ class ParameterMaps:
         """
         left, result = by_parameter.copy(), np.zeros((len(by_parameter), self._size))
         if self._tied:
-            place = {name: i for i, name in enumerate(self._parameters)}
-            known = {name: values[:, i] for name, i in place.items()}
+            known = {name: values[:, i] for name, i in self._named.items()}
             for name, expression in reversed(self._tied.items()):
                 for argument, slope in expression.gradient(known).items():
-                    left[:, place[argument]] += slope * left[:, place[name]]
+                    left[:, self._named[argument]] += slope * left[:, self._named[name]]
         np.put_along_axis(result, self._columns, left[:, self._places], axis=1)
         return result
 

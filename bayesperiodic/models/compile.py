@@ -78,6 +78,8 @@ class Kernels:
         `split_derivatives`.
     transitions : GridFunction
         Columns: the arguments of the smooth signs in the equations, which change over within −1 … 1.
+    output_rates : bool
+        Whether `outputs` depends on q̇ or q̈.
     """
 
     residual: GridFunction
@@ -90,6 +92,7 @@ class Kernels:
     parameters: int
     channels: int
     smooth_signs: int
+    output_rates: bool
 
     def evaluate(
         self,
@@ -130,6 +133,7 @@ class Kernels:
 def compile_kernels(model: Model) -> Kernels:
     """Return the compiled functions of a model, from the disk cache where they are there and undamaged."""
     functions = load(kernel_source(model), FUNCTIONS)
+    rates = set(list(model.state_symbols.values())[len(model.states) :])
     return Kernels(
         **{name: GridFunction(compiled) for name, compiled in functions.items()},
         states=len(model.states),
@@ -137,6 +141,7 @@ def compile_kernels(model: Model) -> Kernels:
         parameters=len(model.parameters),
         channels=len(model.outputs),
         smooth_signs=len(model.smooth_signs),
+        output_rates=any(expression.free_symbols & rates for expression in model.output_expressions),
     )
 
 

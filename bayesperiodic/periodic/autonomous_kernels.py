@@ -33,6 +33,7 @@ from bayesperiodic.periodic.kernels import (
     assemble,
     copy,
     differentiate,
+    dot,
     factor,
     is_far,
     largest,
@@ -253,15 +254,6 @@ def newton_free(
             return CONVERGED, iteration + 1, frequency, orientation
         previous = full
     return STALLED, MAX_ITERATIONS, frequency, orientation
-
-
-@njit(f"float64({VECTOR}, {VECTOR})", **OPTIONS)
-def dot(one, other):
-    """Return the sum of products."""
-    total = 0.0
-    for i in range(one.size):
-        total += one[i] * other[i]
-    return total
 
 
 @njit(

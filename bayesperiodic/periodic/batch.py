@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesperiodic.parallel import available_cores, in_threads
-from bayesperiodic.periodic.compiled import adjoint_kernels
+from bayesperiodic.periodic.compiled import adjoint_kernels, batch_kernels
 from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
 from bayesperiodic.periodic.sensitivity import Sensitivities, parameter_sensitivities, softening, softest_direction
 
@@ -130,7 +130,7 @@ class Batch:
             near,
             self._factors,
             left,
-            right,
+            np.ascontiguousarray(right[..., : first.count]),
         )
         self._inputs = np.stack([e.inputs for e in sets])
 
@@ -196,9 +196,10 @@ class Batch:
         every[:] = parameters
         squares = np.empty((self._size, solves, measured.size))
         status, iterations = np.empty((2, self._size, solves), dtype=np.int64)
+        compiled = batch_kernels(self._first.count, grid.stencil)
 
         def part(block: tuple[int, int]) -> None:
-            self._first.kernels.solve_many(
+            compiled.solve_many(
                 model.kernels.residual,
                 model.kernels.residual_jacobian,
                 model.kernels.outputs,
@@ -211,6 +212,7 @@ class Batch:
                 measured,
                 *block,
                 polish,
+                model.kernels.output_rates,
                 z,
                 y,
                 squares,

@@ -1,8 +1,7 @@
-"""The compiled code of the periodic solver, generic in the model: linear algebra, discretisation, Newton, batches.
+"""The compiled code of the periodic solver, generic in the model: linear algebra, discretisation, Newton's iteration.
 
-This text is compiled through the kernel cache as one module (see `compiled`), because code compiled from one file goes
-stale when a function of another file that it calls has changed. Import the functions from `compiled`, which puts in the
-sizes for which loops are unrolled: the numbers of states, start points and offsets, and the band's half-width.
+This text is compiled through the kernel cache. Import the functions from `compiled`, which puts in the sizes for which
+loops are unrolled: the numbers of states, start points and offsets, and the band's half-width.
 
 **Linear systems** with the cyclic block band ∂g/∂z are factored in one of two ways, both right however stable or
 unstable the orbit is, which one march through the period would not be:
@@ -29,12 +28,10 @@ LOWER = HALF * STATES + STATES - 1 if HALF > 0 else 0  # half-width of the folde
 
 CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT = range(5)
 
-STEP_TOLERANCE, POLISHED = 1e-9, 1e-12
+STEP_TOLERANCE = 1e-9
 MAX_ITERATIONS = 50
 MAX_HALVINGS = 20
-MAX_CHORDS = 6
-CHORD_RATE, PREDICTION_RATE = 0.2, 30.0
-LEAST_STIFFNESS, MOST_STIFFNESS = 0.3, 3.0
+CHORD_RATE = 0.2
 ROUNDING = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
 FAR = 0.3
@@ -56,9 +53,9 @@ OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model":
 @njit(f"void({MATRIX}, {MATRIX})", **OPTIONS)
 def copy(source, target):
     """Copy one array into another of the same shape; a slice assignment would bring in the text of its error."""
-    for i in range(source.shape[0]):
-        for s in range(source.shape[1]):
-            target[i, s] = source[i, s]
+    one, other = source.reshape(source.size), target.reshape(target.size)
+    for k in range(one.size):
+        other[k] = one[k]
 
 
 @njit(f"boolean({MATRIX}, int64, int64, {PLACES})", **OPTIONS)
@@ -497,11 +494,26 @@ def scales(columns, states, grid, amplitude, frequency, size, rounding):
 
 @njit(f"void({MATRIX}, {VECTOR})", **OPTIONS)
 def largest(z, amplitude):
-    """Fill the largest absolute value of each state."""
+    """Fill the largest absolute value of each state; four maxima at a time, none of which waits for another."""
+    points = z.shape[0]
+    whole = points - points % 4
     for s in range(STATES if STATES > 0 else z.shape[1]):
-        amplitude[s] = 0.0
-        for i in range(z.shape[0]):
-            amplitude[s] = max(amplitude[s], abs(z[i, s]))
+        a, b, c, d = 0.0, 0.0, 0.0, 0.0
+        for i in range(0, whole, 4):
+            a, b = max(a, abs(z[i, s])), max(b, abs(z[i + 1, s]))
+            c, d = max(c, abs(z[i + 2, s])), max(d, abs(z[i + 3, s]))
+        for i in range(whole, points):
+            a = max(a, abs(z[i, s]))
+        amplitude[s] = max(a, b, c, d)
+
+
+@njit(f"float64({VECTOR}, {VECTOR})", fastmath={"reassoc"}, **OPTIONS)
+def dot(one, other):
+    """Return the sum of products, in whatever order is fastest on this machine."""
+    total = 0.0
+    for i in range(one.size):
+        total += one[i] * other[i]
+    return total
 
 
 @njit(f"float64({MATRIX}, {VECTOR})", **OPTIONS)
@@ -616,95 +628,16 @@ def newton(
     return STALLED, MAX_ITERATIONS
 
 
-@njit(
-    f"Tuple((boolean, int64, float64))({FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR}, "
-    f"float64, float64, boolean, {MATRIX}, {MATRIX}, {MATRIX}, {FACTORS}, {MATRIX}, {MATRIX})",
-    **OPTIONS,
-)
-def chord(
-    residual, grid, inputs, parameters, tau, frequency, drift, amplitude, stiffness, predicted, polish, z, states,
-    change, factors, left, right,
-):  # fmt: skip
-    """Improve z in place with the factors of a nearby solution; return whether that converged, the steps, and how far.
-
-    `states` are left as they were before the last step. A step above `CHORD_RATE` times the one before ends it. The
-    ratio of two steps tells how much smaller the next one will be; that of the first step to the prediction tells the
-    order of magnitude, since the prediction is a chord step too, but for terms of second order: `PREDICTION_RATE` times
-    it was above all but two of a hundred rates found.
-
-    Where ∂g/∂z is nearly singular, steps with another point's factors say little of what is left in the direction that
-    it makes smallest, and after a change of its stiffness there, or of its sign, they go the wrong way. So this
-    direction takes the stiffness expected of the present ∂g/∂z, and factors whose own is too far from it are not used.
-
-    Parameters
-    ----------
-    residual : compiled grid function of the model
-    amplitude : array (states,)
-        Units of the steps.
-    stiffness : float
-        Expected of the present ∂g/∂z in this direction, in units of that of the factors.
-    predicted : float
-        The change that the prediction made, in these units.
-    polish : bool
-        Go on until a step is below `POLISHED` or down to rounding, for derivatives of what is compared with the data.
-    change : array (points, states)
-        Work array.
-    left : array (points, states)
-        Weights of the equations that are largest for a residual in this direction.
-    right : array (points, 3·states)
-        The direction with its time derivatives, so long that its stiffness is 1 for the ∂g/∂z of the factors.
-    """
-    points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
-    if not (stiffness > LEAST_STIFFNESS and stiffness < MOST_STIFFNESS):
-        return False, 0, 0.0
-    correction, tolerance = 1.0 / stiffness - 1.0, STEP_TOLERANCE * min(1.0, stiffness)
-    previous, moved, rate, converged = predicted, 0.0, PREDICTION_RATE, False
-    for iteration in range(MAX_CHORDS):
-        differentiate(z, drift, grid, tau, frequency, states)
-        residual(states, inputs, parameters, tau, frequency, change)
-        along = 0.0
-        if correction != 0.0:
-            for s in range(count):
-                part = 0.0
-                for i in range(points):
-                    part += left[i, s] * change[i, s]
-                along += correction * part
-        back_substitute(grid, factors, change)
-        full = 0.0
-        for s in range(count):
-            largest_change, total = 0.0, 0.0
-            for i in range(points):
-                step = change[i, s] + along * right[i, s]
-                z[i, s] -= step
-                largest_change = max(largest_change, abs(step))
-                total += step
-            if not abs(total) < np.inf:
-                return False, iteration + 1, moved
-            if largest_change > 0.0:
-                full = max(full, largest_change / amplitude[s])
-        moved += full
-        if converged and (full <= POLISHED or not full < CHORD_RATE * previous):
-            return True, iteration + 1, moved
-        if not full < FAR or (iteration > 0 and not full < CHORD_RATE * previous):
-            return False, iteration + 1, moved
-        converged = converged or full <= tolerance or rate * full**2 <= tolerance * previous
-        if converged and (full <= POLISHED or not polish):
-            return True, iteration + 1, moved
-        previous, rate = full, 1.0
-    return converged, MAX_CHORDS, moved
-
-
 @njit(f"void({MATRIX}, {CUBE}, {VECTOR}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
 def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fraction, z):
     """Fill z with the anchor's linear prediction, at a fraction of the way from the anchor's parameters."""
     copy(anchor_z, z)
-    count = STATES if STATES > 0 else z.shape[1]
+    flat = z.reshape(z.size)
     for p in range(parameters.size):
-        change = fraction * (parameters[p] - anchor_parameters[p])
+        change, slope = fraction * (parameters[p] - anchor_parameters[p]), anchor_sensitivities[p].reshape(z.size)
         if change != 0.0:
-            for i in range(z.shape[0]):
-                for s in range(count):
-                    z[i, s] += anchor_sensitivities[p, i, s] * change
+            for k in range(flat.size):
+                flat[k] += slope[k] * change
 
 
 @njit(f"boolean({MATRIX}, {MATRIX}, {MATRIX})", **OPTIONS)
@@ -717,15 +650,6 @@ def is_far(z, predicted, anchor_z):
             change = max(change, abs(predicted[i, s] - anchor_z[i, s]))
             low, high = min(low, anchor_z[i, s]), max(high, anchor_z[i, s])
         if off > FAR * (high - low) and off > FAR * change:
-            return True
-    return False
-
-
-@njit(f"boolean({MATRIX}, int64)", **OPTIONS)
-def was_damped(history, iterations):
-    """Return whether Newton's iteration took a shortened step."""
-    for iteration in range(iterations):
-        if history[iteration, 2] < 1.0:
             return True
     return False
 
@@ -748,168 +672,3 @@ def repetitions(z, periods):
             if same:
                 return times
     return 1
-
-
-@njit(
-    f"void({FUNCTION}, {FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {CUBE}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, "
-    f"{CUBE}, {GAINS}, {MATRIX}, {MATRIX}, {VECTOR}, "
-    f"Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
-    f"{CUBE}, {CUBE}, {CUBE}, {PLACES}, int64, int64, boolean, {GAINS}, {GAINS}, {CUBE}, {INDICES}, {INDICES})",
-    **OPTIONS,
-)
-def solve_many(
-    residual,
-    residual_jacobian,
-    outputs,
-    grid,
-    periods,
-    inputs,
-    parameters,
-    tau,
-    frequency,
-    drift,
-    anchor_parameters,
-    anchor_z,
-    anchor_sensitivities,
-    anchor_amplitude,
-    anchor_softening,
-    anchor_near,
-    anchor_factors,
-    anchor_left,
-    anchor_right,
-    data,
-    measured,
-    start,
-    stop,
-    polish,
-    kept_z,
-    y,
-    squares,
-    status,
-    iterations,
-):
-    """Solve for input sets times parameter vectors, those of the flat indices start … stop (vectors run fastest).
-
-    Each solve starts from the linear prediction of its set's anchor: chord steps with the anchor's factors, else
-    Newton's iteration, else that from the anchor itself. Where all fail, or the result is far from the prediction of a
-    solved anchor or of a shorter period than it, small steps are taken along the way from the anchor's parameters.
-    Where they lead is where the orbit went; if one leaps, or the period becomes shorter, the status is "other orbit".
-    Nothing depends on the order of the solves.
-
-    Parameters
-    ----------
-    inputs : array (sets, points, 3·inputs)
-    parameters : array (sets, solves, parameters)
-    frequency : array (sets,)
-    drift : array (sets, states)
-    anchor_parameters, anchor_z, anchor_sensitivities, anchor_factors, anchor_left, anchor_right : arrays (sets, …)
-    anchor_amplitude : array (sets, states)
-        The largest absolute value of each state.
-    anchor_softening : array (sets, parameters)
-        Derivatives of the stiffness that `chord` takes.
-    anchor_near : array (sets,)
-        How far chord steps may lead, in units of the amplitude, without `is_far` being asked.
-    data : array (sets, points, measured)
-    measured : int array (measured,)
-        The channels that the data are of.
-    polish : bool
-        As `chord` takes it.
-    kept_z : array (sets, solves, points, states), or without entries if z is not wanted
-    y : array (sets, solves, points, channels), or without entries if the outputs are not wanted
-    squares : array (sets, solves, measured)
-        Filled with the sums of squares of data minus outputs.
-    status, iterations : int arrays (sets, solves)
-    """
-    bands, pivots, inverses, gains, transfers, ends, reduced, reduced_pivots = anchor_factors
-    points, count = anchor_z.shape[1], STATES if STATES > 0 else anchor_z.shape[2]
-    solves = parameters.shape[1]
-    states, z = np.empty((points, 3 * count)), np.empty((points, count))
-    predicted, here, last = np.empty((points, count)), np.empty((points, count)), np.empty((points, count))
-    columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MAX_ITERATIONS, 3))
-    change, room = np.empty((points, count)), np.empty((points, y.shape[3]))
-    own = (
-        np.empty_like(bands[0]), np.empty_like(pivots[0]), np.empty_like(inverses[0]), np.empty_like(gains[0]),
-        np.empty_like(transfers[0]), np.empty_like(ends[0]), np.empty_like(reduced[0]),
-        np.empty_like(reduced_pivots[0]),
-    )  # fmt: skip
-    for index in range(start, stop):
-        e, b = index // solves, index % solves
-        theta, at, turn, f = parameters[e, b], anchor_z[e], drift[e], frequency[e]
-        kept = (
-            bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], reduced[e], reduced_pivots[e]
-        )  # fmt: skip
-        predict(at, anchor_sensitivities[e], anchor_parameters[e], theta, 1.0, predicted)
-        copy(predicted, z)
-        close, used, code, doubtful, moved = False, 0, CONVERGED, False, np.inf
-        if ends[e, 0] >= 0:
-            stiffness = 1.0
-            for p in range(theta.size):
-                stiffness += anchor_softening[e, p] * (theta[p] - anchor_parameters[e, p])
-            ahead = 0.0
-            for s in range(count):
-                part = 0.0
-                for i in range(points):
-                    part = max(part, abs(predicted[i, s] - at[i, s]))
-                if part > 0.0:
-                    ahead = max(ahead, part / anchor_amplitude[e, s])
-            close, used, moved = chord(
-                residual, grid, inputs[e], theta, tau, f, turn, anchor_amplitude[e], stiffness, ahead,
-                polish, z, states, change, kept, anchor_left[e], anchor_right[e],
-            )  # fmt: skip
-        if not close:
-            moved = np.inf
-            copy(predicted, z)
-            code, more = newton(
-                residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, history, states, columns, own
-            )  # fmt: skip
-            used += more
-            doubtful = was_damped(history, more)
-            if code != CONVERGED:
-                copy(at, z)
-                code, more = newton(
-                    residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, history, states, columns, own
-                )  # fmt: skip
-                used += more
-                doubtful = True
-        once = repetitions(at, periods)
-        far = moved > anchor_near[e] and is_far(z, predicted, at)
-        if ends[e, 0] >= 0 and (doubtful or far or repetitions(z, periods) > once):
-            leapt = code == CONVERGED
-            done, step, before = 0.0, LARGEST_PART, LARGEST_PART
-            copy(at, here)
-            copy(at, last)
-            predict(at, anchor_sensitivities[e], anchor_parameters[e], theta, -before, last)
-            while done < 1.0:
-                for i in range(points):
-                    for s in range(count):
-                        predicted[i, s] = here[i, s] + (here[i, s] - last[i, s]) * (step / before)
-                copy(predicted, z)
-                between = anchor_parameters[e] + (theta - anchor_parameters[e]) * (done + step)
-                code, more = newton(
-                    residual_jacobian, grid, inputs[e], between, tau, f, turn, z, history, states, columns, own
-                )  # fmt: skip
-                used += more
-                if code == CONVERGED and repetitions(z, periods) > once:
-                    code = OTHER_ORBIT
-                    break
-                if code != CONVERGED or is_far(z, predicted, here):
-                    code = OTHER_ORBIT if leapt or code == CONVERGED else code
-                    step *= 0.5
-                    if step < SMALLEST_PART:
-                        break
-                    continue
-                copy(here, last)
-                copy(z, here)
-                done, before = done + step, step
-                step = min(2.0 * step, LARGEST_PART, 1.0 - done)
-        differentiate(z, turn, grid, tau, f, states)
-        out = y[e, b] if y.size > 0 else room
-        outputs(states, inputs[e], theta, tau, f, out)
-        for m in range(measured.size):
-            total = 0.0
-            for i in range(points):
-                total += (out[i, measured[m]] - data[e, i, m]) ** 2
-            squares[e, b, m] = total
-        if kept_z.size > 0:
-            copy(z, kept_z[e, b])
-        status[e, b], iterations[e, b] = code, used
