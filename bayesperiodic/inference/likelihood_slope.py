@@ -60,11 +60,11 @@ def likelihood_slope(
 
 def _from_squares(problem: "Problem", theta: np.ndarray, noise: np.ndarray) -> LikelihoodSlope:
     """Do it for experiments of which only the sums of squares count, without their components."""
-    orbits, worst = problem.responses.orbits(theta)
+    misfits, places = problem.flat_misfits, problem.flat_places
+    orbits, worst = problem.responses.orbits(theta, misfits)
     if worst != CONVERGED:
         return _failed(problem, STATUSES[worst])
-    misfits, places = problem.flat_misfits, problem.flat_places
-    squares = np.concatenate([m.squares(o.outputs[:, None], 1)[:, 0] for m, o in zip(misfits, orbits, strict=True)])
+    squares = np.concatenate([o.squares for o in orbits])
     value = float(problem.likelihood(Squares(squares[places]), noise))
     if not np.isfinite(value):
         return _failed(problem, STATUSES[CONVERGED])

@@ -6,7 +6,7 @@ import numpy as np
 
 from bayesperiodic.inference.observation import Observation
 from bayesperiodic.parallel import available_cores, in_threads
-from bayesperiodic.periodic.batch import Batch
+from bayesperiodic.periodic.batch import Batch, BatchSolution
 
 SMALLEST_SHARED = 100_000
 
@@ -26,6 +26,7 @@ class Misfits:
         self._kept = [np.array([o.layout[2 + c] for o in observations if o.layout]) for c in range(len(self._columns))]
         self._points = self._data.shape[1]
         self._weights = [self._parseval(kept) for kept in self._kept]
+        self._whole = all(weights is None for weights in self._weights)
 
     @property
     def blocks(self) -> int:
@@ -55,12 +56,24 @@ class Misfits:
             Channels run fastest.
         status : int array (experiments, solves)
         """
-        if all(weights is None for weights in self._weights):
+        if self._whole:
             squares, status = batch.squares(parameters, self._data, self._columns, threads)
             return squares.transpose(0, 2, 1).reshape(self.blocks, -1), status
         found = batch.solve(parameters, threads)
         small = found.outputs.size < SMALLEST_SHARED
         return self.squares(found.outputs, 1 if small else threads or available_cores()), found.status
+
+    def orbits(self, batch: Batch, parameters: np.ndarray) -> tuple[BatchSolution, np.ndarray]:
+        """Solve the experiments for one parameter vector each; return the solution and sums of squares (blocks,).
+
+        Parameters
+        ----------
+        batch : Batch
+            Of these experiments.
+        parameters : array (experiments, 1, parameters)
+        """
+        solved, squares = batch.orbits(parameters, self._data, self._columns)
+        return solved, squares.reshape(-1) if self._whole else self.squares(solved.outputs, 1)[:, 0]
 
     def squares(self, outputs: np.ndarray, threads: int) -> np.ndarray:
         """Return the sums of squares (experiments · channels, solves), channels running fastest.

@@ -54,11 +54,14 @@ class Orbits(NamedTuple):
         All parameters, the delay last.
     z : array (experiments, points, states)
     outputs : array (experiments, points, channels)
+    squares : array (experiments · measured channels,)
+        As `Misfits.solved` returns them.
     """
 
     values: np.ndarray
     z: np.ndarray
     outputs: np.ndarray
+    squares: np.ndarray
 
 
 class Responses:
@@ -217,17 +220,23 @@ class Responses:
             return squares[0], status[0].max(axis=0)
         return np.concatenate(squares), np.concatenate(status).max(axis=0)
 
-    def orbits(self, theta: np.ndarray) -> tuple[list[Orbits], int]:
+    def orbits(self, theta: np.ndarray, misfits: Sequence[Misfits]) -> tuple[list[Orbits], int]:
         """Return the solutions of each of `groups` at one θ (names,), and the worst status.
 
         For a forced model without measured multipliers.
+
+        Parameters
+        ----------
+        theta : array (names,)
+        misfits : sequence of Misfits
+            One of each of `groups`.
         """
         result, worst = [], CONVERGED
-        for _, maps, batch in self._batches:
+        for (_, maps, batch), own in zip(self._batches, misfits, strict=True):
             assert isinstance(batch, Batch)
             values = maps.values(theta[None])
-            solved = batch.solve(values[..., :-1], keep=True, polish=False)
-            result.append(Orbits(values[:, 0], solved.z[:, 0], solved.outputs[:, 0]))
+            solved, squares = own.orbits(batch, values[..., :-1])
+            result.append(Orbits(values[:, 0], solved.z[:, 0], solved.outputs[:, 0], squares))
             worst = max(worst, int(solved.status.max()))
         return result, worst
 

@@ -201,7 +201,8 @@ class PullingKernels:
     output_jacobian : GridFunction
         Columns: ∂f/∂(q, q̇, q̈), row by row (outputs × 3·states).
     pulled : GridFunction
-        Of states (q, q̇, q̈, an adjoint state λ and weights w of the outputs); columns: Σ w·∂f/∂θ − Σ λ·∂g/∂θ.
+        Of states (q, q̇, q̈, an adjoint state λ and weights w of the outputs); its one row is summed over the grid, and
+        its columns: Σ w·∂f/∂θ − Σ λ·∂g/∂θ.
     """
 
     output_jacobian: GridFunction
@@ -224,7 +225,9 @@ def pulling_source(model: Model) -> str:
     # The functions' states are not of the same length.
     modules = [
         _functions({"output_jacobian": _jacobian(f, q)}, q, u, theta, model.time_symbols),
-        _functions({"pulled": pulled}, [*q, *_weights("l", g), *_weights("w", f)], u, theta, model.time_symbols),
+        _functions(
+            {"pulled": pulled}, [*q, *_weights("l", g), *_weights("w", f)], u, theta, model.time_symbols, summed=True
+        ),
     ]
     return _with_elementary("\n\n".join(modules))
 
@@ -244,6 +247,8 @@ def _functions(
     inputs: list[sp.Symbol],
     parameters: list[sp.Symbol],
     time: dict[str, sp.Symbol],
+    *,
+    summed: bool = False,
 ) -> str:
     arguments = {
         **{symbol: f"flat_states[{len(states)}*i + {column}]" for column, symbol in enumerate(states)},
@@ -252,7 +257,7 @@ def _functions(
         time["tau"]: "tau[i]",
         time["frequency"]: "frequency",
     }
-    return "\n\n".join(_function(name, expressions, arguments) for name, expressions in needs.items())
+    return "\n\n".join(_function(name, expressions, arguments, summed) for name, expressions in needs.items())
 
 
 def _with_elementary(functions: str) -> str:
@@ -265,28 +270,49 @@ def _with_elementary(functions: str) -> str:
     return f"{header}\n\n\n{functions}"
 
 
-def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str]) -> str:
-    """Return a function that sweeps the grid; strides known at compile time let its loop be vectorised."""
+def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str], summed: bool) -> str:
+    """Return a function that sweeps the grid; strides known at compile time let its loop be vectorised.
+
+    One that is summed adds up the rows in whatever order is fastest on this machine, and has one row.
+    """
     common, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("common"), order="canonical")
     used = set().union(*(e.free_symbols for e in reduced), *(e.free_symbols for _, e in common))
     places = {symbol: place for symbol, place in arguments.items() if symbol in used and symbol.name != place}
     lines = [f"    flat_{a} = {a}.reshape({a}.size)" for a in ("states", "inputs", "out")]
     lines += [f"    {s} = {place}" for s, place in places.items() if "[" not in place or "i" not in place.split("[")[1]]
-    lines += ["    for i in range(out.shape[0]):"]
+    before, row, after = _sums(reduced) if summed else ([], _row(reduced), [])
+    lines += [*before, f"    for i in range({'states' if summed else 'out'}.shape[0]):"]
     lines += [f"        {s} = {place}" for s, place in places.items() if "[" in place and "i" in place.split("[")[1]]
     lines += [f"        {symbol} = {_code(expression)}" for symbol, expression in common]
-    size = len(reduced)
-    zeros = sum(expression == 0 for expression in reduced)
-    if zeros > MANY_ZEROS:
-        lines += [f"        for column in range({size}):", f"            flat_out[{size}*i + column] = 0.0"]
+    lines += [*row, *after]
+    fast = ', fastmath={"reassoc"}' if summed else ""
+    header = f'@njit("{GRID_SIGNATURE}", cache=CACHE, nogil=True, error_model="numpy"{fast})\n'
+    return header + f"def {name}(states, inputs, parameters, tau, frequency, out):\n" + "\n".join(lines) + "\n"
+
+
+def _row(expressions: list[sp.Expr]) -> list[str]:
+    """Return the lines that fill a row, zeros by a loop where there are many."""
+    size, zeros = len(expressions), sum(expression == 0 for expression in expressions)
+    cleared = zeros > MANY_ZEROS
+    lines = (
+        [f"        for column in range({size}):", f"            flat_out[{size}*i + column] = 0.0"] if cleared else []
+    )
     lines += [
         f"        flat_out[{size}*i + {column}] = {_code(expression)}"
-        for column, expression in enumerate(reduced)
-        if zeros <= MANY_ZEROS or expression != 0
+        for column, expression in enumerate(expressions)
+        if not cleared or expression != 0
     ]
-    lines += [] if reduced else ["        pass"]
-    header = f'@njit("{GRID_SIGNATURE}", cache=CACHE, nogil=True, error_model="numpy")\n'
-    return header + f"def {name}(states, inputs, parameters, tau, frequency, out):\n" + "\n".join(lines) + "\n"
+    return lines or ["        pass"]
+
+
+def _sums(expressions: list[sp.Expr]) -> tuple[list[str], list[str], list[str]]:
+    """Return the lines before, in and after the loop that sum up the rows."""
+    there = [column for column, expression in enumerate(expressions) if expression != 0]
+    return (
+        [f"    sum_{column} = 0.0" for column in there],
+        [f"        sum_{column} += {_code(expressions[column])}" for column in there] or ["        pass"],
+        [f"    flat_out[{c}] = {f'sum_{c}' if c in there else 0.0}" for c in range(len(expressions))],
+    )
 
 
 class _Printer(PythonCodePrinter):

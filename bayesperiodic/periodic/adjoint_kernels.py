@@ -86,7 +86,7 @@ def back_substitute_transposed(grid, factors, right):
 
 @njit(
     f"boolean({FUNCTION}, {FUNCTION}, {FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {MATRIX}, "
-    f"{MATRIX}, Tuple(({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX})), {FACTORS}, {VECTOR})",
+    f"{MATRIX}, Tuple(({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX})), {FACTORS}, {VECTOR})",
     **OPTIONS,
 )
 def pull(
@@ -95,7 +95,7 @@ def pull(
 ):  # fmt: skip
     """Fill Σ weights · ∂ŷ/∂θ (parameters,) at a solution z; return False where ∂g/∂z is singular."""
     first, second, neighbours = grid[0], grid[1], grid[2]
-    states, columns, slopes, adjoint, weighed, parts = work
+    states, columns, slopes, adjoint, weighed = work
     points, count, channels = z.shape[0], STATES if STATES > 0 else z.shape[1], weights.shape[1]
     squared = frequency**2
     differentiate(z, drift, grid, tau, frequency, states)
@@ -131,12 +131,7 @@ def pull(
             weighed[i, 3 * count + s] = adjoint[i, s]
         for c in range(channels):
             weighed[i, 4 * count + c] = weights[i, c]
-    pulled(weighed, inputs, parameters, tau, frequency, parts)
-    for p in range(gradient.size):
-        gradient[p] = 0.0
-    for i in range(points):
-        for p in range(gradient.size):
-            gradient[p] += parts[i, p]
+    pulled(weighed, inputs, parameters, tau, frequency, gradient.reshape((1, gradient.size)))
     return True
 
 
@@ -165,7 +160,6 @@ def pull_many(
     work = (
         np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count))),
         np.empty((points, channels * 3 * count)), np.empty((points, count)), np.empty((points, 4 * count + channels)),
-        np.empty((points, parameters.shape[1])),
     )  # fmt: skip
     for k in range(start, stop):
         regular = pull(

@@ -134,9 +134,7 @@ class Batch:
         )
         self._inputs = np.stack([e.inputs for e in sets])
 
-    def solve(
-        self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False, polish: bool = True
-    ) -> BatchSolution:
+    def solve(self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False) -> BatchSolution:
         """Solve every input set for every parameter vector; the result does not depend on the number of threads.
 
         Parameters
@@ -145,16 +143,14 @@ class Batch:
         threads : int, optional
             By default as many as there are cores.
         keep : bool
-            Return z too.
-        polish : bool
-            Take further chord steps to a z that is kept, so that what is derived from it is as exact as it can be.
+            Return z too, after further chord steps, so that what is derived from it is as exact as it can be.
         """
         model, grid = self._first.model, self._first.grid
         solves = parameters.shape[-2]
         z = np.empty((self._size, solves, grid.points if keep else 0, self._first.count))
         y = np.empty((self._size, solves, grid.points, model.kernels.channels))
         nothing = np.empty((self._size, grid.points, 0)), np.empty(0, dtype=np.int64)
-        _, status, iterations = self._solve(parameters, *nothing, z, y, threads, keep and polish)
+        _, status, iterations = self._solve(parameters, *nothing, z, y, threads, keep)
         frequency = np.repeat(self._shared[1][:, None], solves, axis=1)
         return BatchSolution(z, y, frequency, status, iterations)
 
@@ -179,6 +175,25 @@ class Batch:
         solves, channels = parameters.shape[-2], self._first.model.kernels.channels
         z, y = np.empty((self._size, solves, 0, self._first.count)), np.empty((self._size, solves, 0, channels))
         return self._solve(parameters, data, measured, z, y, threads)[:2]
+
+    def orbits(
+        self, parameters: np.ndarray, data: np.ndarray, measured: np.ndarray, threads: int | None = None
+    ) -> tuple[BatchSolution, np.ndarray]:
+        """Solve for one parameter vector of every input set, z as it is after the solve, and return `squares` too.
+
+        Parameters
+        ----------
+        parameters : array (sets, 1, parameters)
+        data : array (sets, points, measured)
+        measured : int array (measured,)
+            The channels that the data are of.
+        threads : int, optional
+        """
+        model, points = self._first.model, self._first.grid.points
+        z = np.empty((self._size, 1, points, self._first.count))
+        y = np.empty((self._size, 1, points, model.kernels.channels))
+        squares, status, iterations = self._solve(parameters, data, measured, z, y, threads)
+        return BatchSolution(z, y, self._shared[1][:, None], status, iterations), squares
 
     def _solve(
         self,
