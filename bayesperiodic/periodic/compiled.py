@@ -54,9 +54,8 @@ def _kernels(sizes: tuple[int, ...]) -> SimpleNamespace:
     source = _text("kernels.py")
     if GENERIC not in source:
         raise RuntimeError(f"kernels.py does not contain {GENERIC!r}.")
-    return SimpleNamespace(
-        **load(source.replace(GENERIC, f"STATES, REACH, WIDTH, HALF = {', '.join(map(str, sizes))}"), NAMES)
-    )
+    sized = f"STATES, REACH, WIDTH, HALF = {', '.join(map(str, sizes))}"
+    return SimpleNamespace(**load(source.replace(GENERIC, sized), NAMES))
 
 
 @cache
