@@ -105,15 +105,18 @@ class Misfits:
         Parameters
         ----------
         outputs : array (experiments, points, channels)
+            Overwritten by the result.
         by_square : array (experiments · channels,)
             In the order of `squares`.
         """
-        result, factors = np.zeros(outputs.shape), by_square.reshape(len(outputs), -1)
+        factors = 2.0 * by_square.reshape(len(outputs), -1)
+        outputs[..., np.delete(np.arange(outputs.shape[-1]), self._columns)] = 0.0
         for c, column in enumerate(self._columns):
-            kept = self._kept[c]
-            difference = self._within(outputs[..., column] - self._data[..., c], kept)
-            result[..., column] = (2.0 * factors[:, c] * kept / self._points)[:, None] * difference
-        return result
+            own, kept = outputs[..., column], self._kept[c]
+            own -= self._data[..., c]
+            own[...] = self._within(own, kept)
+            own *= (factors[:, c] * kept / self._points)[:, None]
+        return outputs
 
     def _within(self, signals: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Return signals (experiments, points) within as many real components."""

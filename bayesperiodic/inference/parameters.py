@@ -138,6 +138,11 @@ class ParameterMaps:
     Parameters
     ----------
     maps : sequence of ParameterMap
+
+    Attributes
+    ----------
+    moving : tuple of int
+        Which of the model's parameters are free or tied.
     """
 
     def __init__(self, maps: Sequence[ParameterMap]):
@@ -150,6 +155,8 @@ class ParameterMaps:
         self._columns = np.array([[m.columns[name] for name in first.columns] for m in maps], dtype=int)
         named = {name for expression in self._tied.values() for name in expression.names} | self._tied.keys()
         self._named = {name: i for i, name in enumerate(first.parameters) if name in named}
+        free = {*first.columns, *self._tied} - {SHIFT}
+        self.moving = tuple(i for i, name in enumerate(first.parameters) if name in free)
 
     def values(self, theta: np.ndarray) -> np.ndarray:
         """Return all parameters (maps, points, parameters + 1), the delay last, of θ (points, names)."""
@@ -175,7 +182,7 @@ class ParameterMaps:
             for name, expression in reversed(self._tied.items()):
                 for argument, slope in expression.gradient(known).items():
                     left[:, self._named[argument]] += slope * left[:, self._named[name]]
-        np.put_along_axis(result, self._columns, left[:, self._places], axis=1)
+        result[np.arange(len(result))[:, None], self._columns] = left[:, self._places]
         return result
 
 

@@ -486,12 +486,13 @@ class Problem:
         return [Misfits(group) for group in groups] if enough else []
 
     @cached_property
-    def flat_places(self) -> np.ndarray:
-        """Where the blocks are in the misfits of all groups, one after the other, (blocks,)."""
+    def flat_places(self) -> np.ndarray | slice:
+        """Where the blocks are in the misfits of all groups, one after the other, (blocks,), or all in order."""
         every = [self.observations[e.name] for group in self._responses.groups for e in group]
         order = [(o.experiment.name, channel) for o in every for channel in o.channels]
         places = {key: i for i, key in enumerate(order)}
-        return np.array([places[block.experiment, block.channel] for block in self.likelihood.blocks])
+        result = np.array([places[block.experiment, block.channel] for block in self.likelihood.blocks])
+        return slice(None) if np.array_equal(result, np.arange(result.size)) else result
 
     def residuals(self, theta: np.ndarray, threads: int | None = None) -> tuple[Residuals, np.ndarray]:
         """Return the residual components at those of many θ whose solves converge, and how all solves ended.
@@ -557,8 +558,10 @@ class Problem:
         noise = self._noise_at(values, variances)
         with np.errstate(divide="ignore", invalid="ignore"):
             prior = np.asarray(self.log_prior(values) + self.likelihood.log_prior(noise))
-        result = np.full(prior.shape, -np.inf)
         inside = np.isfinite(prior)
+        if inside.all():
+            return np.asarray(prior + self.likelihood_and_status(values, noise)[0])
+        result = np.full(prior.shape, -np.inf)
         if inside.any():
             result[inside] = prior[inside] + self.likelihood_and_status(values[inside], noise[inside])[0]
         return result

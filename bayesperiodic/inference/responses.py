@@ -15,7 +15,7 @@ from bayesperiodic.periodic.autonomous_batch import AutonomousBatch
 from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
-from bayesperiodic.periodic.floquet import first_order_matrix, largest_multiplier
+from bayesperiodic.periodic.floquet import easy_multipliers, first_order_matrix
 from bayesperiodic.periodic.reach import LOST, reach
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities
@@ -253,7 +253,7 @@ class Responses:
         for (_, maps, batch), orbit, own in zip(self._batches, orbits, weights, strict=True):
             assert isinstance(batch, Batch)
             by_parameter = np.zeros(orbit.values.shape)
-            by_parameter[:, :-1] = batch.pull(orbit.values[:, :-1], orbit.z, own)
+            by_parameter[:, maps.moving] = batch.pull(orbit.values[:, :-1], orbit.z, own, maps.moving)
             parts.append(maps.pulled(orbit.values, by_parameter))
         return np.concatenate(parts).sum(axis=0)
 
@@ -360,8 +360,8 @@ class Responses:
             names = [e.name for e in experiments]
             values = maps.values(theta[None])[:, 0]
             z, outputs = np.stack([solved[n][1] for n in names]), np.stack([weights[n].outputs for n in names])
-            by_parameter = np.empty(values.shape)
-            by_parameter[:, :-1] = batch.pull(values[:, :-1], z, outputs)
+            by_parameter = np.zeros(values.shape)
+            by_parameter[:, maps.moving] = batch.pull(values[:, :-1], z, outputs, maps.moving)
             by_parameter[:, -1] = [weights[n].delay for n in names]
             result |= dict(zip(names, maps.pulled(values, by_parameter), strict=True))
         for name, (response, z) in solved.items():
@@ -375,16 +375,17 @@ def leading_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z:
     """Return the `count` largest multipliers of a solution z, or fewer, without an autonomous orbit's trivial 1."""
     if not count:
         return np.empty(0)
-    if count == 1 and not equations.model.autonomous:
-        alone = _largest_alone(equations, parameters, z)
-        if alone is not None:
-            return np.array([alone], dtype=complex)
+    easy = None if equations.model.autonomous else _easy_multipliers(equations, parameters, z, count)
+    if easy is not None:
+        return easy
     solution = _described(equations, parameters, z)
     return _without_trivial(solution, solution.multipliers)[:count]
 
 
-def _largest_alone(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> float | None:
-    """Return the largest multiplier where it is real and well apart from the others; else None."""
+def _easy_multipliers(
+    equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int
+) -> np.ndarray | None:
+    """Return the largest multipliers of a forced model where `floquet.easy_multipliers` finds them."""
     orders = tuple(equations.model.orders.values())
     columns = equations.residual_jacobian(z, parameters)[:, equations.count :]
     try:
@@ -395,7 +396,7 @@ def _largest_alone(equations: PeriodicEquations, parameters: np.ndarray, z: np.n
     spread = np.ptp(z, axis=0)
     sizes = np.where(spread > 0.0, spread, 1.0)
     sizes = np.concatenate([sizes, 2 * np.pi / period * sizes[[order == 2 for order in orders]]])
-    return largest_multiplier(matrix * (sizes / sizes[:, None]), period)
+    return easy_multipliers(matrix * (sizes / sizes[:, None]), period, count)
 
 
 def _described(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> PeriodicSolution:

@@ -20,9 +20,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import llvmlite.binding
+import llvmlite
 import numba
 import platformdirs
+from numba.core.registry import cpu_target
 
 SOURCE, MANIFEST = "kernels.py", "manifest.json"
 
@@ -62,8 +63,9 @@ def load(body: str, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _header() -> str:
+    """Return the line that tells what, besides the text, decides on the machine code."""
     python = ".".join(map(str, sys.version_info[:3]))
-    machine = f"{platform.machine()} {llvmlite.binding.get_host_cpu_name()}"
+    machine = f"{platform.machine()} {' '.join(map(str, cpu_target.target_context.codegen().magic_tuple()))}"
     versions = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, python {python}, {machine}"
     return f"# {versions}\n"
 

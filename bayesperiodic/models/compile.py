@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
 FUNCTIONS = ("residual", "residual_jacobian", "outputs", "derivatives", "transitions")
 SECOND_FUNCTIONS = ("jacobian_change",)
-PULLED_FUNCTIONS = ("output_jacobian", "pulled")
+PULLED_FUNCTIONS = ("pulled_outputs", "pulled_equations")
 MANY_ZEROS = 30
+GATHERS = "from bayesperiodic.models.gathers import without_gathers"
 
 
 class GridFunction(types.WrapperAddressProtocol):
@@ -194,46 +195,50 @@ def second_source(model: Model) -> str:
 
 @dataclass(frozen=True)
 class PullingKernels:
-    """The compiled grid functions that gradients need of one model.
+    """The compiled grid functions that gradients by some of a model's parameters need.
+
+    What is costly to evaluate stands in the outputs or in the equations, rarely in both, so that no function has both.
 
     Attributes
     ----------
-    output_jacobian : GridFunction
-        Columns: ∂f/∂(q, q̇, q̈), row by row (outputs × 3·states).
-    pulled : GridFunction
-        Of states (q, q̇, q̈, an adjoint state λ and weights w of the outputs); its one row is summed over the grid, and
-        its columns: Σ w·∂f/∂θ − Σ λ·∂g/∂θ.
+    pulled_outputs : GridFunction
+        Of states (q, q̇, q̈, weights w of the outputs). Columns: Σ w·∂f/∂(q, q̇, q̈); then, after the last row, summed
+        over the grid: Σ w·∂f/∂θ by those parameters.
+    pulled_equations : GridFunction
+        Of states (q, q̇, q̈, an adjoint state λ). Summed over the grid: −Σ λ·∂g/∂θ by those parameters.
     """
 
-    output_jacobian: GridFunction
-    pulled: GridFunction
+    pulled_outputs: GridFunction
+    pulled_equations: GridFunction
 
 
-def compile_pulling(model: Model) -> PullingKernels:
-    """Return the compiled functions that gradients need of a model."""
-    functions = load(pulling_source(model), PULLED_FUNCTIONS)
+def compile_pulling(model: Model, moving: tuple[int, ...]) -> PullingKernels:
+    """Return the compiled functions that gradients by the parameters of these indices need."""
+    functions = load(pulling_source(model, moving), PULLED_FUNCTIONS)
     return PullingKernels(**{name: GridFunction(compiled) for name, compiled in functions.items()})
 
 
-def pulling_source(model: Model) -> str:
+def pulling_source(model: Model, moving: tuple[int, ...]) -> str:
     """Return the generated module of `PullingKernels` as text."""
     g, f = list(model.equations), list(model.output_expressions)
     q, u = list(model.state_symbols.values()), list(model.input_symbols.values())
     theta = list(model.parameter_symbols.values())
-    weighed = [*zip(_weights("l", g), (-e for e in g), strict=True), *zip(_weights("w", f), f, strict=True)]
-    pulled = [sum((weight * sp.diff(e, x) for weight, e in weighed if x in e.free_symbols), sp.S.Zero) for x in theta]
-    # The functions' states are not of the same length.
-    modules = [
-        _functions({"output_jacobian": _jacobian(f, q)}, q, u, theta, model.time_symbols),
-        _functions(
-            {"pulled": pulled}, [*q, *_weights("l", g), *_weights("w", f)], u, theta, model.time_symbols, summed=True
-        ),
+    weights, adjoint = ([sp.Symbol(f"{w}_{i}", real=True) for i in range(len(e))] for w, e in (("w", f), ("l", g)))
+    by, rest = [theta[i] for i in moving], (u, theta, model.time_symbols)
+    changes, moved = _weighed_changes(weights, f, [*q, *by]), _weighed_changes(adjoint, [-e for e in g], by)
+    functions = [
+        _functions({"pulled_outputs": changes}, [*q, *weights], *rest, summed=len(by)),
+        _functions({"pulled_equations": moved}, [*q, *adjoint], *rest, summed=len(by)),
     ]
-    return _with_elementary("\n\n".join(modules))
+    return _with_elementary("\n\n".join(functions))
 
 
-def _weights(letter: str, expressions: list[sp.Expr]) -> list[sp.Symbol]:
-    return [sp.Symbol(f"{letter}_{i}", real=True) for i in range(len(expressions))]
+def _weighed_changes(weights: list[sp.Symbol], rows: list[sp.Expr], columns: list[sp.Symbol]) -> list[sp.Expr]:
+    """Return Σ weight·∂row/∂column of each column."""
+    return [
+        sum((w * sp.diff(e, x) for w, e in zip(weights, rows, strict=True) if x in e.free_symbols), sp.S.Zero)
+        for x in columns
+    ]
 
 
 def _jacobian(rows: list[sp.Expr], columns: list[sp.Symbol]) -> list[sp.Expr]:
@@ -248,7 +253,7 @@ def _functions(
     parameters: list[sp.Symbol],
     time: dict[str, sp.Symbol],
     *,
-    summed: bool = False,
+    summed: int = 0,
 ) -> str:
     arguments = {
         **{symbol: f"flat_states[{len(states)}*i + {column}]" for column, symbol in enumerate(states)},
@@ -267,21 +272,23 @@ def _with_elementary(functions: str) -> str:
         name = block.partition("def ")[2].partition("(")[0]
         if f"{name}(" in functions:
             functions = f"{block}\n\n\n{functions}"
-    return f"{header}\n\n\n{functions}"
+    return f"{header}\n{GATHERS}\n\n\n{functions}"
 
 
-def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str], summed: bool) -> str:
+def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str], summed: int) -> str:
     """Return a function that sweeps the grid; strides known at compile time let its loop be vectorised.
 
-    One that is summed adds up the rows in whatever order is fastest on this machine, and has one row.
+    The last `summed` expressions are added up in whatever order is fastest on this machine, and put after the rows.
     """
     common, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("common"), order="canonical")
     used = set().union(*(e.free_symbols for e in reduced), *(e.free_symbols for _, e in common))
     places = {symbol: place for symbol, place in arguments.items() if symbol in used and symbol.name != place}
-    lines = [f"    flat_{a} = {a}.reshape({a}.size)" for a in ("states", "inputs", "out")]
+    lines = ["    without_gathers()", *(f"    flat_{a} = {a}.reshape({a}.size)" for a in ("states", "inputs", "out"))]
     lines += [f"    {s} = {place}" for s, place in places.items() if "[" not in place or "i" not in place.split("[")[1]]
-    before, row, after = _sums(reduced) if summed else ([], _row(reduced), [])
-    lines += [*before, f"    for i in range({'states' if summed else 'out'}.shape[0]):"]
+    columns = len(reduced) - summed
+    before, own, after = _sums(reduced[columns:], columns)
+    row = [*_row(reduced[:columns]), *own] or ["        pass"]
+    lines += [*before, "    for i in range(states.shape[0]):"]
     lines += [f"        {s} = {place}" for s, place in places.items() if "[" in place and "i" in place.split("[")[1]]
     lines += [f"        {symbol} = {_code(expression)}" for symbol, expression in common]
     lines += [*row, *after]
@@ -302,16 +309,17 @@ def _row(expressions: list[sp.Expr]) -> list[str]:
         for column, expression in enumerate(expressions)
         if not cleared or expression != 0
     ]
-    return lines or ["        pass"]
+    return lines
 
 
-def _sums(expressions: list[sp.Expr]) -> tuple[list[str], list[str], list[str]]:
-    """Return the lines before, in and after the loop that sum up the rows."""
+def _sums(expressions: list[sp.Expr], columns: int) -> tuple[list[str], list[str], list[str]]:
+    """Return the lines before, in and after the loop that sum up expressions and put them after rows of `columns`."""
+    start = f"{columns}*states.shape[0]" if columns else "0"
     there = [column for column, expression in enumerate(expressions) if expression != 0]
     return (
         [f"    sum_{column} = 0.0" for column in there],
-        [f"        sum_{column} += {_code(expressions[column])}" for column in there] or ["        pass"],
-        [f"    flat_out[{c}] = {f'sum_{c}' if c in there else 0.0}" for c in range(len(expressions))],
+        [f"        sum_{column} += {_code(expressions[column])}" for column in there],
+        [f"    flat_out[{start} + {c}] = {f'sum_{c}' if c in there else 0.0}" for c in range(len(expressions))],
     )
 
 

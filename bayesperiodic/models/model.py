@@ -187,10 +187,25 @@ class Model:
         """The compiled change of ∂g/∂(q, q̇, q̈) along a direction, see `compile.compile_second`."""
         return compile_second(self)
 
+    def pulling_kernels(self, moving: tuple[int, ...]) -> PullingKernels:
+        """Return the compiled grid functions that gradients need.
+
+        Parameters
+        ----------
+        moving : tuple of int
+            Indices of the parameters by which.
+
+        Returns
+        -------
+        PullingKernels
+        """
+        if moving not in self._pulling_kernels:
+            self._pulling_kernels[moving] = compile_pulling(self, moving)
+        return self._pulling_kernels[moving]
+
     @cached_property
-    def pulling_kernels(self) -> PullingKernels:
-        """The compiled grid functions that gradients need."""
-        return compile_pulling(self)
+    def _pulling_kernels(self) -> dict[tuple[int, ...], PullingKernels]:
+        return {}
 
     @cached_property
     def kernels(self) -> Kernels:
@@ -226,7 +241,7 @@ class Model:
         return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
 
     def __getstate__(self) -> dict[str, Any]:
-        compiled = ("kernels", "pulling_kernels", "jacobian_change", "smooth_signs")
+        compiled = ("kernels", "_pulling_kernels", "jacobian_change", "smooth_signs")
         return {key: value for key, value in self.__dict__.items() if key not in compiled}
 
     def __repr__(self) -> str:

@@ -86,21 +86,20 @@ def back_substitute_transposed(grid, factors, right):
 
 @njit(
     f"boolean({FUNCTION}, {FUNCTION}, {FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {MATRIX}, "
-    f"{MATRIX}, Tuple(({MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX})), {FACTORS}, {VECTOR})",
+    f"{MATRIX}, Tuple(({MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, {MATRIX}, {MATRIX})), {FACTORS}, {VECTOR})",
     **OPTIONS,
 )
 def pull(
-    residual_jacobian, output_jacobian, pulled, grid, inputs, parameters, tau, frequency, drift, z, weights, work,
-    factors, gradient,
+    residual_jacobian, pulled_outputs, pulled_equations, grid, inputs, parameters, tau, frequency, drift, z, weights,
+    work, factors, gradient,
 ):  # fmt: skip
-    """Fill Σ weights · ∂ŷ/∂θ (parameters,) at a solution z; return False where ∂g/∂z is singular."""
+    """Fill Σ weights · ∂ŷ/∂θ (moving,) at a solution z; return False where ∂g/∂z is singular."""
     first, second, neighbours = grid[0], grid[1], grid[2]
-    states, columns, slopes, adjoint, weighed = work
+    states, columns, weighed, slopes, adjoint, beside = work
     points, count, channels = z.shape[0], STATES if STATES > 0 else z.shape[1], weights.shape[1]
     squared = frequency**2
     differentiate(z, drift, grid, tau, frequency, states)
     residual_jacobian(states, inputs, parameters, tau, frequency, columns)
-    output_jacobian(states, inputs, parameters, tau, frequency, slopes)
     amplitude = np.empty(count)
     largest(z, amplitude)
     for s in range(count):
@@ -108,30 +107,30 @@ def pull(
     if not factorise(columns, grid, frequency, amplitude, factors):
         return False
     for i in range(points):
-        for s in range(count):
-            adjoint[i, s] = 0.0
+        for s in range(3 * count):
+            weighed[i, s] = states[i, s]
+        for c in range(channels):
+            weighed[i, 3 * count + c] = weights[i, c]
+    pulled_outputs(weighed, inputs, parameters, tau, frequency, slopes.reshape((1, slopes.size)))
     for i in range(points):
         for s in range(count):
-            still, rate, acceleration = 0.0, 0.0, 0.0
-            for c in range(channels):
-                at = c * 3 * count + s
-                still += weights[i, c] * slopes[i, at]
-                rate += weights[i, c] * slopes[i, at + count]
-                acceleration += weights[i, c] * slopes[i, at + 2 * count]
-            adjoint[i, s] += still
+            adjoint[i, s] = slopes[3 * count * i + s]
+    for i in range(points):
+        for s in range(count):
+            rate = slopes[3 * count * i + count + s] * frequency
+            acceleration = slopes[3 * count * i + 2 * count + s] * squared
             if rate != 0.0 or acceleration != 0.0:
-                rate, acceleration = rate * frequency, acceleration * squared
                 for o in range(first.size):
                     adjoint[neighbours[i, o], s] += first[o] * rate + second[o] * acceleration
     back_substitute_transposed(grid, factors, adjoint)
     for i in range(points):
         for s in range(3 * count):
-            weighed[i, s] = states[i, s]
+            beside[i, s] = states[i, s]
         for s in range(count):
-            weighed[i, 3 * count + s] = adjoint[i, s]
-        for c in range(channels):
-            weighed[i, 4 * count + c] = weights[i, c]
-    pulled(weighed, inputs, parameters, tau, frequency, gradient.reshape((1, gradient.size)))
+            beside[i, 3 * count + s] = adjoint[i, s]
+    pulled_equations(beside, inputs, parameters, tau, frequency, gradient.reshape((1, gradient.size)))
+    for p in range(gradient.size):
+        gradient[p] += slopes[3 * count * points + p]
     return True
 
 
@@ -141,10 +140,10 @@ def pull(
     **OPTIONS,
 )
 def pull_many(
-    residual_jacobian, output_jacobian, pulled, grid, inputs, parameters, tau, frequency, drift, z, weights, factors,
-    start, stop, gradients,
+    residual_jacobian, pulled_outputs, pulled_equations, grid, inputs, parameters, tau, frequency, drift, z, weights,
+    factors, start, stop, gradients,
 ):  # fmt: skip
-    """Fill the gradients (sets, parameters) of the input sets start … stop at one solution each; NaN where singular.
+    """Fill the gradients (sets, moving) of the input sets start … stop at one solution each; NaN where singular.
 
     Parameters
     ----------
@@ -159,13 +158,14 @@ def pull_many(
     points, count, channels = z.shape[1], z.shape[2], weights.shape[2]
     work = (
         np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count))),
-        np.empty((points, channels * 3 * count)), np.empty((points, count)), np.empty((points, 4 * count + channels)),
+        np.empty((points, 3 * count + channels)), np.empty(points * 3 * count + gradients.shape[1]),
+        np.empty((points, count)), np.empty((points, 4 * count)),
     )  # fmt: skip
     for k in range(start, stop):
         regular = pull(
-            residual_jacobian, output_jacobian, pulled, grid, inputs[k], parameters[k], tau, frequency[k], drift[k],
-            z[k], weights[k], work, factors, gradients[k],
+            residual_jacobian, pulled_outputs, pulled_equations, grid, inputs[k], parameters[k], tau, frequency[k],
+            drift[k], z[k], weights[k], work, factors, gradients[k],
         )  # fmt: skip
         if not regular:
-            for p in range(parameters.shape[1]):
+            for p in range(gradients.shape[1]):
                 gradients[k, p] = np.nan

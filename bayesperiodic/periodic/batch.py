@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -134,6 +136,10 @@ class Batch:
         )
         self._inputs = np.stack([e.inputs for e in sets])
 
+    @cached_property
+    def _kernels(self) -> SimpleNamespace:
+        return batch_kernels(self._first.count, self._first.grid.stencil)
+
     def solve(self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False) -> BatchSolution:
         """Solve every input set for every parameter vector; the result does not depend on the number of threads.
 
@@ -211,10 +217,10 @@ class Batch:
         every[:] = parameters
         squares = np.empty((self._size, solves, measured.size))
         status, iterations = np.empty((2, self._size, solves), dtype=np.int64)
-        compiled = batch_kernels(self._first.count, grid.stencil)
+        solve_many = self._kernels.solve_many
 
         def part(block: tuple[int, int]) -> None:
-            compiled.solve_many(
+            solve_many(
                 model.kernels.residual,
                 model.kernels.residual_jacobian,
                 model.kernels.outputs,
@@ -242,27 +248,34 @@ class Batch:
         return squares, status, iterations
 
     def pull(
-        self, parameters: np.ndarray, z: np.ndarray, weights: np.ndarray, threads: int | None = None
+        self,
+        parameters: np.ndarray,
+        z: np.ndarray,
+        weights: np.ndarray,
+        moving: tuple[int, ...],
+        threads: int | None = None,
     ) -> np.ndarray:
-        """Return Σ weights · ∂ŷ/∂θ (sets, parameters) at one solution of every input set; NaN where it is singular.
+        """Return Σ weights · ∂ŷ/∂θ (sets, moving) at one solution of every input set; NaN where it is singular.
 
         Parameters
         ----------
         parameters : array (sets, parameters)
         z : array (sets, points, states)
         weights : array (sets, points, channels)
+        moving : tuple of int
+            The parameters by which.
         threads : int, optional
         """
         model, grid = self._first.model, self._first.grid
-        pulling, (frequency, drift) = model.pulling_kernels, self._shared[1:3]
-        gradients = np.empty((self._size, parameters.shape[-1]))
+        pulling, (frequency, drift) = model.pulling_kernels(moving), self._shared[1:3]
+        gradients = np.empty((self._size, len(moving)))
         compiled = adjoint_kernels(self._first.count, grid.stencil)
 
         def part(block: tuple[int, int]) -> None:
             compiled.pull_many(
                 model.kernels.residual_jacobian,
-                pulling.output_jacobian,
-                pulling.pulled,
+                pulling.pulled_outputs,
+                pulling.pulled_equations,
                 grid.packed,
                 self._inputs,
                 np.ascontiguousarray(parameters),

@@ -169,10 +169,11 @@ def floquet(matrix: np.ndarray, period: float) -> Floquet:
     return Floquet(np.array(exponents)[order], steps, length, np.array(v)[order], np.array(w)[order])
 
 
-def largest_multiplier(matrix: np.ndarray, period: float) -> float | None:
-    """Return the multiplier of largest modulus of ẏ = A(t) y where it is real and stands well apart; else None.
+def easy_multipliers(matrix: np.ndarray, period: float, count: int) -> np.ndarray | None:
+    """Return the largest multipliers of ẏ = A(t) y, complex (count,) or fewer; None where that takes `floquet`.
 
-    A vector carried round the period turns into its eigenvector in a few rounds.
+    A vector carried round the period turns in a few rounds into the eigenvector of the largest one, if that is real
+    and stands well apart; and where the product of all transfer matrices is harmless, its eigenvalues are all there is.
 
     Parameters
     ----------
@@ -180,27 +181,39 @@ def largest_multiplier(matrix: np.ndarray, period: float) -> float | None:
         A [1/s] on an equidistant grid of one period, end point excluded.
     period : float
         [s].
+    count : int
     """
     points, size, _ = matrix.shape
-    start = np.full(size, 1.0 / np.sqrt(size))
     steps = _transfer_matrices(matrix, period / points)
-    found, logarithm, sign = _kernels().largest(steps, start, ROUNDS, DECOUPLED)
-    with np.errstate(over="ignore"):
-        return float(sign * np.exp(logarithm)) if found else None
+    if count == 1:
+        found, logarithm, sign = _kernels().largest(steps, np.full(size, 1.0 / np.sqrt(size)), ROUNDS, DECOUPLED)
+        if found:
+            with np.errstate(over="ignore"):
+                return np.array([sign * np.exp(logarithm)], dtype=complex)
+    products, _ = _harmless_products(steps)
+    if len(products) > 1:
+        return None
+    values = np.linalg.eigvals(products[0]).astype(complex)
+    return values[np.argsort(-np.abs(values), kind="stable")][:count]
 
 
 def _transfer_matrices(matrix: np.ndarray, step: float) -> np.ndarray:
     """Return (points, size, size): from each grid point to the next."""
     width = min(STENCIL, len(matrix))
     first = 1 - width // 2
-    offsets = np.arange(width) + first
     stiffness = step * float(np.max(np.linalg.norm(matrix, axis=(1, 2))))
     parts = 1 if stiffness < STIFF else 2 * min(int(np.ceil(0.5 * stiffness / STIFF)), MOST_PARTS // 2)
-    weights = np.array([[_lagrange(offsets, node) for node in (part + GAUSS_NODES) / parts] for part in range(parts)])
-    result = np.empty_like(matrix)
+    weights, result = _interpolation(width, first, parts), np.empty_like(matrix)
     compiled = _kernels().transfer_matrices
     compiled(np.ascontiguousarray(matrix), weights, first, step / parts, GAUSS_MATRIX, GAUSS_WEIGHTS, result)
     return result
+
+
+@cache
+def _interpolation(width: int, first: int, parts: int) -> np.ndarray:
+    """Return the weights (parts, Gauss points, width) of grid points from `first` on, for each part of a step."""
+    offsets = np.arange(width) + first
+    return np.array([[_lagrange(offsets, node) for node in (part + GAUSS_NODES) / parts] for part in range(parts)])
 
 
 def _lagrange(nodes: np.ndarray, at: float) -> np.ndarray:

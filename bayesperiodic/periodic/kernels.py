@@ -34,6 +34,7 @@ MAX_HALVINGS = 20
 CHORD_RATE = 0.2
 ROUNDING = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
+NARROW = 5
 FAR = 0.3
 SAME = 1e-6
 LARGEST_PART, SMALLEST_PART = 1.0 / 16.0, 1.0 / 256.0
@@ -58,6 +59,37 @@ def copy(source, target):
         other[k] = one[k]
 
 
+@njit(f"boolean({VECTOR}, uint64, {PLACES})", **OPTIONS)
+def factor_narrow(flat, stop, pivots):
+    """Do as `factor` for the rows before `stop` of a band of half-width `LOWER`, every loop of a known length."""
+    one, below, row = np.uint64(1), np.uint64(LOWER), np.uint64(3 * LOWER)
+    for j in range(stop):
+        diagonal = j * (row + one) + below
+        pivot, largest = np.uint64(0), abs(flat[diagonal])
+        for i in range(LOWER):
+            m = np.uint64(i) + one
+            value = abs(flat[diagonal + m * row])
+            if value > largest:
+                pivot, largest = m, value
+        pivots[j] = j + pivot
+        if not (largest > 0.0 and largest < np.inf):
+            return False
+        if pivot != 0:
+            other = diagonal + pivot * row
+            for i in range(2 * LOWER + 1):
+                k = np.uint64(i)
+                flat[diagonal + k], flat[other + k] = flat[other + k], flat[diagonal + k]
+        inverse = 1.0 / flat[diagonal]
+        flat[diagonal] = inverse
+        for i in range(LOWER):
+            start = diagonal + (np.uint64(i) + one) * row
+            multiplier = flat[start] * inverse
+            flat[start] = multiplier
+            for k in range(2 * LOWER):
+                flat[start + one + np.uint64(k)] -= multiplier * flat[diagonal + one + np.uint64(k)]
+    return True
+
+
 @njit(f"boolean({MATRIX}, int64, int64, {PLACES})", **OPTIONS)
 def factor(band, lower, upper, pivots):
     """Factor in place, P·A = L·U, the pivots kept as their inverses; return False for one that is zero or not finite.
@@ -73,8 +105,14 @@ def factor(band, lower, upper, pivots):
     flat = band.reshape(band.size)
     size, one, below, above = np.uint64(band.shape[0]), np.uint64(1), np.uint64(lower), np.uint64(upper)
     next_row = np.uint64(band.shape[1]) - one
-    last = np.uint64(0)
-    for j in range(size):
+    first, last = np.uint64(0), np.uint64(0)
+    if 0 < LOWER <= NARROW and lower == LOWER and upper == LOWER and size > 3 * LOWER:
+        # Near the end the rows are shorter.
+        first = size - np.uint64(3 * LOWER)
+        last = first + np.uint64(2 * LOWER - 1)
+        if not factor_narrow(flat, first, pivots):
+            return False
+    for j in range(first, size):
         end = min(j + below, size - one)
         diagonal = j * (next_row + one) + below
         pivot, largest = j, abs(flat[diagonal])

@@ -214,7 +214,7 @@ class CyclicGrid:
         """Number of start points of a march, 0 where the scheme cannot be marched."""
         return len(self.offsets) - 1 if self.lead >= 0 else 0
 
-    @property
+    @cached_property
     def stencil(self) -> tuple[int, int, int]:
         """Reach, number of offsets and half-width, or zeros if the offsets have gaps or are many."""
         few = len(self.offsets) <= UNROLLED_OFFSETS < self.points

@@ -144,7 +144,7 @@ def test_value_and_gradient_where_the_transposed_solve_is_singular(monkeypatch):
     problem = duffing(duffing_run())
     theta, noise = {"c": 0.2, "k": 1.0, "k3": 0.5}, {"displacement": 0.01}
     assert np.isfinite(problem.value_and_gradient(theta, noise)[0])
-    monkeypatch.setattr(Batch, "pull", lambda self, parameters, z, weights: np.full(parameters.shape, np.nan))
+    monkeypatch.setattr(Batch, "pull", lambda self, p, z, weights, moving: np.full((len(p), len(moving)), np.nan))
     value, gradient = problem.value_and_gradient(theta, noise)
     assert value == -np.inf
     assert gradient.tolist() == [0.0] * 4

@@ -4,6 +4,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic.periodic import compiled
 from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
+from bayesperiodic.periodic.schemes import CyclicGrid, find_scheme
 from tests.known import grid
 
 SCHEMES = ["backward2", "central2", "central4", "fourier"]
@@ -114,6 +115,34 @@ def test_transposed_solves_by_segments_and_by_the_band_match_dense_algebra(schem
     adjoint.back_substitute_transposed(equations.grid.packed, factors, solved)
     expected = np.linalg.solve(dense(equations, columns).T, right.ravel())
     assert solved.ravel() == pytest.approx(expected, rel=1e-8, abs=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("states", [1, 2])
+@pytest.mark.parametrize("scheme", ["backward2", "central2", "central4"])
+def test_bands_of_any_length_are_factored_with_row_exchanges(scheme, states):
+    """Random bands without dominance, one with a column of zeros, against dense algebra."""
+    shape, random = CyclicGrid(find_scheme(scheme), 800, 1), np.random.default_rng(2)
+    functions, lower = compiled.kernels(states, shape.stencil), shape.half_width * states + states - 1
+    for size in (lower + 1, 3 * lower, 3 * lower + 1, 3 * lower + 2, 60):
+        matrix = np.tril(np.triu(random.standard_normal((size, size)), -lower), lower)
+        band, pivots = rows_of_band(matrix, lower), np.empty(size, dtype=np.int64)
+        assert functions.factor(band, lower, lower, pivots)
+        assert np.any(pivots != np.arange(size))
+        right = random.standard_normal((2, size))
+        for solve, dense_matrix in ((functions.solve, matrix), (functions.solve_transposed, matrix.T)):
+            x = right.copy()
+            solve(band, lower, lower, pivots, x)
+            assert x @ dense_matrix.T == pytest.approx(right, rel=0, abs=1e-9)
+        matrix[:, size // 3] = 0.0
+        assert not functions.factor(rows_of_band(matrix, lower), lower, lower, pivots)
+
+
+def rows_of_band(matrix: np.ndarray, lower: int) -> np.ndarray:
+    """Return the rows of a band side by side, with room for the fill-in."""
+    band = np.zeros((len(matrix), 3 * lower + 1))
+    for i, j in np.argwhere(matrix):
+        band[i, j - i + lower] = matrix[i, j]
+    return band
 
 
 def test_a_march_that_grows_too_fast_is_left_for_the_folded_band():

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.periodic.floquet import first_order_matrix, floquet, largest_multiplier
+from bayesperiodic.periodic.floquet import easy_multipliers, first_order_matrix, floquet
 from tests.known import grid
 
 PERIOD = 1.7
@@ -206,16 +206,25 @@ def test_multipliers_of_overly_stiff_equations_are_stable_and_positive():
         assert 0.0 <= multiplier.real < 1.0 and multiplier.imag == 0.0
 
 
-def test_a_vector_carried_round_finds_the_largest_multiplier_where_it_is_real_and_alone():
-    """Constant matrices, their multipliers known: signs by half a turn, none where two are a pair or nearly equal."""
+def test_easy_multipliers_are_exact_and_the_others_left_alone():
+    """Constant matrices, their multipliers known: of either sign, pairs, nearly equal ones; a pair too far from 1."""
     tau = np.arange(100) / 100
     real = np.array([[1.0, 3.0], [0.5, -2.0]])
     largest = np.exp(3.0 * np.linalg.eigvals(real).max())
-    assert largest_multiplier(np.tile(real, (100, 1, 1)), 3.0) == pytest.approx(largest, rel=1e-9)
+    for matrix in (real, 10.0 * real):
+        found = easy_multipliers(np.tile(matrix, (100, 1, 1)), 3.0 / matrix[0, 0], 1)
+        assert found == pytest.approx([largest], rel=1e-9)
     # Seen from axes that turn by half a turn in the period the multipliers change their signs.
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     axes = [np.cos(np.pi * t) * np.eye(2) + np.sin(np.pi * t) * turn for t in tau]
     seen = np.array([a @ real @ a.T + np.pi / 3.0 * turn for a in axes])
-    assert largest_multiplier(seen, 3.0) == pytest.approx(-largest, rel=1e-6)
-    assert largest_multiplier(np.tile(turn, (100, 1, 1)), 1.0) is None
-    assert largest_multiplier(np.tile(np.diag([0.1, 0.099]), (100, 1, 1)), 1.0) is None
+    assert easy_multipliers(seen, 3.0, 1) == pytest.approx([-largest], rel=1e-6)
+    pair = easy_multipliers(np.tile(turn, (100, 1, 1)), 1.0, 2)
+    assert sorted(pair, key=np.imag) == pytest.approx([np.exp(-1j), np.exp(1j)], rel=1e-9)
+    near = np.tile(np.diag([-0.2, 0.1, 0.099]), (100, 1, 1))
+    for count in (1, 2):
+        assert easy_multipliers(near, 1.0, count) == pytest.approx(np.exp([0.1, 0.099])[:count], rel=1e-9)
+    far = np.zeros((3, 3))
+    far[:2, :2], far[2, 2] = 5.0 * turn, -40.0
+    for count in (1, 3):
+        assert easy_multipliers(np.tile(far, (100, 1, 1)), 1.0, count) is None

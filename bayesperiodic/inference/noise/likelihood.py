@@ -158,22 +158,25 @@ class Likelihood:
 
     def _flat(self, residuals: Sequence[np.ndarray] | Squares, values: np.ndarray, share: float) -> np.ndarray:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
-        at, columns, sizes, weights, measured = self._levels
+        at, known, columns, sizes, weights, measured = self._levels
         squares = squares_of(residuals)
         squares = squares.transpose(*range(1, squares.ndim), 0)
         v = self.model.level(values[..., columns], measured)
-        terms = weights * (share * sizes * np.log(v) + squares[..., at] / v)
+        parts = [weights * (share * sizes * np.log(v) + squares[..., at] / v)]
+        if known.size:
+            parts.append(squares[..., known])
         # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
-        return -0.5 * sum(np.ascontiguousarray(part).sum(axis=-1) for part in (terms, squares[..., ~at]))
+        return -0.5 * sum(np.ascontiguousarray(part).sum(axis=-1) for part in parts)
 
     @cached_property
-    def _levels(self) -> tuple[np.ndarray, list[int], np.ndarray, np.ndarray, np.ndarray]:
-        """Return which blocks have a variance, and of those its column, their size, weight and measured variance."""
-        at = np.array([block.kind != KNOWN for block in self.blocks], dtype=bool)
+    def _levels(self) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the blocks with a variance, the others, and of the first the column, size, weight, measured variance."""
+        known = np.array([block.kind == KNOWN for block in self.blocks], dtype=bool)
         own = [(block, columns[0]) for block, columns in zip(self.blocks, self._columns, strict=True) if columns]
         return (
-            at,
-            [column for _, column in own],
+            np.flatnonzero(~known) if known.any() else slice(None),
+            np.flatnonzero(known),
+            np.array([column for _, column in own], dtype=int),
             np.array([block.size for block, _ in own]),
             np.array([block.weight for block, _ in own]),
             np.array([0.0 if block.kind == CORRELATED else block.measured for block, _ in own]),
@@ -272,7 +275,7 @@ class Likelihood:
         For errors whose spectrum is flat.
         """
         by_value = self._log_prior(values)[1]
-        at, columns, sizes, weights, measured = self._levels
+        at, _, columns, sizes, weights, measured = self._levels
         v = self.model.level(values[columns], measured)
         by_square = np.full(len(self.blocks), -0.5)
         by_square[at] = -0.5 * weights / v
