@@ -23,7 +23,7 @@ def solved():
     priors = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}
     problem = bp.Problem(LINEAR, [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)], priors=priors)
     fit = bp.map_estimate(problem)
-    return problem, fit, bp.sample(problem, fit, seed=1, progress=False)
+    return problem, fit, bp.sample(problem, fit, seed=1, ensembles=2, progress=False)
 
 
 @pytest.fixture(scope="session")

@@ -191,7 +191,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)},
     ...                      fixed={"m": 1, "k3": 0.5, "variance[displacement]": 1e-4}, scheme="central4")
     >>> fit = bp.map_estimate(problem, progress=False)
-    >>> posterior = bp.sample(problem, fit, seed=1, progress=False)
+    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, progress=False)
     >>> scorecard = bp.compare(problem, fit, posterior)
     >>> scorecard.table["verdict"].to_dict(), scorecard.joint["verdict"]
     ({'c': 'fine', 'k': 'fine'}, 'fine')

@@ -67,6 +67,7 @@ def test_independent_noise_covers_far_too_little_where_errors_are_correlated(nam
     assert all_fitted(CORRELATION, 20)[0][name, False] < 0.6 * RECORDINGS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(TRUTH))
 def test_robust_intervals_cover_where_errors_are_correlated(name):
     assert BAND[0] <= all_fitted(CORRELATION, 20)[0][name, True] <= BAND[1]
@@ -113,6 +114,7 @@ def stationary_on_the_circle(lengthscale: float, seed: int) -> bp.Experiment:
     )
 
 
+@pytest.mark.slow
 def test_residuals_in_units_of_the_right_noise_are_white():
     """Uniform p from 500 runs with known noise parameters (KS at 0.1 %); before whitening hardly any passes 1 %."""
     known = {"variance[force]": SD**2, "lengthscale[force]": 0.08}
@@ -123,6 +125,7 @@ def test_residuals_in_units_of_the_right_noise_are_white():
     assert np.mean(np.array(raw) < 0.01) > 0.5
 
 
+@pytest.mark.slow
 def test_residuals_of_white_noise_are_white():
     """Uniform p from 300 folded recordings, KS at 0.1 %."""
     assert stats.kstest(all_fitted(0.0, 6)[1], "uniform").pvalue > 1e-3

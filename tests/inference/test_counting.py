@@ -44,9 +44,8 @@ def covered(experiments: list[bp.Experiment]) -> int:
     return count
 
 
-@pytest.mark.parametrize(
-    "harmonics", [pytest.param(5, marks=pytest.mark.slow), 20, pytest.param(40, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("harmonics", [5, 20, 40])
 def test_the_interval_of_a_friction_like_regressor_covers_its_truth(harmonics):
     assert BAND[0] <= covered(folded(harmonics)) <= BAND[1]
 

@@ -18,6 +18,7 @@ TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
 FLAT = bp.Normal(0.0, 1e6)
 QUIET = {"progress": False}
+PAIR = QUIET | {"ensembles": 2}
 REGRESSORS = linear_regressors(0.05, 2.0, grid(40))
 
 # Two channels, of which an experiment may lack one.
@@ -55,7 +56,7 @@ def local():
     """Return a problem with a parameter of each experiment's own and known variances, its estimate and posterior."""
     problem = bp.Problem(LINEAR, runs(), priors=PRIORS, local=["coulomb"], fixed={"variance[force]": 9.0})
     fit = bp.map_estimate(problem, **QUIET)
-    return problem, fit, bp.sample(problem, fit, seed=1, **QUIET)
+    return problem, fit, bp.sample(problem, fit, seed=1, **PAIR)
 
 
 def closed_form(experiments):
@@ -97,7 +98,7 @@ def test_variances_of_each_experiment_follow_their_closed_form(prior, spent):
         noise=bp.noise.Independent(per="experiment", prior=prior),
     )
     assert problem.free_noise == (f"variance[force, {FIRST}]", f"variance[force, {SECOND}]")
-    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), seed=2, max_steps=750, **QUIET)
+    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), seed=2, max_steps=750, **PAIR)
     degrees, error = 40 - spent, 4 / np.sqrt(min(posterior.ess.values()))
     scores = []
     for e, name in zip(problem.experiments, problem.free_noise, strict=True):
@@ -113,7 +114,7 @@ def test_the_scale_of_a_covariance_follows_its_closed_form():
     covariance = 4.0 * 0.5 ** np.abs(np.subtract.outer(np.arange(20), np.arange(20)))
     experiment = replace(first, mask=at, covariance=covariance, independent={})
     problem = bp.Problem(LINEAR, [experiment], priors={"coulomb": FLAT}, fixed={"k": 900.0, "c": 40.0})
-    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), seed=5, max_steps=250, **QUIET)
+    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), seed=5, max_steps=250, **PAIR)
     data = (first.outputs["force"] - REGRESSORS[:, :2] @ TRUTH[:2])[at]
     moment, error = profiled(data, REGRESSORS[at, 2:], covariance)[1], 4 / np.sqrt(posterior.ess["scale"])
     scores = (moment / posterior.draws("scale") - 19) / np.sqrt(2 * 19)
@@ -151,7 +152,7 @@ def test_correlated_errors_have_the_posterior_of_a_quadrature_over_the_correlati
         noise=bp.noise.Circulant(kernel="exponential"),
     )
     fit = bp.map_estimate(problem, **QUIET)
-    posterior = bp.sample(problem, fit, seed=3, max_steps=1500, **QUIET)
+    posterior = bp.sample(problem, fit, seed=3, max_steps=1500, **PAIR)
     assert posterior.names == ("k", "variance[force]", "lengthscale[force]")
 
     data = experiment.outputs["force"] - REGRESSORS[:, 1:] @ TRUTH[1:]
@@ -184,7 +185,7 @@ def test_model_error_above_measured_noise_follows_its_closed_form():
         fixed={"k": 900.0, "c": 40.0},
         noise="measured",
     )
-    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), seed=4, max_steps=1500, **QUIET)
+    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), seed=4, max_steps=1500, **PAIR)
     moment = profiled(first.outputs["force"] - REGRESSORS[:, :2] @ TRUTH[:2], REGRESSORS[:, 2:], np.eye(40))[1]
     chi = stats.chi2(39)
     mass = chi.cdf(moment / 4.0)
@@ -394,7 +395,7 @@ def test_failed_solves_are_told_by_cause():
         "run", 1.0, {"x": 0.3 + 0.2 * np.random.default_rng(1).standard_normal(12)}, {"u": np.zeros(12)}, samples=12
     )
     problem = bp.Problem(SADDLE_NODE, [run], priors={"a": bp.Normal(0.1, 0.3)}, fixed={"variance[x]": 0.2})
-    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=250, **QUIET)
+    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=250, **PAIR)
     assert posterior.draws("a").min() > 0.0
     assert sum(posterior.failures.values()) > 0.05
     assert posterior.summary().attrs["failures"] == posterior.failures

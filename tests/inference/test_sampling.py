@@ -11,6 +11,7 @@ from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
 QUIET = {"progress": False}
+PAIR = QUIET | {"ensembles": 2}
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,7 @@ def test_unknown_variance_follows_its_closed_form(variances, prior, lost):
     noise = bp.noise.Independent(prior=prior)
     problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=2)], priors=flat, fixed={"c": 40.0}, noise=noise)
     fit = bp.map_estimate(problem)
-    posterior = bp.sample(problem, fit, seed=2, variances=variances, **QUIET)
+    posterior = bp.sample(problem, fit, seed=2, variances=variances, **PAIR)
     moment, degrees = fit.rms["force"] ** 2 * 40, 38 - lost
     assert list(posterior.ess) == ["k", "coulomb", "variance[force]"]
     error = 4 / np.sqrt(min(posterior.ess.values()))
@@ -92,7 +93,7 @@ def test_variances_of_a_spectrum_of_unknown_shape_cannot_be_collapsed():
     noise = bp.noise.Circulant()
     problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=2)], priors=PRIORS, noise=noise)
     with pytest.raises(ValueError, match="or of circulant ones with a fixed shape"):
-        bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, variances="collapsed", **QUIET)
+        bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, variances="collapsed", **PAIR)
 
 
 def regressors() -> np.ndarray:
@@ -106,7 +107,7 @@ def posterior_point(posterior: bp.Posterior, problem: bp.Problem, index: int) ->
 @pytest.mark.parametrize("start", ["prior", "overdispersed"])
 def test_other_starts_lead_to_the_same_posterior(known_variance, posterior, start):
     """Means within 4 Monte Carlo errors of both runs."""
-    other = bp.sample(*known_variance, seed=3, start=start, **QUIET)
+    other = bp.sample(*known_variance, seed=3, start=start, **PAIR)
     assert other.converged
     for name in ("k", "c", "coulomb"):
         error = 4 * np.sqrt(1 / posterior.ess[name] + 1 / other.ess[name])
@@ -118,7 +119,7 @@ def test_positive_parameter_sampled_in_its_logarithm_keeps_its_natural_density()
     priors = PRIORS | {"c": bp.LogNormal(30.0, 0.5)}
     experiment = linear_experiment(TRUTH, 3.0, seed=3)
     problem = bp.Problem(LINEAR, [experiment], priors=priors, fixed={"variance[force]": 1e12})
-    posterior = bp.sample(problem, bp.map_estimate(problem), seed=3, **QUIET)
+    posterior = bp.sample(problem, bp.map_estimate(problem), seed=3, **PAIR)
     logarithm = np.log(posterior.draws("c") / 30.0) / 0.5
     error = 4 / np.sqrt(posterior.ess["c"])
     assert logarithm.mean() == pytest.approx(0.0, abs=error)
@@ -126,28 +127,28 @@ def test_positive_parameter_sampled_in_its_logarithm_keeps_its_natural_density()
 
 
 def test_same_seed_same_bits_and_another_seed_other_draws(known_variance):
-    first, again, other = (bp.sample(*known_variance, seed=s, max_steps=250, **QUIET) for s in (5, 5, 6))
+    first, again, other = (bp.sample(*known_variance, seed=s, max_steps=250, **PAIR) for s in (5, 5, 6))
     assert np.array_equal(first.draws("k"), again.draws("k"))
     assert not np.array_equal(first.draws("k"), other.draws("k"))
 
 
 def test_bits_do_not_depend_on_the_number_of_cores(known_variance, monkeypatch):
-    two = bp.sample(*known_variance, seed=5, max_steps=250, **QUIET)
+    two = bp.sample(*known_variance, seed=5, max_steps=250, **PAIR)
     monkeypatch.setattr(sampling, "available_cores", lambda: 1)
-    assert np.array_equal(two.draws("k"), bp.sample(*known_variance, seed=5, max_steps=250, **QUIET).draws("k"))
+    assert np.array_equal(two.draws("k"), bp.sample(*known_variance, seed=5, max_steps=250, **PAIR).draws("k"))
 
 
 def test_reaching_max_steps_is_reported(known_variance):
-    posterior = bp.sample(*known_variance, seed=1, max_steps=250, **QUIET)
+    posterior = bp.sample(*known_variance, seed=1, max_steps=250, **PAIR)
     assert not posterior.converged
     assert "max_steps = 250 reached with length only" in posterior.reason
     assert "NOT CONVERGED" in repr(posterior)
 
 
 def test_resumed_run_gives_the_same_chain(known_variance, tmp_path):
-    whole = bp.sample(*known_variance, seed=5, max_steps=500, **QUIET)
-    bp.sample(*known_variance, seed=5, max_steps=250, checkpoint=tmp_path / "run.h5", **QUIET)
-    resumed = bp.sample(*known_variance, seed=5, max_steps=500, checkpoint=tmp_path / "run.h5", **QUIET)
+    whole = bp.sample(*known_variance, seed=5, max_steps=500, **PAIR)
+    bp.sample(*known_variance, seed=5, max_steps=250, checkpoint=tmp_path / "run.h5", **PAIR)
+    resumed = bp.sample(*known_variance, seed=5, max_steps=500, checkpoint=tmp_path / "run.h5", **PAIR)
     assert np.array_equal(whole.draws("k"), resumed.draws("k"))
 
 
@@ -155,19 +156,19 @@ def test_finished_run_comes_back_from_its_checkpoint(known_variance, tmp_path, m
     monkeypatch.setattr(stopping, "LENGTHS", 5.0)
     monkeypatch.setattr(stopping, "TAU_CHANGE", 1.0)
     monkeypatch.setattr(stopping, "RHAT", 1.1)
-    first = bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **QUIET)
-    again = bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **QUIET)
+    first = bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **PAIR)
+    again = bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **PAIR)
     assert first.converged and again.reason == first.reason
     assert np.array_equal(first.draws("k"), again.draws("k"))
 
 
 def test_checkpoint_of_another_run_is_refused(known_variance, tmp_path):
-    bp.sample(*known_variance, seed=5, max_steps=250, checkpoint=tmp_path / "run.h5", **QUIET)
+    bp.sample(*known_variance, seed=5, max_steps=250, checkpoint=tmp_path / "run.h5", **PAIR)
     with pytest.raises(ValueError, match="belongs to another run"):
-        bp.sample(*known_variance, seed=6, max_steps=250, checkpoint=tmp_path / "run.h5", **QUIET)
+        bp.sample(*known_variance, seed=6, max_steps=250, checkpoint=tmp_path / "run.h5", **PAIR)
     (tmp_path / "text.h5").write_text("no HDF5")
     with pytest.raises(ValueError, match="checkpoint: .* cannot be used"):
-        bp.sample(*known_variance, seed=6, max_steps=250, checkpoint=tmp_path / "text.h5", **QUIET)
+        bp.sample(*known_variance, seed=6, max_steps=250, checkpoint=tmp_path / "text.h5", **PAIR)
 
 
 def test_draws_pass_into_arviz_and_carry_units(posterior):
@@ -219,4 +220,4 @@ def test_start_where_nothing_is_finite_fails_loudly(known_variance):
         LINEAR, problem.experiments, priors=PRIORS | {"k": bp.Uniform(0.0, 1.0)}, fixed={"variance[force]": 9.0}
     )
     with pytest.raises(ValueError, match=r"100\.0% have no finite log-posterior"):
-        bp.sample(other, fit, seed=1, **QUIET)
+        bp.sample(other, fit, seed=1, **PAIR)

@@ -13,7 +13,7 @@ import bayesperiodic as bp
 from tests.known import grid
 
 QUIET = {"progress": False}
-TWO = {"ensembles": 2, "seed": 1, "progress": False}
+PAIR = {"ensembles": 2, "seed": 1, "progress": False}
 ERRORS = 5.0
 
 
@@ -74,7 +74,7 @@ def test_correlated_normal(dimension):
     mean = np.linspace(-1.0, 1.0, dimension)
     prior = bp.MultivariateNormal(mean, correlation * np.outer(scale, scale))
     problem = bp.Problem(quiet, [run(force=1.0)], priors={tuple(names): prior}, fixed=known(force=1e3))
-    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), **TWO)
+    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), **PAIR)
     moments = dict(zip(names, zip(mean, scale, strict=True), strict=True))
     check(posterior, moments, {n: stats.norm(*moments[n]).cdf for n in names})
     draws = np.stack([posterior.draws(n) for n in names[:2]])
@@ -87,7 +87,7 @@ def test_banana():
     banana = model("banana", ["a", "b"], lambda p: {"first": p.a, "second": p.b - p.a**2})
     wide = {"a": bp.Normal(0.0, 1e3), "b": bp.Normal(0.0, 1e4)}
     problem = bp.Problem(banana, [run(first=1.0, second=1e-9)], priors=wide, fixed=known(first=0.5, second=0.1))
-    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), **TWO)
+    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), **PAIR)
     of_b = 1.0 + 0.5**2, np.sqrt(4 * 0.5**2 + 2 * 0.5**4 + 0.1**2)
     check(posterior, {"a": (1.0, 0.5), "b": of_b}, {"a": stats.norm(1.0, 0.5).cdf})
 
@@ -97,7 +97,7 @@ def test_two_modes_of_opposite_sign():
     signed = model("square", ["a"], lambda p: {"force": p.a**2})
     problem = bp.Problem(signed, [run(force=1.0)], priors={"a": bp.Normal(0.0, 2.0)}, fixed=known(force=0.1))
     fit = bp.map_estimate(problem, start={"a": 0.8}, **QUIET)
-    posterior = bp.sample(problem, fit, seed=1, start="prior", max_steps=2000, **QUIET)
+    posterior = bp.sample(problem, fit, start="prior", max_steps=2000, **PAIR)
     negative = float(np.mean(posterior.draws("a") < 0.0))
     assert not posterior.converged or abs(negative - 0.5) < ERRORS * 0.5 / np.sqrt(posterior.ess["a"])
 
@@ -107,7 +107,7 @@ def test_edge_of_a_uniform_prior():
     """The data pull beyond the prior's end: a normal cut off one standard deviation below its mean."""
     edged = model("edged", ["a"], lambda p: {"force": p.a})
     problem = bp.Problem(edged, [run(force=1.0)], priors={"a": bp.Uniform(0.0, 0.9)}, fixed=known(force=0.1))
-    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), seed=1, **QUIET)
+    posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), **PAIR)
     cut = stats.truncnorm(-10.0, -1.0, loc=1.0, scale=0.1)
     check(posterior, {"a": (cut.mean(), cut.std())}, {"a": cut.cdf})
 
@@ -131,10 +131,10 @@ def test_ridge_of_a_product():
     mean = np.trapezoid(a * density, a)
     sd = np.sqrt(np.trapezoid((a - mean) ** 2 * density, a))
     assert sd == pytest.approx(0.595, abs=0.002)
-    posterior = bp.sample(problem, fit, seed=1, **QUIET)
+    posterior = bp.sample(problem, fit, **PAIR)
     assert posterior.converged and max(posterior.tau.values()) <= 40
     assert posterior.draws("a").std() == pytest.approx(sd, rel=0.03)
-    natural = bp.sample(problem, fit, seed=1, coordinates="natural", max_steps=1500, **QUIET)
+    natural = bp.sample(problem, fit, coordinates="natural", max_steps=1500, **PAIR)
     assert not natural.converged and "max_steps = 1500 reached with" in natural.reason
 
 
@@ -143,7 +143,7 @@ def test_ridge_of_a_product():
 def test_ridge_with_a_far_second_branch_is_not_called_converged_without_it():
     """Uncut priors leave 1.2 % of the mass with both signs negative: found, or not converged."""
     problem, fit = ridge({"a": bp.Normal(1.0, 1.0), "b": bp.Normal(1.0, 1.0)})
-    posterior = bp.sample(problem, fit, seed=1, max_steps=3000, **QUIET)
+    posterior = bp.sample(problem, fit, max_steps=3000, **PAIR)
     negative = float(np.mean(posterior.draws("a") < 0.0))
     assert not posterior.converged or abs(negative - 0.012) < 0.006
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from bayesperiodic.models import cache
-from bayesperiodic.models.compile import FUNCTIONS, kernel_source
-from tests.known import LINEAR
+from bayesperiodic.models.compile import FUNCTIONS
 
 PROGRAM = """
 import numba
@@ -18,6 +17,23 @@ from tests.known import LINEAR
 functions = load(kernel_source(LINEAR), FUNCTIONS)
 print(sum(sum(f.stats.cache_hits.values()) for f in functions.values()))
 """
+
+
+# What takes little to compile.
+SMALL, NAMES = (
+    """
+from numba import njit
+
+@njit("float64(float64)", cache=CACHE)
+def twice(x):
+    return 2.0 * x
+
+@njit("float64(float64)", cache=CACHE)
+def four_times(x):
+    return twice(twice(x))
+""",
+    ("twice", "four_times"),
+)
 
 
 @pytest.fixture
@@ -37,8 +53,8 @@ def start() -> subprocess.Popen:
 
 def load_with_warning(match: str) -> None:
     with pytest.warns(RuntimeWarning, match=match):
-        functions = cache.load(kernel_source(LINEAR), FUNCTIONS)
-    assert set(functions) == set(FUNCTIONS)
+        functions = cache.load(SMALL, NAMES)
+    assert functions["four_times"](1.5) == 6.0
 
 
 def entry(folder: Path) -> Path:
@@ -55,9 +71,9 @@ def test_second_start_loads_all_functions_from_the_cache(folder):
 
 def test_numba_settings_of_the_user_do_not_move_the_files(folder, tmp_path, monkeypatch):
     monkeypatch.setattr(cache.numba.config, "CACHE_DIR", str(tmp_path / "elsewhere"))
-    cache.load(kernel_source(LINEAR), FUNCTIONS)
+    cache.load(SMALL, NAMES)
     names = {path.name.split("-")[0].split(".")[1] for path in (entry(folder) / "__pycache__").glob("*.nbi")}
-    assert names >= set(FUNCTIONS)
+    assert names >= set(NAMES)
     assert cache.numba.config.CACHE_DIR == str(tmp_path / "elsewhere")
 
 
@@ -71,13 +87,13 @@ def test_two_processes_may_fill_the_cache_at_once(folder):
 
 
 def test_folder_is_private_to_the_user(folder):
-    cache.load(kernel_source(LINEAR), FUNCTIONS)
+    cache.load(SMALL, NAMES)
     assert folder.stat().st_mode & 0o077 == 0
 
 
 @pytest.mark.parametrize("damage", ["truncate", "alter", "remove", "source", "manifest"])
 def test_damaged_entry_is_never_executed(folder, damage):
-    cache.load(kernel_source(LINEAR), FUNCTIONS)
+    cache.load(SMALL, NAMES)
     compiled = sorted((entry(folder) / "__pycache__").glob("*.nbc"))[0]
     if damage == "truncate":
         compiled.write_bytes(compiled.read_bytes()[:100])
@@ -120,8 +136,8 @@ def test_failed_build_leaves_nothing_behind(folder, monkeypatch):
 def test_other_versions_get_an_entry_of_their_own(folder, monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        cache.load(kernel_source(LINEAR), FUNCTIONS)
+        cache.load(SMALL, NAMES)
         monkeypatch.setattr(cache.numba, "__version__", "0.0")
-        cache.load(kernel_source(LINEAR), FUNCTIONS)
+        cache.load(SMALL, NAMES)
     assert len(list(folder.iterdir())) == 2
     assert os.environ["BAYESPERIODIC_CACHE"]

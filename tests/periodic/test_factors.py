@@ -87,7 +87,9 @@ def test_segments_agree_with_the_folded_band_and_are_used(scheme, states, expone
     assert np.max(np.abs(solved - expected) / np.abs(expected).max(axis=0)) < 1e-8  # some 10 roundings of 1/h²
 
 
-@pytest.mark.parametrize("scheme", [*SCHEMES, GAPS, FORWARD], ids=lambda s: getattr(s, "name", s))
+@pytest.mark.parametrize(
+    "scheme", [*SCHEMES, GAPS, pytest.param(FORWARD, marks=pytest.mark.slow)], ids=lambda s: getattr(s, "name", s)
+)
 @pytest.mark.parametrize("states", [1, 4])
 def test_derivatives_are_weighted_sums_of_neighbours(scheme, states):
     equations = equations_of(growing(states), scheme, 40)

@@ -67,7 +67,7 @@ def solve_manufactured(scheme, samples: int) -> tuple[bp.PeriodicSolution, float
         ("central2", 2.0, 0.05, (800, 1600, 3200)),
         ("backward2", 2.0, 0.05, (800, 1600, 3200)),
         ("central4", 4.0, 0.1, (100, 200, 400)),
-        (FORWARD3, 3.0, 0.1, (400, 800, 1600)),
+        pytest.param(FORWARD3, 3.0, 0.1, (400, 800, 1600), marks=pytest.mark.slow),
     ],
 )
 def test_schemes_have_their_order_on_a_manufactured_solution(scheme, order, tolerance, sizes):

@@ -170,7 +170,7 @@ class Likelihood:
 
     @cached_property
     def _levels(self) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return the blocks with a variance, the others, and of the first the column, size, weight and measured value."""
+        """Return blocks with a variance, the others, and of the first the column, size, weight and measured value."""
         known = np.array([block.kind == KNOWN for block in self.blocks], dtype=bool)
         own = [(block, columns[0]) for block, columns in zip(self.blocks, self._columns, strict=True) if columns]
         return (
