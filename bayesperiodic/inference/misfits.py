@@ -114,14 +114,13 @@ class Misfits:
         for c, column in enumerate(self._columns):
             own, kept = outputs[..., column], self._kept[c]
             own -= self._data[..., c]
-            own[...] = self._within(own, kept)
+            if self._weights[c] is not None:
+                own[...] = self._within(own, kept)
             own *= (factors[:, c] * kept / self._points)[:, None]
         return outputs
 
     def _within(self, signals: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Return signals (experiments, points) within as many real components."""
-        if (kept == self._points).all():
-            return signals
         amplitudes = np.fft.rfft(signals, axis=-1)
         for own, size in zip(amplitudes, kept, strict=True):
             own[size // 2 + 1 :] = 0.0

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sympy as sp
 from numba import types
-from numba.core import sigutils
+from numba.core import cgutils, sigutils
+from numba.extending import intrinsic
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympy.printing.pycode import PythonCodePrinter
 
@@ -40,6 +41,11 @@ class GridFunction(types.WrapperAddressProtocol):
 
     Handing over the compiled function itself would look its address up at every call, for longer than a solve takes.
     Without `_numba_type_` Numba would make its type anew at every call.
+
+    Attributes
+    ----------
+    address : int
+        For calls that are too short even for Numba's conversion of this argument, see `grid_function_at`.
     """
 
     def __init__(self, compiled: Any):
@@ -48,10 +54,10 @@ class GridFunction(types.WrapperAddressProtocol):
         self._numba_type_ = types.FunctionType(self._signature)
         self._compiled = compiled
         code = compiled.get_compile_result(self._signature)
-        self._address = code.library.get_pointer_to_function(code.fndesc.llvm_cfunc_wrapper_name)
+        self.address = code.library.get_pointer_to_function(code.fndesc.llvm_cfunc_wrapper_name)
 
     def __wrapper_address__(self) -> int:
-        return self._address
+        return self.address
 
     def signature(self) -> Any:
         """Return the signature, as the protocol asks."""
@@ -60,6 +66,20 @@ class GridFunction(types.WrapperAddressProtocol):
     def __call__(self, *arguments: Any) -> None:
         """Run the compiled function."""
         self._compiled(*arguments)
+
+
+@intrinsic
+def grid_function_at(typing_context: Any, address: Any) -> Any:
+    """Return, within compiled code, the grid function at an address."""
+    arguments, result = sigutils.normalize_signature(GRID_SIGNATURE)
+    kind = types.FunctionType(result(*arguments))
+
+    def structure(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        function = cgutils.create_struct_proxy(kind)(context, builder)
+        function.c_addr = builder.inttoptr(values[0], context.get_value_type(types.voidptr))
+        return function._getvalue()
+
+    return kind(types.int64), structure
 
 
 @dataclass(frozen=True)

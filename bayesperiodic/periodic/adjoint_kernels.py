@@ -9,6 +9,7 @@ the implicit function theorem (de Kraker et al. 1997, eq. 4) read backwards.
 import numpy as np
 from numba import njit
 
+from bayesperiodic.models.compile import grid_function_at
 from bayesperiodic.periodic.kernels import (
     CUBE,
     FACTORS,
@@ -16,6 +17,7 @@ from bayesperiodic.periodic.kernels import (
     GRID,
     MATRIX,
     OPTIONS,
+    PLACES,
     REACH,
     STATES,
     VECTOR,
@@ -84,6 +86,18 @@ def back_substitute_transposed(grid, factors, right):
             right[k, s] = value
 
 
+@njit(f"void({MATRIX}, {MATRIX}, {MATRIX})", **OPTIONS)
+def beside(states, others, both):
+    """Fill `both` with the columns q, q̇, q̈ of `states`, then those of `others`."""
+    first, second = 3 * STATES if STATES > 0 else states.shape[1], others.shape[1]
+    one, other, out = states.reshape(states.size), others.reshape(others.size), both.reshape(both.size)
+    for i in range(states.shape[0]):
+        for s in range(first):
+            out[np.uint64((first + second) * i + s)] = one[np.uint64(first * i + s)]
+        for s in range(second):
+            out[np.uint64((first + second) * i + first + s)] = other[np.uint64(second * i + s)]
+
+
 @njit(
     f"boolean({FUNCTION}, {FUNCTION}, {FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {MATRIX}, "
     f"{MATRIX}, Tuple(({MATRIX}, {MATRIX}, {MATRIX}, {VECTOR}, {MATRIX}, {MATRIX})), {FACTORS}, {VECTOR})",
@@ -95,8 +109,8 @@ def pull(
 ):  # fmt: skip
     """Fill Σ weights · ∂ŷ/∂θ (moving,) at a solution z; return False where ∂g/∂z is singular."""
     first, second, neighbours = grid[0], grid[1], grid[2]
-    states, columns, weighed, slopes, adjoint, beside = work
-    points, count, channels = z.shape[0], STATES if STATES > 0 else z.shape[1], weights.shape[1]
+    states, columns, weighed, slopes, adjoint, extended = work
+    points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
     squared = frequency**2
     differentiate(z, drift, grid, tau, frequency, states)
     residual_jacobian(states, inputs, parameters, tau, frequency, columns)
@@ -106,11 +120,7 @@ def pull(
         amplitude[s] = amplitude[s] if amplitude[s] > 0.0 else 1.0
     if not factorise(columns, grid, frequency, amplitude, factors):
         return False
-    for i in range(points):
-        for s in range(3 * count):
-            weighed[i, s] = states[i, s]
-        for c in range(channels):
-            weighed[i, 3 * count + c] = weights[i, c]
+    beside(states, weights, weighed)
     pulled_outputs(weighed, inputs, parameters, tau, frequency, slopes.reshape((1, slopes.size)))
     for i in range(points):
         for s in range(count):
@@ -123,30 +133,27 @@ def pull(
                 for o in range(first.size):
                     adjoint[neighbours[i, o], s] += first[o] * rate + second[o] * acceleration
     back_substitute_transposed(grid, factors, adjoint)
-    for i in range(points):
-        for s in range(3 * count):
-            beside[i, s] = states[i, s]
-        for s in range(count):
-            beside[i, 3 * count + s] = adjoint[i, s]
-    pulled_equations(beside, inputs, parameters, tau, frequency, gradient.reshape((1, gradient.size)))
+    beside(states, adjoint, extended)
+    pulled_equations(extended, inputs, parameters, tau, frequency, gradient.reshape((1, gradient.size)))
     for p in range(gradient.size):
         gradient[p] += slopes[3 * count * points + p]
     return True
 
 
 @njit(
-    f"void({FUNCTION}, {FUNCTION}, {FUNCTION}, {GRID}, {CUBE}, {MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {CUBE}, {CUBE}, "
+    f"void({PLACES}, {GRID}, {CUBE}, {MATRIX}, {VECTOR}, {VECTOR}, {MATRIX}, {CUBE}, {CUBE}, "
     f"{FACTORS}, int64, int64, {MATRIX})",
     **OPTIONS,
 )
 def pull_many(
-    residual_jacobian, pulled_outputs, pulled_equations, grid, inputs, parameters, tau, frequency, drift, z, weights,
-    factors, start, stop, gradients,
+    functions, grid, inputs, parameters, tau, frequency, drift, z, weights, factors, start, stop, gradients
 ):  # fmt: skip
     """Fill the gradients (sets, moving) of the input sets start … stop at one solution each; NaN where singular.
 
     Parameters
     ----------
+    functions : int array (3,)
+        Addresses of the model's `residual_jacobian`, `pulled_outputs` and `pulled_equations`.
     inputs : array (sets, points, 3·inputs)
     parameters : array (sets, parameters)
     frequency : array (sets,)
@@ -155,6 +162,8 @@ def pull_many(
     weights : array (sets, points, channels)
     factors : work arrays, see `equations.empty_factors`
     """
+    residual_jacobian, pulled_outputs = grid_function_at(functions[0]), grid_function_at(functions[1])
+    pulled_equations = grid_function_at(functions[2])
     points, count, channels = z.shape[1], z.shape[2], weights.shape[2]
     work = (
         np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count))),

@@ -140,6 +140,11 @@ class Batch:
     def _kernels(self) -> SimpleNamespace:
         return batch_kernels(self._first.count, self._first.grid.stencil)
 
+    @cached_property
+    def _functions(self) -> np.ndarray:
+        kernels = self._first.model.kernels
+        return np.array([kernels.residual.address, kernels.residual_jacobian.address, kernels.outputs.address])
+
     def solve(self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False) -> BatchSolution:
         """Solve every input set for every parameter vector; the result does not depend on the number of threads.
 
@@ -212,7 +217,7 @@ class Batch:
         polish: bool = False,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Fill z and y where they have entries; return sums of squares, status and iterations."""
-        model, grid, solves = self._first.model, self._first.grid, z.shape[1]
+        grid, rates, solves = self._first.grid, self._first.model.kernels.output_rates, z.shape[1]
         every = np.empty((self._size, solves, parameters.shape[-1]))
         every[:] = parameters
         squares = np.empty((self._size, solves, measured.size))
@@ -221,9 +226,7 @@ class Batch:
 
         def part(block: tuple[int, int]) -> None:
             solve_many(
-                model.kernels.residual,
-                model.kernels.residual_jacobian,
-                model.kernels.outputs,
+                self._functions,
                 grid.packed,
                 grid.periods,
                 self._inputs,
@@ -233,7 +236,7 @@ class Batch:
                 measured,
                 *block,
                 polish,
-                model.kernels.output_rates,
+                rates,
                 z,
                 y,
                 squares,
@@ -268,14 +271,14 @@ class Batch:
         """
         model, grid = self._first.model, self._first.grid
         pulling, (frequency, drift) = model.pulling_kernels(moving), self._shared[1:3]
+        jacobian, outputs, equations = model.kernels.residual_jacobian, pulling.pulled_outputs, pulling.pulled_equations
+        functions = np.array([jacobian.address, outputs.address, equations.address])
         gradients = np.empty((self._size, len(moving)))
         compiled = adjoint_kernels(self._first.count, grid.stencil)
 
         def part(block: tuple[int, int]) -> None:
             compiled.pull_many(
-                model.kernels.residual_jacobian,
-                pulling.pulled_outputs,
-                pulling.pulled_equations,
+                functions,
                 grid.packed,
                 self._inputs,
                 np.ascontiguousarray(parameters),

@@ -6,6 +6,7 @@ Loaded through the kernel cache, with the functions of `kernels` that it imports
 import numpy as np
 from numba import njit
 
+from bayesperiodic.models.compile import grid_function_at
 from bayesperiodic.periodic.kernels import (
     CHORD_RATE,
     CONVERGED,
@@ -174,7 +175,7 @@ def creep(
 
 
 @njit(
-    f"void({FUNCTION}, {FUNCTION}, {FUNCTION}, {GRID}, int64, {CUBE}, {CUBE}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, "
+    f"void({PLACES}, {GRID}, int64, {CUBE}, {CUBE}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, "
     f"{CUBE}, {GAINS}, {MATRIX}, {MATRIX}, {VECTOR}, "
     f"Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
     f"{CUBE}, {CUBE}, {CUBE}, {PLACES}, int64, int64, boolean, boolean, {GAINS}, {GAINS}, {CUBE}, {INDICES}, "
@@ -182,9 +183,7 @@ def creep(
     **OPTIONS,
 )
 def solve_many(
-    residual,
-    residual_jacobian,
-    outputs,
+    functions,
     grid,
     periods,
     inputs,
@@ -223,6 +222,8 @@ def solve_many(
 
     Parameters
     ----------
+    functions : int array (3,)
+        Addresses of the model's `residual`, `residual_jacobian` and `outputs`.
     inputs : array (sets, points, 3·inputs)
     parameters : array (sets, solves, parameters)
     frequency : array (sets,)
@@ -247,6 +248,8 @@ def solve_many(
         Filled with the sums of squares of data minus outputs.
     status, iterations : int arrays (sets, solves)
     """
+    residual, residual_jacobian = grid_function_at(functions[0]), grid_function_at(functions[1])
+    outputs = grid_function_at(functions[2])
     bands, pivots, inverses, gains, transfers, ends, reduced, reduced_pivots = anchor_factors
     points, count = anchor_z.shape[1], STATES if STATES > 0 else anchor_z.shape[2]
     solves = parameters.shape[1]

@@ -276,22 +276,22 @@ def assemble(columns, grid, states, frequency, band):
     """Fill the folded band of ∂g/∂z from the columns g, ∂g/∂(q, q̇, q̈) of the model's grid function."""
     first, second, _, shift, place, half_width, _ = grid
     points, count = columns.shape[0], STATES if STATES > 0 else states
-    lower = half_width * count + count - 1
+    lower, width = half_width * count + count - 1, WIDTH if WIDTH > 0 else first.size
     one, two = first * frequency, second * frequency**2
+    flat, source = band.reshape(band.size), columns.reshape(columns.size)
+    for k in range(flat.size):
+        flat[k] = 0.0
     for i in range(points):
         for e in range(count):
-            row = band[place[i] * count + e]
-            row[:] = 0.0
-            for s in range(count):
-                column = count + e * 3 * count + s
-                stiffness = columns[i, column]
-                damping = columns[i, column + count]
-                inertia = columns[i, column + 2 * count]
-                for o in range(first.size):
-                    value = damping * one[o] + inertia * two[o]
-                    if shift[i, o] == 0:
-                        value += stiffness
-                    row[shift[i, o] * count + lower + s - e] += value
+            diagonal = (place[i] * count + e) * band.shape[1] + lower - e
+            column = np.uint64(i * columns.shape[1] + count + e * 3 * count)
+            for j in range(count):
+                s, all_states = np.uint64(j), np.uint64(count)
+                damping, inertia = source[column + all_states + s], source[column + all_states + all_states + s]
+                for o in range(width):
+                    entry = np.uint64(diagonal + j + shift[i, o] * count)
+                    flat[entry] += damping * one[o] + inertia * two[o]
+                flat[np.uint64(diagonal + j)] += source[column + s]
 
 
 @njit(f"boolean({MATRIX}, {MATRIX}, int64)", **OPTIONS)

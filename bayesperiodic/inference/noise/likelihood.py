@@ -128,7 +128,7 @@ class Likelihood:
 
     @cached_property
     def _kinds(self) -> list[tuple[str, list[int], np.ndarray]]:
-        """The kinds of free noise parameters, the columns of each and the measured variances that belong to them."""
+        """The kinds of free noise parameters whose prior matters, their columns and the measured variances of these."""
         kinds: dict[str, list[int]] = {}
         for i in self._free:
             name = self.names[i]
@@ -136,6 +136,7 @@ class Likelihood:
         return [
             (kind, columns, np.array([self.measured.get(self.names[i], np.nan) for i in columns]))
             for kind, columns in kinds.items()
+            if not self.model.has_constant_prior(kind)
         ]
 
     def __call__(self, residuals: Sequence[np.ndarray] | Squares, values: np.ndarray, share: float = 1.0) -> np.ndarray:

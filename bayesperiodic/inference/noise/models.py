@@ -202,6 +202,10 @@ class Noise(ABC):
         variances, slopes = self.spectrum(block, values)
         return np.diag(variances), np.stack([np.diag(variances * slope) for slope in slopes.T])
 
+    def has_constant_prior(self, kind: str) -> bool:
+        """Return whether `log_prior` of a kind of noise parameters is zero wherever they are."""
+        return kind not in self.shape_priors and self.prior == JEFFREYS
+
     def log_prior(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the log-density of noise parameters over their logarithms, and its derivative.
 
@@ -222,7 +226,7 @@ class Noise(ABC):
         """
         if kind in self.shape_priors:
             return _over_logarithm(self.shape_priors[kind], value)
-        if self.prior == JEFFREYS:
+        if self.has_constant_prior(kind):
             return np.zeros_like(value), np.zeros_like(value)
         if self.prior == FLAT:
             return np.log(value), np.ones_like(value)
@@ -309,6 +313,10 @@ class Measured(Noise):
     def level(self, value: np.ndarray, measured: Any) -> np.ndarray:
         """Return V = scatter²/cycles + v."""
         return value + measured
+
+    def has_constant_prior(self, kind: str) -> bool:
+        """Return False: Jeffreys' prior is not constant over ln v here."""
+        return False
 
     def log_prior(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the log-density over ln v; Jeffreys' is that of 1/(measured + v)."""

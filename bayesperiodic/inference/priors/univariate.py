@@ -133,10 +133,13 @@ class Univariate(ABC):
         return self.quantile(generator.uniform(size=size))
 
     def _where_inside(self, function: Callable[[np.ndarray], Any], x: np.ndarray, outside: float) -> np.ndarray:
-        x = np.asarray(x, dtype=float)
         low, high = self.support
-        if x.ndim == 0:
-            return np.asarray(function(x) if low < x < high else outside, dtype=float)[()]
+        if np.ndim(x) == 0:
+            # Not as an array without axes, with which everything takes several times as long.
+            number: Any = np.float64(x)
+            number = np.float64(function(number) if low < number < high else outside)
+            return number
+        x = np.asarray(x, dtype=float)
         inside = (x > low) & (x < high)
         result = np.full(x.shape, outside)
         result[inside] = function(x[inside])
