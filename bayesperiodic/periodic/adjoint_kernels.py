@@ -21,6 +21,7 @@ from bayesperiodic.periodic.kernels import (
     REACH,
     STATES,
     VECTOR,
+    WIDTH,
     differentiate,
     factorise,
     largest,
@@ -111,7 +112,7 @@ def pull(
     first, second, neighbours = grid[0], grid[1], grid[2]
     states, columns, weighed, slopes, adjoint, extended = work
     points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
-    squared = frequency**2
+    squared, width = frequency**2, WIDTH if WIDTH > 0 else first.size
     differentiate(z, drift, grid, tau, frequency, states)
     residual_jacobian(states, inputs, parameters, tau, frequency, columns)
     amplitude = np.empty(count)
@@ -124,14 +125,16 @@ def pull(
     pulled_outputs(weighed, inputs, parameters, tau, frequency, slopes.reshape((1, slopes.size)))
     for i in range(points):
         for s in range(count):
-            adjoint[i, s] = slopes[3 * count * i + s]
+            adjoint[i, s] = 0.0
     for i in range(points):
         for s in range(count):
-            rate = slopes[3 * count * i + count + s] * frequency
-            acceleration = slopes[3 * count * i + 2 * count + s] * squared
+            row = np.uint64(3 * count * i + s)
+            rate = slopes[row + np.uint64(count)] * frequency
+            acceleration = slopes[row + np.uint64(2 * count)] * squared
             if rate != 0.0 or acceleration != 0.0:
-                for o in range(first.size):
-                    adjoint[neighbours[i, o], s] += first[o] * rate + second[o] * acceleration
+                for o in range(width):
+                    adjoint[np.uint64(neighbours[i, o]), s] += first[o] * rate + second[o] * acceleration
+            adjoint[i, s] += slopes[row]
     back_substitute_transposed(grid, factors, adjoint)
     beside(states, adjoint, extended)
     pulled_equations(extended, inputs, parameters, tau, frequency, gradient.reshape((1, gradient.size)))

@@ -242,27 +242,27 @@ def differentiate(z, drift, grid, tau, frequency, states):
     """Fill `states` (points, 3·states) with q = z + drift·tau and its time derivatives by the scheme."""
     first, second, neighbours, _, _, _, _ = grid
     points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
-    width = WIDTH if WIDTH > 0 else first.size
     # Offsets in a row, as they are where their number is known, start with the lowest; in the middle none is cyclic.
     start, inside = ((points - neighbours[0, 0]) % points, points - WIDTH + 1) if WIDTH > 0 else (0, 0)
-    squared = frequency**2
+    squared, all_states = frequency**2, np.uint64(count)
     flat, rest = z.reshape(z.size), tau[start:]
     here, out = flat[start * count :], states.reshape(states.size)[3 * start * count :]
-    for k in range(inside):
-        for s in range(count):
-            rate, acceleration = 0.0, 0.0
-            for o in range(width):
-                value = flat[(k + o) * count + s]
+    for k in range(np.uint64(inside)):
+        for j in range(count):
+            s, rate, acceleration = np.uint64(j), 0.0, 0.0
+            for o in range(WIDTH):
+                value = flat[(k + np.uint64(o)) * all_states + s]
                 rate += first[o] * value
                 acceleration += second[o] * value
-            out[3 * count * k + s] = here[count * k + s] + drift[s] * rest[k]
-            out[3 * count * k + count + s] = (rate + drift[s]) * frequency
-            out[3 * count * k + 2 * count + s] = acceleration * squared
+            row = np.uint64(3) * all_states * k + s
+            out[row] = here[all_states * k + s] + drift[s] * rest[k]
+            out[row + all_states] = (rate + drift[s]) * frequency
+            out[row + all_states + all_states] = acceleration * squared
     for k in range(points - inside):
         i = k if k < start else k + inside
         for s in range(count):
             rate, acceleration = 0.0, 0.0
-            for o in range(width):
+            for o in range(first.size):
                 value = z[neighbours[i, o], s]
                 rate += first[o] * value
                 acceleration += second[o] * value
