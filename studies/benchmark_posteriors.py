@@ -28,7 +28,9 @@ WARMUP, DRAWS = 30, 60
 OWN: dict[str, dict[str, Any]] = {
     "sample, default": {"max_steps": 750},
     "sample, variances integrated out": {"variances": "collapsed", "max_steps": 750},
-    "sample, the same by 2 × 64 walkers": {"variances": "collapsed", "max_steps": 750, "ensembles": 2, "walkers": 64},
+    "sample, variances integrated out, 2 × 64 walkers": {
+        "variances": "collapsed", "max_steps": 750, "ensembles": 2, "walkers": 64
+    },  # fmt: skip
     "sample, NUTS": {"sampler": "nuts", "ensembles": 2, "max_steps": 250},
 }
 EMCEE, NUMPYRO = "emcee", "numpyro NUTS around diffrax"
