@@ -29,7 +29,10 @@ OWN: dict[str, dict[str, Any]] = {
     "sample, default": {"max_steps": 750},
     "sample, variances integrated out": {"variances": "collapsed", "max_steps": 750},
     "sample, variances integrated out, 2 × 64 walkers": {
-        "variances": "collapsed", "max_steps": 750, "ensembles": 2, "walkers": 64
+        "variances": "collapsed",
+        "max_steps": 750,
+        "ensembles": 2,
+        "walkers": 64,
     },  # fmt: skip
     "sample, NUTS": {"sampler": "nuts", "ensembles": 2, "max_steps": 250},
 }
