@@ -115,7 +115,7 @@ def start() -> dict[str, float]:
         found["names_s"] = min(_run(NAMES, environment) for _ in range(3))
         found["empty_cache_s"] = _run(FIRST.replace("POWER", "5"), environment)
         found["first_solve_s"] = _run(FIRST.replace("POWER", "3"), environment)
-        found["from_cache_s"] = _run(FIRST.replace("POWER", "3"), environment)
+        found["from_cache_s"] = min(_run(FIRST.replace("POWER", "3"), environment) for _ in range(3))
     return found | {"peak_mb": _run(MEMORY, dict(os.environ))}
 
 

@@ -72,6 +72,7 @@ def test_exact_posteriors_hold_the_truth_uniformly_and_a_likelihood_that_is_wron
         assert np.ptp(right.positions["laplace"][name]) > 0.9
 
 
+@pytest.mark.slow
 def test_ranks_agree_with_the_exact_posterior():
     """Five replicates: among L independent draws, the rank is binomial about the exact position; 4.5 errors."""
     found = bp.calibrate(linear(), replicates=5, seed=3, **SHORT)
@@ -186,6 +187,7 @@ def serial():
     return bp.calibrate(linear(known=False), replicates=4, seed=4, **SHORTEST)
 
 
+@pytest.mark.slow
 def test_a_dask_worker_killed_in_the_middle_changes_nothing(serial, dask, tmp_path, monkeypatch):
     """SIGKILL after the second replicate: its tasks are done again, none is lost or counted twice."""
 
