@@ -203,7 +203,17 @@ class Noise(ABC):
         return np.diag(variances), np.stack([np.diag(variances * slope) for slope in slopes.T])
 
     def has_constant_prior(self, kind: str) -> bool:
-        """Return whether `log_prior` of a kind of noise parameters is zero wherever they are."""
+        """Return whether `log_prior` of a kind of noise parameters is zero wherever they are.
+
+        Parameters
+        ----------
+        kind : str
+            "variance", "lengthscale" or "floor".
+
+        Returns
+        -------
+        bool
+        """
         return kind not in self.shape_priors and self.prior == JEFFREYS
 
     def log_prior(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
