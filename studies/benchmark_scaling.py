@@ -22,7 +22,7 @@ from studies.solver_cost import GEAR
 SIZES = {"samples": (800, 1600, 3200), "experiments": (2, 4, 7, 14), "walkers": (16, 32, 64, 128)}
 FREE = (1, 3, 7, 15)
 WALKERS = 64
-REPEATS = 5
+REPEATS = 15
 
 IMPORT = "import time; t = time.perf_counter(); import bayesperiodic; print(time.perf_counter() - t)"
 # Names are loaded where they are first used.
@@ -59,11 +59,11 @@ def measure(seed: int) -> dict[str, Any]:
 
 def _fitted(sizes: tuple[int, ...], calls: list[Callable[[], Any]], repeats: int) -> dict[str, Any]:
     times = interleaved({str(size): Action(call) for size, call in zip(sizes, calls, strict=True)}, repeats)
-    seconds = [float(np.median(values)) for values in times.values()]
+    exponents = [slope(sizes, repeat) for repeat in zip(*times.values(), strict=True)]  # as a machine's speed drifts
     peaks = [_peak(call) for call in calls]
     return {
-        "sizes": list(sizes), "seconds": seconds, "bytes": peaks, "time_exponent": slope(sizes, seconds),
-        "memory_exponent": slope(sizes, peaks),
+        "sizes": list(sizes), "seconds": [float(np.median(values)) for values in times.values()], "bytes": peaks,
+        "time_exponent": float(np.median(exponents)), "memory_exponent": slope(sizes, peaks),
     }  # fmt: skip
 
 

@@ -1,5 +1,7 @@
+import argparse
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -298,6 +300,26 @@ def test_the_guard_compares_ratios_only_and_names_those_that_are_worse(tmp_path)
     kept.write_text(json.dumps(results(2.0, 0.5)), encoding="utf-8")
     with pytest.raises(RuntimeError, match="shooting"):
         benchmark.guard(results(1.0, 0.5), benchmark.read_kept(kept))
+
+
+def test_the_guard_times_the_draws_of_the_whole_run():
+    def drawn(**given):
+        options = argparse.Namespace(**{"quick": False, "guard": False, "seed": 3, "data": None} | given)
+        return benchmark.problems(options)[benchmark_problems.DUFFING]().theta
+
+    np.testing.assert_array_equal(drawn(quick=True, guard=True), drawn())
+    assert len(drawn(quick=True)) < len(drawn())
+
+
+def test_exponents_are_those_of_the_power_laws():
+    def seconds(size):
+        return 1e-3 * size**1.5 * float(np.ones(100_000 * size).mean())
+
+    sizes = (2, 4, 7)
+    growth = benchmark_scaling._fitted(sizes, [partial(seconds, size) for size in sizes], 3)
+    assert growth["time_exponent"] == pytest.approx(1.5, abs=1e-12)
+    assert growth["memory_exponent"] == pytest.approx(1.0, abs=1e-3)
+    assert growth["seconds"] == pytest.approx([seconds(size) for size in sizes])
 
 
 def test_memory_of_the_batched_call_grows_no_faster_than_the_walkers():
