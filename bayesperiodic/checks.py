@@ -28,6 +28,21 @@ def same_names(argument: str, given: Mapping[str, Any], wanted: Iterable[str]) -
         raise ValueError(f"{argument}: missing {', '.join(map(repr, missing))}; needed: {', '.join(map(repr, names))}.")
 
 
+def holds(argument: str, given: Iterable[str], wanted: Iterable[str], remedy: str) -> None:
+    """Raise a ValueError with a remedy unless a result has all the names wanted of it."""
+    names = list(given)
+    if missing := [name for name in wanted if name not in names]:
+        has = ", ".join(map(repr, names)) or "nothing"
+        raise ValueError(f"{argument}: it has no {', '.join(map(repr, missing))}, only {has}; {remedy}.")
+
+
+def mapping(argument: str, value: Any, example: str) -> Mapping[str, Any]:
+    """Return `value`; raise a ValueError unless it has names and values, as a dict or a table of pandas does."""
+    if not hasattr(value, "items"):
+        raise ValueError(f"{argument}: {value!r} is not allowed; it must be a mapping, such as {example}.")
+    return value
+
+
 def identifiers(argument: str, names: Iterable[str], reserved: Iterable[str] = ()) -> tuple[str, ...]:
     """Return the names as a tuple; raise a ValueError for one that is no identifier, is reserved or comes twice."""
     result = tuple(names)
@@ -63,10 +78,14 @@ def finite_number(argument: str, value: Any) -> float:
     return number
 
 
-def integer(argument: str, value: Any, minimum: int) -> int:
-    """Return `value` as an int; raise a ValueError unless it is a whole number of at least `minimum`."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
-        raise ValueError(f"{argument}: {value!r} is not allowed; it must be a whole number of at least {minimum}.")
+def integer(argument: str, value: Any, minimum: int | None = None) -> int:
+    """Return `value` as an int; raise a ValueError unless it is a whole number, of at least `minimum`."""
+    no_integer = isinstance(value, bool) or not isinstance(value, int | np.integer)
+    if no_integer or (minimum is not None and value < minimum):
+        least = "" if minimum is None else f" of at least {minimum}"
+        whole = isinstance(value, float | np.floating) and float(value).is_integer()
+        hint = f", such as {int(value)}, without a decimal point" if whole else ""
+        raise ValueError(f"{argument}: {value!r} is not allowed; it must be a whole number{least}{hint}.")
     return int(value)
 
 

@@ -50,10 +50,18 @@ class Result:
                     file.create_dataset(f"{ARRAYS}/{key}", data=values)
 
 
+def in_folder(path: str | Path) -> Path:
+    """Return the path; raise a FileNotFoundError if the folder for it is not there."""
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"path: {str(path)!r} is not allowed; there is no folder {str(target.parent)!r}.")
+    return target
+
+
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[Path]:
     """Give a path to write to, whose file takes the place of `path` only when the block ends without an error."""
-    target = Path(path)
+    target = in_folder(path)
     with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
         draft = Path(folder) / target.name
         yield draft
@@ -97,7 +105,10 @@ def load(path: str | Path) -> Any:
             stored = file.get(ARRAYS, {})
             arrays = {key: stored[key][()] for key in stored}
     except (OSError, KeyError, ValueError) as error:
-        raise ValueError(f"path: {str(path)!r} is not a saved result ({error}).") from None
+        raise ValueError(
+            f"path: {str(path)!r} is not a saved result ({error}). It must come from save(); a checkpoint is read by "
+            "sample(…, checkpoint=path)."
+        ) from None
     return _decode(header, arrays, path)
 
 
@@ -142,9 +153,14 @@ def _decode(value: Any, arrays: dict[str, Any], path: str | Path) -> Any:
         return pd.DataFrame(value["table"], index=value["index"])
     if "tree" in value:
         return _read_tree(path)
-    return _result_class(value["result"])(
-        **{name: _decode(item, arrays, path) for name, item in value["fields"].items()}
-    )
+    content = {name: _decode(item, arrays, path) for name, item in value["fields"].items()}
+    kind = _result_class(value["result"])
+    if content.keys() != {field.name for field in fields(kind)}:
+        raise ValueError(
+            f"path: {str(path)!r} is not allowed; its {kind.__name__} was saved by another version of this package. "
+            "Load it with that one, or make it again."
+        )
+    return kind(**content)
 
 
 def _read_tree(path: str | Path) -> Any:

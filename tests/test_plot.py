@@ -127,7 +127,9 @@ def test_corner_draws_the_names_asked_for_and_no_ellipse_where_there_is_no_appro
     for names in ("k", [], ["k", "k"]):
         with pytest.raises(ValueError, match="names: .* is not allowed"):
             bp.plot.corner(posterior, names=names)
-    with pytest.raises(ValueError, match="laplace: 'k' is not known"):
+    with pytest.raises(
+        ValueError, match="laplace: it has no 'k', 'c'.*, only 'm'.*; give an estimate of the same problem"
+    ):
         bp.plot.corner(posterior, laplace=replace(fit, theta={"m": 1.0}))
 
 

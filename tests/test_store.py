@@ -1,5 +1,6 @@
 import os
 
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
@@ -78,6 +79,23 @@ def test_other_files_are_refused(tmp_path):
         bp.load(tmp_path / "text.h5")
     with pytest.raises(FileNotFoundError, match="there is no such file"):
         bp.load(tmp_path / "nothing.h5")
+
+
+def test_a_result_of_another_version_is_refused(tmp_path):
+    path = tmp_path / "run.h5"
+    experiment = bp.Experiment("run", 2.0, {"x": [0.0, 1.0, 0.0, -1.0]}, samples=4)
+    experiment.save(path)
+    with h5py.File(path, "a") as file:
+        (key,) = [k for k in file.attrs if "frequency_se" in str(file.attrs[k])]
+        file.attrs[key] = str(file.attrs[key]).replace('"frequency_se"', '"of_old"')
+    with pytest.raises(ValueError, match="its Experiment was saved by another version"):
+        bp.load(path)
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    experiment = bp.Experiment("run", 2.0, {"x": [0.0, 1.0, 0.0, -1.0]}, samples=4)
+    with pytest.raises(FileNotFoundError, match="path: '.*run.h5' is not allowed; there is no folder '.*nowhere'"):
+        experiment.save(tmp_path / "nowhere" / "run.h5")
 
 
 def test_a_file_cannot_name_a_class_from_elsewhere(solved, tmp_path):

@@ -117,6 +117,7 @@ class Experiment(Result):
         if self.mask is not None:
             object.__setattr__(self, "mask", _checked_mask(self.mask, points))
         for kind in ("outputs", "inputs"):
+            checks.mapping(kind, getattr(self, kind), "{'force': values}")
             channels = {
                 key: checks.finite_vector(f"{kind}[{key!r}]", self._measured(kind, values), points, MEANING)
                 for key, values in getattr(self, kind).items()
@@ -178,9 +179,14 @@ class Experiment(Result):
                 f"covariance: shape {matrix.shape} is not allowed; it must be {(size, size)}, for {values} "
                 f"measured values{f' and {logarithms} multipliers' if size > values else ''}."
             )
-        if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-8):
-            bad = np.count_nonzero(~np.isfinite(matrix))
+        if bad := np.count_nonzero(~np.isfinite(matrix)):
             raise ValueError(f"covariance: it must be finite and symmetric; {bad} of its entries are not finite.")
+        if not np.allclose(matrix, matrix.T, rtol=1e-8):
+            i, j = np.unravel_index(np.argmax(np.abs(matrix - matrix.T)), matrix.shape)
+            raise ValueError(
+                f"covariance: it must be finite and symmetric; entry [{i}, {j}] is {matrix[i, j]:g}, entry [{j}, {i}] "
+                f"is {matrix[j, i]:g}."
+            )
         scale = np.sqrt(np.abs(np.diag(matrix)))
         try:
             np.linalg.cholesky(matrix / np.outer(scale, scale))

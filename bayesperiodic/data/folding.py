@@ -53,14 +53,16 @@ def fold(
     """Fold the steady part of a recording into its mean period on an equidistant grid; see `Recording.fold`."""
     periods = checks.integer("periods", periods, 1)
     samples = checks.integer("samples", samples, 4)
-    start = 0.0 if origin == CROSSING else checks.finite_number("origin", origin)
+    start = _checked_origin(origin)
     names = [*recording.inputs, *recording.outputs]
     signals = np.stack([*recording.inputs.values(), *recording.outputs.values()])
     for channel, values in zip(names, signals, strict=True):
         if np.ptp(values) == 0.0:
             kind = "inputs" if channel in recording.inputs else "outputs"
+            further = ", and write it in the model as a parameter with its value in `fixed`" if kind == "inputs" else ""
             raise ValueError(
-                f"{kind}[{channel!r}]: the constant {values[0]:g} is not allowed; a channel must vary, so leave it out."
+                f"{kind}[{channel!r}]: the constant {values[0]:g} is not allowed; a channel must vary, so leave it out"
+                f"{further}."
             )
     time = recording.time - start
 
@@ -115,6 +117,15 @@ def fold(
     )
 
 
+def _checked_origin(origin: float | str) -> float:
+    """Return the time of τ = 0 [s], 0 where an event shall tell it."""
+    if origin == CROSSING:
+        return 0.0
+    if isinstance(origin, str):
+        raise ValueError(f"origin: {origin!r} is not allowed; it must be a time [s], or {CROSSING!r}.")
+    return checks.finite_number("origin", origin)
+
+
 def _first_guess(
     recording: Recording, time: np.ndarray, signals: np.ndarray, frequency: float | None, periods: int
 ) -> float:
@@ -129,7 +140,9 @@ def _first_guess(
         found = "no period was found" if fundamental is None else f"it has {_cycles(time, fundamental):.2f} cycles"
         raise ValueError(
             f"recording: {recording.name!r} of {np.ptp(time):g} s is not allowed; {found}, and at least "
-            f"{MINIMUM_CYCLES} cycles are needed. Record longer, or give the forcing frequency."
+            f"{MINIMUM_CYCLES} cycles are needed. Record longer, or "
+            + ("give" if frequency is None else f"check frequency = {frequency!r} Hz and periods = {periods},")
+            + " the forcing frequency."
         )
     return fundamental
 

@@ -19,6 +19,11 @@ def read_csv(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise ValueError(f"path: {str(path)!r} cannot be read as CSV ({error}); it needs a header line.") from None
     table.columns = [str(name).strip() for name in table.columns]
+    if _is_no_header(names := [*table.columns]):
+        raise ValueError(
+            f"path: {str(path)!r} is not allowed; its first line is read as {names}. It must name the columns, "
+            "separated by commas, and numbers must have a decimal point."
+        )
     result = {}
     for column in columns:
         values = _pick(path, table, column)
@@ -26,7 +31,7 @@ def read_csv(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
             row = int(np.flatnonzero(pd.to_numeric(values, errors="coerce").isna() & values.notna())[0])
             raise ValueError(
                 f"column {column!r} of {Path(path).name}: {values.iloc[row]!r} in data row {row + 1} is not allowed; "
-                "every cell must be a number."
+                "every cell must be a number, with a decimal point."
             )
         result[column] = _numbers(path, column, values.to_numpy())
     return result
@@ -37,12 +42,15 @@ def read_npz(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
     try:
         with np.load(existing(path), allow_pickle=False) as archive:
             return {c: _numbers(path, c, _pick(path, archive, c)) for c in columns}
-    except (zipfile.BadZipFile, EOFError, AttributeError) as error:
-        raise ValueError(f"path: {str(path)!r} cannot be read as NPZ ({error}).") from None
+    except (zipfile.BadZipFile, EOFError, AttributeError, TypeError) as error:
+        raise ValueError(
+            f"path: {str(path)!r} cannot be read as NPZ ({error}). Save named arrays by numpy.savez."
+        ) from None
     except ValueError as error:
         if "allow_pickle" in str(error):
             raise ValueError(
-                f"path: {str(path)!r} holds pickled objects; only plain arrays are read, save it with such."
+                f"path: {str(path)!r} is no NPZ file, or holds pickled objects. Save plain arrays by numpy.savez, or "
+                "read a CSV or MAT file by from_csv or from_mat."
             ) from None
         raise
 
@@ -69,6 +77,16 @@ def existing(path: str | Path) -> Path:
     if not file.is_file():
         raise FileNotFoundError(f"path: {str(path)!r} is not allowed; there is no such file.")
     return file
+
+
+def _is_no_header(names: list[str]) -> bool:
+    """Return whether a first line holds numbers, or is not split at its separators."""
+    if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
+        return True
+    try:
+        return bool([float(name) for name in names])
+    except ValueError:
+        return False
 
 
 def _pick(path: str | Path, source: Any, column: str) -> Any:

@@ -110,10 +110,13 @@ class Recording(Result):
         100.0
         """
         time = checks.finite_vector("time", time)
+        inputs = {} if inputs is None else inputs
+        for argument, given in (("outputs", outputs), ("inputs", inputs)):
+            checks.mapping(argument, given, "{'force': values}")
         return cls(
             time,
             {key: checks.finite_vector(f"outputs[{key!r}]", values) for key, values in outputs.items()},
-            {key: checks.finite_vector(f"inputs[{key!r}]", values) for key, values in (inputs or {}).items()},
+            {key: checks.finite_vector(f"inputs[{key!r}]", values) for key, values in inputs.items()},
             name or "recording",
         )
 
@@ -261,7 +264,9 @@ class Recording(Result):
         units: Units | None,
         name: str | None,
     ) -> "Recording":
-        inputs, units = inputs or {}, units or {}
+        inputs, units = {} if inputs is None else inputs, units or {}
+        for argument, given in (("outputs", outputs), ("inputs", inputs)):
+            checks.mapping(argument, given, "{'force': 'the column of the force'}")
         if (time is None) == (sampling_rate is None):
             raise ValueError(f"time: {time!r} with sampling_rate {sampling_rate!r} is not allowed; give exactly one.")
         for key in units:

@@ -197,8 +197,8 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     ({'c': 'fine', 'k': 'fine'}, 'fine')
     """
     checks.one_of("coordinates", coordinates, COORDINATES)
-    for name in (*problem.names, *problem.free_noise):
-        checks.one_of("posterior", name, posterior.names)
+    every = (*problem.names, *problem.free_noise)
+    checks.holds("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
     both = {kind: approximation(problem, fit, kind) for kind in COORDINATES}
     laplace = both[coordinates]
     if laplace is None:

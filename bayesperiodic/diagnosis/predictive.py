@@ -177,8 +177,8 @@ def predict(
     count = checks.integer("draws", draws, 20)
     if experiment is not None and run is None:
         raise ValueError(f"experiment: {experiment!r} is not allowed without run, whose parameters it chooses.")
-    for name in (*problem.names, *problem.free_noise):
-        checks.one_of("posterior", name, posterior.names)
+    every = (*problem.names, *problem.free_noise)
+    checks.holds("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
     columns = {name: posterior.draws(name) for name in posterior.names}
     chosen = np.linspace(0, next(iter(columns.values())).size - 1, count).astype(int)
     best = int(np.argmax(posterior.data["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()))

@@ -101,8 +101,9 @@ class ParameterMap:
         known |= fixed
         if without := [n for n in every if n not in columns and n not in known and n not in tied]:
             raise ValueError(
-                f"priors: {', '.join(map(repr, without))} has neither a prior nor a value; a free parameter needs a "
-                "prior, any other a value in `fixed` or an expression in `tied`."
+                f"priors: {', '.join(map(repr, without))} has neither a prior nor a value in experiment "
+                f"{experiment!r}; a free parameter needs a prior, any other a value in `fixed` or an expression in "
+                "`tied`."
             )
         expressions = {name: parse(f"tied[{name!r}]", text, every) for name, text in tied.items()}
         return cls(every, columns, len(names), known, _ordered(expressions))

@@ -9,6 +9,7 @@ import numpy as np
 
 from bayesperiodic import checks
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.data.recording import Recording
 from bayesperiodic.inference.all_at_once import all_at_once
 from bayesperiodic.inference.comparisons import Comparisons
 from bayesperiodic.inference.likelihood_slope import likelihood_slope
@@ -774,6 +775,11 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
     if isinstance(experiments, Experiment):
         raise ValueError(f"experiments: {experiments.name!r} alone is not allowed; give a list of one, [experiment].")
     result = tuple(experiments)
+    for e in result:
+        if isinstance(e, Recording):
+            raise ValueError(f"experiments: the recording {e.name!r} is not allowed; give its mean period, see fold().")
+        if not isinstance(e, Experiment):
+            raise ValueError(f"experiments: {e!r} is not allowed; each must be an Experiment.")
     if not result:
         raise ValueError("experiments: () is not allowed; at least one experiment is needed.")
     names = [experiment.name for experiment in result]
@@ -790,9 +796,12 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
                     f"outputs of experiment {e.name!r}: {channel!r} is constant ({values[0]:g}); a channel must vary "
                     "over the period, or tells nothing about its variance."
                 )
+        if e.guess:
+            checks.same_names(f"guess of experiment {e.name!r}", e.guess, model.states)
         if model.autonomous and not e.frequency_se > 0.0:
             raise ValueError(
                 f"experiment {e.name!r}: frequency_se = {e.frequency_se:g} is not allowed; {model.name!r} is "
-                "autonomous, its measured frequency is data and needs a standard error > 0."
+                "autonomous, its measured frequency is data and needs a standard error > 0. Fold without `frequency`, "
+                "which then is estimated with its error, or give frequency_se."
             )
     return result

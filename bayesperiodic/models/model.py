@@ -107,6 +107,7 @@ class Model:
         self.inputs = checks.identifiers("inputs", inputs, (*RESERVED, *self.states))
         self.parameters = checks.identifiers("parameters", parameters, RESERVED)
         for argument, names in (("states", self.states), ("inputs", self.inputs)):
+            _refuse_derivatives(argument, names)
             checks.identifiers(argument, [d + n for d in ("", "d", "dd") for n in names], RESERVED)
         if not self.states:
             raise ValueError("states: () is not allowed; a model needs at least one state.")
@@ -120,12 +121,17 @@ class Model:
             Names("parameters", self.parameter_symbols),
             Names("inputs", self.input_symbols),
         )
-        self.equations = tuple(self._expression("equations", e) for e in equations(*spaces))
+        written = equations(*spaces)
+        if isinstance(written, sp.Basic):
+            raise ValueError(f"equations: {written} alone is not allowed; return a list, of one for each state.")
+        self.equations = tuple(self._expression("equations", e) for e in written)
         if len(self.equations) != len(self.states):
             raise ValueError(
-                f"equations: {len(self.equations)} are not allowed; there must be one a state, {len(self.states)}."
+                f"equations: {len(self.equations)} are not allowed; there must be {len(self.states)}, one for each of "
+                f"the states {list(self.states)}. An equation may hold s.dd{self.states[0]}: of second order, it needs "
+                "no state for the rate."
             )
-        given = dict(outputs(*spaces))
+        given = dict(checks.mapping("outputs", outputs(*spaces), "{'displacement': s.x}"))
         self.outputs = checks.identifiers("outputs", given, (*RESERVED, *self.inputs))
         self.output_expressions = tuple(self._expression("outputs", given[n]) for n in self.outputs)
         if not self.outputs:
@@ -144,7 +150,10 @@ class Model:
         if isinstance(given, int | float):
             given = sp.Float(given)
         if not isinstance(given, sp.Expr):
-            raise ValueError(f"{argument}: {given!r} is not allowed; write SymPy expressions of s, p and u.")
+            raise ValueError(
+                f"{argument}: {given!r} is not allowed; write SymPy expressions of s, p and u, and an equation "
+                "left = right as left - right."
+            )
         known = {*self.state_symbols.values(), *self.input_symbols.values()}
         known |= {*self.parameter_symbols.values(), *self.time_symbols.values()}
         if strangers := sorted(map(str, given.free_symbols - known)):
@@ -249,6 +258,17 @@ class Model:
             f"Model({self.name!r}, states={list(self.states)}, inputs={list(self.inputs)}, "
             f"parameters={list(self.parameters)}, outputs={list(self.outputs)})"
         )
+
+
+def _refuse_derivatives(argument: str, names: tuple[str, ...]) -> None:
+    space = "s" if argument == "states" else "u"
+    for name in names:
+        for derivative in (f"d{name}", f"dd{name}"):
+            if derivative in names:
+                raise ValueError(
+                    f"{argument}: {derivative!r} is not allowed beside {name!r}, whose derivative it is, and which "
+                    f"needs no name. Leave it out and write {space}.{derivative}."
+                )
 
 
 def _with_derivatives(prefix: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]:

@@ -172,7 +172,8 @@ def _phases(
     if not told or not np.allclose(outputs(phases), values, rtol=1e-6, atol=1e-9):
         what = "states and rates" if rates else "states"
         raise ValueError(
-            f"coordinates: {orbit.coordinates} are not allowed; they must tell the {what} of {model.name!r}, "
-            f"{list(model.states)}, by linear outputs."
+            f"coordinates: {orbit.coordinates} are not allowed; the {what} of {model.name!r}, {list(model.states)}, "
+            "must follow from them by linear equations. Make the section of outputs that are linear in these, such as "
+            "a state and its rate."
         )
     return phases

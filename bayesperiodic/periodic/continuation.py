@@ -286,7 +286,12 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
     (2, {'phi': 2}, True)
     """
     equations, parameters, z = equations_of(model, solution)
-    if not solution.converged or np.min(abs(solution.multipliers + 1.0)) > 0.1:
+    if not solution.converged:
+        raise ValueError(
+            f"solution: status {solution.status!r} is not allowed; it must have converged. Take one of "
+            "branch.period_doublings."
+        )
+    if np.min(abs(solution.multipliers + 1.0)) > 0.1:
         raise ValueError(
             f"solution: multipliers {solution.multipliers} are not allowed; one must be near -1. Take one of "
             "branch.period_doublings."

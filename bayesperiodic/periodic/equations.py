@@ -256,7 +256,7 @@ def winding_numbers(model: Model, winding: int | Mapping[str, int]) -> dict[str,
     """Return the winding number of every angle among the states."""
     angles = [state for state in model.states if state in model.angles]
     if not isinstance(winding, Mapping):
-        turns = checks.integer("winding", winding, -(10**6))
+        turns = checks.integer("winding", winding)
         if turns and not angles:
             raise ValueError(
                 f"winding: {winding!r} is not allowed; no state of {model.name!r} is an angle, see Model(angles=…)."
@@ -269,5 +269,5 @@ def winding_numbers(model: Model, winding: int | Mapping[str, int]) -> dict[str,
         return dict.fromkeys(angles, turns)
     for name, turns in winding.items():
         checks.one_of("winding", name, angles)
-        checks.integer(f"winding[{name!r}]", turns, -(10**6))
+        checks.integer(f"winding[{name!r}]", turns)
     return dict.fromkeys(angles, 0) | dict(winding)

@@ -66,8 +66,8 @@ class Evidence:
         found = identifiability(problem, fit, posterior, profile=False) if found is None else found
         checks.same_names("identifiability", dict.fromkeys(found.table.index), problem.names)
         if comparison is not None:
-            for name in problem.names:
-                checks.one_of("comparison", name, comparison.table.index)
+            remedy = "give the one of this problem, compare(problem, fit, posterior)"
+            checks.holds("comparison", comparison.table.index, problem.names, remedy)
         if prediction is not None:
             checks.same_names("prediction", prediction.median, [e.name for e in problem.experiments])
         return cls(problem, fit, posterior, found, comparison, prediction, unpredicted)

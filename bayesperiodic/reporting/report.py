@@ -13,7 +13,7 @@ from bayesperiodic.reporting import data, estimates, model, record, residuals, s
 from bayesperiodic.reporting.blocks import BAD, CAUTION, NEUTRAL, Badge
 from bayesperiodic.reporting.evidence import Evidence
 from bayesperiodic.reporting.page import page
-from bayesperiodic.store import written_whole
+from bayesperiodic.store import in_folder, written_whole
 
 
 def report(
@@ -83,9 +83,7 @@ def report(
     >>> page[:15], "<script" in page
     ('<!DOCTYPE html>', False)
     """
-    target = Path(path)
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"path: {str(path)!r} is not allowed; there is no folder {str(target.parent)!r}.")
+    target = in_folder(path)
     evidence = Evidence.of(problem, fit, posterior, identifiability, comparison, prediction)
     sections = [summary.section(evidence), data.section(evidence), model.section(evidence)]
     sections += [estimates.section(evidence), residuals.section(evidence), verdicts.section(evidence)]

@@ -150,13 +150,15 @@ def test_exactly_three_cycles_are_enough():
 def test_fewer_than_three_cycles_are_refused():
     with pytest.raises(ValueError, match=r"it has 2\.\d\d cycles, and at least 3 cycles are needed"):
         recording(cycles=2.6, noise=0.0).fold(frequency=FREQUENCY)
-    with pytest.raises(ValueError, match="at least 3 cycles are needed"):
+    with pytest.raises(ValueError, match="at least 3 cycles are needed. Record longer, or give the forcing frequency"):
         recording(cycles=1.3, noise=0.0).fold()
+    with pytest.raises(ValueError, match=r"or check frequency = 2\.317 Hz and periods = 9, the forcing frequency"):
+        recording(cycles=20.3, noise=0.0).fold(frequency=FREQUENCY, periods=9)
 
 
 def test_constant_input_is_refused():
     time = np.arange(500) / 100
-    with pytest.raises(ValueError, match=r"inputs\['x'\]: the constant 2 is not allowed; a channel must vary"):
+    with pytest.raises(ValueError, match=r"inputs\['x'\]: the constant 2 is not allowed; .* its value in `fixed`"):
         bp.Recording.from_arrays(time, {"y": np.sin(9 * time)}, {"x": np.full(500, 2.0)}).fold()
 
 
@@ -183,6 +185,8 @@ def test_random_walks_are_refused(seed):
         ({"harmonics": {"z": 3}}, "harmonics: 'z' is not known; allowed: 'x', 'y'"),
         ({"harmonics": 0}, "must be a whole number of at least 1"),
         ({"samples": 2}, "samples: 2 is not allowed"),
+        ({"samples": 64.0}, "samples: 64.0 is not allowed; .* at least 4, such as 64, without a decimal point"),
+        ({"origin": "Crossing"}, "origin: 'Crossing' is not allowed; it must be a time .s., or 'crossing'"),
         ({"periods": 0}, "periods: 0 is not allowed"),
         ({"frequency": -1.0}, "frequency: -1.0 is not allowed"),
         ({"name": "a/b"}, "name: 'a/b' is not allowed"),

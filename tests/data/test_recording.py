@@ -70,10 +70,36 @@ def test_pickled_npz_is_refused(tmp_path):
         bp.Recording.from_npz(tmp_path / "run.npz", time="t", outputs={"force": "F"})
 
 
+def test_other_files_than_npz_are_answered_with_what_reads_them(csv, tmp_path):
+    with pytest.raises(ValueError, match=r"is no NPZ file, .* a CSV or MAT file by from_csv or from_mat"):
+        bp.Recording.from_npz(csv, time="t", **CHANNELS)
+    np.save(tmp_path / "force.npy", FORCE)
+    with pytest.raises(ValueError, match=r"cannot be read as NPZ .* by numpy\.savez"):
+        bp.Recording.from_npz(tmp_path / "force.npy", sampling_rate=50.0, outputs={"force": "force"})
+
+
+@pytest.mark.parametrize("text", ["t;x;F\n0,5;1,5;2,5\n1,0;1,0;2,0\n", "t\tx\n0\t1\n1\t2\n", "0.0,1.5\n0.1,2.5\n"])
+def test_csv_without_commas_or_header_is_told_what_is_needed(tmp_path, text):
+    (tmp_path / "run.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"its first line is read as .* name the columns, separated by commas"):
+        bp.Recording.from_csv(tmp_path / "run.csv", time="t", outputs={"x": "x"})
+
+
+def test_channels_that_are_no_mapping_are_told_what_one_is(csv):
+    with pytest.raises(ValueError, match="outputs: 'x' is not allowed; it must be a mapping, such as {'force': "):
+        bp.Recording.from_csv(csv, time="t", outputs="x")
+    with pytest.raises(ValueError, match="inputs: .* is not allowed; it must be a mapping"):
+        bp.Recording.from_arrays(TIME, {"force": FORCE}, DISPLACEMENT)
+    with pytest.raises(ValueError, match="outputs: .* is not allowed; it must be a mapping"):
+        bp.Experiment("run", 1.0, DISPLACEMENT, samples=TIME.size)
+
+
 def test_arrays_may_be_pandas_or_xarray():
     recording = bp.Recording.from_arrays(
         pd.Series(TIME), {"force": xr.DataArray(FORCE, dims="time")}, {"displacement": pd.Series(DISPLACEMENT)}
     )
+    table = pd.DataFrame({"force": FORCE})
+    assert np.array_equal(bp.Recording.from_arrays(TIME, table).outputs["force"], FORCE)
     assert np.array_equal(recording.outputs["force"], FORCE)
 
 

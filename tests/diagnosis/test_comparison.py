@@ -324,7 +324,7 @@ def test_wrong_arguments_are_told(solved):
     problem, fit, posterior = solved
     with pytest.raises(ValueError, match="coordinates: 'ridge' is not known; allowed: 'natural', 'sampling'"):
         bp.compare(problem, fit, posterior, coordinates="ridge")
-    with pytest.raises(ValueError, match="posterior: 'a' is not known"):
+    with pytest.raises(ValueError, match="posterior: it has no 'a'.*; give draws of this problem"):
         bp.compare(case("edge")[0], case("edge")[1], posterior)
 
 

@@ -51,6 +51,8 @@ def test_one_walker_that_stays_apart_is_no_convergence():
     """One of 128 independent walkers that is an sd off is hardly seen in any quantile, but stays apart."""
     kept = np.random.default_rng(1).standard_normal((4, 2000, 32, 2))
     tau = np.ones(2)
-    assert shortfall(kept, tau, tau) == []
+    assert shortfall(kept, tau, tau, ("a", "b")) == []
     kept[2, :, 5, 1] += 1.0
-    assert [text[:22] for text in shortfall(kept, tau, tau)] == ["walkers that stay apar"]
+    still = shortfall(kept, np.array([1.0, np.inf]), tau, ("a", "b"))
+    assert still == ["'b' not moving, as every proposal is refused"]
+    assert [text[:22] for text in shortfall(kept, tau, tau, ("a", "b"))] == ["walkers that stay apar"]

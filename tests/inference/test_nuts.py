@@ -176,9 +176,9 @@ def test_too_few_draws_are_not_converged_and_what_nuts_knows_is_kept(linear, bri
 
 def test_walker_alone_must_be_as_long_as_its_ensemble_of_independent_ones():
     draws = np.random.default_rng(3).standard_normal((4, 400, 8, 1))
-    nearly = stopping.shortfall(draws[:, :, :1], np.ones(1), np.ones(1))
+    nearly = stopping.shortfall(draws[:, :, :1], np.ones(1), np.ones(1), ("k",))
     assert nearly[0] == "length only 400 tau"
-    assert stopping.shortfall(draws, np.ones(1), np.ones(1)) == []
+    assert stopping.shortfall(draws, np.ones(1), np.ones(1), ("k",)) == []
 
 
 @needs_nutpie

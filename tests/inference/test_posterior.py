@@ -381,6 +381,9 @@ def test_what_cannot_be_a_prior_is_told(solved, local):
         replace(posterior, converged=False).as_prior(("k",))
     with pytest.warns(UserWarning, match=r"The estimate has not converged \(stalled\)"):
         replace(fit, status="stalled").as_prior(("k",))
+    assert "NOT CONVERGED: stalled; try another start" in repr(replace(fit, status="stalled"))
+    with pytest.raises(ValueError, match="names: 'k', 'c' is not allowed; the data do not determine it"):
+        replace(fit, covariance=fit.covariance * np.inf).as_prior(("k", "c"))
 
 
 def test_local_parameters_are_compared_one_by_one(local):

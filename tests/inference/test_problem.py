@@ -109,13 +109,15 @@ def test_prior_samples_have_the_names(problem):
     [
         (
             {"priors": {"k": PRIORS["k"], "c": PRIORS["c"]}},
-            "'coulomb' has neither a prior nor a value; a free parameter needs a prior",
+            "'coulomb' has neither a prior nor a value in experiment 'run'; a free parameter needs a prior",
         ),
         ({"priors": PRIORS | {"coulom": PRIORS["k"]}}, "priors: 'coulom' is not known.*Did you mean 'coulomb'"),
         ({"fixed": {"k": 1.0}}, "fixed: 'k' has a prior too"),
         ({"fixed": {"variance[forc]": 1.0}}, r"fixed: 'variance\[forc\]' is not known"),
         ({"fixed": {"variance[force]": 0.0}}, r"fixed\['variance\[force\]'\]: 0.0 is not allowed"),
         ({"experiments": []}, "at least one experiment"),
+        ({"experiments": ["run"]}, "experiments: 'run' is not allowed; each must be an Experiment"),
+        ({"priors": PRIORS | {"variance[force]": PRIORS["k"]}}, r"priors: 'variance.force.' .* belongs to the noise"),
     ],
 )
 def test_bad_problems_are_refused_by_name(experiment, changes, message):
@@ -131,6 +133,14 @@ def test_experiments_must_fit_the_model(experiment):
         bp.Problem(LINEAR, [bp.Experiment("run", 2.0, {"torque": tau}, {"x": tau}, samples=40)], priors=PRIORS)
     with pytest.raises(ValueError, match="the names .* must differ"):
         bp.Problem(LINEAR, [experiment, experiment], priors=PRIORS)
+    with pytest.raises(ValueError, match="guess of experiment 'run': 'y' is not known; allowed: "):
+        bp.Problem(LINEAR, [replace(experiment, guess={"y": np.zeros(experiment.samples)})], priors=PRIORS)
+
+
+def test_a_recording_is_to_be_folded():
+    recording = bp.Recording.from_arrays(np.arange(9.0), {"force": np.sin(np.arange(9.0))})
+    with pytest.raises(ValueError, match=r"experiments: the recording 'recording' .*; give its mean period, see fold"):
+        bp.Problem(LINEAR, [recording], priors=PRIORS)
 
 
 def test_fewer_independent_values_than_free_parameters_are_refused():

@@ -219,5 +219,27 @@ def test_start_where_nothing_is_finite_fails_loudly(known_variance):
     other = bp.Problem(
         LINEAR, problem.experiments, priors=PRIORS | {"k": bp.Uniform(0.0, 1.0)}, fixed={"variance[force]": 9.0}
     )
-    with pytest.raises(ValueError, match=r"100\.0% have no finite log-posterior"):
+    with pytest.raises(ValueError, match=r"100\.0% have no finite log-posterior, .*; give a converged fit"):
         bp.sample(other, fit, seed=1, **PAIR)
+
+
+def test_an_estimate_of_another_problem_is_refused(known_variance):
+    problem, fit = known_variance
+    others = [replace(e, name="other") for e in problem.experiments]
+    other = bp.Problem(LINEAR, others, priors=PRIORS, fixed={"variance[force]": 9.0})
+    with pytest.raises(ValueError, match="fit: it has no 'other', only .*; give the estimate of this problem"):
+        bp.sample(other, fit, seed=1, **PAIR)
+    with pytest.raises(ValueError, match="fit: missing 'k'"):
+        bp.sample(problem, replace(fit, theta={n: v for n, v in fit.theta.items() if n != "k"}), seed=1, **PAIR)
+
+
+def test_without_a_laplace_approximation_the_next_step_is_told(known_variance):
+    problem, fit = known_variance
+    for known, step in (
+        ({"undetermined": ("k → k·t, c → c·t",)}, r"fix what the data do not determine \(k → k·t, c → c·t\)"),
+        ({"at_ends": ("k",)}, "widen the prior of 'k', which is at the end of its support"),
+        ({}, "run map_estimate from another start"),
+    ):
+        lost = replace(fit, joint_covariance=fit.joint_covariance * np.nan, **known)
+        with pytest.raises(ValueError, match=f"no Laplace approximation .*{step}, or take start='prior'"):
+            bp.sample(problem, lost, seed=1, **PAIR)

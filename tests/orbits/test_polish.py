@@ -165,5 +165,7 @@ def test_models_that_do_not_fit_the_section_are_refused():
     with pytest.raises(ValueError, match="all must be of one section"):
         polish(orbit, replace(measured(GENTLE[1]), angles=()))
     twice = replace(orbit, coordinates=("rate", "rate"), angles=())
-    with pytest.raises(ValueError, match=r"they must tell the states of 'pendulum', \['phi'\], by linear outputs"):
+    with pytest.raises(
+        ValueError, match=r"the states of 'pendulum', \['phi'\], must follow from them by linear equations"
+    ):
         polish(twice)

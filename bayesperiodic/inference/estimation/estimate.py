@@ -274,7 +274,13 @@ class MapEstimate(Result):
                 stacklevel=2,
             )
         mean = np.array([self.theta[name] for name in key])
-        return MultivariateNormal(mean, self.covariance.loc[[*key], [*key]].to_numpy())
+        covariance = self.covariance.loc[[*key], [*key]].to_numpy()
+        if lost := [name for name, variance in zip(key, np.diag(covariance), strict=True) if not np.isfinite(variance)]:
+            raise ValueError(
+                f"names: {', '.join(map(repr, lost))} is not allowed; the data do not determine it, so its standard "
+                "deviation is not finite. Leave it out, or fix a parameter, see fit.undetermined."
+            )
+        return MultivariateNormal(mean, covariance)
 
     def _gradient(self, quantity: Expression, values: dict[str, float], named: dict[str, str]) -> dict[str, np.ndarray]:
         """Return the derivatives by the free parameters, those through tied ones included; `named` by plain name."""
@@ -298,7 +304,8 @@ class MapEstimate(Result):
         }
 
     def __repr__(self) -> str:
-        lines = [f"MapEstimate ({self.status}), estimate ± Laplace sd (robust sd):"]
+        status = self.status if self.converged else f"NOT CONVERGED: {self.status}; try another start, or starts=8"
+        lines = [f"MapEstimate ({status}), estimate ± Laplace sd (robust sd):"]
         lines += [
             f"  {name:12s} {value:12.6g} ± {self.sd[name]:.3g} ({self.robust_sd[name]:.3g})"
             for name, value in self.theta.items()

@@ -26,7 +26,7 @@ from bayesperiodic.inference.estimation.joint_laplace import joint_laplace, loga
 from bayesperiodic.inference.estimation.noise_uncertainty import with_uncertain_noise
 from bayesperiodic.inference.estimation.residual_split import channel_whiteness, noise_split
 from bayesperiodic.inference.estimation.robust import robust_covariance
-from bayesperiodic.inference.estimation.undetermined import undetermined
+from bayesperiodic.inference.estimation.undetermined import SILENT, undetermined
 from bayesperiodic.inference.problem import Problem
 
 NOISE_SHARE = 0.1
@@ -108,12 +108,14 @@ def map_estimate(
     >>> fit.status, abs(fit.theta["k"] - 1.0) < 3 * fit.sd["k"]
     ('converged', True)
     """
+    if isinstance(start, Mapping):
+        checks.same_names("start", start, problem.names)
     theta = problem.median() if start is None else problem.vector(start)
     checks.integer("starts", starts, 1)
     objective = Objective(problem, bias_correction(problem), np.zeros(len(problem.names), dtype=bool))
     first = _first_iterate(objective, theta)
     if first is None:
-        raise ValueError(_not_finite(problem, theta))
+        raise ValueError(_not_finite(problem, theta, start is not None))
     best, status, history = _climb(objective, first, progress)
     found = [_outcome(problem, best)]
     for draw in problem.joint_prior.sample(starts - 1, np.random.default_rng(checks.integer("seed", seed, 0))):
@@ -248,12 +250,15 @@ def remarks(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             f"The estimate of {name!r}, {fit.theta[name]:.6g}, lies at the end of its prior's support ({low:g}, "
             f"{high:g}); standard deviations do not describe the posterior there. Sample it, or widen the prior."
         )
-    if fit.undetermined:
-        more = len(fit.undetermined) - SHOWN
-        shown = "; or under ".join(fit.undetermined[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
+    if silent := [name for name in problem.names if f"{name}: {SILENT}" in fit.undetermined]:
+        yield f"The data do not depend on {', '.join(map(repr, silent))}; what is said of it is the prior's. Fix it."
+    directions = [text for text in fit.undetermined if not text.endswith(SILENT)]
+    if directions:
+        more = len(directions) - SHOWN
+        shown = "; or under ".join(directions[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
         yield (
-            f"The data do not change under {shown}. What is said of these is the prior's; fix one of them, or report "
-            "the combination that stays."
+            f"The data do not change under {shown}, whatever t. What is said of these is the prior's; fix one of them, "
+            "or report the combination that stays."
         )
 
 
@@ -279,7 +284,7 @@ def _pooled(problem: Problem, channel: str, signals: Mapping[str, Mapping[str, n
     return float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
 
 
-def _not_finite(problem: Problem, theta: np.ndarray) -> str:
+def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
     given = dict(zip(problem.names, theta, strict=True))
     values = ", ".join(f"{name} = {value:.6g}" for name, value in given.items())
     if names := problem.joint_prior.excluding(theta):
@@ -289,18 +294,21 @@ def _not_finite(problem: Problem, theta: np.ndarray) -> str:
             f"start: {excluded} is not allowed; the log-posterior is not finite there, the prior's support is "
             f"({low:g}, {high:g})."
         )
+    values += "" if given_start else " (the priors' medians)"
     together = all_at_once(problem, theta)
     if together is not None and together.blocked:
+        where = "the other experiments' orbits are" if len(problem.experiments) > 1 else "it is an orbit"
         return (
             f"start: {values} is not allowed; {together.blocked!r} cannot be followed from its guess to parameters at "
-            "which the other experiments' orbits are. Leave it out if it may be none, or start elsewhere."
+            f"which {where}. Leave it out if it may be none, or give start={{…}} nearer to the truth."
         )
     if together is not None and together.states:
         near = problem.anchored(together.theta, together.states).linearised(together.theta)
     else:
         near = problem.linearised(theta)
-    statuses = {name: s for name, s in near.statuses.items() if s != "converged"}
+    failed = ", ".join(f"{name!r} ({status})" for name, status in near.statuses.items() if status != "converged")
+    ended = f"without the orbit of {failed}" if failed else "well, but the outputs or the noise are not finite"
     return (
-        f"start: {values} is not allowed; the log-posterior is not finite there, the periodic solve ended with "
-        f"{statuses}. Start elsewhere."
+        f"start: {values} is not allowed; the log-posterior is not finite there, the periodic solve ended {ended}. "
+        "Give start={…}, or priors with other medians, at which problem.solve(theta) converges."
     )

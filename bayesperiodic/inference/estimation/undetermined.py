@@ -7,6 +7,7 @@ import numpy as np
 from bayesperiodic.inference.estimation.directions import in_words, reduced
 
 NEARLY_SINGULAR = 1e-10
+SILENT = "no output depends on it"
 
 
 def undetermined(
@@ -39,7 +40,7 @@ def undetermined(
     slopes = np.where(logarithmic, theta, 1.0)
     scaled = information * np.outer(slopes, slopes)
     size = np.sqrt(np.diag(scaled))
-    silent = [f"{name}: no output depends on it" for name, own in zip(names, size, strict=True) if own == 0.0]
+    silent = [f"{name}: {SILENT}" for name, own in zip(names, size, strict=True) if own == 0.0]
     acting = np.flatnonzero(size > 0.0)
     if not acting.size:
         return tuple(silent)

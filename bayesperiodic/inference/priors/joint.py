@@ -49,6 +49,11 @@ class JointPrior:
             if not members:
                 raise ValueError("priors: the key () is not allowed; a joint prior needs names, such as ('k', 'c').")
             for name in members:
+                if str(name).startswith("variance["):
+                    raise ValueError(
+                        f"priors: {name!r} is not allowed; it belongs to the noise, so give its prior there, "
+                        "noise=noise.Independent(prior=…), or its value in `fixed`."
+                    )
                 checks.one_of("priors", name, known)
                 if name in keys:
                     both = f"{keys[name]!r} and {key!r}" if keys[name] != key else f"twice in {key!r}"

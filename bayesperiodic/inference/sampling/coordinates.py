@@ -92,9 +92,14 @@ class SamplingDensity:
         mode = np.array([fit.joint_mode.get(label, np.nan) for label in labels])
         covariance = fit.joint_covariance.loc[labels, labels].to_numpy().copy()
         if not np.isfinite(mode).all() or not np.isfinite(covariance).all():
+            remedy = "run map_estimate from another start"
+            if fit.undetermined:
+                remedy = f"fix what the data do not determine ({'; '.join(fit.undetermined)})"
+            elif fit.at_ends:
+                remedy = f"widen the prior of {', '.join(map(repr, fit.at_ends))}, which is at the end of its support"
             raise ValueError(
-                "fit: its joint covariance is not finite, so there is no Laplace approximation to start from; fix what "
-                f"the data do not determine ({'; '.join(fit.undetermined) or 'see fit.status'}), or start='prior'."
+                "fit: its joint covariance is not finite, so there is no Laplace approximation to start from; "
+                f"{remedy}, or take start='prior'."
             )
         always = logarithmic(self.problem)
         slopes = np.where(always & ~self.logarithmic, mode[: always.size], 1.0)

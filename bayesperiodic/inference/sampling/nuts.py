@@ -206,7 +206,7 @@ class _Run:
                 self._wait(steps, bar)
                 self.steps, kept = steps, self.kept(steps)
                 tau = chains.autocorrelation_time(kept)
-                missing, last = shortfall(kept, tau, last), tau
+                missing, last = shortfall(kept, tau, last, self.density.labels), tau
                 bar.set_postfix_str(f"tau {tau.max():.1f}, length {steps / tau.max():.0f} tau")
                 passes = 0 if missing else passes + 1
                 if passes >= PASSES:

@@ -159,6 +159,9 @@ def sample(
     checks.one_of("coordinates", coordinates, (RIDGE, NATURAL))
     checks.one_of("variances", variances, (SAMPLED, COLLAPSED))
     checks.one_of("sampler", sampler, (EMCEE, NUTS))
+    checks.same_names("fit", fit.theta, problem.names)
+    runs = [e.name for e in problem.experiments]
+    checks.holds("fit", fit.solutions, runs, "give the estimate of this problem, map_estimate(problem)")
     executor = checked_executor(executor)
     plain = SamplingDensity(problem, coordinates=coordinates, variances=variances)
     if variances == COLLAPSED and not plain.collapsed:
@@ -289,7 +292,7 @@ class _Run:
                 self._advance(steps, crew, bar)
                 kept = self._kept(steps)
                 tau = chains.autocorrelation_time(kept)
-                missing = shortfall(kept, tau, np.array(state["tau"]))
+                missing = shortfall(kept, tau, np.array(state["tau"]), self.plain.labels)
                 passes = 0 if missing else state["passes"] + 1
                 state |= {"steps": steps, "checked": steps, "tau": tau.tolist(), "passes": passes, "missing": missing}
                 bar.set_postfix_str(self._account(kept, tau))

@@ -95,9 +95,11 @@ def _finite(density: SamplingDensity, drawn: Callable[[int], np.ndarray], wanted
         values = density(candidates) if len(candidates) else np.empty(0)
         points = np.concatenate([points, candidates[np.isfinite(values[:, 0] if values.ndim > 1 else values)]])
     if len(points) < wanted:
+        other = "give a converged fit of this problem, or start='prior'"
+        remedy = "narrow the priors, see prior_predictive(problem)" if start == PRIOR else other
         raise ValueError(
-            f"fit: of {tried} start points drawn (start={start!r}) {1 - len(points) / tried:.1%} have no finite "
-            "log-posterior, so the walkers cannot start; check the priors' support and the fit's status."
+            f"start: {start!r} is not allowed; of {tried} start points drawn {1 - len(points) / tried:.1%} have no "
+            f"finite log-posterior, so the walkers cannot start; {remedy}."
         )
     return points[:wanted]
 

@@ -1,5 +1,7 @@
 """When a sampling run is long enough."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from bayesperiodic.inference.sampling import chains
@@ -12,7 +14,7 @@ QUANTILE_SPREAD = 0.25
 APART = 8.0
 
 
-def shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray) -> list[str]:
+def shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: Sequence[str]) -> list[str]:
     """Return what the stop rule misses, in words; nothing if it is passed.
 
     An ensemble of 32 walkers that is 50 autocorrelation times long holds 1600 independent draws, a walker alone would
@@ -24,10 +26,13 @@ def shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray) -> list[str]:
     kept : array (ensembles, steps, walkers, coordinates)
     tau, last : array (coordinates,)
         Autocorrelation time [steps], now and at the check before.
+    labels : sequence of str
+        Names of the coordinates.
     """
     found = []
     if not np.isfinite(tau).all():
-        return ["a coordinate that does not move"]
+        still = [label for label, time in zip(labels, tau, strict=True) if not np.isfinite(time)]
+        return [f"{', '.join(map(repr, still))} not moving, as every proposal is refused"]
     needed = LENGTHS if kept.shape[2] > 1 else LENGTHS_ALONE
     if (lengths := kept.shape[1] / tau.max()) < needed:
         found.append(f"length only {lengths:.0f} tau")
