@@ -1,6 +1,7 @@
 """Argument errors in one voice: name the argument, the value, and what is allowed."""
 
 import difflib
+import reprlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -39,7 +40,7 @@ def holds(argument: str, given: Iterable[str], wanted: Iterable[str], remedy: st
 def mapping(argument: str, value: Any, example: str) -> Mapping[str, Any]:
     """Return `value`; raise a ValueError unless it has names and values, as a dict or a table of pandas does."""
     if not hasattr(value, "items"):
-        raise ValueError(f"{argument}: {value!r} is not allowed; it must be a mapping, such as {example}.")
+        raise ValueError(f"{argument}: {_shown(value)} is not allowed; it must be a mapping, such as {example}.")
     return value
 
 
@@ -97,7 +98,7 @@ def finite_vector(argument: str, values: Any, length: int | None = None, meaning
     try:
         array = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
-        raise ValueError(f"{argument}: {values!r} is not allowed; it must be an array of real numbers.") from None
+        raise ValueError(f"{argument}: {_shown(values)} is not allowed; it must be an array of real numbers.") from None
     if array.ndim != 1:
         raise ValueError(f"{argument}: shape {array.shape} is not allowed; it must be one-dimensional.")
     if length is not None and array.size != length:
@@ -110,3 +111,8 @@ def finite_vector(argument: str, values: Any, length: int | None = None, meaning
             "NaN or infinite); every sample must be finite."
         )
     return array
+
+
+def _shown(value: Any) -> str:
+    """Return a value as a short text, its middle left out where it is long."""
+    return " ".join(reprlib.repr(value).split())
