@@ -19,7 +19,8 @@ def read_csv(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise ValueError(f"path: {str(path)!r} cannot be read as CSV ({error}); it needs a header line.") from None
     table.columns = [str(name).strip() for name in table.columns]
-    if _is_no_header(names := [*table.columns]):
+    columns, names = [*columns], [*table.columns]
+    if not {*columns} <= {*names} and _is_no_header(names):
         raise ValueError(
             f"path: {str(path)!r} is not allowed; its first line is read as {names}. It must name the columns, "
             "separated by commas, and numbers must have a decimal point."

@@ -85,6 +85,12 @@ def test_csv_without_commas_or_header_is_told_what_is_needed(tmp_path, text):
         bp.Recording.from_csv(tmp_path / "run.csv", time="t", outputs={"x": "x"})
 
 
+def test_numbers_may_be_names_of_columns(tmp_path):
+    pd.DataFrame({0: TIME, 1: FORCE}).to_csv(tmp_path / "run.csv", index=False)
+    recording = bp.Recording.from_csv(tmp_path / "run.csv", time="0", outputs={"force": "1"})
+    assert recording.outputs["force"] == pytest.approx(FORCE)
+
+
 def test_channels_that_are_no_mapping_are_told_what_one_is(csv):
     with pytest.raises(ValueError, match="outputs: 'x' is not allowed; it must be a mapping, such as {'force': "):
         bp.Recording.from_csv(csv, time="t", outputs="x")
