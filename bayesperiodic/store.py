@@ -5,7 +5,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -85,7 +85,7 @@ def load(path: str | Path) -> Any:
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file is not one that a result was saved to.
+        If the file is not one that a result was saved to, or a version of this package did that has other fields.
 
     Examples
     --------
@@ -155,7 +155,8 @@ def _decode(value: Any, arrays: dict[str, Any], path: str | Path) -> Any:
         return _read_tree(path)
     content = {name: _decode(item, arrays, path) for name, item in value["fields"].items()}
     kind = _result_class(value["result"])
-    if content.keys() != {field.name for field in fields(kind)}:
+    needed = {f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING}
+    if not needed <= content.keys() <= {f.name for f in fields(kind)}:
         raise ValueError(
             f"path: {str(path)!r} is not allowed; its {kind.__name__} was saved by another version of this package. "
             "Load it with that one, or make it again."

@@ -1,3 +1,4 @@
+import json
 import os
 
 import h5py
@@ -92,6 +93,17 @@ def test_a_result_of_another_version_is_refused(tmp_path):
         bp.load(path)
 
 
+def test_a_result_from_before_a_field_with_a_default_is_read(tmp_path):
+    path = tmp_path / "run.h5"
+    bp.Experiment("run", 2.0, {"x": [0.0, 1.0, 0.0, -1.0]}, samples=4).save(path)
+    with h5py.File(path, "a") as file:
+        (key,) = file.attrs
+        header = json.loads(file.attrs[key])
+        del header["fields"]["origin"]
+        file.attrs[key] = json.dumps(header)
+    assert bp.load(path).origin == 0.0
+
+
 def test_a_folder_that_is_not_there_is_named(tmp_path):
     experiment = bp.Experiment("run", 2.0, {"x": [0.0, 1.0, 0.0, -1.0]}, samples=4)
     with pytest.raises(FileNotFoundError, match="path: '.*run.h5' is not allowed; there is no folder '.*nowhere'"):
@@ -99,8 +111,6 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 
 
 def test_a_file_cannot_name_a_class_from_elsewhere(solved, tmp_path):
-    import h5py
-
     solved[1].save(tmp_path / "fit.h5")
     with h5py.File(tmp_path / "fit.h5", "a") as file:
         file.attrs["bayesperiodic_result"] = '{"result": "subprocess:Popen", "fields": {"args": "true"}}'

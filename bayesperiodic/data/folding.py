@@ -138,11 +138,11 @@ def _first_guess(
         fundamental = guess_frequency(time, signals)
     if fundamental is None or _cycles(time, fundamental) < MINIMUM_CYCLES:
         found = "no period was found" if fundamental is None else f"it has {_cycles(time, fundamental):.2f} cycles"
+        given = f"check frequency = {frequency!r} Hz and periods = {periods}"
         raise ValueError(
             f"recording: {recording.name!r} of {np.ptp(time):g} s is not allowed; {found}, and at least "
             f"{MINIMUM_CYCLES} cycles are needed. Record longer, or "
-            + ("give" if frequency is None else f"check frequency = {frequency!r} Hz and periods = {periods},")
-            + " the forcing frequency."
+            f"{'give the forcing frequency' if frequency is None else given}."
         )
     return fundamental
 

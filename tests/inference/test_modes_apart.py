@@ -53,6 +53,10 @@ def test_one_walker_that_stays_apart_is_no_convergence():
     tau = np.ones(2)
     assert shortfall(kept, tau, tau, ("a", "b")) == []
     kept[2, :, 5, 1] += 1.0
-    still = shortfall(kept, np.array([1.0, np.inf]), tau, ("a", "b"))
-    assert still == ["'b' not moving, as every proposal is refused"]
     assert [text[:22] for text in shortfall(kept, tau, tau, ("a", "b"))] == ["walkers that stay apar"]
+
+
+def test_a_coordinate_that_does_not_move_is_named():
+    kept = np.zeros((4, 2000, 32, 2))
+    still = shortfall(kept, np.array([1.0, np.inf]), np.ones(2), ("a", "b"))
+    assert still == ["'b' not moving, as every proposal is refused"]

@@ -250,9 +250,11 @@ def remarks(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             f"The estimate of {name!r}, {fit.theta[name]:.6g}, lies at the end of its prior's support ({low:g}, "
             f"{high:g}); standard deviations do not describe the posterior there. Sample it, or widen the prior."
         )
-    if silent := [name for name in problem.names if f"{name}: {SILENT}" in fit.undetermined]:
-        yield f"The data do not depend on {', '.join(map(repr, silent))}; what is said of it is the prior's. Fix it."
-    directions = [text for text in fit.undetermined if not text.endswith(SILENT)]
+    silent = [text for text in fit.undetermined if text.endswith(SILENT)]
+    if silent:
+        named = ", ".join(repr(text.removesuffix(f": {SILENT}")) for text in silent)
+        yield f"The data do not depend on {named}; what is said of each is the prior's. Fix it."
+    directions = [text for text in fit.undetermined if text not in silent]
     if directions:
         more = len(directions) - SHOWN
         shown = "; or under ".join(directions[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
