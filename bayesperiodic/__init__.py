@@ -11,19 +11,38 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from bayesperiodic import models, plot
+    from bayesperiodic._io import load
     from bayesperiodic.data.experiment import Experiment
     from bayesperiodic.data.recording import Recording
-    from bayesperiodic.diagnosis.calibration import Calibration, calibrate
-    from bayesperiodic.diagnosis.comparison import Comparison, compare
-    from bayesperiodic.diagnosis.identifiability import Identifiability, identifiability
-    from bayesperiodic.diagnosis.predictive import Prediction, predict
-    from bayesperiodic.diagnosis.prior_predictive import PriorPredictive, prior_predictive
-    from bayesperiodic.inference.estimation.estimate import MapEstimate
-    from bayesperiodic.inference.estimation.map_estimate import map_estimate
-    from bayesperiodic.inference.estimation.profile import Profile, profile
-    from bayesperiodic.inference.noise import models as noise
-    from bayesperiodic.inference.priors.multivariate import MultivariateNormal
-    from bayesperiodic.inference.priors.univariate import (
+    from bayesperiodic.diagnostics.calibration import Calibration, calibrate
+    from bayesperiodic.diagnostics.comparison import Comparison, compare
+    from bayesperiodic.diagnostics.identifiability import Identifiability, identifiability
+    from bayesperiodic.diagnostics.predictive import Prediction, predict
+    from bayesperiodic.diagnostics.prior_predictive import PriorPredictive, prior_predictive
+    from bayesperiodic.estimation.map_estimate import map_estimate
+    from bayesperiodic.estimation.profile import Profile, profile
+    from bayesperiodic.estimation.result import MapEstimate
+    from bayesperiodic.models.model import Model, smooth_abs, smooth_sign
+    from bayesperiodic.orbits.find import find_orbits
+    from bayesperiodic.orbits.orbit import Orbit, Orbits
+    from bayesperiodic.orbits.polish import polish_orbits
+    from bayesperiodic.orbits.section import PoincareSection
+    from bayesperiodic.orbits.select import select_orbits
+    from bayesperiodic.periodic.continuation import (
+        Branch,
+        continue_periodic,
+        double_period,
+        iterate_periodic,
+        solutions_at,
+    )
+    from bayesperiodic.periodic.hopf import HopfPoint, emerging_cycle, hopf_points
+    from bayesperiodic.periodic.schemes import Scheme
+    from bayesperiodic.periodic.solution import PeriodicSolution
+    from bayesperiodic.periodic.solve import solve_periodic
+    from bayesperiodic.periodic.stability import multiplier_sensitivities
+    from bayesperiodic.posterior import noise as noise
+    from bayesperiodic.posterior.joint_priors import MultivariateNormal
+    from bayesperiodic.posterior.priors import (
         HalfNormal,
         InverseGamma,
         LogNormal,
@@ -33,42 +52,45 @@ if TYPE_CHECKING:
         TruncatedNormal,
         Uniform,
     )
-    from bayesperiodic.inference.problem import Problem
-    from bayesperiodic.inference.sampling.posterior import Posterior
-    from bayesperiodic.inference.sampling.sampling import sample
-    from bayesperiodic.models.model import Model
-    from bayesperiodic.models.smooth import smooth_abs, smooth_sign
-    from bayesperiodic.models.structure.result import Structure
-    from bayesperiodic.models.structure.structure import structure
-    from bayesperiodic.orbits.find import find_orbits
-    from bayesperiodic.orbits.orbit import Orbit, Orbits
-    from bayesperiodic.orbits.polish import polish_orbits
-    from bayesperiodic.orbits.section import PoincareSection
-    from bayesperiodic.orbits.selection import select_orbits
-    from bayesperiodic.periodic.continuation import Branch, continue_periodic, double_period, iterate_periodic
-    from bayesperiodic.periodic.hopf import HopfPoint, emerging_cycle, hopf_points
-    from bayesperiodic.periodic.passages import solutions_at
-    from bayesperiodic.periodic.schemes import Scheme
-    from bayesperiodic.periodic.solution import PeriodicSolution
-    from bayesperiodic.periodic.solve import solve_periodic
-    from bayesperiodic.periodic.stability import multiplier_sensitivities
-    from bayesperiodic.reporting.report import report
+    from bayesperiodic.posterior.problem import Problem
+    from bayesperiodic.reporting.build import report
+    from bayesperiodic.sampling.posterior import Posterior
+    from bayesperiodic.sampling.sample import sample
     from bayesperiodic.simulation import simulate
-    from bayesperiodic.store import load
+    from bayesperiodic.symmetry.structure import Structure, structure
 
 _HOMES = {
+    "bayesperiodic._io": ["load"],
     "bayesperiodic.data.experiment": ["Experiment"],
     "bayesperiodic.data.recording": ["Recording"],
-    "bayesperiodic.diagnosis.calibration": ["Calibration", "calibrate"],
-    "bayesperiodic.diagnosis.comparison": ["Comparison", "compare"],
-    "bayesperiodic.diagnosis.identifiability": ["Identifiability", "identifiability"],
-    "bayesperiodic.diagnosis.predictive": ["Prediction", "predict"],
-    "bayesperiodic.diagnosis.prior_predictive": ["PriorPredictive", "prior_predictive"],
-    "bayesperiodic.inference.estimation.estimate": ["MapEstimate"],
-    "bayesperiodic.inference.estimation.map_estimate": ["map_estimate"],
-    "bayesperiodic.inference.estimation.profile": ["Profile", "profile"],
-    "bayesperiodic.inference.priors.multivariate": ["MultivariateNormal"],
-    "bayesperiodic.inference.priors.univariate": [
+    "bayesperiodic.diagnostics.calibration": ["Calibration", "calibrate"],
+    "bayesperiodic.diagnostics.comparison": ["Comparison", "compare"],
+    "bayesperiodic.diagnostics.identifiability": ["Identifiability", "identifiability"],
+    "bayesperiodic.diagnostics.predictive": ["Prediction", "predict"],
+    "bayesperiodic.diagnostics.prior_predictive": ["PriorPredictive", "prior_predictive"],
+    "bayesperiodic.estimation.map_estimate": ["map_estimate"],
+    "bayesperiodic.estimation.profile": ["Profile", "profile"],
+    "bayesperiodic.estimation.result": ["MapEstimate"],
+    "bayesperiodic.models.model": ["Model", "smooth_abs", "smooth_sign"],
+    "bayesperiodic.orbits.find": ["find_orbits"],
+    "bayesperiodic.orbits.orbit": ["Orbit", "Orbits"],
+    "bayesperiodic.orbits.polish": ["polish_orbits"],
+    "bayesperiodic.orbits.section": ["PoincareSection"],
+    "bayesperiodic.orbits.select": ["select_orbits"],
+    "bayesperiodic.periodic.continuation": [
+        "Branch",
+        "continue_periodic",
+        "double_period",
+        "iterate_periodic",
+        "solutions_at",
+    ],
+    "bayesperiodic.periodic.hopf": ["HopfPoint", "emerging_cycle", "hopf_points"],
+    "bayesperiodic.periodic.schemes": ["Scheme"],
+    "bayesperiodic.periodic.solution": ["PeriodicSolution"],
+    "bayesperiodic.periodic.solve": ["solve_periodic"],
+    "bayesperiodic.periodic.stability": ["multiplier_sensitivities"],
+    "bayesperiodic.posterior.joint_priors": ["MultivariateNormal"],
+    "bayesperiodic.posterior.priors": [
         "HalfNormal",
         "InverseGamma",
         "LogNormal",
@@ -78,32 +100,16 @@ _HOMES = {
         "TruncatedNormal",
         "Uniform",
     ],
-    "bayesperiodic.inference.problem": ["Problem"],
-    "bayesperiodic.inference.sampling.posterior": ["Posterior"],
-    "bayesperiodic.inference.sampling.sampling": ["sample"],
-    "bayesperiodic.models.model": ["Model"],
-    "bayesperiodic.models.smooth": ["smooth_abs", "smooth_sign"],
-    "bayesperiodic.models.structure.result": ["Structure"],
-    "bayesperiodic.models.structure.structure": ["structure"],
-    "bayesperiodic.orbits.find": ["find_orbits"],
-    "bayesperiodic.orbits.orbit": ["Orbit", "Orbits"],
-    "bayesperiodic.orbits.polish": ["polish_orbits"],
-    "bayesperiodic.orbits.section": ["PoincareSection"],
-    "bayesperiodic.orbits.selection": ["select_orbits"],
-    "bayesperiodic.periodic.continuation": ["Branch", "continue_periodic", "double_period", "iterate_periodic"],
-    "bayesperiodic.periodic.hopf": ["HopfPoint", "emerging_cycle", "hopf_points"],
-    "bayesperiodic.periodic.passages": ["solutions_at"],
-    "bayesperiodic.periodic.schemes": ["Scheme"],
-    "bayesperiodic.periodic.solution": ["PeriodicSolution"],
-    "bayesperiodic.periodic.solve": ["solve_periodic"],
-    "bayesperiodic.periodic.stability": ["multiplier_sensitivities"],
-    "bayesperiodic.reporting.report": ["report"],
+    "bayesperiodic.posterior.problem": ["Problem"],
+    "bayesperiodic.reporting.build": ["report"],
+    "bayesperiodic.sampling.posterior": ["Posterior"],
+    "bayesperiodic.sampling.sample": ["sample"],
     "bayesperiodic.simulation": ["simulate"],
-    "bayesperiodic.store": ["load"],
+    "bayesperiodic.symmetry.structure": ["Structure", "structure"],
 }
 _MODULES = {
     "models": "bayesperiodic.models",
-    "noise": "bayesperiodic.inference.noise.models",
+    "noise": "bayesperiodic.posterior.noise",
     "plot": "bayesperiodic.plot",
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from bayesperiodic import checks, fourier
+from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.models.integrate import integrate_accurately
 from bayesperiodic.models.model import Model
@@ -80,13 +80,13 @@ def simulate(
     >>> round(float(run.outputs["displacement"][-1]), 3)
     1.0
     """
-    frequency = checks.positive("frequency", frequency)
-    samples = int(checks.positive("duration", duration) * checks.positive("sampling_rate", sampling_rate)) + 1
+    frequency = _checks.positive("frequency", frequency)
+    samples = int(_checks.positive("duration", duration) * _checks.positive("sampling_rate", sampling_rate)) + 1
     time = np.arange(samples) / sampling_rate
     system = FirstOrder.of(model, parameters, inputs or {}, frequency)
     signals = system.signals
     for name in noise or {}:
-        checks.one_of("noise", name, (*model.outputs, *model.inputs))
+        _checks.one_of("noise", name, (*model.outputs, *model.inputs))
     integrate = integrate_periodic if all(isinstance(s, _Periodic) for s in signals) else _integrate
     path = integrate(system, system.start(start or {}), time)
     outputs = system.outputs(time, path)
@@ -95,7 +95,7 @@ def simulate(
     measured_inputs = {name: signals[i](time)[0] for i, name in enumerate(model.inputs)}
     for name, sd in (noise or {}).items():
         target = channels if name in channels else measured_inputs
-        target[name] = target[name] + checks.finite_number(f"noise[{name!r}]", sd) * generator.standard_normal(samples)
+        target[name] = target[name] + _checks.finite_number(f"noise[{name!r}]", sd) * generator.standard_normal(samples)
     return Recording(time, channels, measured_inputs, name=f"synthetic {model.name}", synthetic=True)
 
 
@@ -113,9 +113,9 @@ class FirstOrder:
         cls, model: Model, parameters: Mapping[str, float], inputs: Mapping[str, Signal], frequency: float
     ) -> "FirstOrder":
         """Return the system at checked values of all parameters and under all inputs."""
-        checks.same_names("parameters", parameters, model.parameters)
-        theta = np.array([checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
-        checks.same_names("inputs", inputs, model.inputs)
+        _checks.same_names("parameters", parameters, model.parameters)
+        theta = np.array([_checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
+        _checks.same_names("inputs", inputs, model.inputs)
         signals = [_with_derivatives(name, inputs[name], frequency) for name in model.inputs]
         return cls(model, theta, frequency, signals)
 
@@ -123,8 +123,8 @@ class FirstOrder:
         """Return y from the states and rates that are given, the others zero."""
         names = [*self.model.states, *("d" + self.model.states[i] for i in self.second)]
         for name in given:
-            checks.one_of("start", name, names)
-        return np.array([checks.finite_number(f"start[{n!r}]", given.get(n, 0.0)) for n in names])
+            _checks.one_of("start", name, names)
+        return np.array([_checks.finite_number(f"start[{n!r}]", given.get(n, 0.0)) for n in names])
 
     def amplitudes(self) -> np.ndarray:
         """Return (harmonics, 3·inputs): those of u, u̇, ü, without the harmonics that no periodic input has."""
@@ -219,9 +219,9 @@ class _Periodic:
     """A Fourier series and its first two derivatives as a function of time [s]."""
 
     def __init__(self, argument: str, signal: np.ndarray, frequency: float):
-        values = fourier.coefficients(checks.finite_vector(argument, signal))
+        values = _fourier.coefficients(_checks.finite_vector(argument, signal))
         self.frequency = frequency
-        self.amplitudes = np.stack([fourier.derivative(values, frequency, order) for order in range(3)])
+        self.amplitudes = np.stack([_fourier.derivative(values, frequency, order) for order in range(3)])
 
     def __call__(self, time: np.ndarray) -> list[np.ndarray]:
         size = np.abs(self.amplitudes[0])
@@ -243,3 +243,85 @@ def _with_derivatives(name: str, signal: Signal, frequency: float) -> Callable[[
         return derivatives
 
     return sampled
+
+
+TRANSIENT, ROUNDS, NEWTON = 5, 12, 12
+SETTLED, STEP = 1e-9, 1e-5
+
+
+class NotSettled(RuntimeError):
+    """The motion has no stable steady cycle near where it was started, or did not come to it."""
+
+
+def steady_cycle(
+    model: Model,
+    parameters: Mapping[str, float],
+    inputs: Mapping[str, np.ndarray],
+    *,
+    frequency: float,
+    samples: int,
+    start: Mapping[str, float] | None = None,
+) -> dict[str, np.ndarray]:
+    """Return one cycle of every output after the transient has died out, without noise.
+
+    Five cycles are integrated from the start; then Newton's method looks for the state that a cycle leads back to,
+    which takes slow transients such as those of heat to their end at once. What it finds counts only if it is stable,
+    because a recording shows nothing else; otherwise ten times five more cycles are integrated before it is given up.
+
+    Parameters
+    ----------
+    model : Model
+    parameters : mapping of str to float
+        A value for every parameter.
+    inputs : mapping of str to array (points,)
+        One forcing period each, end point excluded.
+    frequency : float
+        Forcing frequency [Hz].
+    samples : int
+        Of the cycle, end point excluded.
+    start : mapping of str to float, optional
+        As for `simulate`.
+
+    Returns
+    -------
+    dict of str to array (samples,)
+
+    Raises
+    ------
+    NotSettled
+        If there is no stable steady cycle, or the integration fails.
+    """
+    system = FirstOrder.of(model, parameters, inputs, frequency)
+    try:
+        y = system.start(start or {})
+        for _ in range(ROUNDS):
+            y = _after(system, y, TRANSIENT)
+            found = _returning(system, y)
+            if found is not None:
+                time = np.arange(samples) / (samples * frequency)
+                values = system.outputs(time, integrate_periodic(system, found, time))
+                return {name: values[:, i] for i, name in enumerate(model.outputs)}
+    except (RuntimeError, np.linalg.LinAlgError) as error:
+        raise NotSettled(f"{model.name!r}: {error}") from error
+    raise NotSettled(f"{model.name!r} does not settle on a cycle in {ROUNDS * TRANSIENT} periods.")
+
+
+def _after(system: FirstOrder, y: np.ndarray, periods: int) -> np.ndarray:
+    return integrate_periodic(system, y, np.array([0.0, periods / system.frequency]))[-1]
+
+
+def _returning(system: FirstOrder, y: np.ndarray) -> np.ndarray | None:
+    """Return the state near y that a cycle leads back to; None if there is none, or it is not stable."""
+    identity = np.eye(y.size)
+    for _ in range(NEWTON):
+        scale = np.maximum(np.abs(y), np.abs(y).max() * STEP) + np.finfo(float).tiny
+        end = _after(system, y, 1)
+        moved = [_after(system, y + STEP * scale[i] * identity[i], 1) for i in range(y.size)]
+        monodromy = np.stack([(m - end) / (STEP * s) for m, s in zip(moved, scale, strict=True)], axis=1)
+        step = np.linalg.solve(identity - monodromy, end - y)
+        if not np.isfinite(step).all():
+            return None
+        y = y + step
+        if np.all(np.abs(step) <= SETTLED * scale):
+            return y if np.abs(np.linalg.eigvals(monodromy)).max() < 1.0 else None
+    return None

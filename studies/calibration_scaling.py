@@ -18,7 +18,7 @@ import cloudpickle
 import numpy as np
 
 import bayesperiodic as bp
-from bayesperiodic.parallel import team
+from bayesperiodic._parallel import team
 from studies.calibration_cases import duffing
 
 ROUNDS, EACH, LOOP = 7, 6, 20_000_000

@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 
 import cloudpickle
 
-from bayesperiodic import resumed as kept
-from bayesperiodic.parallel import team
+from bayesperiodic import _parallel as kept
+from bayesperiodic._parallel import team
 
 Task = tuple[Any, ...]
 Line = dict[str, Any]

@@ -19,7 +19,7 @@ import numba
 import numpy as np
 
 import bayesperiodic as bp
-from bayesperiodic.parallel import available_cores
+from bayesperiodic._parallel import available_cores
 from studies.sampling_rows import Row, row, unjudged
 from studies.solver_cost import GEAR, RIG
 

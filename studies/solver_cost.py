@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 import bayesperiodic as bp
-from bayesperiodic.parallel import available_cores
+from bayesperiodic._parallel import available_cores
 from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
 

@@ -6,7 +6,7 @@ their classes without a leading underscore. The rules, in the sections of numpyd
 - Parameters (of a result: Attributes) names exactly the arguments (the fields), arrays with their shapes.
 - Returns or Yields is there where something is returned. A property says it in its summary, with an array's shape.
 - Raises names every exception that the body raises, or that a private helper of the same module or class raises which
-  it calls; a call of `bayesperiodic.checks` raises a ValueError. Warns is there where these warn.
+  it calls; a call of `bayesperiodic._checks` raises a ValueError. Warns is there where these warn.
 - Examples is there for every function and class, calls the function, and skips nothing; pytest runs it.
 
 A method that overrides a documented one needs no more than a summary; one without arguments needs no Returns if its

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.steady import NotSettled, steady_cycle
+from bayesperiodic.simulation import NotSettled, steady_cycle
 from tests.known import GEAR, RUNAWAY, grid
 
 WAVE = np.cos(2 * np.pi * grid(16))

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesperiodic import checks, fourier
-from bayesperiodic.store import Result
+from bayesperiodic import _checks, _fourier
+from bayesperiodic._io import Result
 
 MEANING = "samples·periods"
 
@@ -112,20 +112,20 @@ class Experiment(Result):
     def __post_init__(self) -> None:
         if not self.name or any(c in self.name for c in "/[]"):
             raise ValueError(f"name: {self.name!r} is not allowed; any other text without '/', '[' and ']' is.")
-        object.__setattr__(self, "frequency", checks.positive("frequency", self.frequency))
-        points = checks.integer("samples", self.samples, 4) * checks.integer("periods", self.periods, 1)
+        object.__setattr__(self, "frequency", _checks.positive("frequency", self.frequency))
+        points = _checks.integer("samples", self.samples, 4) * _checks.integer("periods", self.periods, 1)
         if self.mask is not None:
             object.__setattr__(self, "mask", _checked_mask(self.mask, points))
         for kind in ("outputs", "inputs"):
-            checks.mapping(kind, getattr(self, kind), "{'force': values}")
+            _checks.mapping(kind, getattr(self, kind), "{'force': values}")
             channels = {
-                key: checks.finite_vector(f"{kind}[{key!r}]", self._measured(kind, values), points, MEANING)
+                key: _checks.finite_vector(f"{kind}[{key!r}]", self._measured(kind, values), points, MEANING)
                 for key, values in getattr(self, kind).items()
             }
-            checks.identifiers(kind, channels)
+            _checks.identifiers(kind, channels)
             object.__setattr__(self, kind, channels)
         guess = {
-            key: checks.finite_vector(f"guess[{key!r}]", values, points, MEANING)
+            key: _checks.finite_vector(f"guess[{key!r}]", values, points, MEANING)
             for key, values in (self.guess or {}).items()
         }
         object.__setattr__(self, "guess", guess)
@@ -133,10 +133,10 @@ class Experiment(Result):
             given = dict(getattr(self, argument) or {})
             object.__setattr__(self, argument, given)
             for key in given:
-                checks.one_of(argument, key, (*self.inputs, *self.outputs))
+                _checks.one_of(argument, key, (*self.inputs, *self.outputs))
         measured = points if self.mask is None else int(self.mask.sum())
         counts = {key: min(measured, 2 * self.harmonics.get(key, points) + 1) for key in self.outputs}
-        checks.same_names("independent", counts | dict(self.independent), self.outputs)
+        _checks.same_names("independent", counts | dict(self.independent), self.outputs)
         object.__setattr__(self, "independent", counts | dict(self.independent))
         self._check_multipliers()
         self._check_covariance(measured * len(self.outputs))
@@ -153,7 +153,7 @@ class Experiment(Result):
             if self.multiplier_sd is not None:
                 raise ValueError("multiplier_sd: it is not allowed without `multipliers`.")
             return
-        values = checks.finite_vector("multipliers", self.multipliers)
+        values = _checks.finite_vector("multipliers", self.multipliers)
         if not values.size or np.any(values == 0.0) or np.any(np.diff(np.abs(values)) > 0.0):
             raise ValueError(
                 f"multipliers: {values.tolist()} is not allowed; they must be real, not zero, and ordered by modulus, "
@@ -161,7 +161,7 @@ class Experiment(Result):
             )
         object.__setattr__(self, "multipliers", values)
         if self.multiplier_sd is not None:
-            sd = checks.finite_vector("multiplier_sd", self.multiplier_sd, values.size)
+            sd = _checks.finite_vector("multiplier_sd", self.multiplier_sd, values.size)
             if np.any(sd <= 0.0):
                 raise ValueError(f"multiplier_sd: {sd.tolist()} is not allowed; they must be > 0.")
             object.__setattr__(self, "multiplier_sd", sd)
@@ -237,13 +237,13 @@ class Experiment(Result):
         >>> run.independent, run.inputs["force"].round(3)[:3].tolist()
         ({'x': 3}, [5.0, 3.536, 0.0])
         """
-        samples = checks.integer("samples", samples, 4)
+        samples = _checks.integer("samples", samples, 4)
         signals: dict[str, dict[str, np.ndarray]] = {"outputs": {}, "inputs": {}}
         highest: dict[str, int] = {}
         for kind, channels in (("outputs", outputs), ("inputs", inputs or {})):
             for channel, values in channels.items():
                 amplitudes = _amplitudes(f"{kind}[{channel!r}]", values, samples)
-                signals[kind][channel] = fourier.on_grid(amplitudes, samples)
+                signals[kind][channel] = _fourier.on_grid(amplitudes, samples)
                 highest[channel] = amplitudes.size - 1
         return cls(
             name,
@@ -280,7 +280,7 @@ class Experiment(Result):
         """
         if channel not in self.harmonics:
             return values
-        return fourier.project(values, self.harmonics[channel])
+        return _fourier.project(values, self.harmonics[channel])
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
@@ -313,7 +313,7 @@ def _amplitudes(argument: str, values: ArrayLike, samples: int) -> np.ndarray:
         )
     if amplitudes[0].imag != 0.0:
         raise ValueError(f"{argument}: {amplitudes[0]} is not allowed as harmonic 0; the mean must be real.")
-    if amplitudes.size - 1 > fourier.highest_harmonic(samples):
+    if amplitudes.size - 1 > _fourier.highest_harmonic(samples):
         raise ValueError(
             f"samples: {samples} is not allowed; harmonic {amplitudes.size - 1} of {argument} needs at least "
             f"{2 * amplitudes.size - 1}."

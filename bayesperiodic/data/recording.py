@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesperiodic import checks
+from bayesperiodic import _checks
+from bayesperiodic._io import Result
 from bayesperiodic.data import reading
-from bayesperiodic.data.units import convert
-from bayesperiodic.store import Result
+from bayesperiodic.data.reading import convert
 
 if TYPE_CHECKING:
     from bayesperiodic.data.experiment import Experiment
+
 
 Units = Mapping[str, float | Sequence[str]]
 
@@ -56,7 +57,7 @@ class Recording(Result):
     synthetic: bool = False
 
     def __post_init__(self) -> None:
-        checks.finite_vector("time", self.time)
+        _checks.finite_vector("time", self.time)
         if self.time.size < 2:
             raise ValueError(f"time: {self.time.size} samples are not allowed; a recording needs at least 2.")
         step = np.diff(self.time)
@@ -68,10 +69,10 @@ class Recording(Result):
             )
         if not self.outputs:
             raise ValueError("outputs: {} is not allowed; a recording needs at least one measured output.")
-        checks.identifiers("outputs and inputs", (*self.outputs, *self.inputs))
+        _checks.identifiers("outputs and inputs", (*self.outputs, *self.inputs))
         for kind, channels in (("outputs", self.outputs), ("inputs", self.inputs)):
             for name, values in channels.items():
-                checks.finite_vector(f"{kind}[{name!r}]", values, self.time.size, "one a time")
+                _checks.finite_vector(f"{kind}[{name!r}]", values, self.time.size, "one a time")
 
     @property
     def sampling_rate(self) -> float:
@@ -109,14 +110,14 @@ class Recording(Result):
         >>> bp.Recording.from_arrays(t, {"angle": np.sin(2 * np.pi * 1.3 * t)}).sampling_rate
         100.0
         """
-        time = checks.finite_vector("time", time)
+        time = _checks.finite_vector("time", time)
         inputs = {} if inputs is None else inputs
         for argument, given in (("outputs", outputs), ("inputs", inputs)):
-            checks.mapping(argument, given, "{'force': values}")
+            _checks.mapping(argument, given, "{'force': values}")
         return cls(
             time,
-            {key: checks.finite_vector(f"outputs[{key!r}]", values) for key, values in outputs.items()},
-            {key: checks.finite_vector(f"inputs[{key!r}]", values) for key, values in inputs.items()},
+            {key: _checks.finite_vector(f"outputs[{key!r}]", values) for key, values in outputs.items()},
+            {key: _checks.finite_vector(f"inputs[{key!r}]", values) for key, values in inputs.items()},
             name or "recording",
         )
 
@@ -266,16 +267,16 @@ class Recording(Result):
     ) -> "Recording":
         inputs, units = {} if inputs is None else inputs, units or {}
         for argument, given in (("outputs", outputs), ("inputs", inputs)):
-            checks.mapping(argument, given, "{'force': 'the column of the force'}")
+            _checks.mapping(argument, given, "{'force': 'the column of the force'}")
         if (time is None) == (sampling_rate is None):
             raise ValueError(f"time: {time!r} with sampling_rate {sampling_rate!r} is not allowed; give exactly one.")
         for key in units:
-            checks.one_of("units", key, ("time", *outputs, *inputs))
+            _checks.one_of("units", key, ("time", *outputs, *inputs))
         wanted = dict.fromkeys([*([time] if time else []), *outputs.values(), *inputs.values()])
         columns = read(path, wanted)
 
         def channel(key: str, column: str) -> np.ndarray:
-            values = checks.finite_vector(f"{key} (column {column!r} of {Path(path).name})", columns[column])
+            values = _checks.finite_vector(f"{key} (column {column!r} of {Path(path).name})", columns[column])
             return convert(key, values, units[key]) if key in units else values
 
         signals = {key: channel(key, column) for key, column in (*outputs.items(), *inputs.items())}
@@ -283,7 +284,7 @@ class Recording(Result):
             seconds = channel("time", time)
         else:
             samples = next(iter(signals.values())).size if signals else 0
-            seconds = np.arange(samples) / checks.positive("sampling_rate", sampling_rate)
+            seconds = np.arange(samples) / _checks.positive("sampling_rate", sampling_rate)
         return cls(
             seconds,
             {key: signals[key] for key in outputs},

@@ -1,6 +1,5 @@
 """What we believe: symbolic models, compiled to kernels; the ready-made ones are attributes here."""
 
-from bayesperiodic.models.flutter import flutter
-from bayesperiodic.models.library import chain, dahl, duffing, landing_gear, pendulum, silverbox, van_der_pol
+from bayesperiodic.models.library import chain, dahl, duffing, flutter, landing_gear, pendulum, silverbox, van_der_pol
 
 __all__ = ["chain", "dahl", "duffing", "flutter", "landing_gear", "pendulum", "silverbox", "van_der_pol"]

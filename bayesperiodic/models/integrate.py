@@ -14,7 +14,7 @@ TRIALS = 100_000
 
 @cache
 def _kernels() -> dict[str, Any]:
-    source = Path(__file__).with_name("integrate_kernels.py").read_text(encoding="utf-8")
+    source = Path(__file__).with_name("_kernels").joinpath("integrate.py").read_text(encoding="utf-8")
     return load(source, ("runge_kutta", "dormand_prince"))
 
 

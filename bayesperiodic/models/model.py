@@ -6,8 +6,8 @@ from typing import Any
 
 import sympy as sp
 
-from bayesperiodic import checks
-from bayesperiodic.models.compile import (
+from bayesperiodic import _checks
+from bayesperiodic.models.code_generation import (
     GridFunction,
     Kernels,
     PullingKernels,
@@ -30,7 +30,7 @@ class Names:
         if name.startswith("_"):
             raise AttributeError(name)
         try:
-            checks.one_of(self._what, name, self._symbols)
+            _checks.one_of(self._what, name, self._symbols)
         except ValueError as error:
             raise AttributeError(str(error)) from None
         return self._symbols[name]
@@ -102,13 +102,13 @@ class Model:
     ):
         if description:
             self.__doc__ = description
-        (self.name,) = checks.identifiers("name", [name])
-        self.states = checks.identifiers("states", states, RESERVED)
-        self.inputs = checks.identifiers("inputs", inputs, (*RESERVED, *self.states))
-        self.parameters = checks.identifiers("parameters", parameters, RESERVED)
+        (self.name,) = _checks.identifiers("name", [name])
+        self.states = _checks.identifiers("states", states, RESERVED)
+        self.inputs = _checks.identifiers("inputs", inputs, (*RESERVED, *self.states))
+        self.parameters = _checks.identifiers("parameters", parameters, RESERVED)
         for argument, names in (("states", self.states), ("inputs", self.inputs)):
             _refuse_derivatives(argument, names)
-            checks.identifiers(argument, [d + n for d in ("", "d", "dd") for n in names], RESERVED)
+            _checks.identifiers(argument, [d + n for d in ("", "d", "dd") for n in names], RESERVED)
         if not self.states:
             raise ValueError("states: () is not allowed; a model needs at least one state.")
 
@@ -131,18 +131,18 @@ class Model:
                 f"the states {list(self.states)}. An equation may hold s.dd{self.states[0]}: of second order, it needs "
                 "no state for the rate."
             )
-        given = dict(checks.mapping("outputs", outputs(*spaces), "{'displacement': s.x}"))
-        self.outputs = checks.identifiers("outputs", given, (*RESERVED, *self.inputs))
+        given = dict(_checks.mapping("outputs", outputs(*spaces), "{'displacement': s.x}"))
+        self.outputs = _checks.identifiers("outputs", given, (*RESERVED, *self.inputs))
         self.output_expressions = tuple(self._expression("outputs", given[n]) for n in self.outputs)
         if not self.outputs:
             raise ValueError("outputs: {} is not allowed; a model needs at least one output.")
 
         self.angles = tuple(angles)
         for angle in self.angles:
-            checks.one_of("angles", angle, (*self.states, *self.outputs))
+            _checks.one_of("angles", angle, (*self.states, *self.outputs))
         self.units = dict(parameters) if isinstance(parameters, Mapping) else {}
         for channel, unit in (units or {}).items():
-            checks.one_of("units", channel, (*self.states, *self.inputs, *self.outputs))
+            _checks.one_of("units", channel, (*self.states, *self.inputs, *self.outputs))
             self.units[channel] = unit
         self.orders = {state: self._order(state) for state in self.states}
 
@@ -273,3 +273,72 @@ def _refuse_derivatives(argument: str, names: tuple[str, ...]) -> None:
 
 def _with_derivatives(prefix: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]:
     return {d + n: sp.Symbol(f"{prefix}_{d}_{n}", real=True) for d in ("", "d", "dd") for n in names}
+
+
+def smooth_sign(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
+    """Return tanh(x / width), a smooth sign.
+
+    Parameters
+    ----------
+    x : sympy expression
+    width : number > 0 or sympy expression, in the units of `x`
+        At ``|x|`` = width the value is 0.76, at 3 width 0.995. A transition crossed in only a few grid steps is
+        not resolved by any difference scheme.
+
+    Returns
+    -------
+    sympy expression
+        Without a unit.
+
+    Raises
+    ------
+    ValueError
+        If a numeric width is not positive and finite.
+
+    Examples
+    --------
+    Coulomb friction of 20 N whose sign changes over within about ±1 mm/s:
+
+    >>> import sympy as sp, bayesperiodic as bp
+    >>> v = sp.Symbol("v")
+    >>> friction = 20 * bp.smooth_sign(v, 1e-3)
+    >>> [round(float(friction.subs(v, speed)), 2) for speed in (-1e-3, 0, 1e-3, 1e-2)]
+    [-15.23, 0.0, 15.23, 20.0]
+    """
+    return sp.tanh(x / _width(width))
+
+
+def smooth_abs(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
+    """Return sqrt(x² + width²) − width, a smooth absolute value that is zero at zero.
+
+    Parameters
+    ----------
+    x : sympy expression
+    width : number > 0 or sympy expression, in the units of `x`
+        Far from zero the value is ``|x|`` − width; the curvature at zero is 1 / width.
+
+    Returns
+    -------
+    sympy expression
+        In the unit of `x`.
+
+    Raises
+    ------
+    ValueError
+        If a numeric width is not positive and finite.
+
+    Examples
+    --------
+    >>> import sympy as sp, bayesperiodic as bp
+    >>> v = sp.Symbol("v")
+    >>> [round(float(bp.smooth_abs(v, 0.1).subs(v, speed)), 3) for speed in (0, 0.1, 1, -10)]
+    [0.0, 0.041, 0.905, 9.9]
+    """
+    w = _width(width)
+    return sp.sqrt(x**2 + w**2) - w
+
+
+def _width(width: float | sp.Expr) -> sp.Expr:
+    if isinstance(width, sp.Expr) and not width.is_number:
+        return width
+    return sp.Float(_checks.positive("width", width))

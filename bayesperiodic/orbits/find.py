@@ -6,19 +6,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from bayesperiodic import checks
-from bayesperiodic.blas import in_one_thread
-from bayesperiodic.orbits.angles import wrapped
-from bayesperiodic.orbits.atlas import Atlas
-from bayesperiodic.orbits.boxes import box_orbits
-from bayesperiodic.orbits.chained import Estimate, refine
-from bayesperiodic.orbits.cycles import has_shorter_period, shift_between
-from bayesperiodic.orbits.determinism import check_chaos
-from bayesperiodic.orbits.local import REACH, LocalMaps
+from bayesperiodic import _checks
+from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.orbits.cycles import (
+    Candidate,
+    Estimate,
+    box_orbits,
+    candidates,
+    has_shorter_period,
+    refine,
+    shift_between,
+)
+from bayesperiodic.orbits.local import REACH, Atlas, LocalMaps, check_chaos, noise_of
 from bayesperiodic.orbits.orbit import Orbit, Orbits
-from bayesperiodic.orbits.scatter import noise_of
-from bayesperiodic.orbits.search import Candidate, candidates
-from bayesperiodic.orbits.section import PoincareSection
+from bayesperiodic.orbits.section import PoincareSection, wrapped
 
 METHODS = ("chained", "boxes")
 QUALITY_DEGREE = 3
@@ -121,9 +122,9 @@ def find_orbits(
     [1, 2]
     """
     wanted = _periods(periods, len(section))
-    checks.one_of("method", method, METHODS)
-    neighbours = checks.integer("neighbours", neighbours, 16)
-    box = checks.positive("box", box)
+    _checks.one_of("method", method, METHODS)
+    neighbours = _checks.integer("neighbours", neighbours, 16)
+    box = _checks.positive("box", box)
     scaled = _scaled(section, neighbours)
     if method == "boxes":
         found = [pair for p in wanted for pair in box_orbits(scaled.maps, scaled.points, p, neighbours, box)]
@@ -137,7 +138,7 @@ def find_orbits(
 
 def _periods(periods: Iterable[int], count: int) -> list[int]:
     try:
-        wanted = sorted({checks.integer("periods", p, 1) for p in periods})
+        wanted = sorted({_checks.integer("periods", p, 1) for p in periods})
     except TypeError:
         raise ValueError(f"periods: {periods!r} is not allowed; it is a collection such as range(1, 6).") from None
     if not wanted or wanted[-1] > count // 20:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 # Powers of the two coordinates, degree by degree, and the factorials that make the coefficients derivatives.
@@ -187,3 +188,148 @@ def _deconvoluted(
             rows.append(mean * rows[-1] + (order - 1) * variance * rows[-2])
         moments.append(np.stack(rows[: highest + 1], axis=-1))
     return (moments[0], moments[1]), weight
+
+
+CENTRES = 600
+ROUNDS = 8
+# A linear return map must extend over so many standard deviations of the noise.
+ROOM = 4.0
+
+
+def noise_of(maps: LocalMaps, neighbours: int) -> np.ndarray:
+    """Return the standard deviations (2,) of independent errors of the two coordinates, in the units of the maps.
+
+    In a neighbourhood where the return map is a quadratic polynomial, what is left of an image has the variance of its
+    own error and of the argument's, stretched by the map. The densest neighbourhoods are used, where curvature adds
+    least; they are widened until the noise is small in them.
+    """
+    centres = maps.arguments[:: max(1, len(maps.arguments) // CENTRES)]
+    noise, count = np.zeros(2), int(2.25 * neighbours)
+    for _ in range(3):
+        width = maps.nearest(centres, count)[0][:, -1]
+        dense = centres[width <= np.median(width)]
+        noise = _fitted(maps, dense, count)
+        if np.median(width) / REACH > ROOM * noise.max() or count * 2 > len(maps.arguments) // 8:
+            break
+        count *= 2
+    return noise
+
+
+def _fitted(maps: LocalMaps, centres: np.ndarray, count: int) -> np.ndarray:
+    fit = maps.fit(centres, count, 2, influence=False)
+    left = maps.rest(centres, fit)
+    rows = (np.eye(2) + fit.jacobian**2).reshape(-1, 2)
+    target = left.reshape(-1)
+    weight = 1.0 / np.maximum(target, 1e-30)
+    solution = np.zeros(2)
+    for _ in range(ROUNDS):
+        solution, _ = nnls(rows * weight[:, None], target * weight)
+        predicted = rows @ solution
+        # Far larger than expected is curvature, not noise.
+        weight = np.where(target < 4.0 * predicted, 1.0, 0.0) / np.maximum(predicted, 1e-30)
+    return np.sqrt(solution)
+
+
+LONGEST_PERIOD = 32
+# Of the distance of two points taken at random.
+SAME_POINT = 0.05
+UNPREDICTED = 0.2
+# Neighbours that part by less than this factor in so many steps do not part at all.
+PARTED = 2.5
+PARTING_STEPS = 6
+PROBES = 400
+NEIGHBOUR = 8
+
+
+def check_chaos(maps: LocalMaps, section: np.ndarray) -> None:
+    """Raise a ValueError for a section that holds no chaotic return map, and say what it seems to be.
+
+    Parameters
+    ----------
+    maps : LocalMaps
+    section : array (n, 2)
+        All points in the order of time, in units of the attractor's size.
+    """
+    generator = np.random.default_rng(0)
+    one, other = generator.integers(len(section), size=(2, 4 * PROBES))
+    apart = np.median(_distance(maps, section[one], section[other]))
+    for period in range(1, min(LONGEST_PERIOD, len(section) // 10) + 1):
+        if np.median(_distance(maps, section[period:], section[:-period])) < SAME_POINT * apart:
+            raise ValueError(
+                f"section: a motion of period {period} is not allowed; its points come back to themselves every "
+                f"{period} returns. Fold the recording with periods={period} instead."
+            )
+    centre = generator.choice(len(maps.arguments) - PARTING_STEPS, min(PROBES, len(section) // 4), replace=False)
+    neighbour = _neighbours(maps, centre)
+    now = np.median(_distance(maps, section[centre], section[neighbour]))
+    images = _distance(maps, section[centre + 1], section[neighbour + 1])
+    if np.median(images) > UNPREDICTED * apart:
+        raise ValueError(
+            f"section: images of neighbouring points {np.median(images) / apart:.0%} as far apart as any two points "
+            "are not allowed; no return map is to be seen. A wrong frequency, or noise as large as the motion, is "
+            "suspected."
+        )
+    later = np.median(_distance(maps, section[centre + PARTING_STEPS], section[neighbour + PARTING_STEPS]))
+    if later < PARTED * now:
+        raise ValueError(
+            "section: a quasi-periodic motion is not allowed; neighbouring points stay together, so that it is not "
+            "chaotic and shows no periodic orbits. Record it where it is chaotic."
+        )
+
+
+def _neighbours(maps: LocalMaps, centre: np.ndarray) -> np.ndarray:
+    """Return a near neighbour of each point that is not its neighbour in time and has a future."""
+    _, index = maps.nearest(maps.arguments[centre], NEIGHBOUR + 2 * PARTING_STEPS)
+    far = (np.abs(index - centre[:, None]) > PARTING_STEPS) & (index < len(maps.arguments) - PARTING_STEPS)
+    rank = np.cumsum(far, axis=1)
+    column = np.argmax(rank >= np.minimum(NEIGHBOUR, rank[:, -1:]), axis=1)
+    return index[np.arange(len(centre)), column]
+
+
+def _distance(maps: LocalMaps, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.abs(maps.wrap(one - other)).max(axis=1)
+
+
+DEGREE = 2
+# Neighbours of all fits together.
+MOST_NEIGHBOURS = 6_000_000
+
+
+class Atlas:
+    """Quadratic polynomials of the return map about points of the section, each good as far as its neighbours lie.
+
+    Parameters
+    ----------
+    maps : LocalMaps
+    count : int
+        Neighbours of each fit.
+    """
+
+    def __init__(self, maps: LocalMaps, count: int):
+        self._maps, self._count = maps, count
+        every = -(-len(maps.arguments) * count // MOST_NEIGHBOURS)
+        self._centres = maps.arguments[::every]
+        fit = maps.fit(self._centres, count, DEGREE, influence=False)
+        self._value, self._jacobian, self._hessian = fit.value, fit.jacobian, fit.hessian
+        self._bandwidth = fit.bandwidth
+        box = np.where(np.isfinite(maps.turn), maps.turn, 0.0)
+        self._tree = cKDTree(maps.inside(self._centres), boxsize=box)
+
+    def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return images (m, 2), derivatives (m, image, argument) and the bandwidth of the polynomials at points (m, 2).
+
+        The bandwidth is infinite where a point lies farther from the nearest centre than that.
+        """
+        _, nearest = self._tree.query(self._maps.inside(points))
+        away = self._maps.wrap(points - self._centres[nearest])
+        curved = np.einsum("mijk,mk->mij", self._hessian[nearest], away)
+        jacobian = self._jacobian[nearest]
+        image = self._value[nearest] + np.einsum("mij,mj->mi", jacobian + 0.5 * curved, away)
+        bandwidth = self._bandwidth[nearest]
+        outside = np.sqrt(np.sum(away**2, axis=-1)) > bandwidth
+        return image, jacobian + curved, np.where(outside, np.inf, bandwidth)
+
+    def exactly(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the same from fits about the points themselves."""
+        fit = self._maps.fit(points, self._count, DEGREE, influence=False)
+        return fit.value, fit.jacobian, fit.bandwidth

@@ -15,7 +15,7 @@ BATCH_NAMES = ("solve_many",)
 FREE_NAMES = ("orient", "bordered_solve", "secant", "has_shrunk", "has_shorter_period", "follow_many")
 ADJOINT_NAMES = ("back_substitute_transposed", "pull_many")
 GENERIC = "STATES, REACH, WIDTH, HALF = 0, 0, 0, 0"
-SHARED = "from bayesperiodic.periodic.kernels import"
+SHARED = "from bayesperiodic.periodic._kernels.newton import"
 UNROLLED_STATES = 3
 ANY = 0, 0, 0, 0
 
@@ -31,17 +31,17 @@ def kernels(states: int, stencil: tuple[int, int, int]) -> SimpleNamespace:
 
 def batch_kernels(states: int, stencil: tuple[int, int, int]) -> SimpleNamespace:
     """Return the compiled functions of `batch_kernels`, specialised likewise."""
-    return _with_shared("batch_kernels.py", BATCH_NAMES, _unrolled(states, stencil))
+    return _with_shared("batch.py", BATCH_NAMES, _unrolled(states, stencil))
 
 
 def adjoint_kernels(states: int, stencil: tuple[int, int, int]) -> SimpleNamespace:
     """Return the compiled functions of `adjoint_kernels`, specialised likewise."""
-    return _with_shared("adjoint_kernels.py", ADJOINT_NAMES, _unrolled(states, stencil))
+    return _with_shared("adjoint.py", ADJOINT_NAMES, _unrolled(states, stencil))
 
 
 def autonomous_kernels() -> SimpleNamespace:
     """Return the compiled functions of `autonomous_kernels`."""
-    return _with_shared("autonomous_kernels.py", FREE_NAMES, ANY)
+    return _with_shared("autonomous.py", FREE_NAMES, ANY)
 
 
 def _unrolled(states: int, stencil: tuple[int, int, int]) -> tuple[int, ...]:
@@ -51,9 +51,9 @@ def _unrolled(states: int, stencil: tuple[int, int, int]) -> tuple[int, ...]:
 
 @cache
 def _kernels(sizes: tuple[int, ...]) -> SimpleNamespace:
-    source = _text("kernels.py")
+    source = _text("newton.py")
     if GENERIC not in source:
-        raise RuntimeError(f"kernels.py does not contain {GENERIC!r}.")
+        raise RuntimeError(f"newton.py does not contain {GENERIC!r}.")
     sized = f"STATES, REACH, WIDTH, HALF = {', '.join(map(str, sizes))}"
     return SimpleNamespace(**load(source.replace(GENERIC, sized), NAMES))
 
@@ -72,4 +72,4 @@ def _with_shared(name: str, wanted: tuple[str, ...], sizes: tuple[int, ...]) -> 
 
 
 def _text(name: str) -> str:
-    return Path(__file__).with_name(name).read_text(encoding="utf-8")
+    return Path(__file__).with_name("_kernels").joinpath(name).read_text(encoding="utf-8")

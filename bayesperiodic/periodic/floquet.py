@@ -39,7 +39,7 @@ STIFF, MOST_PARTS = 3.0, 32
 
 @cache
 def _kernels() -> SimpleNamespace:
-    source = Path(__file__).with_name("floquet_kernels.py").read_text(encoding="utf-8")
+    source = Path(__file__).with_name("_kernels").joinpath("floquet.py").read_text(encoding="utf-8")
     return SimpleNamespace(**load(source, ("transfer_matrices", "along", "across", "largest")))
 
 

@@ -9,14 +9,14 @@ from itertools import pairwise
 import numpy as np
 from scipy.optimize import brentq
 
-from bayesperiodic import checks
+from bayesperiodic import _checks
+from bayesperiodic._io import Result
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
 from bayesperiodic.periodic.family import Family, solve_family
 from bayesperiodic.periodic.floquet import first_order_matrix
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import PeriodicSolution, describe
-from bayesperiodic.store import Result
 
 INTERVALS, FEWEST = 64, 4
 OSCILLATING = 1e-9
@@ -99,13 +99,13 @@ def hopf_points(
         raise ValueError(
             f"model: {model.name!r} is not allowed; it is driven and never at rest. Give an autonomous one."
         )
-    checks.one_of("vary", vary, model.parameters)
-    low, high = (checks.finite_number(f"between[{i}]", value) for i, value in enumerate(between))
+    _checks.one_of("vary", vary, model.parameters)
+    low, high = (_checks.finite_number(f"between[{i}]", value) for i, value in enumerate(between))
     if not low < high:
         raise ValueError(f"between: {between!r} is not allowed; the first value must be below the second.")
     given = dict(parameters) | {vary: low}
-    checks.same_names("parameters", given, model.parameters)
-    theta = np.array([checks.finite_number(f"parameters[{n!r}]", given[n]) for n in model.parameters])
+    _checks.same_names("parameters", given, model.parameters)
+    theta = np.array([_checks.finite_number(f"parameters[{n!r}]", given[n]) for n in model.parameters])
     equations = _equations(model, 1.0, FEWEST, "fourier")
 
     def growth(value: float) -> float:
@@ -166,8 +166,8 @@ def emerging_cycle(
             f"{{{model.states[0]!r}: 0.01}}."
         )
     ((state, size),) = amplitude.items()
-    checks.one_of("amplitude", state, model.states)
-    size = checks.positive(f"amplitude[{state!r}]", size)
+    _checks.one_of("amplitude", state, model.states)
+    size = _checks.positive(f"amplitude[{state!r}]", size)
     own = point.mode[model.states.index(state)]
     if not abs(own) > OSCILLATING:
         moving = [name for name, part in zip(model.states, point.mode, strict=True) if abs(part) > OSCILLATING]

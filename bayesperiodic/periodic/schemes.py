@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bayesperiodic import checks
+from bayesperiodic import _checks
 
 UNROLLED_OFFSETS = 5
 
@@ -119,7 +119,7 @@ def find_scheme(scheme: str | Scheme) -> Scheme:
     """Return a scheme by value or by name; raise a ValueError for an unknown name."""
     if isinstance(scheme, Scheme):
         return scheme
-    checks.one_of("scheme", scheme, SCHEMES)
+    _checks.one_of("scheme", scheme, SCHEMES)
     return SCHEMES[scheme]
 
 
@@ -143,8 +143,8 @@ class CyclicGrid:
     periods: int = 1
 
     def __post_init__(self) -> None:
-        checks.integer("periods", self.periods, 1)
-        checks.integer("samples", self.samples, 2 * self.scheme.reach + 2)
+        _checks.integer("periods", self.periods, 1)
+        _checks.integer("samples", self.samples, 2 * self.scheme.reach + 2)
 
     @property
     def points(self) -> int:

@@ -6,15 +6,131 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesperiodic import checks
+from bayesperiodic import _checks, _fourier
+from bayesperiodic.models.integrate import integrate
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, OTHER_ORBIT
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
-from bayesperiodic.periodic.family import Family, solve_autonomous
-from bayesperiodic.periodic.homotopy import raise_amplitude, sharpen
+from bayesperiodic.periodic.family import INPUTS, Family, solve_autonomous, trace
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, as_guess, describe
-from bayesperiodic.periodic.transient import measured_cycle, settled_period
+
+SOFTEST = 1e-3
+SHARPENING = 2.0
+SMALLEST_SHARPENING = 1.02
+
+
+def raise_amplitude(equations: PeriodicEquations, parameters: np.ndarray, static: np.ndarray) -> Solved | None:
+    """Follow the solution while the inputs' variation about their means grows from nothing; None if that fails."""
+    if not equations.model.inputs:
+        return None
+    mean = np.zeros_like(equations.inputs)
+    width = len(equations.model.inputs)
+    mean[:, :width] = equations.inputs[:, :width].mean(axis=0)
+    family = Family(equations.with_inputs(mean), parameters, (INPUTS,), equations.inputs - mean)
+    beginning = family.equations.solve(parameters, static)
+    if beginning.code != CONVERGED:
+        return None
+    columns = family.equations.residual_jacobian(beginning.z, parameters)
+    factors = family.equations.factors(columns)
+    if not factors.regular:
+        return None
+    linear = factors.solve(family.slopes(np.zeros(1), beginning.z, columns)[0])
+    points = list(trace(family, beginning.z, np.zeros(1), until=1.0, step=0.1, size=np.ptp(linear, axis=0)))
+    if not points or points[-1].values[0] != 1.0:
+        return None
+    return equations.solve(parameters, points[-1].z)
+
+
+def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndarray) -> Solved | None:
+    """Solve with soft signs first and sharpen them step by step; None if that fails or there are none."""
+    if not equations.model.smooth_signs:
+        return None
+    soft = PeriodicEquations(
+        equations.model.softened(), equations.grid, equations.frequency, equations.inputs, equations.drift
+    )
+    sharpness, factor, z = SOFTEST, SHARPENING, guess
+    solved = soft.solve(np.append(parameters, sharpness), z)
+    if solved.code != CONVERGED:
+        return None
+    z = solved.z
+    while sharpness < 1.0:
+        next_sharpness = min(1.0, sharpness * factor)
+        solved = soft.solve(np.append(parameters, next_sharpness), z)
+        if solved.code == CONVERGED:
+            sharpness, z, factor = next_sharpness, solved.z, min(factor**2, SHARPENING)
+        else:
+            factor = np.sqrt(factor)
+            if factor < SMALLEST_SHARPENING:
+                return None
+    return equations.solve(parameters, z)
+
+
+PERIODS = 40
+CYCLES = 120
+NUDGE = 0.1
+
+
+def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: np.ndarray) -> np.ndarray | None:
+    """Return z (points, states) over the last of some tens of response periods after starting at rest at start[0].
+
+    None if the integration fails or an angle does not advance by the turns wanted.
+    """
+    grid, count = equations.grid, equations.count
+    second = [i for i, state in enumerate(equations.model.states) if equations.model.orders[state] == 2]
+    half = _fourier.on_grid(_fourier.coefficients(equations.inputs.T), 2 * grid.points).T
+    path = integrate(
+        equations.model,
+        np.concatenate([start[0], equations.drift[second] * equations.frequency]),
+        half,
+        parameters,
+        frequency=equations.frequency,
+        samples=grid.samples,
+        steps=PERIODS * grid.points,
+        kept=grid.points,
+    )
+    if path is None:
+        return None
+    z = path[:, :count] - equations.drift * (grid.tau[:, None] + (PERIODS - 1) * grid.periods)
+    angles = equations.drift != 0.0
+    turns = [state in equations.model.angles for state in equations.model.states]
+    z[:, turns] -= 2 * np.pi * np.round(z[0, turns] / (2 * np.pi))
+    slip = np.abs(z[-1] - z[0])[angles]
+    return None if np.any(slip > np.pi) else z
+
+
+def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Return z (points, states) and frequency [Hz] of the cycle that an autonomous model settles on; None without one.
+
+    The integration starts near the equilibrium; the cycle is what lies between the last two upward passages of the
+    widest moving state through the middle of its range.
+    """
+    grid, count, model = equations.grid, equations.count, equations.model
+    equilibrium = equations.static_guess(parameters)[0]
+    rates = sum(model.orders.values()) - count
+    start = np.concatenate([equilibrium + NUDGE * np.maximum(np.abs(equilibrium), 1.0), np.zeros(rates)])
+    path = integrate(
+        model,
+        start,
+        np.empty((2, 0)),
+        parameters,
+        frequency=equations.frequency,
+        samples=grid.samples,
+        steps=CYCLES * grid.samples,
+        kept=CYCLES * grid.samples // 4,
+    )
+    if path is None:
+        return None
+    state = path[:, int(np.argmax(np.ptp(path[:, :count], axis=0) / (1.0 + np.abs(path[:, :count]).max(axis=0))))]
+    height = state - 0.5 * (state.max() + state.min())
+    passages = np.flatnonzero((height[:-1] < 0.0) & (height[1:] >= 0.0))
+    if len(passages) < 2:
+        return None
+    times = passages - height[passages] / (height[passages + 1] - height[passages])
+    at = np.linspace(times[-2], times[-1], grid.points, endpoint=False)
+    z = np.stack([np.interp(at, np.arange(len(path)), path[:, s]) for s in range(count)], axis=-1)
+    return z, equations.frequency * grid.samples / float(times[-1] - times[-2])
+
 
 GUESSES = ("static", "integration")
 FEW_STEPS = 4
@@ -105,8 +221,8 @@ def solve_periodic(
     equations = PeriodicEquations.build(
         model, inputs, frequency=frequency, samples=samples, scheme=scheme, periods=periods, winding=winding
     )
-    checks.same_names("parameters", parameters, model.parameters)
-    theta = np.array([checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
+    _checks.same_names("parameters", parameters, model.parameters)
+    theta = np.array([_checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
     if model.autonomous:
         equations, solved, found_by = solve_free(equations, theta, guess)
     else:
@@ -131,7 +247,7 @@ def solve_forced(
         start = as_guess(equations, guess)
         solved, found_by = solve_from(equations, theta, start)
         return _same_orbit(equations, solved, start), found_by
-    checks.one_of("guess", guess, GUESSES)
+    _checks.one_of("guess", guess, GUESSES)
     if guess == "integration":
         settled = settled_period(equations, theta, equations.static_guess(theta))
         if settled is not None:
@@ -188,7 +304,7 @@ def solve_free(
     """Solve for the orbit of an autonomous model; return the equations at its frequency, the solve, and how found."""
     frequency, found_by = equations.frequency, NEWTON
     if isinstance(guess, str):
-        checks.one_of("guess", guess, GUESSES)
+        _checks.one_of("guess", guess, GUESSES)
         cycle = measured_cycle(equations, theta)
         if cycle is None:
             z = equations.static_guess(theta)

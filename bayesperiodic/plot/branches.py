@@ -1,17 +1,19 @@
 """Branches of periodic solutions."""
 
-from collections.abc import Callable, Sequence
-from typing import cast
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, cast
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bayesperiodic import checks
+from bayesperiodic import _checks
+from bayesperiodic.orbits.orbit import Orbit, Orbits
+from bayesperiodic.orbits.section import PoincareSection
 from bayesperiodic.periodic.continuation import FOLD, PERIOD_DOUBLING, Branch
 from bayesperiodic.periodic.solution import PeriodicSolution
-from bayesperiodic.plot.style import ENSEMBLES, axis_label
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label
 
 MEASURES = ("amplitude", "maximum", "section", "period")
 MARKERS = {FOLD: "o", PERIOD_DOUBLING: "D"}
@@ -78,9 +80,9 @@ def branch(
     if labels is not None and len(labels) != len(branches):
         raise ValueError(f"labels: {len(labels)} are not allowed; there must be {len(branches)}, one for each branch.")
     output = next(iter(branch[0].outputs)) if output is None else output
-    checks.one_of("output", output, branch[0].outputs)
+    _checks.one_of("output", output, branch[0].outputs)
     if not callable(measure):
-        checks.one_of("measure", measure, MEASURES)
+        _checks.one_of("measure", measure, MEASURES)
     if ax is None:
         ax = (figure or plt.figure(figsize=(7.0, 4.6), layout="constrained")).add_subplot()
     factor = 2 * np.pi if angular and branch.vary == "frequency" else 1.0
@@ -163,3 +165,179 @@ def _branch_handles(branches: Sequence[Branch], labels: Sequence[str] | None) ->
         if any(kind in b.kinds for b in branches):
             handles.append(plt.Line2D([], [], color="black", marker=marker, mfc="white", mew=1.4, ls="", label=kind))
     return handles
+
+
+MOST_POINTS = 20_000
+PERIOD_MARKERS = "osD^vP*X"
+COLUMNS = 6
+
+
+def section(
+    section: PoincareSection,
+    orbits: Orbits | Sequence[Orbit] = (),
+    *,
+    units: Mapping[str, str] | None = None,
+    figure: Figure | None = None,
+    ax: Axes | None = None,
+) -> Figure:
+    """Draw a Poincaré section, and the points of periodic orbits by their period (de Kraker et al. 1997, fig. 5).
+
+    Parameters
+    ----------
+    section : PoincareSection
+        Of more than 20,000 points every so many are drawn.
+    orbits : Orbits or sequence of Orbit
+    units : mapping of str to str, optional
+        Of the coordinates; angles are in rad.
+    figure : Figure, optional
+        An empty figure to draw into.
+    ax : Axes, optional
+        Axes to draw into, instead.
+
+    Returns
+    -------
+    Figure
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> points = [[0.1, 0.2]]
+    >>> for _ in range(400):
+    ...     x, y = points[-1]
+    ...     points.append([1 - 1.4 * x * x + y, 0.3 * x])
+    >>> henon = bp.PoincareSection.from_points(np.array(points), ("x", "y"), frequency=1.0)
+    >>> bp.plot.section(henon, units={"x": "m", "y": "m/s"}).axes[0].get_xlabel()
+    'x [m]'
+    """
+    if ax is None:
+        ax = (figure or plt.figure(figsize=(7.0, 5.2), layout="constrained")).add_subplot()
+    every = 1 + len(section.points) // MOST_POINTS
+    shown = section.points[::every]
+    name = "section" if every == 1 else f"section, one point in {every}"
+    ax.plot(*shown.T, ",", color="0.65", rasterized=True, zorder=1)
+    handles = [plt.Line2D([], [], marker=".", ls="", color="0.65", label=f"{name} ({len(shown)})")]
+    for rank, period in enumerate(sorted({orbit.period for orbit in orbits})):
+        members = [orbit for orbit in orbits if orbit.period == period]
+        marker, colour = PERIOD_MARKERS[rank % len(PERIOD_MARKERS)], ENSEMBLES[rank % len(ENSEMBLES)]
+        style: dict[str, Any] = {"marker": marker, "color": colour, "ls": "", "ms": 5}
+        points = np.concatenate([orbit.points for orbit in members])
+        ax.plot(*points.T, mec="black", mew=0.5, zorder=3, **style)
+        noun = "orbit" if len(members) == 1 else "orbits"
+        handles.append(
+            plt.Line2D([], [], mec="black", mew=0.5, label=f"period {period}: {len(members)} {noun}", **style)
+        )
+    _label(ax, section.coordinates, section.angles, units)
+    ax.legend(handles=handles, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=1.3)
+    return cast(Figure, ax.figure)
+
+
+def orbits(
+    orbits: Orbits | Sequence[Orbit],
+    *,
+    units: Mapping[str, str] | None = None,
+    figure: Figure | None = None,
+) -> Figure:
+    """Draw the phase portrait of each orbit: the measured cycle, the model's where polished, and the section points.
+
+    Parameters
+    ----------
+    orbits : Orbits or sequence of Orbit
+        At least one.
+    units : mapping of str to str, optional
+        Of the coordinates; angles are in rad.
+    figure : Figure, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ValueError
+        Without orbits.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> x = np.zeros((2000, 2))
+    >>> for k in range(1999):
+    ...     x[k + 1] = 1 - 1.4 * x[k, 0] ** 2 + x[k, 1], 0.3 * x[k, 0]
+    >>> section = bp.PoincareSection.from_points(x[100:], ("x", "y"), frequency=1.0)
+    >>> figure = bp.plot.orbits(bp.find_orbits(section, periods=[1, 2]))
+    >>> [axes.get_title().splitlines()[0] for axes in figure.axes]
+    ['period 1, winding 0', 'period 2, winding 0']
+    """
+    if not len(orbits):
+        raise ValueError("orbits: none is not allowed; at least one must be given.")
+    columns = min(COLUMNS, len(orbits))
+    rows = -(-len(orbits) // columns)
+    figure = figure or plt.figure(figsize=(1.9 * columns + 0.6, 1.85 * rows + 0.7), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for orbit, ax in zip(orbits, axes.flat, strict=False):
+        _portrait(ax, orbit)
+    for ax in axes.flat[len(orbits) :]:
+        ax.set_axis_off()
+    for number, ax in enumerate(axes.flat[: len(orbits)]):
+        # The last panel of a column may stand above an empty one.
+        ax.tick_params(labelbottom=number + columns >= len(orbits))
+    first = orbits[0]
+    figure.supxlabel(_name(first.coordinates[0], first.angles, units), fontsize="medium")
+    figure.supylabel(_name(first.coordinates[1], first.angles, units), fontsize="medium")
+    figure.legend(handles=_handles(orbits), loc="outside upper center", ncols=3, frameon=False, fontsize="small")
+    return figure
+
+
+def _portrait(ax: Axes, orbit: Orbit) -> None:
+    for signals, style in _cycles(orbit):
+        x, y = (_wrapped(signals[c]) if c in orbit.angles else signals[c] for c in orbit.coordinates)
+        # An angle that passes ±π jumps; nothing else moves by half its range between samples.
+        jump = np.flatnonzero(np.abs(np.diff(x)) > np.pi) + 1 if orbit.angles else np.empty(0, dtype=int)
+        ax.plot(np.insert(x, jump, np.nan), np.insert(y, jump, np.nan), **style)
+    ax.plot(*orbit.points.T, "o", color=ENSEMBLES[1], mec="black", mew=0.6, ms=4.5, zorder=4)
+    turns = "" if orbit.winding is None else f", winding {orbit.winding}"
+    ax.set_title(f"period {orbit.period}{turns}\n$\\mu$ = {_multiplier(orbit)}", fontsize="x-small")
+    ax.tick_params(labelsize="x-small")
+
+
+def _cycles(orbit: Orbit) -> list[tuple[Mapping[str, np.ndarray], dict]]:
+    """Return the measured cycle and the model's, each closed, with how it is drawn."""
+    found: list[tuple[Mapping[str, np.ndarray], dict]] = []
+    if orbit.cycle is not None:
+        found.append((orbit.cycle, {"color": COLOURS["measured"], "lw": 2.2, "alpha": 0.45}))
+    if orbit.solution is not None:
+        closed = {c: np.append(v, v[0]) for c, v in orbit.solution.outputs.items() if c in orbit.coordinates}
+        found.append((closed, {"color": COLOURS["map"], "lw": 1.0}))
+    return found
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    return np.angle(np.exp(1j * angle))
+
+
+def _multiplier(orbit: Orbit) -> str:
+    value, sd = orbit.eigenvalues[0], orbit.eigenvalue_sd[0]
+    if abs(value.imag) > 0.0:
+        return f"{value:.3g}"
+    return f"{value.real:.4g} ± {sd:.2g}" if np.isfinite(sd) else f"{value.real:.3g}, not estimated"
+
+
+def _handles(orbits: Orbits | Sequence[Orbit]) -> list[plt.Line2D]:
+    handles = [plt.Line2D([], [], marker="o", ls="", color=ENSEMBLES[1], mec="black", mew=0.6, label="section points")]
+    if any(orbit.cycle is not None for orbit in orbits):
+        handles.append(
+            plt.Line2D([], [], color=COLOURS["measured"], lw=2.2, alpha=0.45, label="closest measured cycle")
+        )
+    if any(orbit.solution is not None for orbit in orbits):
+        handles.append(plt.Line2D([], [], color=COLOURS["map"], lw=1.0, label="model's orbit"))
+    return handles
+
+
+def _label(ax: Axes, coordinates: Sequence[str], angles: Sequence[str], units: Mapping[str, str] | None) -> None:
+    ax.set_xlabel(_name(coordinates[0], angles, units))
+    ax.set_ylabel(_name(coordinates[1], angles, units))
+
+
+def _name(coordinate: str, angles: Sequence[str], units: Mapping[str, str] | None) -> str:
+    known = dict.fromkeys(angles, "rad") | dict(units or {})
+    return axis_label(coordinate, known.get(coordinate, ""))

@@ -5,8 +5,8 @@ One colour means one thing everywhere: measured, MAP, Laplace, MCMC.
 
 import textwrap
 
-from bayesperiodic.inference import labels
-from bayesperiodic.inference.sampling.posterior import Posterior
+from bayesperiodic.posterior import labels
+from bayesperiodic.sampling.posterior import Posterior
 
 #: The colour of what was measured, of the MAP point, of the Laplace approximation and of MCMC, in all figures.
 COLOURS = {"measured": "#000000", "map": "#0072B2", "laplace": "#D55E00", "mcmc": "#56B4E9"}

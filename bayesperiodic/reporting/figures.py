@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.figure import Figure as Drawing
 
 from bayesperiodic import plot
-from bayesperiodic.inference.sampling.posterior import Posterior
-from bayesperiodic.reporting import text
-from bayesperiodic.reporting.blocks import Figure
-from bayesperiodic.reporting.evidence import Evidence
+from bayesperiodic.reporting import html
+from bayesperiodic.reporting.html import Figure
+from bayesperiodic.reporting.inputs import Evidence
+from bayesperiodic.sampling.posterior import Posterior
 
 MOST = 7
 
@@ -33,7 +33,7 @@ def fits(evidence: Evidence) -> Iterator[Figure]:
         channels = ", ".join(f"{channel} [{evidence.unit(channel)}]" for channel in e.outputs)
         band = f", the {prediction.probability:.0%} predictive band of the draws" if prediction else ""
         residual = ", ".join(
-            f"{text.number(float(np.sqrt(np.mean(fit.residuals[e.name][channel] ** 2))))} {evidence.unit(channel)}"
+            f"{html.number(float(np.sqrt(np.mean(fit.residuals[e.name][channel] ** 2))))} {evidence.unit(channel)}"
             for channel in e.outputs
         )
         yield Figure(
@@ -92,7 +92,7 @@ def strongest_pair(posterior: Posterior) -> str:
     matrix = _correlations(posterior)
     i, j = np.unravel_index(np.argmax(np.abs(matrix)), matrix.shape)
     names = posterior.names
-    value = text.number(float(matrix[i, j]), 2)
+    value = html.number(float(matrix[i, j]), 2)
     return f" The strongest correlation is {value}, of {names[min(i, j)]} and {names[max(i, j)]}."
 
 

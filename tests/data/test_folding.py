@@ -3,7 +3,7 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
-from bayesperiodic.data import harmonic_fit
+from bayesperiodic.data import folding
 from tests.known import grid
 
 FREQUENCY = 2.317
@@ -47,8 +47,8 @@ def test_mean_period_is_recovered_on_a_grid_that_the_sampling_does_not_share():
 
 def test_an_input_without_noise_does_not_keep_the_refinement_going(monkeypatch):
     """Its frequency is known to rounding, long before a step is small against its standard error."""
-    calls, original = [], harmonic_fit._linearised
-    monkeypatch.setattr(harmonic_fit, "_linearised", lambda *given: calls.append(given) or original(*given))
+    calls, original = [], folding._linearised
+    monkeypatch.setattr(folding, "_linearised", lambda *given: calls.append(given) or original(*given))
     time = np.arange(716) / (119.37 * 2.0)
     x, y = np.sin(4 * np.pi * time), np.cos(4 * np.pi * time) + 0.1 * np.random.default_rng(1).standard_normal(716)
     assert bp.Recording.from_arrays(time, {"y": y}, {"x": x}).fold(100).frequency == pytest.approx(2.0, rel=1e-12)

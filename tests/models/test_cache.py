@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from bayesperiodic.models import cache
-from bayesperiodic.models.compile import FUNCTIONS
+from bayesperiodic.models.code_generation import FUNCTIONS
 
 PROGRAM = """
 import numba
 from bayesperiodic.models.cache import load
-from bayesperiodic.models.compile import FUNCTIONS, kernel_source
+from bayesperiodic.models.code_generation import FUNCTIONS, kernel_source
 from tests.known import LINEAR
 functions = load(kernel_source(LINEAR), FUNCTIONS)
 print(sum(sum(f.stats.cache_hits.values()) for f in functions.values()))

@@ -7,7 +7,7 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
-from bayesperiodic.models import compile as compilation
+from bayesperiodic.models import code_generation as compilation
 from bayesperiodic.models.cache import load
 
 NAMES = ("exp", "tanh", "atan")

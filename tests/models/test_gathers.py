@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from bayesperiodic.models import compile as generated
-from bayesperiodic.models.gathers import without_gathers
+from bayesperiodic.models import code_generation as generated
+from bayesperiodic.models._kernels.gathers import without_gathers
 from bayesperiodic.models.library import duffing
 
 

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from bayesperiodic.orbits.atlas import Atlas
-from bayesperiodic.orbits.local import LocalMaps
+from bayesperiodic.orbits.local import Atlas, LocalMaps
 
 MATRIX = np.array([[1.2, -0.4], [0.3, 0.8]])
 BEND = 0.7

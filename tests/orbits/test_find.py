@@ -6,7 +6,7 @@ from scipy.stats import binom, chi2
 
 import bayesperiodic as bp
 from bayesperiodic.orbits import find
-from bayesperiodic.orbits.chained import refine
+from bayesperiodic.orbits.cycles import refine
 from tests.orbits import chaos
 from tests.shooting import UNSTABLE, pendulum_orbit
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.orbits.selection import orbit_information
+from bayesperiodic.orbits.select import orbit_information
 from tests import shooting
 from tests.orbits.measured import GENTLE, PENDULUM, at_rest, measured, mirrored, section_problem
 

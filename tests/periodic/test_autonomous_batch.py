@@ -5,8 +5,7 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
-from bayesperiodic.periodic.autonomous_batch import AutonomousBatch, Bordered
-from bayesperiodic.periodic.batch import Anchor
+from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Bordered
 from bayesperiodic.periodic.compiled import CONVERGED, autonomous_kernels
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.solve import collapsed, has_shorter_period

@@ -16,7 +16,7 @@ def newton(x):
 """
 CALLING = """from numba import njit
 
-from bayesperiodic.periodic.kernels import newton
+from bayesperiodic.periodic._kernels.newton import newton
 
 
 @njit("float64(float64)", cache=CACHE)

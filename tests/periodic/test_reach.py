@@ -4,7 +4,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic.periodic.batch import Anchor
 from bayesperiodic.periodic.equations import PeriodicEquations
-from bayesperiodic.periodic.reach import reach
+from bayesperiodic.periodic.family import reach
 from bayesperiodic.periodic.solve import solve_free
 from tests import shooting
 from tests.known import CYCLE, SADDLE_NODE, grid

@@ -5,7 +5,7 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
-from bayesperiodic.reporting import mathml, text
+from bayesperiodic.reporting import html, inputs
 
 
 def shown(markup: str) -> str:
@@ -22,7 +22,7 @@ def equations(*expressions):
         equations=lambda s, p, u: [s.ddx - u.force],
         outputs=lambda s, p, u: {f"y{i}": e(s, p, u) for i, e in enumerate(expressions)},
     )
-    return [shown(row).partition("=")[2] for row in mathml.outputs(model)]
+    return [shown(row).partition("=")[2] for row in inputs.outputs(model)]
 
 
 @pytest.mark.parametrize(
@@ -38,23 +38,23 @@ def equations(*expressions):
     ],
 )
 def test_names_are_typeset_with_greek_letters_and_subscripts(name, written):
-    assert mathml.symbol(name) == f"<math>{written}</math>"
+    assert inputs.symbol(name) == f"<math>{written}</math>"
 
 
 def test_derivatives_are_dots_over_the_letter_alone():
-    (row,) = mathml.equations(bp.models.duffing)
+    (row,) = inputs.equations(bp.models.duffing)
     assert shown(row) == "mx¨+cx˙+kx+k3x3=force"
     assert '<mover accent="true"><mi>x</mi><mo>¨</mo></mover>' in row
     assert (
         '<msub><mover accent="true"><mi>x</mi><mo>¨</mo></mover><mn>1</mn></msub>'
-        in mathml.equations(bp.models.chain(2))[0]
+        in inputs.equations(bp.models.chain(2))[0]
     )
 
 
 def test_what_no_state_enters_stands_on_the_right():
-    assert shown(mathml.equations(bp.models.silverbox)[0]).endswith("=gdrive+u0")
-    assert shown(mathml.equations(bp.models.van_der_pol)[0]) == "x¨−μωx˙(1−x2)+ω2x=0"
-    assert shown(mathml.equations(bp.models.landing_gear())[0]).endswith("=force−θ11")
+    assert shown(inputs.equations(bp.models.silverbox)[0]).endswith("=gdrive+u0")
+    assert shown(inputs.equations(bp.models.van_der_pol)[0]) == "x¨−μωx˙(1−x2)+ω2x=0"
+    assert shown(inputs.equations(bp.models.landing_gear())[0]).endswith("=force−θ11")
 
 
 def test_functions_and_numbers_print_as_they_are_read():
@@ -74,12 +74,12 @@ def test_functions_and_numbers_print_as_they_are_read():
 
 @pytest.mark.parametrize("model", [bp.models.pendulum, bp.models.landing_gear(), bp.models.flutter, bp.models.dahl])
 def test_every_model_gives_sound_markup_that_names_all_its_parameters(model):
-    rows = [*mathml.equations(model), *mathml.outputs(model)]
+    rows = [*inputs.equations(model), *inputs.outputs(model)]
     assert not re.search(r"p_|s_d|u_|NaN|&\w+;", "".join(rows).replace("&lt;", "").replace("&gt;", ""))
     whole = "".join(rows)
     used = set().union(*(e.free_symbols for e in (*model.equations, *model.output_expressions)))
     for name, symbol in model.parameter_symbols.items():
-        inner = mathml.symbol(name).removeprefix("<math>").removesuffix("</math>")
+        inner = inputs.symbol(name).removeprefix("<math>").removesuffix("</math>")
         assert (inner in whole) == (symbol in used)
 
 
@@ -87,7 +87,7 @@ def test_every_model_gives_sound_markup_that_names_all_its_parameters(model):
     "value, sd", [(768.123, 4.5678), (-3e-9, 2e-11), (2.5e8, 3e6), (0.0, 1e-4), (1e-3, 1e-9), (5.0, 700.0)]
 )
 def test_rounding_loses_less_than_a_hundredth_of_a_standard_deviation(value, sd):
-    rounding = text.Rounding.of(value, sd)
+    rounding = html.Rounding.of(value, sd)
     for x in (value, value + 1.7 * sd, sd):
         mantissa, _, power = rounding.text(x).replace("−", "-").partition("×10")
         power = power.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))

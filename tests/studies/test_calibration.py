@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from bayesperiodic.diagnosis.campaigns import refuse
+from bayesperiodic.diagnostics.campaigns import refuse
 from studies import calibration
 from studies.__main__ import main
 from studies.calibration_cases import OVERCOUNT

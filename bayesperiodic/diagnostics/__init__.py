@@ -1,0 +1,1 @@
+"""Identifiability, checks of the Laplace approximation, model adequacy and calibration."""

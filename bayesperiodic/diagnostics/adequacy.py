@@ -1,0 +1,343 @@
+"""Whether a model explains its data: discrepancy tests of every experiment and channel, and the verdict."""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+from scipy.fft import dct
+
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.estimation.result import of_periodogram
+from bayesperiodic.posterior.density import Linearisation
+from bayesperiodic.posterior.noise import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
+from bayesperiodic.posterior.problem import Problem
+
+RANK = 1e-6
+ABSORBED = 1e-3
+NOT_TESTED = float("nan")
+
+
+class Unexplained:
+    """The part of whitened residual components that no change of the parameters explains.
+
+    Parameters
+    ----------
+    components : array (size,)
+        Independent, with one variance, where the model holds.
+    changes : array (parameters, size)
+        Their derivatives by the parameters; rows may be dependent or zero.
+    harmonic : int array (size,)
+        To which each component belongs.
+
+    Attributes
+    ----------
+    square : float
+        Sum of squares.
+    freedom : int
+        Degrees of freedom behind it.
+    """
+
+    def __init__(self, components: np.ndarray, changes: np.ndarray, harmonic: np.ndarray):
+        self._basis = column_space(changes)
+        self._rest = components - self._basis @ (self._basis.T @ components)
+        self.square = float(self._rest @ self._rest)
+        self.freedom = components.size - self._basis.shape[1]
+        self.harmonics, self._group = np.unique(harmonic, return_inverse=True)
+
+    @cached_property
+    def _sums(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Sums over each harmonic: b bᵀ of the basis, b·e, e² of the residual e, and the number of components."""
+        b, e = self._basis, self._rest
+        each = np.eye(self.harmonics.size)[:, self._group]
+        gram = np.einsum("hs,si,sj->hij", each, b, b, optimize=True)
+        return gram, each @ (b * e[:, None]), each @ e**2, each.sum(axis=1)
+
+    def explained(self, sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sum of squares (sets,) that free amplitudes of sets of harmonics would explain, and their number.
+
+        Parameters
+        ----------
+        sets : bool array (sets, harmonics)
+        """
+        gram, along, square, size = (np.tensordot(sets.astype(float), part, 1) for part in self._sums)
+        values, vectors = np.linalg.eigh(gram)
+        left = 1.0 - values
+        # Combinations of the set's components that the parameters can produce themselves hold no information.
+        absorbed = left < ABSORBED
+        turned = np.einsum("srj,sr->sj", vectors, along) ** 2
+        ratio = np.where(absorbed, -1.0 / np.maximum(values, 0.5), 1.0 / np.maximum(left, ABSORBED))
+        return square + np.sum(turned * ratio, axis=1), np.rint(size - absorbed.sum(axis=1)).astype(int)
+
+    def whiteness(self) -> float:
+        """Return p of Bartlett's test: the cumulative power of the harmonics, the highest first, on a straight line."""
+        tails = np.tri(self.harmonics.size, dtype=bool)[:, ::-1]
+        square, freedom = self.explained(tails)
+        pairs = np.diff(freedom, prepend=0) == 2
+        power = np.diff(square, prepend=0.0)[pairs][::-1]
+        return of_periodogram(np.maximum(power, 0.0)).p if power.size >= 2 else NOT_TESTED
+
+    def harmonic_content(self) -> tuple[float, float]:
+        """Return p of too much power in one harmonic or in the lowest 2ᵏ + 1, and the harmonic that has most.
+
+        The smallest p of the F tests, times their number.
+        """
+        count = self.harmonics.size
+        lowest = np.array([np.arange(count) <= 2**k for k in range(count.bit_length()) if 2**k < count - 1], dtype=bool)
+        sets = np.concatenate([np.eye(count, dtype=bool), lowest.reshape(-1, count)])
+        square, freedom = self.explained(sets)
+        rest = self.freedom - freedom
+        tested = (freedom > 0) & (rest > 0)
+        if not tested.any():
+            return NOT_TESTED, NOT_TESTED
+        p = np.ones(len(sets))
+        p[tested] = _f_test(square[tested], freedom[tested], (self.square - square)[tested], rest[tested])
+        _, _, power, size = self._sums
+        return min(1.0, float(p.min() * tested.sum())), float(self.harmonics[np.argmax(power / size)])
+
+
+def column_space(changes: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis (size, rank) of the span of rows (parameters, size), each taken at its own size."""
+    length = np.linalg.norm(changes, axis=1)
+    rows = changes[length > 0.0] / length[length > 0.0, None]
+    if not rows.size:
+        return np.empty((changes.shape[1], 0))
+    _, values, basis = np.linalg.svd(rows, full_matrices=False)
+    return basis[values > RANK * values[0]].T
+
+
+def excess(variance: float, freedom: float, known: float, known_freedom: float) -> float:
+    """Return p of a variance at least so far above a known one, which may itself have been estimated."""
+    if not freedom > 0.0 or not known > 0.0:
+        return NOT_TESTED
+    if np.isinf(known_freedom):
+        return float(stats.chi2.sf(freedom * variance / known, freedom))
+    return float(stats.f.sf(variance / known, freedom, known_freedom))
+
+
+def consistency(parts: Sequence[tuple[np.ndarray, np.ndarray, str]], known: frozenset[str]) -> float:
+    """Return p of residuals that parameters of their own would explain far better than common ones: Chow's test.
+
+    Parameters
+    ----------
+    parts : sequence of (array (size,), array (parameters, size), str)
+        Whitened components of each block, their derivatives, and the group of blocks with one unknown variance.
+    known : set of str
+        Groups whose whitened variance is known to be 1.
+
+    References
+    ----------
+    G. C. Chow, Tests of equality between sets of coefficients in two linear regressions, Econometrica 28 (1960)
+    591-605.
+    """
+    own = [Unexplained(r, j, np.zeros(r.size, dtype=int)) for r, j, _ in parts]
+    scale, freedoms = dict.fromkeys(known, 1.0), [np.inf]
+    for group in {g for *_, g in parts} - known:
+        members = [u for u, (*_, g) in zip(own, parts, strict=True) if g == group]
+        freedom = sum(u.freedom for u in members)
+        if freedom and (square := sum(u.square for u in members)) > 0.0:
+            scale[group] = square / freedom
+            freedoms.append(freedom)
+    kept = [(u, r, j, g) for u, (r, j, g) in zip(own, parts, strict=True) if g in scale]
+    if not kept:
+        return NOT_TESTED
+    r, j = (np.concatenate([part[i] / np.sqrt(scale[part[3]]) for part in kept], axis=-1) for i in (1, 2))
+    common = Unexplained(r, j, np.zeros(r.size, dtype=int))
+    square = common.square - sum(u.square / scale[g] for u, _, _, g in kept)
+    freedom = common.freedom - sum(u.freedom for u, *_ in kept)
+    return excess(square / freedom, freedom, 1.0, min(freedoms)) if freedom > 0 else NOT_TESTED
+
+
+def holm(p: np.ndarray) -> np.ndarray:
+    """Return p-values adjusted for their number; NaN for those not tested, which do not count.
+
+    References
+    ----------
+    S. Holm, A simple sequentially rejective multiple test procedure, Scandinavian Journal of Statistics 6 (1979) 65-70.
+    """
+    adjusted = np.full(p.shape, np.nan)
+    tested = np.flatnonzero(~np.isnan(p))
+    order = tested[np.argsort(p[tested], kind="stable")]
+    steps = p[order] * np.arange(order.size, 0, -1)
+    adjusted[order] = np.minimum(1.0, np.maximum.accumulate(steps)) if order.size else steps
+    return adjusted
+
+
+def _f_test(square: np.ndarray, freedom: np.ndarray, other: np.ndarray, other_freedom: np.ndarray) -> np.ndarray:
+    """Return p of a mean square at least so far above another."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = square / freedom / (np.maximum(other, 0.0) / other_freedom)
+    return np.asarray(stats.f.sf(np.nan_to_num(ratio, nan=0.0, posinf=np.inf), freedom, other_freedom))
+
+
+LEVEL = 0.01
+SHAPES = 20
+TESTS = ("whiteness", "harmonics", "size", "amplitude", "consistency")
+ADEQUATE, MISSPECIFIED, UNTESTED = "adequate", "misspecified", "not tested"
+ALL = "all"
+
+
+def adequacy(
+    problem: Problem, here: Linearisation, noise: np.ndarray, replicates: Mapping[tuple[str, str], np.ndarray]
+) -> pd.DataFrame:
+    """Return the table of `Prediction`: the p-values of all tests, and what they say together.
+
+    Parameters
+    ----------
+    problem : Problem
+    here : Linearisation
+        At a draw near the best fit.
+    noise : array (draws, noise_names)
+        Draws of the noise parameters.
+    replicates : mapping of (str, str) to array (draws, points)
+        Of the data, by experiment and channel; NaN outside the mask and where a solve failed.
+    """
+    likelihood = problem.likelihood
+    shapes = np.median(noise, axis=0)[None] if problem.noise.flat else noise[:: max(1, len(noise) // SHAPES)]
+    rows: dict[str, dict[str, float | str]] = {}
+    white = [_Whitened(problem, here, shape) for shape in shapes]
+    for i, block in enumerate(likelihood.blocks):
+        if block.kind == KNOWN:
+            continue
+        row: dict[str, float | str] = {"experiment": block.experiment, "channel": block.channel}
+        # The spectrum of correlated noise is known by its draws alone: their mean p is that of the realised residual.
+        found = [w.spectral_tests(i) for w in white]
+        whiteness, harmonics, harmonic = np.array(found).T
+        row |= {"whiteness": float(whiteness.mean()), "harmonics": float(harmonics.mean()), "harmonic": harmonic[0]}
+        row |= _size(problem, here, block, i, white[0])
+        row["amplitude"] = _amplitude(problem, block, replicates)
+        rows[f"{block.experiment} {block.channel}"] = row
+    common = float(np.mean([w.consistency() for w in white]))
+    rows[ALL] = {"experiment": ALL, "channel": ALL, "consistency": common}
+    columns = ["experiment", "channel", *TESTS, "harmonic", "model_error_share"]
+    return _judged(pd.DataFrame.from_dict(rows, orient="index", columns=columns))
+
+
+def adjusted_p(table: pd.DataFrame) -> np.ndarray:
+    """Return the p-values (rows, tests) of a table, adjusted for the number of all of them."""
+    return holm(table[[*TESTS]].to_numpy(dtype=float).ravel()).reshape(len(table), -1)
+
+
+def _judged(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the table with each row's smallest adjusted p, and its verdict."""
+    adjusted = adjusted_p(table)
+    smallest = np.min(np.where(np.isnan(adjusted), np.inf, adjusted), axis=1)
+    smallest[-1] = min(smallest)
+    table["p"] = np.where(np.isinf(smallest), np.nan, smallest)
+    table["verdict"] = np.select([np.isinf(smallest), smallest < LEVEL], [UNTESTED, MISSPECIFIED], ADEQUATE)
+    return table
+
+
+class _Whitened:
+    """Residual components and their derivatives in units of the noise at one value (names,) of its parameters.
+
+    Where fewer values are independent than there are components, the measured period is a smooth curve, and the
+    components are those of the lowest harmonics, as many as independent values.
+    """
+
+    def __init__(self, problem: Problem, here: Linearisation, noise: np.ndarray):
+        likelihood = problem.likelihood
+        self.blocks = likelihood.blocks
+        names = [problem.noise.parameter_names(block) for block in self.blocks]
+        self.groups = [own[0] if own else KNOWN for own in names]
+        self.known = frozenset(
+            g for g, own in zip(self.groups, names, strict=True) if set(own) <= set(likelihood.fixed)
+        )
+        residuals = likelihood.whitened(here.residuals, noise)
+        changes = likelihood.whitened(here.changes, noise)
+        self.parts = [
+            (kept(block, r), kept(block, j), labels(block))
+            for block, r, j in zip(self.blocks, residuals, changes, strict=True)
+        ]
+
+    def spectral_tests(self, index: int) -> tuple[float, float, float]:
+        """Return p of whiteness and of the harmonic content of a block, and the harmonic with most power."""
+        r, j, harmonic = self.parts[index]
+        if self.blocks[index].kind == CORRELATED or not _testable(r, j):
+            return NOT_TESTED, NOT_TESTED, NOT_TESTED
+        unexplained = Unexplained(r, j, harmonic)
+        return unexplained.whiteness(), *unexplained.harmonic_content()
+
+    def consistency(self) -> float:
+        """Return p of the test of common parameters."""
+        parts = [(r, j, g) for (r, j, _), g in zip(self.parts, self.groups, strict=True) if _testable(r, j)]
+        return consistency(parts, self.known) if len(parts) == len(self.parts) else NOT_TESTED
+
+
+def _testable(r: np.ndarray, j: np.ndarray) -> bool:
+    return bool(np.isfinite(r).all() and np.isfinite(j).all())
+
+
+def kept(block: Block, components: np.ndarray) -> np.ndarray:
+    """Return the components (…, kept) that the tests take, points as cosine components along the period."""
+    if block.kind == POINTS:
+        components = dct(components, norm="ortho", axis=-1)
+    return components[..., _order(block)]
+
+
+def labels(block: Block) -> np.ndarray:
+    """Return the harmonics (kept,) of the components that the tests take."""
+    return _harmonic(block)[_order(block)]
+
+
+def _order(block: Block) -> np.ndarray:
+    number = min(block.size, int(np.rint(block.count))) if block.kind in (SPECTRAL, POINTS) else block.size
+    return np.sort(np.argsort(_harmonic(block), kind="stable")[:number])
+
+
+def _harmonic(block: Block) -> np.ndarray:
+    if block.kind == SPECTRAL:
+        return block.harmonic
+    return (np.arange(block.size) + 1) // 2
+
+
+def _size(problem: Problem, here: Linearisation, block: Block, index: int, white: _Whitened) -> dict[str, float | str]:
+    """Return p of a residual larger than the measured noise, or the known one, and the share that is model error."""
+    nothing: dict[str, float | str] = {"size": NOT_TESTED, "model_error_share": NOT_TESTED}
+    r, j = (np.sqrt(block.weight) * kept(block, part[index]) for part in (here.residuals, here.changes))
+    if not _testable(r, j):
+        return nothing
+    if not block.measured > 0.0:
+        if white.groups[index] not in white.known:
+            return nothing
+        unexplained, measured = Unexplained(*white.parts[index]), 1.0
+        freedom, behind = float(unexplained.freedom), np.inf
+    else:
+        unexplained, measured = Unexplained(r, j, labels(block)), block.measured
+        e = next(e for e in problem.experiments if e.name == block.experiment)
+        # A sum of squares of unequal variances has fewer degrees of freedom.
+        evenness = _evenness(e, block)
+        freedom = unexplained.freedom * evenness
+        behind = (e.cycles - 1) * block.count * evenness if e.cycles > 1 else np.inf
+    if not unexplained.freedom:
+        return nothing
+    variance = unexplained.square / unexplained.freedom
+    return {
+        "size": excess(variance, freedom, measured, behind),
+        "model_error_share": max(0.0, 1.0 - measured / variance) if variance > 0.0 else 0.0,
+    }
+
+
+def _evenness(experiment: Experiment, block: Block) -> float:
+    """Return the effective share of degrees of freedom where the variance differs between harmonics (Satterthwaite)."""
+    if block.channel not in experiment.amplitude_variance:
+        return 1.0
+    variance = experiment.amplitude_variance[block.channel]
+    each = np.concatenate([variance[:1], np.repeat(0.25 * variance[1:], 2)])
+    return float(each.sum() ** 2 / (each.size * np.sum(each**2)))
+
+
+def _amplitude(problem: Problem, block: Block, replicates: Mapping[tuple[str, str], np.ndarray]) -> float:
+    """Return the two-sided posterior predictive p of the rms about the mean, normal between the replicates."""
+    if (block.experiment, block.channel) not in replicates:
+        return NOT_TESTED
+    e = next(e for e in problem.experiments if e.name == block.experiment)
+    mask = slice(None) if e.mask is None else e.mask
+    values = replicates[block.experiment, block.channel][:, mask]
+    found = values[np.isfinite(values).all(axis=1)].std(axis=1)
+    sd = found.std(ddof=1) if found.size > 1 else 0.0
+    if not sd > 0.0:
+        return NOT_TESTED
+    score = (e.outputs[block.channel][mask].std() - found.mean()) / (sd * np.sqrt(1.0 + 1.0 / found.size))
+    return float(2.0 * stats.t.sf(abs(score), found.size - 1))

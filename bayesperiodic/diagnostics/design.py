@@ -1,0 +1,217 @@
+"""What the data say at the estimate, measured against what the prior says: Fisher information in prior units."""
+
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.special import ndtr
+
+from bayesperiodic import _checks
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.estimation.laplace import logarithmic
+from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.periodic.solve import solve_periodic
+from bayesperiodic.posterior.problem import Problem
+
+ONE_SD = float(ndtr(1.0))
+SMALLEST, HARDLY = 1e-12, 1e-3
+
+
+@dataclass(frozen=True)
+class Information:
+    """The Fisher information of the data in the logarithms of positive parameters and in signed ones as they are.
+
+    Attributes
+    ----------
+    names : tuple of str
+    theta : array (names,)
+        The estimate.
+    logarithmic : bool array (names,)
+    matrix : array (names, names)
+        −∂² log-likelihood, its expectation, by these coordinates.
+    prior_sd : array (names,)
+        Half the central 68 % interval of each prior, in these coordinates.
+    """
+
+    names: tuple[str, ...]
+    theta: np.ndarray
+    logarithmic: np.ndarray
+    matrix: np.ndarray
+    prior_sd: np.ndarray
+
+    @classmethod
+    def of(cls, problem: Problem, fit: MapEstimate) -> "Information":
+        """Return the information at an estimate, its noise parameters taken as known."""
+        theta, logs = problem.vector(fit.theta), logarithmic(problem)
+        guesses = {name: solution.states for name, solution in fit.solutions.items()}
+        here = problem.anchored(theta, guesses).linearised(theta)
+        changes = problem.likelihood.whitened(here.changes, problem.noise_values(fit.noise))
+        slopes = np.where(logs, theta, 1.0)
+        design = np.concatenate(changes, axis=1) * slopes[:, None]
+        return cls(problem.names, theta, logs, design @ design.T, prior_sds(problem, logs))
+
+    @cached_property
+    def _relative(self) -> tuple[np.ndarray, np.ndarray]:
+        """Eigenvalues, ascending, and eigenvectors of the information per unit of the prior's precision."""
+        scaled = self.matrix * np.outer(self.prior_sd, self.prior_sd)
+        values, vectors = np.linalg.eigh(scaled)
+        return np.maximum(values, 0.0), vectors
+
+    @property
+    def gains(self) -> np.ndarray:
+        """Information of the data over that of the prior along each direction, ascending."""
+        return self._relative[0]
+
+    @property
+    def directions(self) -> np.ndarray:
+        """The directions, columns, in the coordinates themselves (names, directions)."""
+        return self._relative[1] * self.prior_sd[:, None]
+
+    @property
+    def spectrum(self) -> np.ndarray:
+        """Eigenvalues of the information, descending: per unit of the logarithm, or of the prior's sd if signed."""
+        return self._scaled_eigenvalues[::-1]
+
+    @property
+    def condition(self) -> float:
+        """The largest over the smallest of these."""
+        values = self._scaled_eigenvalues
+        return float(values[-1] / values[0]) if values[0] > 0.0 else np.inf
+
+    @cached_property
+    def _scaled_eigenvalues(self) -> np.ndarray:
+        scale = np.where(self.logarithmic, 1.0, self.prior_sd)
+        values = np.linalg.eigvalsh(self.matrix * np.outer(scale, scale))
+        return np.where(values > SMALLEST * values[-1], values, 0.0)
+
+    @property
+    def alone(self) -> np.ndarray:
+        """Standard deviation that the data alone leave each parameter if all others are known, in prior sds."""
+        with np.errstate(divide="ignore"):
+            return 1.0 / (np.sqrt(np.diag(self.matrix)) * self.prior_sd)
+
+    @property
+    def together(self) -> np.ndarray:
+        """The same if the others are unknown too; infinite for what a direction without information moves.
+
+        It does not move a parameter that changes by less than 0.1 % of its prior's sd where others do by all of theirs.
+        """
+        values, vectors = self._relative
+        told = values > SMALLEST * max(values[-1], np.finfo(float).tiny)
+        known = np.sum(vectors[:, told] ** 2 / values[told], axis=1)
+        unseen = np.any(np.abs(vectors[:, ~told]) > HARDLY, axis=1)
+        return np.where(unseen, np.inf, np.sqrt(known))
+
+    @property
+    def collinearity(self) -> np.ndarray:
+        """By how much the others make each standard deviation longer; 1 for a parameter that none is like."""
+        with np.errstate(invalid="ignore"):
+            return self.together / self.alone
+
+    def coordinate(self, name: str, values: np.ndarray) -> np.ndarray:
+        """Return values of a parameter in its coordinate."""
+        return np.log(values) if self.logarithmic[self.names.index(name)] else values
+
+
+def prior_sds(problem: Problem, logs: np.ndarray) -> np.ndarray:
+    """Return half the central 68 % interval of each prior, of the logarithm where that is the coordinate."""
+    result = np.empty(len(problem.names))
+    for i, name in enumerate(problem.names):
+        low, high = problem.joint_prior.marginals[name].quantile(np.array([1.0 - ONE_SD, ONE_SD]))
+        result[i] = 0.5 * (np.log(high / low) if logs[i] else high - low)
+    return result
+
+
+FACTORS = (0.5, 1.0, 2.0)
+MOST_RUNS = 5
+
+
+class Candidate(NamedTuple):
+    """An experiment that might be done: a run's inputs, their variation scaled, at another frequency [Hz]."""
+
+    run: str
+    frequency: float
+    scale: float
+
+
+def default_candidates(problem: Problem) -> list[Candidate]:
+    """Return half, the same and twice the frequency and the amplitude of a few runs, those least alike in frequency.
+
+    Of all runs if some parameters are local to them.
+    """
+    runs = sorted(problem.experiments, key=lambda e: e.frequency)
+    most = len(runs) if any("[" in name for name in problem.names) else MOST_RUNS
+    chosen = [runs[i] for i in sorted({round(k) for k in np.linspace(0, len(runs) - 1, most)})]
+    scales = FACTORS if problem.model.inputs else (1.0,)
+    return [Candidate(e.name, f * e.frequency, s) for e in chosen for f in FACTORS for s in scales]
+
+
+def rank_candidates(
+    problem: Problem, fit: MapEstimate, information: Information, candidates: Iterable[Candidate]
+) -> pd.DataFrame:
+    """Return what each candidate would add: nats of information in all, and each parameter's sd over today's.
+
+    The noise is taken as white with today's variances, the number of independent values as that of the run, and the
+    orbit as the one that follows from the run's; a candidate whose orbit cannot be found has NaN.
+
+    Returns
+    -------
+    DataFrame
+        Columns run, frequency, scale, gain and one a parameter; most informative first.
+    """
+    runs = {e.name: e for e in problem.experiments}
+    scale = information.prior_sd
+    before = information.matrix * np.outer(scale, scale) + np.eye(scale.size)
+    now, rows = np.sqrt(np.diag(np.linalg.inv(before))), []
+    for candidate in candidates:
+        _checks.one_of("candidates", candidate.run, runs)
+        added = _added(problem, fit, information, runs[candidate.run], candidate)
+        after = before + added * np.outer(scale, scale)
+        row: dict[str, object] = {**candidate._asdict(), "gain": np.nan}
+        if np.isfinite(after).all():
+            row["gain"] = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1])
+            row |= dict(zip(problem.names, np.sqrt(np.diag(np.linalg.inv(after))) / now, strict=True))
+        rows.append(row)
+    table = pd.DataFrame(rows, columns=[*Candidate._fields, "gain", *problem.names])
+    return table.sort_values("gain", ascending=False, na_position="last", ignore_index=True)
+
+
+def _added(
+    problem: Problem, fit: MapEstimate, information: Information, run: Experiment, candidate: Candidate
+) -> np.ndarray:
+    """Return the information of a candidate in the coordinates of `information`; NaN where it has no orbit."""
+    theta = problem.vector(fit.theta)
+    parameter_map = problem.parameter_maps[run.name]
+    values = parameter_map.values(theta[None])[0]
+    inputs = {name: u.mean() + candidate.scale * (u - u.mean()) for name, u in run.inputs.items()}
+    with warnings.catch_warnings():
+        # The grid is the run's, and how fine it is has been said of the run.
+        warnings.simplefilter("ignore", UserWarning)
+        solution = solve_periodic(
+            problem.model,
+            dict(zip(problem.model.parameters, values.tolist(), strict=False)),
+            inputs,
+            frequency=candidate.frequency,
+            samples=run.samples,
+            scheme=problem.scheme,
+            periods=run.periods,
+            winding=run.winding,
+            guess=fit.solutions[run.name].states,
+        )
+    if not solution.converged:
+        return np.full((theta.size, theta.size), np.nan)
+    slopes = parameter_map.slopes(theta)[:-1] * np.where(information.logarithmic, information.theta, 1.0)
+    noise = np.array([[fit.noise[name] for name in problem.noise_names]])
+    variances = problem.likelihood.value_variances(noise)
+    total = np.zeros((theta.size, theta.size))
+    for channel in run.outputs:
+        if (run.name, channel) in variances:
+            by_parameter = np.stack([solution.sensitivities[channel][n] for n in problem.model.parameters])
+            changes = slopes.T @ by_parameter
+            weight = run.independent[channel] / changes.shape[1] / float(variances[run.name, channel][0])
+            total += weight * changes @ changes.T
+    return total

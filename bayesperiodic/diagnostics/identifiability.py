@@ -1,0 +1,457 @@
+"""What the data determine, what only the prior does, and what to do about it: a verdict for each parameter."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import pandas as pd
+import sympy as sp
+from scipy.special import ndtr
+
+from bayesperiodic._io import Result
+from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.diagnostics.design import Candidate, Information, default_candidates, rank_candidates
+from bayesperiodic.estimation.laplace import combinations, in_words, reduced
+from bayesperiodic.estimation.profile import ONE_SIDED, Profile
+from bayesperiodic.estimation.profile import profile as profile_of
+from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.models.model import Model
+from bayesperiodic.posterior.labels import local_names
+from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.sampling.coordinates import SamplingDensity
+from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.symmetry.structure import Structure, analysed
+from bayesperiodic.symmetry.system import system_of
+
+
+def structure_of(problem: Problem) -> Structure:
+    """Return the structure of a problem's model for its measured channels, free parameters and ties.
+
+    A parameter that is fixed at zero in every experiment is left out of the equations, any other fixed one is known.
+    One that experiments have their own of is taken as one parameter.
+    """
+    free = {name for name in problem.names if "[" not in name} | set(local_names(problem.names))
+    fixed = {name: set(values.values()) for name, values in problem.fixed.items() if name not in free}
+    parameters = set(problem.model.parameters)
+    zeros = tuple(sorted(name for name, values in fixed.items() if values == {0.0} and name in parameters))
+    known = tuple(name for name in problem.model.parameters if name in fixed)
+    tied = tuple((name, text) for name, text in problem.tied.items() if name in parameters)
+    return _structure(problem.model, problem.channels, known, zeros, tied)
+
+
+@lru_cache(maxsize=64)
+def _structure(
+    model: Model,
+    outputs: tuple[str, ...],
+    known: tuple[str, ...],
+    zeros: tuple[str, ...],
+    tied: tuple[tuple[str, str], ...],
+) -> Structure:
+    symbols = model.parameter_symbols
+    values = {symbols[name]: sp.S.Zero for name in zeros}
+    # The text has passed the whitelist of `expressions` before it gets here.
+    ties = {symbols[n]: sp.nsimplify(sp.parse_expr(text, local_dict=dict(symbols)), rational=True) for n, text in tied}
+    for _ in ties:
+        ties = {symbol: expression.subs(ties | values) for symbol, expression in ties.items()}
+    system = system_of(model, outputs)
+    return analysed(model.name, system.given(known, values | ties), known)
+
+
+POWER = 1.25
+MOST_DRAWS = 20_000
+
+
+def power_scaling(problem: Problem, posterior: Posterior) -> dict[str, tuple[float, float]]:
+    """Return the sensitivity of each parameter's posterior to the prior and to the likelihood ([1]_).
+
+    Draws are weighted by the prior of θ, or the likelihood, to the powers 0.25 and −0.2; the cumulative Jensen-Shannon
+    distance between the weighted and the plain distribution, per doubling of the weight, is averaged over the two. A
+    value above 0.05 is noticeable: of a normal distribution, a mean that moves by a sixth of its standard deviation as
+    the weight doubles. Both large tell of a conflict; only that to the prior large, of data that say little.
+
+    References
+    ----------
+    .. [1] N. Kallioinen, T. Paananen, P.-C. Bürkner, A. Vehtari, Detecting and diagnosing prior and likelihood
+       sensitivity with power-scaling, Statistics and Computing 34 (2024) 57.
+    """
+    step = max(1, posterior.draws(problem.names[0]).size // MOST_DRAWS)
+    theta = np.stack([posterior.draws(name)[::step] for name in problem.names], axis=-1)
+    lp = posterior.data["sample_stats"]["lp"].transpose("chain", "draw").to_numpy().ravel()[::step]
+    prior = np.asarray(problem.log_prior(theta))
+    logs = SamplingDensity(problem).logarithmic
+    free = [name for name in problem.free_noise]
+    noise = problem.likelihood.complete(
+        np.array([posterior.draws(name)[::step] for name in free]).reshape(len(free), -1).T
+        if free
+        else np.empty((len(theta), 0))
+    )
+    likelihood = lp - prior - problem.likelihood.log_prior(noise) - np.log(theta[:, logs]).sum(axis=1)
+    return {
+        name: (_sensitivity(theta[:, i], prior), _sensitivity(theta[:, i], likelihood))
+        for i, name in enumerate(problem.names)
+    }
+
+
+def _sensitivity(values: np.ndarray, log_density: np.ndarray) -> float:
+    """Return the mean distance per doubling between draws and draws weighted by a density to small powers."""
+    distances = []
+    for power in (POWER - 1.0, 1.0 / POWER - 1.0):
+        logarithm = power * (log_density - log_density.max())
+        weights = np.exp(logarithm - logarithm.max())
+        distances.append(cumulative_jensen_shannon(values, weights / weights.sum()))
+    return float(np.mean(distances) / np.log2(POWER))
+
+
+def cumulative_jensen_shannon(values: np.ndarray, weights: np.ndarray) -> float:
+    """Return the distance, 0 to 1, of draws from the same draws with weights; the larger of both directions.
+
+    The root of the cumulative Jensen-Shannon divergence of the distribution functions over its largest value.
+
+    References
+    ----------
+    H.-V. Nguyen, J. Vreeken, Non-parametric Jensen-Shannon divergence, ECML PKDD 2015, 173-189.
+    """
+    order = np.argsort(values, kind="stable")
+    x, plain, weighted = values[order], np.full(values.size, 1.0 / values.size), weights[order]
+    return max(_one_sided(x, plain, weighted), _one_sided(-x[::-1], plain, weighted[::-1]))
+
+
+def _one_sided(x: np.ndarray, plain: np.ndarray, weighted: np.ndarray) -> float:
+    widths = np.diff(x)
+    p, q = np.cumsum(plain)[:-1], np.cumsum(weighted)[:-1]
+    total = np.sum((p + q) * widths)
+    if total <= 0.0:
+        return 0.0
+    middle = 0.5 * (p + q)
+
+    def against(own: np.ndarray, other: np.ndarray) -> float:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            terms = np.where(own > 0.0, own * np.log2(own / middle), 0.0)
+        return float(np.sum(terms * widths) + np.sum((other - own) * widths) / (2.0 * np.log(2.0)))
+
+    return float(np.sqrt(max(against(p, q) + against(q, p), 0.0) / total))
+
+
+DETERMINED, PRIOR_ONLY = "determined", "only with the prior"
+COMBINATION, SIGN, NOTHING = "only in combination", "sign undetermined", "not determined"
+# In prior sds: what the data alone may leave for a parameter to be determined (a contraction of 0.9), and from where on
+# they say nothing (1 % of the prior's information).
+ENOUGH, SILENT = 1.0 / 3.0, 10.0
+COLLINEAR = 5.0
+ONE_SIGN = 0.975
+MONTE_CARLO_ERRORS = 3.0
+NULL = 1e-13
+PRIOR_DRAWS = 20_000
+BOTH_SIGNS = "both signs fit the data: take a prior of one sign, or measure an output that is odd in it"
+
+
+@dataclass(frozen=True)
+class Identifiability(Result):
+    """What the data say about each parameter and each direction, against what the prior says.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row a parameter. ``verdict``: "determined", "only with the prior", "only in combination", "sign undetermined"
+        or "not determined". ``contraction``: 1 − (posterior sd / prior sd)², of the logarithm of positive parameters,
+        with its Monte Carlo error ``contraction_mcse``. ``alone`` and ``together``: the sd that the data alone leave,
+        in prior sds, if the other parameters are known and if they are not; ``collinearity`` their ratio. ``profile``:
+        its shape. ``structural``: the parameters with which the equations let it change unseen, if any. ``p_negative``
+        and ``p_negative_mcse``: probability of a value below zero; NaN for positive parameters. ``prior_sensitivity``
+        and ``likelihood_sensitivity``: see `power_scaling`. ``evidence`` and ``remedy`` in words.
+    directions : DataFrame
+        A row a direction in parameter space, the one that the data say least about first: information of the data over
+        that of the prior, contraction, the direction in words, and combinations that do not change along it.
+    spectrum : array (names,)
+        Eigenvalues of the Fisher information, descending, per unit of the logarithm of positive parameters and of the
+        prior's sd of signed ones.
+    condition : float
+        The largest over the smallest.
+    experiments : DataFrame
+        Candidates for a further experiment, the most informative first: gain in nats, and what would be left of each
+        parameter's sd.
+    structure : Structure
+        What the equations and the measured channels could determine at all, of the free parameters.
+    converged : bool
+        False if the draws, where there are any, have not converged.
+
+    Examples
+    --------
+    With the mass free too, a weak motion at one frequency tells k − m·ω² and little more:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": 0.3 * np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.03}, seed=1).fold(32, harmonics=3)
+    >>> priors = {"m": bp.LogNormal(1, 0.5), "c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)}
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors=priors, scheme="fourier", fixed={"k3": 0.5})
+    >>> found = bp.identifiability(problem, bp.map_estimate(problem, progress=False), profile=False)
+    >>> found.verdicts
+    {'m': 'only in combination', 'c': 'determined', 'k': 'determined'}
+    >>> found.table.loc["m", "remedy"]
+    'fix one of m, k'
+    """
+
+    table: pd.DataFrame
+    directions: pd.DataFrame
+    spectrum: np.ndarray
+    condition: float
+    experiments: pd.DataFrame
+    structure: Structure
+    converged: bool
+
+    @property
+    def verdicts(self) -> dict[str, str]:
+        """The verdict of each parameter."""
+        return dict(self.table["verdict"])
+
+    def __repr__(self) -> str:
+        lines = [] if self.converged else ["The draws have NOT CONVERGED; neither has what follows."]
+        for name, row in self.table.iterrows():
+            lines.append(f"{name}: {row['verdict']}; {row['evidence']}.")
+            if row["remedy"]:
+                lines.append(f"    {row['remedy']}.")
+        lines.append(f"Fisher information: condition number {self.condition:.3g}.")
+        return "\n".join(lines)
+
+
+@in_one_thread
+def identifiability(
+    problem: Problem,
+    fit: MapEstimate,
+    posterior: Posterior | None = None,
+    *,
+    profile: Profile | bool = True,
+    candidates: Iterable[tuple[str, float, float]] | None = None,
+) -> Identifiability:
+    """Say of each parameter whether the data determine it, with the evidence and a remedy.
+
+    Widths are those of the draws, or of the Laplace approximation where there are none, relative to the prior. In this
+    order: a signed parameter whose size is determined and whose sign is not (probability of either above 2.5 %, by more
+    than three Monte Carlo errors) has its "sign undetermined". One whose profile ([1]_) ends at the prior's support on
+    one side, and not because of other parameters, is determined "only with the prior". Where the data, with all else
+    known, have less than 1 % of the prior's information, it is "not determined". One that the equations themselves let
+    change together with others unseen, see `structure`, is determined "only in combination". Where the data alone, the
+    others unknown, leave less than a third of the prior's sd, it is "determined". For the rest, it is so "only in
+    combination" if the other parameters make it at least five times wider, else "only with the prior".
+
+    Parameters
+    ----------
+    problem : Problem
+    fit : MapEstimate
+    posterior : Posterior, optional
+    profile : Profile or bool
+        The profiles of all parameters, True to compute them, False to do without.
+    candidates : iterable of (run, frequency [Hz], scale), optional
+        Experiments that could be done: the inputs of a run, their variation scaled, at another frequency. By default
+        half, the same and twice the frequency and the amplitude of up to five runs.
+
+    Returns
+    -------
+    Identifiability
+
+    Raises
+    ------
+    ValueError
+        For an estimate of another problem, or a candidate of an unknown run.
+
+    References
+    ----------
+    .. [1] A. Raue, C. Kreutz, T. Maiwald, J. Bachmann, M. Schilling, U. Klingmüller, J. Timmer, Structural and
+       practical identifiability analysis of partially observed dynamical models by exploiting the profile likelihood,
+       Bioinformatics 25 (2009) 1923-1929.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> bp.identifiability(problem, fit, profile=False).verdicts
+    {'c': 'determined', 'k': 'determined'}
+    """
+    information = Information.of(problem, fit)
+    profiles = profile_of(problem, fit) if profile is True else (profile or None)
+    widths, errors = _widths(problem, fit, posterior, information)
+    options = default_candidates(problem) if candidates is None else [Candidate(*c) for c in candidates]
+    experiments = rank_candidates(problem, fit, information, options)
+    directions = _directions(information)
+    scaling = power_scaling(problem, posterior) if posterior is not None else {}
+    structure, rows = structure_of(problem), {}
+    for i, name in enumerate(problem.names):
+        together = np.sqrt(1.0 / max(1.0 / widths[i] ** 2 - 1.0, 1e-12)) if posterior else information.together[i]
+        row: dict[str, object] = {
+            "contraction": 1.0 - widths[i] ** 2,
+            "contraction_mcse": errors[i],
+            "alone": information.alone[i],
+            "together": together,
+            "collinearity": information.collinearity[i],
+            "profile": profiles.shape[name] if profiles and name in profiles.names else "",
+            "structural": ", ".join(_partners(structure, name)),
+        }
+        negative, error = _negative(problem, fit, posterior, name)
+        row |= {"p_negative": negative, "p_negative_mcse": error}
+        row |= dict(zip(("prior_sensitivity", "likelihood_sensitivity"), scaling.get(name, (np.nan,) * 2), strict=True))
+        row["verdict"] = _verdict(row, _size_known(problem, fit, posterior, name))
+        row["evidence"] = _evidence(row)
+        both = row["verdict"] == SIGN and abs(fit.theta[name]) > 2.0 * fit.sd[name]
+        row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments, structure)
+        rows[name] = row
+    table = pd.DataFrame.from_dict(rows, orient="index")
+    table = table[["verdict", *(c for c in table.columns if c != "verdict")]]
+    converged = posterior is None or posterior.converged
+    return Identifiability(
+        table, directions, information.spectrum, information.condition, experiments, structure, converged
+    )
+
+
+def _partners(structure: Structure, name: str) -> list[str]:
+    """Return the parameters with which the equations let one change unseen, itself among them; none if they do not."""
+    plain = name.partition("[")[0]
+    found = [p for symmetry in structure.symmetries if plain in symmetry.parameters for p in symmetry.parameters]
+    return list(dict.fromkeys(found))
+
+
+def _widths(
+    problem: Problem, fit: MapEstimate, posterior: Posterior | None, information: Information
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return posterior over prior sd of each parameter in its coordinate, and the contraction's Monte Carlo error."""
+    if posterior is None:
+        labels = list(problem.names)
+        variances = np.diag(fit.joint_covariance.loc[labels, labels])
+        return np.sqrt(variances) / information.prior_sd, np.zeros(len(labels))
+    prior = problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))
+    widths, errors = np.empty((2, len(problem.names)))
+    for i, name in enumerate(problem.names):
+        values = information.coordinate(name, posterior.draws(name))
+        widths[i] = _half_width(values) / _half_width(information.coordinate(name, prior[:, i]))
+        # The error of half the central 68 % interval of a normal sample is 1.1 times that of its sd.
+        errors[i] = 2.0 * widths[i] ** 2 * 1.1 / np.sqrt(2.0 * posterior.ess[name])
+    return widths, errors
+
+
+def _half_width(values: np.ndarray) -> float:
+    low, high = np.quantile(values, [ndtr(-1.0), ndtr(1.0)])
+    return float(0.5 * (high - low))
+
+
+def _is_signed(problem: Problem, name: str) -> bool:
+    low, high = problem.joint_prior.supports[name]
+    return low < 0.0 < high
+
+
+def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, name: str) -> tuple[float, float]:
+    """Return the probability that a parameter is negative, and its Monte Carlo error; NaN if it cannot be."""
+    if not _is_signed(problem, name):
+        return np.nan, np.nan
+    if posterior is None:
+        return float(ndtr(-fit.theta[name] / fit.sd[name])), 0.0
+    share = float(np.mean(posterior.draws(name) < 0.0))
+    size = posterior.ess[name]
+    bounded = np.clip(share, 1.0 / (size + 2.0), 1.0 - 1.0 / (size + 2.0))
+    return share, float(np.sqrt(bounded * (1.0 - bounded) / size))
+
+
+def _size_known(problem: Problem, fit: MapEstimate, posterior: Posterior | None, name: str) -> bool:
+    """Return whether the data halve, at least, the prior's spread of a signed parameter's absolute value."""
+    if not _is_signed(problem, name):
+        return False
+    column = problem.names.index(name)
+    prior = np.abs(problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))[:, column])
+    if posterior is None:
+        normal = np.random.default_rng(1).standard_normal(PRIOR_DRAWS)
+        return _half_width(np.abs(fit.theta[name] + fit.sd[name] * normal)) < 0.5 * _half_width(prior)
+    return _half_width(np.abs(posterior.draws(name))) < 0.5 * _half_width(prior)
+
+
+def _verdict(row: dict, size_known: bool) -> str:
+    margin = MONTE_CARLO_ERRORS * row["p_negative_mcse"]
+    if size_known and max(row["p_negative"], 1.0 - row["p_negative"]) < ONE_SIGN - margin:
+        return SIGN
+    if row["profile"] == ONE_SIDED and row["collinearity"] < COLLINEAR:
+        return PRIOR_ONLY
+    if row["alone"] > SILENT:
+        return NOTHING
+    if row["structural"]:
+        return COMBINATION
+    if row["together"] <= ENOUGH:
+        return DETERMINED
+    return COMBINATION if row["collinearity"] >= COLLINEAR and row["alone"] < 1.0 else PRIOR_ONLY
+
+
+def _evidence(row: dict) -> str:
+    error = f" ± {row['contraction_mcse']:.2g}" if row["contraction_mcse"] else ""
+    text = f"contraction {row['contraction']:.3g}{error}"
+    if row["collinearity"] >= COLLINEAR:
+        wider = "without limit" if not row["collinearity"] < 1e6 else f"{row['collinearity']:.3g} times"
+        text += f", the other parameters widen it {wider}"
+    if row["structural"]:
+        text += ", by the equations themselves"
+    if row["alone"] > ENOUGH and row["profile"] != ONE_SIDED:
+        text += f", the data alone would leave {row['alone']:.3g} prior sds with all else known"
+    if row["profile"] and row["profile"] != "closed":
+        text += f", its profile is {row['profile']}"
+    if np.isfinite(row["p_negative"]):
+        text += f", P(negative) = {row['p_negative']:.3g}"
+        text += f" ± {row['p_negative_mcse']:.2g}" if row["p_negative_mcse"] else ""
+    if np.isfinite(row["prior_sensitivity"]) and row["prior_sensitivity"] > 0.05:
+        text += f", sensitive to the prior ({row['prior_sensitivity']:.2g} a doubling)"
+    return text
+
+
+def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame, structure: Structure) -> str:
+    """Return what to do about a parameter: what to fix, what to report, what to measure."""
+    if row["verdict"] == DETERMINED:
+        return ""
+    if row["verdict"] == COMBINATION and row["structural"]:
+        return f"fix one of {row['structural']}, or report {', '.join(structure.combinations)}".removesuffix(
+            ", or report "
+        )
+    if row["verdict"] == COMBINATION:
+        own = directions[directions["parameters"].str.split(", ").apply(lambda members: name in members)]
+        own = own[own["gain"] < 1.0 / ENOUGH**2]
+        if len(own):
+            best = own.iloc[0]
+            combos = f", or report {best['combinations']}" if best["combinations"] else ""
+            return f"fix one of {best['parameters']}{combos}"
+    if len(experiments) and name in experiments:
+        ranked = experiments.dropna(subset=[name]).sort_values(name)
+        if len(ranked) and ranked.iloc[0][name] < 0.9:
+            best = ranked.iloc[0]
+            return (
+                f"measure {best['run']} at {best['frequency']:.3g} Hz with {best['scale']:.3g} times its amplitude: "
+                f"that would leave {best[name]:.0%} of the sd"
+            )
+    return "report it with its prior, or fix it; no candidate for a further experiment narrows it by a tenth"
+
+
+def _directions(information: Information) -> pd.DataFrame:
+    """Return the directions of parameter space by what the data say about them, the least first.
+
+    Directions about which they say nothing are shown with as few parameters each as possible.
+    """
+    gains, vectors = information.gains, information.directions.T
+    silent = gains < NULL * gains.max()
+    shown = vectors.copy()
+    if silent.sum() > 1:
+        shown[silent] = reduced(vectors[silent])
+    rows = []
+    for gain, vector in zip(gains, shown, strict=True):
+        natural = np.where(np.abs(vector) > 0.05 * np.abs(vector).max(), vector, 0.0)
+        members = [name for name, part in zip(information.names, natural, strict=True) if part]
+        rows.append(
+            {
+                "gain": gain,
+                "contraction": gain / (1.0 + gain),
+                "direction": in_words(vector, information.names, information.logarithmic),
+                "parameters": ", ".join(members),
+                "combinations": ", ".join(combinations(vector, information.names, information.logarithmic))
+                if gain < 1.0 / ENOUGH**2
+                else "",
+            }
+        )
+    return pd.DataFrame(rows)

@@ -1,0 +1,154 @@
+"""Before any sampling: how much of the prior has the periodic orbit at all, and what outputs it expects."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from tqdm import tqdm
+
+from bayesperiodic import _checks
+from bayesperiodic._io import Result
+from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.diagnostics.predictive import Bands, bands
+from bayesperiodic.periodic import family
+from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
+from bayesperiodic.posterior.problem import Problem
+
+NO_ORBIT, OTHER, FAILED = "no orbit", "other orbit", "solver failed"
+ENDS = {
+    family.FOLD: (NO_ORBIT, "the branch ends in a fold"),
+    family.EQUILIBRIUM: (NO_ORBIT, "the cycle shrinks to an equilibrium"),
+    family.SHORTER: (NO_ORBIT, "the orbit merges with one of a shorter period"),
+    family.ROUND_FOLDS: (OTHER, "the branch folds and comes back, another orbit of it exists"),
+    family.ARRIVED: (FAILED, "the orbit exists"),
+    family.LOST: (FAILED, "nor can the branch be followed"),
+}
+
+
+@dataclass(frozen=True)
+class PriorPredictive(Result):
+    """What the prior expects of the periodic solves and of the outputs.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row an experiment: the shares of the draws whose solve converged, that have another orbit than the one small
+        steps from the prior's medians lead to, that have no orbit, and at which the solver failed although nothing
+        shows that there is none; and the share of the measured values ``inside`` the central 90 % of the draws'
+        outputs. In the row "all" a draw counts by its worst experiment, in this order.
+    causes : dict of str to float
+        Share of all solves, draws times experiments, by cause.
+    outputs : Bands
+        Median and central 90 % band of the outputs over the draws, without noise.
+    draws : int
+
+    Examples
+    --------
+    With a prior of k this wide, one draw in 25 belongs to another branch of the resonance:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.2, duration=200,
+    ...                   sampling_rate=8, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 1.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> expected = bp.prior_predictive(problem, draws=50, progress=False)
+    >>> expected.table.loc["all", ["converged", "other orbit", "no orbit"]].to_dict()
+    {'converged': 0.96, 'other orbit': 0.04, 'no orbit': 0.0}
+    >>> list(expected.causes)
+    ['other orbit (stalled): the branch folds and comes back, another orbit of it exists']
+    >>> expected.outputs.low["synthetic duffing"]["displacement"].shape
+    (32,)
+    """
+
+    table: pd.DataFrame
+    causes: dict[str, float]
+    outputs: Bands
+    draws: int
+
+    def __repr__(self) -> str:
+        causes = "".join(f"\n  {share:.1%}: {cause}" for cause, share in self.causes.items())
+        table = self.table.to_string(float_format="{:.1%}".format)
+        return f"PriorPredictive of {self.draws} draws\n{table}" + (f"\nfailed solves:{causes}" if causes else "")
+
+
+@in_one_thread
+def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progress: bool = True) -> PriorPredictive:
+    """Solve every experiment for draws from the prior, and find out why some solves fail.
+
+    The solves start from the orbits at the prior's medians. Where one fails, the branch of orbits through there is
+    followed by arclength along the straight line to the draw: where the branch ends in a fold, shrinks to an
+    equilibrium or merges with an orbit of a shorter period, there is no orbit of its kind at the draw; where it leads
+    there after all, there is one and the solver failed. The sampler gives both the density zero, so the first share
+    belongs to the model and the second is a defect to be counted.
+
+    Parameters
+    ----------
+    problem : Problem
+    draws : int
+        At least 20.
+    seed : int
+    progress : bool
+        Show a progress bar while failed solves are looked into.
+
+    Returns
+    -------
+    PriorPredictive
+
+    Raises
+    ------
+    ValueError
+        For fewer than 20 draws, or a negative seed.
+    RuntimeError
+        If no draw has a periodic solution.
+
+    Examples
+    --------
+    Priors that are wide enough to hold the measured period:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> expected = bp.prior_predictive(problem, draws=50, progress=False)
+    >>> float(expected.table.loc["synthetic duffing", "inside"])
+    1.0
+    """
+    count = _checks.integer("draws", draws, 20)
+    theta = problem.joint_prior.sample(count, np.random.default_rng(_checks.integer("seed", seed, 0)))
+    solved = problem.responses.solve(theta)
+    verdicts, causes = {}, Counter[str]()
+    failed = [(name, i) for name, s in solved.items() for i in np.flatnonzero(s.status != CONVERGED)]
+    for name in solved:
+        verdicts[name] = np.full(count, STATUSES[CONVERGED], dtype=object)
+    for name, i in tqdm(failed, desc="failed solves", disable=not (progress and failed)):
+        verdicts[name][i], why = ENDS[problem.responses.reach(theta[i], name)]
+        causes[f"{verdicts[name][i]} ({STATUSES[solved[name].status[i]]}): {why}"] += 1
+    outputs, converged = problem.outputs(theta)
+    if not converged.any():
+        raise RuntimeError(
+            f"problem: none of {count} draws from its priors has a periodic solution in all experiments. Narrow the "
+            "priors about values at which problem.solve(theta) converges."
+        )
+    prediction = bands(problem, outputs, converged, {})
+    order = [STATUSES[CONVERGED], OTHER, NO_ORBIT, FAILED]
+    worst = np.max([[order.index(v) for v in row] for row in verdicts.values()], axis=0)
+    verdicts["all"] = np.array(order, dtype=object)[worst]
+    rows = {name: {what: float(np.mean(row == what)) for what in order} for name, row in verdicts.items()}
+    table = pd.DataFrame.from_dict(rows, orient="index")
+    table["inside"] = [*(_inside(problem, prediction, e) for e in range(len(problem.experiments))), np.nan]
+    shares = {cause: number / (count * len(solved)) for cause, number in causes.most_common()}
+    return PriorPredictive(table, shares, prediction, count)
+
+
+def _inside(problem: Problem, prediction: Bands, index: int) -> float:
+    """Return the share of an experiment's measured values within the band."""
+    e = problem.experiments[index]
+    within = [
+        (values >= prediction.low[e.name][channel]) & (values <= prediction.high[e.name][channel])
+        for channel, values in e.outputs.items()
+    ]
+    return float(np.mean(within if e.mask is None else np.array(within)[:, e.mask]))

@@ -1,0 +1,322 @@
+"""What is wrong with a normal approximation, in one of a few words, beyond tolerance and Monte Carlo error."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import quad
+from scipy.ndimage import gaussian_filter1d
+from scipy.special import chdtri, ndtr, ndtri
+
+BATCHES = 8
+# Expected Wasserstein distance of n independent standard normal draws from their own distribution, times √n.
+WASSERSTEIN_FLOOR = float(np.sqrt(2 / np.pi) * quad(lambda z: np.sqrt(ndtr(z) * ndtr(-z)), -20.0, 20.0)[0])
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Draws of one quantity, whole and in batches.
+
+    The Monte Carlo error of a statistic is the standard deviation of its values in the batches over √batches. A batch
+    is an eighth of the steps of one independent ensemble, several autocorrelation times where the sampler converged.
+
+    Attributes
+    ----------
+    whole : array (draws,)
+    batches : array (batches, size)
+    size : float
+        Effective sample size.
+    ensembles : int
+        Whose batches come one after the other.
+    """
+
+    whole: np.ndarray
+    batches: np.ndarray
+    size: float
+    ensembles: int
+
+    @classmethod
+    def of(cls, draws: np.ndarray, ensemble: np.ndarray, size: float) -> "Sample":
+        """Return the sample of draws (chains·steps,), one chain after the other, by their ensembles (chains,)."""
+        chains = draws.reshape(ensemble.size, -1)[np.argsort(ensemble, kind="stable")]
+        count, steps = np.unique(ensemble).size, chains.shape[1]
+        parts = min(BATCHES, steps)
+        used = steps // parts * parts
+        shaped = chains[:, steps - used :].reshape(count, -1, parts, used // parts)
+        batches = shaped.transpose(0, 2, 1, 3).reshape(count * parts, -1)
+        return cls(draws, batches, max(size, 1.0) if np.isfinite(size) else 1.0, count)
+
+    def by_ensemble(self) -> list["Sample"]:
+        """Return the sample that each ensemble is by itself."""
+        parts = np.split(self.batches, self.ensembles)
+        return [Sample(part.ravel(), part, max(self.size / self.ensembles, 1.0), 1) for part in parts]
+
+    def of_values(self, function: Callable[[np.ndarray], np.ndarray]) -> "Sample":
+        """Return the sample of a function of the quantity."""
+        return Sample(function(self.whole), function(self.batches), self.size, self.ensembles)
+
+    def error(self, statistic: Callable[[np.ndarray], np.ndarray]) -> float:
+        """Return the Monte Carlo error of a statistic, which acts along the last axis."""
+        values = statistic(self.batches)
+        return float(np.std(values, ddof=1) / np.sqrt(len(values)))
+
+    def estimate(self, statistic: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:
+        """Return a statistic of all draws and its Monte Carlo error."""
+        return float(statistic(self.whole)), self.error(statistic)
+
+    def share(self, inside: Callable[[np.ndarray], np.ndarray], expected: float) -> tuple[float, float]:
+        """Return the share of draws for which a condition holds, and its Monte Carlo error.
+
+        The error is at least that of `expected` in as many independent draws as the effective sample size.
+        """
+        share, error = self.estimate(lambda x: np.mean(inside(x), axis=-1))
+        return share, max(error, float(np.sqrt(expected * (1.0 - expected) / self.size)))
+
+
+def skewness(x: np.ndarray) -> np.ndarray:
+    """Return the skewness (…,) of draws (…, n)."""
+    z = x - x.mean(axis=-1, keepdims=True)
+    return np.mean(z**3, axis=-1) / np.mean(z**2, axis=-1) ** 1.5
+
+
+def wasserstein(x: np.ndarray, mean: float, sd: float) -> np.ndarray:
+    """Return the first Wasserstein distance (…,) between draws (…, n) and a normal distribution, by its quantiles."""
+    count = x.shape[-1]
+    return np.mean(np.abs(np.sort(x, axis=-1) - mean - sd * ndtri((np.arange(count) + 0.5) / count)), axis=-1)
+
+
+def wasserstein_distance(sample: Sample, mean: float, sd: float) -> tuple[float, float]:
+    """Return the Wasserstein distance from a normal distribution in sds of the draws, and its Monte Carlo error.
+
+    A distance is biased upwards: draws of the normal distribution itself are 1.3/√ESS sds away from it. The error is
+    the root of the squares of the spread between batches and of this bias.
+    """
+    if not np.isfinite(sd):
+        return np.inf, np.nan
+    own = float(sample.whole.std())
+    value, spread = sample.estimate(lambda x: wasserstein(x, mean, sd))
+    return value / own, float(np.hypot(spread / own, WASSERSTEIN_FLOOR / np.sqrt(sample.size)))
+
+
+def radii(points: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the Mahalanobis distances (n,) of points (n, dimension) from the centre of a normal distribution."""
+    scale = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    floor = np.finfo(float).eps * values.size * values.max()
+    z = ((points - mean) / scale) @ (vectors / np.sqrt(np.maximum(values, floor)))
+    return np.sqrt(np.sum(z**2, axis=1))
+
+
+def normal_draws(
+    mean: np.ndarray, covariance: np.ndarray, size: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return draws (size, dimension) of a normal distribution and their log-densities (size,), but for a constant."""
+    scale = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    z = generator.standard_normal((size, mean.size))
+    return mean + scale * ((z * np.sqrt(np.maximum(values, 0.0))) @ vectors.T), -0.5 * np.sum(z**2, axis=1)
+
+
+MASS, DEPTH = 0.05, 0.7
+GRID = 256
+ENDS = (0.001, 0.999)
+
+
+def has_other_mode(sample: Sample, point: float) -> bool:
+    """Return whether more than 5 % of the draws lie beyond a valley of their density, as seen from a point.
+
+    The density is a kernel estimate with Silverman's bandwidth for the effective sample size, in every batch. A valley
+    is lower than 0.7 of the lower of the peaks on its two sides. Both the mass and the depth must hold by three Monte
+    Carlo errors, so neither skewness nor the noise of a flat top makes a mode.
+    """
+    x = sample.whole
+    spread = min(x.std(), float(np.subtract(*np.quantile(x, [0.75, 0.25]))) / 1.349) or x.std()
+    if not spread > 0.0:
+        return False
+    bandwidth = 0.9 * spread * sample.size**-0.2
+    low, high = np.quantile(x, ENDS)
+    edges = np.linspace(low - 3 * bandwidth, high + 3 * bandwidth, GRID + 1)
+    width = edges[1] - edges[0]
+    inside = np.clip(((sample.batches - edges[0]) / width).astype(int), 0, GRID - 1)
+    batches = len(inside)
+    counts = np.bincount((inside + GRID * np.arange(batches)[:, None]).ravel(), minlength=batches * GRID)
+    shares = counts.reshape(batches, GRID) / inside.shape[1]
+    density = gaussian_filter1d(shares, bandwidth / width, mode="constant")
+    return any(
+        _separates(density, shares, at, point > edges[at] + 0.5 * width) for at in _valleys(density.mean(axis=0))
+    )
+
+
+def _valleys(density: np.ndarray) -> np.ndarray:
+    """Return where a density has local minima."""
+    falls, rises = np.diff(density)[:-1] < 0.0, np.diff(density)[1:] >= 0.0
+    return np.flatnonzero(falls & rises) + 1
+
+
+def _separates(density: np.ndarray, shares: np.ndarray, valley: int, point_above: bool) -> bool:
+    """Return whether a valley is deep enough and the mass beyond it large enough, by the batches (batches, grid)."""
+    mean = density.mean(axis=0)
+    peaks = int(np.argmax(mean[:valley])), valley + int(np.argmax(mean[valley:]))
+    peak = min(peaks, key=lambda place: mean[place])
+    far = shares[:, :valley] if point_above else shares[:, valley:]
+    return _beyond_errors(far.sum(axis=1) - MASS) and _beyond_errors(DEPTH * density[:, peak] - density[:, valley])
+
+
+def _beyond_errors(values: np.ndarray) -> bool:
+    """Return whether the mean over batches is above zero by three standard errors."""
+    return bool(values.mean() > ERRORS * values.std(ddof=1) / np.sqrt(len(values)))
+
+
+FINE, NARROW, WIDE, SHAPE, MODE = "fine", "too narrow", "too wide", "wrong shape", "wrong mode"
+UNCONVERGED = "not converged"
+ERRORS = 3.0
+TAIL, END_SHIFT = 0.05, 0.25
+END = float(ndtri(1.0 - TAIL))
+LEVELS = (0.5, 0.9, 0.95)
+SCALE = 1.0 + END_SHIFT / END
+PILED, EDGE = 0.05, 0.25
+REACH, FEW = 3.0, 0.05
+USABLE_K = 0.7
+
+
+def marginal_verdict(sample: Sample, mean: float, sd: float, support: tuple[float, float], converged: bool) -> str:
+    """Return the verdict on a normal approximation of one quantity.
+
+    What counts are the ends of its 90 % interval: that more (or less) than 5 % of the draws lie beyond an end, still
+    after it was moved by a quarter of the draws' sd, and by more than three Monte Carlo errors.
+
+    Parameters
+    ----------
+    sample : Sample
+    mean, sd : float
+        Of the approximation.
+    support : tuple of float
+        Of the prior.
+    converged : bool
+        If the draws have not converged there is no verdict, unless every ensemble by itself shows another mode.
+    """
+    if not converged:
+        return _unconverged(sample, mean)
+    if not np.isfinite(sd):
+        return WIDE
+    if _elsewhere(sample, mean, sd) or has_other_mode(sample, mean):
+        return MODE
+    own = float(sample.whole.std())
+    low = _end(sample, mean, sd, own)
+    high = _end(sample.of_values(np.negative), -mean, sd, own)
+    if low == high == FINE:
+        distance, error = wasserstein_distance(sample, mean, sd)
+        return SHAPE if distance - ERRORS * error > END_SHIFT else FINE
+    if _piled(sample, support, own):
+        return SHAPE
+    quantiles = np.quantile(sample.whole, [TAIL, 1.0 - TAIL])
+    outwards = np.array([mean - END * sd - quantiles[0], quantiles[1] - mean - END * sd]) / own
+    if np.all(outwards > 0.5 * END_SHIFT):
+        return NARROW
+    return WIDE if np.all(outwards < -0.5 * END_SHIFT) else SHAPE
+
+
+def _unconverged(sample: Sample, mean: float) -> str:
+    every = all(has_other_mode(ensemble, mean) for ensemble in sample.by_ensemble())
+    return MODE if every else UNCONVERGED
+
+
+def _end(sample: Sample, mean: float, sd: float, own: float) -> str:
+    """Return the verdict on the lower end of the 90 % interval; `own` is the sd of the draws."""
+    end = mean - END * sd
+    beyond, error = sample.share(lambda x: x < end - END_SHIFT * own, TAIL)
+    if beyond > TAIL + ERRORS * error:
+        return NARROW
+    beyond, error = sample.share(lambda x: x < end + END_SHIFT * own, TAIL)
+    return WIDE if beyond < TAIL - ERRORS * error else FINE
+
+
+def _elsewhere(sample: Sample, mean: float, sd: float) -> bool:
+    """Return whether less than 5 % of the draws lie on this side of either end of mean ± 3 sd."""
+    for sign in (1.0, -1.0):
+        within, error = sample.share(lambda x, s=sign: s * (x - mean) < REACH * sd, FEW)  # type: ignore[misc]
+        if within < FEW - ERRORS * error:
+            return True
+    return False
+
+
+def _piled(sample: Sample, support: tuple[float, float], own: float) -> bool:
+    """Return whether more than 5 % of the draws lie within a quarter of their sd of an end of the support.
+
+    They are 1.8 % of a normal posterior cut two sds from its centre, and 12 % of one cut at its centre.
+    """
+    for end in support:
+        if np.isfinite(end):
+            near, error = sample.share(lambda x, e=end: np.abs(x - e) < EDGE * own, PILED)  # type: ignore[misc]
+            if near > PILED + ERRORS * error:
+                return True
+    return False
+
+
+def joint_verdict(
+    points: np.ndarray,
+    mean: np.ndarray,
+    covariance: np.ndarray,
+    sampled: Callable[[np.ndarray], Sample],
+    pareto_k: tuple[float, float],
+    converged: bool,
+) -> str:
+    """Return the verdict on a normal approximation of all coordinates together.
+
+    Ellipsoids of 50, 90 and 95 % hold too few draws if they still do after their radii grew by 15 % (as far as a
+    quarter of a sd moves the ends of a 90 % interval), and too many accordingly; by more than three Monte Carlo errors.
+    The approximation is then too narrow or too wide if a normal distribution with the draws' own mean and covariance
+    would be fine and a shift of the mean alone is not what is wrong; otherwise, and where the Pareto k̂ is above 0.7 by
+    its error, the shape is wrong.
+
+    Parameters
+    ----------
+    points : array (draws, dimension)
+    mean, covariance : array (dimension,), (dimension, dimension)
+    sampled : callable
+        Makes a Sample of values (draws,).
+    pareto_k : tuple of float
+        With its error.
+    converged : bool
+        See `marginal_verdict`.
+    """
+    own_mean, own_covariance = points.mean(axis=0), np.atleast_2d(np.cov(points.T))
+    direction = _widest(own_covariance)
+    along = sampled(points @ direction)
+    if not converged:
+        return _unconverged(along, float(mean @ direction))
+    if not np.isfinite(covariance).all():
+        return WIDE
+    if has_other_mode(along, float(mean @ direction)):
+        return MODE
+    found = _ellipsoids(sampled(radii(points, mean, covariance)), mean.size)
+    if found == FINE:
+        return SHAPE if pareto_k[0] - pareto_k[1] > USABLE_K else FINE
+    if _ellipsoids(sampled(radii(points, own_mean, own_covariance)), mean.size) != FINE:
+        return SHAPE
+    return SHAPE if _ellipsoids(sampled(radii(points, own_mean, covariance)), mean.size) == FINE else found
+
+
+def ellipsoid_radii(levels: np.ndarray, dimension: int) -> np.ndarray:
+    """Return the Mahalanobis radii of the ellipsoids that hold these probabilities."""
+    return np.sqrt(chdtri(dimension, 1.0 - np.asarray(levels)))
+
+
+def _ellipsoids(distances: Sample, dimension: int) -> str:
+    """Return whether the ellipsoids hold as many draws as they should."""
+    found = set()
+    for level, radius in zip(LEVELS, ellipsoid_radii(np.array(LEVELS), dimension), strict=True):
+        larger, error = distances.share(lambda r, R=radius: r < SCALE * R, level)  # type: ignore[misc]
+        if larger < level - ERRORS * error:
+            found.add(NARROW)
+        smaller, error = distances.share(lambda r, R=radius: r < R / SCALE, level)  # type: ignore[misc]
+        if smaller > level + ERRORS * error:
+            found.add(WIDE)
+    return found.pop() if len(found) == 1 else SHAPE if found else FINE
+
+
+def _widest(covariance: np.ndarray) -> np.ndarray:
+    """Return the direction along which draws, in units of their sds, spread most."""
+    scale = np.sqrt(np.diag(covariance))
+    safe = np.where(scale > 0.0, scale, 1.0)
+    return np.linalg.eigh(covariance / np.outer(safe, safe))[1][:, -1] / safe

@@ -1,0 +1,1 @@
+"""MAP estimate, Laplace approximation and profiles."""

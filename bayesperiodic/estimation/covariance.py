@@ -1,0 +1,360 @@
+"""Standard deviations that hold although the noise model does not: the sandwich with the residual's own spectrum."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesperiodic import _fourier
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.estimation.gauss_newton import Iterate, information
+from bayesperiodic.periodic.compiled import CONVERGED
+from bayesperiodic.periodic.equations import PeriodicEquations
+from bayesperiodic.periodic.sensitivity import input_sensitivities
+from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
+from bayesperiodic.periodic.solve import solve_forced, solve_free
+from bayesperiodic.posterior.noise import LENGTHSCALE, SPECTRAL, Block
+from bayesperiodic.posterior.observation import Response
+from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.posterior.simulator import leading_multipliers
+
+# Correlation lengths tried, in response periods; white noise beside them has this prior probability.
+LENGTHSCALES = np.geomspace(1e-3, 3.0, 40)
+WHITE = 0.5
+ROUNDS, SETTLED = 10, 1e-3
+RIDGE = 1e-12
+
+
+def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarray) -> np.ndarray:
+    """Return C (J + P) C, with C the inverse of H of eq. (8), P the prior's curvature and J the scores' variance.
+
+    J takes the variance of each Fourier component from the residual itself. A first-order autoregressive spectrum (or
+    white noise) is fitted to it, the residual is divided by that (prewhitening, [1]_), and what is left is smoothed
+    over neighbouring harmonics. Two things make the low harmonics, on which most outputs depend, honest: the fit takes
+    out just these, so that the spectrum has the restricted likelihood [2]_, with the parameters integrated out; and
+    the little that is left tells the correlation length poorly, so that J is averaged over its posterior, and raised
+    for the few values behind each smoothed one. Components that are no Fourier components keep the model's variance.
+
+    References
+    ----------
+    .. [1] D. W. K. Andrews, J. C. Monahan, An improved heteroskedasticity and autocorrelation consistent covariance
+       matrix estimator, Econometrica 60 (1992) 953-966.
+    .. [2] D. A. Harville, Maximum likelihood approaches to variance component estimation and to related problems,
+       Journal of the American Statistical Association 72 (1977) 320-338.
+    """
+    likelihood, prior = problem.likelihood, problem.joint_prior.curvature(estimate.theta)
+    ones = [np.ones(block.size) for block in likelihood.blocks]
+    changes, residuals, units = (
+        likelihood.whitened(vectors, estimate.noise)
+        for vectors in (estimate.here.changes, estimate.here.residuals, ones)
+    )
+    information = prior + sum(s @ s.T for s in changes)
+    if not np.isfinite(information).all():
+        return np.full_like(covariance, np.nan)
+    middle = prior
+    for block, s, r, unit in zip(likelihood.blocks, changes, residuals, units, strict=True):
+        variance = np.ones(block.size)
+        if block.kind == SPECTRAL:
+            variance = _Refits.of(block, s, r, unit, information).variance(block) if r.any() else np.zeros(block.size)
+        middle = middle + (s * variance) @ s.T
+    return covariance @ middle @ covariance
+
+
+@dataclass(frozen=True)
+class _Refits:
+    """Least squares of one block's whitened residual, once for each spectrum that it may have.
+
+    Attributes
+    ----------
+    spectrum : array (spectra, size)
+        Of the whitened residual, with the scale that suits it best.
+    square : array (spectra, size)
+        Squared residuals of the fits in units of their spectra.
+    left : array (spectra, size)
+        What to expect of these: the independent values per component, less what the fit takes out.
+    posterior : array (spectra,)
+        Probabilities of the spectra.
+    """
+
+    spectrum: np.ndarray
+    square: np.ndarray
+    left: np.ndarray
+    posterior: np.ndarray
+
+    @classmethod
+    def of(cls, block: Block, s: np.ndarray, r: np.ndarray, unit: np.ndarray, information: np.ndarray) -> "_Refits":
+        """Return the fits; what other blocks and the prior say of θ stays as it is."""
+        shape, log_prior = _shapes(block, unit)
+        scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(information)), np.finfo(float).tiny))
+        others = _positive((information - s @ s.T) * np.outer(scale, scale))
+        s, score = s * scale[:, None], (s * scale[:, None]) @ r
+        own = (s / shape[:, None, :]) @ s.T
+        pull = (r / shape) @ s.T
+        size = np.ones(len(shape))
+        for _ in range(ROUNDS):
+            total = own / size[:, None, None] + others
+            step = np.linalg.solve(total, (pull / size[:, None] - score)[..., None])[..., 0]
+            square = (r - step @ s) ** 2 / shape
+            taken = np.einsum("am,gam->gm", s, np.linalg.solve(total, s / shape[:, None, :])) / size[:, None]
+            left = np.maximum(block.weight - taken, 0.0)
+            before = size
+            size = np.maximum(square.sum(axis=1), np.finfo(float).tiny) / np.maximum(left.sum(axis=1), RIDGE)
+            if np.allclose(size, before, rtol=SETTLED, atol=0.0):
+                break
+        misfit = square.sum(axis=1) / size + np.einsum("ga,ab,gb->g", step, others, step) + 2.0 * step @ score
+        logarithms = block.weight * np.sum(np.log(size[:, None] * shape), axis=1) + np.linalg.slogdet(total)[1]
+        log_posterior = log_prior - 0.5 * (misfit + logarithms)
+        posterior = np.exp(log_posterior - log_posterior.max())
+        return cls(size[:, None] * shape, square / size[:, None], left, posterior / posterior.sum())
+
+    def variance(self, block: Block) -> np.ndarray:
+        """Return the variance (size,) of the whitened residual's components, corrected and averaged."""
+        corrected = [
+            spectrum * _smoothed(block, square, left)
+            for spectrum, square, left in zip(self.spectrum, self.square, self.left, strict=True)
+        ]
+        return self.posterior @ np.array(corrected)
+
+
+def _shapes(block: Block, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return spectra (spectra, size) in units of the noise model, white and autoregressive, and their log-priors."""
+    lengths = np.concatenate([[0.0], LENGTHSCALES])
+    shape = unit**2 / (1.0 + (2 * np.pi * lengths[:, None] * block.harmonic) ** 2)
+    weight = np.exp(LENGTHSCALE.log_prob(LENGTHSCALES)) * LENGTHSCALES
+    weight = np.concatenate([[WHITE], (1.0 - WHITE) * weight / weight.sum()])
+    return shape / shape.mean(axis=1, keepdims=True), np.log(weight)
+
+
+def _positive(matrix: np.ndarray) -> np.ndarray:
+    """Return a symmetric matrix with its negative eigenvalues cut off."""
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    return (vectors * np.maximum(values, RIDGE)) @ vectors.T
+
+
+def _smoothed(block: Block, square: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """Return squares over their expectation (size,), smoothed over harmonics, as the mean of an unknown variance."""
+    highest = int(block.harmonic.max())
+    half = int(np.ceil(np.sqrt(highest + 1.0)))
+    window = 1.0 - (np.arange(-half, half + 1) / (half + 1.0)) ** 2
+    middle = slice(half, half + highest + 1)
+    power, expected, doubled = (
+        np.convolve(np.bincount(block.harmonic, values, highest + 1), weights)[middle]
+        for values, weights in ((square, window), (left, window), (left, window**2))
+    )
+    freedom = expected**2 / np.maximum(doubled, RIDGE)
+    ratio = power / np.maximum(expected, RIDGE) * _excess(freedom) / _excess(np.sum(left))
+    return ratio[block.harmonic]
+
+
+def _excess(freedom: np.ndarray) -> np.ndarray:
+    """Return the mean of a variance over its estimate, ν/(ν − 2), for estimates with ν degrees of freedom."""
+    return np.maximum(freedom, 1.0) / np.maximum(freedom - 2.0, 1.0)
+
+
+# Quantiles of the priors of a spectrum's shape that are tried: many of the first parameter, few of any other.
+MANY, FEW = 60, 9
+TAIL = 0.005
+UPDATES, JITTER = 3, 1e-12
+
+
+def with_uncertain_noise(problem: Problem, estimate: Iterate, covariance: np.ndarray) -> np.ndarray:
+    """Return the covariance of θ (names, names) with the noise parameters integrated out instead of held.
+
+    Models without a shape, whose variances alone are unknown, keep their covariance; intervals by Student's t are all
+    they need. A spectrum's shape is known poorly from the low harmonics, on which most outputs depend and which the fit
+    takes out. So θ is estimated again, by linear least squares, for shapes from all over their prior; their posterior
+    is that of the restricted likelihood [1]_, with θ integrated out, and the covariance is that of the mixture about
+    the estimate. With several channels the changes that each brings by itself are added.
+
+    Parameters
+    ----------
+    problem : Problem
+    estimate : Iterate
+    covariance : array (names, names)
+        Inverse of H of eq. (8) at the estimate.
+
+    References
+    ----------
+    .. [1] D. A. Harville, Maximum likelihood approaches to variance component estimation and to related problems,
+       Journal of the American Statistical Association 72 (1977) 320-338.
+    """
+    shaped = [(group, members) for group, members in problem.likelihood.groups() if _is_shaped(problem, group, members)]
+    if not shaped or not np.all(np.diag(covariance) > 0.0):
+        return covariance
+    total = information(problem, estimate)[0] + problem.joint_prior.curvature(estimate.theta)
+    result = covariance.copy()
+    for group, members in shaped:
+        result += _mixture(problem, estimate, total, covariance, group, members) - covariance
+    scale = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(result / np.outer(scale, scale))
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale)
+
+
+def _is_shaped(problem: Problem, group: tuple[str, ...], members: list[int]) -> bool:
+    """Return whether a group of noise parameters, all unknown, has a shape beside its variance, over whole periods."""
+    shaped = any(name.partition("[")[0] in problem.noise.shape_priors for name in group)
+    spectral = all(problem.likelihood.blocks[b].kind == SPECTRAL for b in members)
+    return shaped and spectral and set(group) <= set(problem.free_noise)
+
+
+def _mixture(
+    problem: Problem,
+    estimate: Iterate,
+    hessian: np.ndarray,
+    covariance: np.ndarray,
+    group: tuple[str, ...],
+    members: list[int],
+) -> np.ndarray:
+    """Return the covariance of the mixture over the noise parameters of one group, the others held."""
+    likelihood, blocks = problem.likelihood, [problem.likelihood.blocks[b] for b in members]
+    scale = np.sqrt(np.diag(covariance))
+    s = np.concatenate([estimate.here.changes[b] for b in members], axis=1) * scale[:, None]
+    r = np.concatenate([estimate.here.residuals[b] for b in members])
+    weight = np.concatenate([np.full(block.size, block.weight) for block in blocks])
+    here = estimate.noise[[likelihood.names.index(name) for name in group]]
+    now = weight / _spectra(problem, blocks, here)
+    others = hessian * np.outer(scale, scale) - (s * now) @ s.T + JITTER * np.eye(scale.size)
+    pull, freedom = -(s * now) @ r, max(float(weight.sum()) - len(problem.names), 1.0)
+    points, log_prior = _points(problem)
+    log_posterior, found = np.empty(len(points)), np.empty((len(points), *covariance.shape))
+    spectra = _spectra(problem, blocks, np.column_stack([np.ones(len(points)), points]))
+    for i in range(len(points)):
+        shape = spectra[i]
+        own = weight / shape
+        left, variance = r, float(np.sum(own * r**2)) / freedom
+        for _ in range(UPDATES):
+            total = (s * own) @ s.T / variance + others
+            step = np.linalg.solve(total, s @ (own * r) / variance + pull)
+            left = r - step @ s
+            variance = max(float(np.sum(own * left**2)) / freedom, np.finfo(float).tiny)
+        misfit = np.sum(own * left**2) / variance + step @ others @ step - 2.0 * step @ pull
+        logarithms = float(np.sum(weight * np.log(variance * shape))) + np.linalg.slogdet(total)[1]
+        log_posterior[i] = log_prior[i] - 0.5 * (misfit + logarithms)
+        found[i] = np.linalg.inv(total) + np.outer(step, step)
+    posterior = np.exp(log_posterior - log_posterior.max())
+    return np.tensordot(posterior / posterior.sum(), found, 1) * np.outer(scale, scale)
+
+
+def _spectra(problem: Problem, blocks: list[Block], values: np.ndarray) -> np.ndarray:
+    """Return the variances of the components of all blocks one after the other, (…, components)."""
+    return np.concatenate([problem.noise.spectrum(block, values)[0] for block in blocks], axis=-1)
+
+
+def _points(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Return shape parameters (points, parameters) spread over their priors, and their log-weights."""
+    axes, weights = [], []
+    for number, prior in enumerate(problem.noise.shape_priors.values()):
+        ends = np.log(prior.quantile(np.array([TAIL, 1.0 - TAIL])))
+        values = np.exp(np.linspace(ends[0], ends[1], MANY if number == 0 else FEW))
+        axes.append(values)
+        weights.append(prior.log_prob(values) + np.log(values))
+    grid = np.meshgrid(*axes, indexing="ij")
+    log_prior = sum(np.meshgrid(*weights, indexing="ij"))
+    return np.stack([axis.ravel() for axis in grid], axis=-1), np.asarray(log_prior).ravel()
+
+
+def doubling_shift(
+    problem: Problem, estimate: Iterate, solutions: Mapping[str, PeriodicSolution], covariance: np.ndarray
+) -> np.ndarray:
+    """Return by how many standard deviations the estimate would move on twice as many points, (names,).
+
+    Every experiment is solved again on the finer grid at the estimate; a Gauss-Newton step turns the change of the
+    residuals into that of the parameters. NaN if a solve fails.
+
+    Parameters
+    ----------
+    problem : Problem
+    estimate : Iterate
+    solutions : mapping of str to PeriodicSolution
+        At the estimate.
+    covariance : array (names, names)
+    """
+    finer: list[np.ndarray] = []
+    for e in problem.experiments:
+        response = _on_twice_the_points(problem, estimate.theta, e, solutions[e.name])
+        if response is None:
+            return np.full(estimate.theta.size, np.nan)
+        finer += problem.observations[e.name].residuals(response)
+    moved = [there - here for there, here in zip(finer, estimate.here.residuals, strict=True)]
+    changes = problem.likelihood.whitened(estimate.here.changes, estimate.noise)
+    white = problem.likelihood.whitened(moved, estimate.noise)
+    right = np.sum([s @ r for s, r in zip(changes, white, strict=True)], axis=0)
+    with np.errstate(invalid="ignore"):
+        return covariance @ right / np.sqrt(np.diag(covariance))
+
+
+def _on_twice_the_points(
+    problem: Problem, theta: np.ndarray, experiment: Experiment, coarse: PeriodicSolution
+) -> Response | None:
+    """Return the response on a grid of twice as many points, at every second of them; None if the solve fails."""
+    points = 2 * experiment.samples * experiment.periods
+    equations = PeriodicEquations.build(
+        problem.model,
+        {n: _fourier.on_grid(_fourier.coefficients(u), points) for n, u in experiment.inputs.items()},
+        frequency=coarse.frequency,
+        samples=2 * experiment.samples,
+        scheme=problem.scheme,
+        periods=experiment.periods,
+        winding=experiment.winding,
+    )
+    values = problem.parameter_maps[experiment.name].values(theta[None])[0]
+    parameters, delay = np.ascontiguousarray(values[:-1]), values[-1]
+    if problem.model.autonomous:
+        equations, solved, _ = solve_free(equations, parameters, coarse)
+    else:
+        solved, _ = solve_forced(equations, parameters, coarse)
+    if solved.code != CONVERGED:
+        return None
+    count = 0 if experiment.multipliers is None else experiment.multipliers.size
+    found = leading_multipliers(equations, parameters, solved.z, count)
+    outputs = equations.outputs(solved.z, parameters)[::2]
+    return Response(outputs, np.array(equations.frequency), np.log(np.abs(found)), np.array(delay))
+
+
+def input_noise(problem: Problem, theta: np.ndarray, solutions: Mapping[str, PeriodicSolution]) -> dict[str, float]:
+    """Return the standard deviation that the inputs' noise brings to each channel, root mean square over experiments.
+
+    The noise of each kept Fourier amplitude of an input, and of its derivatives, is carried through the linearised
+    periodic problem; the variance is averaged over the period, within the harmonics kept.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : array (names,)
+    solutions : mapping of str to PeriodicSolution
+        At θ, by experiment.
+    """
+    variances: dict[str, list[float]] = {channel: [0.0] for channel in problem.channels}
+    for e in problem.experiments:
+        directions = _perturbations(e)
+        if not len(directions):
+            continue
+        equations = problem.responses.equations[e.name].at_frequency(solutions[e.name].frequency)
+        z, parameters = (
+            periodic_part(equations, solutions[e.name].states),
+            problem.responses.parameters(theta[None], e.name)[0],
+        )
+        derivative = input_sensitivities(equations, z, parameters, directions)
+        if derivative is None:
+            continue
+        for channel in e.outputs:
+            moved = e.project(channel, derivative.outputs[:, :, problem.model.outputs.index(channel)])
+            variances[channel].append(float(np.sum(np.mean(moved**2, axis=1))))
+    return {channel: float(np.sqrt(np.mean(v[1:] or v))) for channel, v in variances.items()}
+
+
+def _perturbations(experiment: Experiment) -> np.ndarray:
+    """Return one-sd perturbations (directions, points, 3·inputs) of (u, u̇, ü), two a noisy Fourier amplitude."""
+    points = experiment.samples * experiment.periods
+    count, directions = len(experiment.inputs), []
+    for i, name in enumerate(experiment.inputs):
+        for h, variance in enumerate(experiment.amplitude_variance.get(name, ())):
+            for part in (1.0,) if h == 0 else (1.0, 1j):
+                amplitude = np.zeros(h + 1, dtype=complex)
+                amplitude[h] = part * np.sqrt(variance if h == 0 else 0.5 * variance)
+                direction = np.zeros((points, 3 * count))
+                for order in range(3):
+                    rate = _fourier.derivative(amplitude, experiment.frequency / experiment.periods, order)
+                    direction[:, order * count + i] = _fourier.on_grid(rate, points)
+                directions.append(direction)
+    return np.array(directions)

@@ -1,0 +1,210 @@
+"""The staged Gauss-Newton iteration: noise parameters from the residuals, then a step in θ (eq. 7-8)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesperiodic.posterior.density import Linearisation
+from bayesperiodic.posterior.likelihood import estimate_noise
+from bayesperiodic.posterior.problem import Problem
+
+MAX_ITERATIONS = 100
+MAX_HALVINGS = 30
+SCALED_STEP = 1e-8
+SMALL_STEP, SMALL_GAIN = 1e-4, 1e-12
+SINGULAR = 1e-13
+MAX_ROUNDS, PRESSED = 10, 1e-3
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """Where the iteration stands.
+
+    Attributes
+    ----------
+    theta : array (names,)
+    here : Linearisation
+        At θ, which anchors the next solves.
+    noise : array (noise_names,)
+        The noise parameters that suit the residuals there.
+    objective : float
+    """
+
+    theta: np.ndarray
+    here: Linearisation
+    noise: np.ndarray
+    objective: float
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What the iteration maximises over θ, the noise parameters having been replaced by the best ones.
+
+    Attributes
+    ----------
+    problem : Problem
+    share : float
+        What multiplies the logarithms of the variances: 1 − l/Σn makes their best values those of eq. (7), 1 those of
+        the maximum of eq. (6).
+    logarithmic : bool array (names,)
+        Parameters whose density is taken over their logarithm.
+    """
+
+    problem: Problem
+    share: float
+    logarithmic: np.ndarray
+
+    def at(self, theta: np.ndarray, near: Linearisation | None, noise: np.ndarray) -> Iterate | None:
+        """Return the iterate at θ, solved from a near one; None where the log-posterior is not finite."""
+        prior = float(self.problem.log_prior(theta))
+        if not np.isfinite(prior):
+            return None
+        problem = self.problem if near is None else self.problem.with_responses(near.responses)
+        trial = Linearisation(theta, problem.responses, problem.comparisons)
+        if not trial.converged or not all(np.isfinite(r).all() for r in trial.residuals):
+            return None
+        likelihood = problem.likelihood
+        noise = estimate_noise(likelihood, trial.residuals, noise, self.share)
+        value = float(likelihood(trial.residuals, noise, self.share) + likelihood.log_prior(noise))
+        value += prior + float(np.sum(np.log(theta[self.logarithmic])))
+        return Iterate(theta, trial, noise, value) if np.isfinite(value) else None
+
+    def anchored(self, iterate: Iterate) -> Iterate:
+        """Return the iterate with the solves anchored at it."""
+        here = self.problem.with_responses(iterate.here.responses).linearised(iterate.theta)
+        return Iterate(iterate.theta, here, iterate.noise, iterate.objective)
+
+    def moved(self, theta: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Return θ after a step, along which parameters whose density is over the logarithm grow exponentially.
+
+        So the step stays on the ridge of a product, which is straight in logarithms.
+        """
+        result, logs = theta + step, self.logarithmic
+        with np.errstate(over="ignore"):
+            result[logs] = theta[logs] * np.exp(step[logs] / theta[logs])
+        return result
+
+    def hessian_and_gradient(self, iterate: Iterate) -> tuple[np.ndarray, np.ndarray]:
+        """Return H of eq. (8) and the gradient of the objective, the prior's part included in both."""
+        hessian, gradient = information(self.problem, iterate)
+        prior, theta, logarithmic = self.problem.joint_prior, iterate.theta, self.logarithmic
+        hessian = hessian + prior.curvature(theta)
+        hessian[logarithmic, logarithmic] += theta[logarithmic] ** -2
+        gradient = gradient + prior.gradient(theta)
+        gradient[logarithmic] += 1.0 / theta[logarithmic]
+        return hessian, gradient
+
+
+def information(problem: Problem, iterate: Iterate) -> tuple[np.ndarray, np.ndarray]:
+    """Return the data's part of H of eq. (8), (names, names), and of its gradient, (names,)."""
+    changes = np.concatenate(problem.likelihood.whitened(iterate.here.changes, iterate.noise), axis=1)
+    residuals = np.concatenate(problem.likelihood.whitened(iterate.here.residuals, iterate.noise))
+    return changes @ changes.T, changes @ residuals
+
+
+def bias_correction(problem: Problem) -> float:
+    """Return 1 − l/Σn, for which the variances of the first stage are those of eq. (7); 1 if that is not positive."""
+    share = 1.0 - len(problem.names) / problem.counted if problem.counted else 1.0
+    return share if share > 0.0 else 1.0
+
+
+def climb(
+    objective: Objective,
+    start: Iterate,
+    held: np.ndarray | None = None,
+    report: Callable[[Iterate, float], None] | None = None,
+) -> tuple[Iterate, str, np.ndarray]:
+    """Raise the objective from a start until the steps are small, and never lower it.
+
+    Where H is not positive definite (convex log-priors that outweigh the data) steps take its negative curvature with
+    the opposite sign; directions without curvature are left alone. Each solve starts from the iterate before and is
+    checked to lie on the same branch, so that a step cannot slip to another periodic solution; steps whose solve fails
+    are halved. A parameter at the end of its prior's support is held while the gradient presses it outwards.
+
+    Parameters
+    ----------
+    objective : Objective
+    start : Iterate
+        Anchored.
+    held : bool array (names,), optional
+        Parameters that stay.
+    report : callable, optional
+        Called with every new iterate and the length of its step in standard deviations.
+
+    Returns
+    -------
+    iterate : Iterate
+    status : str
+        "converged", "stalled" (no step raised the objective), "iterations" (their limit was reached) or "singular".
+    history : array (iterations,)
+        The objective at each iterate.
+    """
+    always = np.zeros(start.theta.size, dtype=bool) if held is None else held
+    now, resting, history = start, always, [start.objective]
+    for _ in range(MAX_ROUNDS):
+        now, status, objectives = _ascend(objective, now, resting, report)
+        history += objectives
+        ends = at_ends(objective, now)
+        inwards = ends * objective.hessian_and_gradient(now)[1] < 0.0
+        wanted = always | (ends != 0.0 if status == "stalled" else resting & ~inwards)
+        if np.array_equal(wanted, resting):
+            break
+        resting = wanted
+    return now, status, np.array(history)
+
+
+def at_ends(objective: Objective, iterate: Iterate) -> np.ndarray:
+    """Return −1 or 1 for parameters next to the lower or upper end of their support, 0 for others, (names,)."""
+    hessian, _ = objective.hessian_and_gradient(iterate)
+    low, high = np.transpose(list(objective.problem.joint_prior.supports.values()))
+    near = PRESSED / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
+    return 1.0 * (high - iterate.theta < near) - (iterate.theta - low < near)
+
+
+def _ascend(
+    objective: Objective, start: Iterate, held: np.ndarray, report: Callable[[Iterate, float], None] | None
+) -> tuple[Iterate, str, list[float]]:
+    """Climb with the same parameters held throughout; return the end, the status, and the objectives on the way."""
+    now = start
+    history: list[float] = []
+    for _ in range(MAX_ITERATIONS):
+        hessian, gradient = objective.hessian_and_gradient(now)
+        if not np.isfinite(hessian).all() or not np.isfinite(gradient).all():
+            return now, "singular", history
+        step, size = _step(hessian, gradient, held)
+        if size < SCALED_STEP:
+            return now, "converged", history
+        damping = 1.0
+        for _ in range(MAX_HALVINGS):
+            trial = objective.at(objective.moved(now.theta, damping * step), now.here, now.noise)
+            if trial is not None and trial.objective > now.objective:
+                break
+            damping, trial = 0.5 * damping, None
+            if size < SMALL_STEP:
+                return now, "converged", history
+        if trial is None:
+            return now, "stalled", history
+        gain, now = trial.objective - now.objective, objective.anchored(trial)
+        history.append(now.objective)
+        if report is not None:
+            report(now, damping * size)
+        if size < SMALL_STEP and gain < SMALL_GAIN:
+            return now, "converged", history
+    return now, "iterations", history
+
+
+def _step(hessian: np.ndarray, gradient: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the step uphill and its length in standard deviations, √(step·H·step), all directions together."""
+    moving = np.flatnonzero(~held)
+    step = np.zeros_like(gradient)
+    if not moving.size:
+        return step, 0.0
+    part = hessian[np.ix_(moving, moving)]
+    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(part)), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(part * np.outer(scale, scale))
+    values = np.abs(values)
+    along, curved = vectors.T @ (scale * gradient[moving]), values > SINGULAR * values.max()
+    along = np.where(curved, along / np.where(curved, values, 1.0), 0.0)
+    step[moving] = scale * (vectors @ along)
+    return step, float(np.sqrt(np.sum(values * along**2)))

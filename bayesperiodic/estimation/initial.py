@@ -1,0 +1,282 @@
+"""Orbits and parameters found together: a start for the estimator where the start's own orbits are far or do not exist.
+
+With measured orbits the equations of motion need not hold until the end. First θ is moved to where they hold best along
+the measured orbits. Then each iteration linearises g(z, θ) = 0 at the present orbit z of every experiment and at θ,
+which do not solve it yet, and takes the Gauss-Newton step of all unknowns; the orbits are eliminated, as
+dz = −g_z⁻¹ (g + g_θ dθ) ([1]_). Every orbit is led from the measured one by steps over which the equations are nearly
+linear, so none is lost, and none turns into another on the way.
+
+References
+----------
+.. [1] H. G. Bock, Recent advances in parameter identification techniques for ordinary differential equations, in:
+   Numerical Treatment of Inverse Problems in Differential and Integral Equations, Birkhäuser, 1983, 95-121.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.periodic.equations import CyclicFactors, PeriodicEquations
+from bayesperiodic.posterior.likelihood import Likelihood, estimate_noise
+from bayesperiodic.posterior.observation import Observation, Response
+
+if TYPE_CHECKING:
+    from bayesperiodic.posterior.problem import Problem
+
+
+MAX_ITERATIONS = 60
+LARGEST_STEP = 0.7
+NONLINEAR, SMALLEST_SHARE = 0.5, 1e-3
+ON_ORBIT, SMALL_STEP = 1e-6, 1e-2
+
+
+@dataclass(frozen=True)
+class Linear:
+    """One experiment's equations and outputs linearised where neither orbit nor parameters solve them.
+
+    Attributes
+    ----------
+    factors : CyclicFactors
+        Of ∂g/∂z.
+    correction : array (points, states)
+        −g_z⁻¹ g, Newton's step at fixed parameters.
+    response : array (names, points, states)
+        −g_z⁻¹ g_θ.
+    residuals : list of array (size,)
+        Of the corrected orbit, one array a block.
+    changes : list of array (names, size)
+        Derivatives of the predicted components by θ.
+    """
+
+    factors: CyclicFactors
+    correction: np.ndarray
+    response: np.ndarray
+    residuals: list[np.ndarray]
+    changes: list[np.ndarray]
+
+
+class Together(NamedTuple):
+    """What was found: θ (names,), the states of every experiment, and which experiment stood in the way, if any.
+
+    Without states θ is where the way ended.
+    """
+
+    theta: np.ndarray
+    states: dict[str, dict[str, np.ndarray]]
+    blocked: str
+
+
+def all_at_once(problem: Problem, theta: np.ndarray) -> Together | None:
+    """Return θ and orbits near the MAP point; None where the model is autonomous or an experiment has no guess.
+
+    The way starts at a θ and at the experiments' own guesses. Multipliers are not looked at, and positive parameters
+    move in their logarithms.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : array (names,)
+    """
+    if problem.model.autonomous or not all(e.guess for e in problem.experiments):
+        return None
+    together = _Together(problem)
+    return together.iterate(together.fitting(theta))
+
+
+class _Together:
+    def __init__(self, problem: Problem):
+        self.problem, self.maps = problem, problem.parameter_maps
+        experiments = [_without_multipliers(e) for e in problem.experiments]
+        self.observations = {e.name: Observation(e, problem.model, self.maps[e.name].delayed) for e in experiments}
+        blocks = [block for observation in self.observations.values() for block in observation.blocks]
+        self.likelihood = Likelihood(problem.noise, blocks, problem.likelihood.fixed)
+        self.equations: dict[str, PeriodicEquations] = problem._responses.equations
+        self.logarithmic = np.array([s == (0.0, np.inf) for s in problem.joint_prior.supports.values()])
+        self.guess = {e.name: self._periodic_part(e) for e in experiments}
+
+    def _periodic_part(self, e: Experiment) -> np.ndarray:
+        equations = self.equations[e.name]
+        states = np.stack([e.guess[name] for name in self.problem.model.states], axis=-1)
+        return states - equations.drift * equations.grid.tau[:, None]
+
+    def fitting(self, theta: np.ndarray) -> np.ndarray:
+        """Return the θ near which the equations hold best along the experiments' guesses, by damped Gauss-Newton."""
+        now = self._misfit(theta)
+        for _ in range(MAX_ITERATIONS):
+            total, count = 0.0, 0
+            hessian, gradient = np.zeros((theta.size, theta.size)), np.zeros(theta.size)
+            for name, z in self.guess.items():
+                own, equations = self.maps[name], self.equations[name]
+                at = np.ascontiguousarray(own.values(theta[None])[0, :-1])
+                g = _weighed(equations, equations.residual_jacobian(z, at)[:, : equations.count, None]).ravel()
+                by = _weighed(equations, equations.derivatives(z, at).g_theta @ own.slopes(theta)[:-1])
+                by = by.reshape(g.size, theta.size)
+                hessian, gradient = hessian + by.T @ by, gradient - by.T @ g
+                total, count = total + g @ g, count + g.size
+            weight = self.problem.counted / max(total, np.finfo(float).tiny)
+            step, size = self._step(weight * hessian, weight * gradient, theta)
+            if size < SMALL_STEP:
+                break
+            share = 1.0
+            while share > SMALLEST_SHARE:
+                there = self._there(theta, share * step)
+                trial = self._misfit(there)
+                if trial < now:
+                    break
+                share *= 0.5
+            else:
+                break
+            theta, now = there, trial
+        return theta
+
+    def _misfit(self, theta: np.ndarray) -> float:
+        """Return −log of the prior's density and of that of the equations' errors along the guesses."""
+        prior = float(self.problem.log_prior(theta))
+        if not np.isfinite(prior):
+            return np.inf
+        total = 0.0
+        for name, z in self.guess.items():
+            at = np.ascontiguousarray(self.maps[name].values(theta[None])[0, :-1])
+            equations = self.equations[name]
+            g = _weighed(equations, equations.residual_jacobian(z, at)[:, : equations.count, None])
+            total += float(np.sum(g**2))
+        return 0.5 * self.problem.counted * np.log(max(total, np.finfo(float).tiny)) - prior
+
+    def _there(self, theta: np.ndarray, step: np.ndarray) -> np.ndarray:
+        return np.where(self.logarithmic, theta * np.exp(step * self.logarithmic), theta + step)
+
+    def iterate(self, theta: np.ndarray) -> Together:
+        """Return where the Gauss-Newton iteration in orbits and θ leads to from the guesses and a θ."""
+        orbits, noise = self.guess, self.likelihood.guess()
+        for _ in range(MAX_ITERATIONS):
+            linear = {}
+            for name, z in orbits.items():
+                one = self._linearise(name, z, theta)
+                if one is None:
+                    return Together(theta, {}, name)
+                linear[name] = one
+            noise = estimate_noise(self.likelihood, [r for one in linear.values() for r in one.residuals], noise, 1.0)
+            step, size = self._step(*self._information(linear, noise), theta)
+            off = {name: _size(one.correction, orbits[name]) for name, one in linear.items()}
+            worst = max(off, key=lambda name: off[name])
+            if off[worst] < ON_ORBIT and size < SMALL_STEP:
+                return Together(theta, {name: self._states(name, z) for name, z in orbits.items()}, "")
+            theta, orbits, blocked = self._moved(linear, orbits, theta, step)
+            if blocked:
+                return Together(theta, {}, blocked)
+        return Together(theta, {}, worst)
+
+    def _linearise(self, name: str, z: np.ndarray, theta: np.ndarray) -> Linear | None:
+        """Return one experiment's equations linearised at an orbit and θ; None where ∂g/∂z is singular."""
+        equations, own = self.equations[name], self.maps[name]
+        parameters, slopes = np.ascontiguousarray(own.values(theta[None])[0]), own.slopes(theta)
+        at, by = parameters[:-1], slopes[:-1]
+        d, columns = equations.derivatives(z, at), equations.residual_jacobian(z, at)
+        factors = equations.factors(columns)
+        if not np.isfinite(columns).all() or not factors.regular:
+            return None
+        g = np.concatenate([np.einsum("nep,pt->tne", d.g_theta, by), columns[None, :, : equations.count]])
+        dz = factors.solve(-g)
+        outputs = np.einsum("ncq,dnq->dnc", d.f_q, equations.changes(dz))
+        outputs[:-1] += np.einsum("ncp,pt->tnc", d.f_theta, by)
+        frequency, none = np.array(equations.frequency), np.zeros(0)
+        here = Response(equations.outputs(z, at) + outputs[-1], frequency, none, parameters[-1])
+        directions = Response(outputs[:-1], np.zeros(theta.size), np.zeros((theta.size, 0)), slopes[-1])
+        observation = self.observations[name]
+        return Linear(factors, dz[-1], dz[:-1], observation.residuals(here), observation.changes(here, directions))
+
+    def _information(self, linear: dict[str, Linear], noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the data's part of the Hessian and of the gradient of the log-density by θ."""
+        changes = [c for one in linear.values() for c in one.changes]
+        residuals = [r for one in linear.values() for r in one.residuals]
+        white = np.concatenate(self.likelihood.whitened(changes, noise), axis=1)
+        return white @ white.T, white @ np.concatenate(self.likelihood.whitened(residuals, noise))
+
+    def _step(self, hessian: np.ndarray, gradient: np.ndarray, theta: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the step of θ's coordinates, positive parameters in their logarithms, and its length in sds."""
+        prior = self.problem.joint_prior
+        by_prior = prior.gradient(theta)
+        unit = np.where(self.logarithmic, theta, 1.0)
+        hessian = (hessian + prior.curvature(theta)) * np.outer(unit, unit)
+        hessian -= np.diag(np.where(self.logarithmic, theta * by_prior, 0.0))
+        gradient = (gradient + by_prior) * unit
+        scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
+        values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+        values = np.maximum(np.abs(values), 1e-13 * np.abs(values).max())
+        along = vectors.T @ (scale * gradient) / values
+        step = scale * (vectors @ along)
+        longest = np.max(np.abs(step), where=self.logarithmic, initial=0.0)
+        return step * min(1.0, LARGEST_STEP / max(longest, LARGEST_STEP)), float(np.sqrt(np.sum(values * along**2)))
+
+    def _moved(
+        self, linear: dict[str, Linear], orbits: dict[str, np.ndarray], theta: np.ndarray, step: np.ndarray
+    ) -> tuple[np.ndarray, dict[str, np.ndarray], str]:
+        """Return θ and the orbits a step further, so short that all equations are nearly linear; or what forbids it."""
+        share, blocked = 1.0, next(iter(orbits))
+        while share > SMALLEST_SHARE:
+            there = self._there(theta, share * step)
+            share *= 0.5
+            if not np.isfinite(self.problem.log_prior(there)):
+                continue
+            moved: dict[str, np.ndarray] = {}
+            for name, one in linear.items():
+                z = self._orbit_moved(name, one, orbits[name], there - theta, there, 2.0 * share)
+                if z is None:
+                    blocked = name
+                    break
+                moved[name] = z
+            else:
+                return there, moved, ""
+        return theta, orbits, blocked
+
+    def _orbit_moved(
+        self, name: str, linear: Linear, z: np.ndarray, change: np.ndarray, there: np.ndarray, share: float
+    ) -> np.ndarray | None:
+        """Return an orbit a step further, with one chord correction; None where the step is not nearly linear."""
+        equations = self.equations[name]
+        step = share * linear.correction + np.tensordot(change, linear.response, (0, 0))
+        at = np.ascontiguousarray(self.maps[name].values(there[None])[0, :-1])
+        columns = equations.residual_jacobian(z + step, at)
+        if not np.isfinite(columns).all():
+            return None
+        again = linear.factors.solve(-columns[None, :, : equations.count])[0]
+        curved = _size(again - (1.0 - share) * linear.correction, z)
+        if curved > NONLINEAR * _size(step, z) and curved > ON_ORBIT:
+            return None
+        return z + step + (again if share == 1.0 else 0.0)
+
+    def _states(self, name: str, z: np.ndarray) -> dict[str, np.ndarray]:
+        equations = self.equations[name]
+        states = z + equations.drift * equations.grid.tau[:, None]
+        return dict(zip(self.problem.model.states, states.T.copy(), strict=True))
+
+
+def _weighed(equations: PeriodicEquations, values: np.ndarray) -> np.ndarray:
+    """Return values (points, equations, columns) as real Fourier amplitudes, harmonics weighed down by their square.
+
+    An orbit's noise is weighed up by as much where it is differentiated twice.
+    """
+    amplitudes = np.fft.rfft(values, axis=0) / len(values)
+    harmonic = np.arange(len(amplitudes)) / equations.grid.periods
+    amplitudes /= (1.0 + harmonic**2)[:, None, None]
+    return np.concatenate([amplitudes.real, amplitudes.imag])
+
+
+def _size(change: np.ndarray, z: np.ndarray) -> float:
+    """Return the largest change (points, states) in units of the range of each state of an orbit."""
+    spread = np.ptp(z, axis=0)
+    return float(np.max(np.abs(change) / np.where(spread > 0.0, spread, 1.0)))
+
+
+def _without_multipliers(experiment: Experiment) -> Experiment:
+    if experiment.multipliers is None:
+        return experiment
+    covariance = experiment.covariance
+    if covariance is not None and experiment.multiplier_sd is None:
+        size = len(covariance) - experiment.multipliers.size
+        covariance = covariance[:size, :size]
+    return replace(experiment, multipliers=None, multiplier_sd=None, covariance=covariance)

@@ -1,0 +1,314 @@
+"""The Laplace approximation over all sampling coordinates together, from the exact Hessian."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+import pandas as pd
+
+from bayesperiodic.estimation.gauss_newton import SINGULAR, Iterate, Objective, climb
+from bayesperiodic.posterior.density import Linearisation
+from bayesperiodic.posterior.problem import Problem
+
+STEP = 1e-3
+NOISE_STEP = 1e-4
+
+
+@dataclass(frozen=True)
+class JointLaplace:
+    """The mode of the density in sampling coordinates and the inverse of its exact Hessian.
+
+    Attributes
+    ----------
+    mode : dict of str to float
+        Natural values of the parameters and of the free noise parameters.
+    covariance : DataFrame (coordinates × coordinates)
+        Of the sampling coordinates, by the names of what they are made of: the logarithm of a parameter whose prior's
+        support is (0, ∞) and of every noise parameter, any other parameter itself. NaN where there is no maximum.
+    """
+
+    mode: dict[str, float]
+    covariance: pd.DataFrame
+
+
+def logarithmic(problem: Problem) -> np.ndarray:
+    """Return which parameters are sampled in their logarithm, (names,)."""
+    return np.array([support == (0.0, np.inf) for support in problem.joint_prior.supports.values()])
+
+
+def joint_laplace(problem: Problem, start: Iterate) -> JointLaplace:
+    """Climb from the estimate to the mode in sampling coordinates and take the exact Hessian there.
+
+    The Hessian over θ comes from central differences of the exact gradient; parameters local to experiments are moved
+    together, because each experiment knows only its own.
+    """
+    objective = Objective(problem, 1.0, logarithmic(problem))
+    first = objective.at(start.theta, start.here, start.noise)
+    labels = [*problem.names, *problem.free_noise]
+    nothing = pd.DataFrame(np.full((len(labels), len(labels)), np.nan), index=labels, columns=labels)
+    if first is None:
+        return JointLaplace({}, nothing)
+    mode, _, _ = climb(objective, objective.anchored(first))
+    free = [problem.noise_names.index(name) for name in problem.free_noise]
+    values = [*mode.theta.tolist(), *mode.noise[free].tolist()]
+    hessian = _hessian(problem, objective, mode, free)
+    if not np.isfinite(hessian).all() or not np.all(np.diag(hessian) > 0.0):
+        return JointLaplace(dict(zip(labels, values, strict=True)), nothing)
+    scale = 1.0 / np.sqrt(np.diag(hessian))
+    curvatures, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+    if curvatures.min() < SINGULAR * curvatures.max():
+        return JointLaplace(dict(zip(labels, values, strict=True)), nothing)
+    covariance = (vectors / curvatures) @ vectors.T * np.outer(scale, scale)
+    return JointLaplace(dict(zip(labels, values, strict=True)), pd.DataFrame(covariance, index=labels, columns=labels))
+
+
+def _hessian(problem: Problem, objective: Objective, mode: Iterate, free: list[int]) -> np.ndarray:
+    """Return −∂² log-density over the sampling coordinates."""
+    count, logs = len(problem.names), objective.logarithmic
+    by_theta = -_second_derivatives(problem, objective, mode) + problem.joint_prior.curvature(mode.theta)
+    gradient = mode.here.forward(problem.likelihood.gradients(mode.here.residuals, mode.noise)[0])
+    gradient = gradient + problem.joint_prior.gradient(mode.theta)
+    slopes = np.where(logs, mode.theta, 1.0)
+    hessian = np.zeros((count + len(free), count + len(free)))
+    hessian[:count, :count] = by_theta * np.outer(slopes, slopes) - np.diag(np.where(logs, gradient * mode.theta, 0.0))
+    for row, column in enumerate(free):
+        changes = []
+        for sign in (1.0, -1.0):
+            noise = mode.noise.copy()
+            noise[column] *= np.exp(sign * NOISE_STEP)
+            by_residual, by_noise = problem.likelihood.gradients(mode.here.residuals, noise)
+            changes.append(np.concatenate([mode.here.forward(by_residual) * slopes, by_noise[free]]))
+        hessian[count + row] = -(changes[0] - changes[1]) / (2.0 * NOISE_STEP)
+        hessian[:count, count + row] = hessian[count + row, :count]
+    return 0.5 * (hessian + hessian.T)
+
+
+def _second_derivatives(problem: Problem, objective: Objective, mode: Iterate) -> np.ndarray:
+    """Return ∂² log-likelihood/∂θ² at the mode, (names, names)."""
+    hessian, _ = objective.hessian_and_gradient(mode)
+    sd = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
+    result = np.zeros((len(problem.names),) * 2)
+    for group in _moved_together(problem):
+        ends = []
+        for sign in (1.0, -1.0):
+            theta = mode.theta.copy()
+            theta[list(group.values())] += sign * STEP * sd[list(group.values())]
+            ends.append(_gradients(problem, theta, mode))
+        for experiment, column in group.items():
+            result[:, column] += (ends[0][experiment] - ends[1][experiment]) / (2.0 * STEP * sd[column])
+    return 0.5 * (result + result.T)
+
+
+def _moved_together(problem: Problem) -> list[dict[str, int]]:
+    """Return sets of columns of θ of which every experiment knows at most one, by experiment."""
+    groups: dict[str, dict[str, int]] = {}
+    for experiment, parameter_map in problem.parameter_maps.items():
+        for name, column in parameter_map.columns.items():
+            groups.setdefault(name, {})[experiment] = column
+    return list(groups.values())
+
+
+def _gradients(problem: Problem, theta: np.ndarray, mode: Iterate) -> dict[str, np.ndarray]:
+    """Return each experiment's gradient of the log-likelihood by θ, at the noise parameters of the mode."""
+    near = problem.with_responses(mode.here.responses)
+    there = (
+        near.linearised(theta)
+        if problem.model.autonomous
+        else Linearisation(theta, mode.here.responses, problem.comparisons)
+    )
+    if not there.converged:
+        return dict.fromkeys(problem.observations, np.full(theta.size, np.nan))
+    by_residual = problem.likelihood.gradients(there.residuals, mode.noise)[0]
+    return there.by_experiment(by_residual, adjoint=not problem.model.autonomous)
+
+
+SHOWN = 0.05
+LARGEST = 4
+ROUNDED = 0.06
+
+
+def reduced(directions: np.ndarray) -> np.ndarray:
+    """Return vectors that span the same space (directions, names), each without what the others begin with.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesperiodic.estimation.laplace import reduced
+    >>> reduced(np.array([[2.0, 2.0, 4.0], [0.0, 3.0, 3.0]])).tolist()
+    [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]
+    """
+    rows = directions.copy()
+    for i in range(len(rows)):
+        relative = np.abs(rows) / np.abs(rows).max(axis=1, keepdims=True)
+        column = int(np.argmax(relative[i] > SHOWN))
+        rows[i] /= rows[i, column]
+        for j in range(len(rows)):
+            if j != i:
+                rows[j] -= rows[j, column] * rows[i]
+    return rows
+
+
+def exponents(direction: np.ndarray) -> list[Fraction] | None:
+    """Return a direction in logarithms as simple fractions, the first positive; None if there are none nearby.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesperiodic.estimation.laplace import exponents
+    >>> exponents(np.array([0.499, -0.001, -0.998]))
+    [Fraction(1, 1), Fraction(0, 1), Fraction(-2, 1)]
+    """
+    shown = np.abs(direction) > SHOWN * np.abs(direction).max()
+    smallest = np.abs(direction[shown]).min()
+    for unit in (smallest, np.abs(direction).max()):
+        found = [Fraction(float(v / unit)).limit_denominator(LARGEST) for v in np.where(shown, direction, 0.0)]
+        errors = [abs(float(f) - v / unit) for f, v in zip(found, direction, strict=True)]
+        largest, lost = max(abs(f) for f in found), any(not f for f, s in zip(found, shown, strict=True) if s)
+        if largest <= LARGEST and not lost and max(errors) < ROUNDED * max(1.0, float(largest)):
+            sign = 1 if next(f for f in found if f) > 0 else -1
+            return [sign * f for f in found]
+    return None
+
+
+def combinations(direction: np.ndarray, names: Sequence[str], logarithmic: np.ndarray) -> list[str]:
+    """Return combinations of the parameters that do not change along a direction, as expressions.
+
+    Products of powers where all that move are positive, sums where none is; nothing for a mixture or where no simple
+    exponents fit.
+
+    Parameters
+    ----------
+    direction : array (names,)
+        In logarithms of positive parameters and in signed ones as they are.
+    names : sequence of str
+    logarithmic : bool array (names,)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesperiodic.estimation.laplace import combinations
+    >>> combinations(np.array([1.0, -1.0]), ["a", "b"], np.array([True, True]))
+    ['a*b']
+    >>> combinations(np.array([1.0, 0.5, 0.5]), ["m", "k", "c"], np.array([True, True, True]))
+    ['m/k**2', 'c/k']
+    >>> combinations(np.array([1.0, -1.0]), ["a", "b"], np.array([False, False]))
+    ['a + b']
+    """
+    shown = np.flatnonzero(np.abs(direction) > SHOWN * np.abs(direction).max())
+    if shown.size < 2:
+        return []
+    powers = logarithmic[shown]
+    if powers.all():
+        rational = exponents(direction[shown])
+        if rational is None:
+            return []
+        pivot = min(range(len(rational)), key=lambda i: (abs(rational[i]), i))
+        ratios = [r / rational[pivot] for r in rational]
+        if max(max(abs(r.numerator), r.denominator) for r in ratios) > LARGEST:
+            return []
+        return [
+            _product(names[shown[i]], ratios[i], names[shown[pivot]], first=i < pivot)
+            for i in range(len(rational))
+            if i != pivot
+        ]
+    if powers.any():
+        return []
+    pivot = int(np.argmax(np.abs(direction[shown])))
+    return [
+        _sum(names[shown[pivot]], -float(direction[shown[pivot]] / direction[shown[i]]), names[shown[i]])
+        for i in range(shown.size)
+        if i != pivot
+    ]
+
+
+def _product(name: str, ratio: Fraction, other: str, *, first: bool) -> str:
+    """Return name·other^(−ratio), raised to whole exponents that begin with a positive one."""
+    own, its = ratio.denominator, -ratio.numerator
+    factors = [(name, own), (other, its)] if first or its < 0 else [(other, its), (name, own)]
+    return _of_powers(factors)
+
+
+def _of_powers(factors: list[tuple[str, int]]) -> str:
+    def power(name: str, exponent: int) -> str:
+        return name if exponent == 1 else f"{name}**{exponent}"
+
+    above = [power(n, e) for n, e in factors if e > 0]
+    below = [power(n, -e) for n, e in factors if e < 0]
+    return "/".join(["*".join(above), *below])
+
+
+def _sum(name: str, ratio: float, other: str) -> str:
+    scale = "" if abs(abs(ratio) - 1.0) < ROUNDED else f"{abs(ratio):.3g}*"
+    return f"{name} {'+' if ratio > 0 else '-'} {scale}{other}"
+
+
+def in_words(direction: np.ndarray, names: Sequence[str], logarithmic: np.ndarray) -> str:
+    """Return what moves together along a direction, the simplest exponents put in where they fit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesperiodic.estimation.laplace import in_words
+    >>> in_words(np.array([0.5, -1.0]), ["a", "b"], np.array([True, True]))
+    'a → a·t, b → b·t^-2'
+    """
+    shown = np.flatnonzero(np.abs(direction) > SHOWN * np.abs(direction).max())
+    powers = [i for i in shown if logarithmic[i]]
+    unit = direction[powers[0]] if powers else direction[shown[np.argmax(np.abs(direction[shown]))]]
+    simple = exponents(direction[shown]) if len(powers) == shown.size else None
+    parts = []
+    for k, i in enumerate(shown):
+        name = names[int(i)]
+        ratio = float(simple[k] / simple[0]) if simple else float(direction[i] / unit)
+        if logarithmic[i]:
+            parts.append(f"{name} → {name}·t" + ("" if abs(ratio - 1.0) < 5e-4 else f"^{ratio:.3g}"))
+        else:
+            scale = "" if abs(abs(ratio) - 1.0) < 5e-4 else f"{abs(ratio):.3g}·"
+            parts.append(f"{name} → {name} {'+' if ratio > 0 else '−'} {scale}{'ln t' if powers else 't'}")
+    return ", ".join(parts)
+
+
+NEARLY_SINGULAR = 1e-10
+SILENT = "no output depends on it"
+
+
+def undetermined(
+    information: np.ndarray, theta: np.ndarray, names: Sequence[str], logarithmic: np.ndarray
+) -> tuple[str, ...]:
+    """Return, in words, the directions in which the data's information vanishes.
+
+    Parameters
+    ----------
+    information : array (names, names)
+        The data's part of H of eq. (8).
+    theta : array (names,)
+    names : sequence of str
+    logarithmic : bool array (names,)
+        Positive parameters; their combinations are written as products of powers.
+
+    Returns
+    -------
+    tuple of str
+        Such as "a: no output depends on it" or "a → a·t, b → b·t^-1": changes of the parameters that change no output.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesperiodic.estimation.laplace import undetermined
+    >>> row = np.array([2.0, 1.0]) / [3.0, 5.0]
+    >>> undetermined(np.outer(row, row), np.array([3.0, 5.0]), ["a", "b"], np.array([True, True]))
+    ('a → a·t, b → b·t^-2',)
+    """
+    slopes = np.where(logarithmic, theta, 1.0)
+    scaled = information * np.outer(slopes, slopes)
+    size = np.sqrt(np.diag(scaled))
+    silent = [f"{name}: {SILENT}" for name, own in zip(names, size, strict=True) if own == 0.0]
+    acting = np.flatnonzero(size > 0.0)
+    if not acting.size:
+        return tuple(silent)
+    part = scaled[np.ix_(acting, acting)] / np.outer(size[acting], size[acting])
+    values, vectors = np.linalg.eigh(part)
+    directions = reduced(vectors[:, values < NEARLY_SINGULAR].T / size[acting])
+    own = [names[i] for i in acting.tolist()]
+    return tuple(silent + [in_words(direction, own, logarithmic[acting]) for direction in directions])

@@ -1,0 +1,311 @@
+"""The paper's Bayesian estimator: staged Gauss-Newton to the MAP point, and its Laplace covariance."""
+
+import warnings
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import pandas as pd
+from tqdm import tqdm
+
+from bayesperiodic import _checks
+from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.estimation.covariance import doubling_shift, input_noise, robust_covariance, with_uncertain_noise
+from bayesperiodic.estimation.gauss_newton import (
+    SINGULAR,
+    Iterate,
+    Objective,
+    at_ends,
+    bias_correction,
+    climb,
+    information,
+)
+from bayesperiodic.estimation.initial import all_at_once
+from bayesperiodic.estimation.laplace import SILENT, joint_laplace, logarithmic, undetermined
+from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, noise_split
+from bayesperiodic.posterior.problem import Problem
+
+NOISE_SHARE = 0.1
+LARGEST_SHIFT = 0.1
+SHOWN = 3
+LOST = 1e-6
+
+
+@in_one_thread
+def map_estimate(
+    problem: Problem,
+    *,
+    start: Mapping[str, float] | None = None,
+    starts: int = 1,
+    seed: int = 0,
+    progress: bool = True,
+) -> MapEstimate:
+    r"""Find the MAP point by staged Gauss-Newton, and the Laplace covariance there.
+
+    Each iteration solves the channel variances from eq. (7) of [1]_ with its bias correction,
+
+    .. math::
+
+        v_\beta = \frac{M_\beta}{n_\beta \, (1 - l / \sum_\beta n_\beta)},
+
+    for l parameters, which is s·Σe²/(nNs − l) for equal counts, and then updates θ by eq. (8). Printed there, the
+    right-hand side lacks the prior's gradient (θ̄ − θ)/σ², without which the iteration would not end at a maximum of
+    eq. (6); it is added. Other noise models have their parameters in place of the variances, found by maximising the
+    same objective. Steps are halved until the objective, eq. (6) with nN replaced by nN − l/s, rises; it never falls.
+    Where convex log-priors outweigh the data, steps (not the covariance) take their curvature with the opposite sign.
+
+    Where every experiment of a forced model has a guess of its orbit, orbits and parameters are first found together,
+    from these guesses and `start`: the orbits need not exist at the start, and none is lost or swapped on the way.
+
+    Parameters
+    ----------
+    problem : Problem
+    start : mapping of str to float, optional
+        A first guess of every free parameter; by default the medians of the priors.
+    starts : int
+        How many starts to try; those after the first are draws from the priors, and the best estimate is kept.
+    seed : int
+        Of these draws.
+    progress : bool
+        Show the iterations, with the objective and the step in standard deviations.
+
+    Returns
+    -------
+    MapEstimate
+
+    Raises
+    ------
+    ValueError
+        If the log-posterior is not finite at the start, or a name is unknown.
+
+    Warns
+    -----
+    UserWarning
+        If the noise of the measured inputs brings more than a tenth of the residual to an output, if twice as many
+        points would move an estimate by more than a tenth of its standard deviation, if an estimate lies at the end of
+        its prior's support, and if the data do not determine a parameter or a combination of them.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
+
+    Examples
+    --------
+    The spring of an oscillator from 40 noisy periods, its mass known:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(2, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> fit.status, abs(fit.theta["k"] - 1.0) < 3 * fit.sd["k"]
+    ('converged', True)
+    """
+    if isinstance(start, Mapping):
+        _checks.same_names("start", start, problem.names)
+    theta = problem.median() if start is None else problem.vector(start)
+    _checks.integer("starts", starts, 1)
+    objective = Objective(problem, bias_correction(problem), np.zeros(len(problem.names), dtype=bool))
+    first = _first_iterate(objective, theta)
+    if first is None:
+        raise ValueError(_not_finite(problem, theta, start is not None))
+    best, status, history = _climb(objective, first, progress)
+    found = [_outcome(problem, best)]
+    for draw in problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0))):
+        other = _first_iterate(objective, draw)
+        if other is None:
+            found.append({"objective": -np.inf} | dict.fromkeys(problem.names, np.nan))
+            continue
+        end, other_status, other_history = _climb(objective, other, progress)
+        found.append(_outcome(problem, end))
+        if end.objective > best.objective:
+            best, status, history = end, other_status, other_history
+    result = _describe(objective, best, status, history, tuple(found))
+    for text in remarks(problem, result):
+        warnings.warn(text, UserWarning, stacklevel=3)
+    return result
+
+
+def _first_iterate(objective: Objective, theta: np.ndarray) -> Iterate | None:
+    """Return the anchored iterate at a start; None where the log-posterior is not finite."""
+    if not np.isfinite(objective.problem.log_prior(theta)):
+        return None
+    problem = objective.problem
+    together = all_at_once(problem, theta)
+    if together is not None and together.states:
+        near = problem.anchored(together.theta, together.states).linearised(together.theta)
+        iterate = objective.at(together.theta, near, problem.likelihood.guess())
+        if iterate is not None:
+            return Iterate(together.theta, near, iterate.noise, iterate.objective)
+    if together is not None and all(e.mask is not None for e in problem.experiments):
+        return None
+    near = problem.linearised(theta)
+    iterate = objective.at(theta, near, problem.likelihood.guess())
+    return iterate and Iterate(theta, near, iterate.noise, iterate.objective)
+
+
+def _climb(objective: Objective, first: Iterate, progress: bool) -> tuple[Iterate, str, np.ndarray]:
+    with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress) as bar:
+
+        def report(iterate: Iterate, size: float) -> None:
+            bar.update()
+            bar.set_postfix_str(f"objective {iterate.objective:.6g}, step {size:.2g} sd")
+
+        return climb(objective, first, report=report)
+
+
+def _outcome(problem: Problem, iterate: Iterate) -> dict[str, float]:
+    return {"objective": iterate.objective} | dict(zip(problem.names, iterate.theta.tolist(), strict=True))
+
+
+def _describe(
+    objective: Objective, best: Iterate, status: str, history: np.ndarray, starts: tuple[dict[str, float], ...]
+) -> MapEstimate:
+    problem, share = objective.problem, objective.share
+    names, likelihood = problem.names, problem.likelihood
+    data, _ = information(problem, best)
+    solutions = problem.with_responses(best.here.responses).solve(best.theta)
+    covariance, lost = _inverse(data + problem.joint_prior.curvature(best.theta))
+    robust = robust_covariance(problem, best, covariance)
+    covariance = with_uncertain_noise(problem, best, covariance)
+    shift = doubling_shift(problem, best, solutions, covariance)
+    shift[lost] = np.nan
+    for matrix in (covariance, robust):
+        matrix[lost], matrix[:, lost] = np.nan, np.nan
+        matrix[lost, lost] = np.inf
+    with np.errstate(invalid="ignore"):
+        sd, robust_sd = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
+    residuals = best.here.compared()
+    joint = joint_laplace(problem, best)
+    noise = dict(zip(problem.noise_names, best.noise.tolist(), strict=True))
+    rms = {c: _pooled(problem, c, residuals) for c in problem.channels}
+    measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} for e in problem.experiments}
+    return MapEstimate(
+        status=status,
+        theta=dict(zip(names, best.theta.tolist(), strict=True)),
+        sd=dict(zip(names, sd.tolist(), strict=True)),
+        robust_sd=dict(zip(names, robust_sd.tolist(), strict=True)),
+        variances={_short(name): noise[name] for name in likelihood.counts},
+        noise=noise,
+        noise_prior=problem.noise.prior_text,
+        covariance=pd.DataFrame(covariance, index=list(names), columns=list(names)),
+        joint_mode=joint.mode,
+        joint_covariance=joint.covariance,
+        degrees_of_freedom=max(float(problem.counted - len(names)), 1.0) if problem.free_noise else np.inf,
+        independent={_short(name): count for name, count in likelihood.counts.items()},
+        solutions=solutions,
+        residuals=residuals,
+        rms=rms,
+        fvu={c: rms[c] ** 2 / max(_pooled(problem, c, measured) ** 2, np.finfo(float).tiny) for c in problem.channels},
+        whiteness=channel_whiteness(problem, best),
+        noise_split=noise_split(problem, best, share),
+        input_noise=input_noise(problem, best.theta, solutions),
+        doubling_shift=dict(zip(names, shift.tolist(), strict=True)),
+        at_ends=tuple(name for name, end in zip(names, at_ends(objective, best), strict=True) if end),
+        undetermined=undetermined(data, best.theta, names, logarithmic(problem)),
+        history=history,
+        starts=starts,
+        tied=_tied_slopes(problem, best.theta),
+    )
+
+
+def _inverse(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inverse of a symmetric matrix, and which parameters are in directions without curvature.
+
+    These directions are left out of the inverse.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+    curved = np.abs(values) > SINGULAR * np.abs(values).max()
+    inverse = (vectors[:, curved] / values[curved]) @ vectors[:, curved].T * np.outer(scale, scale)
+    return inverse, np.any(np.abs(vectors[:, ~curved]) > LOST, axis=1)
+
+
+def remarks(problem: Problem, fit: MapEstimate) -> Iterator[str]:
+    """Give what must be said of an estimate: what it may not be trusted for, and what to do about it."""
+    for channel, noise in fit.input_noise.items():
+        if noise > NOISE_SHARE * fit.rms[channel]:
+            yield (
+                f"The noise of the measured inputs, differentiated, brings {noise:.3g} to {channel!r}, "
+                f"{noise / fit.rms[channel]:.0%} of the residual's {fit.rms[channel]:.3g}; keep fewer input harmonics "
+                "(fold(harmonics=…)) or measure the derivative."
+            )
+    shifts = {name: shift for name, shift in fit.doubling_shift.items() if abs(shift) > LARGEST_SHIFT}
+    if shifts:
+        worst = max(shifts, key=lambda name: abs(shifts[name]))
+        yield (
+            f"Twice as many points would move {worst!r} by {shifts[worst]:.2g} of its standard deviation; take more "
+            f"samples than {max(e.samples for e in problem.experiments)}, or a scheme of higher order."
+        )
+    for name in fit.at_ends:
+        low, high = problem.joint_prior.supports[name]
+        yield (
+            f"The estimate of {name!r}, {fit.theta[name]:.6g}, lies at the end of its prior's support ({low:g}, "
+            f"{high:g}); standard deviations do not describe the posterior there. Sample it, or widen the prior."
+        )
+    silent = [text for text in fit.undetermined if text.endswith(SILENT)]
+    if silent:
+        named = ", ".join(repr(text.removesuffix(f": {SILENT}")) for text in silent)
+        yield f"The data do not depend on {named}; what is said of each is the prior's. Fix it."
+    directions = [text for text in fit.undetermined if text not in silent]
+    if directions:
+        more = len(directions) - SHOWN
+        shown = "; or under ".join(directions[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
+        yield (
+            f"The data do not change under {shown}, whatever t. What is said of these is the prior's; fix one of them, "
+            "or report the combination that stays."
+        )
+
+
+def _short(name: str) -> str:
+    """Return a channel from ``variance[channel]``, other names as they are."""
+    return name[len("variance[") : -1] if name.startswith("variance[") else name
+
+
+def _tied_slopes(problem: Problem, theta: np.ndarray) -> dict[str, dict[str, float]]:
+    each = np.array([parameter_map.slopes(theta) for parameter_map in problem.parameter_maps.values()])
+    common = np.where(np.ptp(each, axis=0) == 0.0, each[0], np.nan)
+    every = next(iter(problem.parameter_maps.values())).parameters
+    slopes = dict(zip(every, common.tolist(), strict=True))
+    return {name: dict(zip(problem.names, slopes[name], strict=True)) for name in problem.tied}
+
+
+def _pooled(problem: Problem, channel: str, signals: Mapping[str, Mapping[str, np.ndarray]]) -> float:
+    """Return the root mean square of a channel over the measured points of all experiments."""
+    values = []
+    for e in problem.experiments:
+        if channel in e.outputs:
+            values.append(signals[e.name][channel][slice(None) if e.mask is None else e.mask])
+    return float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
+
+
+def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
+    given = dict(zip(problem.names, theta, strict=True))
+    values = ", ".join(f"{name} = {value:.6g}" for name, value in given.items())
+    if names := problem.joint_prior.excluding(theta):
+        low, high = problem.joint_prior.supports[names[0]]
+        excluded = ", ".join(f"{name} = {given[name]:.6g}" for name in names)
+        return (
+            f"start: {excluded} is not allowed; the log-posterior is not finite there, the prior's support is "
+            f"({low:g}, {high:g})."
+        )
+    values += "" if given_start else " (the priors' medians)"
+    together = all_at_once(problem, theta)
+    if together is not None and together.blocked:
+        where = "the other experiments' orbits are" if len(problem.experiments) > 1 else "it is an orbit"
+        return (
+            f"start: {values} is not allowed; {together.blocked!r} cannot be followed from its guess to parameters at "
+            f"which {where}. Leave it out if it may be none, or give start={{…}} nearer to the truth."
+        )
+    if together is not None and together.states:
+        near = problem.anchored(together.theta, together.states).linearised(together.theta)
+    else:
+        near = problem.linearised(theta)
+    failed = ", ".join(f"{name!r} ({status})" for name, status in near.statuses.items() if status != "converged")
+    ended = f"without the orbit of {failed}" if failed else "well, but the outputs or the noise are not finite"
+    return (
+        f"start: {values} is not allowed; the log-posterior is not finite there, the periodic solve ended {ended}. "
+        "Give start={…}, or priors with other medians, at which problem.solve(theta) converges."
+    )

@@ -1,0 +1,486 @@
+"""Profiles: the best log-density for every value of one parameter, found by following the ridge from the estimate."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import brentq
+from scipy.special import ndtri
+
+from bayesperiodic import _checks
+from bayesperiodic._io import Result
+from bayesperiodic._linalg import in_one_thread
+from bayesperiodic._parallel import checked_executor, team
+from bayesperiodic.estimation.gauss_newton import PRESSED, Iterate, Objective, bias_correction, climb
+from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.posterior.density import Linearisation
+from bayesperiodic.posterior.parameters import SHIFT
+from bayesperiodic.posterior.priors import Prior
+from bayesperiodic.posterior.problem import Problem
+
+# How far apart points lie, as changes of the root of the drop; how steps grow, are cut, and when they are short.
+SPACING, GROWTH, SHORTENED, SMALLEST = 0.5, 3.0, 0.25, 0.01
+# Beyond the root that belongs to 99 %, 2.576, so that the end of that interval lies between two points.
+FURTHEST = 2.8
+# A step leaves a tenth of the distance to the support's end; the last point leaves a millionth of the peak's, so that
+# priors that vanish at the end are seen to, or lies at the outermost thousandth of the prior if that is closer.
+NEARER, NEAREST, TAIL = 0.1, 1e-6, 1e-3
+MOST_POINTS, MOST_FAILURES, MOST_ROUNDS = 60, 5, 5
+GAIN, CUT = 1e-6, 1e-12
+
+
+class Point(NamedTuple):
+    """A value of the parameter and the best iterate found there; None without a finite log-posterior."""
+
+    value: float
+    iterate: Iterate | None
+
+
+@dataclass(frozen=True)
+class Ridge:
+    """The best points of an objective for every value of one parameter.
+
+    Attributes
+    ----------
+    objective : Objective
+    column : int
+        The parameter's place in θ.
+    peak : Iterate
+        Where to start, anchored.
+    """
+
+    objective: Objective
+    column: int
+    peak: Iterate
+
+    @property
+    def at(self) -> float:
+        """The parameter at the peak."""
+        return float(self.peak.theta[self.column])
+
+    @property
+    def _prior(self) -> Prior:
+        joint = self.objective.problem.joint_prior
+        return joint.marginals[joint.names[self.column]]
+
+    def limits(self) -> tuple[float, float]:
+        """Return the outermost values that are tried: close to the ends of the prior's support, or infinite."""
+        tails = self._prior.quantile(np.array([TAIL, 1.0 - TAIL]))
+        below, above = (self._limit(end, tail) for end, tail in zip(self._prior.support, tails, strict=True))
+        return below, above
+
+    def _limit(self, end: float, tail: float) -> float:
+        if np.isinf(end):
+            return end
+        if abs(end - self.at) < PRESSED * self._size():
+            return self.at
+        nearest = end + NEAREST * (self.at - end)
+        return float(tail) if abs(tail - end) < abs(nearest - end) else nearest
+
+    def followed(self) -> list[Point]:
+        """Return points, ascending, found from the peak outwards and back from both ends.
+
+        Where the way back finds that an end is too high, the profile goes on from there.
+        """
+        step, points = SPACING * self._size(), [Point(self.at, self.peak)]
+        for _ in range(MOST_ROUNDS):
+            top = max(point.iterate.objective for point in points if point.iterate is not None)
+            below, above = self._outwards(points[0], -step, top), self._outwards(points[-1], step, top)
+            if not below and not above:
+                break
+            points = sorted([*below, *points, *above], key=lambda point: point.value)
+            points = self._swept(self._swept(points)[::-1])[::-1]
+        return points
+
+    def _size(self) -> float:
+        """Return the standard deviation that the ridge's curvature at the peak tells, or what the prior allows."""
+        quartiles = self._prior.quantile(np.array([0.25, 0.75]))
+        width = float(quartiles[1] - quartiles[0])
+        _, curvature = self._tangent(self.peak)
+        if curvature > 0.0:
+            return min(curvature**-0.5, width)
+        return min(width, *(abs(self.at - end) for end in self._prior.support))
+
+    def _outwards(self, start: Point, step: float, top: float) -> list[Point]:
+        """Return points from one on in one direction, each started from the one before.
+
+        The root of twice the drop from the top changes by about `SPACING` from point to point; a step that changes it
+        by more than twice that is shortened, unless it is short already and so across a jump.
+        """
+        end, limit = self._prior.support[step > 0.0], self.limits()[step > 0.0]
+        points: list[Point] = []
+        (now, here), first, overshot, failures = start, step, end, 0
+        while here is not None and now != limit and _root(top, here) <= FURTHEST and len(points) < MOST_POINTS:
+            value = _next(now, step, end, limit)
+            step, there = value - now, self._climbed(here, value)
+            if there is None:
+                points.append(Point(value, None))
+                step, failures = SHORTENED * step, failures + 1
+                if failures == MOST_FAILURES:
+                    break
+                continue
+            ratio = SPACING / max(abs(_root(top, there) - _root(top, here)), SPACING / GROWTH)
+            if ratio < 0.5 and abs(step) > SMALLEST * min(abs(first), abs(now - end)):
+                step, overshot = step * max(ratio, SHORTENED), value
+                continue
+            points.append(Point(value, there))
+            now, here, top = value, there, max(top, there.objective)
+            if ratio < 0.5:
+                step, overshot = first, end
+                continue
+            widest = max(1.0, 0.5 * (overshot - now) / step) if overshot * step > now * step else GROWTH
+            step *= min(ratio, widest)
+        return points
+
+    def _swept(self, points: list[Point]) -> list[Point]:
+        """Return the points from an end on, each started from the one before too, and the better iterates kept.
+
+        Beyond the peak that has been done, and is repeated only as long as it improves.
+        """
+        kept, improved, side = points[:1], False, np.sign(points[0].value - self.at)
+        for point in points[1:]:
+            inwards = side != 0.0 and side * (point.value - self.at) >= 0.0
+            before = next((p.iterate for p in kept[::-1] if p.iterate is not None), None)
+            other = self._climbed(before, point.value) if before is not None and (inwards or improved) else None
+            improved = other is not None and (point.iterate is None or other.objective > point.iterate.objective + GAIN)
+            kept.append(Point(point.value, other) if improved else point)
+        return kept
+
+    def _climbed(self, start: Iterate, value: float) -> Iterate | None:
+        """Return the best iterate with the parameter at a value, climbed from a neighbour."""
+        held = self._held
+        plain = np.where(held, value, start.theta)
+        tangent = start.theta + (value - start.theta[self.column]) * self._tangent(start)[0]
+        found = [self.objective.at(theta, start.here, start.noise) for theta in (tangent, plain)]
+        finite = [iterate for iterate in found if iterate is not None]
+        if not finite:
+            return None
+        first = max(finite, key=lambda iterate: iterate.objective)
+        return climb(self.objective, self.objective.anchored(first), held)[0]
+
+    @property
+    def _held(self) -> np.ndarray:
+        return np.arange(self.peak.theta.size) == self.column
+
+    def _tangent(self, iterate: Iterate) -> tuple[np.ndarray, float]:
+        """Return ∂θ/∂parameter along the ridge, (names,), and the curvature −∂²objective/∂parameter² along it.
+
+        Directions of the other parameters without curvature stay where they are.
+        """
+        hessian, _ = self.objective.hessian_and_gradient(iterate)
+        held, slope = self._held, self._held.astype(float)
+        if not np.isfinite(hessian).all():
+            return slope, 0.0
+        scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
+        scaled = hessian * np.outer(scale, scale)
+        others = np.linalg.pinv(scaled[np.ix_(~held, ~held)], rcond=CUT, hermitian=True) @ scaled[~held, self.column]
+        curvature = scaled[self.column, self.column] - others @ scaled[~held, self.column]
+        slope[~held] = -scale[~held] * others / scale[self.column]
+        return slope, float(curvature / scale[self.column] ** 2) if curvature > CUT else 0.0
+
+
+def _root(top: float, iterate: Iterate) -> float:
+    """Return how many standard deviations the drop from the top is worth."""
+    return float(np.sqrt(2.0 * max(top - iterate.objective, 0.0)))
+
+
+def _next(now: float, step: float, end: float, limit: float) -> float:
+    """Return the value a step further, but no further than a limit and most of the way to the support's end."""
+    if np.isinf(end):
+        return now + step
+    inside = min if step > 0.0 else max
+    return inside(now + step, end + NEARER * (now - end), limit)
+
+
+WIDEST = 0.99
+BETTER = 1e-4
+CLOSED, ONE_SIDED, FLAT = "closed", "one-sided", "flat"
+
+
+@dataclass(frozen=True)
+class Profile(Result):
+    """The best log-density for every value of a parameter, all others and the noise parameters being free.
+
+    Attributes
+    ----------
+    map, sd : dict of str to float
+        The estimate and its Laplace standard deviations, of all free parameters. The Laplace approximation of a profile
+        is −improvement − ½((values − map)/sd)².
+    values : dict of str to array (points,)
+        By profiled parameter, ascending, in its unit.
+    log_density : dict of str to array (points,)
+        The profile there, relative to the best value found at all; NaN where no finite log-posterior was found.
+    paths : dict of str to array (points, names)
+        All free parameters along the profile, in the order of `map`; NaN where there is no profile.
+    limits : dict of str to (float, float)
+        The outermost values tried, close to the ends of the prior's support, or infinite.
+    best : dict of str to float
+        Where the best value was found: the estimate, unless there is a better one.
+    improvement : float
+        By how much the log-density is higher there than at the estimate.
+    units : dict of str to str
+        Of all free parameters.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> found = bp.profile(problem, fit, ["k"])
+    >>> found.shape, found.failed
+    ({'k': 'closed'}, {'k': 0})
+    >>> low, high = found.interval(0.95)["k"]
+    >>> low < found.map["k"] < high
+    True
+    """
+
+    map: dict[str, float]
+    sd: dict[str, float]
+    values: dict[str, np.ndarray]
+    log_density: dict[str, np.ndarray]
+    paths: dict[str, np.ndarray]
+    limits: dict[str, tuple[float, float]]
+    best: dict[str, float]
+    improvement: float
+    units: dict[str, str]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The profiled parameters."""
+        return tuple(self.values)
+
+    @property
+    def failed(self) -> dict[str, int]:
+        """How many points of each profile have no finite log-posterior."""
+        return {name: int(np.isnan(density).sum()) for name, density in self.log_density.items()}
+
+    def interval(self, probability: float = 0.9) -> dict[str, tuple[float, float]]:
+        """Return where each profile has dropped by ½χ² with one degree of freedom (likelihood ratio), outermost.
+
+        Between points the root of the drop, a straight line for a parabola, is interpolated monotonically.
+
+        Parameters
+        ----------
+        probability : float
+            Above 0 and at most 0.99, which is as far as profiles are followed.
+
+        Returns
+        -------
+        dict of str to (float, float)
+            An end is −∞ or ∞ where the profile does not come down before the prior's support ends, NaN where solves
+            fail before it has come down.
+
+        Raises
+        ------
+        ValueError
+            For any other probability.
+        """
+        if not 0.0 < _checks.finite_number("probability", probability) <= WIDEST:
+            raise ValueError(f"probability: {probability!r} is not allowed; it must be above 0 and at most {WIDEST}.")
+        level = float(ndtri(0.5 + 0.5 * probability))
+        result = {}
+        for name, values in self.values.items():
+            roots, (low, high) = np.sqrt(np.maximum(-2.0 * self.log_density[name], 0.0)), self.limits[name]
+            below = -_crossing(-values[::-1], roots[::-1], level, -low)
+            result[name] = below, _crossing(values, roots, level, high)
+        return result
+
+    @property
+    def shape(self) -> dict[str, str]:
+        """How many ends of the 99 % interval are finite: "closed" (both), "one-sided" or "flat" (none).
+
+        An informative prior closes a profile too.
+        """
+        named = (FLAT, ONE_SIDED, CLOSED)
+        return {name: named[int(np.isfinite(ends).sum())] for name, ends in self.interval(WIDEST).items()}
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """A row a profile: map, sd, the 90 % intervals of Laplace and of the profile, shape, points and failed."""
+        half = float(ndtri(0.95))
+        rows: dict[str, dict[str, object]] = {}
+        for name, (low, high) in self.interval(0.9).items():
+            at, sd = self.map[name], self.sd[name]
+            rows[name] = {"map": at, "sd": sd, "laplace_low": at - half * sd, "laplace_high": at + half * sd}
+            rows[name] |= {"low": low, "high": high, "shape": self.shape[name]}
+            rows[name] |= {"points": self.values[name].size, "failed": self.failed[name]}
+        return pd.DataFrame.from_dict(rows, orient="index")
+
+    def __repr__(self) -> str:
+        text = f"Profile, 90 % intervals:\n{self.table.to_string(float_format='{:.5g}'.format)}"
+        if self.improvement > BETTER:
+            text += f"\nThe log-density is higher by {self.improvement:.3g} at {_written(self.best)}."
+        return text
+
+
+def _crossing(values: np.ndarray, roots: np.ndarray, level: float, limit: float) -> float:
+    """Return where the roots, right of the lowest, cross a level for the last time.
+
+    Infinite if they do not up to the limit; NaN if solves fail before they have, or no root is below the level.
+    """
+    top = int(np.nanargmin(roots))
+    found = top + np.flatnonzero(np.isfinite(roots[top:]))
+    values, roots = values[found], roots[found]
+    inside = np.flatnonzero(roots <= level)
+    if not inside.size:
+        return np.nan
+    last = int(inside[-1])
+    if last == values.size - 1:
+        return np.inf if values[last] == limit else np.nan
+    curve = PchipInterpolator(values, roots)
+    return float(brentq(lambda x: float(curve(x)) - level, values[last], values[last + 1], xtol=1e-300, rtol=1e-14))
+
+
+@in_one_thread
+def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = None, *, executor: Any = None) -> Profile:
+    """Follow the best log-density from the estimate along every parameter, outwards and back again.
+
+    What is profiled is what `map_estimate` maximises: eq. (6) of [1]_ with the bias correction of eq. (7), the priors
+    included. At every value of a parameter the staged iteration runs over all the others, started from its neighbour.
+    Points are spaced by about half a standard deviation of the drop; they go on until the profile has dropped beyond
+    what a 99 % interval takes, the prior's support ends, or solves fail. Then every point is started from its outer
+    neighbour too, and the better value is kept: where branches cross, the way out stays on the first one for too long.
+
+    Parameters
+    ----------
+    problem : Problem
+    fit : MapEstimate
+        Of this problem.
+    names : sequence of str, optional
+        Parameters to profile; by default all that are free.
+    executor : None, int, Dask Client, or executor with the interface of concurrent.futures
+        Who follows them, one parameter a task, as in `sample`: by default threads of this process. It does not change
+        the result.
+
+    Returns
+    -------
+    Profile
+
+    Raises
+    ------
+    ValueError
+        For an unknown name, an estimate that has no finite log-posterior in this problem, or an executor that takes no
+        tasks.
+    WorkersLost
+        If the executor's workers died (a RuntimeError).
+
+    Warns
+    -----
+    UserWarning
+        If a profile finds a better point than the estimate.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
+    >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
+    ...                          frequency=0.1, samples=50)
+    >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5, "variance[displacement]": 0.01})
+    >>> profile = bp.profile(problem, bp.map_estimate(problem, progress=False))
+    >>> profile.shape
+    {'c': 'closed', 'k': 'closed'}
+    >>> profile.table[["laplace_low", "low", "laplace_high", "high"]].round(2)
+       laplace_low   low  laplace_high  high
+    c         0.15  0.15          0.25  0.25
+    k         0.94  0.94          1.06  1.06
+    """
+    chosen = _checked_names(problem, names)
+    executor = checked_executor(executor)
+    objective, peak = _at_estimate(problem, fit)
+    with team(executor, (objective, peak)) as crew:
+        found = dict(crew.run(_followed, [problem.names.index(name) for name in chosen]))
+    top, best = peak.objective, peak.theta
+    values, density, paths, limits = {}, {}, {}, {}
+    for number, name in enumerate(chosen):
+        limits[name], values[name], density[name], paths[name] = found[number]
+        if np.nanmax(density[name]) > top:
+            top, best = np.nanmax(density[name]), paths[name][np.nanargmax(density[name])]
+    result = Profile(
+        map=dict(fit.theta),
+        sd=dict(fit.sd),
+        values=values,
+        log_density={name: value - top for name, value in density.items()},
+        paths=paths,
+        limits=limits,
+        best=dict(zip(problem.names, best.tolist(), strict=True)),
+        improvement=float(top - peak.objective),
+        units={name: _unit(problem, name) for name in problem.names},
+    )
+    if result.improvement > BETTER:
+        warnings.warn(
+            f"The log-density is higher by {result.improvement:.3g} than at the estimate where "
+            f"{_written(result.best)}; start there, map_estimate(problem, start=profile.best), and profile again.",
+            UserWarning,
+            stacklevel=3,
+        )
+    return result
+
+
+def _checked_names(problem: Problem, names: Sequence[str] | None) -> tuple[str, ...]:
+    if names is None:
+        return problem.names
+    if isinstance(names, str) or not len(names):
+        raise ValueError(f"names: {names!r} is not allowed; it must be a sequence of names, such as {problem.names!r}.")
+    for name in names:
+        _checks.one_of("names", name, problem.names)
+    return tuple(dict.fromkeys(names))
+
+
+def _at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate]:
+    """Return what is maximised and where the estimate stands, its solves anchored at the estimate's own solutions."""
+    _checks.same_names("fit.theta", fit.theta, problem.names)
+    _checks.same_names("fit.noise", fit.noise, problem.noise_names)
+    _checks.same_names("fit.solutions", fit.solutions, [e.name for e in problem.experiments])
+    theta = problem.vector(fit.theta)
+    responses = problem.anchored(theta, {name: s.states for name, s in fit.solutions.items()}).responses
+    objective = Objective(problem, bias_correction(problem), np.zeros(theta.size, dtype=bool))
+    near = Linearisation(theta, responses, problem.comparisons)
+    peak = objective.at(theta, near, np.array([fit.noise[name] for name in problem.noise_names]))
+    if peak is None:
+        raise ValueError(
+            f"fit: {_written(fit.theta)} is not allowed; the log-posterior is not finite there. Give "
+            "an estimate of this problem."
+        )
+    return objective, objective.anchored(peak)
+
+
+def _followed(
+    start: tuple[Objective, Iterate], column: int
+) -> tuple[tuple[float, float], np.ndarray, np.ndarray, np.ndarray]:
+    """Return the limits of the parameter in a column of θ, and the values, the objective and θ along its profile."""
+    ridge = Ridge(start[0], column, start[1])
+    return ridge.limits(), *_arrays(ridge.followed(), start[1].theta.size)
+
+
+def _arrays(points: list[Point], size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the values, the objective and θ of points, NaN where there is none."""
+    nothing = np.full(size, np.nan)
+    return (
+        np.array([value for value, _ in points]),
+        np.array([np.nan if iterate is None else iterate.objective for _, iterate in points]),
+        np.array([nothing if iterate is None else iterate.theta for _, iterate in points]),
+    )
+
+
+def _unit(problem: Problem, name: str) -> str:
+    plain = name.partition("[")[0]
+    return "s" if plain == SHIFT else problem.model.units.get(plain, "")
+
+
+def _written(theta: dict[str, float]) -> str:
+    return ", ".join(f"{name} = {value:.6g}" for name, value in theta.items())

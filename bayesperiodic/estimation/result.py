@@ -1,0 +1,440 @@
+"""MapEstimate: the MAP point, its Laplace approximations, and an account of the residual."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.special import stdtrit
+
+from bayesperiodic import _checks, _fourier
+from bayesperiodic._expressions import Expression, parse_all
+from bayesperiodic._io import Result
+from bayesperiodic.estimation.gauss_newton import Iterate
+from bayesperiodic.periodic.solution import PeriodicSolution
+from bayesperiodic.posterior import labels
+from bayesperiodic.posterior.joint_priors import MultivariateNormal
+from bayesperiodic.posterior.noise import POINTS, SPECTRAL
+from bayesperiodic.posterior.problem import Problem
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Bartlett's test of a residual that repeats every period.
+
+    Attributes
+    ----------
+    p : float
+        Probability, for white residuals, of a cumulative periodogram at least as far from a straight line; the
+        Kolmogorov-Smirnov distance of the kept harmonics, exact for independent normal values. NaN if not tested.
+    lag1 : float
+        Circular autocorrelation at the distance of two independent values, one period / (2·harmonics + 1).
+    """
+
+    p: float
+    lag1: float
+
+
+def whiteness(residual: np.ndarray, harmonics: int | None = None) -> Whiteness:
+    """Test one residual period (points,) for whiteness; by default over all harmonics of the grid."""
+    return of_periodogram(np.abs(_fourier.coefficients(residual, harmonics)[1:]) ** 2)
+
+
+def of_components(components: np.ndarray, harmonic: np.ndarray) -> Whiteness:
+    """Test real Fourier components (size,) that belong to given harmonics (size,)."""
+    power = np.bincount(harmonic, components**2)
+    complete = np.bincount(harmonic) == 2
+    return of_periodogram(power[complete])
+
+
+def of_periodogram(power: np.ndarray) -> Whiteness:
+    """Test the squared amplitudes of harmonics 1, 2, … for being those of white noise.
+
+    References
+    ----------
+    M. S. Bartlett, An Introduction to Stochastic Processes, Cambridge University Press, 1955.
+    """
+    from scipy.stats import kstest
+
+    if power.size < 2 or power.sum() == 0.0:
+        return Whiteness(1.0, 0.0)
+    harmonic = np.arange(1, power.size + 1)
+    cumulative = np.cumsum(power)[:-1] / power.sum()
+    lag = 2.0 * np.pi / (2 * power.size + 1)
+    return Whiteness(
+        float(kstest(cumulative, "uniform").pvalue),
+        float(np.sum(power * np.cos(lag * harmonic)) / power.sum()),
+    )
+
+
+@dataclass(frozen=True)
+class NoiseSplit:
+    """Standard deviations of one value of a channel's mean period, in the channel's units.
+
+    Attributes
+    ----------
+    measurement : float
+        What the scatter of the measured cycles explains; NaN where that is not known.
+    model : float
+        What is left: √(total² − measurement²), or zero.
+    total : float
+        That of the residual, corrected for the number of free parameters as in eq. (7).
+    """
+
+    measurement: float
+    model: float
+    total: float
+
+
+def noise_split(problem: Problem, estimate: Iterate, share: float) -> dict[str, NoiseSplit]:
+    """Return the split of every channel whose history was compared; `share` is 1 − l/Σn of eq. (7)."""
+    sums = {channel: np.zeros(3) for channel in problem.channels}
+    for block, r in zip(problem.likelihood.blocks, estimate.here.residuals, strict=True):
+        if block.kind in (SPECTRAL, POINTS):
+            sums[block.channel] += [block.count, block.weight * float(r @ r), block.count * block.measured]
+    result = {}
+    for channel, (count, square, measured) in sums.items():
+        if count:
+            total, measurement = square / (count * share), measured / count
+            result[channel] = NoiseSplit(*np.sqrt([measurement, max(total - measurement, 0.0), total]).tolist())
+    return result
+
+
+def channel_whiteness(problem: Problem, estimate: Iterate) -> dict[str, Whiteness]:
+    """Return the whiteness of every channel's residual in units of the noise model.
+
+    With several experiments p is the smallest, corrected for their number, lag1 the mean; NaN where only single points
+    were compared.
+    """
+    white = problem.likelihood.whitened(estimate.here.residuals, estimate.noise)
+    tests: dict[str, list[Whiteness]] = {channel: [] for channel in problem.channels}
+    for block, r in zip(problem.likelihood.blocks, white, strict=True):
+        if block.kind == SPECTRAL:
+            tests[block.channel].append(of_components(r, block.harmonic))
+    nothing = [Whiteness(float("nan"), float("nan"))]
+    return {
+        channel: Whiteness(
+            float(np.minimum(1.0, len(found or nothing) * min(t.p for t in found or nothing))),
+            float(np.mean([t.lag1 for t in found or nothing])),
+        )
+        for channel, found in tests.items()
+    }
+
+
+@dataclass(frozen=True)
+class MapEstimate(Result):
+    """The maximum of the posterior density and the normal approximation around it.
+
+    Attributes
+    ----------
+    status : str
+        "converged", "stalled" (no step raised the objective), "iterations" (their limit was reached) or "singular".
+    theta, sd : dict of str to float
+        Estimates and their standard deviations, in natural values and the parameters' units.
+    robust_sd : dict of str to float
+        Standard deviations that hold although the residuals are not as the noise model says (sandwich with the
+        residual's smoothed spectrum); far from `sd`, the noise model is too sure of itself or not sure enough.
+    variances : dict of str to float
+        Variance of the mean period of each channel (or "channel, experiment"), and "scale", eq. (7) ([1]_) or as fixed.
+    noise : dict of str to float
+        All noise parameters by their full names.
+    noise_prior : str
+        The prior of the variances, in words.
+    covariance : DataFrame (names × names)
+        Inverse of H of eq. (8) at these variances; where the correlation of the noise is estimated too (`Circulant`),
+        with that uncertainty integrated in.
+    joint_mode : dict of str to float
+        Mode of the density in sampling coordinates: natural values of parameters and free noise parameters.
+    joint_covariance : DataFrame
+        Inverse of the exact Hessian there, over the sampling coordinates: logarithms of the parameters whose prior's
+        support is (0, ∞) and of the noise parameters, other parameters as they are. NaN where there is no maximum.
+    degrees_of_freedom : float
+        Independent values less free parameters; infinite where all variances are fixed.
+    independent : dict of str to float
+        Independent values behind each variance.
+    solutions : dict of str to PeriodicSolution
+        By experiment.
+    residuals : dict of str to dict of str to array (points,)
+        y − ŷ within the kept harmonics, by experiment and channel.
+    rms, fvu : dict of str to float
+        Root mean square of the residuals of each channel, and their mean square over the variance of the measured
+        channel (the fraction of variance unexplained).
+    whiteness : dict of str to Whiteness
+        Of the residuals in units of the noise model, by channel; with several experiments p is the smallest, corrected
+        for their number, lag1 the mean.
+    noise_split : dict of str to NoiseSplit
+        Measurement noise and model error of each channel.
+    input_noise : dict of str to float
+        Standard deviation that the noise of the measured inputs brings to each channel.
+    doubling_shift : dict of str to float
+        By how many standard deviations each estimate would move on twice as many points; NaN if those solves fail.
+    at_ends : tuple of str
+        Parameters whose estimate lies at the end of their prior's support.
+    undetermined : tuple of str
+        Parameters or combinations of them that change no output at all, in words; what is said of them is the prior's.
+    history : array (iterations,)
+        The objective before each step and at the end.
+    starts : tuple of dict of str to float
+        Of every start, the objective it led to (−inf: none) under "objective", and the estimates.
+    tied : dict of str to dict of str to float
+        Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> for name, value in fit.theta.items():
+    ...     print(f"{name} = {value:.3f} ± {fit.sd[name]:.3f}")
+    c = 0.200 ± 0.001
+    k = 1.000 ± 0.001
+    >>> low, high = fit.interval(0.9)["k"]
+    >>> low < 1.0 < high, fit.whiteness["displacement"].p > 0.01
+    (True, True)
+    """
+
+    status: str
+    theta: dict[str, float]
+    sd: dict[str, float]
+    robust_sd: dict[str, float]
+    variances: dict[str, float]
+    noise: dict[str, float]
+    noise_prior: str
+    covariance: pd.DataFrame
+    joint_mode: dict[str, float]
+    joint_covariance: pd.DataFrame
+    degrees_of_freedom: float
+    independent: dict[str, float]
+    solutions: dict[str, PeriodicSolution]
+    residuals: dict[str, dict[str, np.ndarray]]
+    rms: dict[str, float]
+    fvu: dict[str, float]
+    whiteness: dict[str, Whiteness]
+    noise_split: dict[str, NoiseSplit]
+    input_noise: dict[str, float]
+    doubling_shift: dict[str, float]
+    at_ends: tuple[str, ...]
+    undetermined: tuple[str, ...]
+    history: np.ndarray
+    starts: tuple[dict[str, float], ...]
+    tied: dict[str, dict[str, float]]
+
+    @property
+    def converged(self) -> bool:
+        """True if the status is "converged"."""
+        return self.status == "converged"
+
+    @property
+    def correlations(self) -> pd.DataFrame:
+        """Correlations of the parameters, from `covariance`."""
+        sd = np.sqrt(np.diag(self.covariance))
+        return pd.DataFrame(self.covariance / np.outer(sd, sd))
+
+    def interval(self, probability: float = 0.9, *, robust: bool = False) -> dict[str, tuple[float, float]]:
+        """Return the equal-tailed interval of each parameter, Student's t with `degrees_of_freedom`.
+
+        With few independent values a normal interval is too short, because the variance is estimated too.
+
+        Parameters
+        ----------
+        probability : float
+            Between 0 and 1.
+        robust : bool
+            Take `robust_sd` instead of `sd`.
+
+        Returns
+        -------
+        dict of str to (float, float)
+            In the parameters' units.
+
+        Raises
+        ------
+        ValueError
+            If the probability is not between 0 and 1.
+        """
+        if not 0.0 < _checks.finite_number("probability", probability) < 1.0:
+            raise ValueError(f"probability: {probability!r} is not allowed; it must be between 0 and 1.")
+        width = float(stdtrit(min(self.degrees_of_freedom, 1e9), 0.5 + 0.5 * probability))
+        sd = self.robust_sd if robust else self.sd
+        return {name: (value - width * sd[name], value + width * sd[name]) for name, value in self.theta.items()}
+
+    def derive(self, expressions: Mapping[str, str], *, experiment: str | None = None) -> pd.DataFrame:
+        """Return quantities derived from the parameters, with standard deviations by the delta method.
+
+        The standard deviation is √(gᵀ C g) with the exact gradient g by the free parameters and the `covariance` C:
+        exact for linear combinations, otherwise good as far as the expression is straight within the uncertainty.
+
+        Parameters
+        ----------
+        expressions : mapping of str to str
+            By new name: numbers, names of parameters (free, fixed or tied), pi, + - * / ** and sqrt, exp, log, sin,
+            cos, tan, atan, sinh, cosh, tanh, abs.
+        experiment : str, optional
+            Whose local parameters, and fixed values, the expressions mean, by their plain names: with "run 7"
+            ``theta16`` is ``theta16[run 7]``. Without it they can name only what all experiments share.
+
+        Returns
+        -------
+        DataFrame
+            Columns value and sd, a row a quantity; ``attrs["covariance"]`` holds the covariances between the quantities
+            as a dict of dict of floats. The sd is NaN where a tied parameter enters that follows a local one.
+
+        Raises
+        ------
+        ValueError
+            For an expression that is not allowed or has no finite value at the estimate, a new name that is no
+            identifier or that a parameter has, an unknown experiment.
+
+        Examples
+        --------
+        >>> import numpy as np, bayesperiodic as bp
+        >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
+        >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
+        ...                          frequency=0.1, samples=50, scheme="central4")
+        >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
+        >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)},
+        ...                      fixed={"m": 1, "k3": 0.5, "variance[displacement]": 1e-4}, scheme="central4")
+        >>> fit = bp.map_estimate(problem, progress=False)
+        >>> fit.derive({"damping_ratio": "c/(2*sqrt(k*m))"}).round(4)
+                       value      sd
+        damping_ratio    0.1  0.0016
+        """
+        if experiment is not None:
+            _checks.one_of("experiment", experiment, self.solutions)
+        named = labels.in_experiment(self.theta, experiment)
+        values = self._fixed(experiment) | {plain: self.theta[name] for plain, name in named.items()}
+        hint = labels.local_hint(self.theta, experiment)
+        quantities = parse_all("expressions", expressions, values, labels.local_names(self.theta), hint)
+        at = {name: float(quantity.value(values)) for name, quantity in quantities.items()}
+        for name, value in at.items():
+            if not np.isfinite(value):
+                raise ValueError(
+                    f"expressions[{name!r}]: {quantities[name].text!r} is not allowed; it is {value} at the estimate "
+                    "and must be finite."
+                )
+        covariance = _carried(self.covariance, [self._gradient(q, values, named) for q in quantities.values()])
+        with np.errstate(invalid="ignore"):
+            sd = np.sqrt(np.diag(covariance))
+        table = pd.DataFrame({"value": list(at.values()), "sd": sd}, index=list(at))
+        table.attrs["covariance"] = {
+            name: dict(zip(at, row, strict=True)) for name, row in zip(at, covariance.tolist(), strict=True)
+        }
+        return table
+
+    def as_prior(self, names: tuple[str, ...]) -> MultivariateNormal:
+        """Return the normal approximation of these parameters, as the prior of the next problem.
+
+        See `Posterior.as_prior`; the mean is the maximum, and the covariance is taken from `covariance`.
+
+        Parameters
+        ----------
+        names : tuple of str
+            Free parameters, local ones as ``theta16[run 7]``, in the order of the prior's.
+
+        Returns
+        -------
+        MultivariateNormal
+
+        Raises
+        ------
+        ValueError
+            For anything else than a tuple of different free parameters.
+
+        Warns
+        -----
+        UserWarning
+            If the estimate has not converged.
+
+        Examples
+        --------
+        >>> import numpy as np, bayesperiodic as bp
+        >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
+        >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
+        ...                          frequency=0.1, samples=50, scheme="central4")
+        >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
+        >>> known = {"m": 1, "k3": 0.5, "variance[displacement]": 1e-4}
+        >>> problem = bp.Problem(bp.models.duffing, [run], fixed=known, scheme="central4",
+        ...                      priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)})
+        >>> names = ("c", "k")
+        >>> prior = bp.map_estimate(problem, progress=False).as_prior(names)
+        >>> bp.Problem(bp.models.duffing, [run], fixed=known, priors={names: prior}).median().round(3).tolist()
+        [0.2, 1.0]
+        """
+        key = labels.checked_key(names, self.theta, self.noise)
+        if not self.converged:
+            warnings.warn(
+                f"The estimate has not converged ({self.status}), nor has this prior. Try map_estimate from another "
+                "start, or from several.",
+                stacklevel=2,
+            )
+        mean = np.array([self.theta[name] for name in key])
+        covariance = self.covariance.loc[[*key], [*key]].to_numpy()
+        if lost := [name for name, variance in zip(key, np.diag(covariance), strict=True) if not np.isfinite(variance)]:
+            raise ValueError(
+                f"names: {', '.join(map(repr, lost))} is not allowed; the data do not determine it, so its standard "
+                "deviation is not finite. Leave it out, or fix a parameter, see fit.undetermined."
+            )
+        return MultivariateNormal(mean, covariance)
+
+    def _gradient(self, quantity: Expression, values: dict[str, float], named: dict[str, str]) -> dict[str, np.ndarray]:
+        """Return the derivatives by the free parameters, those through tied ones included; `named` by plain name."""
+        partial = quantity.gradient(values)
+        total = {name: np.array(0.0) for name in self.theta}
+        for plain, slope in partial.items():
+            if plain in named:
+                total[named[plain]] = total[named[plain]] + slope
+            for name, through in self.tied.get(plain, {}).items():
+                total[name] = total[name] + slope * through
+        return total
+
+    def _fixed(self, experiment: str | None) -> dict[str, float]:
+        """Return the parameters that are not free, tied ones among them: of one experiment, or common to all."""
+        free = {*self.theta, *(labels.local_names(self.theta) if experiment is None else ())}
+        first, *others = (solution.parameters for run, solution in self.solutions.items() if experiment in (None, run))
+        return {
+            name: value
+            for name, value in first.items()
+            if name not in free and all(other.get(name) == value for other in others)
+        }
+
+    def __repr__(self) -> str:
+        status = self.status if self.converged else f"NOT CONVERGED: {self.status}; try another start, or starts=8"
+        lines = [f"MapEstimate ({status}), estimate ± Laplace sd (robust sd):"]
+        lines += [
+            f"  {name:12s} {value:12.6g} ± {self.sd[name]:.3g} ({self.robust_sd[name]:.3g})"
+            for name, value in self.theta.items()
+        ]
+        lines += [f"  {name} = {value:.4g}" for name, value in self.noise.items()]
+        lines[-1] += f" ({self.noise_prior})" if self.noise else ""
+        for channel, rms in self.rms.items():
+            line = f"  rms of {channel}: {rms:.4g}, unexplained variance {self.fvu[channel]:.2%}"
+            if channel in self.noise_split and np.isfinite(self.noise_split[channel].measurement):
+                split = self.noise_split[channel]
+                line += f", measurement noise {split.measurement:.3g}, model error {split.model:.3g}"
+            if np.isfinite(self.whiteness[channel].p):
+                line += f", whiteness p = {self.whiteness[channel].p:.2g}"
+            lines.append(line)
+        lines += [f"  not determined by the data: {text}" for text in self.undetermined]
+        return "\n".join(lines)
+
+
+def _carried(covariance: pd.DataFrame, gradients: list[dict[str, np.ndarray]]) -> np.ndarray:
+    """Return the covariance of quantities with these gradients; what a quantity does not depend on has no say."""
+    matrix = covariance.to_numpy()
+    rows = [np.array([float(gradient[name]) for name in covariance.columns]) for gradient in gradients]
+    result = np.zeros((len(rows), len(rows)))
+    with np.errstate(invalid="ignore", over="ignore"):
+        for i, a in enumerate(rows):
+            for j, b in enumerate(rows):
+                result[i, j] = a[a != 0.0] @ matrix[np.ix_(a != 0.0, b != 0.0)] @ b[b != 0.0]
+    return result

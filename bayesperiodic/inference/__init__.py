@@ -1,1 +1,0 @@
-"""What we conclude: priors, posterior density, estimates, samples."""

@@ -1,1 +1,0 @@
-"""The estimate, and everything that a fit tells of itself."""

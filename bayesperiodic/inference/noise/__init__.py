@@ -1,1 +1,0 @@
-"""What is assumed of the residuals."""

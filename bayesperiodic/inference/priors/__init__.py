@@ -1,1 +1,0 @@
-"""What is believed before the data."""

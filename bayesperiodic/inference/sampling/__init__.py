@@ -1,1 +1,0 @@
-"""Draws from the posterior, and how far to trust them."""

@@ -1,0 +1,339 @@
+"""Where truths lie among the answers: histograms, distribution functions, coverage."""
+
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.special import ndtri
+
+from bayesperiodic import _checks
+from bayesperiodic.diagnostics.calibration import (
+    Calibration,
+    bin_count,
+    binomial_band,
+    coverage,
+    ecdf_band,
+    evaluation_points,
+)
+from bayesperiodic.diagnostics.campaigns import METHODS
+from bayesperiodic.diagnostics.comparison import Comparison
+from bayesperiodic.diagnostics.verdicts import END_SHIFT, ERRORS, FINE, LEVELS
+from bayesperiodic.estimation.profile import CLOSED, Profile
+from bayesperiodic.plot.posterior import chosen, draw_marginal, panel_grid
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, said_of, wrapped_label
+
+LEVEL = 0.99
+# Of the histograms' axes, for the legend.
+HEADROOM = 1.45
+COLUMNS = {
+    "truths in each bin / expected": "position of the truth in the posterior",
+    "distribution function − diagonal": "position of the truth in the posterior",
+    "coverage − probability": "probability of the interval",
+}
+LABELS = {"mcmc": "MCMC", "laplace": "Laplace"}
+LINES = {"mcmc": "-", "laplace": "--"}
+
+
+def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
+    """Draw rank histograms, empirical distribution functions and coverage of every quantity, MCMC and Laplace together.
+
+    A row a quantity. Left the histogram of where the truth lies among the answers, flat if calibrated, with the band of
+    99 % of each bin; a ∪ means intervals that are too narrow. In the middle the distribution function less the
+    diagonal, with the band that holds all of it with 99 %. Right the coverage of central intervals less their
+    probability, with the pointwise band of 99 %.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    figure : Figure, optional
+        An empty figure with a constrained layout to draw into.
+
+    Returns
+    -------
+    Figure
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = np.cos(2 * np.pi * np.arange(32) / 32)
+    >>> run = bp.Experiment("run", 0.1, {"displacement": force}, {"force": force}, samples=32, cycles=4,
+    ...                     harmonics={"displacement": 5, "force": 5})
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"k": bp.LogNormal(1, 0.1)}, scheme="fourier",
+    ...                      fixed={"m": 1, "c": 0.2, "k3": 0.5, "variance[displacement]": 1e-4})
+    >>> found = bp.calibrate(problem, replicates=2, seed=1, max_steps=250, progress=False)
+    >>> [axes.get_title() for axes in bp.plot.ranks(found).axes]
+    ['truths in each bin / expected', 'distribution function − diagonal', 'coverage − probability']
+    """
+    names = calibration.names
+    figure = figure or plt.figure(figsize=(10.5, 2.1 * len(names) + 1.0), layout="constrained")
+    panels = figure.subplots(len(names), 3, squeeze=False)
+    verdicts = calibration.table.set_index(["method", "quantity"])["verdict"]
+    for row, name in zip(panels, names, strict=True):
+        for method in METHODS:
+            values = calibration.positions[method][name]
+            values = np.sort(values[np.isfinite(values)])
+            said = f"{LABELS[method]}: {verdicts[method, name]}"
+            _histogram(row[0], values, method, said)
+            _distribution(row[1], values, method)
+            _coverage(row[2], values, method)
+        row[0].set_ylim(0.0, HEADROOM * row[0].get_ylim()[1])
+        row[0].set_ylabel(wrapped_label(name, ""))
+        row[0].legend(frameon=False, fontsize="small", loc="upper center")
+    for top, bottom, (title, label) in zip(panels[0], panels[-1], COLUMNS.items(), strict=True):
+        top.set_title(title, fontsize="medium")
+        bottom.set_xlabel(label)
+    figure.suptitle(f"{calibration.replicates} synthetic campaigns; bands of 99 %", fontsize="medium")
+    return figure
+
+
+def _histogram(axes: Axes, values: np.ndarray, method: str, label: str) -> None:
+    bins = bin_count(values.size)
+    counts, edges = np.histogram(values, bins, (0.0, 1.0))
+    expected = max(values.size, 1) / bins
+    if method == METHODS[0] and values.size:
+        low, high = binomial_band(values.size, np.array(1.0 / bins), 1.0 - LEVEL)
+        axes.axhspan(float(low) * bins, float(high) * bins, color="grey", alpha=0.25, lw=0)
+    axes.stairs(counts / expected, edges, color=COLOURS[method], ls=LINES[method], lw=1.6, label=label)
+    axes.set_xlim(0.0, 1.0)
+
+
+def _distribution(axes: Axes, values: np.ndarray, method: str) -> None:
+    points = evaluation_points()
+    if method == METHODS[0] and values.size:
+        low, high = ecdf_band(values.size, LEVEL)
+        axes.fill_between(points, low - points, high - points, color="grey", alpha=0.25, lw=0)
+    steps = np.searchsorted(values, points, side="right") / max(values.size, 1)
+    axes.plot(points, steps - points, color=COLOURS[method], ls=LINES[method], lw=1.4)
+    axes.set_xlim(0.0, 1.0)
+
+
+def _coverage(axes: Axes, values: np.ndarray, method: str) -> None:
+    levels = evaluation_points()
+    if method == METHODS[0] and values.size:
+        low, high = binomial_band(values.size, levels, 1.0 - LEVEL)
+        axes.fill_between(levels, low - levels, high - levels, color="grey", alpha=0.25, lw=0)
+    axes.plot(
+        levels, [coverage(values, level) - level for level in levels], color=COLOURS[method], ls=LINES[method], lw=1.4
+    )
+    axes.set_xlim(0.0, 1.0)
+
+
+# Those of several lines that mean nothing else.
+LOOKS = [(colour, style) for style in ("-", "-.") for colour in ENSEMBLES if colour not in COLOURS.values()]
+LIMIT = 4.0
+
+
+def comparison(comparison: Comparison, *, names: Sequence[str] | None = None, figure: Figure | None = None) -> Figure:
+    """Draw a comparison of Laplace with MCMC: marginals, quantiles against quantiles, and ellipsoid coverage.
+
+    Quantiles are distances from the MAP in sds of the draws; the grey band is as far as an end may be off. Named are
+    the parameters with a verdict other than "fine", the six farthest from Laplace. Ellipsoids are those of all
+    coordinates together, whatever names are drawn; their band is three Monte Carlo errors wide to each side.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    names : sequence of str, optional
+        Those to draw; by default all.
+    figure : Figure, optional
+        An empty figure with a constrained layout to draw into.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ValueError
+        For an unknown name.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
+    >>> figure = bp.plot.comparison(bp.compare(problem, fit, posterior))
+    >>> [axes.get_xlabel().splitlines()[0] for axes in figure.axes]
+    ['c', 'k', 'Laplace quantile − MAP [posterior sd]', "probability of Laplace's ellipsoid"]
+    """
+    names = chosen(names, tuple(comparison.table.index))
+    columns, rows = panel_grid(len(names))
+    size = max(2.4 * columns, 8.4), 2.5 * rows + 4.6
+    figure = figure or plt.figure(figsize=size, layout="constrained")
+    top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[2.5 * rows + 0.4, 4.2])[:, 0]
+    panels = top.subplots(rows, columns, squeeze=False).ravel()
+    for axes, name in zip(panels, names, strict=False):
+        about = comparison.table.loc[name].to_dict()
+        draw_marginal(axes, comparison.edges[name], comparison.densities[name], about["map"], about["laplace_sd"])
+        axes.set_title(about["verdict"], fontsize="medium")
+        axes.set_xlabel(_coordinate_label(comparison, name))
+    for axes in panels[len(names) :]:
+        axes.remove()
+    top.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
+    if said := said_of(comparison.synthetic, comparison.converged):
+        top.suptitle(said, x=0.99, ha="right", fontsize="medium")
+    left, right = below.subplots(1, 2)
+    _quantiles(left, comparison, names)
+    _interval_coverage(right, comparison)
+    return figure
+
+
+def _coordinate_label(comparison: Comparison, name: str) -> str:
+    coordinate, unit = str(comparison.table.loc[name, "coordinate"]), comparison.units[name]
+    if coordinate == name or not unit:
+        return wrapped_label(coordinate, unit)
+    return f"{wrapped_label(coordinate, '')}\n(in {unit})"
+
+
+def _quantiles(axes: Axes, comparison: Comparison, names: Sequence[str]) -> None:
+    table = comparison.table.loc[[*names]]
+    wrong = table[table["verdict"] != FINE].sort_values("wasserstein", ascending=False).index[: len(LOOKS)]
+    axes.axline((0.0, 0.0), slope=1.0, color=COLOURS["laplace"], lw=1.4, ls="--")
+    reach = np.array([-LIMIT, LIMIT])
+    axes.fill_between(reach, reach - END_SHIFT, reach + END_SHIFT, color="grey", alpha=0.25, lw=0)
+    unnamed = "fine" if set(table["verdict"]) == {FINE} or len(wrong) == sum(table["verdict"] != FINE) else "others"
+    for name in [*table.index.difference(wrong, sort=False), *wrong]:
+        line = table.loc[name]
+        if not np.isfinite(line["laplace_sd"]):
+            continue
+        across = ndtri(comparison.probabilities) * line["laplace_sd"] / line["sd"]
+        up = (comparison.quantiles[name] - line["map"]) / line["sd"]
+        if name in wrong:
+            colour, style = LOOKS[int(np.flatnonzero(wrong == name)[0])]
+            axes.plot(across, up, color=colour, ls=style, lw=2.0, label=axis_label(f"{name}: {line['verdict']}", ""))
+        else:
+            axes.plot(across, up, color="black", lw=0.8, label=unnamed)
+    axes.set_xlim(-LIMIT, LIMIT)
+    axes.set_ylim(-LIMIT, LIMIT)
+    axes.set_aspect("equal")
+    axes.set_xlabel("Laplace quantile − MAP [posterior sd]")
+    axes.set_ylabel("MCMC quantile − MAP [posterior sd]")
+    handles = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    axes.legend(handles.values(), handles.keys(), frameon=False, fontsize="small", loc="upper left")
+
+
+def _interval_coverage(axes: Axes, comparison: Comparison) -> None:
+    across, shares, errors = comparison.probabilities, comparison.shares, comparison.shares_mcse
+    axes.plot([0.0, 1.0], [0.0, 1.0], color=COLOURS["laplace"], lw=1.4, ls="--", label="Laplace")
+    axes.fill_between(
+        across, shares - ERRORS * errors, shares + ERRORS * errors, color=COLOURS["mcmc"], alpha=0.45, lw=0
+    )
+    axes.plot(across, shares, color=COLOURS["mcmc"], lw=1.8, label="MCMC")
+    axes.plot(LEVELS, np.interp(LEVELS, across, shares), "o", color=COLOURS["mcmc"], ms=6)
+    axes.set_xlim(0.0, 1.0)
+    axes.set_ylim(0.0, 1.0)
+    axes.set_aspect("equal")
+    axes.set_xlabel("probability of Laplace's ellipsoid")
+    axes.set_ylabel("share of the draws inside")
+    axes.set_title(
+        rf"jointly: {comparison.joint['verdict']}, $\hat{{k}}$ = {comparison.joint['pareto_k']:.2f}", fontsize="medium"
+    )
+    axes.legend(frameon=False, fontsize="small", loc="upper left")
+
+
+PROFILES_ACROSS = 3
+PROFILE_LEGEND = ("profile", "MAP", "Laplace", "solve failed")
+AT_90, DEEPEST = -0.5 * 1.6449**2, -4.2
+
+
+def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Figure | None = None) -> Figure:
+    """Draw each profile over the Laplace approximation's parabola, with the level that a 90 % interval reaches down to.
+
+    Where the parabola leaves the profile, the standard deviation misleads; a profile that does not come down is named.
+    Values over more than two decades have a logarithmic axis. A parabola without a finite standard deviation is left
+    out.
+
+    Parameters
+    ----------
+    profile : Profile
+    names : sequence of str, optional
+        Those to draw; by default all.
+    figure : Figure, optional
+        An empty figure to draw into.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ValueError
+        For a name without a profile.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
+    >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
+    ...                          frequency=0.1, samples=50)
+    >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5, "variance[displacement]": 0.01})
+    >>> followed = bp.profile(problem, bp.map_estimate(problem, progress=False), ["k"])
+    >>> figure = bp.plot.profile(followed)
+    >>> figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()
+    ('k [N/m]', 'relative log-density')
+    """
+    shown = profile.names if names is None else tuple(names)
+    for name in shown:
+        _checks.one_of("names", name, profile.names)
+    columns = min(len(shown), PROFILES_ACROSS)
+    rows = -(-len(shown) // columns)
+    figure = figure or plt.figure(figsize=(3.0 * columns + 0.8, 2.7 * rows + 0.6), layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
+    for axes, name in zip(panels, shown, strict=False):
+        _profile_panel(axes, profile, name)
+    for axes in panels[len(shown) :]:
+        axes.remove()
+    for axes in panels[: len(shown) : columns]:
+        axes.set_ylabel("relative log-density")
+    drawn = {label: line for axes in figure.axes for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    legend = {label: drawn[label] for label in PROFILE_LEGEND if label in drawn}
+    figure.legend(legend.values(), legend.keys(), loc="outside upper center", ncols=len(legend), frameon=False)
+    return figure
+
+
+def _profile_panel(axes: Axes, profile: Profile, name: str) -> None:
+    values, density = profile.values[name], profile.log_density[name]
+    at, sd, found, bottom = profile.map[name], profile.sd[name], np.isfinite(density), DEEPEST - profile.improvement
+    wide = values[0] > 0.0 and values[-1] > 100.0 * values[0]
+    curve, peak, laplace, failed = PROFILE_LEGEND
+    axes.plot(values[found], density[found], ".-", color=COLOURS["map"], lw=1.6, ms=5, label=curve)
+    axes.plot(at, -profile.improvement, "o", color=COLOURS["map"], ms=6, label=peak)
+    if np.isfinite(sd):
+        x = np.geomspace(values[0], values[-1], 400) if wide else _laplace_range(profile, name)
+        parabola = -profile.improvement - 0.5 * ((x - at) / sd) ** 2
+        axes.plot(x, parabola, color=COLOURS["laplace"], lw=1.6, ls="--", zorder=1.5, label=laplace)
+    if not found.all():
+        low = np.full(np.sum(~found), 0.97 * bottom)
+        axes.plot(values[~found], low, "x", color=COLOURS["measured"], ms=5, label=failed)
+    axes.axhline(AT_90, color="grey", lw=0.8, ls=":", zorder=1)
+    axes.annotate(
+        "90%", (1, AT_90), (-3, 1), ("axes fraction", "data"), "offset points", color="grey", ha="right", va="bottom"
+    )
+    if profile.shape[name] != CLOSED:
+        axes.annotate(profile.shape[name], (0.5, 0.03), xycoords="axes fraction", ha="center", va="bottom")
+    if wide:
+        axes.set_xscale("log")
+    else:
+        axes.locator_params(axis="x", nbins=3)
+    axes.set_ylim(bottom, 0.35)
+    axes.set_xlabel(axis_label(name, profile.units[name]))
+
+
+def _laplace_range(profile: Profile, name: str) -> np.ndarray:
+    """Return values as far as three standard deviations, where that is within the support and not far beyond."""
+    values, reach, (low, high) = profile.values[name], 3.0 * profile.sd[name], profile.limits[name]
+    margin = 0.5 * np.ptp(values)
+    return np.linspace(
+        min(values[0], max(low, values[0] - margin, profile.map[name] - reach)),
+        max(values[-1], min(high, values[-1] + margin, profile.map[name] + reach)),
+        400,
+    )

@@ -1,0 +1,1 @@
+"""Problem, priors, noise models and the posterior density."""

@@ -1,0 +1,503 @@
+"""The log-likelihood of residuals under a noise model, and its derivatives."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize
+
+from bayesperiodic import _checks
+from bayesperiodic.posterior.noise import (
+    CORRELATED,
+    FLAT,
+    JEFFREYS,
+    KNOWN,
+    POINTS,
+    SCALE,
+    SPECTRAL,
+    VARIANCE,
+    Block,
+    Independent,
+    Noise,
+)
+
+
+class Squares(NamedTuple):
+    """What the likelihood needs of residual components whose errors have a flat spectrum.
+
+    Attributes
+    ----------
+    squares : array (blocks, …)
+        The sum of the squares of each block.
+    """
+
+    squares: np.ndarray
+
+
+class Residuals(Sequence[np.ndarray]):
+    """One array (…, size) of components a block.
+
+    Parameters
+    ----------
+    stacks : sequence of array (members, …, size)
+    places : sequence of (int, int)
+        Stack and member of each block.
+    """
+
+    def __init__(self, stacks: Sequence[np.ndarray], places: Sequence[tuple[int, int]]):
+        self._stacks, self._places = tuple(stacks), tuple(places)
+
+    @classmethod
+    def of(cls, blocks: Sequence[np.ndarray]) -> "Residuals":
+        """Return the residuals of these blocks, as they are if they are residuals already."""
+        if isinstance(blocks, cls):
+            return blocks
+        return cls([np.asarray(block)[None] for block in blocks], [(b, 0) for b in range(len(blocks))])
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, block: Any) -> Any:
+        stack, member = self._places[block]
+        return self._stacks[stack][member]
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return (self._stacks[stack][member] for stack, member in self._places)
+
+    def at(self, index: int) -> "Residuals":
+        """Return the components (size,) at one place of the middle axis (…,)."""
+        return Residuals([stack[:, index] for stack in self._stacks], self._places)
+
+    def like(self, blocks: Sequence[np.ndarray]) -> "Residuals":
+        """Return other arrays, one a block, side by side as these are."""
+        if isinstance(blocks, Residuals) and blocks._places == self._places:
+            return blocks
+        members: list[dict[int, np.ndarray]] = [{} for _ in self._stacks]
+        for (stack, member), block in zip(self._places, blocks, strict=True):
+            members[stack][member] = block
+        return Residuals([np.stack([own[m] for m in range(len(own))]) for own in members], self._places)
+
+    def scaled(self, factors: np.ndarray) -> "Residuals":
+        """Return the components (size,) of each block times its factor, factors (blocks,)."""
+        own = [np.empty((len(stack), 1)) for stack in self._stacks]
+        for (stack, member), factor in zip(self._places, factors, strict=True):
+            own[stack][member] = factor
+        return Residuals([stack * factor for stack, factor in zip(self._stacks, own, strict=True)], self._places)
+
+    def stacks(self) -> tuple[np.ndarray, ...]:
+        """Return the arrays (members, …, size)."""
+        return self._stacks
+
+    @cached_property
+    def squares(self) -> np.ndarray:
+        """The sum of the squares of each block, (blocks, …)."""
+        sums = [np.einsum("...i,...i->...", stack, stack) for stack in self._stacks]
+        result = np.empty((len(self._places), *sums[0].shape[1:]))
+        for block, (stack, member) in enumerate(self._places):
+            result[block] = sums[stack][member]
+        return result
+
+
+def squares_of(residuals: Sequence[np.ndarray] | Squares) -> np.ndarray:
+    """Return the sum of the squares of each block, (blocks, …)."""
+    return residuals.squares if isinstance(residuals, Squares) else Residuals.of(residuals).squares
+
+
+class Likelihood:
+    """A noise model on the blocks of a problem: the log-likelihood of their residuals and its derivatives.
+
+    Parameters
+    ----------
+    model : Noise
+    blocks : sequence of Block
+    fixed : mapping of str to float
+        Noise parameters with known values.
+
+    Attributes
+    ----------
+    names : tuple of str
+        All noise parameters.
+    free : tuple of str
+        Those without a known value.
+    """
+
+    def __init__(self, model: Noise, blocks: Sequence[Block], fixed: Mapping[str, float]):
+        self.model, self.blocks = model, tuple(blocks)
+        model.check([b for b in blocks if not set(model.parameter_names(b)) <= set(fixed)])
+        self.names = tuple(dict.fromkeys(name for block in blocks for name in model.parameter_names(block)))
+        for name, value in fixed.items():
+            _checks.one_of("fixed", name, self.names)
+            _checks.positive(f"fixed[{name!r}]", value)
+        self.fixed = {name: float(fixed[name]) for name in self.names if name in fixed}
+        self.free = tuple(name for name in self.names if name not in fixed)
+        self._columns = [[self.names.index(name) for name in model.parameter_names(block)] for block in blocks]
+        self._free = [self.names.index(name) for name in self.free]
+
+    def groups(self) -> list[tuple[tuple[str, ...], list[int]]]:
+        """Return the noise parameters that belong together, by name, and the indices of their blocks."""
+        together = dict.fromkeys(tuple(columns) for columns in self._columns if columns)
+        return [
+            (tuple(self.names[i] for i in group), [b for b, own in enumerate(self._columns) if tuple(own) == group])
+            for group in together
+        ]
+
+    @cached_property
+    def counts(self) -> dict[str, float]:
+        """Independent values behind each variance (and "scale"), by its name."""
+        result: dict[str, float] = {}
+        for block, columns in zip(self.blocks, self._columns, strict=True):
+            if block.counted:
+                name = self.names[columns[0]]
+                result[name] = result.get(name, 0.0) + block.count
+        return result
+
+    @cached_property
+    def measured(self) -> dict[str, float]:
+        """Measured variance behind each variance, the mean over its values; NaN where it is not known."""
+        total: dict[str, float] = {}
+        for block, columns in zip(self.blocks, self._columns, strict=True):
+            if block.counted:
+                name = self.names[columns[0]]
+                total[name] = total.get(name, 0.0) + block.count * block.measured
+        return {name: value / self.counts[name] for name, value in total.items()}
+
+    def moments(self, residuals: Sequence[np.ndarray] | Squares) -> dict[str, np.ndarray]:
+        """Return Σ weight·r²/S (…,) behind each variance (and "scale"), the M of eq. (6), by its name.
+
+        S, the spectrum for a variance of 1, is 1 for errors whose spectrum is flat; all else has to be known.
+        """
+        result: dict[str, np.ndarray] = {}
+        own = residuals if isinstance(residuals, Squares) or self.model.flat else self._unit(residuals)
+        for block, columns, square in zip(self.blocks, self._columns, squares_of(own), strict=True):
+            if block.counted:
+                name = self.names[columns[0]]
+                result[name] = result.get(name, 0.0) + block.weight * square
+        return result
+
+    def _unit(self, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return the residuals over the square roots of the spectra for variances of 1."""
+        values = np.array([self.fixed.get(name, 1.0) for name in self.names])
+        result = list(residuals)
+        for members in self._alike:
+            block, columns = self.blocks[members[0]], self._columns[members[0]]
+            if block.kind == SPECTRAL:
+                scale = np.sqrt(self._variances(block, np.array([1.0, *values[columns[1:]]]))[0])
+                for b in members:
+                    result[b] = residuals[b] / scale
+        return result
+
+    def value_variances(self, values: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
+        """Return the variance (…,) of one value of each channel, by (experiment, channel), where it has its own."""
+        result = {}
+        for block, columns in zip(self.blocks, self._columns, strict=True):
+            if block.kind in (SPECTRAL, POINTS):
+                own, count = values[..., columns], max(block.points, 1)
+                harmonic = np.minimum(np.arange(count), count - np.arange(count))
+                whole = block if block.kind == SPECTRAL else replace(block, harmonic=harmonic, size=count)
+                result[block.experiment, block.channel] = self.model.spectrum(whole, own)[0].mean(axis=-1)
+        return result
+
+    def complete(self, free: np.ndarray) -> np.ndarray:
+        """Return the values of all noise parameters (…, names) from those of the free ones (…, free)."""
+        values = np.empty((*free.shape[:-1], len(self.names)))
+        for i, name in enumerate(self.names):
+            values[..., i] = self.fixed[name] if name in self.fixed else free[..., self.free.index(name)]
+        return values
+
+    def log_prior(self, values: np.ndarray) -> np.ndarray:
+        """Return the log-density of the free noise parameters over their logarithms, (…,)."""
+        return self._log_prior(values)[0]
+
+    def _log_prior(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        total, slopes = np.zeros(values.shape[:-1]), np.zeros(values.shape)
+        for kind, columns, measured in self._kinds:
+            value, slopes[..., columns] = self.model.log_prior(kind, values[..., columns], measured)
+            total = total + value.sum(axis=-1)
+        return total, slopes
+
+    @cached_property
+    def _kinds(self) -> list[tuple[str, list[int], np.ndarray]]:
+        """The kinds of free noise parameters whose prior matters, their columns and the measured variances of these."""
+        kinds: dict[str, list[int]] = {}
+        for i in self._free:
+            name = self.names[i]
+            kinds.setdefault(VARIANCE if name.startswith(SCALE) else name.partition("[")[0], []).append(i)
+        return [
+            (kind, columns, np.array([self.measured.get(self.names[i], np.nan) for i in columns]))
+            for kind, columns in kinds.items()
+            if not self.model.has_constant_prior(kind)
+        ]
+
+    def __call__(self, residuals: Sequence[np.ndarray] | Squares, values: np.ndarray, share: float = 1.0) -> np.ndarray:
+        """Return the log-likelihood (…,) of residuals, one (…, size) a block, at values (…, names).
+
+        The sums of their squares are enough where the errors have a flat spectrum.
+        The logarithms of the variances are multiplied by `share`: 1 − l/Σn for the bias correction of eq. (7).
+        """
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            total = (self._flat if self.model.flat else self._by_kind)(residuals, values, share)
+        return np.where(np.isfinite(total), total, -np.inf)
+
+    def _by_kind(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
+        """Return the log-likelihood (…,), alike blocks together."""
+        total = np.zeros(values.shape[:-1])
+        for members in self._alike:
+            own = values[..., self._columns[members[0]]]
+            total = total + self._together([residuals[b] for b in members], self.blocks[members[0]], own, share)
+        return total
+
+    def _flat(self, residuals: Sequence[np.ndarray] | Squares, values: np.ndarray, share: float) -> np.ndarray:
+        """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
+        at, known, columns, sizes, weights, measured = self._levels
+        squares = squares_of(residuals)
+        squares = squares.transpose(*range(1, squares.ndim), 0)
+        v = self.model.level(values[..., columns], measured)
+        parts = [weights * (share * sizes * np.log(v) + squares[..., at] / v)]
+        if known.size:
+            parts.append(squares[..., known])
+        # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
+        return -0.5 * sum(np.ascontiguousarray(part).sum(axis=-1) for part in parts)
+
+    @cached_property
+    def _levels(self) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return blocks with a variance, the others, and of the first the column, size, weight and measured value."""
+        known = np.array([block.kind == KNOWN for block in self.blocks], dtype=bool)
+        own = [(block, columns[0]) for block, columns in zip(self.blocks, self._columns, strict=True) if columns]
+        return (
+            np.flatnonzero(~known) if known.any() else slice(None),
+            np.flatnonzero(known),
+            np.array([column for _, column in own], dtype=int),
+            np.array([block.size for block, _ in own]),
+            np.array([block.weight for block, _ in own]),
+            np.array([0.0 if block.kind == CORRELATED else block.measured for block, _ in own]),
+        )
+
+    @cached_property
+    def _alike(self) -> list[list[int]]:
+        """The indices of blocks whose components have the same variances: whole periods, their harmonics the same."""
+        groups: dict[Any, list[int]] = {}
+        for b, (block, columns) in enumerate(zip(self.blocks, self._columns, strict=True)):
+            measured = block.measured if self.model.needs_scatter else None
+            key = (tuple(columns), block.weight, measured, block.harmonic.tobytes())
+            groups.setdefault(key if block.kind == SPECTRAL else b, []).append(b)
+        return list(groups.values())
+
+    def _together(self, residuals: list[np.ndarray], block: Block, values: np.ndarray, share: float) -> np.ndarray:
+        """Return the log-likelihood (…,) of blocks like this one, the logarithms multiplied by `share`."""
+        if block.kind != SPECTRAL:
+            return self._alone(block, residuals[0], values, share)
+        variances = self._variances(block, values)[0]
+        squares = sum(r**2 for r in residuals)
+        terms = len(residuals) * share * np.log(variances) + squares / variances
+        return -0.5 * block.weight * np.sum(terms, axis=-1)
+
+    def _alone(self, block: Block, r: np.ndarray, values: np.ndarray, share: float) -> np.ndarray:
+        """Return the log-likelihood (…,) of one block, the logarithms of the variances multiplied by `share`."""
+        if block.kind == KNOWN:
+            return -0.5 * _square(r)
+        if self._is_dense(block):
+            flat, rows = values.reshape(-1, values.shape[-1]), r.reshape(-1, r.shape[-1])
+            each = [self._dense(block, row, v, share)[0] for row, v in zip(rows, flat, strict=True)]
+            return np.array(each).reshape(values.shape[:-1])
+        variances = self._variances(block, values)[0]
+        if block.kind == CORRELATED:
+            v = variances[..., 0]
+            return -0.5 * block.weight * (share * block.size * np.log(v) + _square(r) / v)
+        return -0.5 * block.weight * np.sum(share * np.log(variances) + r**2 / variances, axis=-1)
+
+    def _is_dense(self, block: Block) -> bool:
+        """Return whether the components of a block are correlated: points under noise that is not white."""
+        return block.kind == POINTS and not self.model.flat
+
+    def _variances(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if block.kind == CORRELATED:
+            shape = (*values.shape[:-1], block.size)
+            return np.broadcast_to(values[..., :1], shape), np.ones((*shape, 1))
+        return self.model.spectrum(block, values)
+
+    def _dense(
+        self, block: Block, r: np.ndarray, values: np.ndarray, share: float
+    ) -> tuple[float, np.ndarray, np.ndarray]:
+        """Return the log-likelihood of one residual with a dense covariance, and its gradients by r and ln φ."""
+        covariance, slopes = self.model.covariance(block, values)
+        try:
+            factor = np.linalg.cholesky(covariance)
+        except np.linalg.LinAlgError:
+            return -np.inf, np.zeros_like(r), np.zeros(len(slopes))
+        half = solve_triangular(factor, r, lower=True)
+        solved = solve_triangular(factor, half, lower=True, trans=1)
+        inverse = solve_triangular(factor, np.eye(block.size), lower=True)
+        traces = np.einsum("ki,kj,pij->p", inverse, inverse, slopes)
+        value = -0.5 * block.weight * (2 * share * np.sum(np.log(np.diag(factor))) + half @ half)
+        return value, -block.weight * solved, 0.5 * block.weight * (solved @ slopes @ solved - share * traces)
+
+    def gradients(
+        self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float = 1.0
+    ) -> tuple[Sequence[np.ndarray], np.ndarray]:
+        """Return the gradients of log-likelihood plus log-prior of φ, by each block's residual and by ln φ (names,)."""
+        if self.model.flat:
+            components = Residuals.of(residuals)
+            by_square, by_value = self.square_slopes(components.squares, values, share)
+            return components.scaled(2.0 * by_square), by_value
+        slopes = self._log_prior(values)[1]
+        by_residual: list[np.ndarray] = [np.empty(0)] * len(self.blocks)
+        for members in self._alike:
+            block, columns = self.blocks[members[0]], self._columns[members[0]]
+            own = np.stack([residuals[b] for b in members])
+            if block.kind == KNOWN:
+                by_residual[members[0]] = -own[0]
+                continue
+            if self._is_dense(block):
+                _, by_residual[members[0]], by_phi = self._dense(block, own[0], values[columns], share)
+            else:
+                variances, change = self._variances(block, values[columns])
+                for b, r in zip(members, own, strict=True):
+                    by_residual[b] = -block.weight * r / variances
+                by_phi = 0.5 * block.weight * np.sum(own**2 / variances - share, axis=0) @ change
+            slopes[columns] += by_phi
+        return by_residual, slopes
+
+    def square_slopes(
+        self, squares: np.ndarray, values: np.ndarray, share: float = 1.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the derivatives of the same by each block's sum of squares (blocks,) and by ln φ (names,).
+
+        For errors whose spectrum is flat.
+        """
+        by_value = self._log_prior(values)[1]
+        at, _, columns, sizes, weights, measured = self._levels
+        v = self.model.level(values[columns], measured)
+        by_square = np.full(len(self.blocks), -0.5)
+        by_square[at] = -0.5 * weights / v
+        # V is v plus what is measured, so that ∂ ln V/∂ ln v = v/V.
+        by_level = 0.5 * weights * (squares[at] / v - share * sizes) * values[columns] / v
+        np.add.at(by_value, columns, by_level)
+        return by_square, by_value
+
+    def whitened(self, vectors: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
+        """Return vectors (…, size), one a block, in units of the noise: their squares sum to −2 log-likelihood."""
+        result = list(vectors)
+        for members in self._alike:
+            block, columns, first = self.blocks[members[0]], self._columns[members[0]], members[0]
+            if block.kind == KNOWN:
+                continue
+            if self._is_dense(block):
+                covariance, _ = self.model.covariance(block, values[columns])
+                rows = vectors[first].reshape(-1, block.size)
+                white = solve_triangular(np.linalg.cholesky(covariance), rows.T, lower=True)
+                result[first] = np.sqrt(block.weight) * white.T.reshape(vectors[first].shape)
+            else:
+                scale = np.sqrt(block.weight / self._variances(block, values[columns])[0])
+                for b in members:
+                    result[b] = vectors[b] * scale
+        return result
+
+    def simulate(self, values: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:
+        """Return noise at values (draws, names): components (draws, size), one array a block."""
+        result = []
+        for block, columns in zip(self.blocks, self._columns, strict=True):
+            white = generator.standard_normal((len(values), block.size))
+            if self._is_dense(block):
+                factors = np.linalg.cholesky([self.model.covariance(block, row)[0] for row in values[:, columns]])
+                white = np.einsum("dij,dj->di", factors, white)
+            elif block.kind != KNOWN:
+                white *= np.sqrt(self._variances(block, values[:, columns])[0])
+            result.append(white)
+        return result
+
+    def guess(self) -> np.ndarray:
+        """Return where the noise parameters start, (names,): variances 1, shapes at the medians of their priors."""
+        values = np.ones(len(self.names))
+        for i, name in enumerate(self.names):
+            kind = name.partition("[")[0]
+            if kind in self.model.shape_priors:
+                values[i] = float(self.model.shape_priors[kind].quantile(np.array(0.5)))
+            values[i] = self.fixed.get(name, values[i])
+        return values
+
+
+def _square(r: np.ndarray) -> np.ndarray:
+    """Return the sum of squares (…,) of components (…, size)."""
+    return np.einsum("...i,...i->...", r, r)
+
+
+LOWEST, HIGHEST = 25.0, 8.0
+TINY = np.finfo(float).tiny
+
+
+def estimate_noise(
+    likelihood: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, share: float
+) -> np.ndarray:
+    """Return the noise parameters that suit given residuals best, (names,).
+
+    For independent errors with the prior 1/v this is eq. (7) of [1]_, v = Σe²/(n·share); otherwise it maximises the
+    log-likelihood, its logarithms multiplied by `share`, plus the log-prior.
+
+    Parameters
+    ----------
+    likelihood : Likelihood
+    residuals : sequence of array (size,)
+        One a block.
+    start : array (names,)
+    share : float
+        1 − l/Σn for the bias correction of eq. (7), 1 for the maximum of eq. (6).
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
+    """
+    values = start.copy()
+    for group, members in likelihood.groups():
+        if not set(group) & set(likelihood.free):
+            continue
+        blocks = [likelihood.blocks[b] for b in members]
+        chosen = [residuals[b] for b in members]
+        total = sum(block.weight * float(r @ r) for block, r in zip(blocks, chosen, strict=True))
+        count = sum(block.count for block in blocks)
+        plain = isinstance(likelihood.model, Independent) or all(block.kind == CORRELATED for block in blocks)
+        corrected = count * share - {JEFFREYS: 0.0, FLAT: 2.0}.get(str(likelihood.model.prior), np.inf)
+        columns = [likelihood.names.index(name) for name in group]
+        if plain and corrected > 0.0:
+            values[columns[0]] = max(total / corrected, TINY)
+            continue
+        held = {name: values[i] for name, i in zip(group, columns, strict=True) if name in likelihood.fixed}
+        part = Likelihood(likelihood.model, blocks, held)
+        values[columns] = _maximise(part, chosen, values[columns], max(total / count, TINY), share)
+    return values
+
+
+def _maximise(
+    part: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, size: float, share: float
+) -> np.ndarray:
+    """Return the best values of one group's noise parameters, from a start and from variances of the given size."""
+    free = [part.names.index(name) for name in part.free]
+
+    def complete(logarithms: np.ndarray) -> np.ndarray:
+        values = start.copy()
+        values[free] = np.exp(logarithms)
+        return values
+
+    def negative(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
+        values = complete(logarithms)
+        value = float(part(residuals, values, share) + part.log_prior(values))
+        if not np.isfinite(value):
+            return 1e300, np.zeros(len(free))
+        return -value, -part.gradients(residuals, values, share)[1][free]
+
+    variances = [part.names[i].startswith((VARIANCE, SCALE)) for i in free]
+    centre = np.where(variances, np.log(size), np.log(part.guess()[free]))
+    bounds = [(c - LOWEST, c + HIGHEST) for c in centre]
+    here = np.clip(np.log(start[free]), *np.transpose(bounds))
+    found = minimize(
+        negative,
+        min((here, centre), key=lambda x: negative(x)[0]),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"gtol": 1e-9, "ftol": 1e-15, "maxiter": 500},
+    )
+    return complete(found.x)

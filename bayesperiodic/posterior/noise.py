@@ -1,0 +1,492 @@
+"""Noise models: what is assumed of the residuals, by name.
+
+Every model gives each residual component its own variance V_j(φ), in a basis in which the components are independent:
+Fourier components for whole periods. The log-likelihood is −½ Σ_j w_j [ln V_j + r_j²/V_j] with w_j independent values
+per component. The noise parameters φ are positive, and densities are over their logarithms.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bayesperiodic import _checks
+from bayesperiodic.posterior.joint_priors import as_prior
+from bayesperiodic.posterior.priors import LogNormal, Prior
+
+SPECTRAL, POINTS, CORRELATED, KNOWN = "spectral", "points", "correlated", "known"
+SCALE = "scale"
+
+
+@dataclass(frozen=True)
+class Block:
+    """What a noise model must know about one vector of residual components.
+
+    Attributes
+    ----------
+    experiment : str
+    channel : str
+        An output; "scale" for all section values of an experiment together, "multipliers" or "frequency".
+    kind : str
+        "spectral": real Fourier components, of which white noise of variance v has independent ones of variance v;
+        "points": values at the points of a mask; "correlated": values whitened by their given covariance, up to one
+        unknown factor; "known": values in units of their known standard deviations.
+    count : float
+        Independent values behind the components.
+    size : int
+        Number of components.
+    harmonic : array (size,)
+        Of the response period, of each spectral component.
+    position : array (size,)
+        Of each point, in response periods.
+    points : int
+        Grid points of the response period.
+    measured : float
+        Variance of one value that the scatter of the measured cycles explains; NaN where that is not known.
+    """
+
+    experiment: str
+    channel: str
+    kind: str
+    count: float
+    size: int
+    harmonic: np.ndarray
+    position: np.ndarray
+    points: int
+    measured: float
+
+    @property
+    def weight(self) -> float:
+        """Independent values per component."""
+        return self.count / self.size
+
+    @property
+    def counted(self) -> bool:
+        """Whether the variance is unknown, so that eq. (7) counts the values."""
+        return self.kind != KNOWN
+
+
+__all__ = ["Circulant", "Independent", "Measured", "Noise"]
+
+CHANNEL, EXPERIMENT = "channel", "experiment"
+JEFFREYS, FLAT = "jeffreys", "flat"
+VARIANCE = "variance"
+
+# A residual correlated over a few per cent of a period is what smooth model errors leave.
+LENGTHSCALE = LogNormal(0.03, 1.5)
+FLOOR = LogNormal(0.01, 2.0)
+
+
+@dataclass(frozen=True)
+class Noise(ABC):
+    """What the noise models share.
+
+    Parameters
+    ----------
+    per : "channel" or "experiment"
+        Whether a channel has the same noise parameters in all experiments, or its own in each.
+    prior : "jeffreys", "flat", a prior with positive support, or a frozen scipy.stats distribution
+        Of each variance: Jeffreys' 1/v, a constant density of v, or a proper one.
+
+    Raises
+    ------
+    ValueError
+        For another ``per``, or a prior that is none of these.
+
+    Examples
+    --------
+    Every noise model has a name, which a `Problem` takes in its place, and a prior of its variances:
+
+    >>> import bayesperiodic as bp
+    >>> models = bp.noise.Independent(), bp.noise.Measured(), bp.noise.Circulant(prior=bp.InverseGamma(3, 2))
+    >>> {noise.name: noise.prior_text for noise in models if isinstance(noise, bp.noise.Noise)}["circulant"]
+    'prior InverseGamma(shape=3.0, scale=2.0)'
+    """
+
+    per: str = field(default=CHANNEL, kw_only=True)
+    prior: Any = field(default=JEFFREYS, kw_only=True)
+
+    name: ClassVar[str]
+    flat: ClassVar[bool] = True
+    needs_scatter: ClassVar[bool] = False
+
+    @property
+    def shape_priors(self) -> dict[str, Prior]:
+        """The priors of the spectrum's parameters beyond the variance."""
+        return {}
+
+    def __post_init__(self) -> None:
+        _checks.one_of("per", self.per, (CHANNEL, EXPERIMENT))
+        if isinstance(self.prior, str):
+            _checks.one_of("prior", self.prior, (JEFFREYS, FLAT))
+            return
+        prior = as_prior("prior", self.prior)
+        if prior.support[0] < 0.0:
+            raise ValueError(f"prior: {self.prior!r} is not allowed; a variance is positive, and its support is not.")
+
+    @property
+    def proper(self) -> bool:
+        """Whether the prior of a variance can be normalised."""
+        return not isinstance(self.prior, str)
+
+    @property
+    def spare(self) -> int:
+        """How many more values than free parameters the prior of a variance needs: the flat one diverges with two."""
+        return 2 if self.prior == FLAT else 0
+
+    @property
+    def prior_text(self) -> str:
+        """The prior of a variance in words."""
+        return {JEFFREYS: "Jeffreys prior 1/v", FLAT: "flat prior"}.get(self.prior, f"prior {self.prior!r}")
+
+    def check(self, blocks: Sequence[Block]) -> None:
+        """Refuse data that this noise model cannot be used for.
+
+        Parameters
+        ----------
+        blocks : sequence of Block
+            The residual components of all channels of all experiments.
+
+        Raises
+        ------
+        ValueError
+            For channels whose scatter is needed and not known, or grids that cannot be mixed.
+        """
+        points: dict[str, int] = {}
+        for block in (b for b in blocks if b.kind in (SPECTRAL, POINTS)):
+            if self.needs_scatter and not block.measured > 0.0:
+                raise ValueError(
+                    f"noise: {self.name!r} is not allowed; experiment {block.experiment!r} has no scatter of "
+                    f"{block.channel!r}. Give scatter and cycles, or take 'independent'."
+                )
+            if not self.flat and points.setdefault(self.label(block), block.points) != block.points:
+                raise ValueError(
+                    f"noise: {self.name!r} is not allowed; experiments have {points[self.label(block)]} and "
+                    f"{block.points} points in the response period, and share the correlation of {block.channel!r}. "
+                    "Give all the same samples and periods, or take per='experiment'."
+                )
+
+    def label(self, block: Block) -> str:
+        """Return what stands in the brackets of a block's noise parameters.
+
+        Parameters
+        ----------
+        block : Block
+
+        Returns
+        -------
+        str
+            The channel, followed by the experiment where each has its own.
+        """
+        return block.channel if self.per == CHANNEL else f"{block.channel}, {block.experiment}"
+
+    def parameter_names(self, block: Block) -> tuple[str, ...]:
+        """Return the names of the noise parameters of a block.
+
+        Parameters
+        ----------
+        block : Block
+
+        Returns
+        -------
+        tuple of str
+            The variance first; none where the errors are known.
+        """
+        if block.kind == KNOWN:
+            return ()
+        if block.kind == CORRELATED:
+            return (SCALE if self.per == CHANNEL else f"{SCALE}[{block.experiment}]",)
+        return tuple(f"{kind}[{self.label(block)}]" for kind in (VARIANCE, *self.shape_priors))
+
+    def level(self, value: np.ndarray, measured: Any) -> np.ndarray:
+        """Return V of errors whose spectrum is flat.
+
+        Parameters
+        ----------
+        value : array (…)
+            The variance v [channel's unit squared].
+        measured : float or array (…)
+            What the scatter of the cycles explains of the variance of the mean period.
+
+        Returns
+        -------
+        array (…)
+        """
+        return value
+
+    @abstractmethod
+    def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the variances of the residual components of a block, and their derivatives.
+
+        Parameters
+        ----------
+        block : Block
+        values : array (…, parameters)
+            Of the block's noise parameters, the variance first.
+
+        Returns
+        -------
+        variances : array (…, size)
+            V_j of the residual components.
+        slopes : array (…, size, parameters)
+            ∂ ln V_j/∂ ln φ.
+        """
+
+    def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the covariance of the residuals at the points of a mask, and its derivatives.
+
+        Parameters
+        ----------
+        block : Block
+        values : array (parameters,)
+            Of the block's noise parameters, the variance first.
+
+        Returns
+        -------
+        covariance : array (size, size)
+        slopes : array (parameters, size, size)
+            By ln φ.
+        """
+        variances, slopes = self.spectrum(block, values)
+        return np.diag(variances), np.stack([np.diag(variances * slope) for slope in slopes.T])
+
+    def has_constant_prior(self, kind: str) -> bool:
+        """Return whether `log_prior` of a kind of noise parameters is zero wherever they are.
+
+        Parameters
+        ----------
+        kind : str
+            "variance", "lengthscale" or "floor".
+
+        Returns
+        -------
+        bool
+        """
+        return kind not in self.shape_priors and self.prior == JEFFREYS
+
+    def log_prior(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log-density of noise parameters over their logarithms, and its derivative.
+
+        Parameters
+        ----------
+        kind : str
+            "variance", "lengthscale" or "floor".
+        value : array (…)
+        measured : float or array (…)
+            As in `level`.
+
+        Returns
+        -------
+        log_density : array (…)
+            Over ln φ; improper ones up to a constant.
+        slope : array (…)
+            By ln φ.
+        """
+        if kind in self.shape_priors:
+            return _over_logarithm(self.shape_priors[kind], value)
+        if self.has_constant_prior(kind):
+            return np.zeros_like(value), np.zeros_like(value)
+        if self.prior == FLAT:
+            return np.log(value), np.ones_like(value)
+        return _over_logarithm(self._proper_prior, value)
+
+    @cached_property
+    def _proper_prior(self) -> Prior:
+        return as_prior("prior", self.prior)
+
+
+@dataclass(frozen=True)
+class Independent(Noise):
+    """Independent, identically distributed errors of unknown variance, the paper's model.
+
+    Each channel has one unknown variance v ([1]_, eq. 6-7), that of one independent value of the mean period. With
+    whole periods the independent values are 2·harmonics + 1, not the grid points.
+
+    Parameters
+    ----------
+    per : "channel" or "experiment"
+    prior : "jeffreys", "flat" or a prior
+        See `Noise`.
+
+    Raises
+    ------
+    ValueError
+        For another ``per``, or a prior that is none of these.
+
+    References
+    ----------
+    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
+       equilibrium states, 1997.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> bp.noise.Independent(per="experiment").prior_text
+    'Jeffreys prior 1/v'
+    """
+
+    name: ClassVar[str] = "independent"
+
+    def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return V = v."""
+        shape = (*values.shape[:-1], block.size)
+        return np.broadcast_to(values[..., :1], shape), np.ones((*shape, 1))
+
+
+@dataclass(frozen=True)
+class Measured(Noise):
+    """Measurement noise known from the scatter of the cycles, plus an independent model error of unknown variance.
+
+    V = scatter²/cycles + v, with the variance of the mean period that the fold found where there is one (corrected for
+    correlation between cycles). Jeffreys' prior means 1/(V) here, which is 1/v for large model errors and proper
+    towards v = 0.
+
+    Parameters
+    ----------
+    per : "channel" or "experiment"
+    prior : "jeffreys", "flat" or a prior
+        Of the model error's variance.
+
+    Raises
+    ------
+    ValueError
+        For another ``per``, or a prior that is none of these.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> bp.noise.Measured().name
+    'measured'
+    """
+
+    name: ClassVar[str] = "measured"
+    needs_scatter: ClassVar[bool] = True
+
+    def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return V = scatter²/cycles + v."""
+        shape = (*values.shape[:-1], block.size)
+        total = np.broadcast_to(self.level(values[..., :1], block.measured), shape)
+        return total, (values[..., :1] / total)[..., None]
+
+    def level(self, value: np.ndarray, measured: Any) -> np.ndarray:
+        """Return V = scatter²/cycles + v."""
+        return value + measured
+
+    def has_constant_prior(self, kind: str) -> bool:
+        """Return False: Jeffreys' prior is not constant over ln v here."""
+        return False
+
+    def log_prior(self, kind: str, value: np.ndarray, measured: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log-density over ln v; Jeffreys' is that of 1/(measured + v)."""
+        if self.prior != JEFFREYS:
+            return super().log_prior(kind, value, measured)
+        known = np.where(np.asarray(measured) > 0.0, measured, 0.0)
+        share = np.where(known > 0.0, value / (known + value), 1.0)
+        return np.log(share), 1.0 - share
+
+
+@dataclass(frozen=True)
+class Circulant(Noise):
+    """Errors that are correlated along the period and stationary on the circle.
+
+    Their covariance depends on the distance of two points alone, so that Fourier components are independent, with
+    V_h = v·S_h: v is the variance of one value, S the spectrum of the kernel with mean 1. Both kernels become white
+    noise as the correlation length goes to zero. This is exact for noise that repeats with the period, and to O(1/K)
+    for the mean of K cycles of a stationary process. Values at the points of a mask take the dense covariance.
+
+    Parameters
+    ----------
+    kernel : "matern" or "exponential"
+        "matern": once differentiable errors (Matérn, ν = 3/2, [1]_) over a white floor, S ∝ (3 + (2πhℓ)²)⁻² + floor;
+        for smooth model errors under measurement noise. "exponential": a first-order autoregressive process in
+        continuous time, S ∝ 1/(1 + (2πhℓ)²).
+    per : "channel" or "experiment"
+    prior : "jeffreys", "flat" or a prior
+        Of the variance. The correlation length ℓ, as a fraction of the response period, has the prior
+        LogNormal(0.03, 1.5); the floor, as a multiple of the correlated part's variance, LogNormal(0.01, 2).
+
+    Raises
+    ------
+    ValueError
+        For another ``kernel`` or ``per``, or a prior that is none of these.
+
+    References
+    ----------
+    .. [1] C. E. Rasmussen, C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press, 2006, section 4.2.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> bp.noise.Circulant(kernel="exponential").shape_priors
+    {'lengthscale': LogNormal(median=0.03, spread=1.5)}
+    """
+
+    kernel: str = field(default="matern", kw_only=True)
+
+    name: ClassVar[str] = "circulant"
+    flat: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _checks.one_of("kernel", self.kernel, ("matern", "exponential"))
+
+    @property
+    def shape_priors(self) -> dict[str, Prior]:
+        """The priors of the spectrum's shape."""
+        shape: dict[str, Prior] = {"lengthscale": LENGTHSCALE}
+        return shape | ({"floor": FLOOR} if self.kernel == "matern" else {})
+
+    def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return V = v·S_h, S with mean 1 over the components."""
+        return self._spectrum(block.harmonic, values)
+
+    def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return v·Σ_h S_h cos(2πh(t_i − t_j))/n at the points of a mask."""
+        harmonic = np.minimum(np.arange(block.points), block.points - np.arange(block.points))
+        variances, slopes = self._spectrum(harmonic, values)
+        point = np.rint(block.position * block.points).astype(int)
+        by_lag = np.fft.ifft(np.vstack([variances, slopes.T * variances])).real
+        found = by_lag[:, np.abs(point[:, None] - point[None, :])]
+        return found[0], found[1:]
+
+    def _spectrum(self, harmonic: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = 2 * np.pi * harmonic * values[..., 1:2]
+        if self.kernel == "exponential":
+            power, slope = 1.0 / (1.0 + x**2), -2.0 * x**2 / (1.0 + x**2)
+        else:
+            power, slope = (3.0 + x**2) ** -2, -4.0 * x**2 / (3.0 + x**2)
+        mean = power.mean(axis=-1, keepdims=True)
+        power, slope = power / mean, slope - np.mean(power * slope, axis=-1, keepdims=True) / mean
+        if self.kernel == "exponential":
+            return values[..., :1] * power, np.stack([np.ones_like(slope), slope], axis=-1)
+        floor = values[..., 2:3]
+        total = power + floor
+        slopes = [np.ones_like(slope), slope * power / total, floor / total - floor / (1.0 + floor)]
+        return values[..., :1] * total / (1.0 + floor), np.stack(slopes, axis=-1)
+
+
+NAMED: dict[str, type[Noise]] = {model.name: model for model in (Independent, Measured, Circulant)}
+
+
+def as_noise(given: str | Noise) -> Noise:
+    """Return a noise model from its name or itself.
+
+    Raises
+    ------
+    ValueError
+        If it is neither.
+    """
+    if isinstance(given, Noise):
+        return given
+    if not isinstance(given, str):
+        raise ValueError(f"noise: {given!r} is not allowed; it must be a name or a model such as noise.Independent().")
+    _checks.one_of("noise", given, NAMED)
+    return NAMED[given]()
+
+
+def _over_logarithm(prior: Prior, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a prior's log-density over ln x, and its derivative by ln x."""
+    return prior.log_prob(value) + np.log(value), prior.gradient(value) * value + 1.0

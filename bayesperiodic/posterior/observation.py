@@ -1,0 +1,461 @@
+"""From a periodic response to what is compared with one experiment, and the derivatives of that."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from bayesperiodic import _fourier
+from bayesperiodic._parallel import in_threads
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.models.model import Model
+from bayesperiodic.posterior.likelihood import Residuals
+from bayesperiodic.posterior.noise import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
+
+
+class Response(NamedTuple):
+    """What a model answers in one experiment, or the derivatives of that along directions on the leading axis.
+
+    Attributes
+    ----------
+    outputs : array (…, points, channels)
+        In the order of the model's outputs.
+    frequency : array (…,)
+        [Hz].
+    log_multipliers : array (…, multipliers)
+        log|μ|, largest first, as many as were measured.
+    delay : array (…,)
+        By how much the measured outputs are late against the model's [s].
+    """
+
+    outputs: np.ndarray
+    frequency: np.ndarray
+    log_multipliers: np.ndarray
+    delay: np.ndarray
+
+
+class Observation:
+    """The comparison of a response with one experiment.
+
+    Outputs are delayed, compared with the data (angles modulo 2π), and taken at the points of the mask or as Fourier
+    components within the harmonics kept. The orbit of an autonomous model, whose phase is free, is first turned until
+    the first harmonics of its measured outputs agree best with those of the data.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    model : Model
+    delayed : bool
+        Whether the delay is a parameter; without it outputs are not shifted at all, unless the phase is free.
+
+    Attributes
+    ----------
+    channels : tuple of str
+        Those measured, in the order of the model's outputs.
+    columns : list of int
+        Where these are among the model's outputs.
+    data : array (points, channels)
+    """
+
+    def __init__(self, experiment: Experiment, model: Model, delayed: bool):
+        self.experiment = experiment
+        self.channels = tuple(channel for channel in model.outputs if channel in experiment.outputs)
+        self.columns = [model.outputs.index(channel) for channel in self.channels]
+        self._angles = [channel in model.angles for channel in self.channels]
+        self._free_phase = model.autonomous
+        self._shifted = delayed or model.autonomous
+        self.data = np.stack([experiment.outputs[channel] for channel in self.channels], axis=-1)
+        self._points = len(self.data)
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """What the noise model must know, one entry a vector of components."""
+        e, found = self.experiment, []
+        if e.covariance is not None:
+            found.append(self._block(SCALE, CORRELATED, float(self._values), self._values))
+        else:
+            for channel in self.channels:
+                kind = SPECTRAL if e.mask is None else POINTS
+                size = len(self._harmonics[channel]) if e.mask is None else int(e.mask.sum())
+                found.append(self._block(channel, kind, float(e.independent[channel]), size))
+        if e.multipliers is not None:
+            found.append(self._block("multipliers", KNOWN, 0.0, e.multipliers.size))
+        if self._free_phase:
+            found.append(self._block("frequency", KNOWN, 0.0, 1))
+        return tuple(found)
+
+    def _block(self, channel: str, kind: str, count: float, size: int) -> Block:
+        mask = self.experiment.mask
+        return Block(
+            self.experiment.name,
+            channel,
+            kind,
+            count,
+            size,
+            self._harmonics[channel] if kind == SPECTRAL else np.empty(0),
+            np.flatnonzero(mask) / self._points if kind == POINTS and mask is not None else np.empty(0),
+            self._points,
+            _measured_variance(self.experiment, channel),
+        )
+
+    @property
+    def _values(self) -> int:
+        mask = self.experiment.mask
+        return (self._points if mask is None else int(mask.sum())) * len(self.channels)
+
+    @cached_property
+    def _harmonics(self) -> dict[str, np.ndarray]:
+        """The harmonic of each spectral component, by channel."""
+        result, highest = {}, _fourier.highest_harmonic(self._points)
+        for channel in self.channels:
+            kept = self.experiment.harmonics.get(channel)
+            harmonics = np.arange(1, 1 + min(highest if kept is None else kept, highest))
+            nyquist = [self._points // 2] if kept is None and self._points % 2 == 0 else []
+            result[channel] = np.array([0, *harmonics, *harmonics, *nyquist])
+        return result
+
+    @cached_property
+    def _joint(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what whitens the values, the regression of log|μ| on them, and what whitens the rest of log|μ|."""
+        e, size = self.experiment, self._values
+        count = 0 if e.multipliers is None else e.multipliers.size
+        values, slopes = np.empty((0, 0)), np.zeros((count, 0))
+        if e.covariance is not None:
+            values, slopes = _whitening(e.covariance[:size, :size]), np.zeros((count, size))
+        if e.multiplier_sd is not None:
+            return values, slopes, np.diag(1.0 / e.multiplier_sd)
+        if not count or e.covariance is None:
+            return values, slopes, np.empty((0, 0))
+        cross = e.covariance[size:, :size]
+        slopes = np.linalg.solve(e.covariance[:size, :size], cross.T).T
+        return values, slopes, _whitening(e.covariance[size:, size:] - slopes @ cross.T)
+
+    def data_components(self) -> list[np.ndarray]:
+        """Return the Fourier components (size,) of each measured channel."""
+        return [self._spectral(self.data[:, c], self._harmonics[name]) for c, name in enumerate(self.channels)]
+
+    def components(self, outputs: np.ndarray) -> list[np.ndarray]:
+        """Return the Fourier components (…, size) of each measured channel of outputs (…, points, channels)."""
+        pairs = zip(self.columns, self.channels, strict=True)
+        return [self._spectral(outputs[..., column], self._harmonics[name]) for column, name in pairs]
+
+    def spread(self, weights: Sequence[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
+        """Return the transpose of `components` applied to weights (…, size) a channel: (…, points, channels)."""
+        total = np.zeros((*weights[0].shape[:-1], *shape))
+        for own, column, name in zip(weights, self.columns, self.channels, strict=True):
+            total[..., column] = self._spread(own, self._harmonics[name])
+        return total
+
+    def residuals(self, response: Response) -> list[np.ndarray]:
+        """Return the residual components, one array (…, size) a block."""
+        e = self.experiment
+        difference = self.data - self._predicted(response)
+        for c, angle in enumerate(self._angles):
+            if angle:
+                difference[..., c] = np.mod(difference[..., c] + np.pi, 2 * np.pi) - np.pi
+        known = [] if e.multipliers is None else [np.log(np.abs(e.multipliers)) - response.log_multipliers]
+        frequency = [e.frequency - response.frequency] if self._free_phase else []
+        return self._components(difference, known, frequency)
+
+    @cached_property
+    def layout(self) -> tuple[Any, ...] | None:
+        """What experiments have in common that are compared all at once; None where there is more to compare."""
+        e = self.experiment
+        if (
+            self._shifted
+            or any(self._angles)
+            or not (e.mask is None and e.covariance is None and e.multipliers is None)
+        ):
+            return None
+        return self._points, self.channels, *(self._harmonics[channel].size for channel in self.channels)
+
+    def changes(self, response: Response, directions: Response) -> list[np.ndarray]:
+        """Return the derivatives of the predicted components along directions, one array (directions, size) a block."""
+        e = self.experiment
+        moved = directions.outputs[..., self.columns]
+        if self._shifted:
+            moved = self._shift(moved, self._fraction(response))
+            moved = moved - self._rate(response) * self._fraction_changes(response, directions)[:, None, None]
+        known = [] if e.multipliers is None else [directions.log_multipliers]
+        return self._components(moved, known, [directions.frequency] if self._free_phase else [])
+
+    def pulled(self, response: Response, weights: list[np.ndarray]) -> Response:
+        """Return the derivatives of Σ weights · predicted components by everything in a forced model's response."""
+        e, total, joint = self.experiment, np.zeros_like(self.data), np.zeros(0)
+        if e.multipliers is not None:
+            joint = weights[-1] @ self._joint[2]
+        if e.covariance is not None:
+            whitening, slopes, _ = self._joint
+            at = slice(None) if e.mask is None else e.mask
+            total[at] = (weights[0] @ whitening - slopes.T @ joint).reshape(-1, len(self.channels))
+        else:
+            for c, channel in enumerate(self.channels):
+                if e.mask is not None:
+                    total[e.mask, c] = weights[c]
+                else:
+                    total[:, c] = self._spread(weights[c], self._harmonics[channel])
+        by_delay = 0.0
+        if self._shifted:
+            by_delay = -float(np.sum(total * self._rate(response))) * float(response.frequency) / e.periods
+            total = self._shift(total, -self._fraction(response))
+        outputs = np.zeros_like(response.outputs)
+        outputs[:, self.columns] = total
+        return Response(outputs, np.zeros(()), joint, np.array(by_delay))
+
+    def predicted(self, response: Response) -> dict[str, np.ndarray]:
+        """Return ŷ (…, points) of each measured channel, turned and delayed."""
+        return dict(zip(self.channels, np.moveaxis(self._predicted(response), -1, 0), strict=True))
+
+    def replicates(self, response: Response, components: list[np.ndarray]) -> dict[str, np.ndarray]:
+        """Return what might have been measured, ŷ plus noise (draws, points), by channel; NaN outside the mask.
+
+        Angles are within half a turn of the data.
+
+        Parameters
+        ----------
+        response : Response
+            With draws on its leading axis.
+        components : list of array (draws, size)
+            Of the noise, one array a block.
+        """
+        e, noise = self.experiment, np.full((len(components[0]), *self.data.shape), np.nan)
+        if e.covariance is not None:
+            values = solve_triangular(self._joint[0], components[0].T, lower=True).T
+            mask = np.ones(self._points, dtype=bool) if e.mask is None else e.mask
+            noise[:, mask] = values.reshape(len(values), -1, len(self.channels))
+        else:
+            for c, channel in enumerate(self.channels):
+                if e.mask is None:
+                    noise[..., c] = self._signal(components[c], self._harmonics[channel])
+                else:
+                    noise[:, e.mask, c] = components[c]
+        values = self._predicted(response) + noise
+        turned = self.data - (np.mod(self.data - values + np.pi, 2 * np.pi) - np.pi)
+        return {n: (turned if self._angles[c] else values)[..., c] for c, n in enumerate(self.channels)}
+
+    def compared(self, response: Response) -> dict[str, np.ndarray]:
+        """Return y − ŷ (points,) of each channel, within the harmonics kept and zero where nothing was measured."""
+        difference = self.data - self._predicted(response)
+        result = {}
+        for c, channel in enumerate(self.channels):
+            e = difference[:, c]
+            e = np.mod(e + np.pi, 2 * np.pi) - np.pi if self._angles[c] else e
+            mask = self.experiment.mask
+            result[channel] = self.experiment.project(channel, e) if mask is None else np.where(mask, e, 0.0)
+        return result
+
+    def _components(
+        self, values: np.ndarray, multipliers: list[np.ndarray], frequency: list[np.ndarray]
+    ) -> list[np.ndarray]:
+        """Return the components of differences (…, points, channels), and of those of log|μ| and the frequency."""
+        e, found = self.experiment, []
+        picked = values if e.mask is None else values[..., e.mask, :]
+        flat = picked.reshape(*picked.shape[:-2], picked.shape[-2] * picked.shape[-1])
+        if e.covariance is not None:
+            found.append(_times(self._joint[0], flat))
+        else:
+            for c, channel in enumerate(self.channels):
+                column = picked[..., c]
+                found.append(column if e.mask is not None else self._spectral(column, self._harmonics[channel]))
+        for logarithms in multipliers:
+            _, slopes, whitening = self._joint
+            explained = _times(slopes, flat) if slopes.shape[1] else 0.0
+            found.append(_times(whitening, logarithms - explained))
+        found += [np.asarray(difference)[..., None] / e.frequency_se for difference in frequency]
+        return found
+
+    def _spectral(self, signal: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
+        """Return real Fourier components whose mean square is that of the signal within the harmonics."""
+        highest = (harmonic.size - 1) // 2
+        amplitudes = _fourier.coefficients(signal, highest) * np.sqrt(0.5 * harmonic.size)
+        amplitudes[..., 0] *= np.sqrt(2.0)
+        parts = [amplitudes.real, amplitudes.imag[..., 1:]]
+        if harmonic.size % 2 == 0:
+            alternating = np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0) / self._points
+            parts.append(np.sum(signal * alternating, axis=-1, keepdims=True) * np.sqrt(harmonic.size))
+        return np.concatenate(parts, axis=-1)
+
+    def _signal(self, components: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
+        """Return the signals (…, points) that have these real Fourier components (…, size): `_spectral` undone."""
+        highest = (harmonic.size - 1) // 2
+        amplitudes = components[..., : highest + 1].astype(complex)
+        amplitudes[..., 1:] += 1j * components[..., highest + 1 : 2 * highest + 1]
+        amplitudes *= np.sqrt(2.0 / harmonic.size)
+        amplitudes[..., 0] *= np.sqrt(0.5)
+        signal = _fourier.on_grid(amplitudes, self._points)
+        if harmonic.size % 2 == 0:
+            alternating = np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0)
+            signal += components[..., -1:] / np.sqrt(harmonic.size) * alternating
+        return signal
+
+    def _spread(self, weights: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
+        """Return the transpose of `_spectral` applied to weights (size,), its inverse but for a factor."""
+        return self._signal(weights, harmonic) * harmonic.size / self._points
+
+    def _predicted(self, response: Response) -> np.ndarray:
+        """Return the model's outputs (…, points, channels), turned and delayed."""
+        outputs = response.outputs[..., self.columns]
+        return self._shift(outputs, self._fraction(response), turning=True) if self._shifted else outputs
+
+    def _fraction(self, response: Response) -> np.ndarray:
+        """Return by what fraction of the response period the outputs are shifted, (…,)."""
+        fraction = np.asarray(response.delay) * response.frequency / self.experiment.periods
+        if self._free_phase:
+            own, reference = self._fundamentals(response.outputs), self._reference
+            # In real numbers: the rounding of NumPy's complex products depends on how many there are.
+            cosine = np.sum(own.real * reference.real - own.imag * reference.imag, axis=-1)
+            sine = np.sum(own.real * reference.imag + own.imag * reference.real, axis=-1)
+            fraction = fraction + np.arctan2(sine, cosine) / (2 * np.pi)
+        return fraction
+
+    def _fundamentals(self, outputs: np.ndarray) -> np.ndarray:
+        """Return the complex amplitude of the first harmonic of each channel, (…, channels)."""
+        return _fourier.coefficients(np.moveaxis(outputs[..., self.columns], -1, -2), 1)[..., 1]
+
+    @cached_property
+    def _reference(self) -> np.ndarray:
+        """What multiplies the channels' fundamentals, so that the angle of the sum is by how much they are behind.
+
+        With the variances of the measurement, where they are known, it is the likeliest phase; one channel's phase
+        alone would bring its noise into all others. Angles, which may wind, have no part in it unless there is nothing
+        else.
+        """
+        noise = np.array([_measured_variance(self.experiment, channel) for channel in self.channels])
+        known = bool(np.all(np.isfinite(noise) & (noise > 0.0)))
+        weights = 1.0 / (noise if known else self.data.var(axis=0))
+        angles = np.array(self._angles)
+        weights[angles & ~angles.all()] = 0.0
+        return weights * np.conj(_fourier.coefficients(self.data.T, 1)[:, 1])
+
+    def _fraction_changes(self, response: Response, directions: Response) -> np.ndarray:
+        delays = directions.delay * response.frequency + response.delay * directions.frequency
+        changes = delays / self.experiment.periods
+        if self._free_phase:
+            moved = directions.outputs[..., self.columns]
+            changes = changes + np.einsum("...pc,pc->...", moved, self._phase_gradient(response))
+        return changes
+
+    def _phase_gradient(self, response: Response) -> np.ndarray:
+        """Return the derivatives (points, channels) of the outputs' phase [turns] by their values."""
+        agreement = np.sum(self._fundamentals(response.outputs) * self._reference)
+        wave = np.exp(-2j * np.pi * np.arange(self._points) / self._points) * 2.0 / self._points
+        return np.imag(np.outer(wave, self._reference) / agreement) / (2 * np.pi)
+
+    def _shift(self, signals: np.ndarray, fraction: np.ndarray, turning: bool = False) -> np.ndarray:
+        """Return signals (…, points, channels) that come a fraction of the response period later."""
+        phase = np.asarray(fraction)[..., None, None]
+        trend = self._trend(signals) if turning else 0.0
+        spectrum = np.fft.rfft(signals - trend * np.arange(self._points)[:, None] / self._points, axis=-2)
+        harmonic = np.arange(spectrum.shape[-2])[:, None]
+        turn = np.exp(-2j * np.pi * harmonic * phase)
+        if self._points % 2 == 0:
+            turn[..., -1, :] = turn[..., -1, :].real
+        shifted = np.fft.irfft(spectrum * turn, n=self._points, axis=-2)
+        return shifted + trend * (np.arange(self._points)[:, None] / self._points - phase)
+
+    def _trend(self, signals: np.ndarray) -> np.ndarray:
+        """Return what angles advance in a response period, (…, 1, channels), whole turns; zero for other channels."""
+        ahead = 2.0 * signals[..., -1:, :] - signals[..., -2:-1, :]
+        turns = np.rint((ahead - signals[..., :1, :]) / (2 * np.pi))
+        return 2 * np.pi * np.where(self._angles, turns, 0.0)
+
+    def _rate(self, response: Response) -> np.ndarray:
+        """Return the derivative (points, channels) of the predicted outputs by their phase [per response period]."""
+        predicted = self._predicted(response)
+        trend = self._trend(predicted)
+        spectrum = np.fft.rfft(predicted - trend * np.arange(self._points)[:, None] / self._points, axis=0)
+        spectrum *= 2j * np.pi * np.arange(len(spectrum))[:, None]
+        if self._points % 2 == 0:
+            spectrum[-1] = 0.0
+        return np.fft.irfft(spectrum, n=self._points, axis=0) + trend
+
+
+def _times(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return matrix · row of rows (…, size), row by row: the rounding of one product may depend on their number."""
+    return (matrix @ rows[..., None])[..., 0]
+
+
+def _whitening(covariance: np.ndarray) -> np.ndarray:
+    """Return the inverse of the lower Cholesky factor."""
+    return solve_triangular(np.linalg.cholesky(covariance), np.eye(len(covariance)), lower=True)
+
+
+def _measured_variance(experiment: Experiment, channel: str) -> float:
+    """Return the variance of one value of the mean period that the scatter of the cycles explains; NaN if unknown."""
+    if channel in experiment.amplitude_variance:
+        variance = experiment.amplitude_variance[channel]
+        return float(variance[0] + 0.5 * np.sum(variance[1:]))
+    if channel in experiment.scatter:
+        return float(experiment.scatter[channel] ** 2 / experiment.cycles)
+    return float("nan")
+
+
+class Comparisons:
+    """Observations in groups, each of one layout.
+
+    Parameters
+    ----------
+    groups : iterable of sequence of Observation
+    """
+
+    def __init__(self, groups: Iterable[Sequence[Observation]]):
+        self._groups = [tuple(group) for group in groups]
+        self.observations = {o.experiment.name: o for group in self._groups for o in group}
+        self._data = [_data(group) for group in self._groups]
+        self._places, first = [], 0
+        for group in self._groups:
+            blocks = range(first, first + len(group[0].blocks))
+            self._places += [[(block, member) for block in blocks] for member in range(len(group))]
+            first = blocks.stop
+
+    def residuals(self, responses: Mapping[str, Response], threads: int) -> Residuals:
+        """Return the residual components of responses by experiment, in the order of the mapping."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = in_threads(lambda g: self._compared(g, responses), range(len(self._groups)), threads)
+        own = dict(zip(self.observations, self._places, strict=True))
+        return Residuals(
+            [stack for stacks in found for stack in stacks], [place for name in responses for place in own[name]]
+        )
+
+    def pulled(self, responses: Mapping[str, Response], weights: Residuals) -> dict[str, Response]:
+        """Return the derivatives of Σ weights · predicted components by everything in one response an experiment.
+
+        Parameters
+        ----------
+        responses : mapping of str to Response
+            Without leading axes; in the same order as those that led to the residuals.
+        weights : Residuals
+            Of the same places as these.
+        """
+        result, first = {}, 0
+        for group, data in zip(self._groups, self._data, strict=True):
+            stacks = weights.stacks()[first : first + len(group[0].blocks)]
+            first += len(stacks)
+            if data is None:
+                (alone,) = group
+                name = alone.experiment.name
+                result[name] = alone.pulled(responses[name], [stack[0] for stack in stacks])
+                continue
+            outputs = group[0].spread(stacks, responses[group[0].experiment.name].outputs.shape)
+            for o, own in zip(group, outputs, strict=True):
+                result[o.experiment.name] = Response(own, np.zeros(()), np.zeros(0), np.zeros(()))
+        return {name: result[name] for name in responses}
+
+    def _compared(self, group: int, responses: Mapping[str, Response]) -> list[np.ndarray]:
+        """Return the residual components of a group, an array (experiments, solves, size) a block."""
+        observations, data = self._groups[group], self._data[group]
+        if data is None:
+            (alone,) = observations
+            return [block[None] for block in alone.residuals(responses[alone.experiment.name])]
+        outputs = [responses[o.experiment.name].outputs for o in observations]
+        signals = np.stack(outputs) if len(outputs) > 1 else outputs[0][None]
+        return [own - components for own, components in zip(data, observations[0].components(signals), strict=True)]
+
+
+def _data(group: Sequence[Observation]) -> list[np.ndarray] | None:
+    """Return the measured components of a group, an array (experiments, 1, size) a channel; None without a layout."""
+    if group[0].layout is None:
+        return None
+    return [np.stack(own)[:, None] for own in zip(*(o.data_components() for o in group), strict=True)]

@@ -1,0 +1,203 @@
+"""Which parameters of a model are free, fixed or tied, and how all of them follow from the free ones."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bayesperiodic import _checks
+from bayesperiodic._expressions import Expression, parse
+
+SHIFT = "shift"
+
+
+def local_name(name: str, experiment: str) -> str:
+    """Return what a parameter local to an experiment is called, such as ``theta16[run 7]``."""
+    return f"{name}[{experiment}]"
+
+
+def expand_priors(
+    priors: Mapping[Any, Any],
+    local: Sequence[str],
+    experiments: Sequence[str],
+    fixed: Mapping[str, Mapping[str, float]],
+) -> dict[Any, Any]:
+    """Return the priors with every local parameter's given once for each experiment that has no fixed value of it."""
+    result: dict[Any, Any] = {}
+    for key, prior in priors.items():
+        if key in local:
+            names = [local_name(key, e) for e in experiments if e not in fixed.get(key, {})]
+            result |= {name: prior for name in names if name not in priors}
+        else:
+            result[key] = prior
+    return result
+
+
+def free_names(parameters: Iterable[str], local: Iterable[str], experiments: Iterable[str]) -> list[str]:
+    """Return every name that a free parameter may have, in order."""
+    result: list[str] = []
+    for name in (*parameters, SHIFT):
+        if name in local:
+            result += [local_name(name, experiment) for experiment in experiments]
+        elif name != SHIFT:
+            result.append(name)
+    return result
+
+
+@dataclass(frozen=True)
+class ParameterMap:
+    """From θ, the free parameters of all experiments, to all parameters of one experiment.
+
+    Attributes
+    ----------
+    parameters : tuple of str
+        All of the model's, and last "shift", the delay of the measured outputs [s].
+    columns : dict of str to int
+        Where the free ones of this experiment are in θ.
+    size : int
+        Length of θ.
+    fixed : dict of str to float
+    tied : dict of str to Expression
+        Each only of parameters that are free, fixed or tied before it.
+    """
+
+    parameters: tuple[str, ...]
+    columns: dict[str, int]
+    size: int
+    fixed: dict[str, float]
+    tied: dict[str, Expression]
+
+    @classmethod
+    def of(
+        cls,
+        parameters: tuple[str, ...],
+        names: tuple[str, ...],
+        experiment: str,
+        fixed: Mapping[str, float],
+        tied: Mapping[str, Any],
+    ) -> "ParameterMap":
+        """Return the checked map of an experiment; `names` are those of θ.
+
+        Raises
+        ------
+        ValueError
+            For a parameter that is none of the three or two of them, an unknown name, an expression that is not allowed
+            or that comes back to itself.
+        """
+        every = (*parameters, SHIFT)
+        columns = {}
+        for name in every:
+            for candidate in (name, local_name(name, experiment)):
+                if candidate in names:
+                    columns[name] = names.index(candidate)
+        for name in tied:
+            _checks.one_of("tied", name, every)
+            for argument, others in (("priors", columns), ("fixed", fixed)):
+                if name in others:
+                    raise ValueError(f"tied: {name!r} is in {argument} too; a parameter is free, fixed or tied.")
+        known = {SHIFT: 0.0} if SHIFT not in columns and SHIFT not in tied else {}
+        known |= fixed
+        if without := [n for n in every if n not in columns and n not in known and n not in tied]:
+            raise ValueError(
+                f"priors: {', '.join(map(repr, without))} has neither a prior nor a value in experiment "
+                f"{experiment!r}; a free parameter needs a prior, any other a value in `fixed` or an expression in "
+                "`tied`."
+            )
+        expressions = {name: parse(f"tied[{name!r}]", text, every) for name, text in tied.items()}
+        return cls(every, columns, len(names), known, _ordered(expressions))
+
+    @property
+    def delayed(self) -> bool:
+        """Whether the outputs may be late."""
+        return SHIFT in self.columns or SHIFT in self.tied or self.fixed[SHIFT] != 0.0
+
+    def values(self, theta: np.ndarray) -> np.ndarray:
+        """Return all parameters (points, parameters + 1), the delay last, of θ (points, names)."""
+        return self._alone.values(theta)[0]
+
+    @cached_property
+    def _alone(self) -> "ParameterMaps":
+        return ParameterMaps([self])
+
+    def slopes(self, theta: np.ndarray) -> np.ndarray:
+        """Return ∂(all parameters)/∂θ at one θ (names,), (parameters + 1, names)."""
+        nothing = np.zeros(self.size)
+        by_name = {name: np.eye(1, self.size, i)[0] for name, i in self.columns.items()}
+        known: dict[str, Any] = {**self.fixed, **{name: float(theta[i]) for name, i in self.columns.items()}}
+        for name, expression in self.tied.items():
+            gradient = expression.gradient(known)
+            by_name[name] = sum((float(slope) * by_name[n] for n, slope in gradient.items() if n in by_name), nothing)
+            known[name] = float(expression.value(known))
+        return np.stack([by_name.get(name, nothing) for name in self.parameters])
+
+
+class ParameterMaps:
+    """Maps of several experiments in which the same parameters are free, evaluated together.
+
+    Parameters
+    ----------
+    maps : sequence of ParameterMap
+
+    Attributes
+    ----------
+    moving : tuple of int
+        Which of the model's parameters are free or tied.
+    """
+
+    def __init__(self, maps: Sequence[ParameterMap]):
+        first = maps[0]
+        if any(m.columns.keys() != first.columns.keys() or m.tied.keys() != first.tied.keys() for m in maps):
+            raise ValueError("maps: the same parameters must be free, and the same tied.")
+        self._tied, self._size = first.tied, first.size
+        self._fixed = np.array([[m.fixed.get(name, np.nan) for name in first.parameters] for m in maps])
+        self._places = [first.parameters.index(name) for name in first.columns]
+        self._columns = np.array([[m.columns[name] for name in first.columns] for m in maps], dtype=int)
+        named = {name for expression in self._tied.values() for name in expression.names} | self._tied.keys()
+        self._named = {name: i for i, name in enumerate(first.parameters) if name in named}
+        free = {*first.columns, *self._tied} - {SHIFT}
+        self.moving = tuple(i for i, name in enumerate(first.parameters) if name in free)
+
+    def values(self, theta: np.ndarray) -> np.ndarray:
+        """Return all parameters (maps, points, parameters + 1), the delay last, of θ (points, names)."""
+        result = np.repeat(self._fixed[:, None], len(theta), axis=1)
+        result[:, :, self._places] = theta[:, self._columns].transpose(1, 0, 2)
+        if self._tied:
+            known = {name: result[..., i] for name, i in self._named.items()}
+            for name, expression in self._tied.items():
+                known[name][:] = expression.value(known)
+        return result
+
+    def pulled(self, values: np.ndarray, by_parameter: np.ndarray) -> np.ndarray:
+        """Return derivatives by θ, (maps, names), from those by all parameters at their values (maps, parameters + 1).
+
+        Parameters
+        ----------
+        values, by_parameter : array (maps, parameters + 1)
+            The delay last.
+        """
+        left, result = by_parameter.copy(), np.zeros((len(by_parameter), self._size))
+        if self._tied:
+            known = {name: values[:, i] for name, i in self._named.items()}
+            for name, expression in reversed(self._tied.items()):
+                for argument, slope in expression.gradient(known).items():
+                    left[:, self._named[argument]] += slope * left[:, self._named[name]]
+        result[np.arange(len(result))[:, None], self._columns] = left[:, self._places]
+        return result
+
+
+def _ordered(expressions: dict[str, Expression]) -> dict[str, Expression]:
+    """Return the expressions such that each comes after those that it names."""
+    result: dict[str, Expression] = {}
+    while len(result) < len(expressions):
+        ready = [
+            name
+            for name, expression in expressions.items()
+            if name not in result and all(n not in expressions or n in result for n in expression.names)
+        ]
+        if not ready:
+            circle = {name: e.text for name, e in expressions.items() if name not in result}
+            raise ValueError(f"tied: {circle!r} is not allowed; these expressions come back to themselves.")
+        result |= {name: expressions[name] for name in ready}
+    return result

@@ -1,0 +1,270 @@
+"""Sampling of θ and the noise parameters by their gradient, with nutpie's NUTS: a check on the other sampler."""
+
+import time
+import warnings
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from tqdm import tqdm
+
+from bayesperiodic._parallel import available_cores
+from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.posterior.labels import CHAIN, DRAW
+from bayesperiodic.sampling import convergence
+from bayesperiodic.sampling.convergence import shortfall
+from bayesperiodic.sampling.coordinates import SAMPLED, RidgeMap, SamplingDensity
+from bayesperiodic.sampling.posterior import Posterior, gather
+from bayesperiodic.sampling.starts import start_points, walking_axes
+
+TUNE = 300
+BLOCK = 250
+PASSES = 2
+PAUSE = 0.01
+POSITION = "u"
+# By their names in ArviZ's schema.
+STATISTICS = {
+    "diverging": "diverging",
+    "energy": "energy",
+    "tree_depth": "depth",
+    "n_steps": "n_steps",
+    "step_size": "step_size",
+    "acceptance_rate": "mean_tree_accept",
+}
+
+
+def refuse_for_nuts(walkers: int | None, variances: str, checkpoint: str | Path | None, executor: Any) -> None:
+    """Raise a ValueError for arguments of `sample` that the no-U-turn sampler does not take."""
+    for argument, value, default, hint in (
+        ("walkers", walkers, None, "a chain has no walkers, so leave it out, and see ensembles"),
+        (
+            "variances",
+            variances,
+            SAMPLED,
+            "their gradient is not to be had when they are integrated out, so sample them",
+        ),
+        ("checkpoint", checkpoint, None, "its chains cannot be resumed, so leave it out"),
+        ("executor", executor, None, "its chains run in threads of this process, so leave it out"),
+    ):
+        if value is not default and value != default:
+            raise ValueError(f"{argument}: {value!r} is not allowed with sampler='nuts'; {hint}.")
+
+
+def sample_nuts(
+    plain: SamplingDensity,
+    fit: MapEstimate,
+    seed: int,
+    ensembles: int,
+    max_steps: int,
+    start: str,
+    progress: bool,
+) -> Posterior:
+    """Sample a density with independent chains of the no-U-turn sampler, each an ensemble of one walker.
+
+    A chain starts where a walker would and moves along the same axes. Nothing else is shared with emcee but the density
+    itself; its gradient comes from a transposed solve. The chains run side by side and are looked at every 250 draws,
+    so that the result depends on the seed alone, and not on how far each of them had got.
+
+    Parameters
+    ----------
+    plain : SamplingDensity
+    fit, seed, ensembles, max_steps, start, progress
+        See `sample`.
+
+    Returns
+    -------
+    Posterior
+        `failures` are fractions of all points of all trajectories, tuning included.
+
+    Raises
+    ------
+    ImportError
+        Without nutpie.
+
+    Warns
+    -----
+    UserWarning
+        If trajectories diverged.
+    """
+    nutpie = _nutpie()
+    sequences = np.random.SeedSequence(seed).spawn(ensembles + 2)
+    guesses = {name: solution.states for name, solution in fit.solutions.items()}
+    problem = plain.problem.anchored(plain.problem.vector(fit.theta), guesses)
+    density = SamplingDensity(problem, available_cores(), plain.coordinates)
+    axes = walking_axes(density, fit, start, np.random.default_rng(sequences[ensembles]))
+    starts = start_points(density, fit, start, ensembles, np.random.default_rng(sequences[ensembles + 1]))
+    run = _Run(SamplingDensity(problem, coordinates=plain.coordinates), axes)
+    try:
+        for u, sequence in zip(axes.inwards(starts), sequences, strict=False):
+            own = SamplingDensity(problem, coordinates=plain.coordinates)
+            chain_seed = int(sequence.generate_state(1, np.uint64)[0])
+            run.chains.append(_Chain(nutpie, own, axes, u, chain_seed, max_steps))
+        run.go(max_steps, progress)
+    except BaseException:
+        run.cancel()
+        raise
+    return run.posterior(nutpie.__version__, seed)
+
+
+def _nutpie() -> ModuleType:
+    """Return the nutpie module, imported without the notice of the ArviZ that it imports."""
+    convergence.arviz()
+    try:
+        import nutpie
+        import nutpie.compiled_pyfunc
+    except ImportError as error:
+        raise ImportError(
+            f"sampler: 'nuts' needs the package nutpie, which cannot be imported ({error}). Install it with "
+            'pip install "bayesperiodic[nuts]".'
+        ) from error
+    return nutpie
+
+
+class _Chain:
+    """One chain, which nutpie moves in a thread of its own."""
+
+    def __init__(
+        self, nutpie: ModuleType, density: SamplingDensity, axes: RidgeMap, u: np.ndarray, seed: int, most: int
+    ):
+        self.density, self.axes = density, axes
+        self.draws: list[np.ndarray] = []
+        self.accounts: list[tuple[int, Counter[str]]] = []
+        self.error: Exception | None = None
+        model = nutpie.compiled_pyfunc.from_pyfunc(
+            density.dimension,
+            make_logp_fn=lambda: self._value_and_gradient,
+            make_expand_fn=lambda *_: self._keep,
+            expanded_dtypes=[np.dtype(float)],
+            expanded_shapes=[(density.dimension,)],
+            expanded_names=[POSITION],
+            make_initial_point_fn=lambda _: np.ascontiguousarray(u),
+        )
+        self.sampler = nutpie.sample(
+            model, chains=1, cores=1, tune=TUNE, draws=most + 1, seed=seed, progress_bar=False, blocking=False
+        )
+
+    def _value_and_gradient(self, u: np.ndarray) -> tuple[float, np.ndarray]:
+        try:
+            value, gradient = self.density.value_and_gradient(self.axes.outwards(u))
+        except Exception as error:
+            self.error = error
+            raise
+        return value, gradient @ self.axes.axes
+
+    def _keep(self, u: np.ndarray) -> dict[str, np.ndarray]:
+        """Take down a draw, and what the density had counted until then."""
+        self.accounts.append((self.density.calls, self.density.failures.copy()))
+        self.draws.append(np.array(u))
+        return {POSITION: u}
+
+    @property
+    def done(self) -> int:
+        """Draws since the end of tuning that nutpie surely has too: it may not have filed the last one yet."""
+        return max(0, len(self.draws) - TUNE - 1)
+
+    def check(self) -> None:
+        """Raise what ended the chain before its time."""
+        if self.error is not None:
+            raise self.error
+        with suppress(TimeoutError):  # It raises one while all is well.
+            _ = self.sampler.is_finished
+
+
+class _Run:
+    """The chains, how far they are, and what the stop rule says."""
+
+    def __init__(self, density: SamplingDensity, axes: RidgeMap):
+        self.density, self.axes = density, axes
+        self.chains: list[_Chain] = []
+        self.steps, self.converged, self.reason = 0, False, ""
+
+    def cancel(self) -> None:
+        """End the chains for nothing."""
+        for chain in self.chains:
+            with suppress(RuntimeError):  # That of a chain that failed.
+                chain.sampler.cancel()
+
+    def go(self, max_steps: int, progress: bool) -> None:
+        """Wait until the stop rule is passed twice in succession, `max_steps` are reached, or Ctrl-C."""
+        try:
+            self._judge(max_steps, progress)
+        except KeyboardInterrupt:
+            self.steps = min(chain.done for chain in self.chains)
+            if self.steps < BLOCK:
+                raise
+            self.reason = f"interrupted after {self.steps} draws"
+
+    def _judge(self, max_steps: int, progress: bool) -> None:
+        passes, last = 0, np.full(self.density.dimension, np.inf)
+        with tqdm(total=max_steps, unit="draw", desc="sampling", disable=not progress) as bar:
+            for steps in range(BLOCK, max_steps + 1, BLOCK):
+                self._wait(steps, bar)
+                self.steps, kept = steps, self.kept(steps)
+                tau = convergence.autocorrelation_time(kept)
+                missing, last = shortfall(kept, tau, last, self.density.labels), tau
+                bar.set_postfix_str(f"tau {tau.max():.1f}, length {steps / tau.max():.0f} tau")
+                passes = 0 if missing else passes + 1
+                if passes >= PASSES:
+                    self.converged = True
+                    self.reason = f"stop rule passed after {steps} draws of {len(self.chains)} chains"
+                    return
+        left = ", ".join(missing) or "the stop rule passed only once"
+        self.reason = f"max_steps = {max_steps} reached with {left}"
+
+    def _wait(self, steps: int, bar: tqdm) -> None:
+        """Wait until every chain has so many draws."""
+        while (done := min(chain.done for chain in self.chains)) < steps:
+            bar.update(done - bar.n)
+            for chain in self.chains:
+                chain.check()
+            time.sleep(PAUSE)
+        bar.update(steps - bar.n)
+
+    def kept(self, steps: int) -> np.ndarray:
+        """Return the chains (chains, steps, 1, coordinates) without tuning."""
+        walked = np.array([chain.draws[TUNE : TUNE + steps] for chain in self.chains])
+        return self.axes.outwards(walked)[:, :, None, :]
+
+    def posterior(self, version: str, seed: int) -> Posterior:
+        """End the chains and return their draws, with what nutpie tells about each of them."""
+        found = [chain.sampler.abort()["sample_stats"] for chain in self.chains]
+        stats = {
+            ours: np.stack([np.asarray(one[theirs])[0, : self.steps] for one in found])
+            for ours, theirs in STATISTICS.items()
+        }
+        log_density = np.stack([np.asarray(one["logp"])[0, : self.steps] for one in found])
+        self._report(int(stats["diverging"].sum()), log_density.size)
+        accounts = [chain.accounts[TUNE + self.steps - 1] for chain in self.chains]
+        self.density.calls = sum(calls for calls, _ in accounts)
+        self.density.failures = sum((failures for _, failures in accounts), Counter())
+        result = gather(
+            self.density,
+            self.kept(self.steps),
+            log_density[:, :, None],
+            converged=self.converged,
+            reason=self.reason,
+            acceptance=float(stats["acceptance_rate"].mean()),
+            seed=seed,
+        )
+        described = result.data["sample_stats"].to_dataset()
+        result.data["sample_stats"] = xr.DataTree(
+            described.assign({name: ((CHAIN, DRAW), values) for name, values in stats.items()})
+        )
+        result.data.attrs["nutpie"] = version
+        return result
+
+    def _report(self, diverged: int, total: int) -> None:
+        """Say in the reason, and in a warning, how many trajectories diverged."""
+        if not diverged:
+            return
+        self.reason += f", {diverged} of {total} trajectories diverged"
+        warnings.warn(
+            f"{diverged} of {total} trajectories diverged: they ran into points where the log-posterior is not finite, "
+            "such as the ends of a prior's support or failed solves, or where it bends too sharply. The draws may miss "
+            "what lies behind; compare them with those of sampler='emcee'.",
+            stacklevel=6,
+        )

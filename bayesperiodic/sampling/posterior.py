@@ -1,0 +1,523 @@
+"""Posterior: draws, and how far they can be trusted."""
+
+import importlib.metadata
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import emcee
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from bayesperiodic import _checks
+from bayesperiodic._expressions import parse_all
+from bayesperiodic._io import Result
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
+from bayesperiodic.posterior import labels
+from bayesperiodic.posterior.joint_priors import MultivariateNormal
+from bayesperiodic.posterior.labels import (
+    CHAIN,
+    CHANNEL,
+    DRAW,
+    EXPERIMENT,
+    NOISE,
+    column,
+    full_name,
+    local_names,
+    pack,
+    squared,
+)
+from bayesperiodic.posterior.noise import SCALE
+from bayesperiodic.posterior.parameters import SHIFT
+from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.sampling import convergence
+from bayesperiodic.sampling.checkpoint import fingerprint
+from bayesperiodic.sampling.coordinates import SamplingDensity
+
+SAMPLED_ONLY = "Only sampled parameters are kept with the draws; write the value of a fixed one as a number."
+
+
+@dataclass(frozen=True)
+class Posterior(Result):
+    """Draws from the posterior of θ and the noise parameters.
+
+    Every quantity has a full name, as in the problem: ``k``, ``theta16[run 7]``, ``variance[force]``, or
+    ``variance[force, run 7]`` where the noise model has its own parameters for each experiment.
+
+    Attributes
+    ----------
+    data : DataTree
+        Group ``posterior``: variables with dims (chain, draw) first; a chain is a walker, the coordinate ``ensemble``
+        tells to which ensemble it belongs. A parameter that experiments have their own of is one variable with the dim
+        ``experiment``, which holds its fixed value where it is not free. ``variance``, ``lengthscale`` and ``floor``
+        have the dim ``channel``, then ``experiment`` where each has its own; ``scale`` has at most the latter. Known
+        noise parameters are kept with the others, with their values; NaN stands where there is none, such as the
+        variance of a channel in an experiment that lacks it. Attributes: ``units``, or ``units of <channel>`` of
+        ``variance``; ``noise``, the noise model's name, on its parameters alone. Group ``sample_stats``: lp, the
+        log-density in sampling coordinates, and the status of the draw's solves. Group ``posterior_predictive``: at a
+        few draws, replicates of the measured outputs, noise included, and largest_multiplier, the modulus of each
+        orbit's largest Floquet multiplier. Group ``orbits``: every experiment's states, turns included, at the draw
+        with the highest density. Groups ``observed_data`` and ``constant_data``: outputs and inputs.
+    converged : bool
+        True if the stop rule was passed.
+    reason : str
+        Why sampling stopped.
+    tau, ess, rhat : dict of str to float
+        Integrated autocorrelation time [steps], effective sample size (draws / tau), R-hat between ensembles; in
+        sampling coordinates, by full name.
+    acceptance : float
+        Mean fraction of accepted proposals.
+    failures : dict of str to float
+        Fraction of proposals whose periodic solve failed, by status.
+    log_posterior_calls : int
+        Proposals, each with one solve of every experiment.
+    seed : int
+
+    Examples
+    --------
+    A short run, which the stop rule does not pass:
+
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
+    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
+    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
+    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
+    >>> fit = bp.map_estimate(problem, progress=False)
+    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
+    >>> posterior.converged, posterior.names
+    (False, ('c', 'k', 'variance[displacement]'))
+    >>> summary = posterior.summary()
+    >>> bool(summary.loc["k", "q05"] < 1.0 < summary.loc["k", "q95"])
+    True
+    >>> posterior.data["posterior"]["k"].dims, posterior.draws("k").size == 16 * 200
+    (('chain', 'draw'), True)
+    >>> list(posterior.derive({"damping_ratio": "c/(2*sqrt(k))"}).index)
+    ['damping_ratio']
+    """
+
+    data: xr.DataTree
+    converged: bool
+    reason: str
+    tau: dict[str, float]
+    ess: dict[str, float]
+    rhat: dict[str, float]
+    acceptance: float
+    failures: dict[str, float]
+    log_posterior_calls: int
+    seed: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Full names of all that was sampled, parameters first, in the order of the summary."""
+        return tuple(self.tau)
+
+    def draws(self, name: str) -> np.ndarray:
+        """Return all draws of what has this full name, chains one after the other.
+
+        Parameters
+        ----------
+        name : str
+            Such as "k", "theta16[run 7]" or "variance[force]"; see `names`.
+
+        Returns
+        -------
+        array (chains·draws,)
+            In its unit.
+
+        Raises
+        ------
+        ValueError
+            For an unknown name.
+        """
+        return labels.column(self._group, name).ravel()
+
+    def guesses(self, experiments: Iterable[str], states: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
+        """Return the states at the draw with the highest density, from which to solve again.
+
+        Parameters
+        ----------
+        experiments : iterable of str
+        states : iterable of str
+
+        Returns
+        -------
+        dict of str to dict of str to array (samples·periods,)
+            By experiment and state, turns of angles included.
+        """
+        group, states = self.data["orbits"].to_dataset(), tuple(states)
+        return {run: {state: group[f"{run} {state}"].to_numpy() for state in states} for run in experiments}
+
+    @property
+    def _group(self) -> xr.Dataset:
+        return self.data["posterior"].to_dataset()
+
+    @property
+    def _noise(self) -> list[str]:
+        """Full names of the noise parameters."""
+        return [n for n, (variable, _) in labels.places(self._group).items() if labels.is_noise(self._group, variable)]
+
+    def summary(self) -> pd.DataFrame:
+        """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, a row a parameter.
+
+        Its ``attrs`` tell the interval, whether the draws converged and why, and the failed solves by status.
+        """
+        table = _table(
+            {
+                name: _described(self.draws(name), self.ess[name]) | {"tau": self.tau[name], "rhat": self.rhat[name]}
+                for name in self.names
+            }
+        )
+        table.attrs |= {"converged": self.converged, "reason": self.reason, "failures": dict(self.failures)}
+        return table
+
+    def derive(self, expressions: Mapping[str, str], *, experiment: str | None = None) -> pd.DataFrame:
+        """Return quantities derived from the sampled parameters, evaluated at every draw.
+
+        Parameters
+        ----------
+        expressions : mapping of str to str
+            By new name, such as ``{"damping_ratio": "c/(2*sqrt(k*1.5))"}``: numbers, names of sampled parameters, pi,
+            + - * / ** and sqrt, exp, log, sin, cos, tan, atan, sinh, cosh, tanh, abs. Fixed parameters are not kept
+            with the draws; their values are written as numbers.
+        experiment : str, optional
+            Whose local parameters the expressions mean, by their plain names: with "run 7" ``theta16`` is
+            ``theta16[run 7]``. Without it they can name shared parameters only.
+
+        Returns
+        -------
+        DataFrame
+            Mean, sd, 90 % equal-tailed interval, Monte Carlo error and ESS, a row a quantity, as in `summary`; the ESS
+            is that of the quantity itself, NaN for one that does not vary.
+
+        Raises
+        ------
+        ValueError
+            For an expression that is not allowed or not finite at some draw, a new name that is no identifier or that a
+            parameter has, an unknown experiment.
+        """
+        group, noise = self._group, self._noise
+        if experiment is not None:
+            _checks.one_of("experiment", experiment, group[labels.EXPERIMENT].values.tolist())
+        kept = [name for name in labels.places(group) if name not in noise]
+        named = labels.in_experiment(kept, experiment)
+        note = f"{SAMPLED_ONLY} {labels.local_hint(kept, experiment)}".strip()
+        quantities = parse_all("expressions", expressions, named, ["variance", *map(str, group.data_vars)], note)
+        values = {plain: labels.column(group, name) for plain, name in named.items()}
+        rows = {}
+        for name, quantity in quantities.items():
+            draws = np.broadcast_to(quantity.value(values), (group.sizes["chain"], group.sizes["draw"]))
+            if bad := int(np.sum(~np.isfinite(draws))):
+                raise ValueError(
+                    f"expressions[{name!r}]: {quantity.text!r} is not allowed; it is NaN or infinite at {bad} of "
+                    f"{draws.size} draws and must be finite at all of them."
+                )
+            rows[name] = _described(draws.ravel(), self._effective_size(draws))
+        return _table(rows)
+
+    def as_prior(self, names: tuple[str, ...]) -> MultivariateNormal:
+        """Return the normal distribution with the mean and covariance of the draws: the prior of the next problem.
+
+        It is given for the same names, ``priors={names: posterior.as_prior(names)}``. It is over natural values, so
+        that a parameter that was positive is no longer kept positive, and noise parameters are left out. A tail or a
+        second mode of the draws does not survive; see `compare`.
+
+        Parameters
+        ----------
+        names : tuple of str
+            Free parameters, local ones as ``theta16[run 7]``, in the order of the prior's.
+
+        Returns
+        -------
+        MultivariateNormal
+
+        Raises
+        ------
+        ValueError
+            For anything else than a tuple of different free parameters.
+
+        Warns
+        -----
+        UserWarning
+            If the draws have not converged.
+        """
+        noise = self._noise
+        key = labels.checked_key(names, [name for name in self.names if name not in noise], noise)
+        if not self.converged:
+            warnings.warn(
+                f"The draws have not converged ({self.reason}), nor has this prior. Sample longer, see max_steps.",
+                stacklevel=2,
+            )
+        draws = np.stack([self.draws(name) for name in key])
+        return MultivariateNormal(draws.mean(axis=1), np.cov(draws).reshape(len(key), len(key)))
+
+    def _effective_size(self, draws: np.ndarray) -> float:
+        """Return the effective sample size of values (chains, draws); NaN if they do not vary."""
+        if np.ptp(draws) == 0.0:
+            return np.nan
+        ensemble = self._group["ensemble"].to_numpy()
+        ensembles = np.stack([draws[ensemble == e].T[:, :, None] for e in np.unique(ensemble)])
+        return draws.size / float(convergence.autocorrelation_time(ensembles)[0])
+
+    def __repr__(self) -> str:
+        state = "converged" if self.converged else "NOT CONVERGED"
+        failed = ", ".join(f"{status} {share:.2%}" for status, share in self.failures.items())
+        solves = f"; failed solves of {self.log_posterior_calls} proposals: {failed or 'none'}"
+        table = self.summary().to_string(float_format="{:.5g}".format)
+        return f"Posterior ({state}: {self.reason}{solves})\n{table}"
+
+
+def _described(draws: np.ndarray, ess: float) -> dict[str, float]:
+    low, median, high = np.quantile(draws, [0.05, 0.5, 0.95])
+    sd = draws.std(ddof=1)
+    return {
+        "mean": draws.mean(),
+        "sd": sd,
+        "q05": low,
+        "q50": median,
+        "q95": high,
+        "mcse_mean": sd / np.sqrt(ess),
+        "ess": ess,
+    }
+
+
+def _table(rows: dict[str, dict[str, float]]) -> pd.DataFrame:
+    table = pd.DataFrame.from_dict(rows, orient="index")
+    table.attrs["interval"] = "90 % equal-tailed: q05 to q95"
+    return table
+
+
+MOST = {CHAIN: 20, DRAW: 5}
+
+
+def posterior_predictive(problem: Problem, posterior: xr.Dataset, time: dict[str, str], seed: int) -> xr.Dataset:
+    """Return replicates of the measured mean periods, noise included, at a few draws of a few walkers.
+
+    Parameters
+    ----------
+    problem : Problem
+        With its anchors at the estimate.
+    posterior : Dataset
+        Draws of all parameters, dims (chain, draw).
+    time : dict of str to str
+        Name of each experiment's time axis.
+    seed : int
+
+    Returns
+    -------
+    Dataset
+        Variables ``<experiment> <channel>`` with dims (chain, draw, time axis); ``largest_multiplier``, the modulus of
+        the largest Floquet multiplier, with dims (chain, draw, experiment). NaN where a solve fails.
+    """
+    chosen = posterior.isel({dim: _spread(posterior.sizes[dim], most) for dim, most in MOST.items()})
+    shape = chosen.sizes[CHAIN], chosen.sizes[DRAW]
+    theta, noise = (
+        np.array([column(chosen, name).ravel() for name in names]).reshape(len(names), -1).T
+        for names in (problem.names, problem.noise_names)
+    )
+    if not problem.noise_names:
+        noise = np.empty((len(theta), 0))
+    components = problem.likelihood.simulate(noise, np.random.default_rng(seed))
+    solved, variables, largest = problem.responses.solve(theta, keep=True), {}, []
+    for e in problem.experiments:
+        observation, found = problem.observations[e.name], solved[e.name]
+        own, components = components[: len(observation.blocks)], components[len(observation.blocks) :]
+        failed = found.status != CONVERGED
+        for channel, values in observation.replicates(found.response, own).items():
+            values[failed] = np.nan
+            variables[f"{e.name} {channel}"] = ((CHAIN, DRAW, time[e.name]), values.reshape(*shape, -1))
+        largest.append(problem.responses.largest_multipliers(theta, e.name, found).reshape(shape))
+    variables["largest_multiplier"] = ((CHAIN, DRAW, EXPERIMENT), np.stack(largest, axis=-1))
+    return xr.Dataset(variables, coords=chosen.coords)
+
+
+def orbits(problem: Problem, theta: np.ndarray, time: dict[str, str]) -> xr.Dataset:
+    """Return the states, turns included, of every experiment's orbit at one θ (names,).
+
+    Returns
+    -------
+    Dataset
+        Variables ``<experiment> <state>`` over the experiment's time axis.
+    """
+    return xr.Dataset(
+        {
+            f"{name} {state}": ((time[name],), values)
+            for name, solution in problem.solve(theta).items()
+            for state, values in solution.states.items()
+        },
+        coords={time[e.name]: e.time for e in problem.experiments},
+    )
+
+
+def _spread(size: int, wanted: int) -> np.ndarray:
+    """Return at most so many indices, equally spaced."""
+    return np.linspace(0, size - 1, min(size, wanted)).astype(int)
+
+
+ENSEMBLE = "ensemble"
+
+
+def gather(
+    density: SamplingDensity,
+    kept: np.ndarray,
+    log_density: np.ndarray,
+    *,
+    converged: bool,
+    reason: str,
+    acceptance: float,
+    seed: int,
+) -> Posterior:
+    """Return the posterior that chains in sampling coordinates hold.
+
+    Parameters
+    ----------
+    density : SamplingDensity
+        With the counts of calls and failures of all ensembles.
+    kept : array (ensembles, steps, walkers, coordinates)
+    log_density : array (ensembles, steps, walkers)
+    converged, reason, acceptance, seed
+        See `Posterior`.
+    """
+    problem, labels = density.problem, density.labels
+    data = tree(problem, *density.to_natural(kept), log_density, seed)
+    data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason}
+    tau = convergence.autocorrelation_time(kept)
+    return Posterior(
+        data=data,
+        converged=converged,
+        reason=reason,
+        tau=dict(zip(labels, tau.tolist(), strict=True)),
+        ess=dict(zip(labels, (log_density.size / tau).tolist(), strict=True)),
+        rhat=dict(zip(labels, convergence.rhat(kept).tolist(), strict=True)),
+        acceptance=acceptance,
+        failures={status: count / density.calls for status, count in density.failures.items()},
+        log_posterior_calls=density.calls,
+        seed=seed,
+    )
+
+
+def tree(problem: Problem, theta: np.ndarray, noise: np.ndarray, log_density: np.ndarray, seed: int) -> xr.DataTree:
+    """Return draws as the groups of `Posterior.data`.
+
+    Parameters
+    ----------
+    problem : Problem
+        With its anchors set.
+    theta : array (ensembles, steps, walkers, names)
+        Natural values.
+    noise : array (ensembles, steps, walkers, noise_names)
+    log_density : array (ensembles, steps, walkers)
+    seed : int
+        Of the replicates.
+    """
+    ensembles, steps, walkers = log_density.shape
+    best = theta.reshape(-1, theta.shape[-1])[np.argmax(log_density)]
+    theta, noise, lp = (_by_chain(values) for values in (theta, noise, log_density[..., None]))
+    coords = {
+        CHAIN: np.arange(ensembles * walkers),
+        DRAW: np.arange(steps),
+        ENSEMBLE: (CHAIN, np.repeat(np.arange(ensembles), walkers)),
+    }
+    posterior, time = _variables(problem, theta, noise).assign_coords(coords), _time_axes(problem)
+    status = np.where(np.isfinite(lp[..., 0]), CONVERGED, NOT_FINITE).astype(np.int8)
+    meanings = {
+        "flag_values": list(range(len(STATUSES))),
+        "flag_meanings": " ".join(s.replace(" ", "_") for s in STATUSES),
+    }
+    result = xr.DataTree.from_dict(
+        {
+            "posterior": posterior,
+            "sample_stats": xr.Dataset(
+                {"lp": ((CHAIN, DRAW), lp[..., 0]), "status": ((CHAIN, DRAW), status, meanings)}, coords=coords
+            ),
+            "posterior_predictive": posterior_predictive(problem, posterior, time, seed),
+            "orbits": orbits(problem, best, time),
+            "observed_data": _signals(problem, "outputs"),
+            "constant_data": _signals(problem, "inputs"),
+        }
+    )
+    result.attrs = {
+        "fingerprint": fingerprint(problem),
+        "synthetic": int(any(e.synthetic for e in problem.experiments)),
+        "bayesperiodic": importlib.metadata.version("bayesperiodic"),
+        "emcee": emcee.__version__,
+    }
+    return result
+
+
+def _by_chain(values: np.ndarray) -> np.ndarray:
+    """Return values (ensembles, steps, walkers, columns) as (chains, draws, columns)."""
+    ensembles, steps, walkers, columns = values.shape
+    return values.transpose(0, 2, 1, 3).reshape(ensembles * walkers, steps, columns)
+
+
+def _variables(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> xr.Dataset:
+    """Return θ (chains, draws, names) and noise parameters (chains, draws, noise_names) as labelled variables."""
+    columns = {name: theta[..., i] for i, name in enumerate(problem.names)}
+    columns |= _fixed_locals(problem, theta.shape[:-1])
+    columns |= {name: noise[..., i] for i, name in enumerate(problem.noise_names)}
+    dims = {name.partition("[")[0]: _dims(problem, name) for name in (*problem.names, *problem.noise_names)}
+    coords = {CHANNEL: list(problem.channels), EXPERIMENT: [e.name for e in problem.experiments]}
+    noises = {name.partition("[")[0] for name in problem.noise_names}
+    return xr.Dataset(
+        {
+            variable: (
+                *packed,
+                _noise_attributes(problem, variable) if variable in noises else _unit(problem, variable),
+            )
+            for variable, packed in pack(columns, dims, coords).items()
+        },
+        coords=coords,
+    )
+
+
+def _fixed_locals(problem: Problem, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """Return the values of local parameters in the experiments where they are fixed."""
+    return {
+        full_name(plain, (run,)): np.full(shape, parameter_map.fixed[plain])
+        for plain in local_names(problem.names)
+        for run, parameter_map in problem.parameter_maps.items()
+        if plain in parameter_map.fixed
+    }
+
+
+def _dims(problem: Problem, name: str) -> tuple[str, ...]:
+    """Return the dims, after chain and draw, of the variable that a full name belongs to."""
+    if "[" not in name:
+        return ()
+    if name in problem.names or name.startswith(f"{SCALE}["):
+        return (EXPERIMENT,)
+    return (CHANNEL,) if problem.noise.per == CHANNEL else (CHANNEL, EXPERIMENT)
+
+
+def _unit(problem: Problem, parameter: str) -> dict[str, str]:
+    return {"units": "s" if parameter == SHIFT else problem.model.units.get(parameter, "")}
+
+
+def _noise_attributes(problem: Problem, variable: str) -> dict[str, str]:
+    """Return the noise model's name, and the unit of each channel's variance."""
+    units = problem.model.units if variable == "variance" else {}
+    each = {f"units of {channel}": squared(units[channel]) for channel in problem.channels if channel in units}
+    return {NOISE: problem.noise.name} | each
+
+
+def _signals(problem: Problem, kind: str) -> xr.Dataset:
+    return xr.Dataset(
+        {
+            f"{experiment.name} {channel}": ((_time(experiment),), values)
+            for experiment in problem.experiments
+            for channel, values in getattr(experiment, kind).items()
+        },
+        coords={_time(experiment): experiment.time for experiment in problem.experiments},
+    )
+
+
+def _time_axes(problem: Problem) -> dict[str, str]:
+    return {experiment.name: _time(experiment) for experiment in problem.experiments}
+
+
+def _time(experiment: Experiment) -> str:
+    """Return the name of an experiment's time axis, which no channel can have."""
+    return f"{experiment.name} time [s]"

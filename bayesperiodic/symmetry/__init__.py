@@ -1,0 +1,1 @@
+"""Structural identifiability: symmetries of a model."""

@@ -1,0 +1,422 @@
+"""Structural identifiability: which parameters the equations and the measured channels can determine at all."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import pandas as pd
+import sympy as sp
+
+from bayesperiodic import _checks
+from bayesperiodic._io import Result
+from bayesperiodic.models.model import Model
+from bayesperiodic.symmetry.determining import Generator, determining_equations, generators_of
+from bayesperiodic.symmetry.invariants import (
+    Directions,
+    Flow,
+    coefficients_of,
+    combinations_of,
+    directions_of,
+    flow_of,
+    verified,
+)
+from bayesperiodic.symmetry.system import System, system_of
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """A change of parameters, and of states that are not measured, that leaves all measured outputs as they are.
+
+    Attributes
+    ----------
+    kind : {"scaling", "shift", "other"}
+        "shift" adds a constant to a parameter or a state, and may transform others along with it.
+    parameters : tuple of str
+        Those that change: knowing any one of them removes the symmetry.
+    generator : dict of str to str
+        Parameter or state -> its infinitesimal change.
+    transformation : dict of str to str
+        Parameter or state -> its image under the finite transformation, whose amount is `amount`; confirmed by exact
+        substitution in the equations. Empty if no closed form was found.
+    amount : str
+        Name of the amount: a factor > 0 of scalings, otherwise a number that is 0 where nothing changes.
+    factor : tuple of tuple of str
+        The matrix that the transformation multiplies the equations by.
+    no_help : tuple of str
+        Determined or other parameters that enter the same combinations, but do not remove the symmetry if known.
+    """
+
+    kind: str
+    parameters: tuple[str, ...]
+    generator: dict[str, str]
+    transformation: dict[str, str]
+    amount: str
+    factor: tuple[tuple[str, ...], ...]
+    no_help: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        if self.transformation:
+            return f"{self.kind}: {', '.join(f'{name} → {image}' for name, image in self.transformation.items())}"
+        changes = ", ".join(f"d({name}) = {move}" for name, move in self.generator.items())
+        return f"{self.kind}: {changes} (infinitesimally; no closed form found)"
+
+
+@dataclass(frozen=True)
+class Structure(Result):
+    """Which parameters, and which combinations of them, equations and measured outputs determine at all.
+
+    Attributes
+    ----------
+    model : str
+        Its name.
+    outputs : tuple of str
+        What is measured.
+    known : tuple of str
+        Parameters taken as known.
+    table : DataFrame
+        A row a parameter that is not known. verdict: "determined", "only in combination", "not determined" (no
+        combination with it either) or "does not appear"; enters: the combinations (of a determined parameter: the
+        coefficients without undetermined ones) by which it enters; fix: the numbers, from 1, of the symmetries that
+        knowing it removes; partners: others that determine it once one of them is known.
+    combinations : tuple of str
+        Independent combinations that are determined, of the parameters that are not; texts that `derive` takes. With
+        directions that are `unexplained`, confirmed along these at random values only.
+    symmetries : tuple of Symmetry
+        Independent of each other.
+    to_fix : tuple of str
+        The first parameters, in the model's order, that leave no symmetry once they are known.
+    rank : int or None
+        Number of directions of the parameters (without those that do not appear) that the outputs react to, the rank
+        of exact sensitivities at random values of the parameters; None where it could not be computed.
+    points : int
+        Number of these random values.
+    unexplained : tuple of str
+        Parameters in directions that no output reacted to and that no symmetry found explains.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> found = bp.structure(bp.models.duffing, fixed=["k"])
+    >>> found.complete, found.table["verdict"].to_dict()
+    (True, {'m': 'determined', 'c': 'determined', 'k3': 'determined'})
+    >>> swing = bp.structure(bp.models.pendulum, fixed=["a", "g", "v0"])
+    >>> swing.symmetries
+    (scaling: m → m*t, k1 → k1*t, k2 → k2*t, k3 → k3*t,)
+    """
+
+    model: str
+    outputs: tuple[str, ...]
+    known: tuple[str, ...]
+    table: pd.DataFrame
+    combinations: tuple[str, ...]
+    symmetries: tuple[Symmetry, ...]
+    to_fix: tuple[str, ...]
+    rank: int | None
+    points: int
+    unexplained: tuple[str, ...]
+
+    @property
+    def complete(self) -> bool:
+        """True if the rank confirms that there is no symmetry but those found."""
+        return self.rank is not None and not self.unexplained
+
+    def __repr__(self) -> str:
+        known = f"; known: {', '.join(self.known)}" if self.known else ""
+        lines = [f"Structure of {self.model}, measured: {', '.join(self.outputs)}{known}"]
+        lines += self._verdicts() + self._changes()
+        return "\n".join([*lines, f"  {self._confirmation()}"])
+
+    def _verdicts(self) -> list[str]:
+        named = {v: list(self.table.index[self.table["verdict"] == v]) for v in self.table["verdict"].unique()}
+        lines = []
+        if names := named.get("determined"):
+            lines.append(f"  Determined: {', '.join(map(self._through, names))}.")
+        if names := named.get("only in combination"):
+            missing = len(names) - len(self.to_fix) - len(self.combinations)
+            more = f" and {missing} more without a closed form" * (missing > 0)
+            forms = f", which enter only by {', '.join(self.combinations)}{more}" if self.combinations else ""
+            lines.append(f"  Only in combination: {', '.join(names)}{forms}.")
+        for verdict in ("not determined", "does not appear"):
+            if names := named.get(verdict):
+                lines.append(f"  {verdict.capitalize()}: {', '.join(names)}.")
+        return lines
+
+    def _through(self, name: str) -> str:
+        """Return a determined parameter, with what determines it if it enters a combination with others too."""
+        terms = str(self.table.at[name, "enters"])
+        shared = any(name in symmetry.no_help for symmetry in self.symmetries)
+        return f"{name} through {_listed(terms.split('; '), 'and')}" if shared and terms else name
+
+    def _changes(self) -> list[str]:
+        if not self.symmetries:
+            return []
+        lines = ["  Changes that leave the equations and the outputs as they are, confirmed by exact substitution:"]
+        for number, symmetry in enumerate(self.symmetries, 1):
+            wanted = "" if len(symmetry.parameters) == 1 else "one of "
+            helpless = f"; fixing {_listed(symmetry.no_help, 'or')} does not help" if symmetry.no_help else ""
+            lines += [f"    {number}. {symmetry!r}", f"       Fix {wanted}{', '.join(symmetry.parameters)}{helpless}."]
+        if len(self.to_fix) == 1:
+            return lines
+        lines.append(f"  {len(self.to_fix)} parameters must be fixed, for example {_listed(self.to_fix, 'and')}.")
+        order = list(self.table.index)
+        groups = {tuple(sorted((n, *p.split(", ")), key=order.index)) for n, p in self.table["partners"].items() if p}
+        if groups:
+            told = [", ".join(group) for group in sorted(groups, key=lambda g: order.index(g[0]))]
+            lines.append(f"  Knowing one of a group determines the rest of it: {'; '.join(told)}.")
+        return lines
+
+    def _confirmation(self) -> str:
+        if self.rank is None:
+            return "The rank of exact sensitivities is not available, so further symmetries are not ruled out."
+        appearing = int((self.table["verdict"] != "does not appear").sum())
+        if not appearing:
+            return "No unknown parameter appears."
+        said = f"Rank of exact sensitivities at {self.points} random parameter values: {self.rank} of {appearing}"
+        if self.unexplained:
+            return f"{said}; further changes, for which no form was found, involve {', '.join(self.unexplained)}."
+        return f"{said}, so no other change leaves the outputs as they are."
+
+
+def _listed(names: Sequence[str], conjunction: str) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {conjunction} {names[-1]}"
+
+
+def written(expression: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
+    """Return an expression as text such as "k1/(m*l**2)".
+
+    Parameters
+    ----------
+    expression : expression
+    names : dict
+        Symbol -> name, in the order in which factors and terms are written.
+    """
+    order = {symbol: place for place, symbol in enumerate(names)}
+    number, rest = sp.factor_terms(expression).as_coeff_Mul()
+    negative = number.is_negative
+    above = [(sp.Integer(abs(number.p)), sp.S.One)] if abs(number.p) != 1 else []
+    below = [(sp.Integer(number.q), sp.S.One)] if number.q != 1 else []
+    for factor in sorted(sp.Mul.make_args(rest), key=lambda f: _place(f, order)):
+        base, power = (factor, sp.S.One) if isinstance(factor, sp.exp) else factor.as_base_exp()
+        if base.is_Add and power.is_Integer and _terms(base, order)[0].as_coeff_Mul()[0] < 0:
+            base, negative = -base, negative ^ (power.is_odd)
+        if base != 1:
+            rational = power.is_Rational
+            (below if rational and power < 0 else above).append((base, abs(power) if rational else power))
+    several = len(above) + len(below) > 1 or bool(negative)
+    upper = "*".join(_power(base, power, names, several) for base, power in above) or "1"
+    lower = "*".join(_power(base, power, names, True) for base, power in below)
+    fraction = upper if not below else f"{upper}/{lower}" if len(below) == 1 else f"{upper}/({lower})"
+    return f"-{fraction}" if negative else fraction
+
+
+def _terms(total: sp.Expr, order: Mapping[sp.Symbol, int]) -> list[sp.Expr]:
+    return sorted(total.args, key=lambda term: (len(term.free_symbols), _place(term, order)))
+
+
+def _place(factor: sp.Expr, order: Mapping[sp.Symbol, int]) -> tuple[bool, int, str]:
+    places = sorted(order.get(s, len(order)) for s in factor.free_symbols)
+    return not factor.as_base_exp()[0].is_Symbol, places[0] if places else -1, str(factor)
+
+
+def _power(base: sp.Expr, power: sp.Expr, names: Mapping[sp.Symbol, str], beside: bool) -> str:
+    text = _base(base, names)
+    simple = base.is_Atom or base.is_Function
+    if power == 1:
+        return f"({text})" if base.is_Add and beside else text
+    exponent = str(power) if power.is_Integer else f"({written(power, names)})"
+    return f"{text}**{exponent}" if simple else f"({text})**{exponent}"
+
+
+def _base(base: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
+    if base.is_Symbol:
+        return names.get(base, str(base))
+    if base.is_Add:
+        order = {symbol: place for place, symbol in enumerate(names)}
+        first, *others = [written(term, names) for term in _terms(base, order)]
+        return first + "".join(f" - {t[1:]}" if t.startswith("-") else f" + {t}" for t in others)
+    if base.is_Function:
+        return f"{base.func.__name__.lower()}({', '.join(written(a, names) for a in base.args)})"
+    return str(base.xreplace({s: sp.Symbol(n) for s, n in names.items()}))
+
+
+def structure(
+    model: Model, *, outputs: Iterable[str] | None = None, fixed: Mapping[str, float] | Iterable[str] = ()
+) -> Structure:
+    """Find which parameters, and which combinations of them, can be determined from the measured outputs at all.
+
+    Everything is taken at its best: no noise, no end of data, any inputs, frequencies and motions, and parameters in
+    general position. What is found undetermined here no experiment can determine; the converse needs the data.
+
+    Two searches meet. One is for transformations of the parameters and the states that map solutions to solutions and
+    leave outputs, inputs and time alone (Lie symmetries, as in [1]_ [2]_; those of the states affine in states and
+    inputs). They obey linear equations, solved exactly over the rational functions of the parameters; a finite
+    transformation is accepted only if substitution in the symbolic equations confirms it. The other is the rank of
+    exact sensitivities of the outputs' Taylor coefficients at random values, beyond which no symmetry of any kind can
+    exist [3]_. Where the two add up to the number of parameters, nothing is left open.
+
+    Parameters
+    ----------
+    model : Model
+    outputs : iterable of str, optional
+        The measured ones; by default all.
+    fixed : iterable of str, or mapping of str to number, optional
+        Parameters that are known. A value of zero removes their terms, any other is taken as general.
+
+    Returns
+    -------
+    Structure
+
+    Raises
+    ------
+    ValueError
+        For an unknown output or parameter, no output, or a value of zero that the equations divide by.
+
+    Notes
+    -----
+    "Determined" means up to isolated alternatives: discrete ambiguities, such as the common sign of two factors, are
+    not looked for. A jump (not a corner) whose place depends on a parameter is seen by the symmetries but not by the
+    sensitivities, so that no rank is given then.
+
+    References
+    ----------
+    .. [1] J. W. T. Yates, N. D. Evans, M. J. Chappell, Structural identifiability analysis via symmetries of
+       differential equations, Automatica 45, 2009, 2585-2591.
+    .. [2] B. Merkt, J. Timmer, D. Kaschek, Higher-order Lie symmetries in identifiability and predictability analysis
+       of dynamic models, Physical Review E 92, 2015, 012920.
+    .. [3] A. Sedoglavic, A probabilistic algorithm to test local algebraic observability in polynomial time, Journal
+       of Symbolic Computation 33, 2002, 735-755.
+
+    Examples
+    --------
+    >>> import bayesperiodic as bp
+    >>> found = bp.structure(bp.models.pendulum, fixed=["a", "g", "v0"])
+    >>> found.combinations
+    ('k1/(m*l**2)', 'k2/(m*l**2)', 'k3/(m*l**2)')
+    >>> found.table.verdict["l"]
+    'determined'
+    """
+    measured = model.outputs if outputs is None else tuple(outputs)
+    for name in measured:
+        _checks.one_of("outputs", name, model.outputs)
+    if not measured:
+        raise ValueError("outputs: () is not allowed; at least one must be measured.")
+    known = tuple(fixed)
+    for name in known:
+        _checks.one_of("fixed", name, model.parameters)
+    values = dict(fixed) if isinstance(fixed, Mapping) else {}
+    zeros = [name for name, value in values.items() if _checks.finite_number(f"fixed[{name!r}]", value) == 0.0]
+    whole = system_of(model, measured)
+    system = whole.given(known, {whole.parameters[name]: sp.S.Zero for name in zeros})
+    for name in zeros:
+        if any(e.has(sp.zoo, sp.nan, sp.oo) for e in (*system.equations, *system.outputs.values())):
+            raise ValueError(f"fixed: {name} = 0 is not allowed; the equations divide by it.")
+    return analysed(model.name, system, known)
+
+
+def analysed(name: str, whole: System, known: tuple[str, ...]) -> Structure:
+    """Return the structure of a symbolic system, in which parameters may have been replaced by expressions."""
+    system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if n in whole.appearing})
+    names = {s: n for n, s in (whole.parameters | whole.known).items()}
+    kinds, generators, flows = _symmetries(system)
+    directions = directions_of(system, generators)
+    coefficients = coefficients_of(system)
+    found = combinations_of(system, generators, [f for f in flows if f], directions, coefficients)
+    combinations = {c: written(c, names).removeprefix("-") for c in found}
+    return Structure(
+        model=name,
+        outputs=tuple(system.outputs),
+        known=known,
+        table=_table(whole, system, generators, directions, coefficients, combinations, names),
+        combinations=tuple(combinations.values()),
+        symmetries=tuple(
+            _symmetry(system, kind, generator, flow, combinations, names)
+            for kind, generator, flow in zip(kinds, generators, flows, strict=True)
+        ),
+        to_fix=directions.smallest_set(),
+        rank=len(system.parameters) - len(directions.rows) if directions.points or not system.parameters else None,
+        points=directions.points,
+        unexplained=directions.unexplained,
+    )
+
+
+def _symmetries(system: System) -> tuple[list[str], list[Generator], list[Flow | None]]:
+    """Return the kinds of the symmetries, their generators and, where there is a closed one, their finite forms."""
+    found = generators_of(determining_equations(system)) if system.parameters else []
+    flows = [verified(system, flow) if (flow := flow_of(g)) else None for g in found]
+    return (
+        [_kind(g) for g in found],
+        [flow.generator if flow else g for g, flow in zip(found, flows, strict=True)],
+        flows,
+    )
+
+
+def _kind(generator: Generator) -> str:
+    if generator.weights:
+        return "scaling"
+    constant = any(move.is_number for move in (*generator.parameters.values(), *generator.states.values()))
+    return "shift" if constant else "other"
+
+
+def _table(
+    whole: System,
+    system: System,
+    generators: Sequence[Generator],
+    directions: Directions,
+    coefficients: Mapping[sp.Expr, bool],
+    combinations: Mapping[sp.Expr, str],
+    names: Mapping[sp.Symbol, str],
+) -> pd.DataFrame:
+    moved = directions.moved
+    unsure = {system.parameters[n] for n in moved}
+    rows = {}
+    for parameter, symbol in whole.parameters.items():
+        verdict, enters, partners = "determined", [t for c, t in combinations.items() if symbol in c.free_symbols], []
+        if parameter not in system.parameters:
+            verdict = "does not appear"
+        elif parameter in moved:
+            alone = directions.alone(parameter)
+            verdict = "not determined" if alone else "only in combination"
+            partners = [] if alone else directions.partners(parameter)
+        else:
+            own = [c for c in coefficients if symbol in c.free_symbols and not c.free_symbols & unsure]
+            own = [] if any(c.free_symbols == {symbol} for c in own) else own
+            own.sort(key=lambda c: not coefficients[c])
+            enters = [written(c, names).removeprefix("-") + " (in the drive)" * coefficients[c] for c in own]
+        rows[parameter] = {
+            "verdict": verdict,
+            "enters": "; ".join(enters),
+            "fix": ", ".join(str(i) for i, g in enumerate(generators, 1) if parameter in g.parameters),
+            "partners": ", ".join(partners),
+        }
+    return pd.DataFrame.from_dict(rows, orient="index", columns=["verdict", "enters", "fix", "partners"])
+
+
+def _symmetry(
+    system: System,
+    kind: str,
+    generator: Generator,
+    flow: Flow | None,
+    combinations: Mapping[sp.Expr, str],
+    names: Mapping[sp.Symbol, str],
+) -> Symmetry:
+    symbols = system.parameters | {s: system.symbols[s] for s in generator.states}
+    moves = generator.parameters | generator.states
+    shared = [c.free_symbols for c in combinations if c.free_symbols & {symbols[n] for n in generator.parameters}]
+    texts = {**names, **{system.symbols[s]: s for s in (*system.symbols,)}}
+    amount = ""
+    if flow is not None:
+        wanted = ("t", "scale", "scale_factor") if flow.amount.is_positive else ("delta", "shift_by", "amount")
+        amount = next(n for n in wanted if n not in texts.values())
+        texts[flow.amount] = amount
+    return Symmetry(
+        kind=kind,
+        parameters=tuple(generator.parameters),
+        generator={n: written(move, texts) for n, move in moves.items()},
+        transformation={n: written(flow.images[symbols[n]], texts) for n in moves} if flow else {},
+        amount=amount,
+        factor=tuple(tuple(written(e, texts) for e in flow.factor.row(i)) for i in range(flow.factor.rows))
+        if flow and flow.factor
+        else (),
+        no_help=tuple(
+            n for n, s in system.parameters.items() if n not in generator.parameters and any(s in c for c in shared)
+        ),
+    )

@@ -1,0 +1,247 @@
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+import bayesperiodic as bp
+from bayesperiodic.diagnostics.design import Candidate, Information, rank_candidates
+from bayesperiodic.diagnostics.identifiability import cumulative_jensen_shannon, structure_of
+from tests.known import GEAR, LINEAR, grid, linear_experiment, linear_regressors
+from tests.periodic.test_orbits import PENDULUM
+from tests.posterior.observed import pendulum_run
+from tests.posterior.test_targets import known, model, run
+
+QUIET = {"progress": False}
+SHORT = QUIET | {"seed": 1, "ensembles": 2, "max_steps": 500}
+TRUTH = np.array([900.0, 40.0, 25.0])
+PRIORS = {"k": bp.LogNormal(800.0, 0.2), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
+WIDE = bp.Normal(0.0, 2.0)
+CUT = bp.TruncatedNormal(1.0, 1.0, 0.0, np.inf)
+
+
+@pytest.fixture(scope="module")
+def linear():
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS, fixed={"variance[force]": 9.0})
+    return problem, bp.map_estimate(problem, **QUIET)
+
+
+def one(force, value: float, sd: float, **priors) -> tuple[bp.Problem, bp.MapEstimate]:
+    """Return the problem of one number, measured with an error of this sd, and its estimate."""
+    problem = bp.Problem(
+        model("one", list(priors), lambda p: {"force": force(p)}), [run(force=value)], priors=priors,
+        fixed=known(force=sd),
+    )  # fmt: skip
+    return problem, bp.map_estimate(problem, start={name: 0.8 for name in priors}, **QUIET)
+
+
+def verdicts(problem: bp.Problem, fit: bp.MapEstimate, **changes) -> dict[str, str]:
+    posterior = bp.sample(problem, fit, **(SHORT | changes))
+    return bp.identifiability(problem, fit, posterior).verdicts
+
+
+def test_information_is_that_of_the_regression(linear):
+    """In ln k, c and coulomb: sds with all others known and unknown, in prior sds, from XᵀX/9."""
+    problem, fit = linear
+    found = Information.of(problem, fit)
+    slopes = np.array([fit.theta["k"], 1.0, 1.0])
+    design = linear_regressors(0.05, 2.0, grid(40)) * slopes
+    matrix = design.T @ design / 9.0
+    assert found.matrix == pytest.approx(matrix, rel=1e-8)
+    assert found.prior_sd == pytest.approx([0.2, 20.0, 10.0], rel=1e-9)
+    assert found.alone == pytest.approx(np.diag(matrix) ** -0.5 / [0.2, 20.0, 10.0], rel=1e-8)
+    assert found.together == pytest.approx(np.sqrt(np.diag(np.linalg.inv(matrix))) / [0.2, 20.0, 10.0], rel=1e-8)
+    assert found.collinearity == pytest.approx(found.together / found.alone)
+    scaled = matrix * np.outer([1.0, 20.0, 10.0], [1.0, 20.0, 10.0])
+    assert found.spectrum == pytest.approx(np.linalg.eigvalsh(scaled)[::-1], rel=1e-8)
+    assert found.condition == pytest.approx(np.linalg.cond(scaled), rel=1e-8)
+
+
+@pytest.mark.parametrize(("moved", "left"), [(1e-5, 0.01), (0.1, np.inf)])
+def test_an_open_direction_counts_for_what_it_moves(moved, left):
+    """Nothing is known along (moved, 1, 1); k is known to 0.01 prior sds but for that."""
+    nothing = np.array([moved, 1.0, 1.0])
+    directions = np.linalg.qr(np.column_stack([nothing, [1.0, 0.0, 0.0], [0.0, 1.0, -1.0]]))[0]
+    matrix = directions @ np.diag([0.0, 1e4, 4.0]) @ directions.T
+    found = Information(("k", "c", "shift"), np.zeros(3), np.zeros(3, dtype=bool), matrix, np.ones(3))
+    assert found.together[0] == pytest.approx(left, rel=1e-3)
+    assert np.isinf(found.together[1:]).all()
+
+
+def test_contraction_is_that_of_the_normal_posterior(linear):
+    """With draws and without; the draws' within four of the Monte Carlo errors that are stated with it."""
+    problem, fit = linear
+    table = bp.identifiability(problem, fit, profile=False).table
+    design = linear_regressors(0.05, 2.0, grid(40))
+    posterior = np.linalg.inv(design.T @ design / 9.0 + np.diag([0.0, 20.0**-2, 10.0**-2]))
+    expected = 1.0 - np.diag(posterior)[1:] / [20.0**2, 10.0**2]
+    assert table.loc[["c", "coulomb"], "contraction"].to_numpy() == pytest.approx(expected, abs=2e-3)
+    drawn = bp.identifiability(problem, fit, bp.sample(problem, fit, **SHORT), profile=False).table
+    off = drawn.loc[["c", "coulomb"], "contraction"].to_numpy() - expected
+    assert np.all(np.abs(off) < 4 * drawn.loc[["c", "coulomb"], "contraction_mcse"] + 2e-3)
+    assert set(drawn["verdict"]) == {"determined"} and not any(drawn["remedy"])
+
+
+@pytest.mark.filterwarnings("ignore:The data do not change under")
+@pytest.mark.parametrize(
+    ("force", "prior", "combination"),
+    [(lambda p: p.a * p.b, CUT, "a*b"), (lambda p: p.a + p.b, WIDE, "a + b"), (lambda p: p.a / p.b**2, CUT, "a/b**2")],
+    ids=["product", "sum", "power"],
+)
+def test_ridges_are_named(force, prior, combination):
+    problem, fit = one(force, 1.0, 0.02, a=prior, b=prior)
+    found = bp.identifiability(problem, fit)
+    assert found.verdicts == {"a": "only in combination", "b": "only in combination"}
+    assert found.directions.loc[0, "combinations"] == combination
+    assert found.directions.loc[0, "gain"] == pytest.approx(0.0, abs=1e-6) and found.condition > 1e9
+    assert f"fix one of a, b, or report {combination}" in repr(found)
+    assert verdicts(problem, fit) == found.verdicts
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "prior", "verdict"),
+    [
+        (1.0, 0.05, WIDE, "determined"),
+        (0.05, 0.1, WIDE, "sign undetermined"),
+        (-0.9, 0.1, WIDE, "determined"),
+        (1.0, 0.25, bp.LogNormal(1.0, 0.1), "only with the prior"),
+        (1.0, 5.0, bp.LogNormal(1.0, 0.1), "not determined"),
+        (-0.1, 0.1, CUT, "only with the prior"),
+    ],
+    ids=["positive", "small", "negative", "sharp prior", "hardly measured", "cut off"],
+)
+def test_a_number_that_is_measured_directly(value, sd, prior, verdict):
+    """The probability of the wrong sign is Φ(−value/sd), within four Monte Carlo errors."""
+    problem, fit = one(lambda p: p.a, value, sd, a=prior)
+    assert bp.identifiability(problem, fit).verdicts == {"a": verdict}
+    posterior = bp.sample(problem, fit, **SHORT)
+    found = bp.identifiability(problem, fit, posterior)
+    assert found.verdicts == {"a": verdict}
+    row = found.table.loc["a"]
+    if prior is WIDE:
+        exact = stats.norm.cdf(-value / sd, scale=1.0)
+        assert row["p_negative"] == pytest.approx(exact, abs=4 * row["p_negative_mcse"] + 2e-3)
+    else:
+        assert np.isnan(row["p_negative"])
+
+
+def test_a_sign_that_the_data_cannot_see():
+    """Only a² is measured; the remedy is no further experiment."""
+    problem, fit = one(lambda p: p.a**2, 1.0, 0.1, a=WIDE)
+    posterior = bp.sample(problem, fit, **SHORT, start="prior")
+    found = bp.identifiability(problem, fit, posterior, profile=False)
+    assert found.verdicts == {"a": "sign undetermined"}
+    assert "both signs fit the data" in found.table.loc["a", "remedy"]
+    assert not found.converged and "NOT CONVERGED" in repr(found)
+
+
+def test_a_parameter_that_no_output_depends_on():
+    problem, fit = one(lambda p: p.a + 0 * p.b, 1.0, 0.05, a=WIDE, b=WIDE)
+    assert bp.identifiability(problem, fit, profile=False).verdicts == {"a": "determined", "b": "not determined"}
+
+
+def test_candidates_add_what_the_same_experiment_would(linear):
+    """Doing a run again doubles the information; with twice the amplitude each linear regressor counts four times."""
+    problem, fit = linear
+    information = Information.of(problem, fit)
+    found = rank_candidates(problem, fit, information, [Candidate("run", 2.0, 1.0), Candidate("run", 2.0, 2.0)])
+    scale = information.prior_sd
+    now = information.matrix * np.outer(scale, scale) + np.eye(3)
+    again = found[found["scale"] == 1.0].iloc[0]
+    twice = np.linalg.inv(now + information.matrix * np.outer(scale, scale))
+    assert again["gain"] == pytest.approx(-0.5 * (np.linalg.slogdet(twice)[1] + np.linalg.slogdet(now)[1]), rel=1e-6)
+    ratio = np.sqrt(np.diag(twice) / np.diag(np.linalg.inv(now)))
+    assert again[list(problem.names)].astype(float).to_numpy() == pytest.approx(ratio, rel=1e-6)
+    louder = found.iloc[0]
+    assert louder["scale"] == 2.0 and louder["k"] < again["k"] and louder["c"] < again["c"]
+
+
+def test_without_candidates_the_verdicts_are_the_same(linear):
+    problem, fit = linear
+    bare = bp.identifiability(problem, fit, profile=False, candidates=[])
+    assert bare.experiments.empty and "gain" in bare.experiments
+    assert bare.verdicts == bp.identifiability(problem, fit, profile=False).verdicts
+
+
+def test_own_candidates_are_ranked_and_unknown_runs_refused(linear):
+    problem, fit = linear
+    found = bp.identifiability(problem, fit, profile=False, candidates=[("run", 1.0, 0.5), ("run", 3.0, 2.0)])
+    assert list(found.experiments["frequency"]) == [3.0, 1.0]
+    with pytest.raises(ValueError, match="candidates: 'ran' is not known"):
+        bp.identifiability(problem, fit, profile=False, candidates=[("ran", 1.0, 0.5)])
+
+
+def test_distance_of_weighted_draws_is_that_of_their_distributions():
+    """N(0, 1) against N(½, 1), by quadrature up to the outermost draws; within 2 % at 200 000 draws."""
+    draws = np.random.default_rng(1).standard_normal(200_000)
+    weights = np.exp(0.5 * draws)
+
+    def distance(low: float, high: float, mean: float) -> float:
+        def against(x, first, second):
+            own, other = stats.norm.cdf(x, first), stats.norm.cdf(x, second)
+            return own * np.log2(2 * own / (own + other)) + (other - own) / (2 * np.log(2))
+
+        def both(x):
+            return stats.norm.cdf(x) + stats.norm.cdf(x, mean)
+
+        parts = [integrate.quad(against, low, high, args=pair, limit=200)[0] for pair in ((0.0, mean), (mean, 0.0))]
+        return np.sqrt(sum(parts) / integrate.quad(both, low, high, limit=200)[0])
+
+    exact = max(distance(draws.min(), draws.max(), 0.5), distance(-draws.max(), -draws.min(), -0.5))
+    assert cumulative_jensen_shannon(draws, weights / weights.sum()) == pytest.approx(exact, rel=0.02)
+    assert cumulative_jensen_shannon(draws, np.full(draws.size, 1.0 / draws.size)) == pytest.approx(0.0, abs=1e-7)
+
+
+def test_power_scaling_tells_the_prior_from_the_data(linear):
+    """A posterior that is the prior's reacts to it alone, one that is the data's to them."""
+    problem, fit = one(lambda p: p.a, 1.0, 5.0, a=bp.LogNormal(1.0, 0.1))
+    table = bp.identifiability(problem, fit, bp.sample(problem, fit, **SHORT), profile=False).table
+    assert table.loc["a", "prior_sensitivity"] > 0.05 > table.loc["a", "likelihood_sensitivity"]
+    problem, fit = one(lambda p: p.a, 1.0, 0.05, a=WIDE)
+    table = bp.identifiability(problem, fit, bp.sample(problem, fit, **SHORT), profile=False).table
+    assert table.loc["a", "likelihood_sensitivity"] > 0.05 > table.loc["a", "prior_sensitivity"]
+
+
+def test_it_is_saved_and_loaded(linear, tmp_path):
+    found = bp.identifiability(*linear, profile=False)
+    found.save(tmp_path / "verdict.h5")
+    assert repr(bp.load(tmp_path / "verdict.h5")) == repr(found)
+
+
+@pytest.mark.filterwarnings("ignore:The data do not change under")
+def test_what_the_equations_leave_open_is_named_whatever_the_data():
+    """In one rotation of the pendulum m, k1, k2 and k3 appear only as k/(m l²), and l is determined by the drive."""
+    fixed = {name: PENDULUM[name] for name in ("a", "g", "v0")}
+    free = {name: bp.LogNormal(PENDULUM[name], 0.5) for name in ("m", "l", "k1", "k2", "k3")}
+    problem = bp.Problem(bp.models.pendulum, [pendulum_run()], priors=free, fixed=fixed, scheme="central4")
+    fit = bp.map_estimate(problem, start={name: PENDULUM[name] for name in free}, **QUIET)
+    found = bp.identifiability(problem, fit, profile=False)
+    assert found.verdicts["l"] == "determined"
+    assert {found.verdicts[name] for name in ("m", "k1", "k2", "k3")} == {"only in combination"}
+    assert found.structure.combinations == ("k1/(m*l**2)", "k2/(m*l**2)", "k3/(m*l**2)")
+    assert "fix one of m, k1, k2, k3, or report k1/(m*l**2), k2/(m*l**2), k3/(m*l**2)" in repr(found)
+    known = bp.Problem(
+        bp.models.pendulum, [pendulum_run()], priors={n: free[n] for n in ("l", "k2", "k3")}, scheme="central4",
+        fixed=fixed | {"m": 0.1, "k1": PENDULUM["k1"]},
+    )  # fmt: skip
+    assert not structure_of(known).symmetries
+
+
+def test_structure_knows_ties_and_fixed_zeros():
+    """The temperature scaling of the landing gear ends with theta5 fixed, the shift with theta12 at zero."""
+    gear = bp.models.landing_gear("displacement")
+    wave = np.cos(2 * np.pi * grid(40))
+    noise = np.random.default_rng(1).standard_normal((2, 40))
+    run = bp.Experiment(
+        "run", 0.1, {"force": 5e3 + noise[0], "pressure": 1e6 + noise[1]}, {"displacement": 0.12 + 0.05 * wave},
+        samples=40,
+    )  # fmt: skip
+
+    def found(free: tuple[str, ...], tied: dict[str, str]) -> bp.Structure:
+        priors = {name: bp.Normal(GEAR[name], 0.1 * abs(GEAR[name]) + 0.1) for name in free}
+        fixed = {name: value for name, value in GEAR.items() if name not in (*free, *tied)}
+        return structure_of(bp.Problem(gear, [run], priors=priors, fixed=fixed, tied=tied))
+
+    assert not found(("theta4", "theta6", "theta16"), {"theta11": "-1e5*theta4"}).symmetries
+    loose = found(("theta5", "theta15", "theta16", "theta17"), {})
+    assert [s.parameters for s in loose.symmetries] == [("theta5", "theta15", "theta16", "theta17")]
+    held = found(("theta5", "theta15", "theta16"), {"theta17": "-293*theta16/2"})
+    assert not held.symmetries

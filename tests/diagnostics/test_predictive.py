@@ -1,0 +1,370 @@
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.diagnostics.adequacy import TESTS
+from tests.diagnostics.exact import draw, posterior_of
+from tests.known import LINEAR, RUNAWAY, grid, linear_experiment, linear_regressors
+from tests.posterior.observed import DUFFING, DUFFING_PRIORS, SAMPLES
+from tests.posterior.test_gradient import CASES
+
+TRUTH = np.array([900.0, 40.0, 25.0])
+FLAT = {"k": bp.Normal(900.0, 1e5), "c": bp.Normal(40.0, 1e4), "coulomb": bp.Normal(25.0, 1e4)}
+
+# What a Duffing model without the quadratic stiffness k2 cannot do: the even harmonics.
+ASYMMETRIC = bp.Model(
+    "asymmetric_duffing",
+    states=["x"],
+    inputs=["force"],
+    parameters=["m", "c", "k", "k2", "k3"],
+    equations=lambda s, p, u: [p.m * s.ddx + p.c * s.dx + p.k * s.x + p.k2 * s.x**2 + p.k3 * s.x**3 - u.force],
+    outputs=lambda s, p, u: {"displacement": s.x},
+)
+
+# The data determine the product a b alone, an exact scaling symmetry.
+PRODUCT = bp.Model(
+    "product",
+    states=["w"],
+    inputs=["x"],
+    parameters=["a", "b"],
+    equations=lambda s, p, u: [s.dw + s.w - u.x],
+    outputs=lambda s, p, u: {"force": p.a * p.b * u.x},
+)
+
+
+def test_band_has_its_closed_form_and_covers_the_data(solved):
+    """The predictive variance of a linear model is v + xᵀ C x; 90 % of the 40 samples, binomial band at 99 %."""
+    problem, fit, posterior = solved
+    prediction = bp.predict(problem, posterior, draws=1000)
+    design = linear_regressors(0.05, 2.0, grid(40))
+    variance = posterior.draws("variance[force]").mean()
+    sd = np.sqrt(variance + np.einsum("ni,ij,nj->n", design, fit.covariance.to_numpy(), design))
+    low, high = prediction.low["run"]["force"], prediction.high["run"]["force"]
+    assert (high - low) / 2 == pytest.approx(1.6449 * sd, rel=0.08)
+    assert prediction.median["run"]["force"] == pytest.approx(design @ list(fit.theta.values()), abs=0.5)
+    inside = np.sum((problem.experiments[0].outputs["force"] > low) & (problem.experiments[0].outputs["force"] < high))
+    assert 30 <= inside <= 40
+    assert prediction.failed == 0
+
+
+def test_too_few_draws_are_refused(solved):
+    problem, _, posterior = solved
+    with pytest.raises(ValueError, match="draws: 5 is not allowed"):
+        bp.predict(problem, posterior, draws=5)
+
+
+def test_draws_of_another_problem_are_refused(solved):
+    problem, _, posterior = solved
+    other = bp.Problem(PRODUCT, [replace(problem.experiments[0])], priors={n: bp.Normal(1.0, 1.0) for n in "ab"})
+    with pytest.raises(ValueError, match="posterior: it has no 'a', 'b', only 'k'.*; give draws of this problem"):
+        bp.predict(other, posterior)
+
+
+def test_draws_that_have_not_converged_are_told(solved):
+    problem, _, posterior = solved
+    assert bp.predict(problem, posterior, draws=20).note == ""
+    unfinished = replace(posterior, converged=False, reason="max_steps = 250 reached")
+    assert "have not converged (max_steps = 250 reached)" in repr(bp.predict(problem, unfinished, draws=20))
+
+
+def linear_draws(problem: bp.Problem, seed: int) -> bp.Posterior:
+    """Return exact draws of LINEAR under flat priors, from the normal equations."""
+    design = np.concatenate([linear_regressors(0.05, 2.0, grid(40))] * len(problem.experiments))
+    data = np.concatenate([e.outputs["force"] for e in problem.experiments])
+    theta, (square,), *_ = np.linalg.lstsq(design, data, rcond=None)
+    generator, freedom = np.random.default_rng(seed), data.size - 3
+    variance = square / generator.chisquare(freedom, 40)
+    spread = generator.multivariate_normal(np.zeros(3), np.linalg.inv(design.T @ design), 40)
+    return posterior_of(problem, theta + np.sqrt(variance)[:, None] * spread, variance[:, None], seed)
+
+
+def test_well_determined_linear_problems_raise_no_alarm():
+    """40 problems of two experiments; the level is 1 %, and 3 alarms or more have a probability of 0.7 %."""
+    alarms = 0
+    for seed in range(40):
+        runs = [linear_experiment(TRUTH, 3.0, seed=2 * seed + i, name=f"run {i}") for i in range(2)]
+        problem = bp.Problem(LINEAR, runs, priors=FLAT)
+        table = bp.predict(problem, linear_draws(problem, seed), draws=20).table
+        assert table[["whiteness", "harmonics", "amplitude"]].drop("all").notna().all(axis=None)
+        alarms += table.loc["all", "verdict"] == "misspecified"
+    assert alarms <= 2
+
+
+def test_an_experiment_under_other_parameters_is_no_single_fault_but_one_of_the_whole():
+    """Each run is explained by parameters of its own, 900 and 1100 N/m, and not by common ones."""
+    runs = [linear_experiment([k, 40.0, 25.0], 3.0, seed=i, name=f"run {i}") for i, k in enumerate((900.0, 1100.0))]
+    problem = bp.Problem(LINEAR, runs, priors=FLAT)
+    prediction = bp.predict(problem, linear_draws(problem, 1), draws=40)
+    assert prediction.table.loc["all", "consistency"] < 1e-4
+    assert prediction.table.loc["all", "verdict"] == prediction.verdict == "misspecified"
+    assert prediction.table.loc["run 0 force", "whiteness"] > 0.01
+    assert "no common parameters explain" in repr(prediction)
+
+
+@cache
+def duffing_posterior(k2: float, seed: int = 1, sd: float = 0.02, noise: str = "independent", cycles: int = 10):
+    """Return a Duffing problem without k2, and draws of its Laplace approximation, for data made with k2."""
+    force = np.cos(2 * np.pi * grid(SAMPLES)) + 0.2 * np.sin(4 * np.pi * grid(SAMPLES))
+    truth = bp.solve_periodic(
+        ASYMMETRIC, DUFFING | {"k2": k2}, {"force": force}, frequency=0.1, samples=SAMPLES, scheme="central4"
+    )
+    outputs = {c: x + sd * np.random.default_rng(seed).standard_normal(x.size) for c, x in truth.outputs.items()}
+    scatter = {"displacement": sd * np.sqrt(cycles)}
+    run = bp.Experiment("run", 0.1, outputs, {"force": force}, samples=SAMPLES, scatter=scatter, cycles=cycles)
+    problem = bp.Problem(
+        bp.models.duffing, [run], priors=DUFFING_PRIORS, fixed={"m": DUFFING["m"]}, noise=noise, scheme="central4"
+    )
+    fit = bp.map_estimate(problem, progress=False)
+    return problem, draw(problem, fit, seed)
+
+
+def test_plenty_of_data_and_a_missing_stiffness_is_misspecified():
+    """The stiffness is known within 20 %, and a mean and a second harmonic are left that the model cannot have."""
+    problem, posterior = duffing_posterior(0.1)
+    assert max(posterior.draws(n).std() / abs(posterior.draws(n).mean()) for n in ("k", "k3")) < 0.2
+    prediction = bp.predict(problem, posterior, draws=40)
+    row = prediction.table.loc["run displacement"]
+    assert row["verdict"] == prediction.verdict == "misspecified"
+    assert max(row["harmonics"], row["size"]) < 1e-6
+    assert row["harmonic"] <= 2.0
+    residual = problem.linearised({n: posterior.draws(n).mean() for n in problem.names}).residuals[0]
+    assert row["model_error_share"] == pytest.approx(1.0 - 0.02**2 / np.mean(residual**2), abs=0.03)
+    said = repr(prediction)
+    assert (
+        "the model is misspecified" in said and "too much power in some harmonics" in said and "is model error" in said
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_right_model_is_adequate(seed):
+    """The false-alarm rate of each is 1 %, the seeds are fixed."""
+    problem, posterior = duffing_posterior(0.0, seed)
+    prediction = bp.predict(problem, posterior, draws=40)
+    assert prediction.verdict == "adequate"
+    assert prediction.table.loc["run displacement", "model_error_share"] < 0.3
+
+
+def test_power_against_a_missing_stiffness():
+    """With k2 = 5 % of k and noise of 1 % of the peak-to-peak value, 95 % are named; 19 of 20 or more, at least."""
+    verdicts = [bp.predict(*duffing_posterior(0.05, seed), draws=20).verdict for seed in range(20)]
+    assert verdicts.count("misspecified") >= 19
+
+
+def test_circulant_noise_hides_a_correlated_misfit_from_all_but_the_scatter():
+    """A drifting baseline of the shape of circulant noise, three times the measurement noise."""
+    harmonic = np.array([0, *range(1, 20), *range(1, 20), 20])
+    generator = np.random.default_rng(4)
+    spectrum = (3.0 + (2 * np.pi * harmonic * 0.05) ** 2) ** -2
+    components = 30.0 * np.sqrt(spectrum / spectrum.mean()) * generator.standard_normal(40)
+    plain = linear_experiment(TRUTH, 3.0, seed=1)
+    problem = bp.Problem(LINEAR, [plain], priors=FLAT)
+    error = problem.observations["run"]._signal(components, harmonic)
+    run = replace(plain, outputs={"force": plain.outputs["force"] + error})
+    for given, misspecified in (({}, False), ({"scatter": {"force": 9.0}, "cycles": 9}, True)):
+        problem = bp.Problem(LINEAR, [replace(run, **given)], priors=FLAT, noise="circulant")
+        fit = bp.map_estimate(problem, progress=False)
+        prediction = bp.predict(problem, draw(problem, fit, 1), draws=40)
+        row = prediction.table.loc["run force"]
+        assert min(row["whiteness"], row["harmonics"]) > 0.01
+        assert (prediction.verdict == "misspecified") is misspecified
+        assert ("takes a correlated misfit as noise" in repr(prediction)) is not misspecified
+    assert row["model_error_share"] > 0.9
+
+
+def product_posterior(damping: float):
+    """Return draws along the whole ridge a b = 900, of a model without damping, for data with it."""
+    run = linear_experiment([900.0, damping, 0.0], 3.0, seed=2)
+    problem = bp.Problem(PRODUCT, [run], priors={"a": bp.LogNormal(30.0, 2.0), "b": bp.LogNormal(30.0, 2.0)})
+    x = run.inputs["x"]
+    product = float(run.outputs["force"] @ x / (x @ x))
+    square = float(np.sum((run.outputs["force"] - product * x) ** 2))
+    generator = np.random.default_rng(3)
+    variance = square / generator.chisquare(39, 200)
+    a = 30.0 * np.exp(1.4 * generator.standard_normal(200))
+    b = (product + np.sqrt(variance / (x @ x)) * generator.standard_normal(200)) / a
+    return problem, posterior_of(problem, np.stack([a, b], axis=-1), variance[:, None])
+
+
+def test_parameters_that_nothing_determines_are_no_fault_of_the_model():
+    """On the ridge of an exact symmetry a varies by a factor of 100 between draws, and the model is adequate."""
+    problem, posterior = product_posterior(0.0)
+    low, high = np.quantile(posterior.draws("a"), [0.05, 0.95])
+    assert high > 50 * low
+    prediction = bp.predict(problem, posterior)
+    assert prediction.verdict == "adequate"
+    assert "the model is adequate" in repr(prediction)
+
+
+def test_undetermined_and_misspecified_is_misspecified():
+    prediction = bp.predict(*product_posterior(40.0))
+    assert prediction.verdict == "misspecified"
+    assert prediction.table.loc["run force", "harmonic"] == 1.0
+
+
+def test_a_parameter_fixed_at_a_wrong_value_is_misspecified_and_a_strong_prior_is_not():
+    """With c = 10 instead of 40 N s/m the force lacks 19 N of damping; a prior that insists on it is a prior."""
+    run = linear_experiment([900.0, 40.0, 0.0], 3.0, seed=3)
+    tight = {"k": bp.Normal(900.0, 1e5), "c": bp.Normal(10.0, 0.1)}
+    for changes, verdict in (
+        ({"priors": {"k": FLAT["k"]}, "fixed": {"c": 10.0, "coulomb": 0.0}}, "misspecified"),
+        ({"priors": tight, "fixed": {"coulomb": 0.0}}, "adequate"),
+    ):
+        problem = bp.Problem(LINEAR, [run], **changes)
+        fit = bp.map_estimate(problem, progress=False)
+        prediction = bp.predict(problem, draw(problem, fit, 1), draws=40)
+        assert prediction.table.loc["run force", "harmonics"] < 0.01 or verdict == "adequate"
+        assert prediction.verdict == verdict
+
+
+def test_few_independent_values_behind_a_smooth_curve_are_no_alarm():
+    """White noise in harmonics 0 to 5 on 40 points is no harmonic content, once its 11 values are counted."""
+    spectrum = np.fft.rfft(50.0 * np.random.default_rng(6).standard_normal(40))
+    spectrum[6:] = 0.0
+    clean = linear_regressors(0.05, 2.0, grid(40)) @ np.array([900.0, 40.0, 0.0])
+    plain = linear_experiment(TRUTH, 3.0, seed=1)
+    run = replace(plain, outputs={"force": clean + np.fft.irfft(spectrum, 40)}, independent={})
+    fixed = {"coulomb": 0.0}
+    verdicts = {}
+    for independent in (11, 40):
+        counted = replace(run, independent={"force": independent})
+        problem = bp.Problem(LINEAR, [counted], priors={"k": FLAT["k"], "c": FLAT["c"]}, fixed=fixed)
+        fit = bp.map_estimate(problem, progress=False)
+        verdicts[independent] = bp.predict(problem, draw(problem, fit, 1), draws=40).verdict
+    assert verdicts == {11: "adequate", 40: "misspecified"}
+
+
+@pytest.mark.parametrize(
+    ("case", "tests"),
+    [
+        ("local and delayed", 7),
+        ("harmonics kept, tied", 3),
+        ("angle of a rotation", 7),
+        ("section and multiplier", 0),
+        ("autonomous", 3),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Twice as many points")
+def test_every_kind_of_observation_is_tested_where_values_are_left(case, tests):
+    """Data made with the model: no alarm at 1 % a case (fixed seeds)."""
+    problem, _ = CASES[case]()
+    posterior = draw(problem, bp.map_estimate(problem, progress=False), 1, draws=40)
+    found = bp.predict(problem, posterior, draws=20)
+    assert found.verdict == ("adequate" if tests else "not tested")
+    assert found.table[[*TESTS]].notna().sum(axis=None) == tests
+    assert ("too few values" in repr(found)) is (tests == 0)
+
+
+def test_points_of_a_mask_are_white_in_the_units_of_correlated_noise():
+    problem, theta = CASES["masked, correlated"]()
+    scale = problem.linearised(theta).residuals[0].var()
+    values = np.tile(problem.likelihood.guess(), (20, 1))
+    values[:, [n.startswith("variance") for n in problem.noise_names]] *= scale
+    table = bp.predict(problem, posterior_of(problem, np.tile(theta, (20, 1)), values), draws=20).table
+    assert table[["whiteness", "harmonics"]].drop("all").min(axis=None) > 0.01
+
+
+def test_a_posterior_without_periodic_solutions_predicts_nothing():
+    generator = np.random.default_rng(1)
+    run = bp.Experiment("run", 1.0, {"x": generator.standard_normal(40)}, {"u": np.zeros(40)}, samples=40)
+    problem = bp.Problem(RUNAWAY, [run], priors={"a": bp.LogNormal(1.0, 0.5)})
+    nothing = posterior_of(problem, generator.lognormal(0.0, 0.1, (40, 1)), np.ones((40, 1)))
+    with pytest.raises(RuntimeError, match="none of its draws has a periodic solution"):
+        bp.predict(problem, nothing)
+
+
+def test_it_is_saved_and_loaded(tmp_path, solved):
+    problem, _, posterior = solved
+    found = bp.predict(problem, posterior, draws=20, run=lambda p: recording(p))
+    found.save(tmp_path / "prediction.h5")
+    again = bp.load(tmp_path / "prediction.h5")
+    assert repr(again) == repr(found)
+    assert np.array_equal(again.transient.high["force"], found.transient.high["force"])
+    assert np.array_equal(again.low["run"]["force"], found.low["run"]["force"])
+
+
+def recording(p: dict[str, float], samples: int = 50) -> bp.Recording:
+    """Return the force of LINEAR's outputs on a ramp of x, in closed form."""
+    time = np.arange(samples) / 100.0
+    x, v = 0.1 * time, np.full(samples, 0.1)
+    return bp.Recording.from_arrays(time, {"force": p["k"] * x + p["c"] * v + p["coulomb"] * np.tanh(v / 0.1)})
+
+
+def test_transient_bands_are_the_quantiles_of_the_signal(solved):
+    """The force on a ramp is linear in θ, so the 90 % band is ±1.645 sds of what the draws' covariance says."""
+    problem, _, posterior = solved
+    prediction = bp.predict(problem, posterior, draws=1000, run=recording)
+    bands = prediction.transient
+    design = np.stack([0.1 * bands.time, np.full(50, 0.1), np.full(50, np.tanh(1.0))], axis=-1)
+    theta = np.stack([posterior.draws(name) for name in problem.names])
+    sd = np.sqrt(np.einsum("ni,ij,nj->n", design, np.cov(theta), design))
+    assert (bands.high["force"] - bands.low["force"]) / 2 == pytest.approx(1.6449 * sd, rel=0.1)
+    assert bands.median["force"] == pytest.approx(design @ theta.mean(axis=1), abs=5 * sd.max() / np.sqrt(1000))
+    assert (bands.draws, bands.failed, bands.probability) == (1000, 0, 0.9)
+    assert "without measurement noise from 1000 runs" in repr(prediction)
+
+
+def test_runs_that_fail_are_counted_by_reason_and_left_out(solved):
+    problem, _, posterior = solved
+    calls = []
+
+    def sometimes(p):
+        calls.append(p)
+        if len(calls) % 4 == 0:
+            raise RuntimeError("the integration failed")
+        return recording(p)
+
+    def not_finite(p):
+        calls.append(p)
+        return recording(p | {"k": np.nan} if len(calls) % 2 else p)
+
+    bands = bp.predict(problem, posterior, draws=20, run=sometimes).transient
+    assert bands.failures == {"RuntimeError: the integration failed": 5} and bands.failed == 5
+    assert list(calls[0]) == ["k", "c", "coulomb"]
+    calls.clear()
+    bands = bp.predict(problem, posterior, draws=20, run=not_finite).transient
+    assert bands.failed == 10 and np.isfinite(bands.high["force"]).all()
+    with pytest.raises(RuntimeError, match="it failed at all 20 draws, last with: 'mass'"):
+        bp.predict(problem, posterior, draws=20, run=lambda p: (_ for _ in ()).throw(ArithmeticError("'mass'")))
+
+
+def test_recordings_that_cannot_be_compared_are_refused(solved):
+    problem, _, posterior = solved
+    lengths = iter([50, *[51] * 20])
+    with pytest.raises(ValueError, match="recordings of 50 and 51 samples.* all must have the same times"):
+        bp.predict(problem, posterior, draws=20, run=lambda p: recording(p, next(lengths)))
+    names = iter([["force"], *[["pressure"]] * 20])
+    with pytest.raises(ValueError, match="outputs of the recordings: 'pressure' is not known"):
+        bp.predict(
+            problem,
+            posterior,
+            draws=20,
+            run=lambda p: bp.Recording.from_arrays([0, 1], {n: [0, 1] for n in next(names)}),
+        )
+    with pytest.raises(ValueError, match="run: it returned a dict; it must return a Recording"):
+        bp.predict(problem, posterior, draws=20, run=lambda p: p)
+    with pytest.raises(ValueError, match="experiment: 'run' is not allowed without run"):
+        bp.predict(problem, posterior, experiment="run")
+
+
+def test_runs_take_the_fixed_tied_and_local_parameters_of_the_experiment_named():
+    runs = [linear_experiment(TRUTH, 3.0, seed=i, name=f"run {i}") for i in range(2)]
+    problem = bp.Problem(
+        LINEAR,
+        runs,
+        priors={"k": FLAT["k"]},
+        local=["k"],
+        tied={"c": "k/20"},
+        fixed={"coulomb": {"run 0": 1, "run 1": 2}},
+    )
+    theta = np.random.default_rng(1).normal([900.0, 500.0], 1.0, (40, 2))
+    posterior, seen = posterior_of(problem, theta, np.full((40, 1), 9.0)), []
+    with pytest.raises(ValueError, match="experiments differ in 'k', so name the one .* 'run 0', 'run 1'"):
+        bp.predict(problem, posterior, draws=20, run=recording)
+    bp.predict(problem, posterior, draws=20, run=lambda p: seen.append(p) or recording(p), experiment="run 1")
+    assert seen[0] == {"k": posterior.draws("k[run 1]")[0], "c": seen[0]["k"] / 20, "coulomb": 2.0}
+    assert seen[0]["k"] == pytest.approx(500.0, abs=6.0)
+    with pytest.raises(ValueError, match="experiment: 'run 3' is not known"):
+        bp.predict(problem, posterior, draws=20, run=recording, experiment="run 3")

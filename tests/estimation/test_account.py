@@ -1,0 +1,286 @@
+"""What an estimate tells of itself: joint Laplace, discretisation, undetermined directions, starts, orbit identity."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.estimation.laplace import undetermined
+from bayesperiodic.sampling.coordinates import SamplingDensity
+from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+from tests.posterior.observed import DUFFING, DUFFING_PRIORS, duffing_run
+
+TRUTH = np.array([900.0, 40.0, 25.0])
+PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}
+PRODUCT = bp.Model(
+    "product",
+    states=["w"],
+    inputs=["x"],
+    parameters=["a", "b", "shift_a", "shift_b", "idle"],
+    equations=lambda s, p, u: [s.dw + s.w - u.x],
+    outputs=lambda s, p, u: {"force": p.a * p.b**2 * u.x + (p.shift_a + 2 * p.shift_b) * u.dx},
+)
+SIGNED = bp.Model(
+    "signed",
+    states=["w"],
+    inputs=["x"],
+    parameters=["a"],
+    equations=lambda s, p, u: [s.dw + s.w - u.x],
+    outputs=lambda s, p, u: {"force": p.a**2 * u.x + 0.05 * p.a * u.dx},
+)
+
+
+def sine_run(force) -> bp.Experiment:
+    """Return an experiment of x = sin 2πτ at 1 Hz with 1 % noise; `force` takes x and its rate."""
+    tau = grid(60)
+    clean = force(np.sin(2 * np.pi * tau), 2 * np.pi * np.cos(2 * np.pi * tau))
+    noise = 0.01 * np.ptp(clean) * np.random.default_rng(1).standard_normal(60)
+    return bp.Experiment("run", 1.0, {"force": clean + noise}, {"x": np.sin(2 * np.pi * tau)}, samples=60)
+
+
+def second_differences(density: SamplingDensity, mode: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return the Hessian of the sampled density by central differences of fourth order."""
+    weights = {-2: 1 / 12, -1: -2 / 3, 1: 2 / 3, 2: -1 / 12}
+    hessian = np.empty((mode.size, mode.size))
+    for i in range(mode.size):
+        for j in range(mode.size):
+            points, factors = [], []
+            for a, wa in weights.items():
+                for b, wb in weights.items():
+                    point = mode.copy()
+                    point[i] += a * steps[i]
+                    point[j] += b * steps[j]
+                    points.append(point)
+                    factors.append(wa * wb)
+            hessian[i, j] = np.dot(factors, density(np.array(points))) / steps[i] / steps[j]
+    return hessian
+
+
+@pytest.mark.filterwarnings("ignore:Twice as many points")
+@pytest.mark.parametrize(
+    ("noise", "known"), [("independent", {}), ("circulant", {}), ("independent", {"variance[displacement]": 3.0})]
+)
+def test_joint_laplace_is_that_of_the_sampled_density(noise, known):
+    """Its mode is where the density of the sampling coordinates is stationary, its covariance the inverse Hessian."""
+    runs = [duffing_run(harmonics={"displacement": 9}), duffing_run("run 2", 0.13, 2, harmonics={"displacement": 9})]
+    problem = bp.Problem(
+        bp.models.duffing, runs, priors=DUFFING_PRIORS, fixed={"m": 1.0} | known, local=["c"], noise=noise
+    )
+    fit = bp.map_estimate(problem, progress=False)
+    density = SamplingDensity(problem.anchored(fit.theta))
+    mode, covariance = density.laplace(fit)
+    sd = np.sqrt(np.diag(covariance))
+    ends = mode + np.concatenate([np.diag(0.02 * sd), -np.diag(0.02 * sd)])
+    values = density(ends).reshape(2, -1)
+    assert np.abs(values[0] - values[1]) / 0.04 == pytest.approx(0.0, abs=2e-4)
+    hessian = -second_differences(density, mode, 0.05 * sd)
+    scaled = np.linalg.inv(covariance) * np.outer(sd, sd)
+    assert scaled == pytest.approx(hessian * np.outer(sd, sd), abs=3e-4 * np.abs(scaled).max())
+
+
+@pytest.mark.filterwarnings("ignore:Twice as many points")
+def test_doubling_tells_what_twice_as_many_points_do():
+    """The announced shift against the estimate on the finer grid, the data being the same Fourier series."""
+    fits = []
+    for samples in (60, 120):
+        force = np.cos(2 * np.pi * grid(samples))
+        noise = np.random.default_rng(2).standard_normal(5) * 0.001
+        truth = bp.solve_periodic(
+            bp.models.duffing, DUFFING, {"force": force}, frequency=0.1, samples=samples, scheme="fourier"
+        )
+        spectrum = np.fft.rfft(truth.outputs["displacement"])[:10] / samples
+        spectrum[:5] += noise
+        kept = {"harmonics": {"displacement": 9}, "independent": {"displacement": 19}}
+        full = np.zeros(samples // 2 + 1, dtype=complex)
+        full[:10] = spectrum * samples
+        run = bp.Experiment(
+            "run", 0.1, {"displacement": np.fft.irfft(full, samples)}, {"force": force}, samples=samples, **kept
+        )
+        problem = bp.Problem(bp.models.duffing, [run], priors=DUFFING_PRIORS, fixed={"m": 1.0})
+        fits.append(bp.map_estimate(problem, progress=False))
+    moved = [(fits[1].theta[n] - fits[0].theta[n]) / fits[0].sd[n] for n in fits[0].theta]
+    assert max(abs(m) for m in moved) > 0.2
+    assert list(fits[0].doubling_shift.values()) == pytest.approx(moved, rel=0.1, abs=2e-2)
+
+
+@pytest.mark.slow
+def test_a_grid_too_coarse_for_the_posterior_is_announced():
+    run = duffing_run(harmonics={"displacement": 9})
+    quiet = replace(run, outputs={"displacement": run.outputs["displacement"]})
+    problem = bp.Problem(
+        bp.models.duffing,
+        [quiet],
+        priors=DUFFING_PRIORS,
+        fixed={"m": 1.0, "variance[displacement]": 1e-8},
+        scheme="backward2",
+    )
+    with pytest.warns(UserWarning, match=r"Twice as many points would move '.*' by .* take more samples than 200"):
+        fit = bp.map_estimate(problem, progress=False)
+    assert max(abs(shift) for shift in fit.doubling_shift.values()) > 0.1
+
+
+def test_directions_without_information_are_named():
+    """Products keep a·b², sums keep a + 2b, and one parameter is nowhere; the prior says what is left."""
+    run = sine_run(lambda x, rate: 12.0 * x + 0.5 * rate)
+    priors = {
+        "a": bp.LogNormal(3.0, 0.3),
+        "b": bp.LogNormal(2.0, 0.3),
+        "shift_a": bp.Normal(0.1, 0.2),
+        "shift_b": bp.Normal(0.2, 0.2),
+        "idle": bp.Normal(5.0, 2.0),
+    }
+    with pytest.warns(UserWarning, match="The data do not depend on 'idle'; .* Fix it"):
+        fit = bp.map_estimate(bp.Problem(PRODUCT, [run], priors=priors), progress=False)
+    assert fit.converged
+    assert set(fit.undetermined) == {
+        "idle: no output depends on it",
+        "a → a·t, b → b·t^-0.5",
+        "shift_a → shift_a + t, shift_b → shift_b − 0.5·t",
+    }
+    assert fit.theta["idle"] == pytest.approx(5.0) and fit.sd["idle"] == pytest.approx(2.0)
+    assert "not determined by the data: idle" in repr(fit)
+    assert fit.correlations.loc["shift_a", "shift_b"] == pytest.approx(-1.0, abs=0.05)
+
+
+def test_without_a_prior_that_decides_the_fit_ends_all_the_same():
+    """Uniform priors leave H singular; the estimate is on the ridge, and the ridge is named."""
+    run = sine_run(lambda x, rate: 12.0 * x)
+    priors = {"a": bp.Uniform(0.0, 50.0), "b": bp.Uniform(0.0, 50.0)}
+    fixed = {"shift_a": 0.0, "shift_b": 0.0, "idle": 0.0}
+    with pytest.warns(UserWarning, match="The data do not change under"):
+        fit = bp.map_estimate(bp.Problem(PRODUCT, [run], priors=priors, fixed=fixed), progress=False)
+    assert fit.theta["a"] * fit.theta["b"] ** 2 == pytest.approx(12.0, rel=0.02)
+    assert len(fit.undetermined) == 1
+
+
+def test_several_directions_are_told_apart():
+    """Of a sum of four only the sum is known: three directions, each named by one parameter and the last."""
+    row = np.ones(4)
+    found = undetermined(np.outer(row, row), np.ones(4), list("abcd"), np.ones(4, dtype=bool))
+    assert found == ("a → a·t, d → d·t^-1", "b → b·t, d → d·t^-1", "c → c·t, d → d·t^-1")
+
+
+@pytest.mark.filterwarnings("ignore:Twice as many points")
+def test_residuals_hold_the_harmonics_that_were_kept():
+    run = duffing_run(harmonics={"displacement": 3})
+    problem = bp.Problem(bp.models.duffing, [run], priors=DUFFING_PRIORS, fixed={"m": 1.0})
+    residual = bp.map_estimate(problem, progress=False).residuals["run 1"]["displacement"]
+    spectrum = np.abs(np.fft.rfft(residual))
+    assert spectrum[4:].max() < 1e-12 < spectrum[:4].max()
+
+
+def test_what_is_determined_keeps_its_sd_beside_what_is_not():
+    """With uniform priors only a·b² is known, and the sum beside it as if it were alone."""
+    run = sine_run(lambda x, rate: 12.0 * x + 0.5 * rate)
+    priors = {"a": bp.Uniform(0.0, 50.0), "b": bp.Uniform(0.0, 50.0), "shift_a": bp.Uniform(-5.0, 5.0)}
+    fixed = {"shift_b": 0.0, "idle": 0.0, "variance[force]": 0.25}
+    with pytest.warns(UserWarning, match="The data do not change under"):
+        fit = bp.map_estimate(bp.Problem(PRODUCT, [run], priors=priors, fixed=fixed), progress=False)
+    rate = 2 * np.pi * np.cos(2 * np.pi * grid(60))
+    assert fit.sd["shift_a"] == pytest.approx(np.sqrt(0.25 / np.sum(rate**2)), rel=1e-6)
+    assert fit.sd["a"] == fit.sd["b"] == np.inf
+
+
+def test_an_estimate_at_the_end_of_a_support_is_the_best_one_inside():
+    """Bounded least squares in closed form: the parameter pressed against the end is fixed there."""
+    run = linear_experiment(TRUTH, 3.0, seed=1)
+    wide = {"k": bp.Normal(800.0, 1e6), "c": bp.Normal(30.0, 1e6), "coulomb": bp.Uniform(0.0, 20.0)}
+    with pytest.warns(UserWarning, match=r"'coulomb', 20, lies at the end of its prior's support \(0, 20\)"):
+        fit = bp.map_estimate(
+            bp.Problem(LINEAR, [run], priors=wide, fixed={"variance[force]": 9.0}),
+            start={"k": 100.0, "c": 400.0, "coulomb": 1.0},
+            progress=False,
+        )
+    x = linear_regressors(0.05, 2.0, grid(40))
+    best = np.linalg.lstsq(x[:, :2], run.outputs["force"] - 20.0 * x[:, 2], rcond=None)[0]
+    assert fit.converged and fit.at_ends == ("coulomb",)
+    assert [fit.theta["k"], fit.theta["c"]] == pytest.approx(best, rel=1e-4)
+    assert fit.theta["coulomb"] == pytest.approx(20.0, abs=0.01)
+
+
+def test_directions_without_information_do_not_end_the_climb():
+    """Three collinear columns: from far away the sum is found all the same, to 1e-6 of its standard deviation."""
+    run = sine_run(lambda x, rate: 12.0 * x + 0.5 * rate)
+    priors = {"shift_a": bp.Normal(400.0, 1e9), "shift_b": bp.Normal(900.0, 1e9)}
+    fixed = {"a": 12.0, "b": 1.0, "idle": 0.0, "variance[force]": 0.25}
+    with pytest.warns(UserWarning, match="The data do not change under"):
+        fit = bp.map_estimate(bp.Problem(PRODUCT, [run], priors=priors, fixed=fixed), progress=False)
+    x, rate = np.sin(2 * np.pi * grid(60)), 2 * np.pi * np.cos(2 * np.pi * grid(60))
+    best = rate @ (run.outputs["force"] - 12.0 * x) / (rate @ rate)
+    found = fit.theta["shift_a"] + 2 * fit.theta["shift_b"]
+    assert fit.converged
+    assert found == pytest.approx(best, abs=1e-5 * np.sqrt(0.25 / (rate @ rate)))
+
+
+def test_determined_problems_say_nothing():
+    fit = bp.map_estimate(bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS), progress=False)
+    assert fit.undetermined == ()
+
+
+@pytest.mark.filterwarnings("ignore:Twice as many points")
+def test_the_objective_never_falls():
+    problem = bp.Problem(bp.models.duffing, [duffing_run()], priors=DUFFING_PRIORS, fixed={"m": 1.0})
+    fit = bp.map_estimate(problem, start={"c": 0.6, "k": 0.5, "k3": 1.5}, progress=False)
+    assert fit.converged and len(fit.history) > 3
+    assert np.all(np.diff(fit.history) > 0.0)
+
+
+def test_further_starts_find_the_better_mode():
+    """Force = a²·x + 0.05·a·ẋ: a start on the wrong side of zero ends near −2, one of eight draws finds +2."""
+    problem = bp.Problem(SIGNED, [sine_run(lambda x, rate: 4.0 * x + 0.1 * rate)], priors={"a": bp.Normal(0.0, 3.0)})
+    one = bp.map_estimate(problem, start={"a": -1.5}, progress=False)
+    many = bp.map_estimate(problem, start={"a": -1.5}, starts=8, seed=1, progress=False)
+    assert one.converged and one.theta["a"] < -1.0
+    assert many.theta["a"] == pytest.approx(2.0, rel=0.01)
+    assert len(many.starts) == 8
+    assert many.starts[0]["objective"] == pytest.approx(one.history[-1])
+    assert max(s["objective"] for s in many.starts) == many.history[-1]
+    with pytest.raises(ValueError, match="starts: 0 is not allowed"):
+        bp.map_estimate(problem, starts=0)
+
+
+def test_no_step_slips_to_another_periodic_solution():
+    """Near Duffing's fold a full step has no upper branch; the estimate stays on the measured one and is right."""
+    tau, theta = grid(200), {"m": 1.0, "c": 0.1, "k": 1.0, "k3": 0.5}
+    force = {"force": 0.4 * np.cos(2 * np.pi * tau)}
+    settings = {"frequency": 0.22, "samples": 200, "scheme": "central4"}
+    upper = bp.solve_periodic(bp.models.duffing, theta, force, guess={"x": 2.0 * np.cos(2 * np.pi * tau)}, **settings)
+    lower = bp.solve_periodic(bp.models.duffing, theta, force, guess={"x": -0.4 * np.cos(2 * np.pi * tau)}, **settings)
+    assert np.ptp(upper.states["x"]) > 2.5 * np.ptp(lower.states["x"])
+    noise = 0.01 * np.random.default_rng(3).standard_normal(200)
+    run = bp.Experiment(
+        "upper", 0.22, {"displacement": upper.states["x"] + noise}, force, samples=200, guess=upper.states
+    )
+    problem = bp.Problem(
+        bp.models.duffing,
+        [run],
+        priors={"c": bp.LogNormal(0.1, 0.5), "k3": bp.LogNormal(0.5, 0.3)},
+        fixed={"m": 1.0, "k": 1.0},
+        scheme="central4",
+    )
+    fit = bp.map_estimate(problem, start={"c": 0.02, "k3": 0.52}, progress=False)
+    assert fit.converged
+    assert np.ptp(fit.solutions["upper"].states["x"]) == pytest.approx(np.ptp(upper.states["x"]), rel=0.02)
+    assert abs(fit.theta["c"] - 0.1) < 4 * fit.sd["c"] and abs(fit.theta["k3"] - 0.5) < 4 * fit.sd["k3"]
+
+
+def test_noise_is_split_into_measurement_and_model():
+    """Scatter of 6 N in 4 cycles is 3 N of the mean; with a residual of 5 N (eq. 7) 4 N are left to the model."""
+    run = linear_experiment(TRUTH, 5.0, seed=4)
+    fit = bp.map_estimate(bp.Problem(LINEAR, [replace(run, scatter={"force": 6.0}, cycles=4)], priors=PRIORS))
+    residual = run.outputs["force"] - linear_regressors(0.05, 2.0, grid(40)) @ list(fit.theta.values())
+    total = np.sum(residual**2) / 37
+    split = fit.noise_split["force"]
+    assert split.measurement == pytest.approx(3.0)
+    assert split.total == pytest.approx(np.sqrt(total), rel=1e-9)
+    assert split.model == pytest.approx(np.sqrt(total - 9.0), rel=1e-9)
+
+
+def test_an_estimate_comes_back_from_its_file(tmp_path):
+    fit = bp.map_estimate(bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS), progress=False)
+    fit.save(tmp_path / "fit.h5")
+    again = bp.load(tmp_path / "fit.h5")
+    assert again.theta == fit.theta and again.noise == fit.noise
+    assert again.joint_covariance.equals(fit.joint_covariance)
+    assert repr(again) == repr(fit)

@@ -1,0 +1,158 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.estimation.result import whiteness
+from tests.known import LINEAR, RUNAWAY, grid, linear_experiment, linear_regressors
+
+TRUTH = np.array([900.0, 40.0, 25.0])
+PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
+MEAN, PRECISION = np.array([800.0, 30.0, 20.0]), np.diag([60.0**-2, 20.0**-2, 10.0**-2])
+
+
+def closed_form(experiment, variance, weight=1.0):
+    """Return mean and covariance of the normal posterior of a linear model."""
+    design = linear_regressors(0.05, 2.0, grid(experiment.samples))
+    covariance = np.linalg.inv(weight * design.T @ design / variance + PRECISION)
+    mean = covariance @ (weight * design.T @ experiment.outputs["force"] / variance + PRECISION @ MEAN)
+    return mean, covariance
+
+
+def test_known_variance_gives_the_closed_form():
+    experiment = linear_experiment(TRUTH, 3.0, seed=1)
+    fit = bp.map_estimate(bp.Problem(LINEAR, [experiment], priors=PRIORS, fixed={"variance[force]": 9.0}))
+    mean, covariance = closed_form(experiment, 9.0)
+    assert list(fit.theta.values()) == pytest.approx(mean, rel=1e-10)
+    assert fit.covariance.to_numpy() == pytest.approx(covariance, rel=1e-10)
+    assert list(fit.sd.values()) == pytest.approx(np.sqrt(np.diag(covariance)), rel=1e-10)
+    assert fit.variances == {"force": 9.0}
+    assert fit.converged
+
+
+def test_progress_is_shown_unless_unwanted(capsys):
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS)
+    bp.map_estimate(problem, progress=False)
+    assert capsys.readouterr().err == ""
+    bp.map_estimate(problem)
+    assert "objective" in capsys.readouterr().err
+
+
+def test_independent_values_weigh_the_samples():
+    experiment = linear_experiment(TRUTH, 3.0, seed=2, independent=11)
+    fit = bp.map_estimate(bp.Problem(LINEAR, [experiment], priors=PRIORS, fixed={"variance[force]": 9.0}))
+    mean, covariance = closed_form(experiment, 9.0, weight=11 / 40)
+    assert list(fit.theta.values()) == pytest.approx(mean, rel=1e-10)
+    assert fit.covariance.to_numpy() == pytest.approx(covariance, rel=1e-10)
+
+
+def test_unknown_variance_is_that_of_equation_7():
+    """V = s Σe² / (nNs − l) with s = 1 channel, N = 2 experiments, n = 40 samples, l = 3 parameters."""
+    experiments = [replace(linear_experiment(TRUTH, 3.0, seed=s), name=f"run {s}") for s in (3, 4)]
+    fit = bp.map_estimate(bp.Problem(LINEAR, experiments, priors=PRIORS))
+    design = linear_regressors(0.05, 2.0, grid(40))
+    total = sum(np.sum((e.outputs["force"] - design @ list(fit.theta.values())) ** 2) for e in experiments)
+    assert fit.variances["force"] == pytest.approx(total / (40 * 2 - 3), rel=1e-9)
+    v = fit.variances["force"]
+    covariance = np.linalg.inv(2 * design.T @ design / v + PRECISION)
+    right = sum(design.T @ e.outputs["force"] for e in experiments) / v + PRECISION @ MEAN
+    assert list(fit.theta.values()) == pytest.approx(covariance @ right, rel=1e-7)
+
+
+def test_estimate_maximises_equation_6_with_the_corrected_count():
+    """With eq. (7) the staged iteration ends at the maximum of −½ (nN − l/s) ln M + ln p(θ)."""
+    experiment = linear_experiment(TRUTH, 3.0, seed=5)
+    problem = bp.Problem(LINEAR, [experiment], priors=PRIORS)
+    fit = bp.map_estimate(problem)
+    best = np.array(list(fit.theta.values()))
+
+    def objective(theta):
+        residual = experiment.outputs["force"] - linear_regressors(0.05, 2.0, grid(40)) @ theta
+        return -0.5 * (40 - 3) * np.log(np.sum(residual**2)) + problem.log_prior(theta)
+
+    for direction in np.eye(3) * np.array(list(fit.sd.values())):
+        for step in (-0.05, 0.05):
+            assert objective(best + step * direction) < objective(best)
+
+
+def test_positive_parameter_is_estimated_at_the_mode_of_its_natural_density():
+    priors = PRIORS | {"c": bp.LogNormal(30.0, 0.5)}
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=6)], priors=priors, fixed={"variance[force]": 9.0})
+    fit = bp.map_estimate(problem)
+    best = np.array(list(fit.theta.values()))
+    step = np.array([0.0, 1e-3, 0.0])
+    values = problem.log_posterior(np.stack([best - step, best, best + step]), np.full((3, 1), 9.0))
+    assert values[1] > max(values[0], values[2])
+
+
+def test_intervals_are_students():
+    fit = bp.map_estimate(bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=7, independent=7)], priors=PRIORS))
+    low, high = fit.interval(0.9)["k"]
+    assert fit.degrees_of_freedom == 4
+    assert (high - low) / 2 / fit.sd["k"] == pytest.approx(2.1318, rel=1e-4)
+    with pytest.raises(ValueError, match="probability: 1.2 is not allowed"):
+        fit.interval(1.2)
+
+
+def test_white_residuals_pass_and_smooth_ones_do_not():
+    """Uniform p for white noise (1000 series, KS at 0.1 %), tiny p and large lag1 for a random walk."""
+    from scipy import stats
+
+    generator = np.random.default_rng(8)
+    p = [whiteness(generator.standard_normal(200), 30).p for _ in range(1000)]
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+    smooth = whiteness(np.cumsum(generator.standard_normal(400)) - np.linspace(0, 1, 400), 60)
+    assert smooth.p < 1e-6 and smooth.lag1 > 0.5
+
+
+def test_noise_of_differentiated_inputs_is_carried_to_the_output():
+    """Force = c·ẋ with x of known amplitude noise: sd of the force from its closed form, and the warning."""
+    model = bp.Model(
+        "dashpot",
+        states=["w"],
+        inputs=["x"],
+        parameters=["c"],
+        equations=lambda s, p, u: [s.dw + s.w - u.x],
+        outputs=lambda s, p, u: {"force": p.c * u.dx + s.w},
+    )
+    tau = grid(200)
+    x = np.sin(2 * np.pi * tau)
+    variance = np.array([0.0, 1e-4, 4e-4])
+    rate = 2j * np.pi * 1.5 * np.arange(3)
+    noise = np.random.default_rng(9).standard_normal(200) * 0.05
+    experiment = bp.Experiment(
+        "run",
+        1.5,
+        {"force": 2 * 2 * np.pi * 1.5 * np.cos(2 * np.pi * tau) + noise},
+        {"x": x},
+        samples=200,
+        amplitude_variance={"x": variance},
+    )
+    with pytest.warns(UserWarning, match="noise of the measured inputs, differentiated, brings") as caught:
+        fit = bp.map_estimate(bp.Problem(model, [experiment], priors={"c": bp.Normal(0, 10)}))
+    assert caught[0].filename == __file__
+    gain = fit.theta["c"] * rate + 1 / (1 + rate)
+    expected = np.sqrt(np.sum(0.5 * np.abs(gain) ** 2 * variance))
+    assert fit.input_noise["force"] == pytest.approx(expected, rel=2e-3)
+
+
+def test_start_outside_the_support_is_refused():
+    problem = bp.Problem(
+        LINEAR, [linear_experiment(TRUTH, 3.0, seed=10)], priors=PRIORS | {"k": bp.Uniform(0.0, 1000.0)}
+    )
+    with pytest.raises(ValueError, match=r"start: k = 2000 is not allowed; .* support is \(0, 1000\)"):
+        bp.map_estimate(problem, start={"k": 2000.0, "c": 1.0, "coulomb": 1.0})
+    with pytest.raises(ValueError, match="start: 'kk' is not known.*Did you mean 'k'"):
+        bp.map_estimate(problem, start={"kk": 2000.0, "c": 1.0, "coulomb": 1.0})
+
+
+def test_start_without_periodic_solution_is_refused():
+    experiment = bp.Experiment(
+        "run", 1.0, {"x": np.cos(2 * np.pi * grid(50))}, {"u": np.sin(2 * np.pi * grid(50))}, samples=50
+    )
+    with pytest.raises(
+        ValueError,
+        match=r"start: a = 1 \(the priors' medians\) is .* the periodic solve ended without the orbit of 'run'",
+    ):
+        bp.map_estimate(bp.Problem(RUNAWAY, [experiment], priors={"a": bp.LogNormal(1.0, 0.1)}))

@@ -1,0 +1,315 @@
+import warnings
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+from scipy.special import ndtri
+
+import bayesperiodic as bp
+from bayesperiodic.estimation.profile import Ridge
+from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+
+TRUTH = np.array([900.0, 40.0, 25.0])
+PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
+WIDE = {name: bp.Uniform(-1e5, 1e5) for name in PRIORS}
+WAVE, RATE = np.sin(2 * np.pi * grid(40)), 2 * np.pi * np.cos(2 * np.pi * grid(40))
+
+
+def instant(name, parameters, outputs):
+    """Return a model whose output is a formula of the input x and its rate; the state is there because one must be."""
+    return bp.Model(
+        name,
+        states=["w"],
+        inputs=["x"],
+        parameters=parameters,
+        equations=lambda s, p, u: [s.dw + s.w - u.x],
+        outputs=lambda s, p, u: {"y": outputs(p, u)},
+    )
+
+
+def posed(model, y, variance, priors, *, wave=WAVE):
+    run = bp.Experiment("run", 1.0, {"y": y}, {"x": wave}, samples=40)
+    return bp.Problem(model, [run], priors=priors, fixed={"variance[y]": variance})
+
+
+def fitted(problem, start=None):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return bp.map_estimate(problem, start=start, progress=False)
+
+
+@pytest.fixture(scope="module")
+def linear():
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS, fixed={"variance[force]": 9.0})
+    fit = fitted(problem)
+    return problem, fit, bp.profile(problem, fit)
+
+
+def test_known_variance_gives_the_parabola_and_the_normal_interval(linear):
+    _, fit, profile = linear
+    assert profile.names == ("k", "c", "coulomb")
+    for probability in (0.5, 0.9, 0.99):
+        half, ends = ndtri(0.5 + probability / 2), profile.interval(probability)
+        for name, sd in fit.sd.items():
+            z = (profile.values[name] - fit.theta[name]) / sd
+            assert profile.log_density[name] == pytest.approx(-0.5 * z**2, abs=1e-8)
+            assert (np.array(ends[name]) - fit.theta[name]) / sd == pytest.approx([-half, half], abs=1e-8)
+    assert set(profile.shape.values()) == {"closed"}
+
+
+def test_other_parameters_follow_their_conditional_means(linear):
+    _, fit, profile = linear
+    slopes = fit.covariance["k"] / fit.covariance.loc["k", "k"]
+    expected = np.array(list(fit.theta.values())) + np.outer(profile.values["k"] - fit.theta["k"], slopes)
+    assert profile.paths["k"] == pytest.approx(expected, rel=1e-9)
+
+
+def test_unknown_variance_gives_the_logarithm_of_the_misfit():
+    """−½ (n − l) ln M along the profile, with M = M₀ (1 + z²/(n − l)) for a linear model and flat priors."""
+    experiment = linear_experiment(TRUTH, 3.0, seed=2, independent=11)
+    problem = bp.Problem(LINEAR, [experiment], priors=WIDE)
+    fit = fitted(problem)
+    profile = bp.profile(problem, fit)
+    design = linear_regressors(0.05, 2.0, grid(40))
+    best, misfit, *_ = np.linalg.lstsq(design, experiment.outputs["force"], rcond=None)
+    sd = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * misfit[0] / (11 - 3))
+    for i, name in enumerate(problem.names):
+        z = (profile.values[name] - best[i]) / sd[i]
+        assert profile.log_density[name] == pytest.approx(-0.5 * 8 * np.log1p(z**2 / 8), abs=1e-8)
+        half = np.sqrt(8 * np.expm1(1.959964**2 / 8))
+        ends = (np.array(profile.interval(0.95)[name]) - best[i]) / sd[i]
+        assert ends == pytest.approx([-half, half], rel=1e-3)
+
+
+def test_only_a_product_is_determined():
+    """Of a·b alone, a is as good anywhere in its support, b where a's support lets it be; c does not mind."""
+    model = instant("product", ["a", "b", "c"], lambda p, u: p.a * p.b * u.x + p.c * u.dx)
+    priors = {"a": bp.LogUniform(0.1, 10.0), "b": bp.LogUniform(1e-4, 1e4), "c": bp.Normal(0.0, 10.0)}
+    problem = posed(model, 2 * WAVE + 0.7 * RATE, 0.01, priors)
+    fit = fitted(problem)
+    profile = bp.profile(problem, fit)
+    assert profile.shape == {"a": "flat", "b": "closed", "c": "closed"}
+    assert profile.log_density["a"] == pytest.approx(0.0, abs=1e-9)
+    assert profile.values["a"][[0, -1]] == pytest.approx([0.1, 10.0], rel=2e-2)
+    assert profile.paths["a"][:, 0] * profile.paths["a"][:, 1] == pytest.approx(
+        fit.theta["a"] * fit.theta["b"], rel=1e-9
+    )
+    assert profile.interval()["a"] == (-np.inf, np.inf)
+    sd = 0.1 / np.linalg.norm(WAVE)
+    assert profile.interval()["b"] == pytest.approx([0.2 - 0.1 * 1.645 * sd, 20 + 10 * 1.645 * sd], rel=5e-3)
+    z = (profile.values["c"] - fit.theta["c"]) * np.hypot(np.linalg.norm(RATE) / 0.1, 1 / 10.0)
+    assert profile.log_density["c"] == pytest.approx(-0.5 * z**2, abs=1e-8)
+
+
+def test_a_saturating_parameter_is_bounded_on_one_side():
+    """Y = a/(1 + a)·x measured as 0.98 ± 0.02: a ≥ 17.9, and nothing above."""
+    sd = 0.02
+    model = instant("saturating", ["a"], lambda p, u: p.a / (1 + p.a) * u.x)
+    problem = posed(model, 0.98 * WAVE, sd**2 * WAVE @ WAVE, {"a": bp.Uniform(0.0, 1e6)})
+    profile = bp.profile(problem, fitted(problem, {"a": 40.0}))
+    z = (profile.values["a"] / (1 + profile.values["a"]) - 0.98) / sd
+    assert profile.log_density["a"] == pytest.approx(-0.5 * z**2, abs=1e-9)
+    assert profile.shape == {"a": "one-sided"}
+    gain = 0.98 - 1.644854 * sd
+    assert profile.interval()["a"] == (pytest.approx(gain / (1 - gain), rel=3e-3), np.inf)
+
+
+def test_a_skewed_profile_is_that_of_brute_force():
+    force = np.cos(2 * np.pi * grid(50))
+    true = bp.solve_periodic(
+        bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force}, frequency=0.1, samples=50
+    )
+    problem = bp.Problem(
+        bp.models.duffing,
+        [bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)],
+        priors={"k": bp.LogNormal(1.0, 1.0), "k3": bp.Normal(0.5, 1.0)},
+        fixed={"m": 1, "c": 0.2, "variance[displacement]": 1.0},
+    )
+    fit = fitted(problem)
+    profile = bp.profile(problem, fit)
+    for name, other, around in (("k", "k3", 0.0), ("k3", "k", 1.0)):
+        best, width = np.full(profile.values[name].size, around), 2.5
+        for _ in range(3):
+            tried = best[:, None] + np.linspace(-width, width, 251)
+            found = problem.log_posterior({name: profile.values[name][:, None], other: tried}, {})
+            best, width = np.take_along_axis(tried, found.argmax(axis=1)[:, None], axis=1)[:, 0], 0.02 * width
+        expected = found.max(axis=1) - float(problem.log_posterior(fit.theta, {}))
+        # On the straight way from the prior's medians to the outermost k3 the branch of orbits turns back.
+        reached = slice(1 if name == "k3" else 0, None)
+        assert profile.log_density[name][reached] == pytest.approx(expected[reached], abs=1e-6)
+        assert np.all(profile.log_density[name] > expected - 1e-6)
+    low, high = profile.interval()["k"]
+    assert abs((high - fit.theta["k"]) / (fit.theta["k"] - low) - 1) > 0.1
+
+
+def double_well(mean):
+    """Return a problem where b jumps from near 1 to near −1 as a grows, later on the way up than on the way down."""
+    model = instant("wells", ["a", "b"], lambda p, u: p.b**2 * u.x + (p.a + p.b) * u.dx / (2 * np.pi))
+    wave = WAVE * np.sqrt(2 / 40)
+    priors = {"a": bp.Normal(mean, 2.0), "b": bp.Normal(0.0, 5.0)}
+    return posed(model, wave, 0.3, priors, wave=wave)
+
+
+def test_the_way_back_finds_the_branch_that_the_way_out_misses(monkeypatch):
+    problem = double_well(-0.5)
+    fit = fitted(problem, {"a": -1.0, "b": 1.0})
+    both = bp.profile(problem, fit, ["a"])
+    monkeypatch.setattr(Ridge, "_swept", lambda self, points: points)
+    out = bp.profile(problem, fit, ["a"])
+    assert np.array_equal(both.values["a"], out.values["a"])
+    gain = both.log_density["a"] - out.log_density["a"]
+    assert gain.min() > -1e-9
+    assert gain.max() > 1.0
+    b = np.linspace(-3.0, 3.0, 20_001)
+    every = [problem.log_posterior({"a": a, "b": b}, {}).max() for a in both.values["a"]]
+    assert both.log_density["a"] == pytest.approx(every - problem.log_posterior(fit.theta, {}), abs=1e-6)
+
+
+def test_an_end_lifted_by_another_branch_is_followed_further():
+    """Outwards a stays in a narrow well of b; the jump at its upper end leads into a wide one, back past the peak."""
+    model = instant(
+        "unlike_wells",
+        ["a", "b"],
+        lambda p, u: (p.b**2 + 0.6 * p.a) * u.x + p.a * (2 + 1.5 * p.b) * u.dx / (2 * np.pi),
+    )
+    wave, priors = WAVE * np.sqrt(2 / 40), {"a": bp.Normal(0.0, 5.0), "b": bp.Normal(-1.0, 2.0)}
+    problem = posed(model, wave, 0.3, priors, wave=wave)
+    fit = fitted(problem, {"a": 0.0, "b": 1.0})
+    with pytest.warns(UserWarning, match="The log-density is higher by 0.49") as caught:
+        profile = bp.profile(problem, fit, ["a"])
+    assert caught[0].filename == __file__
+    assert profile.values["a"][0] < -3.0 < -0.5 < fit.theta["a"] - 3 * fit.sd["a"]
+    b = np.linspace(-4.0, 4.0, 20_001)
+    every = np.array([problem.log_posterior({"a": a, "b": b}, {}).max() for a in profile.values["a"]])
+    assert profile.log_density["a"] == pytest.approx(every - problem.log_posterior(profile.best, {}), abs=1e-5)
+    assert profile.shape == {"a": "closed"}
+
+
+def test_a_better_point_than_the_estimate_is_told_and_helps():
+    problem = double_well(0.5)
+    fit = fitted(problem, {"a": -1.0, "b": 1.0})
+    with pytest.warns(
+        UserWarning, match=r"higher by 0.17 than .* b = -1.0.*start there, map_estimate\(problem, start="
+    ):
+        profile = bp.profile(problem, fit, ["a"])
+    assert profile.improvement == pytest.approx(0.1699, abs=1e-3)
+    at_map = profile.log_density["a"][profile.values["a"] == fit.theta["a"]]
+    assert at_map == pytest.approx(-profile.improvement)
+    assert "higher by 0.17 at a = 1.15" in repr(profile)
+    again = bp.profile(problem, fitted(problem, profile.best), ["a"])
+    assert again.map["b"] < 0.0
+    assert again.improvement == 0.0
+
+
+@pytest.mark.filterwarnings("ignore:The log-density is higher")
+@pytest.mark.parametrize("support", [(1.99, 2.01), (2.01, 2.05), (1.8, 1.99)])
+def test_a_parameter_at_the_end_of_its_support_does_not_hold_the_others(support):
+    """Against bounded least squares: b presses against the ends of its support as a moves, and c makes up for it."""
+    model = instant("bounded", ["a", "b", "c"], lambda p, u: p.a * u.x + p.b * (u.x + u.dx + u.x**2) + p.c * u.dx)
+    design = np.stack([WAVE, WAVE + RATE + WAVE**2, RATE], axis=-1) / 0.1
+    y = design @ [1.0, 2.0, 0.5] + np.random.default_rng(3).standard_normal(40)
+    priors = {"a": bp.Uniform(-10.0, 10.0), "b": bp.Uniform(*support), "c": bp.Uniform(-10.0, 10.0)}
+    problem = posed(model, 0.1 * y, 0.01, priors)
+    profile = bp.profile(problem, fitted(problem), ["a"])
+    bounds = [support[0], -10.0], [support[1], 10.0]
+    costs = [
+        lsq_linear(design[:, 1:], y - design[:, 0] * a, bounds=bounds, tol=1e-13).cost for a in profile.values["a"]
+    ]
+    pressed = np.min(np.abs(profile.paths["a"][:, [1]] - support), axis=1) < 1e-6
+    assert pressed.sum() > 5
+    assert profile.log_density["a"] == pytest.approx(np.min(costs) - np.array(costs), abs=1e-5)
+
+
+def test_ends_are_unknown_where_solves_fail():
+    """A state at rest at √a exists for a > 0 alone, and data this weak do not keep a from zero."""
+    model = bp.Model(
+        "saddle_node",
+        states=["w"],
+        inputs=["x"],
+        parameters=["a"],
+        equations=lambda s, p, u: [s.dw + s.w**2 - p.a - u.x],
+        outputs=lambda s, p, u: {"y": s.w},
+    )
+    wave = 0.1 * WAVE
+    true = bp.solve_periodic(model, {"a": 1.0}, {"x": wave}, frequency=1.0, samples=40)
+    problem = posed(model, true.outputs["y"], 50.0, {"a": bp.Normal(1.0, 1.0)}, wave=wave)
+    profile = bp.profile(problem, fitted(problem, {"a": 1.0}))
+    assert profile.failed["a"] == np.isnan(profile.log_density["a"]).sum() > 0
+    assert np.isnan(profile.paths["a"][np.isnan(profile.log_density["a"])]).all()
+    assert profile.values["a"][np.isfinite(profile.log_density["a"])].min() < 0.2
+    low, high = profile.interval()["a"]
+    assert np.isnan(low)
+    assert np.isfinite(high)
+    assert profile.shape == {"a": "one-sided"}
+
+
+def test_the_profile_stays_on_the_branch_of_the_estimate():
+    """Below its jump a hardening oscillator responds large or small; the estimate's own solution decides."""
+    force, parameters = 0.6 * np.cos(2 * np.pi * grid(50)), {"m": 1.0, "c": 0.1, "k": 1.0, "k3": 0.5}
+    start = bp.solve_periodic(bp.models.duffing, parameters, {"force": force}, frequency=0.1, samples=50)
+    branch = bp.continue_periodic(bp.models.duffing, start, "frequency", until=0.3, step=0.01, progress=False)
+    large = next(s for s in branch if abs(s.frequency - 0.3) < 0.005)
+    runs = [
+        bp.Experiment("run", large.frequency, large.outputs, {"force": force}, samples=50, guess=guess)
+        for guess in (large.states, {})
+    ]
+    guided, plain = (
+        bp.Problem(
+            bp.models.duffing,
+            [run],
+            priors={"k3": bp.Uniform(0.4, 0.6)},
+            fixed={"m": 1, "c": 0.1, "k": 1, "variance[displacement]": 0.01},
+        )
+        for run in runs
+    )
+    fit = fitted(guided)
+    assert float(plain.log_posterior(fit.theta, {})) < float(guided.log_posterior(fit.theta, {})) - 100
+    expected, found = (bp.profile(problem, fit) for problem in (guided, plain))
+    assert found.improvement < 1e-6
+    assert found.log_density["k3"] == pytest.approx(expected.log_density["k3"], abs=1e-6)
+
+
+def test_local_parameters_have_their_units():
+    runs = [linear_experiment(TRUTH, 3.0, seed=s, name=f"run {s}") for s in (4, 5)]
+    problem = bp.Problem(LINEAR, runs, priors=PRIORS, local=["coulomb"], fixed={"variance[force]": 9.0})
+    profile = bp.profile(problem, fitted(problem), ["coulomb[run 5]"])
+    assert profile.names == ("coulomb[run 5]",)
+    assert profile.units["coulomb[run 5]"] == "N"
+    assert profile.paths["coulomb[run 5]"].shape == (13, 4)
+
+
+def test_saved_profile_reads_back_and_prints_the_same(linear, tmp_path):
+    _, _, profile = linear
+    profile.save(tmp_path / "profile.h5")
+    loaded = bp.load(tmp_path / "profile.h5")
+    assert isinstance(loaded, bp.Profile)
+    assert repr(loaded) == repr(profile)
+    assert loaded.interval(0.95) == profile.interval(0.95)
+    assert np.array_equal(loaded.paths["c"], profile.paths["c"])
+
+
+def test_the_table_holds_both_intervals(linear):
+    _, fit, profile = linear
+    row = profile.table.loc["k"]
+    assert row["laplace_low"] == pytest.approx(fit.theta["k"] - 1.644854 * fit.sd["k"])
+    assert row["low"] == pytest.approx(row["laplace_low"])
+    assert (row["shape"], row["points"], row["failed"]) == ("closed", 13, 0)
+    assert "laplace_low" in repr(profile)
+
+
+def test_what_cannot_be_profiled_is_told(linear):
+    problem, fit, profile = linear
+    with pytest.raises(ValueError, match="names: 'kk' is not known.*Did you mean 'k'"):
+        bp.profile(problem, fit, ["kk"])
+    for names in ("k", []):
+        with pytest.raises(ValueError, match="names: .* is not allowed; it must be a sequence of names"):
+            bp.profile(problem, fit, names)
+    with pytest.raises(ValueError, match=r"probability: 0.999 is not allowed; it must be above 0 and at most 0.99"):
+        profile.interval(0.999)
+    run = linear_experiment(TRUTH, 3.0, seed=1)
+    other = bp.Problem(LINEAR, [run], priors=PRIORS | {"c": bp.Uniform(0.0, 1.0)}, fixed={"variance[force]": 9.0})
+    with pytest.raises(ValueError, match=r"fit: k = .* is not allowed; the log-posterior is not finite there"):
+        bp.profile(other, fit)
+    fewer = bp.Problem(LINEAR, [run], priors={"k": PRIORS["k"]}, fixed={"c": 40.0, "coulomb": 25.0})
+    with pytest.raises(ValueError, match="fit.theta: 'c' is not known"):
+        bp.profile(fewer, fit)

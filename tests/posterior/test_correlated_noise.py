@@ -1,0 +1,158 @@
+"""Do 90 % intervals cover 90 % where errors are correlated along the period, and are residuals taken apart rightly.
+
+Recordings of 119 samples a cycle with a first-order autoregressive process on the line, ρ = 0.9 from sample to sample,
+or with white noise, folded to n = 800. 300 each; the count of covered truths must lie in the two-sided 99 % binomial
+band (a false-alarm rate of 1 % a statement).
+"""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy import signal, stats
+
+import bayesperiodic as bp
+from bayesperiodic import noise
+from bayesperiodic.estimation.result import NoiseSplit, whiteness
+from tests.known import LINEAR, grid, linear_regressors
+
+RECORDINGS, HARMONICS = 300, 20
+FREQUENCY, PER_CYCLE, AMPLITUDE, SD = 2.0, 119.37, 0.05, 10.0
+TRUTH = {"k": 900.0, "coulomb": 25.0}
+DAMPING, CORRELATION = 40.0, 0.9
+FLAT = {"k": bp.Normal(900.0, 1e5), "coulomb": bp.Normal(25.0, 1e4)}
+BAND = stats.binom.ppf([0.005, 0.995], RECORDINGS, 0.9)
+COUNT = 2 * HARMONICS + 1
+
+
+@cache
+def folded(correlation: float, cycles: int, recordings: int = RECORDINGS) -> list[bp.Experiment]:
+    time = np.arange(int(cycles * PER_CYCLE) + 2) / (PER_CYCLE * FREQUENCY)
+    tau = FREQUENCY * time
+    clean = linear_regressors(AMPLITUDE, FREQUENCY, tau) @ [TRUTH["k"], DAMPING, TRUTH["coulomb"]]
+    x = AMPLITUDE * np.sin(2 * np.pi * tau)
+    white = np.random.default_rng(1).standard_normal((recordings, 500 + time.size))
+    errors = SD * np.sqrt(1.0 - correlation**2) * signal.lfilter([1.0], [1.0, -correlation], white)[:, 500:]
+    return [
+        bp.Recording.from_arrays(time, {"force": clean + e}, {"x": x}).fold(
+            800, harmonics=HARMONICS, frequency=FREQUENCY
+        )
+        for e in errors
+    ]
+
+
+def fitted(experiment: bp.Experiment, model="independent", **fixed: float) -> bp.MapEstimate:
+    problem = bp.Problem(LINEAR, [experiment], priors=FLAT, fixed={"c": DAMPING} | fixed, noise=model)
+    return bp.map_estimate(problem, progress=False)
+
+
+@cache
+def all_fitted(correlation: float, cycles: int, model="independent") -> tuple[dict[tuple[str, bool], int], list[float]]:
+    """Return how many intervals held their truth, by parameter and by whether they were robust, and all whiteness p."""
+    count, p = {(name, robust): 0 for name in TRUTH for robust in (False, True)}, []
+    for experiment in folded(correlation, cycles):
+        fit = fitted(experiment, model)
+        p.append(fit.whiteness["force"].p)
+        for name, robust in count:
+            low, high = fit.interval(0.9, robust=robust)[name]
+            count[name, robust] += low < TRUTH[name] < high
+    return count, p
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(TRUTH))
+def test_independent_noise_covers_far_too_little_where_errors_are_correlated(name):
+    assert all_fitted(CORRELATION, 20)[0][name, False] < 0.6 * RECORDINGS
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(TRUTH))
+def test_robust_intervals_cover_where_errors_are_correlated(name):
+    assert BAND[0] <= all_fitted(CORRELATION, 20)[0][name, True] <= BAND[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(TRUTH))
+@pytest.mark.parametrize("robust", [False, True])
+def test_circulant_noise_covers_where_errors_are_correlated(name, robust):
+    """Its spectrum is the exponential kernel's but for O(1/20); the length is estimated, and its uncertainty counts."""
+    assert BAND[0] <= all_fitted(CORRELATION, 20, noise.Circulant(kernel="exponential"))[0][name, robust] <= BAND[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(TRUTH))
+@pytest.mark.parametrize("robust", [False, True])
+def test_both_intervals_cover_where_errors_are_white(name, robust):
+    assert BAND[0] <= all_fitted(0.0, 6)[0][name, robust] <= BAND[1]
+
+
+def test_where_the_prior_says_everything_the_robust_sd_is_the_priors():
+    experiment = folded(0.0, 6)[0]
+    priors = {"k": bp.Normal(900.0, 1e-3), "coulomb": bp.Normal(25.0, 1e-5)}
+    fit = bp.map_estimate(bp.Problem(LINEAR, [experiment], priors=priors, fixed={"c": DAMPING}), progress=False)
+    assert list(fit.robust_sd.values()) == pytest.approx([1e-3, 1e-5], rel=1e-6)
+
+
+def stationary_on_the_circle(lengthscale: float, seed: int) -> bp.Experiment:
+    """Return an experiment whose kept harmonics have errors with the exponential kernel's spectrum."""
+    tau, generator = grid(200), np.random.default_rng(seed)
+    harmonic = np.arange(HARMONICS + 1)
+    power = 1.0 / (1.0 + (2 * np.pi * harmonic * lengthscale) ** 2)
+    power /= (power[0] + 2.0 * power[1:].sum()) / COUNT
+    cosine, sine = generator.standard_normal((2, harmonic.size)) * np.sqrt(power * np.where(harmonic, 2.0, 1.0) / COUNT)
+    waves = 2 * np.pi * np.outer(tau, harmonic)
+    clean = linear_regressors(AMPLITUDE, FREQUENCY, tau) @ [TRUTH["k"], DAMPING, TRUTH["coulomb"]]
+    return bp.Experiment(
+        "run",
+        FREQUENCY,
+        {"force": clean + SD * (np.cos(waves) @ cosine + np.sin(waves) @ sine)},
+        {"x": AMPLITUDE * np.sin(2 * np.pi * tau)},
+        samples=200,
+        harmonics={"force": HARMONICS},
+    )
+
+
+@pytest.mark.slow
+def test_residuals_in_units_of_the_right_noise_are_white():
+    """Uniform p from 500 runs with known noise parameters (KS at 0.1 %); before whitening hardly any passes 1 %."""
+    known = {"variance[force]": SD**2, "lengthscale[force]": 0.08}
+    runs = [stationary_on_the_circle(0.08, seed) for seed in range(500)]
+    fits = [fitted(run, noise.Circulant(kernel="exponential"), **known) for run in runs]
+    assert stats.kstest([fit.whiteness["force"].p for fit in fits], "uniform").pvalue > 1e-3
+    raw = [whiteness(fit.residuals["run"]["force"], HARMONICS).p for fit in fits]
+    assert np.mean(np.array(raw) < 0.01) > 0.5
+
+
+@pytest.mark.slow
+def test_residuals_of_white_noise_are_white():
+    """Uniform p from 300 folded recordings, KS at 0.1 %."""
+    assert stats.kstest(all_fitted(0.0, 6)[1], "uniform").pvalue > 1e-3
+
+
+@cache
+def splits(amplitude: float) -> list[NoiseSplit]:
+    """Return how 100 recordings of white noise are taken apart, harmonic 8 having this amplitude beside the model."""
+    wave = amplitude * np.cos(2 * np.pi * 8 * grid(800) + 0.3)
+    runs = [replace(e, outputs={"force": e.outputs["force"] + wave}) for e in folded(0.0, 20, 100)]
+    return [fitted(run).noise_split["force"] for run in runs]
+
+
+def test_measurement_noise_is_that_of_the_mean_of_20_cycles():
+    """Each sd of 19 · 41 degrees of freedom is within four standard errors, of 100 (a false-alarm rate of 0.6 %)."""
+    expected = SD * np.sqrt(COUNT / (20 * PER_CYCLE))
+    for split in splits(0.0):
+        assert split.measurement == pytest.approx(expected, rel=4.0 / np.sqrt(2 * 19 * COUNT))
+
+
+@pytest.mark.parametrize("amplitude", [0.0, 4.0])
+def test_model_error_is_what_measurement_noise_leaves_open(amplitude):
+    """The mean of total² less measured² over 100 recordings is amplitude²/2 within four standard errors.
+
+    The wave is in none of the regressors, which have odd harmonics only, so that eq. (7) raises its share by 41/39.
+    """
+    found = splits(amplitude)
+    excess = np.array([split.total**2 - split.measurement**2 for split in found])
+    expected = 0.5 * amplitude**2 * COUNT / (COUNT - 2)
+    assert abs(excess.mean() - expected) < 4.0 * excess.std(ddof=1) / 10.0
+    assert [split.model**2 for split in found] == pytest.approx(np.maximum(excess, 0.0), rel=1e-9, abs=1e-12)

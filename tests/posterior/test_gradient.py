@@ -1,0 +1,158 @@
+"""The gradient of the log-posterior for every kind of observation, against eighth-order differences."""
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.periodic.batch import Batch
+from tests.posterior.observed import (
+    DUFFING_PRIORS,
+    PENDULUM_PRIORS,
+    SAMPLES,
+    cycle_run,
+    duffing_run,
+    pendulum_problem,
+    pendulum_run,
+    section_run,
+)
+
+EIGHTH_ORDER = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+DELAY = {"shift": bp.Normal(0.0, 0.1)}
+POINTS = np.arange(SAMPLES) % 20 == 3
+
+
+def duffing(*experiments: bp.Experiment, **changes) -> bp.Problem:
+    arguments = {"priors": DUFFING_PRIORS, "fixed": {"m": 1.0}}
+    return bp.Problem(bp.models.duffing, experiments, **(arguments | changes))
+
+
+CASES = {
+    "every sample": lambda: (duffing(duffing_run()), [0.21, 1.02, 0.48]),
+    "harmonics kept, tied": lambda: (
+        duffing(
+            duffing_run(harmonics={"displacement": 7}),
+            priors={"c": bp.LogNormal(0.2, 0.3), "k": bp.Normal(1.0, 0.3)},
+            tied={"k3": "0.5*k**2"},
+        ),
+        [0.21, 1.02],
+    ),
+    "circulant": lambda: (
+        duffing(duffing_run(harmonics={"displacement": 9}), noise="circulant"),
+        [0.21, 1.02, 0.48],
+    ),
+    "measured": lambda: (
+        duffing(duffing_run(scatter={"displacement": 0.2}, cycles=9), noise="measured"),
+        [0.21, 1.02, 0.48],
+    ),
+    "local and delayed": lambda: (
+        duffing(
+            duffing_run(),
+            duffing_run("run 2", 0.13, seed=2),
+            priors=DUFFING_PRIORS | DELAY,
+            local=["c"],
+            noise=bp.noise.Independent(per="experiment"),
+        ),
+        [0.21, 0.19, 1.02, 0.48, 0.05, -0.03],
+    ),
+    "angle of a rotation": lambda: (pendulum_problem([pendulum_run()]), [0.301, 4.6e-4]),
+    "delayed angle": lambda: (
+        pendulum_problem([pendulum_run()], priors=PENDULUM_PRIORS | DELAY),
+        [0.301, 4.6e-4, 0.02],
+    ),
+    "section and multiplier": lambda: (
+        pendulum_problem([section_run()], noise=bp.noise.Independent(prior=bp.InverseGamma(3.0, 2.0))),
+        [0.301, 4.6e-4],
+    ),
+    "masked, correlated": lambda: (
+        pendulum_problem([pendulum_run(mask=POINTS, multipliers=[-1.75], multiplier_sd=[0.1])], noise="circulant"),
+        [0.301, 4.6e-4],
+    ),
+    "autonomous": lambda: (
+        bp.Problem(
+            bp.models.van_der_pol,
+            [cycle_run()],
+            priors={"mu": bp.LogNormal(1.5, 0.3), "omega": bp.Normal(1.0, 0.2)},
+            scheme="central4",
+        ),
+        [1.52, 1.003, 0.05],
+    ),
+}
+
+
+def differences(problem: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return the gradient of the log-posterior by θ and the logarithms of the free noise parameters.
+
+    Every point is solved to rounding, as an anchor is: chord steps end when the next one would be below 1e-9, which
+    shows in differences.
+    """
+    columns = [problem.noise_names.index(name) for name in problem.free_noise]
+    result = []
+    for i in range(len(problem.names) + len(columns)):
+        parameter = i < len(problem.names)
+        step, total = 1e-3 * abs(theta[i]) if parameter else 1e-2, 0.0
+        for k, weight in EIGHTH_ORDER.items():
+            for sign in (1, -1):
+                moved, loud = theta.copy(), noise.copy()
+                if parameter:
+                    moved[i] += sign * k * step
+                else:
+                    loud[columns[i - len(problem.names)]] *= np.exp(sign * k * step)
+                total += sign * weight * float(problem.anchored(moved).log_posterior(moved, loud))
+        result.append(total / step)
+    return np.array(result)
+
+
+@pytest.mark.filterwarnings("ignore:A smooth sign")
+@pytest.mark.parametrize("case", CASES)
+def test_gradient_is_that_of_the_density(case):
+    problem, theta = CASES[case]()
+    theta, noise = np.array(theta), problem.likelihood.guess()
+    noise[[name.startswith("variance") for name in problem.noise_names]] = 0.01
+    problem = problem.anchored(theta)
+    adjoint, forward = (problem.gradient(theta, noise, method=m) for m in ("adjoint", "forward"))
+    numerical = differences(problem, theta, noise)
+    scale = np.abs(numerical) + 1e-3 * np.abs(numerical).max()
+    assert np.abs(forward - numerical) / scale == pytest.approx(0.0, abs=1e-8)
+    assert adjoint == pytest.approx(forward, rel=1e-10, abs=1e-10 * np.abs(forward).max())
+
+
+@pytest.mark.filterwarnings("ignore:A smooth sign")
+@pytest.mark.parametrize("case", CASES)
+def test_value_and_gradient_away_from_the_anchors(case):
+    """Against a solve to rounding at the same point."""
+    problem, theta = CASES[case]()
+    theta, noise = np.array(theta), problem.likelihood.guess()
+    problem = problem.anchored(theta)
+    moved = theta * (1.0 + 1e-3 * np.random.default_rng(1).standard_normal(theta.size))
+    exact = problem.anchored(moved)
+    value, gradient = problem.value_and_gradient(moved, noise)
+    assert value == pytest.approx(float(problem.log_posterior(moved, noise)), abs=1e-5)
+    assert value == pytest.approx(float(exact.log_posterior(moved, noise)), rel=1e-9, abs=1e-7)
+    expected = exact.gradient(moved, noise, method="forward")
+    assert gradient == pytest.approx(expected, rel=1e-6, abs=1e-8 * np.abs(expected).max())
+
+
+def test_value_and_gradient_outside_the_support():
+    value, gradient = duffing(duffing_run()).value_and_gradient(
+        {"c": -1.0, "k": 1.0, "k3": 0.5}, {"displacement": 0.01}
+    )
+    assert value == -np.inf
+    assert gradient.tolist() == [0.0] * 4
+
+
+def test_value_and_gradient_where_the_transposed_solve_is_singular(monkeypatch):
+    problem = duffing(duffing_run())
+    theta, noise = {"c": 0.2, "k": 1.0, "k3": 0.5}, {"displacement": 0.01}
+    assert np.isfinite(problem.value_and_gradient(theta, noise)[0])
+    monkeypatch.setattr(Batch, "pull", lambda self, p, z, weights, moving: np.full((len(p), len(moving)), np.nan))
+    value, gradient = problem.value_and_gradient(theta, noise)
+    assert value == -np.inf
+    assert gradient.tolist() == [0.0] * 4
+
+
+def test_gradient_needs_a_point_inside_the_support():
+    problem = duffing(duffing_run())
+    with pytest.raises(ValueError, match="theta: .* the log-posterior is not finite there"):
+        problem.gradient({"c": -1.0, "k": 1.0, "k3": 0.5}, {"displacement": 0.01})
+    with pytest.raises(ValueError, match="method: 'reverse' is not known; allowed: 'adjoint', 'forward'"):
+        problem.gradient({"c": 0.2, "k": 1.0, "k3": 0.5}, {"displacement": 0.01}, method="reverse")

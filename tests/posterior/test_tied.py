@@ -1,0 +1,72 @@
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+
+PRIORS = {"k": bp.Normal(800.0, 60.0), "coulomb": bp.Normal(20.0, 10.0)}
+VARIANCE = {"variance[force]": 9.0}
+
+
+def problem(tied, priors=PRIORS, fixed=VARIANCE) -> bp.Problem:
+    return bp.Problem(
+        LINEAR, [linear_experiment([900.0, 45.0, 25.0], 3.0, seed=1)], priors=priors, fixed=fixed, tied=tied
+    )
+
+
+def test_a_tied_parameter_follows_the_free_ones():
+    """C = k/20 + coulomb turns the linear model into one with two regressors, whose posterior is closed."""
+    fit = bp.map_estimate(problem({"c": "k/20 + coulomb"}), progress=False)
+    x = linear_regressors(0.05, 2.0, grid(40))
+    regressors = np.stack([x[:, 0] + x[:, 1] / 20, x[:, 2] + x[:, 1]], axis=-1)
+    data = linear_experiment([900.0, 45.0, 25.0], 3.0, seed=1).outputs["force"]
+    precision = regressors.T @ regressors / 9.0 + np.diag([60.0**-2, 10.0**-2])
+    mean = np.linalg.solve(precision, regressors.T @ data / 9.0 + np.array([800 / 60.0**2, 20 / 10.0**2]))
+    assert list(fit.theta.values()) == pytest.approx(mean, rel=1e-9)
+    assert fit.covariance.to_numpy() == pytest.approx(np.linalg.inv(precision), rel=1e-8)
+    derived = fit.derive({"damping": "c", "sum": "c + k"})
+    slopes = np.array([[1 / 20, 1.0], [21 / 20, 1.0]])
+    assert derived["value"].to_numpy() == pytest.approx(slopes @ mean, rel=1e-9)
+    exact = np.sqrt(np.diag(slopes @ np.linalg.inv(precision) @ slopes.T))
+    assert derived["sd"].to_numpy() == pytest.approx(exact, rel=1e-8)
+
+
+def test_density_and_prediction_use_the_tie():
+    tied, free = problem({"c": "0.05*k"}), problem({}, priors=PRIORS | {"c": bp.Normal(45.0, 1e3)})
+    theta = {"k": np.array([850.0, 910.0]), "coulomb": np.array([20.0, 31.0])}
+    expected = free.log_likelihood(theta | {"c": 0.05 * theta["k"]}, {})
+    assert tied.log_likelihood(theta, {}) == pytest.approx(expected, rel=1e-12)
+
+
+def test_chains_of_ties_and_nonlinear_ones_have_exact_slopes():
+    chained = problem({"c": "sqrt(coulomb)*2", "coulomb": "k**2/1e5"}, priors={"k": PRIORS["k"]})
+    at = chained.parameters(np.array([[800.0]]), "run")[0]
+    assert at == pytest.approx([800.0, 2 * np.sqrt(6.4), 6.4])
+    slopes = chained.parameter_maps["run"].slopes(np.array([800.0]))
+    assert slopes[:, 0] == pytest.approx([1.0, 0.016 / np.sqrt(6.4), 0.016, 0.0], rel=1e-12)
+    fit = bp.map_estimate(chained, progress=False)
+    assert fit.converged and fit.tied["coulomb"]["k"] == pytest.approx(2 * fit.theta["k"] / 1e5)
+
+
+def test_ties_are_part_of_the_fingerprint():
+    from bayesperiodic.sampling.checkpoint import fingerprint
+
+    assert fingerprint(problem({"c": "0.05*k"})) != fingerprint(problem({"c": "0.06*k"}))
+
+
+@pytest.mark.parametrize(
+    ("tied", "fixed", "message"),
+    [
+        ({"c": "k2/20"}, {}, r"tied\['c'\].*'k2' is not known.*Did you mean 'k'"),
+        ({"c": "2*c"}, {}, "tied: .* come back to themselves"),
+        ({"damping": "k"}, {}, "tied: 'damping' is not known"),
+        ({"c": "k", "k": "c"}, {}, "tied: 'k' is in priors too"),
+        ({"c": "k"}, {"c": 1.0}, "tied: 'c' is in fixed too"),
+        ({"c": "__import__('os')"}, {}, r"tied\['c'\].* is not"),
+        ({"c": 3.0}, {}, r"tied\['c'\]: 3.0 is not allowed"),
+        ({}, {}, "'c' has neither a prior nor a value"),
+    ],
+)
+def test_bad_ties_are_named(tied, fixed, message):
+    with pytest.raises(ValueError, match=message):
+        problem(tied, fixed=VARIANCE | fixed)

@@ -1,0 +1,200 @@
+"""A run that is killed, at any moment, goes on as if nothing had happened."""
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import emcee
+import h5py
+import numpy as np
+import pytest
+from filelock import FileLock
+from tqdm import tqdm
+
+import bayesperiodic as bp
+from bayesperiodic.sampling import checkpoint, sample
+from tests.known import LINEAR, linear_experiment
+
+TRUTH = np.array([900.0, 40.0, 25.0])
+PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}
+RUN = {"seed": 5, "ensembles": 2, "walkers": 8, "max_steps": 150, "progress": False}
+WRITES = [(h5py.Group, "create_dataset"), (h5py.AttributeManager, "__setitem__"), (os, "replace")]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_blocks():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sample, "BLOCK", 50)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def lock_of_this_process(monkeypatch):
+    """Keep tqdm's lock, a semaphore, from forked children: one that is killed with it would stop this process too."""
+    monkeypatch.setattr(tqdm, "_lock", threading.RLock(), raising=False)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS)
+    return problem, bp.map_estimate(problem, progress=False)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(problem, tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "run.h5"
+    return bp.sample(*problem, checkpoint=path, **RUN), content(path)
+
+
+def content(path: Path) -> dict[str, np.ndarray]:
+    """Return everything that emcee finds in the file: chains, log-densities, accepted counts, random states."""
+    result = {}
+    for name in ("ensemble 0", "ensemble 1"):
+        backend = emcee.backends.HDFBackend(str(path), name=name, read_only=True)
+        result[f"{name} chain"], result[f"{name} lp"] = backend.get_chain(), backend.get_log_prob()
+        result[f"{name} accepted"] = np.array(backend.accepted)
+        for number, part in enumerate(backend.random_state):
+            result[f"{name} random state {number}"] = np.array(part)
+    return result
+
+
+def same(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> bool:
+    return one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)
+
+
+def in_child(work: Callable[[], object]) -> int:
+    """Start work in a child process; return its number."""
+    child = os.fork()
+    if child == 0:
+        try:
+            work()
+        finally:
+            os._exit(0)
+    return child
+
+
+def die_at(monkeypatch: pytest.MonkeyPatch, write: int) -> None:
+    """Kill this process instead of its nth write."""
+    count = 0
+
+    def counted(original: Callable) -> Callable:
+        def wrapper(*arguments, **named):
+            nonlocal count
+            count += 1
+            if count == write:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return original(*arguments, **named)
+
+        return wrapper
+
+    for owner, name in WRITES:
+        monkeypatch.setattr(owner, name, counted(getattr(owner, name)))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_killed_between_any_two_writes_of_a_save(problem, uninterrupted, tmp_path, monkeypatch):
+    """The second save is interrupted at each of its writes, until one save needs no more of them."""
+    monkeypatch.setattr(checkpoint, "PATIENCE", 0.0)
+    with monkeypatch.context() as patch:
+        total = 0
+
+        def counting(original: Callable) -> Callable:
+            def wrapper(*arguments, **named):
+                nonlocal total
+                total += 1
+                return original(*arguments, **named)
+
+            return wrapper
+
+        for owner, name in WRITES:
+            patch.setattr(owner, name, counting(getattr(owner, name)))
+        bp.sample(*problem, checkpoint=tmp_path / "counted.h5", **(RUN | {"max_steps": 50}))
+    assert total > 20
+    for write in range(total + 1, 2 * total + 1):
+        path = tmp_path / f"run {write}.h5"
+
+        def work(path: Path = path, write: int = write) -> None:
+            with pytest.MonkeyPatch.context() as patch:
+                die_at(patch, write)
+                bp.sample(*problem, checkpoint=path, **RUN)
+
+        _, status = os.waitpid(in_child(work), 0)
+        assert os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
+        assert len(content(path)["ensemble 0 chain"]) == 50
+        bp.sample(*problem, checkpoint=path, **RUN)
+        assert same(content(path), uninterrupted[1])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_killed_at_twenty_random_moments(problem, uninterrupted, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoint, "PATIENCE", 0.0)
+    started = time.monotonic()
+    bp.sample(*problem, checkpoint=tmp_path / "timed.h5", **RUN)
+    duration = time.monotonic() - started
+    for number, moment in enumerate(np.random.default_rng(1).uniform(0.0, duration, 20)):
+        path = tmp_path / f"run {number}.h5"
+        child = in_child(lambda path=path: bp.sample(*problem, checkpoint=path, **RUN))
+        time.sleep(moment)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        resumed = bp.sample(*problem, checkpoint=path, **RUN)
+        assert same(content(path), uninterrupted[1])
+        assert np.array_equal(resumed.draws("k"), uninterrupted[0].draws("k"))
+        assert resumed.log_posterior_calls == uninterrupted[0].log_posterior_calls
+
+
+def test_interrupted_runs_give_what_they_have_and_can_go_on(problem, uninterrupted, tmp_path, monkeypatch):
+    """Ctrl-C in the third block: a partial result that says so, and the same chain in the end."""
+    path, calls = tmp_path / "run.h5", 0
+    original = bp.Problem.misfits
+
+    def interrupted(self, *arguments, **named):
+        nonlocal calls
+        calls += 1
+        if calls == 225:
+            signal.raise_signal(signal.SIGINT)
+        return original(self, *arguments, **named)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bp.Problem, "misfits", interrupted)
+        partial = bp.sample(*problem, checkpoint=path, **RUN)
+    assert not partial.converged and partial.reason.startswith("interrupted after ")
+    assert "NOT CONVERGED" in repr(partial)
+    bp.sample(*problem, checkpoint=path, **RUN)
+    assert same(content(path), uninterrupted[1])
+
+
+def test_a_chain_may_be_continued_further(problem, uninterrupted, tmp_path):
+    path = tmp_path / "run.h5"
+    bp.sample(*problem, checkpoint=path, **(RUN | {"max_steps": 100}))
+    further = bp.sample(*problem, checkpoint=path, **RUN)
+    assert same(content(path), uninterrupted[1])
+    again = bp.sample(*problem, checkpoint=path, **RUN)
+    assert again.reason == further.reason == uninterrupted[0].reason
+
+
+def test_a_file_that_is_damaged_locked_or_of_another_run_is_refused(problem, tmp_path):
+    path = tmp_path / "run.h5"
+    bp.sample(*problem, checkpoint=path, **(RUN | {"max_steps": 50}))
+    with pytest.raises(
+        ValueError, match=r"checkpoint: .* belongs to another run \(.* seed 5.*\), this one is .* seed 6"
+    ):
+        bp.sample(*problem, checkpoint=path, **(RUN | {"seed": 6}))
+    with FileLock(f"{path}.lock"), pytest.raises(ValueError, match="checkpoint: .* is in use by another run"):
+        bp.sample(*problem, checkpoint=path, **RUN)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match="checkpoint: .* it is damaged or no HDF5 file"):
+        bp.sample(*problem, checkpoint=path, **RUN)
+
+
+def test_nothing_is_left_beside_the_file(problem, tmp_path):
+    bp.sample(*problem, checkpoint=tmp_path / "run.h5", **(RUN | {"max_steps": 50}))
+    assert [path.name for path in tmp_path.iterdir()] == ["run.h5"]

@@ -1,0 +1,307 @@
+"""Whoever walks, the chain is the same; whoever dies, nothing that was walked is lost."""
+
+import os
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from importlib.util import find_spec
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+from tqdm import tqdm
+
+import bayesperiodic as bp
+from bayesperiodic.posterior import problem as problem_module
+from bayesperiodic.posterior.likelihood import Squares
+from bayesperiodic.sampling import ensemble, sample
+from bayesperiodic.sampling.coordinates import SamplingDensity
+from tests.posterior.observed import (
+    DUFFING,
+    DUFFING_PRIORS,
+    SAMPLES,
+    cycle_run,
+    duffing_run,
+    pendulum_problem,
+    pendulum_run,
+    section_run,
+)
+from tests.sampling.test_checkpoint import content, same
+
+RUN = {"seed": 5, "ensembles": 2, "walkers": 8, "max_steps": 150}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_blocks():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sample, "BLOCK", 50)
+        yield
+
+
+@pytest.fixture(scope="module")
+def posed():
+    """Return a problem of three experiments and its estimate."""
+    runs = [duffing_run(f"run {n}", frequency, seed=n) for n, frequency in enumerate((0.05, 0.1, 0.3))]
+    problem = bp.Problem(bp.models.duffing, runs, priors=DUFFING_PRIORS, fixed={"m": 1.0})
+    return problem, bp.map_estimate(problem, progress=False)
+
+
+def sampled(posed, **changes) -> bp.Posterior:
+    return bp.sample(*posed, **(RUN | {"progress": False} | changes))
+
+
+@pytest.fixture(scope="module")
+def serial(posed, tmp_path_factory):
+    path = tmp_path_factory.mktemp("serial") / "run.h5"
+    return sampled(posed, checkpoint=path), path
+
+
+def alike(one: bp.Posterior, other: bp.Posterior) -> bool:
+    """Return whether two posteriors are the same to the last bit."""
+    draws = all(np.array_equal(one.draws(name), other.draws(name)) for name in one.names)
+    lp = np.array_equal(one.data["sample_stats"]["lp"], other.data["sample_stats"]["lp"])
+    counts = ("log_posterior_calls", "failures", "acceptance", "reason", "tau")
+    return one.names == other.names and draws and lp and all(getattr(one, c) == getattr(other, c) for c in counts)
+
+
+@pytest.mark.parametrize("cores", [1, 2, 4])
+def test_same_bits_with_any_number_of_threads(posed, serial, cores, monkeypatch):
+    monkeypatch.setattr(sample, "available_cores", lambda: cores)
+    monkeypatch.setattr(problem_module, "SMALLEST_SHARED", 1)
+    assert alike(sampled(posed), serial[0])
+
+
+def test_pieces_leave_no_trace(posed, serial, monkeypatch):
+    """In pieces of another length the same chain, and accepted proposals are those that moved a walker."""
+    monkeypatch.setattr(ensemble, "PIECE", 7)
+    assert alike(sampled(posed), serial[0])
+    kept = content(serial[1])
+    for name in ("ensemble 0", "ensemble 1"):
+        moved = np.any(np.diff(kept[f"{name} chain"], axis=0) != 0.0, axis=-1).sum(axis=0)
+        assert set(kept[f"{name} accepted"] - moved) <= {0.0, 1.0}, "the first step has no predecessor in the chain"
+
+
+@pytest.mark.parametrize("which", ["processes", "dask", "threads"])
+def test_same_bits_with_any_executor(posed, serial, which, request, tmp_path):
+    """Chains, log-densities, accepted counts and random states, in the result and in the checkpoint."""
+    path = tmp_path / "run.h5"
+    with ThreadPoolExecutor(3) as threads:
+        executor = threads if which == "threads" else request.getfixturevalue(which)
+        assert alike(sampled(posed, executor=executor, checkpoint=path), serial[0])
+    assert same(content(path), content(serial[1]))
+
+
+def test_same_bits_with_a_number_of_processes(posed, serial):
+    assert alike(sampled(posed, executor=2), serial[0])
+
+
+def test_same_bits_with_variances_integrated_out(posed, processes):
+    assert alike(*(sampled(posed, executor=e, variances="collapsed", max_steps=50) for e in (None, processes)))
+
+
+def test_same_bits_from_the_prior_with_failing_solves(processes):
+    """A softening spring, which has no periodic solution for many draws of its prior."""
+    priors = {"k": bp.Normal(1.0, 0.5), "k3": bp.Normal(0.0, 1.0)}
+    problem = bp.Problem(bp.models.duffing, [duffing_run()], priors=priors, fixed={"m": 1.0, "c": DUFFING["c"]})
+    fit = bp.map_estimate(problem, start={"k": 1.0, "k3": 0.5}, progress=False)
+    one, other = (sampled((problem, fit), executor=e, start="prior", max_steps=50) for e in (None, processes))
+    assert alike(one, other) and one.failures
+
+
+def test_a_run_goes_on_with_another_executor(posed, serial, processes, dask, tmp_path):
+    path = tmp_path / "run.h5"
+    for steps, executor in ((50, processes), (100, None), (150, dask)):
+        last = sampled(posed, executor=executor, checkpoint=path, max_steps=steps)
+    assert alike(last, serial[0]) and same(content(path), content(serial[1]))
+
+
+def hooked(monkeypatch: pytest.MonkeyPatch, steps: int, act) -> None:
+    """Let something happen once all ensembles have walked so many steps, between two pieces."""
+
+    class Bar(tqdm):
+        def update(self, n=1):
+            super().update(n)
+            if self.n >= steps and not getattr(Bar, "done", False):
+                Bar.done = True
+                act()
+
+    monkeypatch.setattr(sample, "tqdm", Bar)
+
+
+def killed(pool: ProcessPoolExecutor) -> None:
+    for process in list(pool._processes.values()):
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+
+
+def test_dead_workers_leave_what_was_walked(posed, serial, tmp_path, monkeypatch):
+    """First so early that there is no result, then late enough for one, then to the end without workers."""
+    path = tmp_path / "run.h5"
+    for workers, steps in ((1, 0), (2, 75)):
+        with ProcessPoolExecutor(workers, get_context("spawn")) as pool, monkeypatch.context() as patch:
+            hooked(patch, steps, lambda pool=pool: killed(pool))
+            if steps:
+                partial = sampled(posed, executor=pool, checkpoint=path, progress=True)
+            else:
+                with pytest.raises(RuntimeError, match=r"executor: its workers were lost \(BrokenProcessPool: .*too f"):
+                    sampled(posed, executor=pool, checkpoint=path, progress=True)
+    assert not partial.converged
+    assert partial.reason.startswith("stopped after ") and "BrokenProcessPool" in partial.reason
+    walked = len(content(path)["ensemble 0 chain"])
+    assert 75 <= walked < 150
+    assert np.array_equal(content(path)["ensemble 0 chain"], content(serial[1])["ensemble 0 chain"][:walked])
+    assert alike(sampled(posed, checkpoint=path), serial[0]) and same(content(path), content(serial[1]))
+
+
+def test_ctrl_c_leaves_what_was_walked(posed, serial, processes, tmp_path, monkeypatch):
+    path = tmp_path / "run.h5"
+    with monkeypatch.context() as patch:
+        hooked(patch, 75, lambda: signal.raise_signal(signal.SIGINT))
+        partial = sampled(posed, executor=processes, checkpoint=path, progress=True)
+    assert not partial.converged and partial.reason.startswith("interrupted after ")
+    assert alike(sampled(posed, executor=processes, checkpoint=path), serial[0])
+
+
+def test_dask_does_the_tasks_of_a_dead_worker_again(posed, serial, dask, monkeypatch):
+    """Both workers die, one with the only copy of the problem; new ones take their place."""
+
+    def kill() -> None:
+        for process in dask.run(os.getpid).values():
+            os.kill(process, signal.SIGKILL)
+
+    hooked(monkeypatch, 50, kill)
+    assert alike(sampled(posed, executor=dask, progress=True), serial[0])
+
+
+@pytest.mark.parametrize("which", ["processes", "dask"])
+def test_profiles_do_not_depend_on_the_executor(posed, which, request):
+    here, there = (bp.profile(*posed, ["c", "k3"], executor=e) for e in (None, request.getfixturevalue(which)))
+    assert list(there.values) == ["c", "k3"] and here.limits == there.limits and here.best == there.best
+    for name in here.names:
+        assert np.array_equal(here.values[name], there.values[name])
+        assert np.array_equal(here.log_density[name], there.log_density[name])
+        assert np.array_equal(here.paths[name], there.paths[name])
+
+
+def test_bad_executors_are_refused(posed):
+    for call in (bp.sample, bp.profile):
+        arguments = {"seed": 1} if call is bp.sample else {}
+        with pytest.raises(ValueError, match="executor: 0 is not allowed; it must be None, a number of processes"):
+            call(*posed, executor=0, **arguments)
+
+
+def correlated_points() -> bp.Experiment:
+    """Return the rotation at every fourth sample, all errors correlated."""
+    mask = np.arange(SAMPLES) % 4 == 0
+    distance = np.abs(np.subtract.outer(np.arange(2 * mask.sum()), np.arange(2 * mask.sum())))
+    return pendulum_run(mask=mask, covariance=1e-3 * np.exp(-distance / 5.0))
+
+
+def problems() -> dict[str, bp.Problem]:
+    """Return problems of every kind."""
+    two = [duffing_run(), duffing_run("run 2", 0.15, 2)]
+    known = {"m": 1.0}
+    joint = {
+        ("c", "k"): bp.MultivariateNormal([0.2, 1.0], [[0.01, 0.0], [0.0, 0.1]]),
+        "k3": stats.gamma(2.0, scale=0.3),
+    }
+    scatter = duffing_run(scatter={"displacement": 0.01}, cycles=4)
+
+    def duffing(experiments=two, priors=DUFFING_PRIORS, fixed=known, **changes) -> bp.Problem:
+        return bp.Problem(bp.models.duffing, experiments, priors=priors, fixed=fixed, **changes)
+
+    tied = {name: prior for name, prior in DUFFING_PRIORS.items() if name != "c"}
+    own = DUFFING_PRIORS | {"shift": bp.Normal(0.0, 0.1)}
+    cycles = {"mu": bp.LogNormal(1.5, 0.3)}
+    return {
+        "several experiments": duffing(),
+        "joint and scipy priors": duffing(priors=joint),
+        "tied": duffing(priors=tied, tied={"c": "0.2*sqrt(k*m)"}),
+        "local": duffing(priors=own, local=["c"]),
+        "circulant": duffing(noise="circulant"),
+        "measured": duffing([scatter], noise="measured"),
+        "variances of each experiment": duffing(noise=bp.noise.Independent(per="experiment", prior="flat")),
+        "angles": pendulum_problem([pendulum_run()]),
+        "points": pendulum_problem([correlated_points()]),
+        "section": pendulum_problem([section_run()], noise=bp.noise.Independent(prior=bp.InverseGamma(2.0, 1.0))),
+        "autonomous": bp.Problem(
+            bp.models.van_der_pol, [cycle_run()], priors=cycles, fixed={"omega": 1.0}, scheme="central4"
+        ),
+    }
+
+
+@pytest.mark.parametrize("kind", problems())
+def test_a_pickled_problem_has_the_same_density_to_the_last_bit(kind):
+    problem = problems()[kind]
+    anchored = problem.anchored(problem.median())
+    other = pickle.loads(pickle.dumps(anchored))
+    theta = anchored.median() * (1.0 + 0.01 * np.random.default_rng(1).standard_normal((6, len(problem.names))))
+    noise = np.full(len(problem.noise_names), 0.01)
+    expected = anchored.log_posterior(theta, noise)
+    assert np.isfinite(expected).any()
+    assert np.array_equal(other.log_posterior(theta, noise), expected)
+    assert np.array_equal(pickle.loads(pickle.dumps(problem)).median(), problem.median())
+    assert other.names == problem.names and other.tied == problem.tied and repr(other) == repr(problem)
+
+
+def test_the_sum_over_many_experiments_does_not_depend_on_how_many_points_to_the_last_bit():
+    runs = [duffing_run(f"run {n}") for n in range(20)]
+    likelihood = bp.Problem(bp.models.duffing, runs, priors=DUFFING_PRIORS, fixed={"m": 1.0}).likelihood
+    generator = np.random.default_rng(1)
+    squares, values = generator.uniform(size=(20, 37)), generator.uniform(0.1, 1.0, (37, 1))
+    alone = [likelihood(Squares(squares[:, k]), values[k]) for k in range(37)]
+    assert np.array_equal(likelihood(Squares(squares), values), alone)
+
+
+@pytest.mark.parametrize("kind", problems())
+def test_the_density_of_a_point_does_not_depend_on_the_others_to_the_last_bit(kind):
+    problem = problems()[kind]
+    density = SamplingDensity(problem.anchored(problem.median()), threads=2)
+    theta = problem.median() * (1.0 + 0.01 * np.random.default_rng(1).standard_normal((37, len(problem.names))))
+    points = density.from_natural(theta, np.full((37, len(problem.noise_names)), 0.01))
+    values, status = density.evaluate(points)
+    assert np.isfinite(values).sum() > 30
+    for size in (1, 4, 16):
+        parts = [density.evaluate(points[k : k + size]) for k in range(0, 37, size)]
+        assert np.array_equal(np.concatenate([value for value, _ in parts]), values)
+        assert np.array_equal(np.concatenate([ended for _, ended in parts]), status)
+
+
+SCRIPT = """
+import numpy as np
+from mpi4py.futures import MPIPoolExecutor
+import bayesperiodic as bp
+
+if __name__ == "__main__":
+    force = np.cos(2 * np.pi * np.arange(50) / 50)
+    fixed = {"m": 1.0, "k3": 0.5}
+    values, inputs = fixed | {"c": 0.2, "k": 1.0}, {"force": force}
+    truth = bp.solve_periodic(bp.models.duffing, values, inputs, frequency=0.1, samples=50)
+    x = truth.outputs["displacement"] + 0.01 * np.random.default_rng(1).standard_normal(50)
+    run = bp.Experiment("run", 0.1, {"displacement": x}, inputs, samples=50)
+    priors = {"c": bp.LogNormal(0.2, 0.3), "k": bp.Normal(1.0, 0.3)}
+    problem = bp.Problem(bp.models.duffing, [run], priors=priors, fixed=fixed)
+    fit = bp.map_estimate(problem, progress=False)
+    settings = {"seed": 1, "ensembles": 2, "walkers": 8, "max_steps": 250, "progress": False}
+    with MPIPoolExecutor() as pool:
+        there = bp.sample(problem, fit, executor=pool, **settings)
+        profile = bp.profile(problem, fit, executor=pool)
+    here = bp.sample(problem, fit, **settings)
+    same = all(np.array_equal(here.draws(name), there.draws(name)) for name in here.names)
+    print("workers", pool.num_workers, "same", same, profile.shape)
+"""
+
+
+@pytest.mark.skipif(find_spec("mpi4py") is None or shutil.which("mpiexec") is None, reason="needs mpi4py and mpiexec")
+def test_same_bits_with_mpi(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or str(Path.cwd()) for path in sys.path)}
+    command = ["mpiexec", "-n", "3", sys.executable, "-m", "mpi4py.futures", str(script)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
+    assert "same True {'c': 'closed', 'k': 'closed'}" in done.stdout, done.stderr

@@ -1,0 +1,62 @@
+"""Modes that walkers do not pass between: where they start, and what the stop rule says of them."""
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.sampling.convergence import shortfall
+from bayesperiodic.sampling.coordinates import SamplingDensity
+from bayesperiodic.sampling.starts import mirrored_modes, start_points
+from tests.posterior.test_targets import known, model, ridge, run
+
+QUIET = {"progress": False}
+UNCUT = bp.Normal(1.0, 1.0)
+
+
+@pytest.mark.filterwarnings("ignore:The data do not change under")
+def test_the_product_of_two_signed_numbers_has_a_mirrored_mode():
+    """Both negative: the likelihood is the same and N(1, 1) of both is lower by e^-4, up to where the mode is."""
+    problem, fit = ridge({"a": UNCUT, "b": UNCUT})
+    density = SamplingDensity(problem)
+    mean, covariance = density.laplace(fit)
+    ((signs, share),) = mirrored_modes(density, mean, covariance)
+    assert signs.tolist() == [-1.0, -1.0]
+    assert share == pytest.approx(np.exp(-2.0 * mean.sum()), rel=1e-6) and share == pytest.approx(np.exp(-4.0), rel=0.1)
+    points = start_points(density, fit, "laplace", 32, np.random.default_rng(1))
+    product = points.prod(axis=1)
+    assert np.sum(np.all(points < 0.0, axis=1) & (product > 0.0)) >= 2
+
+
+def test_modes_that_are_not_apart_or_not_credible_are_none():
+    """A number measured near zero has one mode on both sides of it; one that is 1 ± 0.1 has no mode at -1."""
+    for value in (0.05, 1.0):
+        problem = bp.Problem(
+            model("number", ["a"], lambda p: {"force": p.a}), [run(force=value)], priors={"a": bp.Normal(0.0, 2.0)},
+            fixed=known(force=0.1),
+        )  # fmt: skip
+        density = SamplingDensity(problem)
+        assert mirrored_modes(density, *density.laplace(bp.map_estimate(problem, **QUIET))) == []
+
+
+def test_positive_parameters_have_no_signs_to_turn():
+    cut = bp.TruncatedNormal(1.0, 1.0, 0.0, np.inf)
+    problem = bp.Problem(
+        model("number", ["a"], lambda p: {"force": p.a}), [run(force=1.0)], priors={"a": cut}, fixed=known(force=0.1)
+    )
+    density = SamplingDensity(problem)
+    assert mirrored_modes(density, *density.laplace(bp.map_estimate(problem, **QUIET))) == []
+
+
+def test_one_walker_that_stays_apart_is_no_convergence():
+    """One of 128 independent walkers that is an sd off is hardly seen in any quantile, but stays apart."""
+    kept = np.random.default_rng(1).standard_normal((4, 2000, 32, 2))
+    tau = np.ones(2)
+    assert shortfall(kept, tau, tau, ("a", "b")) == []
+    kept[2, :, 5, 1] += 1.0
+    assert [text[:22] for text in shortfall(kept, tau, tau, ("a", "b"))] == ["walkers that stay apar"]
+
+
+def test_a_coordinate_that_does_not_move_is_named():
+    kept = np.zeros((4, 2000, 32, 2))
+    still = shortfall(kept, np.array([1.0, np.inf]), np.ones(2), ("a", "b"))
+    assert still == ["'b' not moving, as every proposal is refused"]

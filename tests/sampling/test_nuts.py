@@ -1,0 +1,245 @@
+"""NUTS samples the same density as emcee, by its gradient."""
+
+import importlib.util
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import bayesperiodic as bp
+from bayesperiodic.sampling import convergence, nuts
+from bayesperiodic.sampling.coordinates import SamplingDensity
+from studies import damper
+from tests.known import LINEAR, RUNAWAY, grid, linear_experiment, linear_regressors
+from tests.posterior.test_gradient import CASES, EIGHTH_ORDER
+
+TRUTH = np.array([900.0, 40.0, 25.0])
+PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}
+NUTS = {"sampler": "nuts", "progress": False}
+needs_nutpie = pytest.mark.skipif(importlib.util.find_spec("nutpie") is None, reason="nutpie is not installed")
+
+
+@pytest.fixture(scope="module")
+def linear():
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS)
+    return problem, bp.map_estimate(problem, progress=False)
+
+
+@pytest.fixture
+def briefly(monkeypatch):
+    """Let two chains tune themselves over a few draws."""
+    monkeypatch.setattr(nuts, "TUNE", 100)
+    return NUTS | {"ensembles": 2, "max_steps": 250}
+
+
+@pytest.fixture(scope="module")
+def edge():
+    """Return a problem whose solutions end in a fold amid the posterior: x' = a(1 + x²) − 1 needs a < 1."""
+    tau, generator = grid(60), np.random.default_rng(2)
+    force = -1.0 + 0.1 * np.cos(2 * np.pi * tau)
+    truth = bp.solve_periodic(RUNAWAY, {"a": 0.9}, {"u": force}, frequency=0.5, samples=60, guess={"x": 0 * tau - 0.3})
+    outputs = {"x": truth.outputs["x"] + 0.3 * generator.standard_normal(60)}
+    run = bp.Experiment("run", 0.5, outputs, {"u": force}, samples=60, guess=truth.states)
+    problem = bp.Problem(RUNAWAY, [run], priors={"a": bp.LogNormal(0.9, 0.3)}, fixed={"variance[x]": 1.0})
+    return problem, bp.map_estimate(problem, progress=False)
+
+
+def by_ensemble(posterior: bp.Posterior, name: str) -> np.ndarray:
+    """Return the draws (ensembles, steps, walkers) of what has this name."""
+    group = posterior.data["posterior"]
+    count = len(np.unique(group["ensemble"]))
+    draws = posterior.draws(name).reshape(count, group.sizes["chain"] // count, -1)
+    return draws.transpose(0, 2, 1)
+
+
+def mean_and_error(values: np.ndarray) -> tuple[float, float]:
+    """Return the mean of values (ensembles, steps, walkers) and its Monte Carlo error."""
+    tau = float(convergence.autocorrelation_time(values[..., None])[0])
+    return float(values.mean()), float(values.std() * np.sqrt(tau / values.size))
+
+
+def sd_and_error(values: np.ndarray) -> tuple[float, float]:
+    """Return the standard deviation and its Monte Carlo error."""
+    variance, error = mean_and_error((values - values.mean()) ** 2)
+    return np.sqrt(variance), 0.5 * error / np.sqrt(variance)
+
+
+@pytest.mark.filterwarnings("ignore:A smooth sign")
+@pytest.mark.parametrize("coordinates", ["ridge", "natural"])
+@pytest.mark.parametrize("case", CASES)
+def test_gradient_is_that_of_the_sampling_density(case, coordinates):
+    problem, theta = CASES[case]()
+    noise = problem.likelihood.guess()
+    noise[[name.startswith("variance") for name in problem.noise_names]] = 0.01
+    density = SamplingDensity(problem.anchored(np.array(theta)), coordinates=coordinates)
+    point = density.from_natural(np.array(theta), noise)
+    value, gradient = density.value_and_gradient(point)
+    assert value == pytest.approx(density(point[None])[0], rel=1e-12)
+    steps = np.append(np.full(len(theta), 1e-3) * np.where(density.logarithmic, 1.0, np.abs(theta)), 1e-2 * noise**0)
+    numerical = np.zeros(density.dimension)
+    for i, step in enumerate(steps[: density.dimension]):
+        for k, weight in EIGHTH_ORDER.items():
+            moved = point + k * step * np.eye(density.dimension)[i] * np.array([[1.0], [-1.0]])
+            numerical[i] += weight * -np.diff(density(moved))[0] / step
+    scale = np.abs(numerical) + 1e-3 * np.abs(numerical).max()
+    assert (gradient - numerical) / scale == pytest.approx(np.zeros_like(gradient), abs=1e-7)
+
+
+def test_where_nothing_is_finite_value_and_gradient_say_so(edge):
+    problem, fit = edge
+    density = SamplingDensity(problem.anchored(problem.vector(fit.theta)))
+    assert density.value_and_gradient(np.log([1.5]))[0] == -np.inf
+    assert (density.calls, density.failures.total()) == (1, 1)
+    outside = SamplingDensity(density.problem, coordinates="natural")
+    value, gradient = outside.value_and_gradient(np.array([-1.0]))
+    assert value == -np.inf and gradient == 0.0
+    assert (outside.calls, outside.failures.total()) == (1, 0)
+
+
+@needs_nutpie
+def test_nuts_matches_the_closed_form_within_monte_carlo_error(monkeypatch):
+    """Mean, variance and three quantiles of three parameters within 4 Monte Carlo errors: false alarms below 0.1 %."""
+    for name, looser in {"TAU_CHANGE": 0.2, "QUANTILE_SPREAD": 0.5, "RHAT": 1.02}.items():
+        monkeypatch.setattr(convergence, name, looser)
+    priors = PRIORS | {"c": bp.Normal(30.0, 20.0)}
+    experiment = linear_experiment(TRUTH, 3.0, seed=1)
+    problem = bp.Problem(LINEAR, [experiment], priors=priors, fixed={"variance[force]": 9.0})
+    posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, **NUTS)
+    design = linear_regressors(0.05, 2.0, grid(40))
+    precision = np.diag([60.0**-2, 20.0**-2, 10.0**-2])
+    covariance = np.linalg.inv(design.T @ design / 9.0 + precision)
+    means = covariance @ (design.T @ experiment.outputs["force"] / 9.0 + precision @ [800.0, 30.0, 20.0])
+    assert posterior.converged and posterior.reason.endswith("draws of 4 chains")
+    assert min(posterior.ess.values()) > 4 * convergence.LENGTHS_ALONE
+    assert posterior.failures == {}
+    for name, mean, sd in zip(problem.names, means, np.sqrt(np.diag(covariance)), strict=True):
+        unit = (by_ensemble(posterior, name) - mean) / sd
+        facts = [(unit, 0.0), (unit**2, 1.0)] + [(unit < stats.norm.ppf(p), p) for p in (0.05, 0.5, 0.95)]
+        for values, expected in facts:
+            found, error = mean_and_error(values.astype(float))
+            assert abs(found - expected) < 4 * error
+
+
+@pytest.mark.slow
+@needs_nutpie
+@pytest.mark.filterwarnings("ignore:The noise of the measured inputs", "ignore:Twice as many points")
+def test_nuts_and_emcee_agree_on_the_damper():
+    """Mean and sd of all six within 4 Monte Carlo errors of the difference: false alarms below 0.1 %."""
+    recording, _ = damper.read_recording(None, 1)
+    problem = bp.Problem(bp.models.dahl, [recording.fold(200)], priors=damper.PRIORS)
+    fit = bp.map_estimate(problem, progress=False)
+    emcee = bp.sample(problem, fit, seed=1, progress=False)
+    other = bp.sample(problem, fit, seed=2, max_steps=750, **NUTS)
+    assert emcee.converged and list(emcee.ess) == list(other.ess)
+    for name in emcee.names:
+        one, two = by_ensemble(emcee, name), by_ensemble(other, name)
+        for statistic in (mean_and_error, sd_and_error):
+            (a, error_a), (b, error_b) = statistic(one), statistic(two)
+            assert abs(a - b) < 4 * np.hypot(error_a, error_b)
+            assert np.hypot(error_a, error_b) < 0.05 * one.std()
+
+
+@needs_nutpie
+def test_same_seed_same_draws_and_another_seed_other_draws(linear, briefly):
+    first, again, other = (bp.sample(*linear, seed=s, **briefly) for s in (5, 5, 6))
+    for name in first.names:
+        assert np.array_equal(first.draws(name), again.draws(name))
+        assert not np.array_equal(first.draws(name), other.draws(name))
+    assert first.log_posterior_calls == again.log_posterior_calls
+    assert first.reason == again.reason
+
+
+@needs_nutpie
+def test_too_few_draws_are_not_converged_and_what_nuts_knows_is_kept(linear, briefly, tmp_path):
+    problem, fit = linear
+    posterior = bp.sample(problem, fit, seed=1, start="overdispersed", **briefly)
+    assert not posterior.converged
+    assert "max_steps = 250 reached with" in posterior.reason
+    posterior.save(tmp_path / "draws")
+    known = bp.load(tmp_path / "draws").data
+    assert known.attrs["nutpie"]
+    group = known["sample_stats"]
+    assert dict(group.sizes) == {"chain": 2, "draw": 250}
+    assert {"lp", "status", "diverging", "energy", "tree_depth", "n_steps", "step_size", "acceptance_rate"} == set(
+        group.data_vars
+    )
+    assert group["diverging"].dtype == bool
+    assert posterior.acceptance == pytest.approx(float(group["acceptance_rate"].mean()))
+    assert 0.6 < posterior.acceptance < 0.97
+    assert posterior.log_posterior_calls > int(group["n_steps"].sum())
+    last = [posterior.draws(name)[-1] for name in posterior.names]
+    log_density = float(problem.log_posterior(last[:3], last[3:])) + np.log(last[1])
+    assert float(group["lp"][-1, -1]) == pytest.approx(log_density, abs=1e-8)
+
+
+def test_walker_alone_must_be_as_long_as_its_ensemble_of_independent_ones():
+    draws = np.random.default_rng(3).standard_normal((4, 400, 8, 1))
+    nearly = convergence.shortfall(draws[:, :, :1], np.ones(1), np.ones(1), ("k",))
+    assert nearly[0] == "length only 400 tau"
+    assert convergence.shortfall(draws, np.ones(1), np.ones(1), ("k",)) == []
+
+
+@needs_nutpie
+def test_failed_solves_and_trajectories_that_end_in_them_are_counted(edge, briefly):
+    with pytest.warns(UserWarning, match=r"\d+ of 500 trajectories diverged: .* compare them with") as caught:
+        posterior = bp.sample(*edge, seed=1, **briefly)
+    assert caught[0].filename == __file__
+    diverged = int(posterior.data["sample_stats"]["diverging"].sum())
+    assert diverged > 0
+    assert posterior.reason.endswith(f", {diverged} of 500 trajectories diverged")
+    failed = sum(posterior.failures.values()) * posterior.log_posterior_calls
+    assert failed == pytest.approx(round(failed)) and failed >= diverged
+    assert posterior.draws("a").max() < 1.1
+
+
+@needs_nutpie
+def test_interrupted_run_gives_what_is_there(linear, briefly, monkeypatch):
+    monkeypatch.setattr(nuts, "shortfall", interrupting_at(250))
+    posterior = bp.sample(*linear, seed=1, **(briefly | {"max_steps": 5000}))
+    assert not posterior.converged
+    assert posterior.reason == f"interrupted after {posterior.data['posterior'].sizes['draw']} draws"
+    assert posterior.data["posterior"].sizes["draw"] >= 250
+
+
+def interrupting_at(draws: int) -> Callable[..., list[str]]:
+    def check(kept: np.ndarray, *_: np.ndarray) -> list[str]:
+        if kept.shape[1] == draws:
+            raise KeyboardInterrupt
+        return ["nothing"]
+
+    return check
+
+
+@needs_nutpie
+def test_error_in_the_density_ends_all_chains(linear, monkeypatch):
+    def broken(self: SamplingDensity, point: np.ndarray) -> tuple[float, np.ndarray]:
+        raise ZeroDivisionError("in a thread")
+
+    monkeypatch.setattr(SamplingDensity, "value_and_gradient", broken)
+    with pytest.raises(ZeroDivisionError, match="in a thread"):
+        bp.sample(*linear, seed=1, **NUTS)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"sampler": "hmc"}, "sampler: 'hmc' is not known; allowed: 'emcee', 'nuts'"),
+        ({"walkers": 32}, "walkers: 32 is not allowed with sampler='nuts'; a chain has no walkers"),
+        ({"variances": "collapsed"}, "variances: 'collapsed' is not allowed with sampler='nuts'"),
+        ({"checkpoint": "run.h5"}, "checkpoint: 'run.h5' is not allowed with sampler='nuts'; its chains cannot be"),
+        ({"executor": 2}, "executor: 2 is not allowed with sampler='nuts'; its chains run in threads"),
+        ({"ensembles": 1}, "ensembles: 1 is not allowed"),
+        ({"max_steps": 10}, "max_steps: 10 is not allowed"),
+    ],
+)
+def test_what_nuts_does_not_take_is_named(linear, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        bp.sample(*linear, **({"seed": 1} | NUTS | arguments))
+
+
+def test_without_nutpie_the_extra_is_named(linear, monkeypatch):
+    monkeypatch.setitem(sys.modules, "nutpie", None)
+    with pytest.raises(ImportError, match=r'sampler: \'nuts\' needs .* pip install "bayesperiodic\[nuts\]"'):
+        bp.sample(*linear, seed=1, **NUTS)

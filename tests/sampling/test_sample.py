@@ -1,0 +1,245 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.sampling import convergence, sample
+from bayesperiodic.sampling.coordinates import SamplingDensity
+from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+
+TRUTH = np.array([900.0, 40.0, 25.0])
+PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
+QUIET = {"progress": False}
+PAIR = QUIET | {"ensembles": 2}
+
+
+@pytest.fixture(scope="module")
+def known_variance():
+    experiment = linear_experiment(TRUTH, 3.0, seed=1)
+    problem = bp.Problem(LINEAR, [experiment], priors=PRIORS, fixed={"variance[force]": 9.0})
+    return problem, bp.map_estimate(problem)
+
+
+@pytest.fixture(scope="module")
+def posterior(known_variance):
+    return bp.sample(*known_variance, seed=1, **QUIET)
+
+
+def test_emcee_matches_the_closed_form_within_monte_carlo_error(known_variance, posterior):
+    """Means, sds and covariances within 4 Monte Carlo errors: false-alarm rate below 0.1 % over the nine figures."""
+    problem, _ = known_variance
+    design = linear_regressors(0.05, 2.0, grid(40))
+    precision = np.diag([60.0**-2, 20.0**-2, 10.0**-2])
+    covariance = np.linalg.inv(design.T @ design / 9.0 + precision)
+    right = design.T @ problem.experiments[0].outputs["force"] / 9.0 + precision @ [800.0, 30.0, 20.0]
+    mean, sd = covariance @ right, np.sqrt(np.diag(covariance))
+    assert posterior.converged
+    draws = np.stack([posterior.draws(name) for name in problem.names], axis=-1)
+    error = 4 / np.sqrt(min(posterior.ess.values()))
+    assert (draws.mean(axis=0) - mean) / sd == pytest.approx(np.zeros(3), abs=error)
+    assert np.cov(draws.T) / np.outer(sd, sd) == pytest.approx(covariance / np.outer(sd, sd), abs=np.sqrt(2) * error)
+
+
+@pytest.mark.parametrize(
+    ("variances", "prior", "lost"), [("sampled", "jeffreys", 0), ("collapsed", "jeffreys", 0), ("collapsed", "flat", 2)]
+)
+def test_unknown_variance_follows_its_closed_form(variances, prior, lost):
+    """Flat priors on θ and 1/v (or flat) on v: M/v is χ² with n − l (− 2) degrees of freedom and θ is Student's t."""
+    flat = {"k": bp.Normal(900.0, 1e6), "coulomb": bp.Normal(25.0, 1e6)}
+    noise = bp.noise.Independent(prior=prior)
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=2)], priors=flat, fixed={"c": 40.0}, noise=noise)
+    fit = bp.map_estimate(problem)
+    posterior = bp.sample(problem, fit, seed=2, variances=variances, **PAIR)
+    moment, degrees = fit.rms["force"] ** 2 * 40, 38 - lost
+    assert list(posterior.ess) == ["k", "coulomb", "variance[force]"]
+    error = 4 / np.sqrt(min(posterior.ess.values()))
+    variance = posterior.draws("variance[force]")
+    expected = moment / (degrees - 2)
+    assert variance.mean() == pytest.approx(expected, rel=error * np.sqrt(2 / (degrees - 4)))
+    assert variance.var() == pytest.approx(2 * expected**2 / (degrees - 4), rel=2.5 * error)
+    student = np.sqrt(moment * np.linalg.inv(regressors().T @ regressors())[1, 1] / (degrees - 2))
+    assert posterior.draws("coulomb").std() == pytest.approx(student, rel=error)
+    values = [
+        float(problem.log_posterior(posterior_point(posterior, problem, i), {"force": variance[i]})) for i in (0, 7)
+    ]
+    lp = posterior.data["sample_stats"]["lp"].transpose("chain", "draw").to_numpy().ravel()[[0, 7]]
+    assert values[0] - values[1] == pytest.approx(lp[0] - lp[1], abs=1e-8)
+
+
+@pytest.mark.parametrize("prior", ["jeffreys", "flat"])
+@pytest.mark.parametrize("two", [False, True])
+def test_collapsed_density_of_errors_with_a_known_spectrum_is_the_integral_over_the_variance(prior, two):
+    """By quadrature over ln v, of one experiment and of two that share the variance."""
+    runs = [linear_experiment(TRUTH, 3.0, seed=2)] + [
+        replace(linear_experiment(TRUTH, 3.0, seed=3), name="other")
+    ] * two
+    shape = {"lengthscale[force]": 0.05, "floor[force]": 0.1}
+    noise = bp.noise.Circulant(prior=prior)
+    problem = bp.Problem(LINEAR, runs, priors=PRIORS, fixed=shape, noise=noise)
+    problem = problem.anchored(TRUTH)
+    whole, collapsed = (SamplingDensity(problem, variances=v) for v in ("sampled", "collapsed"))
+    assert collapsed.labels == problem.names and collapsed.collapsed == ("variance[force]",)
+    points = TRUTH * (1.0 + 0.02 * np.random.default_rng(1).standard_normal((4, 3)))
+    found = collapsed(points)[:, 0]
+    logarithms = np.linspace(-6.0, 16.0, 4001)
+    for point, value in zip(points, found, strict=True):
+        every = whole(np.column_stack([np.tile(point, (logarithms.size, 1)), logarithms]))
+        integral = np.log(np.trapezoid(np.exp(every - every.max()), logarithms)) + every.max()
+        assert value == pytest.approx(integral, abs=1e-8)
+
+
+def test_variances_of_a_spectrum_of_unknown_shape_cannot_be_collapsed():
+    noise = bp.noise.Circulant()
+    problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=2)], priors=PRIORS, noise=noise)
+    with pytest.raises(ValueError, match="or of circulant ones with a fixed shape"):
+        bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, variances="collapsed", **PAIR)
+
+
+def regressors() -> np.ndarray:
+    return linear_regressors(0.05, 2.0, grid(40))[:, [0, 2]]
+
+
+def posterior_point(posterior: bp.Posterior, problem: bp.Problem, index: int) -> np.ndarray:
+    return np.array([posterior.draws(name)[index] for name in problem.names])
+
+
+@pytest.mark.parametrize("start", ["prior", "overdispersed"])
+def test_other_starts_lead_to_the_same_posterior(known_variance, posterior, start):
+    """Means within 4 Monte Carlo errors of both runs."""
+    other = bp.sample(*known_variance, seed=3, start=start, **PAIR)
+    assert other.converged
+    for name in ("k", "c", "coulomb"):
+        error = 4 * np.sqrt(1 / posterior.ess[name] + 1 / other.ess[name])
+        assert abs(other.draws(name).mean() - posterior.draws(name).mean()) < error * posterior.draws(name).std()
+
+
+def test_positive_parameter_sampled_in_its_logarithm_keeps_its_natural_density():
+    """No data to speak of: the draws are the prior's."""
+    priors = PRIORS | {"c": bp.LogNormal(30.0, 0.5)}
+    experiment = linear_experiment(TRUTH, 3.0, seed=3)
+    problem = bp.Problem(LINEAR, [experiment], priors=priors, fixed={"variance[force]": 1e12})
+    posterior = bp.sample(problem, bp.map_estimate(problem), seed=3, **PAIR)
+    logarithm = np.log(posterior.draws("c") / 30.0) / 0.5
+    error = 4 / np.sqrt(posterior.ess["c"])
+    assert logarithm.mean() == pytest.approx(0.0, abs=error)
+    assert logarithm.std() == pytest.approx(1.0, abs=error)
+
+
+def test_same_seed_same_bits_and_another_seed_other_draws(known_variance):
+    first, again, other = (bp.sample(*known_variance, seed=s, max_steps=250, **PAIR) for s in (5, 5, 6))
+    assert np.array_equal(first.draws("k"), again.draws("k"))
+    assert not np.array_equal(first.draws("k"), other.draws("k"))
+
+
+def test_bits_do_not_depend_on_the_number_of_cores(known_variance, monkeypatch):
+    two = bp.sample(*known_variance, seed=5, max_steps=250, **PAIR)
+    monkeypatch.setattr(sample, "available_cores", lambda: 1)
+    assert np.array_equal(two.draws("k"), bp.sample(*known_variance, seed=5, max_steps=250, **PAIR).draws("k"))
+
+
+def test_reaching_max_steps_is_reported(known_variance):
+    posterior = bp.sample(*known_variance, seed=1, max_steps=250, **PAIR)
+    assert not posterior.converged
+    assert "max_steps = 250 reached with length only" in posterior.reason
+    assert "NOT CONVERGED" in repr(posterior)
+
+
+def test_resumed_run_gives_the_same_chain(known_variance, tmp_path):
+    whole = bp.sample(*known_variance, seed=5, max_steps=500, **PAIR)
+    bp.sample(*known_variance, seed=5, max_steps=250, checkpoint=tmp_path / "run.h5", **PAIR)
+    resumed = bp.sample(*known_variance, seed=5, max_steps=500, checkpoint=tmp_path / "run.h5", **PAIR)
+    assert np.array_equal(whole.draws("k"), resumed.draws("k"))
+
+
+def test_finished_run_comes_back_from_its_checkpoint(known_variance, tmp_path, monkeypatch):
+    monkeypatch.setattr(convergence, "LENGTHS", 5.0)
+    monkeypatch.setattr(convergence, "TAU_CHANGE", 1.0)
+    monkeypatch.setattr(convergence, "RHAT", 1.1)
+    first = bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **PAIR)
+    again = bp.sample(*known_variance, seed=5, checkpoint=tmp_path / "run.h5", **PAIR)
+    assert first.converged and again.reason == first.reason
+    assert np.array_equal(first.draws("k"), again.draws("k"))
+
+
+def test_checkpoint_of_another_run_is_refused(known_variance, tmp_path):
+    bp.sample(*known_variance, seed=5, max_steps=250, checkpoint=tmp_path / "run.h5", **PAIR)
+    with pytest.raises(ValueError, match="belongs to another run"):
+        bp.sample(*known_variance, seed=6, max_steps=250, checkpoint=tmp_path / "run.h5", **PAIR)
+    (tmp_path / "text.h5").write_text("no HDF5")
+    with pytest.raises(ValueError, match="checkpoint: .* cannot be used"):
+        bp.sample(*known_variance, seed=6, max_steps=250, checkpoint=tmp_path / "text.h5", **PAIR)
+
+
+def test_draws_pass_into_arviz_and_carry_units(posterior):
+    group = posterior.data["posterior"].to_dataset()
+    assert group["k"].dims == ("chain", "draw")
+    assert group["k"].attrs["units"] == "N/m"
+    assert group["variance"].dims == ("chain", "draw", "channel")
+    assert set(np.unique(group["ensemble"])) == {0, 1, 2, 3}
+    assert float(convergence.arviz().ess(group[["k"]])["k"]) > 500
+
+
+def test_rhat_sees_ensembles_that_disagree():
+    generator = np.random.default_rng(4)
+    agreeing = generator.standard_normal((4, 100, 8, 1))
+    assert convergence.rhat(agreeing)[0] < 1.01
+    assert convergence.rhat(agreeing + np.arange(4)[:, None, None, None])[0] > 1.3
+
+
+def test_summary_names_its_interval(posterior):
+    table = posterior.summary()
+    assert list(table.columns) == ["mean", "sd", "q05", "q50", "q95", "mcse_mean", "ess", "tau", "rhat"]
+    assert table.attrs["interval"] == "90 % equal-tailed: q05 to q95"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"walkers": 4},
+            "walkers: 4 is not allowed; it must be even and at least twice the dimension, 6 for k, c, coulomb",
+        ),
+        ({"walkers": 9}, "walkers: 9 is not allowed"),
+        ({"ensembles": 1}, "ensembles: 1 is not allowed"),
+        ({"max_steps": 10}, "max_steps: 10 is not allowed"),
+        ({"seed": -1}, "seed: -1 is not allowed"),
+        ({"start": "laplac"}, "start: 'laplac' is not known; allowed: 'laplace', 'prior', 'overdispersed'"),
+        ({"coordinates": "log"}, "coordinates: 'log' is not known; allowed: 'ridge', 'natural'"),
+        ({"variances": "collapsed"}, "variances: 'collapsed' is not allowed; there is no unknown variance"),
+    ],
+)
+def test_bad_arguments_are_named(known_variance, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        bp.sample(*known_variance, **({"seed": 1, "progress": False} | arguments))
+
+
+def test_start_where_nothing_is_finite_fails_loudly(known_variance):
+    problem, fit = known_variance
+    other = bp.Problem(
+        LINEAR, problem.experiments, priors=PRIORS | {"k": bp.Uniform(0.0, 1.0)}, fixed={"variance[force]": 9.0}
+    )
+    with pytest.raises(ValueError, match=r"100\.0% have no finite log-posterior, .*; give a converged fit"):
+        bp.sample(other, fit, seed=1, **PAIR)
+
+
+def test_an_estimate_of_another_problem_is_refused(known_variance):
+    problem, fit = known_variance
+    others = [replace(e, name="other") for e in problem.experiments]
+    other = bp.Problem(LINEAR, others, priors=PRIORS, fixed={"variance[force]": 9.0})
+    with pytest.raises(ValueError, match="fit: it has no 'other', only .*; give the estimate of this problem"):
+        bp.sample(other, fit, seed=1, **PAIR)
+    with pytest.raises(ValueError, match="fit: missing 'k'"):
+        bp.sample(problem, replace(fit, theta={n: v for n, v in fit.theta.items() if n != "k"}), seed=1, **PAIR)
+
+
+def test_without_a_laplace_approximation_the_next_step_is_told(known_variance):
+    problem, fit = known_variance
+    for known, step in (
+        ({"undetermined": ("k → k·t, c → c·t",)}, r"fix what the data do not determine \(k → k·t, c → c·t\)"),
+        ({"at_ends": ("k",)}, "widen the prior of 'k', which is at the end of its support"),
+        ({}, "run map_estimate from another start"),
+    ):
+        lost = replace(fit, joint_covariance=fit.joint_covariance * np.nan, **known)
+        with pytest.raises(ValueError, match=f"no Laplace approximation .*{step}, or take start='prior'"):
+            bp.sample(problem, lost, seed=1, **PAIR)

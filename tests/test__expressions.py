@@ -1,0 +1,201 @@
+import time
+
+import numpy as np
+import pytest
+
+from bayesperiodic._expressions import FUNCTIONS, MAX_LENGTH, parse, parse_all
+
+VALUES = {"k": 0.7, "m": 1.3, "b": 0.4}
+# Each text with the same in Python, which also takes complex numbers.
+TEXTS = {
+    "k/(m*b**2)": lambda k, m, b: k / (m * b**2),
+    "-k + +m - 2*b": lambda k, m, b: -k + m - 2 * b,
+    "-k**2**b": lambda k, m, b: -(k ** (2**b)),
+    "2**-k": lambda k, m, b: 2**-k,
+    "k**m/b**-1.5": lambda k, m, b: k**m / b**-1.5,
+    "sqrt(k/m)/(2*pi)": lambda k, m, b: np.sqrt(k / m) / (2 * np.pi),
+    "exp(-b*k)*sin(m) + cos(k*m)": lambda k, m, b: np.exp(-b * k) * np.sin(m) + np.cos(k * m),
+    "log(k)*tan(b) - atan(m/k)": lambda k, m, b: np.log(k) * np.tan(b) - np.arctan(m / k),
+    "sinh(k)+cosh(b*b)*tanh(m)": lambda k, m, b: np.sinh(k) + np.cosh(b * b) * np.tanh(m),
+    " 1e-3*(k\n+ m*0x10) ": lambda k, m, b: 1e-3 * (k + m * 16),
+}
+SILLY = [
+    "__import__('os').system('x')",
+    "().__class__",
+    "x if y else z",
+    "9**9**9**9",
+    "k**9**9**9**9",
+    "(9**9)**(9**9)*k",
+    "10.0**300*10.0**300",
+    "(" * 100_000 + "k" + ")" * 100_000,
+    "(" * 400 + "k" + ")" * 400,
+    "-" * 999 + "?",
+    "lambda: 0",
+    "k1; k2",
+    "k\nm",
+    "",
+    "   ",
+    "k[0]",
+    "k.real",
+    "True",
+    "None",
+    "...",
+    "1j",
+    "'a'",
+    "b'a'",
+    "f'{k}'",
+    "k\0",
+    "1e999",
+    "9" * 500,
+    "9" * 5000,
+    "1/0",
+    "log(0)",
+    "sqrt(-1)*k",
+    "k**1001",
+    "k == m",
+    "k < m",
+    "k and m",
+    "not k",
+    "~k",
+    "k ^ 2",
+    "k // m",
+    "k % m",
+    "k @ m",
+    "k << 999999999",
+    "(k, m)",
+    "[k]",
+    "{k}",
+    "{k: m}",
+    "[k for k in m]",
+    "(k := 1)",
+    "k = 1",
+    "sin",
+    "sin()",
+    "sin(k, m)",
+    "sin(*k)",
+    "sin(x=k)",
+    "sin(k, x=m)",
+    "sin(sin)",
+    "k(m)",
+    "eval('1')",
+    "eval(k)",
+    "open(k)",
+    "(sin)(k)(k)",
+    "sin.__call__(k)",
+    "import os",
+    "await k",
+    "yield k",
+    "nan",
+    "inf",
+    "__builtins__",
+    None,
+    3.0,
+    b"k",
+]
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_value_and_derivatives_against_complex_steps(text):
+    expression = parse("e", text, VALUES)
+    assert float(expression.value(VALUES)) == pytest.approx(TEXTS[text](**VALUES), rel=1e-14)
+    gradient = expression.gradient(VALUES, by=VALUES)
+    for name in VALUES:
+        stepped = TEXTS[text](**(VALUES | {name: VALUES[name] + 1e-30j})).imag / 1e-30
+        assert float(gradient[name]) == pytest.approx(stepped, rel=1e-13, abs=1e-16)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_function_has_its_derivative(name):
+    expression = parse("e", f"{name}(k)", ["k"])
+    k, step = np.array([0.3, 1.1, 2.5]), 1e-6
+    function = {"atan": np.arctan}.get(name) or getattr(np, name)
+    assert np.array_equal(expression.value({"k": k}), function(k))
+    assert expression.gradient({"k": k})["k"] == pytest.approx(
+        (function(k + step) - function(k - step)) / (2 * step), rel=1e-8
+    )
+
+
+def test_absolute_value_has_no_derivative_at_zero():
+    slopes = parse("e", "abs(k)", ["k"]).gradient({"k": np.array([-2.0, 0.0, 3.0])})["k"]
+    assert np.array_equal(slopes, [-1.0, np.nan, 1.0], equal_nan=True)
+
+
+def test_powers_of_zero_and_of_negative_numbers():
+    square, zeroth, variable = (parse("e", text, ["k", "m"]) for text in ("k**2", "k**0", "k**m"))
+    assert square.gradient({"k": [-3.0, 0.0]})["k"].tolist() == [-6.0, 0.0]
+    assert zeroth.gradient({"k": [0.0]})["k"].tolist() == [0.0]
+    assert variable.gradient({"k": -3.0, "m": 2.0}, by=["k"])["k"] == -6.0
+    assert variable.gradient({"k": 0.0, "m": 2.0})["m"] == 0.0
+
+
+def test_arrays_broadcast_and_inputs_stay_as_they_were():
+    k, m = np.arange(1.0, 4.0)[:, None], np.arange(1, 3)
+    expression = parse("e", "k/m", ["k", "m", "l"])
+    assert expression.names == ("k", "m")
+    assert np.array_equal(expression.value({"k": k, "m": m}), k / m)
+    gradient = expression.gradient({"k": k, "m": m}, by=["l", "m"])
+    assert np.array_equal(gradient["m"], -k / m**2) and np.array_equal(gradient["l"], np.zeros((3, 2)))
+    alone = parse("e", "k", ["k"]).value({"k": k})
+    alone[:] = 0.0
+    assert k.ravel().tolist() == [1.0, 2.0, 3.0]
+
+
+def test_parts_without_names_are_numbers_at_once():
+    assert parse("e", "2*pi*sqrt(4)**-1", []).steps == (np.pi,)
+    assert parse("e", "9**9", []).steps == (9.0**9,)
+
+
+def test_names_may_hide_pi_and_functions_and_need_not_be_ascii():
+    assert parse("e", "pi*2", ["pi"]).value({"pi": 3.0}) == 6.0
+    assert parse("e", "exp + exp(exp)", ["exp"]).value({"exp": 0.0}) == 1.0
+    micro = "\N{MICRO SIGN}"
+    assert parse("e", f"2*{micro}", [micro]).value({micro: 3.0}) == 6.0
+
+
+def test_long_sums_are_no_matter():
+    text = "+".join(["k"] * (MAX_LENGTH // 2))
+    assert parse("e", text, ["k"]).value({"k": 1.0}) == MAX_LENGTH // 2
+    assert parse("e", "-" * 150 + "k", ["k"]).gradient({"k": 1.0})["k"] == 1.0
+
+
+@pytest.mark.parametrize("text", SILLY, ids=lambda text: repr(text)[:30])
+def test_anything_else_is_a_value_error_at_once(text):
+    begin = time.perf_counter()
+    with pytest.raises(ValueError, match="^tied: ") as caught:
+        parse("tied", text, ["k", "m", "k1", "k2"])
+    assert time.perf_counter() - begin < 0.5
+    assert len(str(caught.value)) < 600 and "allowed" in str(caught.value)
+
+
+def test_messages_name_the_text_and_what_is_allowed():
+    with pytest.raises(
+        ValueError, match=r"^c1: 'k\.real' is not allowed, it contains an attribute .*; it must consist"
+    ):
+        parse("c1", "k.real", ["k"])
+    with pytest.raises(ValueError, match=r"^c1: 'stifness/m': 'stifness' is not known; .*Did you mean 'stiffness'\?$"):
+        parse("c1", "stifness/m", ["stiffness", "m"])
+    with pytest.raises(ValueError, match=r"^c1: 'sinus\(k\)' \(as a function\): 'sinus' is not known.* mean 'sin'\?$"):
+        parse("c1", "sinus(k)", ["k"])
+    with pytest.raises(ValueError, match="powers are written"):
+        parse("c1", "k^2", ["k"])
+    with pytest.raises(ValueError, match="exponent 3.8742e.08 is beyond"):
+        parse("c1", "k**9**9", ["k"])
+    with pytest.raises(ValueError, match="'m' is not known; allowed: 'k', 'pi'. Only k.$"):
+        parse("c1", "k*m", ["k"], note="Only k.")
+
+
+def test_new_names_are_identifiers_of_their_own():
+    assert list(parse_all("derived", {"a": "k", "b": "k*2"}, ["k"])) == ["a", "b"]
+    with pytest.raises(ValueError, match="derived: 'k' is reserved or used twice"):
+        parse_all("derived", {"k": "2*k"}, ["k"])
+    with pytest.raises(ValueError, match="derived: 'a b' is not allowed"):
+        parse_all("derived", {"a b": "2*k"}, ["k"])
+    with pytest.raises(ValueError, match=r"derived\['b'\]: 'a': 'a' is not known"):
+        parse_all("derived", {"a": "k", "b": "a"}, ["k"])
+    with pytest.raises(ValueError, match="derived: 'k' is not allowed; it must be a mapping"):
+        parse_all("derived", "k", ["k"])
+
+
+def test_a_missing_value_is_named():
+    with pytest.raises(ValueError, match="values: missing 'm'; 'k/m' needs them"):
+        parse("e", "k/m", ["k", "m"]).value({"k": 1.0})

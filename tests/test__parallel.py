@@ -1,0 +1,192 @@
+"""The executor seam by itself: who works, what travels, what happens when it does not."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from collections import Counter
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+
+import pytest
+
+from bayesperiodic import _parallel
+from bayesperiodic._parallel import WorkersLost, available_cores, checked_executor, in_threads, team
+
+LOADS: Counter[str] = Counter()
+
+
+class Cargo:
+    """Shared data that count how often this process has unpickled them."""
+
+    def __init__(self):
+        self.name = str(uuid.uuid4())
+
+    def __setstate__(self, state):
+        self.__dict__.update(state)
+        LOADS[self.name] += 1
+
+
+def report(cargo: Cargo, task: float) -> tuple[int, int, int]:
+    time.sleep(task)
+    return os.getpid(), LOADS[cargo.name], available_cores()
+
+
+def power(base: int, exponent: int) -> int:
+    return base**exponent
+
+
+def fail(_: object, task: int) -> None:
+    raise ArithmeticError(f"task {task}")
+
+
+def die(_: object, task: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Recording(ProcessPoolExecutor):
+    """A pool that remembers which tasks carried the shared data."""
+
+    def __init__(self, workers: int):
+        super().__init__(workers, get_context("spawn"))
+        self.carried: list[bool] = []
+
+    def submit(self, function, /, *arguments):  # noqa: D102
+        self.carried.append(arguments[3] is not None)
+        return super().submit(function, *arguments)
+
+
+class Forgetful:
+    """An executor of the plainest kind, whose only process forgets everything every third task."""
+
+    def __init__(self):
+        self.carried: list[bool] = []
+
+    def submit(self, function, /, *arguments) -> Future:  # noqa: D102
+        self.carried.append(arguments[3] is not None)
+        if len(self.carried) % 3 == 0:
+            _parallel._OPENED.clear()
+        future: Future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+
+@pytest.fixture(params=["threads of this process", "given threads", "processes", "dask", "forgetful"])
+def executor(request):
+    if request.param in ("processes", "dask"):
+        return request.getfixturevalue(request.param)
+    if request.param == "given threads":
+        pool = ThreadPoolExecutor(2)
+        request.addfinalizer(pool.shutdown)
+        return pool
+    return Forgetful() if request.param == "forgetful" else None
+
+
+def test_every_task_is_done_once_and_keeps_its_number(executor):
+    with team(executor, 2) as crew:
+        found = list(crew.run(power, range(20)))
+    assert sorted(found) == [(n, 2**n) for n in range(20)]
+
+
+def test_a_task_may_be_followed_by_another(executor):
+    """Chains of powers, 3 → 3² → 3⁴ and so on, each as long as its number says."""
+    lengths = [1, 3, 2, 4]
+    done: Counter[int] = Counter()
+
+    def then(number: int, value: int) -> int | None:
+        done[number] += 1
+        return done[number] + 1 if done[number] < lengths[number] else None
+
+    with team(executor, 3) as crew:
+        found = list(crew.run(power, [1] * 4, then))
+    assert [max(value for n, value in found if n == number) for number in range(4)] == [3**length for length in lengths]
+    assert len(found) == sum(lengths)
+
+
+def test_what_a_task_raises_comes_out(executor):
+    with pytest.raises(ArithmeticError, match="task 7"), team(executor, None) as crew:
+        list(crew.run(fail, [7]))
+
+
+@pytest.mark.parametrize("which", ["processes", "dask"])
+def test_shared_data_are_unpickled_once_in_each_process_and_tasks_have_one_core(which, request):
+    executor = request.getfixturevalue(which)
+    with team(executor, Cargo()) as crew:
+        found = [report for _, report in crew.run(report, [0.02] * 20)]
+    assert {loads for _, loads, _ in found} == {1}
+    assert {cores for *_, cores in found} == {1}
+    assert len({process for process, *_ in found}) <= 2 and os.getpid() not in {process for process, *_ in found}
+    assert available_cores() == len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else True
+
+
+def test_shared_data_travel_about_once_a_worker_and_own_threads_take_them_as_they_are():
+    """Two carriers for two workers; a process that starts late asks for them, at most once for each queued task."""
+    cargo = Cargo()
+    with Recording(2) as pool, team(pool, cargo) as crew:
+        assert len(list(crew.run(report, [0.01] * 40))) == 40
+    assert 2 <= sum(pool.carried) <= 2 + 2 * _parallel.QUEUED_EACH
+    with team(None, cargo) as crew:
+        assert {loads for _, (_, loads, _) in crew.run(report, [0.0] * 4)} == {0}
+
+
+def test_who_has_lost_the_shared_data_gets_them_again():
+    executor = Forgetful()
+    with team(executor, 2) as crew:
+        assert sorted(crew.run(power, range(12))) == [(n, 2**n) for n in range(12)]
+    assert 1 < sum(executor.carried) < len(executor.carried)
+
+
+def test_dead_workers_are_one_clear_error():
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        with pytest.raises(WorkersLost, match=r"executor: its workers were lost \(BrokenProcessPool: "):
+            with team(pool, None) as crew:
+                list(crew.run(die, [0]))
+        with pytest.raises(WorkersLost, match="BrokenProcessPool"), team(pool, None) as crew:
+            list(crew.run(power, [0]))
+    closed = ThreadPoolExecutor(1)
+    closed.shutdown()
+    with pytest.raises(WorkersLost, match="cannot schedule new futures after shutdown"), team(closed, 2) as crew:
+        list(crew.run(power, [1]))
+
+
+def test_a_task_that_kills_dask_workers_ends_the_run(dask, monkeypatch):
+    """Dask gives a task up when too many workers have died of it; here, the first."""
+    monkeypatch.setattr(dask.cluster.scheduler, "allowed_failures", 0)
+    with (
+        pytest.raises(WorkersLost, match=r"executor: its workers were lost \(KilledWorker: "),
+        team(dask, None) as crew,
+    ):
+        list(crew.run(die, [0]))
+
+
+def test_a_script_without_its_guard_is_told_so(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import operator\nfrom bayesperiodic._parallel import team\n"
+        "with team(1, 2) as crew:\n    print(list(crew.run(operator.pow, [3])))\n"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or "." for path in sys.path)}
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, env=environment)
+    assert "must have its calls below: if __name__ == '__main__'" in done.stderr.strip().splitlines()[-1]
+
+
+@pytest.mark.parametrize("bad", [0, -2, True, 1.5, "2", ThreadPoolExecutor, [2], get_context("spawn")])
+def test_what_takes_no_tasks_is_refused(bad):
+    with pytest.raises(ValueError, match=r"executor: .* is not allowed; it must be None, a number of processes of at"):
+        checked_executor(bad)
+
+
+def test_what_cannot_be_pickled_is_refused(processes):
+    with pytest.raises(ValueError, match=r"executor: .* the problem cannot be pickled \(TypeError: cannot pickle '_th"):
+        with team(processes, threading.Lock()):
+            pass
+
+
+def test_items_shared_by_threads_keep_their_order_and_raise():
+    assert in_threads(lambda x: x * x, list(range(50)), 3) == [x * x for x in range(50)]
+    assert in_threads(lambda x: x, [], 3) == []
+    with pytest.raises(ZeroDivisionError):
+        in_threads(lambda x: 1 / x, [1, 0, 2], 2)
