@@ -4,8 +4,40 @@ import scipy.linalg
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import bayesperiodic as bp
-from bayesperiodic._linalg import in_one_thread
+from bayesperiodic._linalg import covariance_cholesky, covariance_eigh, hessian_eigh, in_one_thread
 from tests.known import LINEAR
+
+UNITS = np.array([1e-9, 1.0, 1e7, 3e-4])
+CORRELATION = 0.8 ** np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
+COVARIANCE = CORRELATION * np.outer(UNITS, UNITS)
+
+
+def test_covariance_of_different_units_is_decomposed_like_its_correlation():
+    values, vectors, sd = covariance_eigh(COVARIANCE)
+    assert sd == pytest.approx(UNITS, rel=1e-15)
+    assert values == pytest.approx(scipy.linalg.eigh(CORRELATION, eigvals_only=True), rel=1e-13)
+    assert (vectors * values) @ vectors.T == pytest.approx(CORRELATION, rel=1e-12)
+    factor = covariance_cholesky(COVARIANCE)
+    assert np.array_equal(factor, np.tril(factor))
+    assert factor @ factor.T == pytest.approx(COVARIANCE, rel=1e-13)
+
+
+def test_hessian_of_different_units_has_the_inverse_of_its_scaled_decomposition():
+    hessian = scipy.linalg.toeplitz([4.0, -1.0, 0.5, 0.0]) / np.outer(UNITS, UNITS)
+    values, vectors, scale = hessian_eigh(hessian)
+    assert np.diag(hessian) * scale**2 == pytest.approx(np.ones(4), rel=1e-14)
+    inverse = (vectors / values) @ vectors.T * np.outer(scale, scale)
+    expected = scipy.linalg.inv(scipy.linalg.toeplitz([4.0, -1.0, 0.5, 0.0])) * np.outer(UNITS, UNITS)
+    assert inverse == pytest.approx(expected, rel=1e-12)
+
+
+def test_zero_rows_stay_finite_and_indefinite_covariances_are_refused():
+    singular = np.diag([2.0, 0.0])
+    for decompose in (hessian_eigh, covariance_eigh):
+        assert decompose(singular)[0] == pytest.approx([0.0, 1.0], abs=1e-15)
+    for bad in (singular, np.diag([1.0, -1.0]), np.array([[1.0, 2.0], [2.0, 1.0]])):
+        with pytest.raises(np.linalg.LinAlgError):
+            covariance_cholesky(bad)
 
 
 def threads():

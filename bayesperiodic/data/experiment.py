@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
+from bayesperiodic._linalg import covariance_cholesky
 
 MEANING = "samples·periods"
 
@@ -187,9 +188,8 @@ class Experiment(Result):
                 f"covariance: it must be finite and symmetric; entry [{i}, {j}] is {matrix[i, j]:g}, entry [{j}, {i}] "
                 f"is {matrix[j, i]:g}."
             )
-        scale = np.sqrt(np.abs(np.diag(matrix)))
         try:
-            np.linalg.cholesky(matrix / np.outer(scale, scale))
+            covariance_cholesky(matrix)
         except np.linalg.LinAlgError:
             raise ValueError(
                 "covariance: it must be positive definite; every combination of the values needs an error of its own."
