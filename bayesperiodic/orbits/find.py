@@ -117,8 +117,8 @@ def find_orbits(
     >>> x = np.zeros((2000, 2))
     >>> for k in range(1999):
     ...     x[k + 1] = 1 - 1.4 * x[k, 0] ** 2 + x[k, 1], 0.3 * x[k, 0]
-    >>> section = bp.PoincareSection.from_points(x[100:], ("x", "y"), frequency=1.0)
-    >>> [orbit.period for orbit in bp.find_orbits(section, periods=[1, 2, 3])]
+    >>> henon_section = bp.PoincareSection.from_points(x[100:], ("x", "y"), frequency=1.0)
+    >>> [orbit.period for orbit in bp.find_orbits(henon_section, periods=[1, 2, 3])]
     [1, 2]
     """
     wanted = _periods(periods, len(section))

@@ -349,14 +349,11 @@ class Orbit(Result):
 
     Examples
     --------
-    The fixed point of the Hénon map, x = (√6.09 − 0.7)/2.8; its multipliers are the roots of μ² + 2.8 x μ = 0.3:
+    The fixed point of the Hénon map (section as in `find_orbits`) is x = (√6.09 − 0.7)/2.8; its multipliers are the
+    roots of μ² + 2.8 x μ = 0.3:
 
-    >>> import numpy as np, bayesperiodic as bp
-    >>> x = np.zeros((2000, 2))
-    >>> for k in range(1999):
-    ...     x[k + 1] = 1 - 1.4 * x[k, 0] ** 2 + x[k, 1], 0.3 * x[k, 0]
-    >>> section = bp.PoincareSection.from_points(x[100:], ("x", "y"), frequency=1.0)
-    >>> orbit = bp.find_orbits(section, periods=[1])[0]
+    >>> import bayesperiodic as bp
+    >>> orbit = bp.find_orbits(henon_section, periods=[1])[0]
     >>> orbit.points.round(4).tolist(), orbit.eigenvalues.round(3).tolist()
     ([[0.6314, 0.1894]], [-1.924, 0.156])
     """
@@ -460,12 +457,10 @@ class Orbits(Result):
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> x = np.zeros((2000, 2))
-    >>> for k in range(1999):
-    ...     x[k + 1] = 1 - 1.4 * x[k, 0] ** 2 + x[k, 1], 0.3 * x[k, 0]
-    >>> section = bp.PoincareSection.from_points(x[100:], ("x", "y"), frequency=1.0)
-    >>> orbits = bp.find_orbits(section, periods=[1, 2])
+    Two orbits of the Hénon map (section as in `find_orbits`):
+
+    >>> import bayesperiodic as bp
+    >>> orbits = bp.find_orbits(henon_section, periods=[1, 2])
     >>> len(orbits), orbits[1].name, orbits.rejected
     (2, 'period 2, winding 0, orbit 1', ())
     >>> orbits.table[["period", "modulus"]].round(3)

@@ -305,16 +305,12 @@ def polish_orbits(
 
     Examples
     --------
-    Two thousand periods of a driven pendulum in chaotic motion; its model, integrated with Newton's method on the
-    return map, has the multiplier −1.7059 on the orbit that turns once a period:
+    `pendulum_orbits` are the orbits of period 1 in 2,000 forcing periods of the pendulum in `PoincareSection`'s example.
+    Newton's method on the return map of the integrated model gives the multiplier −1.7059 for the orbit with winding
+    number 1:
 
     >>> import bayesperiodic as bp
-    >>> theta = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
-    >>> recording = bp.simulate(bp.models.pendulum, theta, frequency=1.4467, duration=1400, sampling_rate=60,
-    ...                         start={"phi": 1})
-    >>> section = bp.PoincareSection.from_recording(recording, ("angle", "rate"), frequency=1.4467, angles=["angle"])
-    >>> orbits = bp.find_orbits(section, periods=[1])
-    >>> polished = bp.polish_orbits(bp.models.pendulum, orbits, theta, samples=200)
+    >>> polished = bp.polish_orbits(bp.models.pendulum, pendulum_orbits, pendulum_parameters, samples=200)
     >>> [turning] = [orbit for orbit in polished if orbit.winding == 1 and orbit.eigenvalues[0].real < 0]
     >>> print(f"{turning.solution.multipliers[0].real:.3f}")
     -1.706

@@ -62,15 +62,10 @@ def select_orbits(
 
     Examples
     --------
-    The pendulum at rest is an orbit of period 1 too, but tells nothing of the parameters:
+    With the orbits of `polish_orbits`' example; the pendulum at rest does not depend on the parameters:
 
     >>> import bayesperiodic as bp
-    >>> theta = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
-    >>> recording = bp.simulate(bp.models.pendulum, theta, frequency=1.4467, duration=1400, sampling_rate=60,
-    ...                         start={"phi": 1})
-    >>> section = bp.PoincareSection.from_recording(recording, ("angle", "rate"), frequency=1.4467, angles=["angle"])
-    >>> orbits = bp.find_orbits(section, periods=[1])
-    >>> polished = bp.polish_orbits(bp.models.pendulum, orbits, theta, samples=200)
+    >>> polished = bp.polish_orbits(bp.models.pendulum, pendulum_orbits, pendulum_parameters, samples=200)
     >>> best = bp.select_orbits(polished, ["m", "l"])
     >>> 0 < len(best) < len(polished), "a state of rest" in [reason for _, reason in best.rejected]
     (True, True)
