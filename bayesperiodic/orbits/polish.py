@@ -305,7 +305,7 @@ def polish_orbits(
 
     Examples
     --------
-    `pendulum_orbits` are the orbits of period 1 in 2,000 forcing periods of the pendulum in `PoincareSection`'s example.
+    `pendulum_orbits`: the orbits of period 1 in 2,000 forcing periods of the pendulum in `PoincareSection`'s example.
     Newton's method on the return map of the integrated model gives the multiplier −1.7059 for the orbit with winding
     number 1:
 
