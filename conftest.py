@@ -1,6 +1,7 @@
 """Objects that the examples in the docstrings use without making them.
 
-An example gets every object below whose name it contains. Each is made at its first use and kept for the test run.
+An example gets every object below whose name it contains and does not assign. Each is made at its first use and kept
+for the test run.
 """
 
 import re
@@ -43,7 +44,48 @@ def pendulum_orbits() -> bp.Orbits:
     return bp.find_orbits(section, periods=[1])
 
 
+FORCE = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
+
+
+@cache
+def duffing_run() -> bp.Experiment:
+    """Return the folded response of a Duffing oscillator to one harmonic force."""
+    parameters = {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}
+    recording = bp.simulate(
+        bp.models.duffing, parameters, FORCE, frequency=0.1, duration=400, sampling_rate=4,
+        noise={"displacement": 0.01}, seed=1,
+    )  # fmt: skip
+    return recording.fold(32)
+
+
+@cache
+def duffing_problem() -> bp.Problem:
+    """Return the problem of its damping and stiffness."""
+    priors = {"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)}
+    fixed = {"m": 1, "k3": 0.5}
+    return bp.Problem(bp.models.duffing, [duffing_run()], priors=priors, fixed=fixed, scheme="fourier")
+
+
+@cache
+def duffing_fit() -> bp.MapEstimate:
+    """Return the estimate of this problem."""
+    return bp.map_estimate(duffing_problem(), progress=False)
+
+
+@cache
+def duffing_posterior() -> bp.Posterior:
+    """Return draws of this problem."""
+    return bp.sample(duffing_problem(), duffing_fit(), seed=1, ensembles=2, progress=False)
+
+
 EXAMPLES: dict[str, Callable[[], Any]] = {
+    "np": lambda: np,
+    "bp": lambda: bp,
+    "force": lambda: FORCE,
+    "run": duffing_run,
+    "problem": duffing_problem,
+    "fit": duffing_fit,
+    "posterior": duffing_posterior,
     "henon_section": henon_section,
     "pendulum_parameters": lambda: PENDULUM,
     "pendulum_recording": pendulum_recording,
@@ -57,7 +99,8 @@ def example_objects(request: pytest.FixtureRequest, doctest_namespace: dict[str,
     names: set[str] = set()
     if isinstance(request.node, DoctestItem) and request.node.dtest is not None:
         source = "".join(example.source for example in request.node.dtest.examples)
-        names = set(re.findall(r"\w+", source)) & EXAMPLES.keys()
+        assigned = set(re.findall(r"^(?:.*, )?(\w+)(?:, \w+)* = ", source, re.MULTILINE))
+        names = set(re.findall(r"(?<![\w.])\w+\b(?!=)", source)) & EXAMPLES.keys() - assigned
         doctest_namespace.update({name: EXAMPLES[name]() for name in names})
     yield
     for name in names:
