@@ -1,19 +1,17 @@
-"""From symbolic expressions to compiled functions that sweep the whole time grid.
+"""Generation and compilation of functions of the whole time grid from symbolic expressions.
 
 Every generated function has the signature ``(states, inputs, parameters, tau, frequency, out)`` with
 
 - states (points, 3·states): q, then q̇, then q̈ (per second);
 - inputs (points, 3·inputs): u, u̇, ü;
 - parameters (parameters,), tau (points,) in forcing periods, frequency [Hz];
-- out (points, size): filled, one row a grid point.
+- out (points, size): the result, one row per grid point.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import sympy as sp
@@ -25,28 +23,22 @@ from sympy.printing.pycode import PythonCodePrinter
 
 from bayesperiodic.models.cache import load
 
-if TYPE_CHECKING:
-    from bayesperiodic.models.model import Model
-
-
 GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
 FUNCTIONS = ("residual", "residual_jacobian", "outputs", "derivatives", "transitions")
-SECOND_FUNCTIONS = ("jacobian_change",)
-PULLED_FUNCTIONS = ("pulled_outputs", "pulled_equations")
 MANY_ZEROS = 30
 GATHERS = "from bayesperiodic.models._kernels.gathers import without_gathers"
 
 
 class GridFunction(types.WrapperAddressProtocol):
-    """A compiled grid function that other compiled code takes as an argument.
+    """A compiled grid function that can be passed to other compiled functions.
 
-    Handing over the compiled function itself would look its address up at every call, for longer than a solve takes.
-    Without `_numba_type_` Numba would make its type anew at every call.
+    Numba looks up the address of a compiled function at every call that takes one as an argument, which takes longer
+    than a periodic solve. Here the address is looked up once, and so is the type (`_numba_type_`).
 
     Attributes
     ----------
     address : int
-        For calls that are too short even for Numba's conversion of this argument, see `grid_function_at`.
+        For short calls, in which even the conversion of this argument counts; see `grid_function_at`.
     """
 
     def __init__(self, compiled: Any):
@@ -61,7 +53,7 @@ class GridFunction(types.WrapperAddressProtocol):
         return self.address
 
     def signature(self) -> Any:
-        """Return the signature, as the protocol asks."""
+        """Return the Numba signature."""
         return self._signature
 
     def __call__(self, *arguments: Any) -> None:
@@ -71,7 +63,7 @@ class GridFunction(types.WrapperAddressProtocol):
 
 @intrinsic
 def grid_function_at(typing_context: Any, address: Any) -> Any:
-    """Return, within compiled code, the grid function at an address."""
+    """Return the grid function at an address; for use in compiled code."""
     arguments, result = sigutils.normalize_signature(GRID_SIGNATURE)
     kind = types.FunctionType(result(*arguments))
 
@@ -96,10 +88,10 @@ class Kernels:
     outputs : GridFunction
         Columns: ŷ (outputs).
     derivatives : GridFunction
-        Columns: ∂g/∂θ, ∂g/∂(u, u̇, ü), ∂g/∂f, ∂f/∂(q, q̇, q̈), ∂f/∂θ, ∂f/∂(u, u̇, ü), ∂f/∂f, each row by row; see
+        Columns: ∂g/∂θ, ∂g/∂(u, u̇, ü), ∂g/∂ν, ∂f/∂(q, q̇, q̈), ∂f/∂θ, ∂f/∂(u, u̇, ü), ∂f/∂ν, each row by row; see
         `split_derivatives`.
     transitions : GridFunction
-        Columns: the arguments of the smooth signs in the equations, which change over within −1 … 1.
+        Columns: the arguments of the smooth signs in the equations, whose transitions are within −1 … 1.
     output_rates : bool
         Whether `outputs` depends on q̇ or q̈.
     """
@@ -138,7 +130,7 @@ class Kernels:
         return out
 
     def split_derivatives(self, columns: np.ndarray) -> list[np.ndarray]:
-        """Return g_θ, g_u, g_f, f_q, f_θ, f_u, f_f as arrays (points, rows, columns); g_f is to the frequency."""
+        """Return g_θ, g_u, g_ν, f_q, f_θ, f_u, f_ν as arrays (points, rows, columns), ν being the frequency."""
         parts, start = [], 0
         for shape in self._derivative_shapes():
             stop = start + shape[0] * shape[1]
@@ -152,109 +144,142 @@ class Kernels:
         return [(g, theta), (g, u), (g, 1), (f, 3 * g), (f, theta), (f, u), (f, 1)]
 
 
-def compile_kernels(model: Model) -> Kernels:
-    """Return the compiled functions of a model, from the disk cache where they are there and undamaged."""
-    functions = load(kernel_source(model), FUNCTIONS)
-    rates = set(list(model.state_symbols.values())[len(model.states) :])
-    return Kernels(
-        **{name: GridFunction(compiled) for name, compiled in functions.items()},
-        states=len(model.states),
-        inputs=len(model.inputs),
-        parameters=len(model.parameters),
-        channels=len(model.outputs),
-        smooth_signs=len(model.smooth_signs),
-        output_rates=any(expression.free_symbols & rates for expression in model.output_expressions),
-    )
-
-
-def kernel_source(model: Model) -> str:
-    """Return the generated module as text; the same model always gives the same text."""
-    g, f = list(model.equations), list(model.output_expressions)
-    q, u = list(model.state_symbols.values()), list(model.input_symbols.values())
-    theta, frequency = list(model.parameter_symbols.values()), [model.time_symbols["frequency"]]
-    needs = {
-        "residual": g,
-        "residual_jacobian": [*g, *_jacobian(g, q)],
-        "outputs": [*f],
-        "transitions": [sign.args[0] for sign in model.smooth_signs],
-        "derivatives": [
-            entry
-            for rows, columns in ((g, theta), (g, u), (g, frequency), (f, q), (f, theta), (f, u), (f, frequency))
-            for entry in _jacobian(rows, columns)
-        ],
-    }
-    return _with_elementary(_functions(needs, q, u, theta, model.time_symbols))
-
-
-def compile_second(model: Model) -> GridFunction:
-    """Return the compiled `jacobian_change` of a model: the change of ∂g/∂(q, q̇, q̈) along a direction.
-
-    It is a grid function of states (q, q̇, q̈ and their changes), inputs (u, u̇, ü and their changes), parameters (θ, its
-    change and that of the frequency); columns row by row (states × 3·states).
-    """
-    return GridFunction(load(second_source(model), SECOND_FUNCTIONS)["jacobian_change"])
-
-
-def second_source(model: Model) -> str:
-    """Return the generated module with `jacobian_change` as text."""
-    q, u = list(model.state_symbols.values()), list(model.input_symbols.values())
-    theta, frequency = list(model.parameter_symbols.values()), model.time_symbols["frequency"]
-    change = {symbol: sp.Symbol(f"c_{symbol.name}", real=True) for symbol in (*q, *u, *theta, frequency)}
-    jacobian = _jacobian(list(model.equations), q)
-    changes = [
-        sum((sp.diff(e, x) * dx for x, dx in change.items() if x in e.free_symbols), sp.S.Zero) for e in jacobian
-    ]
-    text = _functions(
-        {"jacobian_change": changes},
-        q + [change[x] for x in q],
-        u + [change[x] for x in u],
-        theta + [change[x] for x in (*theta, frequency)],
-        model.time_symbols,
-    )
-    return _with_elementary(text)
-
-
 @dataclass(frozen=True)
-class PullingKernels:
-    """The compiled grid functions that gradients by some of a model's parameters need.
+class VjpKernels:
+    """Compiled vector-Jacobian products, with respect to some of a model's parameters.
 
-    What is costly to evaluate stands in the outputs or in the equations, rarely in both, so that no function has both.
+    Models that are expensive to evaluate are so in the outputs or in the equations, rarely in both; therefore these
+    are two functions.
 
     Attributes
     ----------
-    pulled_outputs : GridFunction
+    outputs_vjp : GridFunction
         Of states (q, q̇, q̈, weights w of the outputs). Columns: Σ w·∂f/∂(q, q̇, q̈); then, after the last row, summed
-        over the grid: Σ w·∂f/∂θ by those parameters.
-    pulled_equations : GridFunction
-        Of states (q, q̇, q̈, an adjoint state λ). Summed over the grid: −Σ λ·∂g/∂θ by those parameters.
+        over the grid: Σ w·∂f/∂θ.
+    equations_vjp : GridFunction
+        Of states (q, q̇, q̈, adjoint state λ). Summed over the grid: −Σ λ·∂g/∂θ.
     """
 
-    pulled_outputs: GridFunction
-    pulled_equations: GridFunction
+    outputs_vjp: GridFunction
+    equations_vjp: GridFunction
 
 
-def compile_pulling(model: Model, moving: tuple[int, ...]) -> PullingKernels:
-    """Return the compiled functions that gradients by the parameters of these indices need."""
-    functions = load(pulling_source(model, moving), PULLED_FUNCTIONS)
-    return PullingKernels(**{name: GridFunction(compiled) for name, compiled in functions.items()})
+@dataclass(frozen=True)
+class SymbolicModel:
+    """Symbols and expressions of a model, from which its compiled functions are generated.
+
+    Attributes
+    ----------
+    states, inputs : tuple of symbol
+        q, q̇, q̈ and u, u̇, ü.
+    parameters : tuple of symbol
+    tau, frequency : symbol
+    equations, outputs : tuple of expression
+        g and f.
+    transitions : tuple of expression
+        Arguments of the smooth signs in g.
+    """
+
+    states: tuple[sp.Symbol, ...]
+    inputs: tuple[sp.Symbol, ...]
+    parameters: tuple[sp.Symbol, ...]
+    tau: sp.Symbol
+    frequency: sp.Symbol
+    equations: tuple[sp.Expr, ...]
+    outputs: tuple[sp.Expr, ...]
+    transitions: tuple[sp.Expr, ...]
+
+    def kernels(self) -> Kernels:
+        """Return the compiled residual, Jacobian, outputs and derivatives."""
+        rates = set(self.states[len(self.equations) :])
+        return Kernels(
+            **_grid_functions(self.kernel_source(), FUNCTIONS),
+            states=len(self.equations),
+            inputs=len(self.inputs) // 3,
+            parameters=len(self.parameters),
+            channels=len(self.outputs),
+            smooth_signs=len(self.transitions),
+            output_rates=any(expression.free_symbols & rates for expression in self.outputs),
+        )
+
+    def kernel_source(self) -> str:
+        """Return the generated module of `Kernels` as text; the same model always gives the same text."""
+        g, f, q, u = self.equations, self.outputs, self.states, self.inputs
+        theta, frequency = self.parameters, (self.frequency,)
+        blocks = ((g, theta), (g, u), (g, frequency), (f, q), (f, theta), (f, u), (f, frequency))
+        expressions = {
+            "residual": [*g],
+            "residual_jacobian": [*g, *_jacobian(g, q)],
+            "outputs": [*f],
+            "transitions": [*self.transitions],
+            "derivatives": [entry for rows, columns in blocks for entry in _jacobian(rows, columns)],
+        }
+        arguments = self._arguments(q, u, theta)
+        return _module([_function(name, needed, arguments) for name, needed in expressions.items()])
+
+    def jacobian_change(self) -> GridFunction:
+        """Return the compiled directional derivative of ∂g/∂(q, q̇, q̈).
+
+        It is a function of states (q, q̇, q̈ and their changes), inputs (u, u̇, ü and their changes) and parameters (θ,
+        its change and that of the frequency); columns row by row (states × 3·states).
+        """
+        return _grid_functions(self.jacobian_change_source(), ("jacobian_change",))["jacobian_change"]
+
+    def jacobian_change_source(self) -> str:
+        """Return the generated module of `jacobian_change` as text."""
+        moving = (*self.states, *self.inputs, *self.parameters, self.frequency)
+        change = {symbol: sp.Symbol(f"c_{symbol.name}", real=True) for symbol in moving}
+        q, u, theta = ((*own, *map(change.get, own)) for own in (self.states, self.inputs, self.parameters))
+        arguments = self._arguments(q, u, (*theta, change[self.frequency]))
+        changes = [
+            sum((sp.diff(e, x) * dx for x, dx in change.items() if x in e.free_symbols), sp.S.Zero)
+            for e in _jacobian(self.equations, self.states)
+        ]
+        return _module([_function("jacobian_change", changes, arguments)])
+
+    def vjp_kernels(self, moving: tuple[int, ...]) -> VjpKernels:
+        """Return the compiled vector-Jacobian products with respect to the parameters of these indices."""
+        return VjpKernels(**_grid_functions(self.vjp_source(moving), ("outputs_vjp", "equations_vjp")))
+
+    def vjp_source(self, moving: tuple[int, ...]) -> str:
+        """Return the generated module of `VjpKernels` as text."""
+        g, f, q = self.equations, self.outputs, self.states
+        by = tuple(self.parameters[i] for i in moving)
+        weights, adjoint = (
+            tuple(sp.Symbol(f"{letter}_{i}", real=True) for i in range(len(e))) for letter, e in (("w", f), ("l", g))
+        )
+        functions = [
+            _function(
+                name,
+                _vjp(factors, rows, columns),
+                self._arguments((*q, *factors), self.inputs, self.parameters),
+                len(by),
+            )
+            for name, factors, rows, columns in (
+                ("outputs_vjp", weights, f, (*q, *by)),
+                ("equations_vjp", adjoint, tuple(-e for e in g), by),
+            )
+        ]
+        return _module(functions)
+
+    def _arguments(
+        self, states: tuple[sp.Symbol, ...], inputs: tuple[sp.Symbol, ...], parameters: tuple[sp.Symbol, ...]
+    ) -> dict[sp.Symbol, str]:
+        """Return the Python expression of every symbol in a grid function."""
+        return {
+            **{symbol: f"flat_states[{len(states)}*i + {column}]" for column, symbol in enumerate(states)},
+            **{symbol: f"flat_inputs[{len(inputs)}*i + {column}]" for column, symbol in enumerate(inputs)},
+            **{symbol: f"parameters[{index}]" for index, symbol in enumerate(parameters)},
+            self.tau: "tau[i]",
+            self.frequency: "frequency",
+        }
 
 
-def pulling_source(model: Model, moving: tuple[int, ...]) -> str:
-    """Return the generated module of `PullingKernels` as text."""
-    g, f = list(model.equations), list(model.output_expressions)
-    q, u = list(model.state_symbols.values()), list(model.input_symbols.values())
-    theta = list(model.parameter_symbols.values())
-    weights, adjoint = ([sp.Symbol(f"{w}_{i}", real=True) for i in range(len(e))] for w, e in (("w", f), ("l", g)))
-    by, rest = [theta[i] for i in moving], (u, theta, model.time_symbols)
-    changes, moved = _weighed_changes(weights, f, [*q, *by]), _weighed_changes(adjoint, [-e for e in g], by)
-    functions = [
-        _functions({"pulled_outputs": changes}, [*q, *weights], *rest, summed=len(by)),
-        _functions({"pulled_equations": moved}, [*q, *adjoint], *rest, summed=len(by)),
-    ]
-    return _with_elementary("\n\n".join(functions))
+def _grid_functions(source: str, names: Sequence[str]) -> dict[str, GridFunction]:
+    return {name: GridFunction(compiled) for name, compiled in load(source, names).items()}
 
 
-def _weighed_changes(weights: list[sp.Symbol], rows: list[sp.Expr], columns: list[sp.Symbol]) -> list[sp.Expr]:
+def _vjp(weights: Sequence[sp.Symbol], rows: Sequence[sp.Expr], columns: Sequence[sp.Symbol]) -> list[sp.Expr]:
     """Return Σ weight·∂row/∂column of each column."""
     return [
         sum((w * sp.diff(e, x) for w, e in zip(weights, rows, strict=True) if x in e.free_symbols), sp.S.Zero)
@@ -262,65 +287,53 @@ def _weighed_changes(weights: list[sp.Symbol], rows: list[sp.Expr], columns: lis
     ]
 
 
-def _jacobian(rows: list[sp.Expr], columns: list[sp.Symbol]) -> list[sp.Expr]:
+def _jacobian(rows: Sequence[sp.Expr], columns: Sequence[sp.Symbol]) -> list[sp.Expr]:
     """Return ∂rows/∂columns row by row."""
     return [sp.diff(row, x) if x in row.free_symbols else sp.S.Zero for row in rows for x in columns]
 
 
-def _functions(
-    needs: dict[str, list[sp.Expr]],
-    states: list[sp.Symbol],
-    inputs: list[sp.Symbol],
-    parameters: list[sp.Symbol],
-    time: dict[str, sp.Symbol],
-    *,
-    summed: int = 0,
-) -> str:
-    arguments = {
-        **{symbol: f"flat_states[{len(states)}*i + {column}]" for column, symbol in enumerate(states)},
-        **{symbol: f"flat_inputs[{len(inputs)}*i + {column}]" for column, symbol in enumerate(inputs)},
-        **{symbol: f"parameters[{index}]" for index, symbol in enumerate(parameters)},
-        time["tau"]: "tau[i]",
-        time["frequency"]: "frequency",
-    }
-    return "\n\n".join(_function(name, expressions, arguments, summed) for name, expressions in needs.items())
-
-
-def _with_elementary(functions: str) -> str:
-    """Return the text after the elementary functions that it calls and what these call."""
+def _module(functions: list[str]) -> str:
+    """Return the source of grid functions, preceded by the elementary functions that they call."""
+    body = "\n\n".join(functions)
     text = Path(__file__).with_name("_kernels").joinpath("elementary.py").read_text(encoding="utf-8")
     header, *blocks = text.strip().split("\n\n\n")
     for block in reversed(blocks):
         name = block.partition("def ")[2].partition("(")[0]
-        if f"{name}(" in functions:
-            functions = f"{block}\n\n\n{functions}"
-    return f"{header}\n{GATHERS}\n\n\n{functions}"
+        if f"{name}(" in body:
+            body = f"{block}\n\n\n{body}"
+    return f"{header}\n{GATHERS}\n\n\n{body}"
 
 
-def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str], summed: int) -> str:
-    """Return a function that sweeps the grid; strides known at compile time let its loop be vectorised.
+def _function(name: str, expressions: list[sp.Expr], arguments: dict[sp.Symbol, str], summed: int = 0) -> str:
+    """Return the source of a grid function.
 
-    The last `summed` expressions are added up in whatever order is fastest on this machine, and put after the rows.
+    Strides are literals, so that the loop can be vectorised. The last `summed` expressions are summed over the grid, in
+    any order, and stored after the rows.
     """
     common, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("common"), order="canonical")
     used = set().union(*(e.free_symbols for e in reduced), *(e.free_symbols for _, e in common))
     places = {symbol: place for symbol, place in arguments.items() if symbol in used and symbol.name != place}
-    lines = ["    without_gathers()", *(f"    flat_{a} = {a}.reshape({a}.size)" for a in ("states", "inputs", "out"))]
-    lines += [f"    {s} = {place}" for s, place in places.items() if "[" not in place or "i" not in place.split("[")[1]]
+    varying = {symbol: place for symbol, place in places.items() if place.startswith(("flat_", "tau["))}
     columns = len(reduced) - summed
     before, own, after = _sums(reduced[columns:], columns)
-    row = [*_row(reduced[:columns]), *own] or ["        pass"]
-    lines += [*before, "    for i in range(states.shape[0]):"]
-    lines += [f"        {s} = {place}" for s, place in places.items() if "[" in place and "i" in place.split("[")[1]]
-    lines += [f"        {symbol} = {_code(expression)}" for symbol, expression in common]
-    lines += [*row, *after]
+    lines = [
+        "    without_gathers()",
+        *(f"    flat_{a} = {a}.reshape({a}.size)" for a in ("states", "inputs", "out")),
+        *(f"    {symbol} = {place}" for symbol, place in places.items() if symbol not in varying),
+        *before,
+        "    for i in range(states.shape[0]):",
+        *(f"        {symbol} = {place}" for symbol, place in varying.items()),
+        *(f"        {symbol} = {_code(expression)}" for symbol, expression in common),
+        *([*_row(reduced[:columns]), *own] or ["        pass"]),
+        *after,
+    ]
     fast = ', fastmath={"reassoc"}' if summed else ""
     header = f'@njit("{GRID_SIGNATURE}", cache=CACHE, nogil=True, error_model="numpy"{fast})\n'
     return header + f"def {name}(states, inputs, parameters, tau, frequency, out):\n" + "\n".join(lines) + "\n"
 
 
 def _row(expressions: list[sp.Expr]) -> list[str]:
-    """Return the lines that fill a row, zeros by a loop where there are many."""
+    """Return the lines that fill a row; many zeros are set in a loop."""
     size, zeros = len(expressions), sum(expression == 0 for expression in expressions)
     cleared = zeros > MANY_ZEROS
     lines = (
@@ -335,7 +348,7 @@ def _row(expressions: list[sp.Expr]) -> list[str]:
 
 
 def _sums(expressions: list[sp.Expr], columns: int) -> tuple[list[str], list[str], list[str]]:
-    """Return the lines before, in and after the loop that sum up expressions and put them after rows of `columns`."""
+    """Return the lines before, in and after the loop that sum expressions and store them after rows of `columns`."""
     start = f"{columns}*states.shape[0]" if columns else "0"
     there = [column for column, expression in enumerate(expressions) if expression != 0]
     return (
@@ -346,7 +359,7 @@ def _sums(expressions: list[sp.Expr], columns: int) -> tuple[list[str], list[str
 
 
 class _Printer(PythonCodePrinter):
-    """SymPy's Python printer with the generalised functions that differentiation leaves behind."""
+    """SymPy's Python printer, extended by the generalised functions that result from differentiation."""
 
     def _print_sign(self, expression: sp.Expr) -> str:
         argument = self._print(expression.args[0])
@@ -376,13 +389,13 @@ def _code(expression: sp.Expr) -> str:
         text = "# not supported"
     if "#" in text or "\n" in text:
         raise ValueError(
-            f"equations or outputs: {expression} is not allowed; it has a function (or a derivative of one) that "
-            "cannot be compiled. Elementary functions, abs, sign, Min, Max and Piecewise are."
+            "equations or outputs: must be elementary functions, abs, sign, Min, Max and Piecewise, got "
+            f"{expression}, which cannot be compiled."
         )
     return text
 
 
 def as_columns(values: Iterable[np.ndarray], points: int) -> np.ndarray:
-    """Return signals (or their derivatives) side by side as a C-contiguous array (points, columns)."""
+    """Return signals as the columns of a C-contiguous array (points, signals)."""
     stacked = [np.asarray(v, dtype=float) for v in values]
     return np.ascontiguousarray(np.stack(stacked, axis=-1)) if stacked else np.empty((points, 0))

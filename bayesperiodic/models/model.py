@@ -7,14 +7,7 @@ from typing import Any
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic.models.code_generation import (
-    GridFunction,
-    Kernels,
-    PullingKernels,
-    compile_kernels,
-    compile_pulling,
-    compile_second,
-)
+from bayesperiodic.models.code_generation import GridFunction, Kernels, SymbolicModel, VjpKernels
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
 
@@ -191,35 +184,49 @@ class Model:
         other.parameter_symbols = {**self.parameter_symbols, "sharpness_of_signs": sharpness}
         return other
 
+    @property
+    def symbolic(self) -> SymbolicModel:
+        """Symbols and expressions, from which the compiled functions are generated."""
+        return SymbolicModel(
+            states=tuple(self.state_symbols.values()),
+            inputs=tuple(self.input_symbols.values()),
+            parameters=tuple(self.parameter_symbols.values()),
+            tau=self.time_symbols["tau"],
+            frequency=self.time_symbols["frequency"],
+            equations=self.equations,
+            outputs=self.output_expressions,
+            transitions=tuple(sign.args[0] for sign in self.smooth_signs),
+        )
+
+    @cached_property
+    def kernels(self) -> Kernels:
+        """The compiled residual, Jacobian, outputs and derivatives; cached on disk."""
+        return self.symbolic.kernels()
+
     @cached_property
     def jacobian_change(self) -> GridFunction:
-        """The compiled change of ∂g/∂(q, q̇, q̈) along a direction, see `compile.compile_second`."""
-        return compile_second(self)
+        """The compiled directional derivative of ∂g/∂(q, q̇, q̈); see `SymbolicModel.jacobian_change`."""
+        return self.symbolic.jacobian_change()
 
-    def pulling_kernels(self, moving: tuple[int, ...]) -> PullingKernels:
-        """Return the compiled grid functions that gradients need.
+    def vjp_kernels(self, moving: tuple[int, ...]) -> VjpKernels:
+        """Return the compiled vector-Jacobian products that gradients need.
 
         Parameters
         ----------
         moving : tuple of int
-            Indices of the parameters by which.
+            Indices of the parameters of the gradient.
 
         Returns
         -------
-        PullingKernels
+        VjpKernels
         """
-        if moving not in self._pulling_kernels:
-            self._pulling_kernels[moving] = compile_pulling(self, moving)
-        return self._pulling_kernels[moving]
+        if moving not in self._vjp_kernels:
+            self._vjp_kernels[moving] = self.symbolic.vjp_kernels(moving)
+        return self._vjp_kernels[moving]
 
     @cached_property
-    def _pulling_kernels(self) -> dict[tuple[int, ...], PullingKernels]:
+    def _vjp_kernels(self) -> dict[tuple[int, ...], VjpKernels]:
         return {}
-
-    @cached_property
-    def kernels(self) -> Kernels:
-        """The compiled grid functions; loaded from the user's cache folder or compiled at the first use."""
-        return compile_kernels(self)
 
     def input_derivatives(self) -> dict[str, int]:
         """Return for every input the highest time derivative of it that the model uses."""
@@ -250,7 +257,7 @@ class Model:
         return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
 
     def __getstate__(self) -> dict[str, Any]:
-        compiled = ("kernels", "_pulling_kernels", "jacobian_change", "smooth_signs")
+        compiled = ("kernels", "_vjp_kernels", "jacobian_change", "smooth_signs")
         return {key: value for key, value in self.__dict__.items() if key not in compiled}
 
     def __repr__(self) -> str:

@@ -270,8 +270,8 @@ class Batch:
         threads : int, optional
         """
         model, grid = self._first.model, self._first.grid
-        pulling, (frequency, drift) = model.pulling_kernels(moving), self._shared[1:3]
-        jacobian, outputs, equations = model.kernels.residual_jacobian, pulling.pulled_outputs, pulling.pulled_equations
+        vjp, (frequency, drift) = model.vjp_kernels(moving), self._shared[1:3]
+        jacobian, outputs, equations = model.kernels.residual_jacobian, vjp.outputs_vjp, vjp.equations_vjp
         functions = np.array([jacobian.address, outputs.address, equations.address])
         gradients = np.empty((self._size, len(moving)))
         compiled = adjoint_kernels(self._first.count, grid.stencil)

@@ -16,7 +16,6 @@ import h5py
 import numpy as np
 from filelock import FileLock, Timeout
 
-from bayesperiodic.models.code_generation import kernel_source
 from bayesperiodic.posterior.problem import Problem
 
 PATIENCE = 20.0
@@ -159,7 +158,7 @@ def _in_memory(stored: emcee.backends.HDFBackend) -> emcee.backends.Backend:
 
 def fingerprint(problem: Problem) -> str:
     """Return a digest of model, data, priors, fixed values, ties, noise model and scheme."""
-    digest = hashlib.sha256(kernel_source(problem.model).encode())
+    digest = hashlib.sha256(problem.model.symbolic.kernel_source().encode())
     for experiment in problem.experiments:
         digest.update(
             repr(

@@ -12,9 +12,9 @@ from bayesperiodic.models.code_generation import FUNCTIONS
 PROGRAM = """
 import numba
 from bayesperiodic.models.cache import load
-from bayesperiodic.models.code_generation import FUNCTIONS, kernel_source
+from bayesperiodic.models.code_generation import FUNCTIONS
 from tests.known import LINEAR
-functions = load(kernel_source(LINEAR), FUNCTIONS)
+functions = load(LINEAR.symbolic.kernel_source(), FUNCTIONS)
 print(sum(sum(f.stats.cache_hits.values()) for f in functions.values()))
 """
 

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from numba import njit
 
-from bayesperiodic.models import code_generation as generated
 from bayesperiodic.models._kernels.gathers import without_gathers
 from bayesperiodic.models.library import duffing
 
@@ -37,9 +36,9 @@ def test_strided_columns_are_loaded_without_gathers_by_vectorised_code():
 
 def test_generated_functions_take_no_gathers():
     sources = [
-        generated.kernel_source(duffing),
-        generated.pulling_source(duffing, (1,)),
-        generated.second_source(duffing),
+        duffing.symbolic.kernel_source(),
+        duffing.symbolic.vjp_source((1,)),
+        duffing.symbolic.jacobian_change_source(),
     ]
     for source in sources:
         assert (

@@ -105,7 +105,7 @@ def beside(states, others, both):
     **OPTIONS,
 )
 def pull(
-    residual_jacobian, pulled_outputs, pulled_equations, grid, inputs, parameters, tau, frequency, drift, z, weights,
+    residual_jacobian, outputs_vjp, equations_vjp, grid, inputs, parameters, tau, frequency, drift, z, weights,
     work, factors, gradient,
 ):  # fmt: skip
     """Fill Σ weights · ∂ŷ/∂θ (moving,) at a solution z; return False where ∂g/∂z is singular."""
@@ -122,7 +122,7 @@ def pull(
     if not factorise(columns, grid, frequency, amplitude, factors):
         return False
     beside(states, weights, weighed)
-    pulled_outputs(weighed, inputs, parameters, tau, frequency, slopes.reshape((1, slopes.size)))
+    outputs_vjp(weighed, inputs, parameters, tau, frequency, slopes.reshape((1, slopes.size)))
     for i in range(points):
         for s in range(count):
             adjoint[i, s] = 0.0
@@ -137,7 +137,7 @@ def pull(
             adjoint[i, s] += slopes[row]
     back_substitute_transposed(grid, factors, adjoint)
     beside(states, adjoint, extended)
-    pulled_equations(extended, inputs, parameters, tau, frequency, gradient.reshape((1, gradient.size)))
+    equations_vjp(extended, inputs, parameters, tau, frequency, gradient.reshape((1, gradient.size)))
     for p in range(gradient.size):
         gradient[p] += slopes[3 * count * points + p]
     return True
@@ -156,7 +156,7 @@ def pull_many(
     Parameters
     ----------
     functions : int array (3,)
-        Addresses of the model's `residual_jacobian`, `pulled_outputs` and `pulled_equations`.
+        Addresses of the model's `residual_jacobian`, `outputs_vjp` and `equations_vjp`.
     inputs : array (sets, points, 3·inputs)
     parameters : array (sets, parameters)
     frequency : array (sets,)
@@ -165,8 +165,8 @@ def pull_many(
     weights : array (sets, points, channels)
     factors : work arrays, see `equations.empty_factors`
     """
-    residual_jacobian, pulled_outputs = grid_function_at(functions[0]), grid_function_at(functions[1])
-    pulled_equations = grid_function_at(functions[2])
+    residual_jacobian, outputs_vjp = grid_function_at(functions[0]), grid_function_at(functions[1])
+    equations_vjp = grid_function_at(functions[2])
     points, count, channels = z.shape[1], z.shape[2], weights.shape[2]
     work = (
         np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count))),
@@ -175,7 +175,7 @@ def pull_many(
     )  # fmt: skip
     for k in range(start, stop):
         regular = pull(
-            residual_jacobian, pulled_outputs, pulled_equations, grid, inputs[k], parameters[k], tau, frequency[k],
+            residual_jacobian, outputs_vjp, equations_vjp, grid, inputs[k], parameters[k], tau, frequency[k],
             drift[k], z[k], weights[k], work, factors, gradients[k],
         )  # fmt: skip
         if not regular:
