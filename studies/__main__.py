@@ -48,7 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
     matplotlib.rcParams["savefig.format"] = options.format
     options.out = options.out or Path("figures", *(["quick"] if options.quick else []), known[options.name])
     try:
-        importlib.import_module(f"studies.{known[options.name]}").run(options)
+        importlib.import_module(f"studies.{known[options.name]}.run").run(options)
     except (ValueError, RuntimeError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -56,16 +56,18 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _studies() -> dict[str, str]:
-    """Return the module of every study by its name; one called like another with an underscore is a part of it."""
-    modules = [m.name for m in pkgutil.iter_modules(studies.__path__) if m.name not in ("common", "__main__")]
-    parts = {part for part in modules for whole in modules if part.startswith(f"{whole}_")}
-    return {module.replace("_", "-"): module for module in modules if module not in parts}
+    """Return the package of every study, by the study's name."""
+    packages = [m.name for m in pkgutil.iter_modules(studies.__path__) if m.ispkg]
+    return {package.replace("_", "-"): package for package in packages if _main_file(package).is_file()}
 
 
-def _first_line(module: str) -> str:
-    """Return what a study says of itself, read from its text: importing it would load the compiler."""
-    text = Path(studies.__path__[0], f"{module}.py").read_text(encoding="utf-8")
-    return (ast.get_docstring(ast.parse(text)) or "").splitlines()[0]
+def _main_file(package: str) -> Path:
+    return Path(studies.__path__[0], package, "run.py")
+
+
+def _first_line(package: str) -> str:
+    """Return the first line of a study's docstring without importing it, which would load the compiler."""
+    return (ast.get_docstring(ast.parse(_main_file(package).read_text(encoding="utf-8"))) or "").splitlines()[0]
 
 
 if __name__ == "__main__":

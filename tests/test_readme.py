@@ -8,7 +8,8 @@ import pandas as pd
 import pytest
 
 import bayesperiodic as bp
-from studies import flutter_rig, pendulum_recording
+from studies.flutter import rig
+from studies.pendulum import recording as pendulum_recording
 from tests.known import LINEAR, linear_experiment
 
 README = Path(__file__).parents[1] / "README.md"
@@ -50,7 +51,7 @@ def pendulum():
 
 def gear():
     """Two experiments of the landing gear, and what is known of it."""
-    from studies.landing_gear_truth import GEAR
+    from studies.landing_gear.truth import GEAR
 
     model, wave = bp.models.landing_gear("displacement"), np.cos(2 * np.pi * np.arange(200) / 200)
     found = []
@@ -80,7 +81,7 @@ BEFORE = {
     "Your recording, your model": damper_file,
     "A chaotic pendulum": pendulum,
     "A flutter rig's unstable cycles": lambda: {
-        "bp": bp, "values": flutter_rig.RIG | flutter_rig.AUTHORS | flutter_rig.SENSORS,
+        "bp": bp, "values": rig.RIG | rig.AUTHORS | rig.SENSORS,
     },
     "The periodic solver": dict,
     "More than one experiment, and more than histories": gear,

@@ -7,7 +7,7 @@ import pint
 import pytest
 
 import bayesperiodic as bp
-from studies.flutter_reference import RIG, flutter_matrices
+from studies.flutter.reference import RIG, flutter_matrices
 
 LIBRARY = {
     "duffing": lambda: bp.models.duffing,

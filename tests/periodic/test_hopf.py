@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from studies.flutter_reference import RIG, SENSORS, hopf, settled
+from studies.flutter.reference import RIG, SENSORS, hopf, settled
 
 VALUES = RIG | SENSORS
 # Where the published code finds the fold, in m/s.

@@ -8,7 +8,7 @@ import bayesperiodic as bp
 from bayesperiodic.periodic.batch import Bordered
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT
 from bayesperiodic.periodic.family import ARRIVED
-from studies.flutter_reference import RIG, SENSORS, hopf
+from studies.flutter.reference import RIG, SENSORS, hopf
 
 SPEED, SAMPLES = 15.0, 16
 FREE = ("k_alpha", "c_alpha", "c_h", "k_alpha2")

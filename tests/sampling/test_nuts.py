@@ -11,7 +11,7 @@ from scipy import stats
 import bayesperiodic as bp
 from bayesperiodic.sampling import convergence, nuts
 from bayesperiodic.sampling.coordinates import SamplingDensity
-from studies import damper
+from studies.damper import run as damper
 from tests.known import LINEAR, RUNAWAY, grid, linear_experiment, linear_regressors
 from tests.posterior.test_gradient import CASES, EIGHTH_ORDER
 

@@ -8,30 +8,30 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
-from studies import (
-    benchmark,
-    benchmark_contenders,
-    benchmark_diffrax,
-    benchmark_figures,
-    benchmark_floor,
-    benchmark_guard,
-    benchmark_harmonic_balance,
-    benchmark_peers,
-    benchmark_pendulum,
-    benchmark_posteriors,
-    benchmark_problems,
-    benchmark_scaling,
-    benchmark_tables,
-    benchmark_targets,
-    damper,
-)
 from studies.__main__ import main
-from studies.benchmark_equations import NUMPY, FirstOrder, table
-from studies.benchmark_integration import EQUILIBRIUM, PREDICTED, SHOOTING, STARTS, STEADY, Discretised, Method
-from studies.benchmark_kernels import dense, eliminate, signals
-from studies.benchmark_problems import DUFFING_TRUTH, Setting, draws, measured
-from studies.benchmark_reference import refer
-from studies.benchmark_timing import Action, interleaved, ratio, slope
+from studies.benchmark import (
+    contenders,
+    diffrax,
+    figures,
+    harmonic_balance,
+    peers,
+    pendulum,
+    posteriors,
+    problems,
+    scaling,
+    tables,
+    targets,
+)
+from studies.benchmark import floor as benchmark_floor
+from studies.benchmark import guard as benchmark_guard
+from studies.benchmark import run as benchmark
+from studies.benchmark.equations import NUMPY, FirstOrder, table
+from studies.benchmark.integration import EQUILIBRIUM, PREDICTED, SHOOTING, STARTS, STEADY, Discretised, Method
+from studies.benchmark.kernels import dense, eliminate, signals
+from studies.benchmark.problems import DUFFING_TRUTH, Setting, draws, measured
+from studies.benchmark.reference import refer
+from studies.benchmark.timing import Action, interleaved, ratio, slope
+from studies.damper import run as damper
 
 MODELS = ("landing_gear force", "landing_gear displacement", "duffing", "dahl", "pendulum", "silverbox")
 
@@ -164,12 +164,12 @@ def test_the_gradient_by_shooting_is_that_of_its_value(setting):
 def test_every_contender_is_right_before_it_is_timed(setting):
     reference = refer(setting)
     assert reference.uncertainty < 1e-6
-    contest = benchmark_contenders.Contest(reference)
-    scheme = benchmark_contenders.add_own(contest)
-    compiled = benchmark_contenders.add_compiled(contest)
-    benchmark_contenders.add_scipy(contest, compiled)
+    contest = contenders.Contest(reference)
+    scheme = contenders.add_own(contest)
+    compiled = contenders.add_compiled(contest)
+    contenders.add_scipy(contest, compiled)
     contest.add("wrong", 0.02, Action(lambda: pytest.fail("timed")))
-    found = benchmark_contenders.measured(contest, scheme, 2)
+    found = contenders.measured(contest, scheme, 2)
     rows = {row["name"]: row for row in found["rows"]}
     assert rows["wrong"]["milliseconds"] is None and "not right enough" in rows["wrong"]["note"]
     for row in found["rows"]:
@@ -204,31 +204,31 @@ def test_targets_are_called_met_and_missed_as_measured():
     rows = [entry("LSODA from equilibrium", 101.0), entry("solve_bvp from equilibrium", 19.0)]
     rows += [entry("Radau from equilibrium", None)]
     found = {"problems": {"damper": {"rows": rows, "scheme": None, "gradient_ratio": None}}, "floor": {}}
-    met = {row["what"].split()[1]: row["met"] for row in benchmark_targets.rows(found)}
+    met = {row["what"].split()[1]: row["met"] for row in targets.rows(found)}
     assert met == {"LSODA": True, "Radau": None, "solve_bvp": False}
 
 
 def test_a_quick_run_writes_table_and_figure(tmp_path, capsys, setting, monkeypatch):
-    monkeypatch.setattr(benchmark, "problems", lambda options: {benchmark_problems.FORCE: lambda: setting})
+    monkeypatch.setattr(benchmark, "problems", lambda options: {problems.FORCE: lambda: setting})
     monkeypatch.setattr(benchmark_floor, "with_all_free", lambda one, scheme: (one.schemed(scheme), one.theta[0]))
     assert main(["benchmark", "--quick", "--out", str(tmp_path)]) == 0
     results = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     printed = capsys.readouterr().out
     assert "SYNTHETIC" in printed and "dgbtrf" in printed and "What must show" in printed
     assert (tmp_path / "benchmark.png").stat().st_size > 1000
-    floor = results["floor"][benchmark_problems.FORCE]["schemes"]["central4"]
+    floor = results["floor"][problems.FORCE]["schemes"]["central4"]
     assert floor["same_grid_error"] < 1e-4 and floor["floor_us"]["sum"]["median"] > 0.0
-    assert {row["what"].split(":")[0] for row in results["checks"]} >= {benchmark_problems.FORCE}
+    assert {row["what"].split(":")[0] for row in results["checks"]} >= {problems.FORCE}
 
 
 def test_a_peer_that_is_not_installed_is_a_row_that_says_so(setting, monkeypatch):
-    monkeypatch.setattr(benchmark_diffrax.importlib.util, "find_spec", lambda name: None)
-    contest = benchmark_contenders.Contest(refer(replace(setting, name=benchmark_problems.DUFFING)))
-    compiled = benchmark_contenders.add_compiled(contest)
+    monkeypatch.setattr(diffrax.importlib.util, "find_spec", lambda name: None)
+    contest = contenders.Contest(refer(replace(setting, name=problems.DUFFING)))
+    compiled = contenders.add_compiled(contest)
     contest.rows.clear()
-    benchmark_peers.add_peers(contest, compiled)
-    rows = benchmark_contenders.measured(contest, None, 1)["rows"]
-    assert [row["name"] for row in rows] == [*benchmark_peers.DIFFRAX_ROWS, benchmark_peers.BALANCE]
+    peers.add_peers(contest, compiled)
+    rows = contenders.measured(contest, None, 1)["rows"]
+    assert [row["name"] for row in rows] == [*peers.DIFFRAX_ROWS, peers.BALANCE]
     for row in rows:
         assert row["milliseconds"] is None and "is not installed (pip install" in row["note"]
 
@@ -239,7 +239,7 @@ def test_peers_are_right(setting, peer):
     case = setting.cases[0]
     one, p = Discretised(case, 800), setting.parameters(setting.theta, case)
     exact = np.array([Method(one, SHOOTING, PREDICTED, 1e-10)(row) for row in p])
-    tune = {"diffrax": benchmark_diffrax.tune_diffrax, "harmonicbalance": benchmark_harmonic_balance.tune_balanced}
+    tune = {"diffrax": diffrax.tune_diffrax, "harmonicbalance": harmonic_balance.tune_balanced}
     found = tune[peer](one, p, exact, 1e-3)
     assert found is not None and [found(row) for row in p] == pytest.approx(exact, abs=2e-3)
 
@@ -247,7 +247,7 @@ def test_peers_are_right(setting, peer):
 def test_the_density_of_the_peers_is_the_posterior_with_the_variance_integrated_out(setting):
     """∫ p(θ, log v) d log v is proportional to p(θ) M^(−n/2): compared by quadrature of the package's density."""
     methods = [Method(Discretised(case, 400), SHOOTING, PREDICTED, 1e-9) for case in setting.cases]
-    density, warm = benchmark_posteriors.collapsed(setting, methods), setting.problem.anchored(setting.fit.theta)
+    density, warm = posteriors.collapsed(setting, methods), setting.problem.anchored(setting.fit.theta)
     logs = np.log(setting.noise) + np.linspace(-1.5, 1.5, 301)[:, None]
     found = []
     for theta in setting.theta:
@@ -261,10 +261,10 @@ def test_the_potential_of_jax_is_that_density(setting):
     jax = pytest.importorskip("jax")
     pytest.importorskip("diffrax")
     methods = [Method(Discretised(case, 800), SHOOTING, PREDICTED, 1e-9) for case in setting.cases]
-    tuned = [benchmark_diffrax.Integrated(method.discretised, 1e-9) for method in methods]
-    density = benchmark_posteriors.collapsed(setting, methods)
-    middle, factor = np.log(setting.estimate), benchmark_posteriors._axes(setting)
-    potential = jax.jit(benchmark_posteriors._potential(setting, tuned, middle, factor))
+    tuned = [diffrax.Integrated(method.discretised, 1e-9) for method in methods]
+    density = posteriors.collapsed(setting, methods)
+    middle, factor = np.log(setting.estimate), posteriors._axes(setting)
+    potential = jax.jit(posteriors._potential(setting, tuned, middle, factor))
     off = []
     for z in (np.zeros(3), np.array([0.5, -1.0, 0.3])):
         theta = np.exp(middle + factor @ z)
@@ -274,10 +274,10 @@ def test_the_potential_of_jax_is_that_density(setting):
 
 def test_integration_leaves_an_unstable_orbit_at_the_rate_of_its_multiplier():
     """The upright equilibrium's perturbation grows; hanging at rest stays."""
-    hanging = benchmark_pendulum.distances(np.zeros(2))
+    hanging = pendulum.distances(np.zeros(2))
     assert max(hanging) == 0.0
-    upright = benchmark_pendulum.distances(np.array([np.pi, 1e-9]))
-    assert upright[0] > 1e-8 and max(upright) > benchmark_pendulum.LEFT
+    upright = pendulum.distances(np.array([np.pi, 1e-9]))
+    assert upright[0] > 1e-8 and max(upright) > pendulum.LEFT
 
 
 def test_the_guard_compares_ratios_only_and_names_those_that_are_worse(tmp_path):
@@ -305,7 +305,7 @@ def test_the_guard_compares_ratios_only_and_names_those_that_are_worse(tmp_path)
 def test_the_guard_times_the_draws_of_the_whole_run():
     def drawn(**given):
         options = argparse.Namespace(**{"quick": False, "guard": False, "seed": 3, "data": None} | given)
-        return benchmark.problems(options)[benchmark_problems.DUFFING]().theta
+        return benchmark.problems(options)[problems.DUFFING]().theta
 
     np.testing.assert_array_equal(drawn(quick=True, guard=True), drawn())
     assert len(drawn(quick=True)) < len(drawn())
@@ -316,34 +316,34 @@ def test_exponents_are_those_of_the_power_laws():
         return 1e-3 * size**1.5 * float(np.ones(100_000 * size).mean())
 
     sizes = (2, 4, 7)
-    growth = benchmark_scaling._fitted(sizes, [partial(seconds, size) for size in sizes], 3)
+    growth = scaling._fitted(sizes, [partial(seconds, size) for size in sizes], 3)
     assert growth["time_exponent"] == pytest.approx(1.5, abs=1e-12)
     assert growth["memory_exponent"] == pytest.approx(1.0, abs=1e-3)
     assert growth["seconds"] == pytest.approx([seconds(size) for size in sizes])
 
 
 def test_memory_of_the_batched_call_grows_no_faster_than_the_walkers():
-    calls = [benchmark_scaling._batched(samples=200, experiments=2, walkers=walkers) for walkers in (64, 256)]
-    peaks = [benchmark_scaling._peak(call) for call in calls]
+    calls = [scaling._batched(samples=200, experiments=2, walkers=walkers) for walkers in (64, 256)]
+    peaks = [scaling._peak(call) for call in calls]
     assert slope([64, 256], peaks) < 1.2
 
 
 def test_posterior_and_scaling_are_told_and_judged():
     walked = {"ess_per_log_posterior": 0.02}
     own = {"ess_per_second": 100.0, "ess_per_log_posterior": 0.05, "seconds": 10.0, "log_posteriors": 20_000}
-    samplers = {"sample, default": own, benchmark_posteriors.NUMPYRO: {"note": "jax is not installed"}}
+    samplers = {"sample, default": own, posteriors.NUMPYRO: {"note": "jax is not installed"}}
     around = {
         "shooting from equilibrium": {"ess_per_second": 50.0, "milliseconds": 0.4},
         "LSODA from equilibrium": {"ess_per_second": 0.02, "milliseconds": 1000.0},
     }
-    split = benchmark_posteriors._split(samplers, walked, around)
+    split = posteriors._split(samplers, walked, around)
     assert split["against"]["shooting from equilibrium"] == pytest.approx({"ratio": 2.0, "sampler": 2.5, "solver": 0.8})
     posterior = {"samplers": samplers, "emcee": walked, "emcee_around": around, "split": split}
     growth = {"samples": {"time_exponent": 1.05, "memory_exponent": 1.3}}
     start = {"import_s": 0.5, "names_s": 0.9, "first_solve_s": 4.0, "empty_cache_s": 30.0, "from_cache_s": 0.2}
     start["peak_mb"] = 600.0
     found = {"problems": {}, "floor": {}, "posterior": posterior, "scaling": {"growth": growth, "start": start}}
-    assert [row["met"] for row in benchmark_targets.rows(found)] == [False, True, None, True, False, *4 * [True], False]
-    assert "jax is not installed" in benchmark_tables.posterior(posterior)
-    assert "600 MB" in benchmark_scaling.account(found["scaling"])
-    assert len(benchmark_figures.draw(found).axes) == 1
+    assert [row["met"] for row in targets.rows(found)] == [False, True, None, True, False, *4 * [True], False]
+    assert "jax is not installed" in tables.posterior(posterior)
+    assert "600 MB" in scaling.account(found["scaling"])
+    assert len(figures.draw(found).axes) == 1

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bayesperiodic.diagnostics.campaigns import refuse
-from studies import calibration
 from studies.__main__ import main
-from studies.calibration_cases import OVERCOUNT
+from studies.calibration import run as calibration
+from studies.calibration.cases import OVERCOUNT
 
 
 def run(folder, *arguments):

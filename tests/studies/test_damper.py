@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from studies import common, damper
+from studies import common
 from studies.__main__ import main
+from studies.damper import run as damper
 
 REAL = common.find_data(None, damper.FILE)
-real_data = pytest.mark.skipif(REAL is None, reason="the measured file is not to be had here, see studies/damper.py")
+real_data = pytest.mark.skipif(
+    REAL is None, reason="the measured file is not to be had here, see studies/damper/run.py"
+)
 
 
 def run(folder: Path, *arguments: str) -> dict:

@@ -9,20 +9,16 @@ import pandas as pd
 import pytest
 
 import bayesperiodic as bp
-from studies import (
-    common,
-    common_resumed,
-    flutter_campaigns,
-    flutter_checks,
-    flutter_data,
-    flutter_questions,
-    flutter_rig,
-)
+from studies import common, tasks
 from studies.__main__ import main
-from studies.flutter_reference import hopf
+from studies.flutter import campaigns, checks, questions, rig
+from studies.flutter import data as flutter_data
+from studies.flutter.reference import hopf
 
 REAL = common.find_data(None, flutter_data.FILE)
-real_data = pytest.mark.skipif(REAL is None, reason="the measured file is not to be had here, see flutter_data.py")
+real_data = pytest.mark.skipif(
+    REAL is None, reason="the measured file is not to be had here, see studies/flutter/data.py"
+)
 FOUR = ("stable_v15_6", "stable_v17_3", "unstable_v14_9", "unstable_v16_5")
 
 
@@ -30,14 +26,14 @@ def run(folder, *arguments):
     """Run the study in this process, synthetic rigs with four kinds of cycles, and return what it printed."""
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
         patch.setattr(common, "find_data", lambda *_: None)
-        patch.setattr(common_resumed, "workers", lambda: ThreadPoolExecutor(1))
+        patch.setattr(tasks, "workers", lambda: ThreadPoolExecutor(1))
         patch.setattr(flutter_data, "KINDS", {name: flutter_data.KINDS[name] for name in FOUR})
         assert main(["flutter", "--out", str(folder), *arguments]) == 0
     return printed.getvalue()
 
 
 def test_authors_hopf_point_is_that_of_the_eigenvalues_and_a_speed_without_a_cycle_is_told():
-    along = flutter_rig.cycles(flutter_rig.RIG | flutter_rig.AUTHORS | flutter_rig.SENSORS)
+    along = rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS)
     speed, frequency = hopf()
     assert along.hopf.value == pytest.approx(speed, abs=0.05)
     assert along.hopf.frequency == pytest.approx(frequency, abs=0.005)
@@ -48,7 +44,7 @@ def test_authors_hopf_point_is_that_of_the_eigenvalues_and_a_speed_without_a_cyc
 
 def test_half_a_range_is_that_of_the_signal_and_not_of_its_samples():
     tau = (np.arange(12) + 0.3) / 12
-    assert flutter_checks.half_range(0.2 + np.cos(2 * np.pi * tau)) == pytest.approx(1.0, rel=1e-6)
+    assert checks.half_range(0.2 + np.cos(2 * np.pi * tau)) == pytest.approx(1.0, rel=1e-6)
 
 
 @pytest.mark.slow
@@ -64,7 +60,7 @@ def test_a_quick_run_tells_what_was_asked_and_says_synthetic(tmp_path):
 
 
 def test_synthetic_records_are_called_synthetic_and_have_the_cycles_of_the_truth():
-    along = flutter_rig.cycles(flutter_rig.RIG | flutter_rig.TRUE)
+    along = rig.cycles(rig.RIG | rig.TRUE)
     records = flutter_data.generate(1)
     admitted, refused = flutter_data.usable(records)
     assert not refused and set(admitted) == set(flutter_data.KINDS)
@@ -72,17 +68,17 @@ def test_synthetic_records_are_called_synthetic_and_have_the_cycles_of_the_truth
         e, orbit = admitted[record.recording.name], along.at(record.recording.name, record.speed)
         assert e.synthetic and e.frequency_se < 0.003 * e.frequency
         assert abs(e.frequency - orbit.frequency) < 5 * e.frequency_se
-        assert flutter_questions.sizes(e.outputs) == pytest.approx(flutter_questions.sizes(orbit.outputs), rel=0.05)
+        assert questions.sizes(e.outputs) == pytest.approx(questions.sizes(orbit.outputs), rel=0.05)
 
 
 def test_campaigns_are_resumed(tmp_path, monkeypatch):
     """The second time there is none to do."""
     printed = run(tmp_path, "--replicates", "1")
     assert "0 failures" in printed and "kept apart in 1" in printed
-    monkeypatch.setattr(flutter_campaigns, "campaign", None)
+    monkeypatch.setattr(campaigns, "campaign", None)
     assert "1 campaigns, 0 failures" in run(tmp_path, "--replicates", "1")
     (line,) = json.loads((tmp_path / "campaigns" / "results.json").read_text(encoding="utf-8"))["campaigns"]
-    assert max(abs(line["pulls"][name]) for name in flutter_campaigns.STIFFNESSES) < 5.0
+    assert max(abs(line["pulls"][name]) for name in campaigns.STIFFNESSES) < 5.0
 
 
 def test_records_that_drift_or_are_too_short_are_left_out_with_the_reason():
@@ -101,15 +97,15 @@ def test_records_that_drift_or_are_too_short_are_left_out_with_the_reason():
 
 
 def test_amplitudes_of_draws_are_those_of_the_branch_continued_at_their_values():
-    along = flutter_rig.cycles(flutter_rig.RIG | flutter_rig.TRUE)
-    changed = flutter_rig.TRUE | {"k_alpha2": 650.0, "c_h": 7.5, "gain_pitch": 0.8}
-    other = flutter_rig.cycles(flutter_rig.RIG | changed)
-    draws = {n: np.array([flutter_rig.TRUE[n], changed[n], flutter_rig.TRUE[n]]) for n in flutter_rig.TRUE}
+    along = rig.cycles(rig.RIG | rig.TRUE)
+    changed = rig.TRUE | {"k_alpha2": 650.0, "c_h": 7.5, "gain_pitch": 0.8}
+    other = rig.cycles(rig.RIG | changed)
+    draws = {n: np.array([rig.TRUE[n], changed[n], rig.TRUE[n]]) for n in rig.TRUE}
     draws["k_alpha2"][2] = 250.0  # there is no cycle below the Hopf point then
     for name in ("stable", "unstable"):
         orbit = along.at(name, 16.5)
-        found = flutter_questions.drawn_sizes(orbit, flutter_rig.TRUE, draws)
-        here, there = (flutter_questions.sizes(o.outputs) for o in (orbit, other.at(name, 16.5)))
+        found = questions.drawn_sizes(orbit, rig.TRUE, draws)
+        here, there = (questions.sizes(o.outputs) for o in (orbit, other.at(name, 16.5)))
         for channel, size in found.items():
             assert size[:2] == pytest.approx([here[channel], there[channel]], rel=1e-4)
             assert np.isnan(size[2])
@@ -122,7 +118,7 @@ def test_draws_of_laplace_are_normal_in_the_logarithms_of_what_is_positive():
     scale = np.array([600.0, 0.7, 1.0])
     covariance = pd.DataFrame(spread * np.outer(scale, scale), index=names, columns=names)
     fit = SimpleNamespace(theta={"k_alpha2": 600.0, "gain_pitch": 0.7, "offset_pitch": -0.2}, covariance=covariance)
-    drawn = flutter_questions.laplace_draws(fit, 20_000)
+    drawn = questions.laplace_draws(fit, 20_000)
     rows = np.stack([np.log(drawn["k_alpha2"] / 600.0), np.log(drawn["gain_pitch"] / 0.7), drawn["offset_pitch"] + 0.2])
     sds = np.sqrt(np.diag(spread))
     assert np.all(np.abs(rows.mean(axis=1)) < 5 * sds / np.sqrt(20_000))
@@ -131,7 +127,7 @@ def test_draws_of_laplace_are_normal_in_the_logarithms_of_what_is_positive():
 
 def test_speeds_within_a_quarter_are_left_out_together():
     speeds = {"a": 14.9, "b": 16.4, "c": 16.5, "d": 17.2, "e": 17.3}
-    assert flutter_questions.groups(speeds) == [["a"], ["b", "c"], ["d", "e"]]
+    assert questions.groups(speeds) == [["a"], ["b", "c"], ["d", "e"]]
 
 
 @real_data

@@ -10,20 +10,16 @@ from matplotlib.text import Text
 from scipy import integrate, linalg, optimize, stats
 
 import bayesperiodic as bp
-from studies import (
-    common,
-    common_resumed,
-    landing_gear,
-    landing_gear_campaigns,
-    landing_gear_force,
-    landing_gear_slope,
-)
+from studies import common, tasks
 from studies.__main__ import main
-from studies.landing_gear_drop import MASS, drop
-from studies.landing_gear_identification import FORCE, fold
-from studies.landing_gear_quality import FAULTS
-from studies.landing_gear_rig import CYCLES, NOISE, RECORDED, RUNS, SPEED_LIMIT, Run, integrate_steady, measure, steady
-from studies.landing_gear_truth import GEAR, TRUTHS
+from studies.landing_gear import campaigns, force
+from studies.landing_gear import run as landing_gear
+from studies.landing_gear import slope as landing_gear_slope
+from studies.landing_gear.drop import MASS, drop
+from studies.landing_gear.identification import FORCE, fold
+from studies.landing_gear.quality import FAULTS
+from studies.landing_gear.rig import CYCLES, NOISE, RECORDED, RUNS, SPEED_LIMIT, Run, integrate_steady, measure, steady
+from studies.landing_gear.truth import GEAR, TRUTHS
 
 SMALL = next(run for run in RUNS if run.name == "6 Hz 4 mm")
 
@@ -201,7 +197,7 @@ def test_errors_with_the_force_given_have_the_covariance_of_all_noise():
     experiments = [fold(measure(run, (), seed), FORCE) for seed in range(40)]
     pooled = {c: np.mean([e.amplitude_variance[c] for e in experiments], axis=0) for c in NOISE}
     one = replace(experiments[0], amplitude_variance=pooled)
-    carried = landing_gear_force.with_noise_of_the_input(one, GEAR)
+    carried = force.with_noise_of_the_input(one, GEAR)
     errors = []
     for experiment in experiments:
         exact = bp.solve_periodic(
@@ -211,7 +207,7 @@ def test_errors_with_the_force_given_have_the_covariance_of_all_noise():
         errors.append(np.stack(error, axis=-1)[carried.mask].ravel())
     own = np.zeros_like(carried.covariance)
     for c, channel in enumerate(channels):
-        waves = landing_gear_force.amplitudes(one, channel)[carried.mask]
+        waves = force.amplitudes(one, channel)[carried.mask]
         own[c::2, c::2] = waves @ waves.T
     times, directions = linalg.eigh(carried.covariance - own, own)
     squares = (np.array(errors) @ directions) ** 2 / (1.0 + times)
@@ -291,17 +287,17 @@ def test_campaigns_are_counted_and_resumed(tmp_path, monkeypatch):
         if seed % 2:
             experiments[SMALL.name] = one | {"sign": "negative", "mcmc_covers": one["mcmc_covers"] | {"theta6": False}}
         return {
-            "truth": truth, "seed": seed, "source": landing_gear_campaigns.source(), "experiments": experiments
+            "truth": truth, "seed": seed, "source": campaigns.source(), "experiments": experiments
         }  # fmt: skip
 
-    monkeypatch.setattr(common_resumed, "workers", lambda: ThreadPoolExecutor(1))
-    monkeypatch.setattr(landing_gear_campaigns, "campaign", fake)
-    landing_gear_campaigns.campaigns(tmp_path, 2, 1)
-    lines = landing_gear_campaigns.campaigns(tmp_path, 4, 1)
+    monkeypatch.setattr(tasks, "workers", lambda: ThreadPoolExecutor(1))
+    monkeypatch.setattr(campaigns, "campaign", fake)
+    campaigns.campaigns(tmp_path, 2, 1)
+    lines = campaigns.campaigns(tmp_path, 4, 1)
     assert len(done) == len(lines) == 4
-    found = landing_gear_campaigns.account(lines)
+    found = campaigns.account(lines)
     assert found["covered"]["mcmc"] == {"theta4": 56, "theta6": 54, "theta16": 56} and found["called_negative"] == 2
     assert found["covered_by_experiment"][SMALL.name]["theta6"] == 2
     tail = 0.005 / 3
     assert found["band"] == [stats.binom.ppf(tail, 56, 0.9), stats.binom.ppf(1 - tail, 56, 0.9)]
-    assert "called negative 2 times" in landing_gear_campaigns.table(found)
+    assert "called negative 2 times" in campaigns.table(found)

@@ -5,9 +5,9 @@ import pytest
 from scipy.stats import chi2
 
 import bayesperiodic as bp
-from studies import overview
 from studies.__main__ import main
-from studies.verdicts_cases import scaling_symmetry
+from studies.overview import run as overview
+from studies.verdicts.cases import scaling_symmetry
 
 
 @pytest.fixture(scope="module")

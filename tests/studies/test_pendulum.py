@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from studies import pendulum_orbits, pendulum_recording
 from studies.__main__ import main
-from studies.pendulum_shooting import shoot
+from studies.pendulum import orbits
+from studies.pendulum import recording as pendulum_recording
+from studies.pendulum.shooting import shoot
 from tests import shooting
 
 
@@ -72,7 +73,7 @@ def test_shooting_of_the_study_is_that_of_the_tests():
         points = np.array(known.section)
         shot = shoot(pendulum_recording.TRUTH, known.omega, points + 1e-4)
         assert shot.converged and shot.winding == known.winding and shot.prime == len(points)
-        assert pendulum_orbits.distance(shot.points, points) < 1e-9
+        assert orbits.distance(shot.points, points) < 1e-9
         assert shot.multipliers == pytest.approx(np.array(known.multipliers), rel=1e-5)
 
 

@@ -1,4 +1,4 @@
-from studies.common_resumed import remembered
+from studies.tasks import remembered
 
 
 def test_a_part_is_made_once_and_again_for_another_source(tmp_path):

@@ -10,9 +10,11 @@ import xarray as xr
 from PIL import Image
 from scipy import integrate, stats
 
-from studies import sampling_cost, sampling_damper, sampling_ridge
 from studies.__main__ import main
-from studies.sampling_rows import row, table
+from studies.sampling import cost as sampling_cost
+from studies.sampling import damper as sampling_damper
+from studies.sampling import ridge as sampling_ridge
+from studies.sampling.rows import row, table
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from studies import solver
 from studies.__main__ import main
+from studies.solver import run as solver
 from tests import shooting
 
 

@@ -1,0 +1,188 @@
+"""The floor of a log-posterior of the landing gear, and how far each of its stages is from it.
+
+The floor is one compiled sweep for residual and Jacobian, and LAPACK's factorisation and solve of the same band, for
+each of the 14 experiments with its own matrix, restored between passes and not while the clock runs.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import emcee
+import numpy as np
+from scipy.linalg import lapack
+
+import bayesperiodic as bp
+from studies.benchmark.gradient import gradient_error
+from studies.benchmark.problems import SCHEMES, Setting, gear_priors
+from studies.benchmark.timing import Action, interleaved, ratio, spread
+from studies.solver.cost import lapack_band
+
+WALKERS = 64
+COPIED = 64 * 2**20
+EMCEE_STEPS = 200
+SWEEP, FACTOR, SOLVE = "sweep", "dgbtrf", "dgbtrs"
+ALL_FREE = "gradient, 15 parameters"
+STAGES = ("priors", "periodic solves, sums of squares", "likelihood", "the rest of the call")
+
+
+class Floor:
+    """The matrices of all experiments at the estimate.
+
+    Parameters
+    ----------
+    warm : Problem
+        Anchored at θ.
+    theta : array (names,)
+    """
+
+    def __init__(self, warm: bp.Problem, theta: np.ndarray):
+        self._sweeps: list[Callable[[], Any]] = []
+        self._bands: list[np.ndarray] = []
+        generator, solutions = np.random.default_rng(1), warm.solve(theta)
+        for name, equations in warm.responses.equations.items():
+            p = warm.parameters(theta[None], name)[0]
+            z = np.stack(list(solutions[name].states.values()), axis=-1)
+            columns = equations.residual_jacobian(z, p)
+            arguments = equations.states(z), equations.inputs, p, equations.grid.tau, equations.frequency, columns
+            self._sweeps.append(partial(equations.model.kernels.residual_jacobian, *arguments))
+            band, self._lower = lapack_band(equations, columns)
+            self._bands.append(band)
+        self._right = [generator.standard_normal((1, band.shape[1]))[0] for band in self._bands]
+        self._work = [np.array(band, order="F") for band in self._bands]
+        self._pivots: list[np.ndarray] = []
+
+    @property
+    def bytes(self) -> int:
+        """What a factorisation reads and writes, and a solve reads, all matrices together."""
+        return 3 * sum(band.nbytes for band in self._bands)
+
+    def sweep(self) -> None:
+        """Fill residuals and Jacobians."""
+        for one in self._sweeps:
+            one()
+
+    def factor(self) -> float:
+        """Return the seconds of the factorisations."""
+        for work, band in zip(self._work, self._bands, strict=True):
+            work[:] = band
+        before = time.perf_counter()
+        self._pivots = [lapack.dgbtrf(w, self._lower, self._lower, overwrite_ab=True)[1] for w in self._work]
+        return time.perf_counter() - before
+
+    def solve(self) -> float:
+        """Return the seconds of the solves with what was factored last."""
+        rights = [np.array(right) for right in self._right]
+        before = time.perf_counter()
+        for work, pivots, right in zip(self._work, self._pivots, rights, strict=True):
+            lapack.dgbtrs(work, self._lower, self._lower, right, pivots, overwrite_b=True)
+        return time.perf_counter() - before
+
+
+def measure(setting: Setting, repeats: int) -> dict[str, Any]:
+    """Return floor, stages and their ratios, by scheme."""
+    found = {scheme: _of_scheme(setting, scheme, repeats) for scheme in SCHEMES}
+    return {"schemes": found, "bandwidth_gb_per_s": bandwidth(repeats), "emcee_us": emcee_overhead(setting, repeats)}
+
+
+def _of_scheme(setting: Setting, scheme: str, repeats: int) -> dict[str, Any]:
+    warm, noise, theta = setting.schemed(scheme), setting.noise, setting.theta
+    floor, half = Floor(warm, setting.estimate), len(theta) // 2
+    all_free, at = with_all_free(setting, scheme)
+    many = np.resize(theta[:half], (WALKERS, theta.shape[1]))
+    stages = _stages(setting, warm, theta[:half])
+    actions = {
+        SWEEP: Action(floor.sweep), FACTOR: Action(floor.factor), SOLVE: Action(floor.solve),
+        "near": Action(partial(_walk, warm, theta[:half], noise), half),
+        "far": Action(partial(_walk, warm, theta[half:], noise), len(theta) - half),
+        "call": Action(partial(_calls, warm, theta[:half], noise), half),
+        "batched": Action(partial(warm.log_posterior, many, noise), WALKERS),
+        "gradient": Action(partial(_gradient, warm, theta[0], noise)),
+        ALL_FREE: Action(partial(_gradient, all_free, at, noise)),
+    } | {f"stage {name}": Action(run, half) for name, run in stages.items()}  # fmt: skip
+    times = interleaved(actions, repeats)
+    under = times[SWEEP] + times[FACTOR] + times[SOLVE]
+    names = ("near", "far", "call", "batched", "gradient", ALL_FREE)
+    return {
+        "floor_us": {name: spread(1e6 * times[name]) for name in (SWEEP, FACTOR, SOLVE)} | {"sum": spread(1e6 * under)},
+        "us": {name: spread(1e6 * times[name]) for name in names},
+        "ratio": {name: ratio(times[name], under) for name in names},
+        "stages_us": _differences({name: float(np.nanmedian(times[f"stage {name}"])) * 1e6 for name in stages}),
+        "bytes": floor.bytes,
+        "same_grid_error": same_grid_error(setting, warm),
+        "gradient_error": {
+            "gradient": gradient_error(warm, theta[0], noise), ALL_FREE: gradient_error(all_free, at, noise)
+        },
+    }  # fmt: skip
+
+
+def with_all_free(setting: Setting, scheme: str) -> tuple[bp.Problem, np.ndarray]:
+    """Return the problem of all 15 parameters, anchored at the estimate of the three, and these at the first draw."""
+    stated = setting.problem
+    other = bp.Problem(stated.model, stated.experiments, **gear_priors(15), scheme=scheme)
+    both = stated.parameters(np.stack([setting.estimate, setting.theta[0]]), stated.experiments[0].name)
+    estimate, at = (other.vector(dict(zip(stated.model.parameters, row, strict=True))) for row in both)
+    return other.anchored(estimate), at
+
+
+def _walk(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
+    """Compute log-posteriors one by one on one core."""
+    for one in theta:
+        warm.log_prior(one) + warm.log_likelihood(one, noise, 1)
+
+
+def _calls(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
+    for one in theta:
+        warm.log_posterior(one, noise)
+
+
+def _gradient(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
+    warm.value_and_gradient(theta, noise)
+
+
+def _stages(setting: Setting, warm: bp.Problem, theta: np.ndarray) -> dict[str, Callable[[], Any]]:
+    """Return the call's parts, each with all that comes before it but for the priors."""
+    noise, points = setting.noise, [one[None] for one in theta]
+    residuals = [warm.misfits(one, 1)[0] for one in points]
+    return {
+        "priors": lambda: [warm.log_prior(one) for one in theta],
+        "solves": lambda: [warm.misfits(one, 1) for one in points],
+        "likelihood": lambda: [warm.likelihood(one, noise[None]) for one in residuals],
+        "whole": lambda: _walk(warm, theta, noise),
+    }
+
+
+def _differences(times: dict[str, float]) -> dict[str, float]:
+    parts = [times["priors"], times["solves"], times["likelihood"]]
+    parts.append(times["whole"] - sum(parts))
+    return dict(zip(STAGES, parts, strict=True))
+
+
+def same_grid_error(setting: Setting, warm: bp.Problem) -> float:
+    """Return the largest difference at any draw from solves on the same grid that are anchored at the draw itself."""
+    converged = [warm.anchored(theta).log_posterior(theta, setting.noise) for theta in setting.theta]
+    return float(np.max(np.abs(warm.log_posterior(setting.theta, setting.noise) - np.array(converged))))
+
+
+def bandwidth(repeats: int) -> dict[str, float]:
+    """Return how fast one core reads and writes memory in a copy [GB/s]."""
+    source = np.ones(COPIED // 8)
+    target = np.empty_like(source)
+    times = interleaved({"copy": Action(lambda: np.copyto(target, source))}, repeats)["copy"]
+    return spread(2e-9 * COPIED / times)
+
+
+def emcee_overhead(setting: Setting, repeats: int) -> dict[str, float]:
+    """Return what emcee itself takes of a log-posterior [µs], with one that costs nothing."""
+    size = len(setting.problem.names)
+    start = np.random.default_rng(1).standard_normal((WALKERS, size))
+
+    def run() -> None:
+        sampler = emcee.EnsembleSampler(WALKERS, size, lambda x: np.zeros(len(x)), vectorize=True)
+        sampler.run_mcmc(start, EMCEE_STEPS)
+
+    times = interleaved({"emcee": Action(run, WALKERS * EMCEE_STEPS)}, max(3, repeats // 3))["emcee"]
+    return spread(1e6 * times)

@@ -1,0 +1,234 @@
+"""Time integration and shooting of one experiment, each with the cheapest settings that are right enough."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from studies.benchmark.problems import Case
+
+STEADY, SHOOTING = "Runge-Kutta until steady", "shooting"
+EQUILIBRIUM, ESTIMATE, PREDICTED = "from equilibrium", "from the estimate's orbit", "from the predicted orbit"
+STARTS = (EQUILIBRIUM, ESTIMATE, PREDICTED)
+STEPS = (
+    20, 25, 32, 40, 50, 64, 80, 100, 128, 160, 200, 256, 320, 400, 512, 640, 800, 1000, 1280, 1600, 2000, 2560, 3200,
+    4000, 5120, 6400, 8000, 10_240, 12_800, 16_000, 20_480, 25_600, 32_000, 40_960, 51_200,
+)  # fmt: skip
+TOLERANCES = tuple(10.0**-k for k in range(1, 13))
+REFERENCE_STEPS = 25_600, 51_200, 102_400, 204_800
+REFERENCE_TOLERANCE, REFERENCE_ERROR = 1e-10, 1e-5
+MOST = 30
+TIGHT, LOOSE = 1e-11, 1e-9
+
+
+@dataclass(frozen=True)
+class Discretised:
+    """An experiment with so many Runge-Kutta steps a period, and its orbit at the estimate.
+
+    Attributes
+    ----------
+    case : Case
+    steps : int
+    """
+
+    case: Case
+    steps: int
+
+    @cached_property
+    def _inputs(self) -> np.ndarray:
+        return self.case.table(2 * self.steps)
+
+    @cached_property
+    def _buffers(self) -> tuple[np.ndarray, ...]:
+        size, columns = self.case.start.size, self.case.start.size + len(self.case.moving)
+        rows = self.steps + 1
+        return (
+            np.empty((rows, size)), np.empty((rows, size)), np.empty((rows, size, columns)),
+            np.empty((rows, size, columns)), np.empty((self.case.experiment.samples, size)),
+            np.empty((self.case.experiment.samples, len(self.case.model.outputs))),
+            np.empty((self.case.experiment.samples, size * len(self.case.moving))),
+        )  # fmt: skip
+
+    @cached_property
+    def anchor(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """At the estimate: y(0), (I − Φ)⁻¹ and dy(0)/dp; None where shooting does not converge."""
+        if not any(self._newton(self.case.estimate, self.case.first, tolerance) for tolerance in (TIGHT, LOOSE)):
+            return None
+        last, size = self._buffers[2][-1], self.case.start.size
+        inverse = np.linalg.inv(np.eye(size) - last[:, :size])
+        return self._buffers[0][0].copy(), inverse, inverse @ last[:, size:]
+
+    def _newton(self, p: np.ndarray, start: np.ndarray, tolerance: float) -> int:
+        path, rates, wide, wide_rates = self._buffers[:4]
+        return self.case.compiled.newton(
+            p, self._inputs, self.case.period, start.copy(), self.case.scale, tolerance, MOST, path, rates, wide,
+            wide_rates,
+        )  # fmt: skip
+
+    def start(self, p: np.ndarray, kind: str) -> np.ndarray:
+        """Return y(0) to begin with."""
+        if kind == EQUILIBRIUM:
+            return self.case.start.copy()
+        assert self.anchor is not None
+        y, _, slopes = self.anchor
+        if kind == ESTIMATE:
+            return y.copy()
+        return y + slopes @ (p[self.columns] - self.case.estimate[self.columns])
+
+    @cached_property
+    def columns(self) -> list[int]:
+        """Where the moving parameters are in p."""
+        return [list(self.case.model.parameters).index(name) for name in self.case.moving]
+
+    def settle(self, p: np.ndarray, kind: str, tolerance: float) -> int:
+        """Integrate until steady; return the number of cycles, 0 for never."""
+        path, rates = self._buffers[:2]
+        return self.case.compiled.steady(
+            p, self._inputs, self.case.period, self.start(p, kind), self.case.scale, tolerance, path, rates
+        )
+
+    def shoot(self, p: np.ndarray, kind: str, tolerance: float) -> int:
+        """Shoot, with the matrix of the estimate but from equilibrium; return the number of sweeps, 0 for failure."""
+        if kind == EQUILIBRIUM:
+            return self._newton(p, self.case.start, tolerance)
+        assert self.anchor is not None
+        path, rates = self._buffers[:2]
+        return self.case.compiled.chord(
+            p, self._inputs, self.case.period, self.start(p, kind), self.anchor[1], self.case.scale, tolerance, MOST,
+            path, rates,
+        )  # fmt: skip
+
+    @property
+    def orbit(self) -> np.ndarray:
+        """The start y(0) of the cycle integrated last."""
+        return self._buffers[0][0].copy()
+
+    def states(self, times: np.ndarray) -> np.ndarray:
+        """Return the states (size, times) of the cycle integrated last, linearly between its steps."""
+        steps = np.linspace(0.0, self.case.period, self.steps + 1)
+        return np.stack([np.interp(times, steps, column) for column in self._buffers[0].T])
+
+    def log_likelihood(self, p: np.ndarray) -> float:
+        """Return the log-likelihood of the cycle integrated last."""
+        return self.case.log_likelihood(self._outputs(p))
+
+    def _outputs(self, p: np.ndarray) -> np.ndarray:
+        path, rates, _, _, states, outputs, _ = self._buffers
+        self.case.compiled.dense(path, rates, self.case.period / self.steps, states)
+        self.case.compiled.outputs(p, self.case.signals, states, outputs)
+        return outputs
+
+    def value_and_gradient(self, p: np.ndarray, tolerance: float) -> tuple[float, np.ndarray]:
+        """Return the log-likelihood and its gradient by θ: chord steps, then one sweep of the variational equations."""
+        path, rates, wide, wide_rates, states, _, changes = self._buffers
+        self.shoot(p, PREDICTED, tolerance)
+        self.case.compiled.newton(
+            p, self._inputs, self.case.period, path[0].copy(), self.case.scale, np.inf, 1, path, rates, wide, wide_rates
+        )
+        outputs, size, count = self._outputs(p), self.case.start.size, len(self.case.moving)
+        last = wide[-1]
+        slopes = np.linalg.solve(np.eye(size) - last[:, :size], last[:, size:])
+        self._changes(wide, wide_rates, slopes, changes)
+        by_p = np.empty(count)
+        weights = self.case.weighted_residuals(outputs)
+        self.case.compiled.pulled(p, self.case.signals, states, changes, weights, by_p)
+        return self.case.log_likelihood(outputs), by_p @ self.case.slopes
+
+    def _changes(self, wide: np.ndarray, wide_rates: np.ndarray, slopes: np.ndarray, out: np.ndarray) -> None:
+        """Fill the derivatives of the states by p (samples, size·moving)."""
+        size, rows = self.case.start.size, len(wide)
+        by_p, rates = (part[:, :, size:] + part[:, :, :size] @ slopes for part in (wide, wide_rates))
+        self.case.compiled.dense(
+            by_p.reshape(rows, -1), rates.reshape(rows, -1), self.case.period / self.steps, out
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to the log-likelihood of one experiment.
+
+    Attributes
+    ----------
+    discretised : Discretised
+    kind : str
+        `STEADY` or `SHOOTING`.
+    start : str
+        One of `STARTS`.
+    tolerance : float
+        Of the last change of y(0), of its scale.
+    error : float
+        The largest at any draw.
+    sweeps : float
+        Cycles integrated, in the mean.
+    """
+
+    discretised: Discretised
+    kind: str
+    start: str
+    tolerance: float
+    error: float = np.inf
+    sweeps: float = 0.0
+
+    def __call__(self, p: np.ndarray) -> float:
+        """Return the log-likelihood; NaN where no orbit is found."""
+        return self.discretised.log_likelihood(p) if self.run(p) else np.nan
+
+    def run(self, p: np.ndarray) -> int:
+        """Return the number of cycles integrated."""
+        settle = self.discretised.settle if self.kind == STEADY else self.discretised.shoot
+        return settle(p, self.start, self.tolerance)
+
+    def judged(self, parameters: np.ndarray, exact: np.ndarray) -> Method:
+        """Return the same with its error and its sweeps at the draws; the error is infinite where it fails."""
+        values, sweeps = [], []
+        for p in parameters:
+            sweeps.append(self.run(p))
+            if not sweeps[-1]:
+                return self
+            values.append(self.discretised.log_likelihood(p))
+        error = float(np.max(np.abs(np.array(values) - exact)))
+        error = error if np.isfinite(error) else np.inf
+        return Method(self.discretised, self.kind, self.start, self.tolerance, error, float(np.mean(sweeps)))
+
+
+def exact(case: Case, parameters: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the log-likelihood at draws by fine shooting, and by how much twice as long steps change it."""
+    coarse = np.full(len(parameters), np.nan)
+    for steps in (REFERENCE_STEPS[0] // 2, *REFERENCE_STEPS):
+        one = Discretised(case, steps)
+        fine = np.array([Method(one, SHOOTING, PREDICTED, REFERENCE_TOLERANCE)(p) for p in parameters])
+        off = float(np.max(np.abs(fine - coarse)))
+        if off < REFERENCE_ERROR:
+            break
+        coarse = fine
+    return fine, off
+
+
+def discretise(case: Case, parameters: np.ndarray, exact: np.ndarray, allowed: float) -> Discretised:
+    """Return the experiment with the fewest steps whose orbits are no further off than allowed at any draw."""
+    for steps in STEPS:
+        one = Discretised(case, steps)
+        if one.anchor is not None and _off(one, parameters, exact) <= allowed:
+            return one
+    raise RuntimeError(f"{case.experiment.name}: {STEPS[-1]} steps are not as accurate as {allowed:.1e}.")
+
+
+def _off(one: Discretised, parameters: np.ndarray, exact: np.ndarray) -> float:
+    for tolerance in (TIGHT, LOOSE):
+        error = Method(one, SHOOTING, PREDICTED, tolerance).judged(parameters, exact).error
+        if np.isfinite(error):
+            return error
+    return np.inf
+
+
+def tune(
+    one: Discretised, kind: str, start: str, parameters: np.ndarray, exact: np.ndarray, allowed: float
+) -> Method | None:
+    """Return the method with the loosest tolerance that is right enough at every draw; None if there is none."""
+    for tolerance in TOLERANCES:
+        found = Method(one, kind, start, tolerance).judged(parameters, exact)
+        if found.error <= allowed:
+            return found
+    return None

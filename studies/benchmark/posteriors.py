@@ -1,0 +1,226 @@
+"""Effective samples a second from the posterior of the Duffing oscillator: this package, and what a user would write.
+
+The unknown variance is integrated out (Jeffreys' prior), or sampled with the rest; the posterior of the parameters is
+the same. emcee in natural coordinates walks around the fastest contender once. Around the others it would make the same
+chain, because their densities agree, so that its effective samples a log-posterior are divided by the time of theirs.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import emcee
+import numpy as np
+
+import bayesperiodic as bp
+from studies.benchmark import diffrax
+from studies.benchmark.integration import LOOSE, Method
+from studies.benchmark.problems import Setting
+
+WALKERS, STEPS = 16, 1500
+PINTS_SAMPLERS = ("HaarioBardenetACMC", "DreamMCMC")
+PINTS_CHAINS, PINTS_STEPS = 4, 4000
+WARMUP, DRAWS = 30, 60
+OWN: dict[str, dict[str, Any]] = {
+    "sample, default": {"max_steps": 750},
+    "sample, variances integrated out": {"variances": "collapsed", "max_steps": 750},
+    "sample, variances integrated out, 2 × 64 walkers": {
+        "variances": "collapsed",
+        "max_steps": 750,
+        "ensembles": 2,
+        "walkers": 64,
+    },  # fmt: skip
+    "sample, NUTS": {"sampler": "nuts", "ensembles": 2, "max_steps": 250},
+}
+EMCEE, NUMPYRO = "emcee", "numpyro NUTS around diffrax"
+MISSING = 'not installed (pip install "bayesperiodic[benchmark]")'
+
+Density = Callable[[np.ndarray], float]
+
+
+def measure(setting: Setting, contest: Mapping[str, Any], methods: Sequence[Method], seed: int) -> dict[str, Any]:
+    """Return samplers, and emcee around every contender that was timed.
+
+    Parameters
+    ----------
+    setting : Setting
+        With one channel, all harmonics, and positive parameters that are the model's own.
+    contest : dict
+        What `benchmark_contenders.measured` returned.
+    methods : sequence of Method
+        The fastest contender's, one an experiment.
+    seed : int
+    """
+    walked = _emcee(setting, methods, seed)
+    found = {name: _own(setting, seed, options) for name, options in OWN.items()}
+    found |= {f"PINTS {name}, this package's density": _pints(setting, name, seed) for name in PINTS_SAMPLERS}
+    found[NUMPYRO] = _numpyro(setting, methods, seed)
+    around = {
+        row["name"]: {
+            "ess_per_second": 1e3 * walked["ess_per_log_posterior"] / row["milliseconds"]["median"],
+            "milliseconds": row["milliseconds"]["median"],
+        }
+        for row in contest["rows"]
+        if row["milliseconds"] and "gradient" not in row["name"] and "batched" not in row["name"]
+    }
+    return {"samplers": found, "emcee": walked, "emcee_around": around, "split": _split(found, walked, around)}
+
+
+def _split(found: Mapping[str, Any], walked: Mapping[str, Any], around: Mapping[str, Any]) -> dict[str, Any]:
+    """Return by how much the best of this package's samplers is ahead of emcee around each contender, and why."""
+    best = max(
+        (name for name in OWN if "ess_per_second" in found.get(name, {})), key=lambda n: found[n]["ess_per_second"]
+    )
+    own = found[best]
+    return {
+        "best": best,
+        "against": {
+            name: {
+                "ratio": own["ess_per_second"] / entry["ess_per_second"],
+                "sampler": own["ess_per_log_posterior"] / walked["ess_per_log_posterior"],
+                "solver": 1e-3 * entry["milliseconds"] / (own["seconds"] / own["log_posteriors"]),
+            }
+            for name, entry in around.items()
+        },
+    }
+
+
+def effective(chains: np.ndarray) -> float:
+    """Return the smallest effective sample size of chains (steps, chains, coordinates), by emcee's autocorrelation."""
+    tau = emcee.autocorr.integrated_time(chains, quiet=True)
+    return float(chains.shape[0] * chains.shape[1] / np.max(tau))
+
+
+def _account(ess: float, seconds: float, calls: int) -> dict[str, float]:
+    return {
+        "ess": ess, "seconds": seconds, "log_posteriors": calls, "ess_per_second": ess / seconds,
+        "ess_per_log_posterior": ess / calls,
+    }  # fmt: skip
+
+
+def collapsed(setting: Setting, ways: Sequence[Density]) -> Density:
+    """Return ln p(θ) − n/2 ln M(θ), M the sum of squared residuals, from log-likelihoods at known variances."""
+    count = sum(case.experiment.samples for case in setting.cases)
+
+    def density(theta: np.ndarray) -> float:
+        prior = setting.log_prior(theta)
+        if not np.isfinite(prior):
+            return -np.inf
+        squares = 0.0
+        for case, way in zip(setting.cases, ways, strict=True):
+            squares += (case.constant - way(setting.parameters(theta, case)[0])) / case.weights[0]
+        return prior - 0.5 * count * np.log(squares) if np.isfinite(squares) else -np.inf
+
+    return density
+
+
+def _emcee(setting: Setting, methods: Sequence[Method], seed: int) -> dict[str, float]:
+    """Walk in natural coordinates, as the manual of emcee begins; a quarter of the steps is burn-in."""
+    exact = [replace(method, tolerance=LOOSE) for method in methods]  # Walkers stray further than the draws.
+    density, generator = collapsed(setting, exact), np.random.default_rng(seed)
+    sd = np.array(list(setting.fit.sd.values()))
+    start = setting.estimate + 0.1 * sd * generator.standard_normal((WALKERS, sd.size))
+    sampler = emcee.EnsembleSampler(WALKERS, sd.size, density)
+    sampler.random_state = np.random.RandomState(seed).get_state()
+    before = time.perf_counter()
+    sampler.run_mcmc(start, STEPS)
+    seconds = time.perf_counter() - before
+    return _account(effective(sampler.get_chain(discard=STEPS // 4)), seconds, WALKERS * STEPS)
+
+
+def _own(setting: Setting, seed: int, options: Mapping[str, Any]) -> dict[str, Any]:
+    if options.get("sampler") == "nuts" and importlib.util.find_spec("nutpie") is None:
+        return {"note": f"nutpie is {MISSING}"}
+    before = time.perf_counter()
+    posterior = bp.sample(setting.problem, setting.fit, seed=seed, progress=False, **options)
+    seconds = time.perf_counter() - before
+    ess = min(posterior.ess[name] for name in setting.problem.names)
+    return _account(ess, seconds, posterior.log_posterior_calls) | {"note": posterior.reason}
+
+
+def _pints(setting: Setting, name: str, seed: int) -> dict[str, Any]:
+    """Run a sampler of PINTS on this package's density over θ and the logarithm of the variance."""
+    if importlib.util.find_spec("pints") is None:
+        return {"note": f"pints is {MISSING}"}
+    import pints
+
+    warm, size = setting.problem.anchored(setting.fit.theta), len(setting.problem.names)
+    calls = 0
+
+    class Posterior(pints.LogPDF):
+        def n_parameters(self) -> int:
+            return size + 1
+
+        def __call__(self, x: Any) -> float:
+            nonlocal calls
+            calls += 1
+            return float(warm.log_posterior(np.array(x[:size]), np.exp(np.array(x[size:]))))
+
+    generator = np.random.default_rng(seed)
+    sd = np.append(list(setting.fit.sd.values()), 0.05)
+    centre = np.append(setting.estimate, np.log(setting.noise))
+    starts = centre + 0.1 * sd * generator.standard_normal((PINTS_CHAINS, size + 1))
+    np.random.seed(seed)  # noqa: NPY002 (PINTS draws from the global generator)
+    controller = pints.MCMCController(Posterior(), PINTS_CHAINS, list(starts), sd, method=getattr(pints, name))
+    controller.set_max_iterations(PINTS_STEPS)
+    controller.set_log_to_screen(False)
+    before = time.perf_counter()
+    chains = controller.run()
+    seconds = time.perf_counter() - before
+    kept = np.moveaxis(np.asarray(chains)[:, PINTS_STEPS // 4 :, :size], 0, 1)
+    return _account(effective(kept), seconds, calls)
+
+
+def _numpyro(setting: Setting, methods: Sequence[Method], seed: int) -> dict[str, Any]:
+    """Run numpyro's NUTS along the axes of the Laplace approximation; neither compilation nor tuning is timed."""
+    lacking = [name for name in (*diffrax.NEEDED, "numpyro") if importlib.util.find_spec(name) is None]
+    if lacking:
+        return {"note": f"{lacking[0]} is {MISSING}"}
+    import jax
+    from numpyro.infer import MCMC, NUTS
+
+    tuned = [diffrax.Integrated(method.discretised, 1e-6) for method in methods]
+    centre, factor = np.log(setting.estimate), _axes(setting)
+    kernel = NUTS(potential_fn=_potential(setting, tuned, centre, factor), adapt_mass_matrix=False)
+    run = MCMC(kernel, num_warmup=WARMUP, num_samples=DRAWS, progress_bar=False)
+    start = np.zeros(centre.size)
+    run.warmup(jax.random.PRNGKey(seed), init_params=start, extra_fields=("num_steps",), collect_warmup=False)
+    before = time.perf_counter()
+    run.run(run.post_warmup_state.rng_key, init_params=start, extra_fields=("num_steps",))
+    draws = np.exp(centre + np.asarray(run.get_samples()) @ factor.T)
+    seconds = time.perf_counter() - before
+    calls = int(np.sum(run.get_extra_fields()["num_steps"]))
+    return _account(effective(draws[:, None, :]), seconds, calls) | {"note": "without compilation and tuning"}
+
+
+def _axes(setting: Setting) -> np.ndarray:
+    """Return a square root of the Laplace approximation's covariance of ln θ."""
+    names = list(setting.problem.names)
+    covariance = np.asarray(setting.fit.covariance.loc[names, names], dtype=float)
+    return np.linalg.cholesky(covariance / np.outer(setting.estimate, setting.estimate))
+
+
+def _potential(
+    setting: Setting, tuned: Sequence[diffrax.Integrated], middle: np.ndarray, factor: np.ndarray
+) -> Callable[[Any], Any]:
+    """Return minus the log-density over z, as JAX traces it, ln θ = middle + factor · z; priors are log-normal."""
+    import jax.numpy as jnp
+
+    priors = [setting.problem.priors[name] for name in setting.problem.names]
+    centre = np.log([prior.median for prior in priors])
+    spread = np.array([prior.spread for prior in priors])
+    value = diffrax.log_likelihood(setting.problem.model)
+    count = sum(case.experiment.samples for case in setting.cases)
+
+    def potential(z: Any) -> Any:
+        x, squares = middle + factor @ z, 0.0
+        for case, one in zip(setting.cases, tuned, strict=True):
+            p = jnp.asarray(case.estimate).at[jnp.asarray(one.discretised.columns)].set(jnp.exp(x))
+            squares = squares - value(p, *one.parts) / case.weights[0]
+        return 0.5 * count * jnp.log(squares) + 0.5 * jnp.sum(((x - centre) / spread) ** 2)
+
+    return potential

@@ -1,0 +1,339 @@
+"""The problems of the benchmark: posterior densities, and the draws at which every contender has to be right.
+
+The draws are those of the Laplace approximation at the MAP estimate, and as many at three times its standard
+deviations. Variances stay at their estimates, so that log-posteriors differ by the periodic states alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import bayesperiodic as bp
+from studies.benchmark.equations import table
+from studies.benchmark.kernels import Integrators, integrators, misfit
+from studies.damper import run as damper
+from studies.silverbox import data as silverbox_data
+from studies.silverbox import problem as silverbox_problem
+from studies.solver.cost import GEAR, RIG
+
+FORCE, DISPLACEMENT, DUFFING, DAMPER, SILVERBOX = (
+    "landing gear, force given", "landing gear, displacement given", "Duffing, damping ratio 0.5 %", "damper",
+    "Silverbox",
+)  # fmt: skip
+SCHEMES = ("central2", "central4")
+FINE = "central4"
+SAMPLES, NOISE = 800, 3e-3
+WIDE = 3.0
+DUFFING_TRUTH = {"m": 1.0, "c": 0.01, "k": 1.0, "k3": 0.5}
+# [Hz] and [N]: below the resonance, where only one motion is stable.
+DUFFING_RUNS = ((0.075, 0.2), (0.1, 0.15), (0.125, 0.1))
+DUFFING_SAMPLES = 160
+SILVERBOX_SAMPLES = 20_480
+# At 800 points, and at 8192 of the Silverbox, the scheme is too coarse for the accuracy asked for.
+DAMPER_SAMPLES = 1600
+
+
+@dataclass(frozen=True)
+class Case:
+    """One experiment of a problem as an integrator sees it.
+
+    Attributes
+    ----------
+    experiment : Experiment
+    model : Model
+    moving : tuple of str
+        The model's parameters that move with θ.
+    slopes : array (moving, names)
+        Their derivatives by θ at the estimate.
+    estimate : array (parameters + 1,)
+        At the MAP estimate, the frequency last.
+    variances : array (channels,)
+    start : array (size,)
+        Static equilibrium.
+    first : array (size,)
+        About y(0) at the estimate.
+    scale : array (size,)
+        Of the states.
+    """
+
+    experiment: bp.Experiment
+    model: Any
+    moving: tuple[str, ...]
+    slopes: np.ndarray
+    estimate: np.ndarray
+    variances: np.ndarray
+    start: np.ndarray
+    first: np.ndarray
+    scale: np.ndarray
+
+    @property
+    def period(self) -> float:
+        """Of the orbit [s]."""
+        return self.experiment.periods / self.experiment.frequency
+
+    @property
+    def compiled(self) -> Integrators:
+        """The compiled integrators of the model."""
+        return integrators(self.model, self.moving)
+
+    def table(self, points: int) -> np.ndarray:
+        """Return the inputs at so many points of a period."""
+        return table(self.experiment, self.model.inputs, points)
+
+    @cached_property
+    def signals(self) -> np.ndarray:
+        """The inputs at the samples."""
+        return self.table(self.experiment.samples)
+
+    @cached_property
+    def _data(self) -> np.ndarray:
+        return np.ascontiguousarray(np.stack([self.experiment.outputs[c] for c in self.model.outputs], axis=-1))
+
+    @cached_property
+    def _kept(self) -> list[int | None]:
+        """The harmonics of each channel that are compared, None for all."""
+        harmonics = self.experiment.harmonics or {}
+        whole = self.experiment.samples // 2
+        kept = [harmonics.get(channel) for channel in self.model.outputs]
+        return [None if count is None or count >= whole else count for count in kept]
+
+    @cached_property
+    def _counts(self) -> np.ndarray:
+        return np.array([float(self.experiment.independent[c]) for c in self.model.outputs])
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """Of the squared residuals: independent values per sample, over the variance, halved."""
+        return 0.5 * self._counts / (self.experiment.samples * self.variances)
+
+    def log_likelihood(self, outputs: np.ndarray) -> float:
+        """Return eq. (6)'s part of this experiment, from outputs (samples, channels)."""
+        if self.whole:
+            return self.constant - misfit(self._data, outputs, self.weights)
+        return self.constant - float(self.weights @ (self._residuals(outputs) ** 2).sum(axis=0))
+
+    @cached_property
+    def spectral_weights(self) -> np.ndarray:
+        """Of the squared Fourier sums of the residuals (samples // 2 + 1, channels), zero beyond the harmonics kept."""
+        samples = self.experiment.samples
+        twice = np.full((samples // 2 + 1, len(self._kept)), 2.0)
+        twice[[0, -1] if samples % 2 == 0 else [0]] = 1.0
+        for i, kept in enumerate(self._kept):
+            twice[samples if kept is None else kept + 1 :, i] = 0.0
+        return twice * self.weights / samples
+
+    @cached_property
+    def constant(self) -> float:
+        """What does not depend on the outputs."""
+        return -0.5 * float(self._counts @ np.log(self.variances))
+
+    @cached_property
+    def whole(self) -> bool:
+        """Whether all harmonics are compared."""
+        return all(kept is None for kept in self._kept)
+
+    def _residuals(self, outputs: np.ndarray) -> np.ndarray:
+        """Return data minus outputs within the harmonics kept."""
+        amplitudes = np.fft.rfft(self._data - outputs, axis=0)
+        for i, kept in enumerate(self._kept):
+            if kept is not None:
+                amplitudes[kept + 1 :, i] = 0.0
+        return np.fft.irfft(amplitudes, len(outputs), axis=0)
+
+    def weighted_residuals(self, outputs: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the log-likelihood by the outputs (samples, channels)."""
+        residuals = self._data - outputs if self.whole else self._residuals(outputs)
+        return 2.0 * residuals * self.weights
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A posterior density and the points at which contenders have to be right.
+
+    Attributes
+    ----------
+    name : str
+    problem : Problem
+        With the scheme `FINE`.
+    fit : MapEstimate
+    theta : array (draws, names)
+        The first half at the posterior's standard deviations, the second at three times these.
+    synthetic : bool
+    start : callable
+        Static equilibrium of an experiment: from it and its parameters to y.
+    """
+
+    name: str
+    problem: bp.Problem
+    fit: bp.MapEstimate
+    theta: np.ndarray
+    synthetic: bool
+    start: Callable[[bp.Experiment, Mapping[str, float]], np.ndarray]
+    cases: tuple[Case, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cases", tuple(self._case(e) for e in self.problem.experiments))
+
+    @property
+    def noise(self) -> np.ndarray:
+        """The estimates of the noise parameters."""
+        return np.array(list(self.fit.noise.values()))
+
+    @property
+    def estimate(self) -> np.ndarray:
+        """The MAP estimate, (names,)."""
+        return self.problem.vector(self.fit.theta)
+
+    def schemed(self, scheme: str) -> bp.Problem:
+        """Return the problem with another scheme, anchored at the estimate."""
+        stated = self.problem
+        other = bp.Problem(
+            stated.model, stated.experiments, priors=stated.priors, fixed=stated.fixed, tied=stated.tied,
+            noise=stated.noise, scheme=scheme,
+        )  # fmt: skip
+        guesses = {name: solution.states for name, solution in self.fit.solutions.items()}
+        return other.anchored(self.fit.theta, guesses)
+
+    def parameters(self, theta: np.ndarray, case: Case) -> np.ndarray:
+        """Return p (draws, parameters + 1) of an experiment from θ (draws, names)."""
+        values = self.problem.parameters(np.atleast_2d(theta), case.experiment.name)
+        return np.column_stack([values, np.full(len(values), case.experiment.frequency)])
+
+    def log_prior(self, theta: np.ndarray) -> float:
+        """Return the log-prior at one θ."""
+        return float(self.problem.log_prior(theta))
+
+    def _case(self, experiment: bp.Experiment) -> Case:
+        stated, names = self.problem, tuple(self.problem.model.parameters)
+        slopes = stated.parameter_maps[experiment.name].slopes(self.estimate)[: len(names)]
+        at = np.flatnonzero(slopes.any(axis=1))
+        values = stated.parameters(self.estimate[None], experiment.name)[0]
+        by_name = dict(zip(names, map(float, values), strict=True))
+        given = dict(zip(stated.noise_names, self.noise, strict=True))
+        states = self.fit.solutions[experiment.name].states
+        scale, first = [], []
+        for name, order in stated.model.orders.items():
+            x, turning = states[name], 2 * np.pi * experiment.frequency
+            scale += [float(np.abs(x).max()), turning * float(np.ptp(x))][:order]
+            first += [x[0], (x[1] - x[-1]) * experiment.frequency * experiment.samples / 2][:order]
+        return Case(
+            experiment, stated.model, tuple(names[i] for i in at), slopes[at], np.append(values, experiment.frequency),
+            np.array([given[f"variance[{channel}]"] for channel in stated.model.outputs]),
+            self.start(experiment, by_name), np.array(first), np.array(scale),
+        )  # fmt: skip
+
+
+def draws(problem: bp.Problem, fit: bp.MapEstimate, count: int, seed: int) -> np.ndarray:
+    """Return draws of the Laplace approximation, and as many at three times its standard deviations."""
+    names = list(problem.names)
+    factor = np.linalg.cholesky(np.asarray(fit.covariance.loc[names, names], dtype=float))
+    white = np.random.default_rng(seed).standard_normal((2 * count, len(names)))
+    white[count:] *= WIDE
+    return problem.vector(fit.theta) + white @ factor.T
+
+
+def _setting(
+    name: str, problem: bp.Problem, count: int, seed: int, start: Any, guess: Any = None, synthetic: bool = True
+) -> Setting:
+    fit = bp.map_estimate(problem, start=guess, progress=False)
+    if fit.status != "converged":
+        raise RuntimeError(f"{name}: the MAP estimate ended {fit.status!r}.")
+    return Setting(name, problem, fit, draws(problem, fit, count, seed), synthetic, start)
+
+
+def measured(
+    model: Any, truth: Mapping[str, float], runs: Any, samples: int, seed: int, scheme: str = FINE
+) -> list[bp.Experiment]:
+    """Return synthetic experiments with independent noise of 0.3 % of the range, a run being (frequency, inputs)."""
+    generator, found = np.random.default_rng(seed), []
+    for frequency, inputs in runs:
+        solved = bp.solve_periodic(model, truth, inputs, frequency=frequency, samples=samples, scheme=scheme)
+        noisy = {c: y + NOISE * np.ptp(y) * generator.standard_normal(samples) for c, y in solved.outputs.items()}
+        found.append(
+            bp.Experiment(f"{frequency} Hz", frequency, noisy, inputs, samples=samples, synthetic=True)
+        )  # fmt: skip
+    return found
+
+
+def gear_runs(drive: str, samples: int = SAMPLES) -> list[tuple[float, dict[str, np.ndarray]]]:
+    """Return frequencies and inputs of the 14 experiments."""
+    wave = np.cos(2 * np.pi * np.arange(samples) / samples)
+    return [
+        (frequency, {drive: 4500.0 + force * wave if drive == "force" else 0.12 + stroke * wave})
+        for frequency, force, stroke in RIG
+    ]
+
+
+def gear_priors(free: int) -> dict[str, Any]:
+    """Return priors, ties and fixed values of theta4, theta6 and theta16, or of all 15 parameters."""
+    if free == 15:
+        scale = GEAR | {"theta2": 9.81, "theta7": 1 / 293, "theta12": 0.1}
+        return {"priors": {name: bp.Normal(value, 0.01 * abs(scale[name])) for name, value in GEAR.items()}}
+    priors = {
+        "theta4": bp.LogNormal(GEAR["theta4"], 1.0),
+        "theta6": bp.Normal(GEAR["theta6"], 2.5),
+        "theta16": bp.Normal(GEAR["theta16"], 4.0),
+    }
+    tied = {"theta11": "-1e5*theta4"}
+    fixed = {name: value for name, value in GEAR.items() if name not in (*priors, *tied)}
+    return {"priors": priors, "tied": tied, "fixed": fixed}
+
+
+def gear_problem(drive: str, seed: int, *, free: int = 3, samples: int = SAMPLES, runs: int = 14) -> bp.Problem:
+    """Return the problem of theta4, theta6 and theta16, or of all 15 parameters under priors."""
+    model = bp.models.landing_gear(drive)
+    experiments = measured(model, GEAR, gear_runs(drive, samples)[:runs], samples, seed)
+    return bp.Problem(model, experiments, **gear_priors(free), scheme=FINE)
+
+
+def gear(drive: str, count: int, seed: int, **other: Any) -> Setting:
+    """Return the landing gear with one direction given."""
+    problem = gear_problem(drive, seed, **other)
+    start = {name: GEAR[name] for name in problem.names}
+    return _setting(FORCE if drive == "force" else DISPLACEMENT, problem, count, seed, _gear_at_rest, start)
+
+
+def _gear_at_rest(experiment: bp.Experiment, p: Mapping[str, float]) -> np.ndarray:
+    """Return static equilibrium under the mean input, the gas as warm as the wall."""
+    from scipy.optimize import brentq
+
+    wall = -p["theta17"]
+    if "displacement" in experiment.inputs:
+        return np.array([wall])
+    mean = float(experiment.inputs["force"].mean())
+
+    def balance(q: float) -> float:
+        pressure = p["theta5"] * wall / (1.0 + p["theta6"] * q + p["theta7"] * wall)
+        return p["theta4"] * pressure + p["theta11"] + p["theta1"] * p["theta2"] - mean
+
+    return np.array([brentq(balance, -0.1, -0.99 / p["theta6"]), 0.0, wall])
+
+
+def duffing(count: int, seed: int) -> Setting:
+    """Return the Duffing oscillator whose motion takes hundreds of cycles to become steady."""
+    wave = np.cos(2 * np.pi * np.arange(DUFFING_SAMPLES) / DUFFING_SAMPLES)
+    runs = [(frequency, {"force": amplitude * wave}) for frequency, amplitude in DUFFING_RUNS]
+    experiments = measured(bp.models.duffing, DUFFING_TRUTH, runs, DUFFING_SAMPLES, seed)
+    priors = {name: bp.LogNormal(DUFFING_TRUTH[name], 0.5) for name in ("c", "k", "k3")}
+    problem = bp.Problem(bp.models.duffing, experiments, priors=priors, fixed={"m": 1.0}, scheme=FINE)
+    return _setting(DUFFING, problem, count, seed, lambda *_: np.zeros(2), {n: DUFFING_TRUTH[n] for n in priors})
+
+
+def damped(data: Path | None, count: int, seed: int) -> Setting:
+    """Return the measured damper, or a synthetic one."""
+    recording, about = damper.read_recording(data, seed)
+    problem = bp.Problem(bp.models.dahl, [recording.fold(DAMPER_SAMPLES)], priors=damper.PRIORS, scheme=FINE)
+    return _setting(DAMPER, problem, count, seed, lambda *_: np.zeros(1), synthetic=about["synthetic"])
+
+
+def silverbox(data: Path | None, count: int, seed: int) -> Setting:
+    """Return the measured Silverbox, or a synthetic one."""
+    (recording, _), about = silverbox_data.read_steady_parts(data, seed)
+    problem = silverbox_problem.problem(silverbox_problem.fold(recording, SILVERBOX_SAMPLES))
+    return _setting(SILVERBOX, problem, count, seed, lambda *_: np.zeros(2), synthetic=about["synthetic"])

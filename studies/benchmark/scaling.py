@@ -1,0 +1,151 @@
+"""How time and memory grow with samples, experiments, walkers and parameters; what starting takes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import tracemalloc
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import bayesperiodic as bp
+from studies.benchmark.problems import NOISE, gear_problem
+from studies.benchmark.timing import Action, interleaved, slope
+from studies.solver.cost import GEAR
+
+SIZES = {"samples": (800, 1600, 3200), "experiments": (2, 4, 7, 14), "walkers": (16, 32, 64, 128)}
+FREE = (1, 3, 7, 15)
+WALKERS = 64
+REPEATS = 15
+
+IMPORT = "import time; t = time.perf_counter(); import bayesperiodic; print(time.perf_counter() - t)"
+# Names are loaded where they are first used.
+NAMES = IMPORT.replace("bayesperiodic;", "bayesperiodic as bp; bp.Model, bp.Problem, bp.map_estimate, bp.sample;")
+FIRST = """
+import time, numpy as np, bayesperiodic as bp
+model = bp.Model("first", states=["x"], inputs=["force"], parameters={"c": "N s/m", "k3": "N/m^3"},
+    equations=lambda s, p, u: [s.ddx + p.c * s.dx + s.x + p.k3 * s.x**POWER - u.force],
+    outputs=lambda s, p, u: {"displacement": s.x})
+force = {"force": 0.1 * np.cos(2 * np.pi * np.arange(100) / 100)}
+t = time.perf_counter()
+bp.solve_periodic(model, {"c": 0.1, "k3": 0.5}, force, frequency=0.1, samples=100)
+print(time.perf_counter() - t)
+"""
+MEMORY = """
+from studies.benchmark.scaling import at_truth
+problem, theta, noise = at_truth("force", 800, 14)
+import numpy as np
+assert np.isfinite(problem.log_posterior(np.tile(theta, (64, 1)), noise)).all()
+from studies.benchmark.scaling import peak
+print(peak())
+"""
+
+
+def measure(seed: int) -> dict[str, Any]:
+    """Return times and peaks of the batched call of the force-driven landing gear, with their exponents."""
+    found = {}
+    for axis, sizes in SIZES.items():
+        calls = [_batched(**{axis: size}, seed=seed) for size in sizes]
+        found[axis] = _fitted(sizes, calls, REPEATS)
+    found["parameters"] = _fitted(FREE, [_gradient(free, seed) for free in FREE], REPEATS)
+    return {"growth": found, "start": start()}
+
+
+def _fitted(sizes: tuple[int, ...], calls: list[Callable[[], Any]], repeats: int) -> dict[str, Any]:
+    times = interleaved({str(size): Action(call) for size, call in zip(sizes, calls, strict=True)}, repeats)
+    exponents = [slope(sizes, repeat) for repeat in zip(*times.values(), strict=True)]  # as a machine's speed drifts
+    peaks = [_peak(call) for call in calls]
+    return {
+        "sizes": list(sizes), "seconds": [float(np.median(values)) for values in times.values()], "bytes": peaks,
+        "time_exponent": float(np.median(exponents)), "memory_exponent": slope(sizes, peaks),
+    }  # fmt: skip
+
+
+def _peak(call: Callable[[], Any]) -> int:
+    """Return the largest memory that NumPy's arrays take within a call that is not the first [bytes]."""
+    call()
+    tracemalloc.start()
+    call()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak
+
+
+@cache
+def at_truth(drive: str, samples: int, experiments: int, *, free: int = 3, seed: int = 1) -> Any:
+    """Return the landing gear anchored at its true parameters, these, and variances of the noise's size."""
+    problem = gear_problem(drive, seed, free=free, samples=samples, runs=experiments)
+    theta = np.array([GEAR[name] for name in problem.names])
+    spans = {c: np.mean([np.ptp(e.outputs[c]) for e in problem.experiments]) for c in problem.channels}
+    noise = np.array([(NOISE * spans[channel]) ** 2 for channel in problem.channels])
+    return problem.anchored(theta), theta, noise
+
+
+def _batched(samples: int = 800, experiments: int = 14, walkers: int = WALKERS, seed: int = 1) -> Callable[[], Any]:
+    problem, theta, noise = at_truth("force", samples, experiments, seed=seed)
+    many = np.tile(theta, (walkers, 1)) * (1.0 + 1e-6 * np.random.default_rng(seed).standard_normal((walkers, 1)))
+    return partial(problem.log_posterior, many, noise)
+
+
+def _gradient(free: int, seed: int) -> Callable[[], Any]:
+    """Return a gradient by so many parameters."""
+    problem, _, noise = at_truth("force", 800, 14, free=15, seed=seed)
+    kept = dict(list(problem.priors.items())[:free])
+    fixed = {name: GEAR[name] for name in problem.names if name not in kept}
+    fewer = bp.Problem(problem.model, problem.experiments, priors=kept, fixed=fixed, scheme=problem.scheme)
+    theta = np.array([GEAR[name] for name in fewer.names])
+    return partial(fewer.anchored(theta).gradient, theta, noise)
+
+
+def start() -> dict[str, float]:
+    """Return what starting takes [s], and the peak of a process [MB].
+
+    A first solve with nothing in the cache, one of a new model when the package's own kernels are there, and the same
+    from the cache.
+    """
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"BAYESPERIODIC_CACHE": cache}
+        found = {"import_s": min(_run(IMPORT, environment) for _ in range(3))}
+        found["names_s"] = min(_run(NAMES, environment) for _ in range(3))
+        found["empty_cache_s"] = _run(FIRST.replace("POWER", "5"), environment)
+        found["first_solve_s"] = _run(FIRST.replace("POWER", "3"), environment)
+        found["from_cache_s"] = min(_run(FIRST.replace("POWER", "3"), environment) for _ in range(3))
+    return found | {"peak_mb": _run(MEMORY, dict(os.environ))}
+
+
+def peak() -> float:
+    """Return the most memory that this process has had [MB], NaN where the system does not tell.
+
+    A process started from a large one inherits its ``ru_maxrss``.
+    """
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.is_file() else []
+    return next((float(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM")), float("nan"))
+
+
+def _run(text: str, environment: dict[str, str]) -> float:
+    """Return the number that a fresh process prints last."""
+    done = subprocess.run([sys.executable, "-c", text], env=environment, capture_output=True, text=True, check=True)
+    return float(done.stdout.split()[-1])
+
+
+def account(found: dict[str, Any]) -> str:
+    """Return what is printed."""
+    lines = [
+        f"  {axis}: time ∝ {axis}^{one['time_exponent']:.2f}, memory ∝ {axis}^{one['memory_exponent']:.2f}"
+        for axis, one in found["growth"].items()
+    ]
+    began = found["start"]
+    return "\n".join([
+        *lines,
+        f"  import {began['import_s']:.2f} s, with all that an identification uses {began['names_s']:.2f} s",
+        f"  first solve of a new model {began['first_solve_s']:.1f} s, from the cache {began['from_cache_s']:.2f} s",
+        f"  first solve of all {began['empty_cache_s']:.1f} s",
+        f"  64 walkers × 14 experiments: {began['peak_mb']:.0f} MB at the peak",
+    ])  # fmt: skip

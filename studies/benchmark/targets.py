@@ -1,0 +1,112 @@
+"""What the benchmark should show, each beside what was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from studies.benchmark.contenders import GRADIENT, OWN_GRADIENT
+from studies.benchmark.floor import ALL_FREE
+from studies.benchmark.integration import EQUILIBRIUM, ESTIMATE, STEADY
+from studies.benchmark.peers import BALANCE, DIFFRAX_ROWS
+from studies.benchmark.posteriors import NUMPYRO
+from studies.benchmark.problems import DISPLACEMENT, DUFFING, FORCE
+from studies.benchmark.scipy import BVP, INITIAL
+from studies.sampling.rows import Row, row
+
+# Least ratios to one warm log-posterior.
+LEAST = (
+    (f"{STEADY} {EQUILIBRIUM}", 20.0, (DUFFING, FORCE)),
+    (f"{STEADY} {ESTIMATE}", 5.0, (DUFFING, FORCE)),
+    *((f"{method} {start}", 100.0, None) for method in INITIAL for start in (EQUILIBRIUM, ESTIMATE)),
+    *((f"{BVP} {start}", 20.0, None) for start in (EQUILIBRIUM, ESTIMATE)),
+    *((name, 50.0, None) for name in DIFFRAX_ROWS[:3]),
+    (BALANCE, 10.0, None),
+)
+GRADIENT_LEAST, GRADIENT_ERROR = 2.0, 1e-6
+# Largest shares of the floor.
+NEAR, BATCHED, WITH_GRADIENT = 0.35, 0.18, 1.0
+SAME_GRID = 1e-2
+FASTEST, AROUND_SCIPY = 3.0, 20.0
+START = (
+    ("import_s", "import [s]", 1.0), ("names_s", "import with the names of an identification [s]", 1.0),
+    ("first_solve_s", "first solve of a new model [s]", 10.0),
+    ("from_cache_s", "first solve from the cache [s]", 1.0),
+    ("peak_mb", "peak of a process, 64 walkers × 14 experiments [MB]", 500.0),
+)  # fmt: skip
+
+
+def rows(found: Mapping[str, Any]) -> list[Row]:
+    """Return all targets whose measurements are there."""
+    result = []
+    for name, problem in found["problems"].items():
+        result += _of_problem(name, problem)
+    if FORCE in found["floor"]:
+        result += _of_floor(found["floor"][FORCE])
+    if "posterior" in found:
+        result += _of_posterior(found["posterior"])
+    if "scaling" in found:
+        result += _of_scaling(found["scaling"])
+    return result
+
+
+def _of_problem(name: str, problem: Mapping[str, Any]) -> list[Row]:
+    result, by_name = [], {entry["name"]: entry for entry in problem["rows"]}
+    for contender, least, where in LEAST:
+        if contender in by_name and (where is None or name in where):
+            entry = by_name[contender]
+            note = "" if entry["ratio"] else entry["note"]
+            what = f"{name}: {contender} / this package, warm"
+            result.append(row(what, entry["ratio"] and entry["ratio"]["median"], least, None, note))
+    if name in (FORCE, DISPLACEMENT):
+        given = problem["gradient_ratio"]
+        what = f"{name}: {GRADIENT} / this package"
+        result.append(row(what, given and given["median"], GRADIENT_LEAST, None))
+        own = by_name.get(f"{OWN_GRADIENT}, {problem['scheme']}")
+        if own:
+            what = f"{name}: error of this package's gradient, of its largest component"
+            result.append(row(what, own["gradient_error"], 0.0, GRADIENT_ERROR, "against central differences"))
+    return result
+
+
+def _of_floor(floor: Mapping[str, Any]) -> list[Row]:
+    result = []
+    for scheme, entry in floor["schemes"].items():
+        for key, limit, what in (
+            ("near", NEAR, "warm, one core, at draws"), ("far", NEAR, "warm, one core, at three times their spread"),
+            ("call", NEAR, "warm, all cores, at draws"), ("batched", BATCHED, "64 walkers, all cores"),
+            ("gradient", WITH_GRADIENT, "value and gradient, 3 parameters"),
+            (ALL_FREE, WITH_GRADIENT, "value and gradient, 15 parameters"),
+        ):  # fmt: skip
+            result.append(row(f"{FORCE}, {scheme}: {what} / floor", entry["ratio"][key]["median"], 0.0, limit))
+        what = f"{FORCE}, {scheme}: error of the gradient by 15 parameters, of its largest component"
+        result.append(row(what, entry["gradient_error"][ALL_FREE], 0.0, GRADIENT_ERROR, "against central differences"))
+        what = f"{FORCE}, {scheme}: |Δ log-posterior| against solves anchored at the draw"
+        result.append(row(what, entry["same_grid_error"], 0.0, SAME_GRID))
+    return result
+
+
+def _of_posterior(found: Mapping[str, Any]) -> list[Row]:
+    against, best = found["split"]["against"], found["split"]["best"]
+    others = {name: entry["ratio"] for name, entry in against.items() if not name.startswith("this package")}
+    scipy = {name: ratio for name, ratio in others.items() if name.startswith(INITIAL)}
+    result = []
+    for what, ratios, least in (("the fastest", others, FASTEST), ("SciPy's integrators", scipy, AROUND_SCIPY)):
+        if ratios:
+            name = min(ratios, key=lambda n: ratios[n])
+            text = f"effective samples a second: {best} / emcee around {what} ({name})"
+            result.append(row(text, ratios[name], least, None))
+    numpyro, own = found["samplers"][NUMPYRO], found["samplers"][best]
+    there = "ess_per_second" in numpyro
+    value = own["ess_per_second"] / numpyro["ess_per_second"] if there else None
+    text = f"effective samples a second: {best} / {NUMPYRO}"
+    return [*result, row(text, value, FASTEST, None, numpyro.get("note", ""))]
+
+
+def _of_scaling(found: Mapping[str, Any]) -> list[Row]:
+    result = [
+        row(f"exponent of {kind} by {axis}", one[f"{kind}_exponent"], -1.0, 1.1)
+        for axis, one in found["growth"].items()
+        for kind in ("time", "memory")
+    ]
+    return result + [row(what, found["start"][key], 0.0, limit) for key, what, limit in START]

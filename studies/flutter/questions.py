@@ -1,0 +1,219 @@
+"""What the flutter study asks of the fits: what unstable cycles add, what is predicted, how large the misfit is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+import bayesperiodic as bp
+from studies.flutter.rig import (
+    AUTHORS,
+    PRIORS,
+    RIG,
+    SENSORS,
+    SPREADS,
+    SPRINGS,
+    START,
+    Fitted,
+    cycles,
+    estimate,
+    problem,
+)
+
+NEAR = 0.25
+FEWEST = 3
+FREE_SCALES = ("gain_heave", "gain_pitch")
+CHANNELS = ("heave", "pitch")
+CURVE = 240
+
+
+def closed(values: np.ndarray) -> np.ndarray:
+    """Return a closed curve through the samples of a cycle, by its Fourier series."""
+    curve = np.fft.irfft(np.fft.rfft(values), CURVE) * CURVE / values.size
+    return np.append(curve, curve[0])
+
+
+def sizes(outputs: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return half the range of each channel over the cycle, in sensor units."""
+    return {channel: 0.5 * float(np.ptp(closed(outputs[channel]))) for channel in CHANNELS}
+
+
+def errors(fitted: Fitted, experiments: Mapping[str, bp.Experiment]) -> dict[str, Any]:
+    """Return by how much the fitted cycles miss the measured ones, and whether they are of the right stability."""
+    found = {}
+    for name, e in experiments.items():
+        orbit, measured = fitted.fit.solutions[name], sizes(e.outputs)
+        found[name] = {
+            "amplitude_error": {c: v / measured[c] - 1.0 for c, v in sizes(orbit.outputs).items()},
+            "frequency_error": orbit.frequency / e.frequency - 1.0,
+            "stable": orbit.stable,
+            "as_measured": orbit.stable == (not name.startswith("unstable")),
+        }
+    return found
+
+
+def authors_errors(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float]) -> dict[str, Any]:
+    """Return the same for the authors' values and sensor units; None and why where they have no cycle."""
+    along = cycles(RIG | AUTHORS | SENSORS)
+    found: dict[str, Any] = {}
+    for name, e in experiments.items():
+        try:
+            orbit = along.at(name, speeds[name])
+        except ValueError as error:
+            found[name] = {"amplitude_error": None, "frequency_error": None, "why": str(error)}
+            continue
+        measured = sizes(e.outputs)
+        found[name] = {
+            "amplitude_error": {c: v / measured[c] - 1.0 for c, v in sizes(orbit.outputs).items()},
+            "frequency_error": orbit.frequency / e.frequency - 1.0,
+        }
+    return found
+
+
+def mean_size(found: Mapping[str, Any]) -> float | None:
+    """Return the root mean square of all amplitude errors, None where a cycle is missing altogether."""
+    each = [v for one in found.values() if one["amplitude_error"] for v in one["amplitude_error"].values()]
+    return float(np.sqrt(np.mean(np.square(each)))) if each else None
+
+
+def kind_of(name: str) -> str:
+    """Return "stable" or "unstable", what a record's name tells of its cycle."""
+    return "unstable" if name.startswith("unstable") else "stable"
+
+
+def contraction(fits: Mapping[str, Fitted]) -> dict[str, dict[str, dict[str, float]]]:
+    """Return estimate, Laplace and robust sd, and sd over the prior's sd, by parameter and data."""
+    generator = np.random.default_rng(0)
+    prior = {name: float(np.std(one.sample(20_000, generator))) for name, one in PRIORS.items()}
+    gain = PRIORS["gain_pitch"].sample(20_000, generator)
+    draws = {n: PRIORS[n].sample(20_000, generator) for n in ("k_alpha2", "k_alpha3")}
+    prior["k_alpha2 at gain 1"] = float(np.std(draws["k_alpha2"] / gain))
+    prior["k_alpha3 at gain 1"] = float(np.std(draws["k_alpha3"] / gain**2))
+    table: dict[str, dict[str, dict[str, float]]] = {}
+    for kind, fitted in fits.items():
+        fit = fitted.fit
+        values, sds = dict(fit.theta), dict(fit.sd)
+        for name, (value, sd) in springs(fit).items():
+            values[name], sds[name] = value, sd
+        for name, value in values.items():
+            row = {"estimate": value, "sd": sds[name], "over_prior": sds[name] / prior[name]}
+            if name in fit.robust_sd:
+                row["robust_sd"] = fit.robust_sd[name]
+            table.setdefault(name, {})[kind] = row
+    return table
+
+
+def springs(fit: bp.MapEstimate) -> dict[str, tuple[float, float]]:
+    """Return the nonlinear stiffnesses in units of the pitch sensor, which no scale can touch, with their sds."""
+    gain = fit.theta["gain_pitch"]
+    found = {}
+    for power, (name, spring) in enumerate(zip(SPRINGS, ("k_alpha2", "k_alpha3"), strict=True), 1):
+        value = fit.theta[spring] / gain**power
+        slopes = np.array([value / fit.theta[spring], -power * value / gain])
+        block = fit.covariance.loc[[spring, "gain_pitch"], [spring, "gain_pitch"]].to_numpy()
+        found[name] = value, float(np.sqrt(slopes @ block @ slopes))
+    return found
+
+
+def groups(speeds: Mapping[str, float]) -> list[list[str]]:
+    """Return the names of the records by wind speed, those within a quarter of a metre per second together."""
+    found: list[list[str]] = []
+    for name in sorted(speeds, key=lambda name: speeds[name]):
+        if found and speeds[name] - speeds[found[-1][0]] < NEAR:
+            found[-1].append(name)
+        else:
+            found.append([name])
+    return found
+
+
+def leave_out(
+    experiments: Mapping[str, bp.Experiment],
+    speeds: Mapping[str, float],
+    theta: dict[str, float],
+    left: list[str],
+    draws: int,
+) -> tuple[Fitted, dict[str, Any]]:
+    """Return the fit without some cycles, whose way starts at the estimate θ from all, and how it predicts them."""
+    kept = {name: e for name, e in experiments.items() if name not in left}
+    fitted = estimate(kept, speeds, start=START | theta)
+    return fitted, predictions(fitted, experiments, speeds, left, draws)
+
+
+def predictions(
+    fitted: Fitted,
+    experiments: Mapping[str, bp.Experiment],
+    speeds: Mapping[str, float],
+    left: Sequence[str],
+    draws: int,
+) -> dict[str, Any]:
+    """Return the errors of cycles that were not fitted: in per cent, in posterior sds, and with the model's error.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        Without them.
+    experiments : mapping of str to Experiment
+    speeds : mapping of str to float
+        [m/s].
+    left : sequence of str
+    draws : int
+        From the Laplace approximation; there are none where the MAP point itself has no such cycle.
+    """
+    fit, along = fitted.fit, cycles(RIG | fitted.fit.theta)
+    every = laplace_draws(fit, draws)
+    misses = [
+        v / sizes(e.outputs)[c] - 1.0
+        for e in fitted.problem.experiments
+        for c, v in sizes(fit.solutions[e.name].outputs).items()
+    ]
+    model = float(np.sqrt(np.mean(np.square(misses))))
+    found: dict[str, Any] = {}
+    for name in left:
+        try:
+            orbit = along.at(name, speeds[name])
+        except ValueError as error:
+            found[name] = {"cycle_at_map": False, "why": str(error)}
+            continue
+        drawn, best = drawn_sizes(orbit, fit.theta, every), sizes(orbit.outputs)
+        there = np.isfinite(drawn["heave"])
+        found[name] = {"draws_with_a_cycle": int(there.sum()), "draws": draws, "cycle_at_map": True}
+        for channel in CHANNELS:
+            size = sizes(experiments[name].outputs)[channel]
+            off = best[channel] - size
+            found[name][channel] = {"error": off / size}
+            if there.sum() >= FEWEST:
+                sd = float(np.std(drawn[channel][there]))
+                with_model = float(np.hypot(sd, model * size))
+                found[name][channel] |= {"posterior_sds": off / sd, "sds_with_model_error": off / with_model}
+    return found
+
+
+def laplace_draws(fit: bp.MapEstimate, draws: int) -> dict[str, np.ndarray]:
+    """Return draws (draws,) of each parameter from the Laplace approximation, in logarithms of what is positive.
+
+    There the ridges of products, such as a stiffness and a sensor's scale, are straight.
+    """
+    values = np.array(list(fit.theta.values()))
+    positive = np.array([name in SPREADS for name in fit.theta])
+    slopes = np.where(positive, values, 1.0)
+    covariance = fit.covariance.to_numpy() / np.outer(slopes, slopes)
+    changes = np.random.default_rng(0).multivariate_normal(np.zeros(values.size), covariance, size=draws)
+    rows = np.where(positive, values * np.exp(np.where(positive, changes, 0.0)), values + changes)
+    return dict(zip(fit.theta, rows.T, strict=True))
+
+
+def drawn_sizes(
+    orbit: bp.PeriodicSolution, theta: Mapping[str, float], draws: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Return the amplitudes (draws,) of the cycle that continues one at θ, by channel; NaN where there is none."""
+    like = bp.Experiment(
+        "cycle", orbit.frequency, orbit.outputs, samples=orbit.samples, frequency_se=1e-3, guess=orbit.states
+    )
+    stated = problem([like], {"cycle": orbit.parameters["U"]}, frequency_error=0.0, noise="independent")
+    rows = np.stack([draws[name] for name in stated.names], axis=-1)
+    outputs, there = stated.anchored(theta, {"cycle": orbit.states}).outputs(rows)
+    curves = {channel: outputs["cycle"][channel] for channel in CHANNELS}
+    found = [sizes({c: curves[c][i] for c in CHANNELS}) if there[i] else None for i in range(there.size)]
+    return {c: np.array([np.nan if one is None else one[c] for one in found]) for c in CHANNELS}

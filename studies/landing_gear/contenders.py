@@ -1,0 +1,206 @@
+"""Time integration of one experiment of the landing gear until steady, no less accurate than it has to be.
+
+The compiled methods of `studies.landing_gear.integrators`, and SciPy's LSODA and Radau on the same compiled right-hand
+side. Each gets, experiment by experiment, the largest steps and the loosest tolerances with which no output of any draw
+is further off than allowed, of its range, from the integration at its finest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+import bayesperiodic as bp
+from studies.landing_gear.identification import DISPLACEMENT, SAMPLES
+from studies.landing_gear.integrators import CONTROLLED_STEPS, FIXED_STEPS, OUTPUTS, SCIPY_RATES
+
+FIXED, CONTROLLED, LSODA, RADAU = "Runge-Kutta", "Dormand-Prince", "LSODA", "Radau"
+COMPILED, SCIPY = (FIXED, CONTROLLED), (LSODA, RADAU)
+STEPS = (16, 20, 25, 32, 40, 50, 80, 100, 160, 200, 400, 800, 1600, 3200, 6400, 12_800, 25_600)
+RELATIVE = tuple(10.0**-k for k in range(3, 12))
+# Of the gas temperature [K].
+TOLERANCES = tuple(10.0**-k for k in range(10))
+FINEST = 1e-11, 1e-9
+# Points of a cycle between which inputs are interpolated, and what errors are measured by: [m], [m/s].
+TABLE = 16_384
+SCALE = (0.1, 0.1)
+
+# From parameters and start to the states of a cycle (samples, size) and the number of cycles integrated, 0 for never.
+Integrate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]
+
+
+@dataclass(frozen=True)
+class Gear:
+    """One experiment as the integrators see it.
+
+    Attributes
+    ----------
+    drive : str
+    experiment : Experiment
+    parameters : array (draws, parameters)
+        In the order of `landing_gear_integrators.NAMES`.
+    estimate : array (parameters,)
+        The MAP estimate.
+    """
+
+    drive: str
+    experiment: bp.Experiment
+    parameters: np.ndarray
+    estimate: np.ndarray
+
+    def still(self, parameters: np.ndarray) -> np.ndarray:
+        """Return static equilibrium under the mean input, the gas as warm as the wall."""
+        mean, wall = float(self.experiment.inputs[self.drive].mean()), -parameters[14]
+        if self.drive == DISPLACEMENT:
+            return np.array([wall])
+
+        def balance(q: float) -> float:
+            pressure = parameters[4] * wall / (1.0 + parameters[5] * q + parameters[6] * wall)
+            return float(parameters[3] * pressure + parameters[10] - mean)
+
+        return np.array([brentq(balance, -0.1, -0.99 / parameters[5]), 0.0, wall])
+
+    def outputs(self, parameters: np.ndarray, path: np.ndarray) -> np.ndarray:
+        """Return the outputs (SAMPLES, 2) that belong to states (points, size) over a cycle."""
+        if len(path) != SAMPLES:
+            path = np.fft.irfft(np.fft.rfft(path, axis=0) * (SAMPLES / len(path)), SAMPLES, axis=0)
+        return OUTPUTS[self.drive](parameters, self._inputs, np.ascontiguousarray(path))
+
+    def integrator(self, kind: str, fineness: float, tolerance: float) -> Integrate:
+        """Return a compiled method with so many steps a cycle, or with this relative error of a step."""
+        steps, frequency = int(fineness) if kind == FIXED else TABLE // 2, self.experiment.frequency
+        inputs = self._table(2 * steps)
+
+        def fixed(parameters: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, int]:
+            path = np.empty((min(steps, SAMPLES), start.size))
+            return path, FIXED_STEPS[self.drive](parameters, inputs, frequency, start.copy(), tolerance, path)
+
+        def controlled(parameters: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, int]:
+            path, scale = np.empty((SAMPLES, start.size)), self._scale(parameters)
+            count = CONTROLLED_STEPS[self.drive](
+                parameters, inputs, frequency, start.copy(), scale, fineness, tolerance, path
+            )
+            return path, count
+
+        return fixed if kind == FIXED else controlled
+
+    def scipy(self, method: str, relative: float, cycles: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """Return SciPy's integration of so many cycles: from parameters and start to the states of the last."""
+        inputs, frequency = self._table(TABLE), self.experiment.frequency
+        times = (cycles - 1 + np.arange(SAMPLES) / SAMPLES) / frequency
+
+        def integrate(parameters: np.ndarray, start: np.ndarray) -> np.ndarray:
+            solved = solve_ivp(  # type: ignore[call-overload]
+                SCIPY_RATES[self.drive],
+                (0.0, cycles / frequency),
+                start,
+                method,
+                times,
+                rtol=relative,
+                atol=relative * self._scale(parameters),
+                args=(parameters, inputs, frequency),
+            )
+            return solved.y.T if solved.success else np.full((SAMPLES, start.size), np.nan)
+
+        return integrate
+
+    @cached_property
+    def exact(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Steady state at the start of a cycle, and outputs of a cycle, of every draw, by the finest integration."""
+        return [self._exact(parameters) for parameters in self.parameters]
+
+    @property
+    def steady(self) -> bool:
+        """Whether the finest integration becomes steady at every draw."""
+        integrate = self.integrator(CONTROLLED, *FINEST)
+        return all(integrate(parameters, self.still(parameters))[1] for parameters in self.parameters)
+
+    def _exact(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        path, cycles = self.integrator(CONTROLLED, *FINEST)(parameters, self.still(parameters))
+        if not cycles:
+            raise RuntimeError(f"{self.experiment.name}: the time integration does not become steady.")
+        return path[0], self.outputs(parameters, path)
+
+    @cached_property
+    def _inputs(self) -> np.ndarray:
+        return self._table(SAMPLES)
+
+    def _table(self, points: int) -> np.ndarray:
+        """Return the input and its first two derivatives (points, 3) over a cycle."""
+        amplitudes = np.fft.rfft(self.experiment.inputs[self.drive]) / SAMPLES
+        turning = 2j * np.pi * self.experiment.frequency * np.arange(amplitudes.size)
+        kept = min(amplitudes.size, points // 2 + 1)
+        columns = [np.fft.irfft((amplitudes * turning**order)[:kept] * points, points) for order in range(3)]
+        return np.ascontiguousarray(np.stack(columns, axis=-1))
+
+    def _scale(self, parameters: np.ndarray) -> np.ndarray:
+        return np.array([-parameters[14]] if self.drive == DISPLACEMENT else [*SCALE, -parameters[14]])
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method with the settings that an experiment needs.
+
+    Attributes
+    ----------
+    integrate : callable
+    fineness : float
+        Steps a cycle, or relative error of a step.
+    tolerance : float
+        Of the steady temperature [K].
+    error : float
+        The largest of any draw's outputs, of their range.
+    cycles : float
+        The mean that it takes from static equilibrium.
+    """
+
+    integrate: Integrate
+    fineness: float
+    tolerance: float
+    error: float
+    cycles: float
+
+
+def error(outputs: np.ndarray, exact: np.ndarray) -> float:
+    """Return the largest error of outputs (samples, channels), of their range."""
+    return float(np.max(np.abs(outputs - exact).max(axis=0) / np.ptp(exact, axis=0)))
+
+
+def choose(gear: Gear, kind: str, allowed: float) -> Contender:
+    """Return a compiled method with the cheapest settings that are no less accurate than allowed."""
+    for fineness in STEPS if kind == FIXED else RELATIVE:
+        if _judge(gear, gear.integrator(kind, fineness, TOLERANCES[-1]))[0] > allowed:
+            continue
+        for tolerance in TOLERANCES:
+            integrate = gear.integrator(kind, fineness, tolerance)
+            worst, cycles = _judge(gear, integrate)
+            if worst <= allowed:
+                return Contender(integrate, fineness, tolerance, worst, cycles)
+    raise RuntimeError(f"{gear.experiment.name}: {kind} does not become as accurate as {allowed:.1e}.")
+
+
+def _judge(gear: Gear, integrate: Integrate) -> tuple[float, float]:
+    """Return the largest error of all draws, and how many cycles they take in the mean."""
+    worst, count = 0.0, []
+    for parameters, (_, exact) in zip(gear.parameters, gear.exact, strict=True):
+        path, cycles = integrate(parameters, gear.still(parameters))
+        worst = max(worst, error(gear.outputs(parameters, path), exact)) if cycles else np.inf
+        if worst == np.inf:
+            break
+        count.append(cycles)
+    return worst, float(np.mean(count)) if count else 0.0
+
+
+def choose_scipy(gear: Gear, method: str, allowed: float) -> float | None:
+    """Return the loosest relative tolerance with which a cycle from the first draw's steady state is right, or None."""
+    parameters, (steady, exact) = gear.parameters[0], gear.exact[0]
+    for relative in RELATIVE:
+        path = gear.scipy(method, relative, 1)(parameters, steady)
+        if error(gear.outputs(parameters, path), exact) <= allowed:
+            return relative
+    return None

@@ -1,0 +1,238 @@
+"""Figures of the landing gear study."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import bayesperiodic as bp
+from studies.landing_gear.drop import SHORT, Dropped
+from studies.landing_gear.identification import Identified
+from studies.landing_gear.quality import FALSE_ALARM, LIMIT, MEANINGS, Unit, deviations
+from studies.landing_gear.rig import RUNS, Run
+from studies.landing_gear.truth import GEAR
+from studies.landing_gear.verdicts import CONDUCTION, NEGATIVE, POSITIVE, UNDETERMINED, Verdict
+
+CHANNELS = {
+    "displacement": (1e3, "displacement [mm]"),
+    "force": (1e-3, "force [kN]"),
+    "pressure": (1e-6, "pressure [MPa]"),
+}
+TITLE = "SYNTHETIC data"
+NORMAL_90 = 1.6448536269514722
+SIGNS = {POSITIVE: ("#009E73", "o"), UNDETERMINED: ("#999999", "D"), NEGATIVE: ("#CC79A7", "v")}
+# The scale of theta16 is linear up to here, logarithmic beyond [W/K].
+LINEAR_TO, TICKS = 3.0, (-100, -50, -20, -10, -5, -3, -2, -1, 0, 1, 2, 3, 5, 10, 20)
+TRUTH_NAMES = {"A": "truth A: eq. (9) holds", "B": "truth B: lost motion, line lag, convection, friction heat"}
+
+
+def histories(recordings: Mapping[str, bp.Recording], identified: Mapping[str, Identified]) -> Figure:
+    """Draw recorded displacement, force and pressure of one experiment and what the fit says, a column a truth."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(5.0 * len(recordings) + 1.0, 8.5), layout="constrained")
+    grid = figure.subplots(4, len(recordings), sharex=True, squeeze=False, sharey="row")
+    for column, (truth, recording) in zip(grid.T, recordings.items(), strict=True):
+        _histories(column, recording, identified[truth])
+        column[0].set_title(TRUTH_NAMES[truth], fontsize=10)
+    for axes, label in zip(grid[:, 0], (*(label for _, label in CHANNELS.values()), "residual force [N]"), strict=True):
+        axes.set_ylabel(label)
+    figure.legend(*grid[1, 0].get_legend_handles_labels(), frameon=False, ncols=2, loc="outside lower center")
+    experiment = next(iter(recordings.values())).name.replace(" Hz ", " Hz, ±")
+    figure.suptitle(f"Landing gear at {experiment}, {TITLE}")
+    return figure
+
+
+def _histories(column: np.ndarray, recording: bp.Recording, identified: Identified) -> None:
+    (experiment,), fit = identified.problem.experiments, identified.fit
+    residuals = fit.residuals[experiment.name]
+    until = 2.0 / experiment.frequency
+    kept = recording.time <= until
+    time = np.arange(2 * experiment.samples) / (experiment.samples * experiment.frequency)
+    signals = {**recording.inputs, **recording.outputs}
+    for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
+        colours, recorded = bp.plot.COLOURS, scale * signals[channel][kept]
+        axes.plot(recording.time[kept], recorded, ".", ms=2, color=colours["measured"], label="recorded")
+        if channel in residuals:
+            fitted = experiment.outputs[channel] - residuals[channel]
+            axes.plot(time, scale * np.tile(fitted, 2), color=bp.plot.COLOURS["map"], lw=1.4, label="MAP")
+    column[3].plot(time, np.tile(residuals["force"], 2), color=bp.plot.COLOURS["map"], lw=1.0)
+    column[3].axhline(0.0, color="black", lw=0.6)
+    column[3].set_xlabel("time [s]")
+
+
+def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict]], drive: str) -> Figure:
+    """Draw theta16 by experiment: 90 % intervals of draws and of the Laplace approximation, and the sign verdict."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(11.0, 4.2 * len(verdicts) + 1.0), layout="constrained")
+    grid = figure.subplots(len(verdicts), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (truth, by_run) in zip(grid, verdicts.items(), strict=True):
+        _conductions(axes, [by_run[run.name] for run in runs])
+        axes.set_title(TRUTH_NAMES[truth], fontsize=11)
+    names = [f"{run.frequency:g} Hz\n±{1e3 * run.stroke:g} mm" for run in runs]
+    grid[-1].set_xticks(range(len(runs)), names, fontsize=9)
+    handles, labels = grid[0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, ncols=4, loc="outside lower center", fontsize=9)
+    figure.suptitle(
+        f"Heat conduction theta16 by experiment, {drive} given, SYNTHETIC data\n"
+        "(filled: model adequate, open: misspecified)"
+    )
+    return figure
+
+
+def _conductions(axes: Axes, verdicts: Sequence[Verdict]) -> None:
+    at = np.arange(len(verdicts))
+    low, high = np.array([_interval(v) for v in verdicts]).T
+    laplace = np.array([v.identified.fit.interval(0.9)[CONDUCTION] for v in verdicts]).T
+    axes.vlines(at - 0.1, low, high, color=bp.plot.COLOURS["mcmc"], lw=5, label="draws, 90 %")
+    axes.vlines(at + 0.1, *laplace, color=bp.plot.COLOURS["laplace"], lw=2, label="Laplace, 90 %")
+    axes.axhline(GEAR[CONDUCTION], color="black", lw=0.9, ls="--", label="true value 2 W/K")
+    axes.axhline(0.0, color="black", lw=0.6)
+    for sign, (colour, marker) in SIGNS.items():
+        axes.plot([], [], marker, color=colour, label=f"sign: {sign}")
+        for i in (i for i, v in enumerate(verdicts) if v.sign == sign):
+            face = "white" if verdicts[i].misspecified else colour
+            value = verdicts[i].identified.fit.theta[CONDUCTION]
+            axes.plot(i, value, marker, color=colour, mfc=face, ms=8, mew=1.8, zorder=5)
+    axes.set_yscale("symlog", linthresh=LINEAR_TO, linscale=1.5)
+    axes.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS])
+    axes.set_yticks([], minor=True)
+    ends = np.concatenate([low, high, *laplace, [-0.5, GEAR[CONDUCTION] + 0.5]])
+    axes.set_ylim(1.2 * ends.min(), 1.2 * ends.max())
+    axes.set_ylabel("theta16 [W/K]")
+    axes.set_xlim(-0.6, len(verdicts) - 0.4)
+
+
+def _interval(verdict: Verdict) -> tuple[float, float]:
+    posterior = verdict.identified.posterior
+    assert posterior is not None
+    low, high = np.quantile(posterior.draws(CONDUCTION), [0.05, 0.95])
+    return float(low), float(high)
+
+
+def drops(dropped: Mapping[str, Dropped]) -> Figure:
+    """Draw the drop test, a column a truth: the first 2.5 s, and by how much the displacement is off over 30 s."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(5.0 * len(dropped) + 1.0, 9.0), layout="constrained")
+    grid = figure.subplots(4, len(dropped), squeeze=False, sharey="row")
+    for column, (truth, found) in zip(grid.T, dropped.items(), strict=True):
+        _drop(column, found)
+        column[0].set_title(TRUTH_NAMES[truth], fontsize=10)
+    rows = (*(label for _, label in CHANNELS.values()), "displacement minus\npredicted median [mm]")
+    for axes, label in zip(grid[:, 0], rows, strict=True):
+        axes.set_ylabel(label)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, ncols=3, loc="outside lower center")
+    figure.suptitle(f"Drop test, predicted from the shaker's experiments, {TITLE}")
+    return figure
+
+
+def _drop(column: np.ndarray, found: Dropped) -> None:
+    time, band, colours = found.true.time, found.band, bp.plot.COLOURS
+    early = time <= SHORT
+    for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
+        low, high = scale * band.low[channel][early], scale * band.high[channel][early]
+        axes.plot(
+            time[early], scale * found.true.outputs[channel][early], color=colours["measured"], lw=2.6, label="true"
+        )
+        axes.plot(
+            time[early],
+            scale * band.median[channel][early],
+            "--",
+            color=colours["mcmc"],
+            lw=1.4,
+            label="posterior median",
+        )
+        axes.fill_between(time[early], low, high, color=colours["mcmc"], alpha=0.3, lw=0, label="90 % band")
+        axes.tick_params(labelbottom=channel == "pressure")
+    column[2].set_xlabel("time [s]")
+    median = band.median["displacement"]
+    low, high = 1e3 * (band.low["displacement"] - median), 1e3 * (band.high["displacement"] - median)
+    column[3].fill_between(time, low, high, color=colours["mcmc"], alpha=0.3, lw=0)
+    column[3].plot(time, 1e3 * (found.true.outputs["displacement"] - median), color=colours["measured"], lw=1.2)
+    column[3].axhline(0.0, color=colours["mcmc"], ls="--", lw=1.0)
+    column[3].set_xlabel("time [s], until the gas has cooled")
+
+
+def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
+    """Draw the quality-control chart: every unit's deviation from the reference, a row a parameter."""
+    from matplotlib import pyplot as plt
+
+    figure, grid = plt.subplots(len(MEANINGS), 1, figsize=(9.0, 9.5), sharex=True, layout="constrained")
+    number = np.arange(1, len(units) + 1)
+    every = [deviations(reference, unit) for unit in units]
+    kinds = list(dict.fromkeys(unit.kind for unit in units))
+    for axes, (name, meaning) in zip(grid, MEANINGS.items(), strict=True):
+        z = np.array([deviation[name] for deviation in every])
+        out = np.abs(z) > LIMIT
+        axes.axhspan(-LIMIT, LIMIT, color="#DDDDDD", lw=0)
+        axes.plot(number[~out], z[~out], "o", ms=3, color=bp.plot.COLOURS["map"], label='"same"')
+        axes.plot(number[out], z[out], "^", ms=4, color=bp.plot.COLOURS["laplace"], label='"different"')
+        axes.set_yscale("symlog", linthresh=10.0, linscale=2.0)
+        axes.set_yticks([-1000, -100, -10, -5, 0, 5, 10, 100, 1000])
+        axes.set_yticklabels(["−1000", "−100", "−10", "−5", "0", "5", "10", "100", "1000"], fontsize=8)
+        axes.set_ylim(-2.0 * max(10.0, np.abs(z).max()), 2.0 * max(10.0, np.abs(z).max()))
+        axes.minorticks_off()
+        axes.set_ylabel(f"{meaning}\n{name}", fontsize=9)
+    for k, kind in enumerate(kinds):
+        members = np.flatnonzero([unit.kind == kind for unit in units])
+        grid[0].text(
+            number[members].mean(), 1.04, kind, ha="center", va="bottom", transform=grid[0].get_xaxis_transform()
+        )
+        for axes in grid if k else ():
+            axes.axvline(number[members[0]] - 0.5, color="black", lw=0.6)
+    grid[-1].set_xlabel("unit")
+    handles = {label: h for axes in grid for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles, frameon=False, ncols=2, loc="outside lower center")
+    figure.suptitle(
+        "Deviation from the reference gear, in common standard deviations [1], SYNTHETIC data\n"
+        f"(grey: ±{LIMIT:.2f}, a false alarm in {FALSE_ALARM:.0%} of good units)"
+    )
+    return figure
+
+
+def repaired(found: Mapping[str, Any]) -> Figure:
+    """Draw theta16 by experiment under eq. (9) and under the best model, and how each model predicts what it lacks."""
+    from matplotlib import pyplot as plt
+
+    figure, (top, bottom) = plt.subplots(2, 1, figsize=(10.0, 8.5), sharex=True, layout="constrained")
+    styles: dict[str, dict[str, Any]] = {
+        "eq. (9)": {"color": "#0072B2", "lw": 3.0},
+        "pressure line": {"color": "#E69F00", "ls": "--"},
+        "lost motion": {"color": "#CC79A7"},
+        "all four": {"color": "#009E73"},
+    }
+    runs = list(next(iter(found["models"].values()))["scores"])
+    order = [run.name for run in RUNS if run.name in runs]
+    place = np.arange(len(order))
+    for k, (model, one) in enumerate(found["theta16"].items()):
+        values = np.array([one["estimates"][f"{CONDUCTION}[{name}]"] for name in order])
+        top.errorbar(
+            place + 0.12 * (2 * k - 1), values[:, 0], NORMAL_90 * values[:, 1], fmt="o", ms=4, capsize=2,
+            color=styles[model]["color"], label=model,
+        )  # fmt: skip
+    top.axhline(GEAR[CONDUCTION], color="black", lw=0.8, ls=":", label="truth")
+    top.axhline(0.0, color="black", lw=0.8)
+    top.set_yscale("symlog", linthresh=LINEAR_TO, linscale=1.5)
+    top.set_yticks(
+        [t for t in TICKS if abs(t) != 1], [f"{t:g}".replace("-", "−") for t in TICKS if abs(t) != 1], fontsize=8
+    )
+    top.minorticks_off()
+    top.set_ylabel("theta16 [W/K], 90 % interval")
+    top.legend(frameon=False)
+    for model, one in found["models"].items():
+        errors = [one["errors_held_out"][name]["force"] for name in order]
+        bottom.plot(place, errors, "o", ms=4, **{"lw": 1.0, "ls": "-"} | styles[model], label=model)
+    bottom.axhline(found["noise_of_the_mean"]["force"], color="black", lw=0.8, ls=":", label="noise of the mean period")
+    bottom.set_yscale("log")
+    bottom.set_ylabel("rms error of the force [N]\nin experiments held out")
+    bottom.set_xticks(place, [name.replace(" Hz ", " Hz\n±") for name in order], fontsize=8)
+    bottom.legend(frameon=False, ncols=2)
+    figure.suptitle("Better models of the gear of truth B, SYNTHETIC data")
+    return figure

@@ -1,0 +1,166 @@
+"""Quality control, as the paper proposes it: whether a new gear is the same as the reference, and if not, in what.
+
+SYNTHETIC units under three experiments each. Good ones have the reference's parameters, faulty ones too little gas,
+worn friction, or less oil, whose place the gas takes. A parameter of a unit is called "different" where it is off the
+reference's by more than both their standard deviations allow, at a false-alarm rate of 1 % a unit over all parameters.
+The reference is measured several times, so that its own error does not decide over all units. The area theta4 is
+machined and known; the gas's heat capacity theta15 follows its amount, theta5/theta6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import binom, norm
+
+import bayesperiodic as bp
+from studies import tasks as common_resumed
+from studies.landing_gear.identification import DISPLACEMENT, fold
+from studies.landing_gear.rig import RUNS, SAME, Changed, measure
+from studies.landing_gear.truth import GEAR
+
+CAMPAIGN = ("0.2 Hz 80 mm", "1 Hz 36 mm", "4 Hz 8 mm")
+PRIORS = {
+    "theta3": bp.LogNormal(8e3, 0.3),
+    "theta5": bp.LogNormal(GEAR["theta5"], 0.1),
+    "theta6": bp.Normal(-2.5, 0.3),
+    "theta8": bp.LogNormal(150.0, 0.5),
+    "theta16": bp.Normal(3.0, 20.0),
+}
+TIED = {"theta15": f"{GEAR['theta15'] * GEAR['theta6'] / GEAR['theta5']!r}*theta5/theta6"}
+FIXED = {name: value for name, value in GEAR.items() if name not in (*PRIORS, *TIED)}
+MEANINGS = {
+    "theta3": "oil damping", "theta5": "gas charge", "theta6": "gas volume", "theta8": "friction",
+    "theta16": "heat conduction",
+}  # fmt: skip
+GOOD = "good"
+LOST_GAS, WORN, LOST_OIL = 0.02, 0.2, 0.01
+FAULTS: dict[str, Changed] = {
+    GOOD: SAME,
+    "low gas charge": frozenset(
+        {"theta5": (1 - LOST_GAS) * GEAR["theta5"], "theta15": (1 - LOST_GAS) * GEAR["theta15"]}.items()
+    ),
+    "worn friction": frozenset({"theta8": (1 - WORN) * GEAR["theta8"]}.items()),
+    # The same gas in a volume larger by the oil that left.
+    "leaking oil": frozenset(
+        {"theta5": GEAR["theta5"] / (1 + LOST_OIL), "theta6": GEAR["theta6"] / (1 + LOST_OIL)}.items()
+    ),
+}
+TOUCHED = {
+    GOOD: set[str](), "low gas charge": {"theta5"}, "worn friction": {"theta8"}, "leaking oil": {"theta5", "theta6"},
+}  # fmt: skip
+FALSE_ALARM = 0.01
+LIMIT = float(norm.isf(0.5 * FALSE_ALARM / len(PRIORS)))
+POWER = 0.9
+# More tasks than that are shared among processes.
+SERIALLY = 10
+REFERENCE_SEED, FIRST_UNIT = 5000, 10_000
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What is found of one gear.
+
+    Attributes
+    ----------
+    kind : str
+    theta, sd : dict of str to float
+    converged : bool
+    """
+
+    kind: str
+    theta: dict[str, float]
+    sd: dict[str, float]
+    converged: bool
+
+
+def examine(kind: str, seed: int) -> Unit:
+    """Return the estimate of one unit of a kind."""
+    fit = bp.map_estimate(problem(kind, seed), progress=False)
+    return Unit(kind, dict(fit.theta), dict(fit.sd), fit.converged)
+
+
+def problem(kind: str, seed: int) -> bp.Problem:
+    """Return the problem of one unit; seeds differ in the noise of the instruments."""
+    runs = [run for run in RUNS if run.name in CAMPAIGN]
+    return bp.Problem(
+        bp.models.landing_gear(DISPLACEMENT),
+        [fold(measure(run, (), seed, FAULTS[kind]), DISPLACEMENT) for run in runs],
+        priors=PRIORS,
+        fixed=FIXED,
+        tied=TIED,
+        noise=bp.noise.Independent(per="experiment"),
+    )
+
+
+def examine_all(references: int, each: int, seed: int) -> tuple[Unit, list[Unit]]:
+    """Return the reference, measured so many times, and so many units of each kind."""
+    tasks = [(GOOD, REFERENCE_SEED * (seed + 1) + k) for k in range(references)]
+    tasks += [(kind, FIRST_UNIT * (seed + 1) + k) for k, kind in enumerate(np.repeat(list(FAULTS), each).tolist())]
+    found = list(common_resumed.each(examine, tasks, here=len(tasks) <= SERIALLY))
+    return _together(found[:references]), found[references:]
+
+
+def _together(units: Sequence[Unit]) -> Unit:
+    """Return the mean of units that are one gear, measured again and again."""
+    theta = {name: float(np.mean([unit.theta[name] for unit in units])) for name in PRIORS}
+    sd = {name: float(np.sqrt(np.mean([unit.sd[name] ** 2 for unit in units]) / len(units))) for name in PRIORS}
+    return Unit(GOOD, theta, sd, all(unit.converged for unit in units))
+
+
+def deviations(reference: Unit, unit: Unit) -> dict[str, float]:
+    """Return by how many of their common standard deviations a unit is off the reference, by parameter."""
+    return {n: (unit.theta[n] - reference.theta[n]) / float(np.hypot(unit.sd[n], reference.sd[n])) for n in PRIORS}
+
+
+def account(reference: Unit, units: Sequence[Unit]) -> dict[str, Any]:
+    """Return what results.json holds: how often each parameter is called different, by kind of unit."""
+    typical = {name: np.sqrt(np.mean([unit.sd[name] ** 2 for unit in units])) for name in PRIORS}
+    found: dict[str, Any] = {
+        "experiments": list(CAMPAIGN),
+        "limit": LIMIT,
+        "false_alarm_rate": FALSE_ALARM,
+        "reference": {"theta": reference.theta, "sd": reference.sd},
+        "relative_change_found_in_90_percent": {
+            name: float((LIMIT + norm.ppf(POWER)) * np.hypot(typical[name], reference.sd[name]) / abs(GEAR[name]))
+            for name in PRIORS
+        },
+        "kinds": {},
+    }
+    for kind in FAULTS:
+        every = [deviations(reference, unit) for unit in units if unit.kind == kind]
+        different = {name: sum(abs(z[name]) > LIMIT for z in every) for name in PRIORS}
+        touched = TOUCHED[kind]
+        flagged = sum(any(abs(v) > LIMIT for v in z.values()) for z in every)
+        right = sum(all((abs(z[n]) > LIMIT) == (n in touched) for n in PRIORS) for z in every)
+        found["kinds"][kind] = {
+            "changed": {name: value / GEAR[name] - 1.0 for name, value in FAULTS[kind]},
+            "units": len(every),
+            "not_converged": sum(not unit.converged for unit in units if unit.kind == kind),
+            "called_different": different,
+            "units_with_any": flagged,
+            "units_with_all_verdicts_right": right,
+            "error_rate": _rate(flagged if kind == GOOD else len(every) - flagged, len(every)),
+        }
+    return found
+
+
+def _rate(wrong: int, count: int) -> dict[str, Any]:
+    """Return a rate with the exact 95 % interval of a binomial share."""
+    chances = np.linspace(0.0, 1.0, 2001)
+    inside = chances[(binom.cdf(wrong, count, chances) >= 0.025) & (binom.sf(wrong - 1, count, chances) >= 0.025)]
+    return {"wrong": wrong, "of": count, "rate": wrong / count, "interval_95": [float(inside[0]), float(inside[-1])]}
+
+
+def table(found: Mapping[str, Any]) -> str:
+    """Return the counts as lines to print."""
+    lines = [f"  quality control: units called different by more than {found['limit']:.2f} standard deviations, in"]
+    names = "".join(f"{MEANINGS[name]:>17s}" for name in PRIORS)
+    lines.append(f"  {'kind of unit':16s}{'units':>6s}{'any':>5s}{names}")
+    for kind, one in found["kinds"].items():
+        counts = "".join(f"{count:17d}" for count in one["called_different"].values())
+        lines.append(f"  {kind:16s}{one['units']:6d}{one['units_with_any']:5d}{counts}")
+    return "\n".join(lines)

@@ -1,0 +1,157 @@
+"""The pendulum's periodic orbits: found, polished, held against shooting, eigenvalues by two methods."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import bayesperiodic as bp
+from studies.pendulum.recording import ANGLES, COORDINATES, FREQUENCY, OMEGA, TRUTH
+from studies.pendulum.shooting import distance, shoot
+
+SAMPLES = 800
+METHODS = ("chained", "boxes")
+# Classes of prime orbits under cyclic shifts and φ → −φ that close returns and Newton's method found (lower bounds).
+KNOWN_CLASSES = {1: 3, 2: 4, 3: 9, 4: 9, 5: 18}
+WANTED_CLASSES = {1: 3, 2: 4, 3: 9, 4: 9, 5: 17}
+MATCHED = 0.15
+TWO_SIDED_90 = 1.6448536269514722
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A true orbit, by shooting.
+
+    Attributes
+    ----------
+    period, winding : int
+    points : array (period, 2)
+    multipliers : array (2,)
+    equilibrium : bool
+    off : float
+        By how much the polished orbit's section points differ [rad, 5 rad/s].
+    """
+
+    period: int
+    winding: int
+    points: np.ndarray
+    multipliers: np.ndarray
+    equilibrium: bool
+    off: float
+
+
+def references(polished: bp.Orbits) -> tuple[list[Reference], list[str]]:
+    """Return what shooting from polished orbits converges to, and the names of those that it does not confirm.
+
+    Of a pair of symmetric partners one is integrated and the other mirrored.
+    """
+    found: dict[int, Reference] = {}
+    refuted = []
+    for number, orbit in enumerate(polished):
+        points = model_points(orbit)
+        if orbit.partner is not None and orbit.partner in found:
+            one = found[orbit.partner]
+            mirrored = min(
+                (np.roll(-one.points, shift, axis=0) for shift in range(one.period)),
+                key=lambda candidate: distance(candidate, points),
+            )
+            mirror = Reference(one.period, -one.winding, mirrored, one.multipliers, one.equilibrium, 0.0)
+            found[number] = _measured_against(mirror, points)
+            continue
+        shot = shoot(TRUTH, OMEGA, points)
+        reference = Reference(orbit.period, shot.winding, shot.points, shot.multipliers, orbit.equilibrium, 0.0)
+        reference = _measured_against(reference, points)
+        if shot.converged and shot.prime == orbit.period and shot.winding == orbit.winding and reference.off < 1e-3:
+            found[number] = reference
+        else:
+            refuted.append(orbit.name)
+    return list(found.values()), refuted
+
+
+def _measured_against(reference: Reference, points: np.ndarray) -> Reference:
+    r = reference
+    off = distance(r.points, points)
+    return Reference(r.period, r.winding, r.points, r.multipliers, r.equilibrium, off)
+
+
+def model_points(orbit: bp.Orbit) -> np.ndarray:
+    """Return the section points (period, 2) of the polished orbit."""
+    assert orbit.solution is not None
+    return np.stack([orbit.solution.outputs[c][:: orbit.solution.samples] for c in COORDINATES], axis=-1)
+
+
+def classes(orbits: bp.Orbits) -> dict[int, int]:
+    """Return by period how many orbits there are, symmetric partners counted once."""
+    counts = dict.fromkeys(KNOWN_CLASSES, 0)
+    for number, orbit in enumerate(orbits):
+        if orbit.partner is None or orbit.partner >= number or orbit.partner == number:
+            counts[orbit.period] = counts.get(orbit.period, 0) + 1
+    return counts
+
+
+def matched(orbit: bp.Orbit, truths: Sequence[Reference]) -> Reference | None:
+    """Return the true orbit that a candidate stands for, begun where the candidate begins; None where it is none."""
+    best, nearest = None, MATCHED
+    for truth in truths:
+        if truth.period != orbit.period or (orbit.winding is not None and truth.winding != orbit.winding):
+            continue
+        for shift in range(truth.period):
+            points = np.roll(truth.points, shift, axis=0)
+            off = distance(points, orbit.points)
+            if off < nearest:
+                nearest = off
+                best = Reference(truth.period, truth.winding, points, truth.multipliers, truth.equilibrium, off)
+    return best
+
+
+def eigenvalue_table(orbits: bp.Orbits, truths: Sequence[Reference]) -> list[dict[str, Any]]:
+    """Return by period: candidates, true orbits among them, and the errors of the unstable eigenvalue."""
+    rows = []
+    for period in KNOWN_CLASSES:
+        members = [orbit for orbit in orbits if orbit.period == period]
+        pairs = [(o, t) for o in members if (t := matched(o, truths)) is not None and not t.equilibrium]
+        errors = np.array([abs(o.eigenvalues[0] / t.multipliers[0] - 1.0) for o, t in pairs])
+        rows.append(
+            {
+                "period": period,
+                "candidates": len(members),
+                "orbits": sum(matched(o, truths) is not None for o in members),
+                "estimated": sum(bool(np.isfinite(o.eigenvalue_sd[0])) for o, _ in pairs),
+                "median_relative_error": float(np.median(errors)) if errors.size else None,
+            }
+        )
+    return rows
+
+
+def pulls(orbits: bp.Orbits, truths: Sequence[Reference], largest: float) -> dict[str, list[float]]:
+    """Return errors over standard deviations of log|eigenvalue| and of the points, of orbits with |μ| up to a limit."""
+    found: dict[str, list[float]] = {"eigenvalue": [], "point": []}
+    for orbit in orbits:
+        truth = matched(orbit, truths)
+        if truth is None or truth.equilibrium or abs(truth.multipliers[0]) > largest:
+            continue
+        sd = orbit.eigenvalue_sd[0] / abs(orbit.eigenvalues[0])
+        if np.isfinite(sd):
+            found["eigenvalue"].append(float(np.log(abs(orbit.eigenvalues[0] / truth.multipliers[0])) / sd))
+        off = orbit.points - truth.points
+        off[:, 0] = (off[:, 0] + np.pi) % (2 * np.pi) - np.pi
+        found["point"] += list(off.ravel() / np.sqrt(np.diag(orbit.covariance)))
+    return found
+
+
+def covered(pulls: Sequence[float]) -> dict[str, float]:
+    """Return how many 90 % error bars cover, of how many, and the two-sided 99 % binomial band."""
+    from scipy.stats import binom
+
+    count = len(pulls)
+    low, high = binom.interval(0.99, count, 0.9) if count else (0.0, 0.0)
+    inside = int(np.sum(np.abs(pulls) <= TWO_SIDED_90)) if count else 0
+    return {"bars": count, "cover": inside, "band_low": float(low), "band_high": float(high)}
+
+
+def points_only(section: bp.PoincareSection) -> bp.PoincareSection:
+    """Return the same section as a laboratory that samples once a drive period has it."""
+    return bp.PoincareSection.from_points(section.points, COORDINATES, frequency=FREQUENCY, angles=ANGLES)

@@ -1,0 +1,166 @@
+"""A chaotic pendulum, identified from the unstable periodic orbits in its recording (section 5 of the paper).
+
+φ'' + c1 tanh(φ'/v0) + c2 φ' + c3 φ'|φ'| + (g + a ω² cos ωt)/l · sin φ = 0 with c_i = k_i/(m l²), at ω = 9.09 rad/s:
+from 42,754 drive periods to orbits with error bars, to m and l, to k3, and to what all five parameters cannot be told.
+With --replicates N: the counterpart of the paper's table 1, over N recordings.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import Any
+
+import bayesperiodic as bp
+from studies import common
+from studies.pendulum import estimates as pendulum_estimates
+from studies.pendulum import figures as pendulum_figures
+from studies.pendulum import orbits, replicates
+from studies.pendulum import recording as pendulum_recording
+from studies.pendulum import ridge as pendulum_ridge
+from studies.pendulum.estimates import PAPER_ERRORS, START_ERRORS, Identified
+from studies.pendulum.search import Found, search
+
+NOISE_LEVELS = (0.0, 0.001, 0.01)
+PERIODS, QUICK_PERIODS = range(1, 6), range(1, 4)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the study."""
+    if options.replicates < 0 or not 0.0 <= options.noise < 1.0:
+        raise ValueError(
+            f"--replicates {options.replicates} --noise {options.noise} is not allowed; replicates must be at least 0, "
+            "and the noise a fraction of the attractor's size from 0 to 1."
+        )
+    if options.replicates:
+        replicates.run(options)
+        return
+    watch = common.Stopwatch()
+    with watch.part("recording", "the recording"):
+        recording, about = pendulum_recording.get(options.data, options.quick, options.seed)
+    kind = "SYNTHETIC" if about["synthetic"] else "measured"
+    print(f"  {kind} recording: {about['drive_periods']} drive periods, {about['values']} numbers")
+    noise = options.noise if about["synthetic"] else 0.0
+    levels = (0.0, noise) if options.quick or not about["synthetic"] else (*NOISE_LEVELS, noise)
+    with watch.part("orbits", f"finding orbits without a model, noise {', '.join(f'{n:.2%}' for n in set(levels))}"):
+        found = search(recording, levels, options.seed, QUICK_PERIODS if options.quick else PERIODS)
+    results: dict[str, Any] = {"recording": about, "noise": noise, "seed": options.seed, "quick": options.quick}
+    if about["synthetic"]:
+        with watch.part("reference", "the same orbits by shooting"):
+            results |= against_shooting(found)
+        print(orbit_account(results))
+    with watch.part("estimates", "m and l, k3, and all five, from the paper's start"):
+        identified = pendulum_estimates.identify(found[noise].chained)
+        eigenvalue_fits = {
+            which: pendulum_estimates.with_eigenvalues(identified.selected, names)[1]
+            for which, names in pendulum_estimates.FREE.items()
+        }
+    results |= estimates(about, found[noise], identified, eigenvalue_fits)
+    print(estimate_account(results))
+    with watch.part("ridge", "sampling the posterior of all five with emcee"):
+        ridge = pendulum_ridge.sample(identified, options.seed, options.quick)
+    results["all_five"] = pendulum_ridge.collect(ridge)
+    print(f"  {ridge.posterior.reason}\n{ridge.identifiability}\n{ridge.natural}\n{ridge.combinations}")
+    with watch.part("figures", "drawing"):
+        table = results.get("eigenvalues", {})
+        figures = pendulum_figures.figures(found[noise].section, identified, ridge, table)
+        paths = common.save_figures(options.out, figures)
+    results |= {"seconds": watch.total(), "versions": common.versions()}
+    path = common.write_results(options.out, results)
+    print(f"figures{' (synthetic data)' if about['synthetic'] else ''}: {', '.join(map(str, paths))}\nresults: {path}")
+
+
+def against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
+    """Return what was found without noise, held against shooting, and the eigenvalues at every noise and method."""
+    clean = found[0.0].chained
+    polished = bp.polish_orbits(bp.models.pendulum, clean, pendulum_recording.TRUTH, samples=orbits.SAMPLES)
+    truths, refuted = orbits.references(polished)
+    return {
+        "found_without_noise": {
+            "candidates": len(clean),
+            "polished": len(polished),
+            "rejected": [[orbit.name, reason] for orbit, reason in polished.rejected],
+            "classes": orbits.classes(polished),
+            "classes_wanted": orbits.WANTED_CLASSES,
+            "classes_known": orbits.KNOWN_CLASSES,
+            "states_of_rest": sum(orbit.equilibrium for orbit in polished),
+            "not_confirmed_by_shooting": refuted,
+            "largest_difference_from_shooting": max(truth.off for truth in truths),
+        },
+        "eigenvalues": {
+            f"{noise:g}": {
+                "chained": orbits.eigenvalue_table(one.chained, truths),
+                "boxes": orbits.eigenvalue_table(one.boxes, truths),
+            }
+            for noise, one in found.items()
+        },
+        "error_bars": {
+            f"{noise:g}": {
+                kind: orbits.covered(values)
+                for kind, values in orbits.pulls(one.chained, truths, pendulum_estimates.LARGEST).items()
+            }
+            for noise, one in found.items()
+        },
+    }
+
+
+def estimates(
+    about: Mapping[str, Any], found: Found, identified: Identified, with_eigenvalues: Mapping[str, bp.MapEstimate]
+) -> dict[str, Any]:
+    """Return the estimates, the orbits behind them and those left out."""
+    used = sum(orbit.points.size for orbit in identified.selected)
+    table = {}
+    for which, fit in identified.fits.items():
+        table[which] = {
+            "status": fit.status,
+            "parameters": pendulum_estimates.told(fit, synthetic=about["synthetic"]),
+            "scale": fit.noise["scale"],
+            "sd_with_eigenvalues_over_without": {n: with_eigenvalues[which].sd[n] / fit.sd[n] for n in fit.theta},
+        }
+    return {
+        "candidates": {"chained": len(found.chained), "boxes": len(found.boxes)},
+        "polished": len(identified.polished),
+        "selected": [orbit.name for orbit in identified.selected],
+        "left_out": [[orbit.name, reason] for orbit, reason in identified.selected.rejected],
+        "lost_on_the_way": [list(pair) for pair in identified.lost],
+        "estimates": table,
+        "start_errors": START_ERRORS,
+        "paper_errors": PAPER_ERRORS,
+        "data_reduction": {"numbers_in_the_recording": about["values"], "numbers_used": used},
+    }
+
+
+def orbit_account(results: Mapping[str, Any]) -> str:
+    """Return what was found against what is there, to print."""
+    clean = results["found_without_noise"]
+    lines = [
+        f"  without noise {clean['polished']} orbits of {clean['candidates']} candidates; classes by period "
+        f"{clean['classes']}, wanted {clean['classes_wanted']}",
+        f"  largest difference from shooting {clean['largest_difference_from_shooting']:.1e} rad, not confirmed: "
+        f"{clean['not_confirmed_by_shooting'] or 'none'}",
+        "  unstable eigenvalue, median relative error (orbits/candidates) by period",
+    ]
+    for noise, methods in results["eigenvalues"].items():
+        for method, rows in methods.items():
+            cells = [
+                f"{'–' if r['median_relative_error'] is None else format(r['median_relative_error'], '.2%'):>7s} "
+                f"({r['orbits']}/{r['candidates']})"
+                for r in rows
+            ]
+            lines.append(f"    noise {float(noise):.1%} {method:8s} " + "  ".join(cells))
+    return "\n".join(lines)
+
+
+def estimate_account(results: Mapping[str, Any]) -> str:
+    """Return the estimates as a table to print."""
+    reduction = results["data_reduction"]
+    lines = [
+        f"  {len(results['selected'])} orbits selected of {results['polished']}: of "
+        f"{reduction['numbers_in_the_recording']} numbers in the recording {reduction['numbers_used']} are used"
+    ]
+    for which, row in results["estimates"].items():
+        for name, told in row["parameters"].items():
+            error = f", error {told['relative_error']:+.3%}" if "relative_error" in told else ""
+            paper = f" (paper {PAPER_ERRORS[name]:.1%})" if which != "all five" and name in PAPER_ERRORS else ""
+            lines.append(f"    {which:9s} {name:2s} = {told['value']:.6g} ± {told['sd']:.2g}{error}{paper}")
+    return "\n".join(lines)

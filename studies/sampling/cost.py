@@ -1,0 +1,358 @@
+"""What sampling costs beside its log-posteriors: in a pool of workers, and in one vectorised call on several cores."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+import bayesperiodic as bp
+from bayesperiodic._parallel import available_cores
+from studies.sampling.rows import Row, row, unjudged
+from studies.solver.cost import GEAR, RIG
+
+SAMPLES = 800
+LOG_POSTERIOR, SHORT = 5e-3, 1e-5
+WALKERS, ENSEMBLES, STEPS, PIECE = 4, 2, 250, 25
+POOLS = ("process", "dask")
+POINTS = 64
+LOOP = 5_000_000
+TURNS = 100_000
+PRIOR = bp.Normal(1.0, 1.0)
+POOL_LIMIT, GAIN_LIMIT = 1.05, 0.9
+LEAST_GAIN = 1.5
+QUIET = 0.5
+ONLY_LINUX = "not measurable here: only Linux holds a process on one core"
+
+
+def run_cost(quick: bool) -> dict[str, Any]:
+    """Measure what sampling costs on this machine; a quick run leaves the pools out."""
+    load = [*os.getloadavg()] if hasattr(os, "getloadavg") else None
+    found: dict[str, Any] = {"load_average": load, "cores": available_cores()}
+    found["vectorised"] = vectorised_gain(3 if quick else 15)
+    able = hasattr(os, "sched_setaffinity")
+    found["pools"] = None if quick or not able else pool_overhead()
+    found["without_pools"] = "not measured in a quick run" if quick else "dask is not installed" if able else ONLY_LINUX
+    return found
+
+
+def rows(cost: dict[str, Any]) -> list[Row]:
+    """Return what must show of the costs; where this machine cannot tell, there is no verdict."""
+    result, pools, vectorised = [], cost["pools"], cost["vectorised"]
+    for name in POOLS:
+        what = f"wall time of a pool of one {name} worker over that of one thread"
+        if pools is None or name not in pools["ratios"]:
+            result.append(row(what, None, 0.0, POOL_LIMIT, cost["without_pools"]))
+        else:
+            entry = pools["ratios"][name]
+            result.append(row(what, entry["median"], 0.0, POOL_LIMIT, _quartiles(entry["quartiles"])))
+    for drive in ("force", "displacement"):
+        entry = vectorised[drive]
+        what = f"gain of {vectorised['cores']} cores on a vectorised call over that of a plain loop, {drive}-driven"
+        gain, plain = row(what, entry["ratio"], GAIN_LIMIT, None, _quartiles(entry["ratio_quartiles"])), entry["plain"]
+        if plain < LEAST_GAIN:
+            gain = unjudged(gain, f"not measurable on this machine or under this load: a plain loop gains {plain:.2f}")
+        result.append(gain)
+    return result
+
+
+def _quartiles(pair: list[float]) -> str:
+    return f"quartiles {pair[0]:.3f} … {pair[1]:.3f}"
+
+
+def loaded(cost: dict[str, Any]) -> str:
+    """Return a note if others were using the machine when the measurements began, nothing otherwise."""
+    load = cost["load_average"]
+    if load is None or load[0] <= QUIET * cost["cores"]:
+        return ""
+    return f"the machine was busy (load {load[0]:.1f} on {cost['cores']} cores): times are not for quoting"
+
+
+def gear_problem(drive: str) -> bp.Problem:
+    """Return the problem of theta4, theta6 and theta16 of the landing gear with the 14 experiments of `RIG`.
+
+    They are synthetic, with noise of 0.3 % of the range; `drive` is "force" or "displacement".
+    """
+    model, samples = bp.models.landing_gear(drive), SAMPLES
+    wave = np.cos(2 * np.pi * np.arange(samples) / samples)
+    generator, experiments = np.random.default_rng(4), []
+    for frequency, force, stroke in RIG:
+        inputs = {drive: 4500.0 + force * wave if drive == "force" else 0.12 + stroke * wave}
+        truth = bp.solve_periodic(model, GEAR, inputs, frequency=frequency, samples=samples)
+        outputs = {name: y + 3e-3 * np.ptp(y) * generator.standard_normal(samples) for name, y in truth.outputs.items()}
+        run = bp.Experiment(f"{frequency} Hz", frequency, outputs, inputs, samples=samples, synthetic=True)
+        experiments.append(run)
+    priors = {
+        "theta4": bp.LogNormal(GEAR["theta4"], 1.0),
+        "theta6": bp.Normal(GEAR["theta6"], 2.5),
+        "theta16": bp.Normal(GEAR["theta16"], 4.0),
+    }
+    tied = {"theta11": "-1e5*theta4"}
+    fixed = {name: value for name, value in GEAR.items() if name not in (*priors, *tied)}
+    return bp.Problem(model, experiments, priors=priors, fixed=fixed, tied=tied)
+
+
+def estimate(problem: bp.Problem) -> bp.MapEstimate:
+    """Return the MAP estimate of a landing-gear problem, started from the truth."""
+    return bp.map_estimate(problem, start={name: GEAR[name] for name in problem.names}, progress=False)
+
+
+class Pool(NamedTuple):
+    """An executor with one worker held on a core.
+
+    Attributes
+    ----------
+    executor : object
+        None for a thread of this process.
+    clock : callable
+        Returns the processor time [s] that the worker has used.
+    """
+
+    executor: Any
+    clock: Callable[[], float]
+
+
+def pool_overhead(repeats: int = 3, pools: tuple[str, ...] = POOLS, seconds: float = LOG_POSTERIOR) -> dict[str, Any]:
+    """Compare a sampling run on one thread with the same run handed to one worker, log-posteriors taking 5 ms.
+
+    Both compute on the same core, the worker while this process waits on another one: then neither the cores' speeds
+    nor what else runs on them tells the two apart. Runs alternate, thread, processes, thread, Dask, thread, and so on,
+    and each is compared with the mean of its two neighbours. The workers have done a short run before, as starting
+    processes takes seconds whatever the length of a run. A piece, which is what a message carries, is 4 walkers × 25
+    steps, an eighth of what the default walkers make it, so that the overhead of a default run is smaller.
+
+    Parameters
+    ----------
+    repeats : int
+        Of each pool, 20 s each.
+    pools : tuple of str
+        "process", "dask"; the latter is left out where it is not installed.
+    seconds : float
+        What a log-posterior shall take.
+
+    Returns
+    -------
+    dict
+        "ratios" by pool: "median" and "quartiles" of wall times over those of the thread, and the median ratio of
+        "processor_time", this process and the worker together, which other load changes little; "milliseconds" a
+        log-posterior takes in the thread, by the wall clock and the processor's; "walkers"; "log_posteriors" a run and
+        a piece.
+    """
+    kinds = [name for name in pools if name != "dask" or importlib.util.find_spec("distributed")]
+    core, *others = sorted(os.sched_getaffinity(0))
+    with _only_on({core}):
+        problem, fit = slow_problem(seconds)
+    times: dict[str, list[np.ndarray]] = {name: [] for name in ("thread", *kinds)}
+    with ExitStack() as stack:
+        workers = {"thread": Pool(None, float)} | {name: stack.enter_context(_POOLS[name](core)) for name in kinds}
+        for name in kinds:
+            _timed_run(*slow_problem(SHORT), workers[name], core, others)
+        order = ["thread", *(name for _ in range(repeats) for kind in kinds for name in (kind, "thread"))]
+        chains = {}
+        for name in order:
+            used, chains[name] = _timed_run(problem, fit, workers[name], core, others)
+            times[name].append(used)
+    reference = chains["thread"].draws("k")
+    for name, chain in chains.items():
+        if not np.array_equal(chain.draws("k"), reference):
+            raise RuntimeError(f"The chain of {name!r} is not that of the thread.")
+    thread = np.array(times["thread"])
+    between = 0.5 * (thread[1:] + thread[:-1])
+    count = chains["thread"].log_posterior_calls
+    wall, processor = np.median(thread, axis=0) / count * 1e3
+    ratios = {name: np.array(times[name]) / between[i :: len(kinds)] for i, name in enumerate(kinds)}
+    return {
+        "ratios": {
+            name: {
+                "median": float(np.median(values[:, 0])),
+                "quartiles": np.quantile(values[:, 0], [0.25, 0.75]).tolist(),
+                "processor_time": float(np.median(values[:, 1])),
+            }
+            for name, values in ratios.items()
+        },
+        "milliseconds": {"wall": float(wall), "processor": float(processor)},
+        "walkers": WALKERS,
+        "log_posteriors": {"run": count, "piece": WALKERS * PIECE},
+    }
+
+
+def _timed_run(
+    problem: bp.Problem, fit: bp.MapEstimate, pool: Pool, core: int, others: list[int]
+) -> tuple[np.ndarray, bp.Posterior]:
+    """Return wall and processor seconds of a run, this process waiting on another core where a worker computes."""
+    with _only_on({core} if pool.executor is None or not others else {others[0]}):
+        before = time.perf_counter(), time.process_time() + pool.clock()
+        posterior = bp.sample(
+            problem, fit, seed=1, variances="collapsed", executor=pool.executor, ensembles=ENSEMBLES, walkers=WALKERS,
+            max_steps=STEPS, progress=False,
+        )  # fmt: skip
+        after = time.perf_counter(), time.process_time() + pool.clock()
+    return np.subtract(after, before), posterior
+
+
+@contextmanager
+def _process_pool(core: int) -> Iterator[Pool]:
+    with ProcessPoolExecutor(1, get_context("spawn"), _stay_on, (core,)) as pool:
+        yield Pool(pool, lambda: pool.submit(time.process_time).result())
+
+
+@contextmanager
+def _dask_pool(core: int) -> Iterator[Pool]:
+    from distributed import Client, LocalCluster
+
+    with (
+        # A worker that is told to end while it sends a heartbeat says so at length.
+        LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        client.run(_stay_on, core)
+        yield Pool(client, lambda: sum(client.run(time.process_time).values()))
+
+
+_POOLS = {"process": _process_pool, "dask": _dask_pool}
+
+
+def _stay_on(core: int) -> None:
+    """Hold all threads of this process, and those that they start, on one core."""
+    for thread in Path("/proc/self/task").iterdir():
+        os.sched_setaffinity(int(thread.name), {core})
+
+
+@contextmanager
+def _only_on(cores: set[int]) -> Iterator[None]:
+    """Hold this thread, and those that it starts, on some cores."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+@dataclass(frozen=True)
+class SlowPrior:
+    """A normal prior, N(1, 1), that takes a plain loop of so many turns for every value: what a hard model would take.
+
+    With a model that is quick to solve, nothing else takes time in a run, before the walk or after it.
+    """
+
+    turns: int
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """The interval outside of which the density is zero."""
+        return PRIOR.support
+
+    def log_prob(self, x: Any) -> Any:
+        """Return the log-density, after the loop."""
+        _loop(self.turns * np.size(x))
+        return PRIOR.log_prob(x)
+
+    def gradient(self, x: Any) -> Any:
+        """Return the derivative of the log-density."""
+        return PRIOR.gradient(x)
+
+    def curvature(self, x: Any) -> Any:
+        """Return minus its second derivative."""
+        return PRIOR.curvature(x)
+
+    def quantile(self, p: Any) -> Any:
+        """Return quantiles."""
+        return PRIOR.quantile(p)
+
+    def sample(self, size: int, generator: np.random.Generator) -> np.ndarray:
+        """Return independent draws, (size,)."""
+        return PRIOR.sample(size, generator)
+
+
+def slow_problem(seconds: float) -> tuple[bp.Problem, bp.MapEstimate]:
+    """Return a problem of the Duffing oscillator of which a log-posterior takes so many seconds on one core."""
+    _loop(10)
+    turn = min(_seconds(partial(_loop, TURNS), 1, time.thread_time) for _ in range(10)) / TURNS
+    values, samples = {"m": 1.0, "c": 0.5, "k": 1.0, "k3": 0.1}, 40
+    force = {"force": np.cos(2 * np.pi * np.arange(samples) / samples)}
+    truth = bp.solve_periodic(bp.models.duffing, values, force, frequency=0.1, samples=samples, scheme="fourier")
+    noise = 0.05 * np.random.default_rng(4).standard_normal(samples)
+    outputs = {"displacement": truth.outputs["displacement"] + noise}
+    run = bp.Experiment("run", 0.1, outputs, force, samples=samples, synthetic=True)
+    fixed = {name: value for name, value in values.items() if name != "k"}
+    prior = SlowPrior(round(seconds / turn))
+    problem = bp.Problem(bp.models.duffing, [run], priors={"k": prior}, fixed=fixed, scheme="fourier")
+    return problem, bp.map_estimate(problem, progress=False)
+
+
+def vectorised_gain(repeats: int = 15) -> dict[str, Any]:
+    """Compare what all cores gain on one call of 64 walkers × 14 experiments with what they gain on a plain loop.
+
+    The call is `Problem.log_likelihood`, on one thread and on as many as there are cores; the plain loop is compiled,
+    needs no memory, and runs once a core. All four are timed in turn within every repeat.
+
+    Returns
+    -------
+    dict
+        "cores", and by drive: "gain" of the call, "plain" (gain of the plain loop), "ratio" (median of their ratios),
+        "ratio_quartiles", "milliseconds" on one core.
+    """
+    cores, result = available_cores(), {}
+    with ThreadPoolExecutor(cores) as pool:
+        list(pool.map(_loop, [10] * cores))
+        for drive in ("force", "displacement"):
+            problem = gear_problem(drive)
+            fit = estimate(problem)
+            anchored, noise = problem.anchored(fit.theta), np.array(list(fit.noise.values()))
+            theta = _draws(fit, POINTS)
+            actions: dict[str, Callable[[], Any]] = {
+                "one": lambda: anchored.log_likelihood(theta, noise, 1),  # noqa: B023
+                "many": lambda: anchored.log_likelihood(theta, noise, cores),  # noqa: B023
+                "loop_one": lambda: [_loop(LOOP) for _ in range(cores)],
+                "loop_many": lambda: list(pool.map(_loop, [LOOP] * cores)),
+            }
+            rounds = [{name: _seconds(action, 1) for name, action in actions.items()} for _ in range(repeats + 1)][1:]
+            times = {name: np.array([one[name] for one in rounds]) for name in actions}
+            gains, plain = times["one"] / times["many"], times["loop_one"] / times["loop_many"]
+            result[drive] = {
+                "gain": float(np.median(gains)),
+                "plain": float(np.median(plain)),
+                "ratio": float(np.median(gains / plain)),
+                "ratio_quartiles": np.quantile(gains / plain, [0.25, 0.75]).tolist(),
+                "milliseconds": float(np.median(times["one"])) * 1e3,
+            }
+    return {"cores": cores, "walkers": POINTS, "experiments": len(RIG), **result}
+
+
+def _draws(fit: bp.MapEstimate, size: int) -> np.ndarray:
+    """Return θ (size, names) around an estimate, scattered by its standard deviations."""
+    mean, sd = np.array(list(fit.theta.values())), np.array(list(fit.sd.values()))
+    return mean + sd * np.random.default_rng(5).standard_normal((size, mean.size))
+
+
+def _seconds(action: Callable[[], Any], calls: int, clock: Callable[[], float] = time.perf_counter) -> float:
+    """Return the median time of a call."""
+    times = []
+    for _ in range(calls):
+        before = clock()
+        action()
+        times.append(clock() - before)
+    return float(np.median(times))
+
+
+@numba.njit(nogil=True)
+def _loop(count: int) -> float:
+    total = 0.0
+    for k in range(count):
+        total += 1.0 / (1.0 + k * total)
+    return total

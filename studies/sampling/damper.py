@@ -1,0 +1,168 @@
+"""Three ways to sample the damper's posterior: emcee, emcee with the variance integrated out, and NUTS by gradients."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import time
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+import bayesperiodic as bp
+from studies.damper import run as damper
+from studies.sampling.batches import BATCHES, standard_error
+from studies.sampling.rows import Row, row, unjudged
+
+SAMPLERS: dict[str, dict[str, Any]] = {
+    "emcee": {},
+    "emcee, collapsed": {"variances": "collapsed"},
+    "NUTS": {"sampler": "nuts"},
+}
+FALSE_ALARM = 0.01
+MISSING = 'nutpie is not installed (pip install "bayesperiodic[nuts]")'
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """The damper's posterior by several samplers.
+
+    Attributes
+    ----------
+    problem : Problem
+    data : dict
+        Path, digest and whether synthetic.
+    posteriors : dict of str to Posterior
+        By name of the sampler.
+    seconds : dict of str to float
+    """
+
+    problem: bp.Problem
+    data: dict[str, Any]
+    posteriors: dict[str, bp.Posterior]
+    seconds: dict[str, float]
+
+
+def sample_damper(options: argparse.Namespace) -> Sampled:
+    """Sample the damper with every sampler that is installed."""
+    recording, data = damper.read_recording(options.data, options.seed)
+    problem = bp.Problem(bp.models.dahl, [recording.fold()], priors=damper.PRIORS)
+    fit = bp.map_estimate(problem, progress=False)
+    posteriors, seconds = {}, {}
+    for name, settings in SAMPLERS.items():
+        if name == "NUTS" and importlib.util.find_spec("nutpie") is None:
+            continue
+        shorter: dict[str, Any] = {"max_steps": 250, "ensembles": 2} if options.quick else {}
+        before = time.perf_counter()
+        posteriors[name] = bp.sample(problem, fit, seed=options.seed, progress=False, **shorter, **settings)
+        seconds[name] = time.perf_counter() - before
+        print(f"  {name}: {posteriors[name].reason}, {seconds[name]:.0f} s")
+    return Sampled(problem, data, posteriors, seconds)
+
+
+def moments(posterior: bp.Posterior) -> dict[str, dict[str, float]]:
+    """Return mean and sd of every quantity with their Monte Carlo errors.
+
+    What a draw contributes to the sd is, to first order, ((x − mean)² − sd²)/(2 sd).
+    """
+    found = {}
+    for name in posterior.names:
+        values = posterior.draws(name)
+        mean, sd = float(values.mean()), float(values.std())
+        found[name] = {
+            "mean": mean,
+            "sd": sd,
+            "mean_error": standard_error(posterior, values),
+            "sd_error": standard_error(posterior, (values - mean) ** 2 / (2.0 * sd)),
+        }
+    return found
+
+
+def compare_all(posteriors: dict[str, bp.Posterior]) -> list[dict[str, Any]]:
+    """Return every difference of two samplers in a mean or sd, over the combined Monte Carlo error."""
+    tables = {name: moments(posterior) for name, posterior in posteriors.items()}
+    return [
+        {
+            "samplers": [one, other],
+            "quantity": f"{kind} of {name}",
+            "errors": abs(tables[one][name][kind] - tables[other][name][kind])
+            / float(np.hypot(tables[one][name][f"{kind}_error"], tables[other][name][f"{kind}_error"])),
+        }
+        for one, other in combinations(tables, 2)
+        for name in tables[one]
+        for kind in ("mean", "sd")
+    ]
+
+
+def limit(count: int, ensembles: int) -> float:
+    """Return what the largest of so many differences exceeds with a probability of at most 1 % (Bonferroni).
+
+    Each is Student's t; its degrees of freedom are at least those of one sampler's error, one less than it has batches.
+    """
+    return float(stats.t.isf(0.5 * FALSE_ALARM / count, ensembles * BATCHES - 1))
+
+
+def collect(sampled: Sampled) -> dict[str, Any]:
+    """Return what results.json tells about the damper."""
+    differences = compare_all(sampled.posteriors)
+    ensembles = [np.unique(p.data["posterior"]["ensemble"]).size for p in sampled.posteriors.values()]
+    return {
+        "data": sampled.data,
+        "units": {name: bp.models.dahl.units[name] for name in sampled.problem.names} | {"variance[force]": "N²"},
+        "samplers": {name: _account(p, sampled.seconds[name]) for name, p in sampled.posteriors.items()},
+        "differences": differences,
+        "limit": limit(len(differences), min(ensembles)),
+        "false_alarm_rate": FALSE_ALARM,
+    }
+
+
+def _account(posterior: bp.Posterior, seconds: float) -> dict[str, Any]:
+    smallest = min(posterior.ess.values())
+    return {
+        "converged": posterior.converged,
+        "reason": posterior.reason,
+        "moments": moments(posterior),
+        "ess_min": smallest,
+        "rhat_max": max(posterior.rhat.values()),
+        "log_posteriors": posterior.log_posterior_calls,
+        "seconds": seconds,
+        "ess_per_second": smallest / seconds,
+        "ess_per_1000_log_posteriors": 1e3 * smallest / posterior.log_posterior_calls,
+    }
+
+
+def rows(found: dict[str, Any], quick: bool) -> list[Row]:
+    """Return what must show on the damper: agreement of the samplers in pairs, and convergence unless `quick`."""
+    kind = "damper, synthetic" if found["data"]["synthetic"] else "damper"
+    result = []
+    for name in SAMPLERS:
+        entry = found["samplers"].get(name)
+        what = f"{kind}, {name}: called converged (1: yes)"
+        if entry is None:
+            result.append(row(what, None, 1.0, 1.0, MISSING))
+        else:
+            judged = row(what, entry["converged"], 1.0, 1.0, "" if entry["converged"] else entry["reason"])
+            result.append(unjudged(judged, f"a quick run: {entry['reason']}") if quick else judged)
+    for one, other in combinations(SAMPLERS, 2):
+        pair = [d for d in found["differences"] if d["samplers"] == [one, other]]
+        worst = max(pair, key=lambda d: d["errors"], default=None)
+        what = f"{kind}, {one} against {other}: largest difference over its Monte Carlo error"
+        note = MISSING if worst is None else f"largest in the {worst['quantity']}"
+        result.append(row(what, None if worst is None else worst["errors"], 0.0, found["limit"], note))
+    return result
+
+
+def table(found: dict[str, Any]) -> str:
+    """Return the samplers' costs as text."""
+    import pandas as pd
+
+    columns = {
+        "steps": "reason", "ESS, smallest": "ess_min", "log-posteriors": "log_posteriors", "seconds": "seconds",
+        "ESS/s": "ess_per_second", "ESS per 1000 log-posteriors": "ess_per_1000_log_posteriors",
+    }  # fmt: skip
+    return pd.DataFrame(
+        {name: {title: entry[key] for title, key in columns.items()} for name, entry in found["samplers"].items()}
+    ).T.to_string(float_format="{:.4g}".format)

@@ -1,0 +1,176 @@
+"""The ridge a·b = 1 ± 2 %, known by quadrature, on which samplers fool themselves.
+
+With b integrated out in closed form the density of a is known but for its scale. Two priors: N(1, 1) for a and b, cut
+at zero, and uncut, which leaves 1.2 % of the mass on a second branch where both are negative.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.special import log_ndtr
+
+import bayesperiodic as bp
+from studies.sampling.batches import standard_error
+from studies.sampling.rows import Row, row
+
+WIDTH = 0.02
+POINTS = 20
+SHORT, LONG = 1500, 5000
+UNCUT = {"uncut": "laplace", "uncut_prior": "prior"}
+LARGEST = 8.0
+CELLS = 400_000
+# A normal value lies beyond four of its standard errors once in 16,000 times.
+ERRORS = 4.0
+
+
+@dataclass(frozen=True)
+class Ridge:
+    """What was sampled on the ridge, and the truth.
+
+    Attributes
+    ----------
+    default, natural : Posterior
+        Priors cut at zero: the default settings, and a short chain in natural coordinates.
+    uncut, uncut_prior : Posterior
+        Priors over both signs: the default settings but for fewer steps at most, and as many from draws of the priors,
+        which lie on both branches.
+    seconds : dict of str to float
+        Of the four, by name.
+    """
+
+    default: bp.Posterior
+    natural: bp.Posterior
+    uncut: bp.Posterior
+    uncut_prior: bp.Posterior
+    seconds: dict[str, float]
+
+
+def sample_ridge(seed: int, quick: bool) -> Ridge:
+    """Sample both ridges; a quick run gives the uncut one few steps, and the natural chain a third."""
+    cut = bp.TruncatedNormal(1.0, 1.0, 0.0, np.inf)
+    positive, both = _problem(cut), _problem(bp.Normal(1.0, 1.0))
+    fits = [bp.map_estimate(problem, progress=False) for problem in (positive, both)]
+    few = {"max_steps": 250, "ensembles": 2}
+    runs: dict[str, tuple[bp.Problem, bp.MapEstimate, dict[str, Any]]] = {
+        "default": (positive, fits[0], {}),
+        "natural": (positive, fits[0], {"coordinates": "natural", "max_steps": 500 if quick else SHORT}),
+        "uncut": (both, fits[1], few if quick else {"max_steps": LONG}),
+        "uncut_prior": (both, fits[1], {"start": "prior"} | (few if quick else {"max_steps": LONG})),
+    }
+    found, seconds = {}, {}
+    for name, (problem, fit, settings) in runs.items():
+        before = time.perf_counter()
+        found[name] = bp.sample(problem, fit, seed=seed, progress=False, **settings)
+        seconds[name] = time.perf_counter() - before
+        print(f"  {name}: sd(a) = {found[name].draws('a').std():.4f}; {found[name].reason}")
+    return Ridge(**found, seconds=seconds)
+
+
+def _problem(prior: Any) -> bp.Problem:
+    """Return the problem of two factors of which the product is measured, the mean square of x being 1."""
+    model = bp.Model(
+        "ridge",
+        states=["w"],
+        inputs=["x"],
+        parameters=["a", "b"],
+        equations=lambda s, p, u: [s.dw + s.w - u.x],
+        outputs=lambda s, p, u: {"product": p.a * p.b * u.x},
+    )
+    tau = np.arange(POINTS) / POINTS
+    x = np.sqrt(2.0) * np.sin(2 * np.pi * tau)
+    # A second harmonic, which the model has not got, makes the residual finite.
+    outputs = {"product": x + 1e-3 * np.sin(4 * np.pi * tau)}
+    run = bp.Experiment("run", 1.0, outputs, {"x": x}, samples=POINTS, synthetic=True)
+    known = {"variance[product]": POINTS * WIDTH**2}
+    return bp.Problem(model, [run], priors={"a": prior, "b": prior}, fixed=known)
+
+
+def marginal(*, cut: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return a on a grid and its posterior density.
+
+    The integral over b is that of a normal density with precision 1 + a²/s², s the width of the ridge, over b > 0 where
+    the priors are cut, and over all b where they are not.
+    """
+    step = 2 * LARGEST / CELLS
+    a = -LARGEST + step * (np.arange(CELLS) + 0.5)
+    precision = 1.0 + (a / WIDTH) ** 2
+    mean = (1.0 + a / WIDTH**2) / precision
+    # −½ (1 + 1/s² − mean²·precision), without the difference of large numbers.
+    log = -0.5 * (a - 1.0) ** 2 - 0.5 * ((a - 1.0) / WIDTH) ** 2 / precision - 0.5 * np.log(precision)
+    if cut:
+        log = np.where(a > 0.0, log + log_ndtr(mean * np.sqrt(precision)), -np.inf)
+    density = np.exp(log - log.max())
+    return a, density / (density.sum() * step)
+
+
+def spread(*, cut: bool) -> float:
+    """Return the standard deviation of a, by quadrature."""
+    a, density = marginal(cut=cut)
+    weight = density / density.sum()
+    return float(np.sqrt(np.sum(weight * (a - np.sum(weight * a)) ** 2)))
+
+
+def negative_mass() -> float:
+    """Return the posterior mass of the uncut ridge where both factors are negative, by quadrature."""
+    a, density = marginal(cut=False)
+    return float(density[a < 0.0].sum() / density.sum())
+
+
+def collect(ridge: Ridge) -> dict[str, Any]:
+    """Return what results.json tells about the ridge."""
+    table: dict[str, Any] = {"width": WIDTH, "sd_by_quadrature": {"cut": spread(cut=True), "uncut": spread(cut=False)}}
+    for name in ("default", "natural", *UNCUT):
+        posterior: bp.Posterior = getattr(ridge, name)
+        table[name] = {
+            "sd": float(posterior.draws("a").std()),
+            "converged": posterior.converged,
+            "reason": posterior.reason,
+            "tau": posterior.tau,
+            "ess": posterior.ess,
+            "rhat": posterior.rhat,
+            "log_posteriors": posterior.log_posterior_calls,
+            "seconds": ridge.seconds[name],
+        }
+    for name in UNCUT:
+        table[name]["negative_mass"] = _negative_share(getattr(ridge, name))
+    return table
+
+
+def _negative_share(posterior: bp.Posterior) -> dict[str, float]:
+    """Return the fraction of draws on the second branch and its Monte Carlo error.
+
+    Where all draws have the same sign, the error is the one that so many independent draws would have.
+    """
+    negative, truth = (posterior.draws("a") < 0.0).astype(float), negative_mass()
+    error = standard_error(posterior, negative)
+    if np.ptp(negative) == 0.0:
+        error = float(np.sqrt(truth * (1.0 - truth) / posterior.ess["a"]))
+    return {"by_quadrature": truth, "found": float(negative.mean()), "monte_carlo_error": error}
+
+
+def rows(found: dict[str, Any]) -> list[Row]:
+    """Return what must show on the ridge."""
+    default, natural = found["default"], found["natural"]
+    ratio = default["sd"] / found["sd_by_quadrature"]["cut"]
+    return [
+        row("ridge, sd(a) by quadrature, cut", found["sd_by_quadrature"]["cut"], 0.5945, 0.5955),
+        row("ridge, sd(a) by quadrature, uncut", found["sd_by_quadrature"]["uncut"], 0.6405, 0.6415),
+        row("ridge, default: sd(a) over that by quadrature", ratio, 0.97, 1.03),
+        row("ridge, default: called converged (1: yes)", default["converged"], 1.0, 1.0),
+        row("ridge, default: largest tau [steps]", max(default["tau"].values()), 0.0, 40.0),
+        row("ridge, natural, short: called converged (1: yes)", natural["converged"], 0.0, 0.0, natural["reason"]),
+        *(_second_branch(found[name], start) for name, start in UNCUT.items()),
+    ]
+
+
+def _second_branch(uncut: dict[str, Any], start: str) -> Row:
+    mass = uncut["negative_mass"]
+    off = abs(mass["found"] - mass["by_quadrature"]) / mass["monte_carlo_error"]
+    what = f"ridge, uncut, start={start!r}: mass of the second branch, off by Monte Carlo errors"
+    note = f"found {mass['found']:.2%}, true {mass['by_quadrature']:.2%}; {uncut['reason']}"
+    result = row(what, off, 0.0, ERRORS, note)
+    return result if uncut["converged"] else result | {"met": True, "note": f"not called converged: {note}"}

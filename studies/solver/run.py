@@ -1,0 +1,584 @@
+"""The periodic solver against independent references: orders, unstable and rotating orbits, branches with their folds.
+
+Nothing is measured here; all is computed from the models' equations. The references come from multiple shooting and
+Taylor series that share nothing with the package; tests/shooting.py computes them and says how far they are to be
+trusted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+import bayesperiodic as bp
+from studies import common
+
+SCHEMES = {"backward2": "#D55E00", "central2": "#E69F00", "central4": "#009E73", "fourier": "#0072B2"}
+LINES = {"central2": "--", "central4": "-", "backward2": ":", "fourier": "-."}
+TURN = 2 * np.pi
+
+DUFFING = {"m": 0.45, "c": 1.3, "k": 900.0, "k3": 4e5}
+SMOOTH = {"force": 30.0, "frequency": 6.0}
+MANUFACTURED_FREQUENCY = 5.0
+GRIDS = (50, 100, 200, 400, 800, 1600, 3200)
+FOURIER_GRIDS = (8, 12, 16, 20, 24, 32, 48, 64)
+FITTED = (200, 400, 800)
+LEVELS = (0.5, 1.5, 3.0)
+SWEEP = (5.0, 12.0)
+
+# Periods for omega = 1 rad/s, from a Taylor series of order 40 with 36 digits.
+VAN_DER_POL = {
+    0.1: 6.287111272288727,
+    0.5: 6.380675801773584,
+    1.0: 6.663286859323130,
+    2.0: 7.629874479674842,
+    3.0: 8.859095499719917,
+    5.0: 11.61223066771957,
+}
+SHOWN = {1.0: "o", 5.0: "s"}
+
+PENDULUM = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
+LOCKED, CHAOTIC, LOWEST = 13.0, 9.09, 4.5
+INTEGRATED = (12.6, 12.2, 11.2, 10.4, 9.8, 9.7, 9.57, 9.5, 9.434, 9.39)
+# Angular frequencies [rad/s] where a multiplier passes −1 on the branches of periods 1, 2 and 4, and on that of
+# period 1 far below, where it then turns in a fold; multiple shooting.
+DOUBLINGS = {1: 11.777800948492088, 2: 9.626472743642093, 4: 9.452278937446584}
+LOW_DOUBLING, LOW_FOLD = 4.938500543025602, 4.915146579405625
+# Floquet multipliers at 9.09 rad/s, multiple shooting: the two rotations of period 1, then what the branches of periods
+# 1, 2 and 4 have become.
+ROTATIONS = {"first": (-1.70590040864403, -0.3021074360814437), "second": (11.119076795981467, 0.04634963928408056)}
+BRANCHES = {
+    1: ROTATIONS["first"],
+    2: (-2.609047713053087, -0.10180008846405883),
+    4: (-7.068828572869245, -0.009979594703394542),
+}
+# Prime orbits at 9.09 rad/s, multiple shooting: winding number, multipliers, and (φ [rad], φ' [rad/s]) at tau = 0, 1, …
+# rounded, which is enough for a guess.
+Known = tuple[int, tuple[float, float], list[tuple[float, float]]]
+ORBITS: list[Known] = [
+    (2, (-941.3743340323356, -0.0002725575285283573), [(-2.74532, 4.29605), (2.91341, 2.89434), (5.92453, 11.68171)]),
+    (1, (-122.77506891268857, -0.0018950249029012344), [(1.30178, -0.76224), (-2.25737, 2.35324), (3.16479, 4.10531)]),
+    (0, (1074.3035032595035, 0.0002971684531551172), [(-2.71145, 2.95416), (2.06522, -1.31187), (-2.84988, -1.97254)]),
+    (1, (15933.586725656596, 3.014061474872196e-05), [(-2.63377, 3.57527), (2.82581, 2.29399), (3.14683, 0.13266)]),
+    (
+        3,
+        (-227.9016230370968, -0.0003245737304103312),
+        [(1.05880, 0.73544), (-1.42209, 5.36060), (4.37714, 10.66914), (13.11889, 13.34969), (15.90176, 2.30858)],
+    ),
+    (
+        -2,
+        (-419.523599424354, -0.00021747828172510988),
+        [(1.59966, -11.62990), (-6.76177, -13.11434), (-9.24136, 0.32008), (-6.19921, 10.01200), (-5.27641, -9.24868)],
+    ),
+    (
+        1,
+        (1617.961583244552, 5.9566759827580105e-05),
+        [(1.32493, -0.97443), (-2.37435, 1.72195), (2.40979, -0.18801), (-1.47794, 2.38242), (3.23115, 3.71306)],
+    ),
+    (
+        0,
+        (9098.815454703239, 1.1977681555073508e-05),
+        [(2.99016, -4.59147), (-2.00942, 1.22892), (2.87480, 2.07023), (3.53493, 2.87145), (8.16254, -1.77568)],
+    ),
+]
+
+
+def run(options: argparse.Namespace) -> None:
+    """Run the study."""
+    from studies.solver import cost  # compiles
+
+    watch = common.Stopwatch()
+    quick = options.quick
+    results: dict[str, Any] = {"data": "none; everything is computed", "quick": quick}
+    with watch.part("orders", "errors of every scheme on smooth forced Duffing"):
+        results["orders"] = measure_orders()
+    with watch.part("van_der_pol", "periods of van der Pol's oscillator"):
+        results["van_der_pol"] = measure_periods((0.1, *SHOWN) if quick else tuple(VAN_DER_POL))
+    with watch.part("duffing", "frequency responses of the Duffing oscillator"):
+        responses, results["duffing"] = follow_duffing(quick)
+    with watch.part("pendulum", f"the pendulum from {LOCKED:g} down to {CHAOTIC:g} rad/s"):
+        route, results["pendulum"] = follow_pendulum(quick)
+    with watch.part("orbits", f"unstable orbits of periods 3 and 5 at {CHAOTIC:g} rad/s"):
+        results["orbits"] = measure_orbits(ORBITS[1::4] if quick else ORBITS)
+    with watch.part("cost", "what a solve costs, side by side with LAPACK"):
+        results["cost"] = cost.run_cost(quick)
+    with watch.part("time_integration", "the pendulum integrated in time, for the figure"):
+        attractor = integrate_down(INTEGRATED[2:3] if quick else INTEGRATED)
+    with watch.part("figures", "drawing"):
+        figures = {
+            "duffing": draw_duffing(responses),
+            "pendulum": draw_pendulum(route, attractor),
+            "orders": draw_orders(results["orders"]["forced"], results["van_der_pol"]),
+        }
+        paths = common.save_figures(options.out, figures)
+    results["checks"] = checks(results)
+    results["cost"]["checks"] = [verdict(*row) for row in cost.checks(results["cost"])]
+    print("\n" + tables(results) + "\n")
+    path = common.write_results(options.out, results | {"seconds": watch.total(), "versions": common.versions()})
+    print(f"figures: {', '.join(map(str, paths))}\nresults: {path}")
+
+
+def measure_orders() -> dict[str, Any]:
+    """Return errors and fitted orders on forced Duffing, the reference a fine solution, and on an exact solution."""
+    fine = solve_duffing("fourier", harmonic_force(128), SMOOTH["frequency"])
+    again = solve_duffing("fourier", harmonic_force(96), SMOOTH["frequency"])
+    forced, manufactured = {}, {}
+    for scheme in SCHEMES:
+        grids = FOURIER_GRIDS if scheme == "fourier" else GRIDS
+        solutions = {n: solve_duffing(scheme, harmonic_force(n), SMOOTH["frequency"]) for n in grids}
+        forced[scheme] = convergence(solutions, {n: resampled(fine.states["x"], n) for n in grids})
+        exact = {n: manufactured_solution(n) for n in grids}
+        solutions = {n: solve_duffing(scheme, f, MANUFACTURED_FREQUENCY, 1.01 * x) for n, (x, f) in exact.items()}
+        manufactured[scheme] = convergence(solutions, {n: x for n, (x, _) in exact.items()})
+    return {
+        "forced": forced,
+        "manufactured": manufactured,
+        "fitted_at": list(FITTED),
+        "reference": "fourier with 128 points; error relative to the largest displacement",
+        "reference_error": relative_error(again.states["x"], resampled(fine.states["x"], 96)),
+    }
+
+
+def harmonic_force(samples: int) -> np.ndarray:
+    """Return the force [N] of the study of orders on a grid."""
+    return SMOOTH["force"] * np.cos(TURN * np.arange(samples) / samples)
+
+
+def manufactured_solution(samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return x = 0.02 cos ωt + 0.006 sin(2ωt + 0.4) [m] and the force that makes it an exact solution of Duffing's."""
+    angle, omega = TURN * np.arange(samples) / samples, TURN * MANUFACTURED_FREQUENCY
+    first, second = 0.02 * np.exp(1j * angle), -0.006j * np.exp(1j * (2 * angle + 0.4))
+    x, v = (first + second).real, (1j * omega * (first + 2 * second)).real
+    a = (-(omega**2) * (first + 4 * second)).real
+    return x, DUFFING["m"] * a + DUFFING["c"] * v + DUFFING["k"] * x + DUFFING["k3"] * x**3
+
+
+def solve_duffing(
+    scheme: str, force: np.ndarray, frequency: float, guess: np.ndarray | None = None
+) -> bp.PeriodicSolution:
+    """Return a solution on the grid of the force."""
+    return bp.solve_periodic(
+        bp.models.duffing,
+        DUFFING,
+        {"force": force},
+        frequency=frequency,
+        samples=len(force),
+        scheme=scheme,
+        guess="static" if guess is None else {"x": guess},
+    )
+
+
+def convergence(solutions: dict[int, bp.PeriodicSolution], exact: dict[int, np.ndarray]) -> dict[str, Any]:
+    """Return errors of x by number of points and the order fitted to them."""
+    errors = {n: relative_error(s.states["x"], exact[n]) for n, s in solutions.items() if s.converged}
+    fitted = [n for n in FITTED if n in errors]
+    slope = np.polyfit(np.log(fitted), np.log([errors[n] for n in fitted]), 1)[0] if len(fitted) > 1 else None
+    return {
+        "order": None if slope is None else -float(slope),
+        "samples": list(errors),
+        "errors": list(errors.values()),
+        "iterations": [solutions[n].iterations for n in errors],
+    }
+
+
+def relative_error(values: np.ndarray, exact: np.ndarray) -> float:
+    """Return the largest difference in units of the largest exact value."""
+    return float(np.max(np.abs(values - exact)) / np.max(np.abs(exact)))
+
+
+def resampled(values: np.ndarray, points: int) -> np.ndarray:
+    """Return the trigonometric polynomial through the values, at other points of the same period."""
+    amplitudes = np.fft.rfft(values) / len(values)
+    weights = np.where(np.arange(amplitudes.size) % (len(values) / 2) == 0, 1.0, 2.0)
+    angle = TURN * np.arange(points)[:, None] / points * np.arange(amplitudes.size)
+    return (np.exp(1j * angle) @ (weights * amplitudes)).real
+
+
+def measure_periods(values: tuple[float, ...]) -> dict[str, Any]:
+    """Return the relative errors of van der Pol's period for some mu, two schemes and every number of points."""
+    table: dict[str, Any] = {}
+    for mu in values:
+        period, parameters = VAN_DER_POL[mu], {"mu": mu, "omega": 1.0}
+        start = bp.solve_periodic(bp.models.van_der_pol, parameters, frequency=0.15, samples=256, scheme="fourier")
+        table[str(mu)] = {"reference": period}
+        for scheme, grids in (("central4", GRIDS), ("fourier", (16, 24, 32, 48, 64, 96, 128, 192, 256))):
+            found = {}
+            for n in grids:
+                solution = bp.solve_periodic(
+                    bp.models.van_der_pol,
+                    parameters,
+                    frequency=start.frequency,
+                    samples=n,
+                    scheme=scheme,
+                    guess=start,
+                )
+                if solution.converged:
+                    found[n] = solution
+            table[str(mu)][scheme] = {
+                "samples": list(found),
+                "periods": [s.period for s in found.values()],
+                "relative_errors": [abs(s.period / period - 1.0) for s in found.values()],
+                "iterations": [s.iterations for s in found.values()],
+            }
+    return table
+
+
+def follow_duffing(quick: bool) -> tuple[dict[float, bp.Branch], list[dict[str, Any]]]:
+    """Return frequency responses by force amplitude, and their folds by two schemes."""
+    branches, table = {}, []
+    for level in LEVELS:
+        both = []
+        for scheme, samples in (("central4", 200), ("fourier", 64)):
+            force = level * np.cos(TURN * np.arange(samples) / samples)
+            start = solve_duffing(scheme, force, SWEEP[0])
+            step = 1.0 if quick else 0.2
+            both.append(
+                bp.continue_periodic(bp.models.duffing, start, "frequency", until=SWEEP[1], step=step, progress=False)
+            )
+        branches[level] = both[0]
+        folds = [[fold.frequency for fold in b.folds] for b in both]
+        table.append(
+            {
+                "force": level,
+                "folds": folds[0],
+                "folds_fourier": folds[1],
+                "points": len(both[0]),
+                "complete": both[0].complete,
+                "unstable_points": sum(
+                    not s.stable for s, kind in zip(both[0], both[0].kinds, strict=True) if not kind
+                ),
+            }
+        )
+    return branches, table
+
+
+def follow_pendulum(quick: bool) -> tuple[dict[int, bp.Branch], dict[str, Any]]:
+    """Return the branches of periods 1, 2, 4, … down from the locked rotation, and how they compare to shooting."""
+    samples, step, model = 200 if quick else 800, 0.04 if quick else None, bp.models.pendulum
+    tau = np.arange(samples) / samples
+    start = bp.solve_periodic(
+        model,
+        PENDULUM,
+        frequency=LOCKED / TURN,
+        samples=samples,
+        scheme="central4",
+        winding=1,
+        guess={"phi": TURN * tau - 0.4},
+    )
+    branches = {1: bp.continue_periodic(model, start, "frequency", until=CHAOTIC / TURN, step=step, progress=False)}
+    for periods in (2, 4) if quick else (2, 4, 8):
+        doubling = first(branches[periods // 2].period_doublings, f"period {periods // 2}")
+        doubled = bp.double_period(model, doubling, "frequency")
+        back, ahead = (
+            bp.continue_periodic(model, doubled, "frequency", until=until, step=step, progress=False)
+            for until in (doubling.frequency, CHAOTIC / TURN)
+        )
+        branches[periods] = joined(back, ahead)
+    down = bp.continue_periodic(model, branches[1][-1], "frequency", until=LOWEST / TURN, step=step, progress=False)
+    doubling, fold = first(down.period_doublings, "far below"), first(down.folds, "far below")
+    found = {p: [s.frequency * TURN for s in b.period_doublings] for p, b in branches.items()}
+    table = {
+        "scheme": "central4",
+        "samples": samples,
+        "parameters": PENDULUM,
+        "iterations": start.iterations,
+        "points": {str(p): len(b) for p, b in branches.items()},
+        "doublings": {
+            str(p): {"found": found[p], "reference": r, "difference": abs(found[p][0] - r)}
+            for p, r in DOUBLINGS.items()
+        }
+        | {str(p): {"found": found[p]} for p in branches if p not in DOUBLINGS},
+        "multipliers": {str(p): compared(branches[p][-1], BRANCHES[p]) for p in BRANCHES},
+        "below": {
+            "doubling": doubling.frequency * TURN,
+            "doubling_difference": abs(doubling.frequency * TURN - LOW_DOUBLING),
+            "fold": fold.frequency * TURN,
+            "fold_difference": abs(fold.frequency * TURN - LOW_FOLD),
+            "back_at": down[-1].frequency * TURN,
+        },
+        "rotations": measure_rotations({"first": branches[1][-1], "second": down[-1]}),
+    }
+    return branches, table
+
+
+def first(points: tuple[bp.PeriodicSolution, ...], where: str) -> bp.PeriodicSolution:
+    """Return the first of the special points of a branch."""
+    if not points:
+        raise RuntimeError(f"pendulum, {where}: the fold or period doubling that must be there was not found.")
+    return points[0]
+
+
+def joined(back: bp.Branch, ahead: bp.Branch) -> bp.Branch:
+    """Return two branches from the same solution as one."""
+    return dataclasses.replace(
+        ahead,
+        values=np.concatenate([back.values[:0:-1], ahead.values]),
+        solutions=back.solutions[:0:-1] + ahead.solutions,
+        kinds=back.kinds[:0:-1] + ahead.kinds,
+    )
+
+
+def compared(solution: bp.PeriodicSolution, reference: tuple[float, float]) -> dict[str, Any]:
+    """Return real multipliers with their largest relative difference to a reference."""
+    found = solution.multipliers
+    return {
+        "multipliers": found.real.tolist(),
+        "reference": list(reference),
+        "relative_difference": float(np.max(np.abs(found / np.array(reference) - 1.0))) if found.size else np.inf,
+        "status": solution.status,
+        "iterations": solution.iterations,
+        "section": [solution.states["phi"][0], solution.outputs["rate"][0]],
+    }
+
+
+def measure_rotations(rotations: dict[str, bp.PeriodicSolution]) -> dict[str, Any]:
+    """Return the two period-1 rotations at 9.09 rad/s by every scheme."""
+    table: dict[str, Any] = {}
+    for name, known in rotations.items():
+        table[name] = {}
+        for scheme in SCHEMES:
+            samples = 100 if scheme == "fourier" else 800
+            solution = solve_pendulum(known, samples, scheme, winding=1)
+            table[name][scheme] = {"samples": samples} | compared(solution, ROTATIONS[name])
+    return table
+
+
+def solve_pendulum(
+    guess: dict[str, np.ndarray] | bp.PeriodicSolution, samples: int, scheme: str, winding: int, periods: int = 1
+) -> bp.PeriodicSolution:
+    """Return an orbit at 9.09 rad/s."""
+    return bp.solve_periodic(
+        bp.models.pendulum,
+        PENDULUM,
+        frequency=CHAOTIC / TURN,
+        samples=samples,
+        scheme=scheme,
+        winding=winding,
+        periods=periods,
+        guess=guess,
+    )
+
+
+def measure_orbits(orbits: list[Known]) -> list[dict[str, Any]]:
+    """Return unstable orbits by the central schemes, from guesses of which each period is integrated from its start."""
+    frequency, samples, table = CHAOTIC / TURN, 800, []
+    for winding, reference, section in orbits:
+        parts = [integrate(frequency, phi, rate, 1.0, samples)["angle"][:samples] for phi, rate in section]
+        entry: dict[str, Any] = {"period": len(section), "winding": winding}
+        for scheme in ("central2", "central4"):
+            guess = {"phi": np.concatenate(parts)}
+            solution = solve_pendulum(guess, samples, scheme, winding=winding, periods=len(section))
+            entry[scheme] = compared(solution, reference)
+        table.append(entry)
+    return table
+
+
+def integrate(frequency: float, phi: float, rate: float, periods: float, samples: int) -> dict[str, np.ndarray]:
+    """Return the pendulum's outputs over some forcing periods by integration in time."""
+    recording = bp.simulate(
+        bp.models.pendulum,
+        PENDULUM,
+        frequency=frequency,
+        duration=(periods + 0.5 / samples) / frequency,
+        sampling_rate=samples * frequency,
+        start={"phi": phi, "dphi": rate},
+    )
+    return dict(recording.outputs)
+
+
+def integrate_down(frequencies: tuple[float, ...], settling: int = 48, kept: int = 24) -> dict[float, np.ndarray]:
+    """Return rates at tau = 0, 1, … by angular frequency, each run beginning where the last one ended."""
+    phi, rate, points = -0.39, 17.1, {}
+    for omega in frequencies:
+        path = integrate(omega / TURN, phi, rate, settling + kept - 1, 1)
+        phi, rate = float(np.remainder(path["angle"][-1], TURN)), float(path["rate"][-1])
+        points[omega] = path["rate"][-kept:]
+    return points
+
+
+def draw_duffing(branches: dict[float, bp.Branch]) -> Figure:
+    """Draw the frequency responses and shade where the strongest force has two stable states."""
+    figure = bp.plot.branch(*branches.values(), labels=[f"force {level:g} N" for level in branches])
+    axes = figure.axes[0]
+    low, high = sorted(fold.frequency for fold in branches[LEVELS[-1]].folds)
+    axes.axvspan(low, high, color="0.92", lw=0, zorder=0)
+    note = f"at {LEVELS[-1]:g} N two stable states\nand an unstable one"
+    axes.annotate(
+        note,
+        (high, 0.62),
+        (high + 0.4, 0.62),
+        xycoords=("data", "axes fraction"),
+        va="center",
+        arrowprops={"arrowstyle": "-"},
+    )
+    return figure
+
+
+def draw_pendulum(branches: dict[int, bp.Branch], attractor: dict[float, np.ndarray]) -> Figure:
+    """Draw the cascade of the pendulum's rotation, whole and enlarged, with the motion found by time integration."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(10.0, 5.0), layout="constrained")
+    whole, enlarged = figure.subplots(1, 2)
+    for axes, most in ((whole, 4), (enlarged, 8)):
+        shown = {p: b for p, b in branches.items() if p <= most}
+        bp.plot.branch(
+            *shown.values(),
+            measure="section",
+            output="rate",
+            labels=[f"period {p}" for p in shown],
+            angular=True,
+            ax=axes,
+        )
+        for omega, points in attractor.items():
+            axes.plot(np.full(points.size, omega), points, ".", color="black", ms=4, zorder=5)
+        dots = plt.Line2D([], [], color="black", marker=".", ms=4, ls="", label="time integration")
+        legend = axes.get_legend()
+        assert legend is not None
+        handles = legend.legend_handles if axes is whole else legend.legend_handles[1 : len(shown)]
+        axes.legend(handles=[*handles, *([dots] if axes is whole else [])], frameon=False, loc="lower right")
+    whole.set(xlim=(9.0, 13.1), ylim=(7.0, 17.5), title=f"pendulum, from {LOCKED:g} to {CHAOTIC:g} rad/s")
+    enlarged.set(xlim=(9.37, 9.71), ylim=(9.4, 12.6), title="the boxed part enlarged")
+    if INTEGRATED[-1] in attractor:
+        enlarged.text(INTEGRATED[-1] + 0.006, 11.1, "chaotic beyond\nthe cascade", fontsize=9, va="center")
+    whole.indicate_inset(bounds=(9.37, 9.4, 0.34, 3.2), edgecolor="0.4")
+    return figure
+
+
+def draw_orders(forced: dict[str, Any], periods: dict[str, Any]) -> Figure:
+    """Draw errors against the number of points: every scheme on Duffing, two of them on van der Pol's period."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(10.0, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    for scheme, colour in SCHEMES.items():
+        entry = forced[scheme]
+        order = "" if entry["order"] is None else f", fitted order {entry['order']:.2f}"
+        left.loglog(
+            entry["samples"], entry["errors"], "o" + LINES[scheme], color=colour, ms=4, lw=1.4, label=scheme + order
+        )
+    for mu, marker in SHOWN.items():
+        for scheme in ("central4", "fourier"):
+            entry = periods[str(mu)][scheme]
+            right.loglog(
+                entry["samples"],
+                entry["relative_errors"],
+                marker + LINES[scheme],
+                color=SCHEMES[scheme],
+                ms=4,
+                lw=1.4,
+                label=f"{scheme}, mu = {mu:g}",
+            )
+    for axes in (left, right):
+        axes.set_xlabel("points per period n [1]")
+        axes.legend(frameon=False, fontsize=9)
+    left.set_ylabel("largest error / largest displacement [1]")
+    left.set_title("Duffing, smooth forcing: displacement")
+    right.set_ylabel("relative error of the period [1]")
+    right.set_ylim(top=1.0)
+    right.set_title("van der Pol: period of the free oscillation")
+    return figure
+
+
+def checks(results: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return what must show: the value found and the limits allowed."""
+    orders, pendulum, periods = results["orders"], results["pendulum"], results["van_der_pol"]
+    rows: list[tuple[str, float, float, float]] = []
+    for kind in ("forced", "manufactured"):
+        for scheme, order, within in (("backward2", 2, 0.05), ("central2", 2, 0.05), ("central4", 4, 0.1)):
+            rows.append((f"order of {scheme}, {kind}", orders[kind][scheme]["order"], order - within, order + within))
+        rows.append((f"error of fourier at 64 points, {kind}", at(orders[kind]["fourier"], 64), 0.0, 1e-10))
+    for scheme, samples, limit in (("central4", 800, 1e-5), ("fourier", 256, 1e-9)):
+        worst = max(at(entry[scheme], samples, "relative_errors") for entry in periods.values())
+        rows.append((f"van der Pol periods, {scheme} at {samples} points, relative", worst, 0.0, limit))
+    for scheme, limit in (("backward2", 1e-3), ("central2", 1e-5), ("central4", 1e-8), ("fourier", 1e-8)):
+        worst = max(by_scheme[scheme]["relative_difference"] for by_scheme in pendulum["rotations"].values())
+        rows.append((f"multipliers of the period-1 rotations, {scheme}, relative", worst, 0.0, limit))
+    for p, entry in pendulum["doublings"].items():
+        if "difference" in entry:
+            rows.append((f"doubling of period {p} [rad/s]", entry["difference"], 0.0, 1e-4))
+    for what in ("doubling", "fold"):
+        rows.append((f"{what} far below [rad/s]", pendulum["below"][f"{what}_difference"], 0.0, 1e-4))
+    for scheme, limit in (("central2", 1e-4), ("central4", 1e-5)):
+        worst = max(entry[scheme]["relative_difference"] for entry in results["orbits"])
+        rows.append((f"multipliers of the orbits of periods 3 and 5, {scheme}, relative", worst, 0.0, limit))
+    for entry in results["duffing"]:
+        if entry["folds"]:
+            worst = float(np.max(np.abs(np.subtract(entry["folds"], entry["folds_fourier"]))))
+            rows.append((f"Duffing's folds at {entry['force']:g} N, central4 against fourier [Hz]", worst, 0.0, 1e-5))
+    return [verdict(*row) for row in rows]
+
+
+def verdict(what: str, found: float, low: float, high: float) -> dict[str, Any]:
+    """Return a check as results.json holds it."""
+    return {"what": what, "found": found, "low": low, "high": high, "met": bool(low <= found <= high)}
+
+
+def at(entry: dict[str, Any], samples: int, what: str = "errors") -> float:
+    """Return the error at a number of points, infinite where the solve failed."""
+    return dict(zip(entry["samples"], entry[what], strict=True)).get(samples, np.inf)
+
+
+def tables(results: dict[str, Any]) -> str:
+    """Return the account that the study prints."""
+    pendulum, lines = results["pendulum"], []
+    doublings = {
+        f"from period {p} to {2 * int(p)}": {
+            "found": f"{e['found'][0]:.9f}" if e["found"] else "-",
+            "by shooting": f"{e['reference']:.9f}" if "reference" in e else "-",
+            "difference": f"{e['difference']:.1e}" if "difference" in e else "-",
+        }
+        for p, e in pendulum["doublings"].items()
+    }
+    lines += [
+        f"The pendulum's period doublings from {LOCKED:g} down to {CHAOTIC:g} rad/s ({pendulum['scheme']}, "
+        f"{pendulum['samples']} points a forcing period) [rad/s]",
+        pd.DataFrame(doublings).T.to_string(),
+        f"Further down, the rotation turns in a fold at {pendulum['below']['fold']:.9f} rad/s and comes back as the "
+        f"second rotation at {pendulum['below']['back_at']:.2f} rad/s.",
+        "",
+        f"Multipliers of the two period-1 rotations at {CHAOTIC:g} rad/s",
+    ]
+    rotations = [
+        {
+            "rotation": name,
+            "scheme": scheme,
+            "points": e["samples"],
+            "multipliers": ", ".join(f"{m:.10f}" for m in e["multipliers"]),
+            "relative difference": f"{e['relative_difference']:.1e}",
+            "iterations": e["iterations"],
+        }
+        for name, by_scheme in pendulum["rotations"].items()
+        for scheme, e in by_scheme.items()
+    ]
+    lines += [pd.DataFrame(rotations).to_string(index=False), "", f"Unstable prime orbits at {CHAOTIC:g} rad/s"]
+    orbits = [
+        {
+            "period": e["period"],
+            "winding": e["winding"],
+            "larger multiplier": f"{e['central4']['multipliers'][0]:.6f}",
+            **{f"difference, {s}": f"{e[s]['relative_difference']:.1e}" for s in ("central2", "central4")},
+        }
+        for e in results["orbits"]
+    ]
+    lines += [pd.DataFrame(orbits).to_string(index=False), "", "Folds of the Duffing oscillator"]
+    for e in results["duffing"]:
+        folds = " and ".join(f"{f:.6f} Hz" for f in sorted(e["folds"])) or "none"
+        lines.append(f"  force {e['force']:g} N: {folds}")
+    for title, rows in (("What must show", results["checks"]), ("What it costs", results["cost"]["checks"])):
+        verdicts = [
+            {
+                "": "yes" if c["met"] else "NO",
+                "what": c["what"],
+                "found": f"{c['found']:.4g}",
+                "allowed": f"≤ {c['high']:g}" if c["low"] == 0.0 else f"{c['low']:g} … {c['high']:g}",
+            }
+            for c in rows
+        ]
+        lines += ["", title, pd.DataFrame(verdicts).to_string(index=False)]
+    return "\n".join(lines)

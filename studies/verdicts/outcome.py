@@ -1,0 +1,162 @@
+"""What the diagnoses say of one data set of a case, and whether they are right."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+import bayesperiodic as bp
+from studies.verdicts.cases import (
+    ADEQUATE,
+    CASES,
+    COMPARE,
+    DETERMINED,
+    FINE,
+    IDENTIFIABILITY,
+    JOINT,
+    PREDICT,
+    Case,
+)
+
+GOOD = {IDENTIFIABILITY: DETERMINED, COMPARE: FINE, JOINT: FINE, PREDICT: ADEQUATE}
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Draws, and what is said from them."""
+
+    posterior: bp.Posterior
+    comparison: bp.Comparison
+    prediction: bp.Prediction
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Estimate, draws, and what every tool says of them.
+
+    Attributes
+    ----------
+    case : Case
+    problem : Problem
+    fit : MapEstimate
+    identifiability : Identifiability
+    sampled : Drawn or None
+        None where the verdicts do without draws.
+    seconds : float
+    """
+
+    case: Case
+    problem: bp.Problem
+    fit: bp.MapEstimate
+    identifiability: bp.Identifiability
+    sampled: Drawn | None
+    seconds: float
+
+    @property
+    def drawn(self) -> Drawn:
+        """Draws and what is said from them, where there are any."""
+        if self.sampled is None:
+            raise ValueError("drawless: there are no draws here.")
+        return self.sampled
+
+    @property
+    def verdicts(self) -> dict[str, dict[str, str]]:
+        """By tool and parameter; "all" for those on the whole."""
+        found = {IDENTIFIABILITY: self.identifiability.verdicts}
+        if self.sampled is not None:
+            found[COMPARE] = dict(self.sampled.comparison.table["verdict"])
+            found[JOINT] = {"all": str(self.sampled.comparison.joint["verdict"])}
+            found[PREDICT] = dict(self.sampled.prediction.table["verdict"])
+        return found
+
+    @property
+    def wrong(self) -> dict[str, str]:
+        """What is not as expected, by tool and parameter."""
+        said = self.verdicts
+        return {
+            f"{tool} {name}": said[tool][name]
+            for tool, rows in self.case.expected.items()
+            if tool in said
+            for name, allowed in rows.items()
+            if said[tool][name] not in allowed
+        }
+
+    @property
+    def named(self) -> bool:
+        """Whether the fault is named by the tools that must; True where there is none."""
+        faulty = {f"{tool} {name}" for tool, names in self.case.fault.items() for name in names}
+        return not faulty & set(self.wrong)
+
+    @property
+    def warned(self) -> bool:
+        """Whether any tool says anything but that all is well."""
+        return any(verdict != GOOD[tool] for tool, rows in self.verdicts.items() for verdict in rows.values())
+
+    @property
+    def converged(self) -> bool:
+        """Of the estimate, and of the draws where there are any."""
+        return self.fit.converged and (self.sampled is None or self.sampled.posterior.converged)
+
+    @property
+    def p_values(self) -> dict[str, dict[str, float]]:
+        """Of the discrepancy tests, by row of the prediction; those that are not possible left out."""
+        table = self.drawn.prediction.table.select_dtypes("number")
+        return {
+            str(row): {str(c): float(v) for c, v in values.items() if pd.notna(v)} for row, values in table.iterrows()
+        }
+
+    def line(self) -> dict[str, Any]:
+        """Return what is kept of a replicate."""
+        return {
+            "right": not self.wrong,
+            "named": self.named,
+            "warned": self.warned,
+            "converged": self.converged,
+            "wrong": self.wrong,
+            "verdicts": self.verdicts,
+            "numbers": numbers(self),
+            "seconds": round(self.seconds, 2),
+        }
+
+
+def examine(name: str, data_seed: int, sampler_seed: int, *, drawless: bool = False) -> Outcome:
+    """Return what is said of the data of one seed, sampled with another; drawless as far as the case allows it."""
+    start, case = time.perf_counter(), CASES[name]()
+    problem = case.problem(data_seed)
+    fit = bp.map_estimate(problem, progress=False)
+    if drawless and case.drawless:
+        found = bp.identifiability(problem, fit)
+        return Outcome(case, problem, fit, found, None, time.perf_counter() - start)
+    posterior = bp.sample(problem, fit, seed=sampler_seed, progress=False, **case.sampling)
+    found = bp.identifiability(problem, fit, posterior)
+    drawn = Drawn(posterior, bp.compare(problem, fit, posterior), bp.predict(problem, posterior))
+    return Outcome(case, problem, fit, found, drawn, time.perf_counter() - start)
+
+
+def numbers(outcome: Outcome) -> dict[str, Any]:
+    """Return the figures behind the verdicts, Monte Carlo errors as pairs (value, error)."""
+    table = outcome.identifiability.table
+    found: dict[str, Any] = {
+        str(name): {"contraction": _pair(row, "contraction")} | _signed(row) for name, row in table.iterrows()
+    }
+    if outcome.sampled is None:
+        return found
+    comparison = outcome.sampled.comparison
+    for name, row in comparison.table.iterrows():
+        found[str(name)] |= {column: _pair(row, column) for column in ("shift", "sd_ratio", "skewness", "wasserstein")}
+    found["joint"] = {key: _pair(comparison.joint, key) for key in ("share_50", "share_90", "share_95", "pareto_k")}
+    found["joint"]["importance_efficiency"] = float(f"{float(comparison.joint['efficiency']):.5g}")
+    return found
+
+
+def _signed(row: pd.Series) -> dict[str, list[float | None]]:
+    return {} if pd.isna(row["p_negative"]) else {"p_negative": _pair(row, "p_negative")}
+
+
+def _pair(row: Any, column: str) -> list[float | None]:
+    """Return a figure and its Monte Carlo error, to five digits; None for what is not finite."""
+    pair = float(row[column]), float(row[f"{column}_mcse"])
+    return [float(f"{value:.5g}") if abs(value) < float("inf") else None for value in pair]
