@@ -44,6 +44,18 @@ def pendulum_orbits() -> bp.Orbits:
     return bp.find_orbits(section, periods=[1])
 
 
+@cache
+def duffing_calibration() -> bp.Calibration:
+    """Return two replicates of the calibration of a stiffness."""
+    force = FORCE["force"]
+    run = bp.Experiment("run", 0.1, {"displacement": force}, {"force": force}, samples=32, cycles=4,
+                        harmonics={"displacement": 5, "force": 5})  # fmt: skip
+    fixed = {"m": 1, "c": 0.2, "k3": 0.5, "variance[displacement]": 1e-4}
+    priors = {"k": bp.LogNormal(1, 0.1)}
+    problem = bp.Problem(bp.models.duffing, [run], priors=priors, scheme="fourier", fixed=fixed)
+    return bp.calibrate(problem, replicates=2, seed=1, max_steps=250, progress=False)
+
+
 FORCE = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
 
 
@@ -86,6 +98,7 @@ EXAMPLES: dict[str, Callable[[], Any]] = {
     "problem": duffing_problem,
     "fit": duffing_fit,
     "posterior": duffing_posterior,
+    "calibration": duffing_calibration,
     "henon_section": henon_section,
     "pendulum_parameters": lambda: PENDULUM,
     "pendulum_recording": pendulum_recording,

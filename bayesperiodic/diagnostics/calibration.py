@@ -1,4 +1,4 @@
-"""Simulation-based calibration: is a 90 % interval a 90 % interval."""
+"""Simulation-based calibration: coverage of the intervals, and tests of uniformity."""
 
 import hashlib
 import importlib.metadata
@@ -19,7 +19,16 @@ from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic._parallel import resumed
 from bayesperiodic.diagnostics.adequacy import holm
-from bayesperiodic.diagnostics.campaigns import APART, DONE, LAPLACE, MCMC, METHODS, Campaign, refuse, replicate
+from bayesperiodic.diagnostics.campaigns import (
+    APART,
+    DONE,
+    LAPLACE,
+    MCMC,
+    METHODS,
+    Campaign,
+    check_supported,
+    replicate,
+)
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.checkpoint import fingerprint
 
@@ -29,15 +38,15 @@ EDGE = 1e-12
 
 
 def normal_scores(values: np.ndarray) -> np.ndarray:
-    """Return the standard normal quantiles of values in (0, 1); those at the ends count as 1e-12 from them."""
+    """Return the standard normal quantiles of values in [0, 1], clipped to 1e-12 from the ends."""
     return ndtri(np.clip(values, EDGE, 1.0 - EDGE))
 
 
 def dispersion_test(values: np.ndarray) -> tuple[float, float]:
-    """Return the mean square of the normal scores, 1 on average, and the two-sided p-value of its χ² distribution.
+    """Return the mean square of the normal scores, of expectation 1, and the two-sided p-value of its χ² distribution.
 
-    Intervals that are too narrow put the truth into their tails and raise it, to 1.25 if variances are a fifth too
-    small. With 1000 values a level of 1 % sees that in 99.7 % of cases, `ecdf_test` in 76 %, Kolmogorov's in 20 %.
+    If variances are a fifth too small its expectation is 1.25; with 1000 values the power against this alternative at
+    a level of 1 % is 99.7 %, that of `ecdf_test` 76 %, of Kolmogorov's test 20 %.
     """
     square = float(np.sum(normal_scores(values) ** 2))
     low, high = stats.chi2.cdf(square, values.size), stats.chi2.sf(square, values.size)
@@ -45,7 +54,7 @@ def dispersion_test(values: np.ndarray) -> tuple[float, float]:
 
 
 def chi_square_test(values: np.ndarray) -> float:
-    """Return p of the χ² test on the histogram; NaN for too few values for five bins."""
+    """Return p of the χ² test on the histogram; NaN for fewer than 100 values."""
     bins = bin_count(values.size)
     if bins * FEWEST_IN_BIN > values.size:
         return np.nan
@@ -53,14 +62,15 @@ def chi_square_test(values: np.ndarray) -> float:
 
 
 def bin_count(size: int) -> int:
-    """Return how many bins a histogram of so many values has."""
+    """Return the number of bins of a histogram."""
     return int(np.clip(size // FEWEST_IN_BIN, 5, MOST_BINS))
 
 
 def ecdf_test(values: np.ndarray) -> float:
     """Return p of the empirical distribution function's smallest pointwise binomial tail ([1]_, section 3).
 
-    The null distribution is simulated once for every number of values, with a fixed seed.
+    The null distribution is simulated once for every number of values, with a fixed seed. ArviZ 0.23
+    has no public function for it.
 
     References
     ----------
@@ -74,39 +84,26 @@ def ecdf_test(values: np.ndarray) -> float:
 
 
 def ecdf_band(size: int, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the band that holds the whole empirical distribution function of so many values with a probability.
-
-    Parameters
-    ----------
-    size : int
-        Number of values.
-    level : float
-        The probability.
-
-    Returns
-    -------
-    low, high : array (points,)
-        At `evaluation_points`.
-    """
+    """Return the simultaneous band of the empirical distribution function of `size` values, at `evaluation_points`."""
     tail = float(np.quantile(_null(size)[1], 1.0 - level))
     points = evaluation_points()
     return binomial_band(size, points, tail)
 
 
 def binomial_band(size: int, probabilities: np.ndarray, tail: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return between which shares of `size` trials all but a share `tail` of outcomes lie, at each probability."""
+    """Return the central 1 − `tail` intervals of binomial frequencies in `size` trials."""
     low, high = (np.asarray(stats.binom.ppf(q, size, probabilities)) for q in (0.5 * tail, 1.0 - 0.5 * tail))
     return low / size, high / size
 
 
 def evaluation_points() -> np.ndarray:
-    """Return where the empirical distribution function is looked at, (points,)."""
+    """Return the points (points,) at which empirical distribution functions are evaluated."""
     return np.arange(1, POINTS) / POINTS
 
 
 @cache
 def _null(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pointwise two-sided tails (size + 1, points) of each count, and simulated smallest ones."""
+    """Return the pointwise two-sided tails (size + 1, points) of each count, and simulated minima over the points."""
     counts, points = np.arange(size + 1)[:, None], evaluation_points()
     table = 2.0 * np.minimum(stats.binom.cdf(counts, size, points), stats.binom.sf(counts - 1, size, points))
     generator = np.random.default_rng(SIMULATION_SEED)
@@ -124,50 +121,43 @@ TESTS = ("p_dispersion", "p_ecdf", "p_chi_square")
 
 @dataclass(frozen=True)
 class Calibration(Result):
-    """Where the truth lay among the answers, over many simulated campaigns.
+    """Calibration of MCMC and of the Laplace approximation over simulated campaigns.
 
     Attributes
     ----------
     table : DataFrame
-        A row a quantity and method ("mcmc" or "laplace"): replicates counted; dispersion, the mean square of the normal
-        scores, above 1 where intervals are too narrow; shift, their mean; p of the dispersion test, of the ECDF test
-        and of the χ² test of the histogram, each adjusted by Holm's method for the quantities of the method; coverage
-        of the central 50, 80, 90 and 95 % intervals; verdict: "calibrated", "too narrow", "too wide", "not uniform", or
-        "too few replicates" below 20. A well calibrated method gets another verdict than the first for some quantity
-        with a probability of at most 1 % a test.
+        One row per quantity and method ("mcmc" or "laplace"): number of replicates; dispersion, the mean square of the
+        normal scores, above 1 if intervals are too narrow; shift, their mean; p of the dispersion test, the ECDF test
+        and the χ² test of the histogram, each adjusted by Holm's method for the quantities of the method; coverage of
+        the central 50, 80, 90 and 95 % intervals; verdict: "calibrated", "too narrow", "too wide", "not uniform", or
+        "too few replicates" below 20. The probability that a calibrated method gets another verdict for any quantity is
+        at most 1 % per test.
     positions : dict of str to dict of str to array (replicates,)
-        By method and quantity, between 0 and 1: for "mcmc" the rank of the truth among independent draws with ties at
-        random, plus a uniform share of one; for "laplace" its distribution function at the truth. Uniform if
-        calibrated. A variance is that of the folded mean.
+        By method and quantity, between 0 and 1, uniformly distributed if calibrated: for "mcmc" the randomised
+        normalised rank of the truth among independent draws; for "laplace" the distribution function at the truth.
+        Variances are those of the folded mean.
     failures : dict of str to int
-        Replicates by what they failed of: "no steady state" (the truth has none, so that nothing can be recorded),
-        "fold failed", "no estimate", "estimate not converged" (without Laplace), "no draws", "draws not usable" (fewer
-        than 20 independent ones, or R-hat above 1.1; without MCMC).
+        Number of failed replicates by reason: "no steady state" (of the simulated truth), "fold failed", "no estimate",
+        "estimate not converged" (excluded for Laplace), "no draws", "draws not usable" (fewer than 20 independent ones,
+        or R-hat above 1.1; excluded for MCMC).
     replicates : int
-        All of them, failed or not.
+        Total number.
     stop_rule : int
-        How many chains passed the stop rule of `sample` too.
+        Number of chains that passed the stop rule of `sample`.
     draws : float
-        Median number of independent draws behind a rank.
+        Median number of independent draws per rank.
     failed_solves : float
-        Mean share of proposals whose periodic solve failed.
+        Mean fraction of proposals whose periodic solve failed.
     synthetic : bool
         Always True.
 
     Examples
     --------
-    Two replicates are too few for a verdict, but show what is there; a thousand tell miscalibrations of a few per cent:
+    Two replicates are too few for a verdict; a thousand reveal miscalibrations of a few per cent:
 
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = np.cos(2 * np.pi * np.arange(32) / 32)
-    >>> run = bp.Experiment("run", 0.1, {"displacement": force}, {"force": force}, samples=32, cycles=4,
-    ...                     harmonics={"displacement": 5, "force": 5})
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"k": bp.LogNormal(1, 0.1)}, scheme="fourier",
-    ...                      fixed={"m": 1, "c": 0.2, "k3": 0.5, "variance[displacement]": 1e-4})
-    >>> found = bp.calibrate(problem, replicates=2, seed=1, max_steps=250, progress=False)
-    >>> found.positions["laplace"]["k"].shape, found.replicates, found.synthetic
+    >>> calibration.positions["laplace"]["k"].shape, calibration.replicates, calibration.synthetic
     ((2,), 2, True)
-    >>> found.table[["quantity", "method", "replicates"]]
+    >>> calibration.table[["quantity", "method", "replicates"]]
       quantity   method  replicates
     0        k     mcmc           2
     1        k  laplace           2
@@ -191,7 +181,7 @@ class Calibration(Result):
         failed = ", ".join(f"{kind} {count}" for kind, count in self.failures.items()) or "none"
         head = (
             f"Calibration over {self.replicates} synthetic campaigns (failed: {failed}; {self.draws:.0f} independent "
-            f"draws a rank, stop rule passed by {self.stop_rule}, failed solves {self.failed_solves:.2%})"
+            f"draws per rank, stop rule passed by {self.stop_rule}, failed solves {self.failed_solves:.2%})"
         )
         return f"{head}\n{self.table.to_string(float_format='{:.3g}'.format, index=False)}"
 
@@ -209,35 +199,34 @@ def calibrate(
     max_steps: int = 500,
     progress: bool = True,
 ) -> Calibration:
-    """Simulate campaigns with truths from the prior, analyse each, and test where the truths lie.
+    """Test the calibration of the posterior by simulation-based calibration [1]_.
 
-    This is simulation-based calibration [1]_. Each replicate draws θ and the variances, integrates the model in time
-    until it is steady, records as many cycles as the experiment has (three at least) with as many samples a cycle as
-    its grid, adds white noise, folds with the experiment's harmonics and frequency, and finds the MAP point, the
-    Laplace approximation and draws of emcee. The periodic solver has no part in the recording, so that its errors show.
-    Inputs are recorded without noise, as the likelihood takes them.
+    Each replicate draws θ and the variances from the prior, integrates the model in time to its steady state, records
+    as many cycles as the experiment has (at least three) with as many samples per cycle as its grid, adds white noise,
+    folds with the harmonics and the frequency of the experiment, and computes the MAP estimate, the Laplace
+    approximation and draws of emcee. The periodic solver is not used for the recording, so that its errors are
+    detected. Inputs are recorded without noise, as the likelihood assumes.
 
-    A likelihood that counts more independent values than the harmonics have, or a grid that is too coarse, comes out
-    as "too narrow" or "not uniform". A wrong model does not: truths are drawn from the model.
+    A likelihood that counts too many independent values, or a grid that is too coarse, results in "too narrow" or "not
+    uniform". A wrong model is not detected: truths are drawn from the model.
 
     Parameters
     ----------
     problem : Problem
         Forced, with whole histories of one forcing period, `bayesperiodic.noise.Independent` with a proper prior or
-        known variances. Of its data only the settings count.
+        known variances. Of its data only the settings are used.
     replicates : int
     seed : int
-        Replicate k depends on the seed and k alone, whoever computes it.
+        Replicate k depends on the seed and k only, not on the executor.
     folder : path, optional
-        Each replicate is written to ``replicates.jsonl`` there as it ends; the same call does only the missing ones,
-        and one with more replicates those that are new.
+        Each replicate is appended to ``replicates.jsonl`` there; a repeated call computes only the missing ones.
     executor : None, int, Dask Client, or executor with the interface of concurrent.futures
-        None does one replicate after the other. Those of a lost Dask worker are done again by others; where other
-        executors lose their workers, the same call goes on from the folder.
+        None computes serially. Replicates of a lost Dask worker are repeated by others; after the loss of workers of
+        other executors, repeat the call with the same folder.
     ensembles, walkers, max_steps
-        Of each replicate's `sample`. Short chains are enough, because a rank takes only draws at steps five
-        autocorrelation times apart; but not few walkers: with eight in four dimensions the ensemble as a whole moved
-        more slowly than that time tells, and the dispersion of exact ranks came out 5 to 10 % too large.
+        Arguments of `sample` in each replicate. Short chains suffice, because ranks use draws five autocorrelation
+        times apart. Too few walkers bias the result: with eight in four dimensions this time was underestimated, and
+        the dispersion of exact ranks was 5 to 10 % too large.
     progress : bool
 
     Returns
@@ -247,9 +236,9 @@ def calibrate(
     Raises
     ------
     ValueError
-        For an improper prior, or a problem whose recordings are not simulated here; if the folder is in use.
+        For an improper prior, or a problem whose recordings cannot be simulated; if the folder is in use.
     RuntimeError
-        If the executor's workers died; what was done is in the folder.
+        If the workers of the executor died; finished replicates are in the folder.
 
     References
     ----------
@@ -270,7 +259,7 @@ def calibrate(
     """
     _checks.integer("replicates", replicates, 1)
     _checks.integer("seed", seed, 0)
-    refuse(problem)
+    check_supported(problem)
     settings = f"{fingerprint(problem)}, seed {seed}, {ensembles} x {walkers} walkers, {max_steps} steps, {APART} apart"
     source = hashlib.sha256(f"{importlib.metadata.version('bayesperiodic')}, {settings}".encode()).hexdigest()[:16]
     campaign = Campaign(problem, seed, source, ensembles, walkers, max_steps)
@@ -288,7 +277,7 @@ def calibrate(
 
 
 def summary(lines: Sequence[dict[str, Any]], names: Sequence[str]) -> Calibration:
-    """Return what the lines of all replicates say of these quantities."""
+    """Summarise the results of all replicates for these quantities."""
     positions = {
         method: {name: np.array([line[method][name] for line in lines if method in line]) for name in names}
         for method in METHODS
@@ -328,7 +317,7 @@ def _table(method: str, positions: dict[str, np.ndarray]) -> pd.DataFrame:
 
 
 def coverage(positions: np.ndarray, level: float) -> float:
-    """Return the share of truths inside the central interval that should hold them with this probability."""
+    """Return the fraction of truths inside the central intervals of this probability."""
     return float(np.mean(np.abs(positions - 0.5) <= 0.5 * level)) if positions.size else np.nan
 
 

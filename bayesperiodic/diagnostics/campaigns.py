@@ -1,4 +1,4 @@
-"""One simulated campaign: a truth from the prior, recordings of it, and where the pipeline's answers put that truth."""
+"""One replicate of a calibration: a truth from the prior, its recordings, and its rank in the estimates."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -23,23 +23,14 @@ MCMC, LAPLACE = "mcmc", "laplace"
 METHODS = (MCMC, LAPLACE)
 DONE, NO_STEADY_STATE = "done", "no steady state"
 FEWEST_CYCLES = 3
-# Steps between draws that count as independent, in autocorrelation times, which short chains underestimate; the fewest
-# of these draws; the largest R-hat.
+# Steps between draws taken as independent, in autocorrelation times (which short chains underestimate), the least
+# number of these draws, and the largest R-hat.
 APART, FEWEST_DRAWS, LARGEST_RHAT = 5.0, 20, 1.1
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """What every replicate needs.
-
-    Attributes
-    ----------
-    problem : Problem
-    seed : int
-    source : str
-    ensembles, walkers, max_steps
-        See `sample`.
-    """
+    """Settings of all replicates."""
 
     problem: Problem
     seed: int
@@ -49,22 +40,21 @@ class Campaign:
     max_steps: int
 
 
-def refuse(problem: Problem) -> None:
-    """Raise a ValueError for a problem that no truth can be drawn for, or whose recordings are not simulated here."""
+def check_supported(problem: Problem) -> None:
+    """Raise a ValueError for an improper prior, or a problem whose recordings cannot be simulated."""
     noise = problem.noise
     if not isinstance(noise, Independent):
         raise ValueError(
-            f"problem: noise={noise.name!r} is not allowed; recordings are simulated with independent errors, so pose "
-            "it with noise.Independent(prior=…)."
+            f"problem: must have the noise model noise.Independent, got {noise.name!r}. Recordings are simulated with "
+            "independent errors: give noise.Independent(prior=…)."
         )
     if problem.free_noise and not noise.proper:
         raise ValueError(
-            f"problem: the {noise.prior_text} of {problem.free_noise[0]!r} is not allowed; it is improper, and no "
-            "truth can be drawn from it. Give noise.Independent(prior=bp.InverseGamma(…)) or another proper prior, or "
-            "fix the variance."
+            f"problem: must have proper priors, got the {noise.prior_text} of {problem.free_noise[0]!r}. Give "
+            "noise.Independent(prior=bp.InverseGamma(…)) or another proper prior, or fix the variance."
         )
     if problem.model.autonomous:
-        raise ValueError(f"problem: the autonomous model {problem.model.name!r} is not allowed; it must be forced.")
+        raise ValueError(f"problem: must have a forced model, got the autonomous {problem.model.name!r}.")
     for e in problem.experiments:
         turns = [e.winding] if isinstance(e.winding, int) else [*e.winding.values()]
         for what, found in (
@@ -76,16 +66,14 @@ def refuse(problem: Problem) -> None:
         ):
             if found:
                 raise ValueError(
-                    f"problem: experiment {e.name!r} with {what} is not allowed; only whole histories of one forcing "
-                    "period are simulated."
+                    f"problem: experiments must have whole histories of one forcing period, got {e.name!r} with {what}."
                 )
 
 
 def replicate(campaign: Campaign, number: int) -> dict[str, Any]:
-    """Return one replicate as a line for a file: its truth, and how far up each answer the truth lies, from 0 to 1.
+    """Return one replicate as a JSON object: its status, its truth, and the rank of the truth in each estimate.
 
-    Under "status" stands what it failed of, if it did. A replicate depends on the campaign's seed and on its own number
-    alone.
+    A replicate depends on the seed of the campaign and on its number only.
     """
     seeds = np.random.SeedSequence([campaign.seed, number]).spawn(4)
     truths, noise, chain, ties = (np.random.default_rng(seed) for seed in seeds)
@@ -101,12 +89,12 @@ def replicate(campaign: Campaign, number: int) -> dict[str, Any]:
             return line | {"status": NO_STEADY_STATE}
         except ValueError as error:
             return line | {"status": "fold failed", "error": str(error)}
-        truth = theta | _folded_variances(problem, variances, [share for _, share in measured])
-        return line | {"truth": truth} | _answers(campaign, [again for again, _ in measured], truth, chain, ties)
+        truth = theta | _folded_variances(problem, variances, [fraction for _, fraction in measured])
+        return line | {"truth": truth} | _ranks(campaign, [again for again, _ in measured], truth, chain, ties)
 
 
 def _drawn_variances(problem: Problem, generator: np.random.Generator) -> dict[str, float]:
-    """Return every variance, drawn from its prior or as it is fixed."""
+    """Return all variances, drawn from the prior or fixed."""
     values = dict(problem.likelihood.fixed)
     for name in problem.free_noise:
         values[name] = float(as_prior("prior", problem.noise.prior).sample(1, generator)[0])
@@ -125,9 +113,9 @@ def _measured(
     variances: dict[str, float],
     generator: np.random.Generator,
 ) -> tuple[Experiment, float]:
-    """Return an experiment measured again, and the share of its cycles that the fold used.
+    """Return a simulated repetition of an experiment, and the fraction of its cycles that the fold used.
 
-    White noise on the samples has the variance of the folded mean times samples per independent value of that mean.
+    The variance of the samples is that of the folded mean times the samples per independent value of that mean.
     """
     vector = problem.vector(theta)
     values = dict(zip(problem.model.parameters, problem.parameters(vector[None], e.name)[0].tolist(), strict=True))
@@ -154,7 +142,7 @@ def _measured(
 
 
 def _first_state(problem: Problem, e: Experiment) -> dict[str, float]:
-    """Return the states and rates at τ = 0 of the experiment's guess, where it has one."""
+    """Return the states and rates at τ = 0 of the guess of an experiment; empty without a guess."""
     found = {}
     for state, values in e.guess.items():
         found[state] = float(values[0])
@@ -165,27 +153,27 @@ def _first_state(problem: Problem, e: Experiment) -> dict[str, float]:
 
 
 def _folded_variances(problem: Problem, variances: dict[str, float], used: list[float]) -> dict[str, float]:
-    """Return the free variances of the folded means: larger than drawn where the fold left cycles out."""
+    """Return the free variances of the folded means, which are larger if the fold left out cycles."""
     result = {}
     for name in problem.free_noise:
-        shares = [
-            share
-            for e, share in zip(problem.experiments, used, strict=True)
+        fractions = [
+            fraction
+            for e, fraction in zip(problem.experiments, used, strict=True)
             for channel in e.outputs
             if _variance_name(problem, channel, e.name) == name
         ]
-        result[name] = variances[name] / float(np.mean(shares))
+        result[name] = variances[name] / float(np.mean(fractions))
     return result
 
 
-def _answers(
+def _ranks(
     campaign: Campaign,
     experiments: list[Experiment],
     truth: dict[str, float],
     chain: np.random.Generator,
     ties: np.random.Generator,
 ) -> dict[str, Any]:
-    """Return what the estimator and the sampler say of the truth."""
+    """Return the ranks of the truth in the Laplace approximation and among the draws."""
     problem = campaign.problem.with_experiments(experiments)
     try:
         fit = map_estimate(problem, progress=False)
@@ -193,7 +181,7 @@ def _answers(
         return {"status": "no estimate", "error": str(error)}
     found: dict[str, Any] = {"map": fit.status, "stop_rule": False}
     if fit.converged:
-        found[LAPLACE] = _below_laplace(fit, truth)
+        found[LAPLACE] = _laplace_cdf(fit, truth)
     try:
         posterior = sample(
             problem, fit, seed=int(chain.integers(2**32)), ensembles=campaign.ensembles, walkers=campaign.walkers,
@@ -211,10 +199,7 @@ def _answers(
 
 
 def independent_draws(posterior: Posterior) -> dict[str, np.ndarray] | None:
-    """Return draws of every quantity at steps five autocorrelation times apart; None if there are fewer than 20.
-
-    Walkers of one step are independent of each other.
-    """
+    """Return draws of every quantity at steps five autocorrelation times apart; None for fewer than 20."""
     tau, group = max(posterior.tau.values()), posterior.data["posterior"]
     if not np.isfinite(tau):
         return None
@@ -226,19 +211,15 @@ def independent_draws(posterior: Posterior) -> dict[str, np.ndarray] | None:
 
 
 def position(draws: np.ndarray, truth: float, generator: np.random.Generator) -> float:
-    """Return a number that is uniform on (0, 1) if draws and truth come from one distribution.
-
-    It is the rank of the truth among the draws, drawn at random among those equal to it, plus a uniform share of one.
-    """
+    """Return the randomised normalised rank of the truth, uniform on (0, 1) if draws and truth are exchangeable."""
     rank = np.sum(draws < truth) + generator.integers(np.sum(draws == truth) + 1)
     return float((rank + generator.uniform()) / (draws.size + 1))
 
 
-def _below_laplace(fit: MapEstimate, truth: dict[str, float]) -> dict[str, float]:
-    """Return the distribution functions of Laplace at the truth.
+def _laplace_cdf(fit: MapEstimate, truth: dict[str, float]) -> dict[str, float]:
+    """Return the distribution functions of the Laplace approximation at the truth.
 
-    Of a parameter it is Student's t of `MapEstimate.interval`, of a variance the normal distribution of its logarithm
-    in the joint approximation.
+    Student's t of `MapEstimate.interval` for parameters, the joint approximation of the logarithm for variances.
     """
     found = {}
     with np.errstate(invalid="ignore", divide="ignore"):

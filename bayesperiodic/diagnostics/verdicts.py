@@ -1,4 +1,4 @@
-"""What is wrong with a normal approximation, in one of a few words, beyond tolerance and Monte Carlo error."""
+"""Verdicts on normal approximations of draws, with tolerances and Monte Carlo errors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,6 +8,8 @@ from scipy.integrate import quad
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import chdtri, ndtr, ndtri
 
+from bayesperiodic._linalg import covariance_eigh
+
 BATCHES = 8
 # Expected Wasserstein distance of n independent standard normal draws from their own distribution, times √n.
 WASSERSTEIN_FLOOR = float(np.sqrt(2 / np.pi) * quad(lambda z: np.sqrt(ndtr(z) * ndtr(-z)), -20.0, 20.0)[0])
@@ -15,7 +17,7 @@ WASSERSTEIN_FLOOR = float(np.sqrt(2 / np.pi) * quad(lambda z: np.sqrt(ndtr(z) * 
 
 @dataclass(frozen=True)
 class Sample:
-    """Draws of one quantity, whole and in batches.
+    """Draws of one quantity, as a whole and in batches.
 
     The Monte Carlo error of a statistic is the standard deviation of its values in the batches over √batches. A batch
     is an eighth of the steps of one independent ensemble, several autocorrelation times where the sampler converged.
@@ -24,10 +26,10 @@ class Sample:
     ----------
     whole : array (draws,)
     batches : array (batches, size)
+        Those of one ensemble after the other.
     size : float
         Effective sample size.
     ensembles : int
-        Whose batches come one after the other.
     """
 
     whole: np.ndarray
@@ -47,36 +49,26 @@ class Sample:
         return cls(draws, batches, max(size, 1.0) if np.isfinite(size) else 1.0, count)
 
     def by_ensemble(self) -> list["Sample"]:
-        """Return the sample that each ensemble is by itself."""
+        """Return the sample of each ensemble."""
         parts = np.split(self.batches, self.ensembles)
         return [Sample(part.ravel(), part, max(self.size / self.ensembles, 1.0), 1) for part in parts]
 
-    def of_values(self, function: Callable[[np.ndarray], np.ndarray]) -> "Sample":
-        """Return the sample of a function of the quantity."""
-        return Sample(function(self.whole), function(self.batches), self.size, self.ensembles)
-
-    def error(self, statistic: Callable[[np.ndarray], np.ndarray]) -> float:
-        """Return the Monte Carlo error of a statistic, which acts along the last axis."""
-        values = statistic(self.batches)
-        return float(np.std(values, ddof=1) / np.sqrt(len(values)))
-
     def estimate(self, statistic: Callable[[np.ndarray], np.ndarray]) -> tuple[float, float]:
-        """Return a statistic of all draws and its Monte Carlo error."""
-        return float(statistic(self.whole)), self.error(statistic)
+        """Return a statistic of all draws, which acts along the last axis, and its Monte Carlo error."""
+        values = statistic(self.batches)
+        return float(statistic(self.whole)), float(np.std(values, ddof=1) / np.sqrt(len(values)))
 
-    def share(self, inside: Callable[[np.ndarray], np.ndarray], expected: float) -> tuple[float, float]:
-        """Return the share of draws for which a condition holds, and its Monte Carlo error.
+    def fraction(self, inside: Callable[[np.ndarray], np.ndarray], expected: float) -> tuple[float, float]:
+        """Return the fraction of draws that satisfy a condition, and its Monte Carlo error.
 
         The error is at least that of `expected` in as many independent draws as the effective sample size.
         """
-        share, error = self.estimate(lambda x: np.mean(inside(x), axis=-1))
-        return share, max(error, float(np.sqrt(expected * (1.0 - expected) / self.size)))
+        fraction, error = self.estimate(lambda x: np.mean(inside(x), axis=-1))
+        return fraction, max(error, float(np.sqrt(expected * (1.0 - expected) / self.size)))
 
-
-def skewness(x: np.ndarray) -> np.ndarray:
-    """Return the skewness (…,) of draws (…, n)."""
-    z = x - x.mean(axis=-1, keepdims=True)
-    return np.mean(z**3, axis=-1) / np.mean(z**2, axis=-1) ** 1.5
+    def below(self, bound: float, expected: float) -> tuple[float, float]:
+        """Return the fraction of draws below a bound, and its Monte Carlo error."""
+        return self.fraction(lambda x: x < bound, expected)
 
 
 def wasserstein(x: np.ndarray, mean: float, sd: float) -> np.ndarray:
@@ -88,8 +80,8 @@ def wasserstein(x: np.ndarray, mean: float, sd: float) -> np.ndarray:
 def wasserstein_distance(sample: Sample, mean: float, sd: float) -> tuple[float, float]:
     """Return the Wasserstein distance from a normal distribution in sds of the draws, and its Monte Carlo error.
 
-    A distance is biased upwards: draws of the normal distribution itself are 1.3/√ESS sds away from it. The error is
-    the root of the squares of the spread between batches and of this bias.
+    The estimate is biased upwards: draws of the normal distribution itself have a distance of 1.3/√ESS sds. The error
+    is the root of the sum of squares of the spread between batches and of this bias.
     """
     if not np.isfinite(sd):
         return np.inf, np.nan
@@ -99,9 +91,8 @@ def wasserstein_distance(sample: Sample, mean: float, sd: float) -> tuple[float,
 
 
 def radii(points: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the Mahalanobis distances (n,) of points (n, dimension) from the centre of a normal distribution."""
-    scale = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    """Return the Mahalanobis distances (n,) of points (n, dimension) from the mean of a normal distribution."""
+    values, vectors, scale = covariance_eigh(covariance)
     floor = np.finfo(float).eps * values.size * values.max()
     z = ((points - mean) / scale) @ (vectors / np.sqrt(np.maximum(values, floor)))
     return np.sqrt(np.sum(z**2, axis=1))
@@ -110,55 +101,48 @@ def radii(points: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.nd
 def normal_draws(
     mean: np.ndarray, covariance: np.ndarray, size: int, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return draws (size, dimension) of a normal distribution and their log-densities (size,), but for a constant."""
-    scale = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    """Return draws (size, dimension) of a normal distribution and their log-densities (size,) up to a constant."""
+    values, vectors, scale = covariance_eigh(covariance)
     z = generator.standard_normal((size, mean.size))
     return mean + scale * ((z * np.sqrt(np.maximum(values, 0.0))) @ vectors.T), -0.5 * np.sum(z**2, axis=1)
 
 
+# A second mode: least probability beyond the valley, and depth of the valley relative to the lower peak.
 MASS, DEPTH = 0.05, 0.7
-GRID = 256
-ENDS = (0.001, 0.999)
+GRID, GRID_RANGE = 256, (0.001, 0.999)
 
 
 def has_other_mode(sample: Sample, point: float) -> bool:
-    """Return whether more than 5 % of the draws lie beyond a valley of their density, as seen from a point.
+    """Return whether more than 5 % of the draws are separated from a point by a valley of their density.
 
     The density is a kernel estimate with Silverman's bandwidth for the effective sample size, in every batch. A valley
-    is lower than 0.7 of the lower of the peaks on its two sides. Both the mass and the depth must hold by three Monte
-    Carlo errors, so neither skewness nor the noise of a flat top makes a mode.
+    is lower than 0.7 of the lower of the peaks on its two sides. Both criteria must hold by three Monte Carlo errors,
+    so that neither skewness nor the noise of a flat density is taken for a mode.
     """
     x = sample.whole
     spread = min(x.std(), float(np.subtract(*np.quantile(x, [0.75, 0.25]))) / 1.349) or x.std()
     if not spread > 0.0:
         return False
     bandwidth = 0.9 * spread * sample.size**-0.2
-    low, high = np.quantile(x, ENDS)
+    low, high = np.quantile(x, GRID_RANGE)
     edges = np.linspace(low - 3 * bandwidth, high + 3 * bandwidth, GRID + 1)
     width = edges[1] - edges[0]
     inside = np.clip(((sample.batches - edges[0]) / width).astype(int), 0, GRID - 1)
     batches = len(inside)
     counts = np.bincount((inside + GRID * np.arange(batches)[:, None]).ravel(), minlength=batches * GRID)
-    shares = counts.reshape(batches, GRID) / inside.shape[1]
-    density = gaussian_filter1d(shares, bandwidth / width, mode="constant")
-    return any(
-        _separates(density, shares, at, point > edges[at] + 0.5 * width) for at in _valleys(density.mean(axis=0))
-    )
+    mass = counts.reshape(batches, GRID) / inside.shape[1]
+    density = gaussian_filter1d(mass, bandwidth / width, mode="constant")
+    slope = np.diff(density.mean(axis=0))
+    valleys = np.flatnonzero((slope[:-1] < 0.0) & (slope[1:] >= 0.0)) + 1
+    return any(_separates(density, mass, at, point > edges[at] + 0.5 * width) for at in valleys)
 
 
-def _valleys(density: np.ndarray) -> np.ndarray:
-    """Return where a density has local minima."""
-    falls, rises = np.diff(density)[:-1] < 0.0, np.diff(density)[1:] >= 0.0
-    return np.flatnonzero(falls & rises) + 1
-
-
-def _separates(density: np.ndarray, shares: np.ndarray, valley: int, point_above: bool) -> bool:
+def _separates(density: np.ndarray, mass: np.ndarray, valley: int, point_above: bool) -> bool:
     """Return whether a valley is deep enough and the mass beyond it large enough, by the batches (batches, grid)."""
     mean = density.mean(axis=0)
     peaks = int(np.argmax(mean[:valley])), valley + int(np.argmax(mean[valley:]))
     peak = min(peaks, key=lambda place: mean[place])
-    far = shares[:, :valley] if point_above else shares[:, valley:]
+    far = mass[:, :valley] if point_above else mass[:, valley:]
     return _beyond_errors(far.sum(axis=1) - MASS) and _beyond_errors(DEPTH * density[:, peak] - density[:, valley])
 
 
@@ -174,7 +158,9 @@ TAIL, END_SHIFT = 0.05, 0.25
 END = float(ndtri(1.0 - TAIL))
 LEVELS = (0.5, 0.9, 0.95)
 SCALE = 1.0 + END_SHIFT / END
+# Accumulation at an end of the support: probability within a distance in sds of the draws.
 PILED, EDGE = 0.05, 0.25
+# Another mode: probability on one side of the mean ± 3 sd of the approximation.
 REACH, FEW = 3.0, 0.05
 USABLE_K = 0.7
 
@@ -182,18 +168,9 @@ USABLE_K = 0.7
 def marginal_verdict(sample: Sample, mean: float, sd: float, support: tuple[float, float], converged: bool) -> str:
     """Return the verdict on a normal approximation of one quantity.
 
-    What counts are the ends of its 90 % interval: that more (or less) than 5 % of the draws lie beyond an end, still
-    after it was moved by a quarter of the draws' sd, and by more than three Monte Carlo errors.
-
-    Parameters
-    ----------
-    sample : Sample
-    mean, sd : float
-        Of the approximation.
-    support : tuple of float
-        Of the prior.
-    converged : bool
-        If the draws have not converged there is no verdict, unless every ensemble by itself shows another mode.
+    An end of its 90 % interval is wrong if more (or less) than 5 % of the draws lie beyond it by more than three Monte
+    Carlo errors, even after moving it by a quarter of the sd of the draws. `support` is that of the prior. Draws that
+    have not converged get no verdict, unless every ensemble by itself shows another mode.
     """
     if not converged:
         return _unconverged(sample, mean)
@@ -203,7 +180,7 @@ def marginal_verdict(sample: Sample, mean: float, sd: float, support: tuple[floa
         return MODE
     own = float(sample.whole.std())
     low = _end(sample, mean, sd, own)
-    high = _end(sample.of_values(np.negative), -mean, sd, own)
+    high = _end(Sample(-sample.whole, -sample.batches, sample.size, sample.ensembles), -mean, sd, own)
     if low == high == FINE:
         distance, error = wasserstein_distance(sample, mean, sd)
         return SHAPE if distance - ERRORS * error > END_SHIFT else FINE
@@ -224,33 +201,28 @@ def _unconverged(sample: Sample, mean: float) -> str:
 def _end(sample: Sample, mean: float, sd: float, own: float) -> str:
     """Return the verdict on the lower end of the 90 % interval; `own` is the sd of the draws."""
     end = mean - END * sd
-    beyond, error = sample.share(lambda x: x < end - END_SHIFT * own, TAIL)
+    beyond, error = sample.below(end - END_SHIFT * own, TAIL)
     if beyond > TAIL + ERRORS * error:
         return NARROW
-    beyond, error = sample.share(lambda x: x < end + END_SHIFT * own, TAIL)
+    beyond, error = sample.below(end + END_SHIFT * own, TAIL)
     return WIDE if beyond < TAIL - ERRORS * error else FINE
 
 
 def _elsewhere(sample: Sample, mean: float, sd: float) -> bool:
-    """Return whether less than 5 % of the draws lie on this side of either end of mean ± 3 sd."""
-    for sign in (1.0, -1.0):
-        within, error = sample.share(lambda x, s=sign: s * (x - mean) < REACH * sd, FEW)  # type: ignore[misc]
-        if within < FEW - ERRORS * error:
-            return True
-    return False
+    """Return whether fewer than 5 % of the draws lie below mean + 3 sd, or above mean − 3 sd."""
+    low = sample.below(mean + REACH * sd, FEW)
+    high = sample.fraction(lambda x: x > mean - REACH * sd, FEW)
+    return any(within < FEW - ERRORS * error for within, error in (low, high))
 
 
 def _piled(sample: Sample, support: tuple[float, float], own: float) -> bool:
     """Return whether more than 5 % of the draws lie within a quarter of their sd of an end of the support.
 
-    They are 1.8 % of a normal posterior cut two sds from its centre, and 12 % of one cut at its centre.
+    A normal posterior truncated two sds from its centre has 1.8 % there, one truncated at its centre 12 %.
     """
-    for end in support:
-        if np.isfinite(end):
-            near, error = sample.share(lambda x, e=end: np.abs(x - e) < EDGE * own, PILED)  # type: ignore[misc]
-            if near > PILED + ERRORS * error:
-                return True
-    return False
+    bounds = [end for end in support if np.isfinite(end)]
+    near = [sample.fraction(lambda x, e=end: np.abs(x - e) < EDGE * own, PILED) for end in bounds]  # type: ignore[misc]
+    return any(fraction > PILED + ERRORS * error for fraction, error in near)
 
 
 def joint_verdict(
@@ -261,20 +233,20 @@ def joint_verdict(
     pareto_k: tuple[float, float],
     converged: bool,
 ) -> str:
-    """Return the verdict on a normal approximation of all coordinates together.
+    """Return the verdict on a normal approximation of all coordinates jointly.
 
-    Ellipsoids of 50, 90 and 95 % hold too few draws if they still do after their radii grew by 15 % (as far as a
-    quarter of a sd moves the ends of a 90 % interval), and too many accordingly; by more than three Monte Carlo errors.
-    The approximation is then too narrow or too wide if a normal distribution with the draws' own mean and covariance
-    would be fine and a shift of the mean alone is not what is wrong; otherwise, and where the Pareto k̂ is above 0.7 by
-    its error, the shape is wrong.
+    An ellipsoid of 50, 90 or 95 % contains too few draws if it still does, by more than three Monte Carlo errors, after
+    its radius is increased by 15 % (which corresponds to a shift of the end of a 90 % interval by a quarter of a sd);
+    too many accordingly. The approximation is then "too narrow" or "too wide" if a normal distribution with the mean
+    and covariance of the draws is fine and correcting the mean alone is not sufficient; otherwise, and where the Pareto
+    k̂ exceeds 0.7 by its error, it has the "wrong shape".
 
     Parameters
     ----------
     points : array (draws, dimension)
     mean, covariance : array (dimension,), (dimension, dimension)
     sampled : callable
-        Makes a Sample of values (draws,).
+        Constructor of a Sample from values (draws,).
     pareto_k : tuple of float
         With its error.
     converged : bool
@@ -298,25 +270,25 @@ def joint_verdict(
 
 
 def ellipsoid_radii(levels: np.ndarray, dimension: int) -> np.ndarray:
-    """Return the Mahalanobis radii of the ellipsoids that hold these probabilities."""
+    """Return the Mahalanobis radii of the ellipsoids of given probabilities."""
     return np.sqrt(chdtri(dimension, 1.0 - np.asarray(levels)))
 
 
 def _ellipsoids(distances: Sample, dimension: int) -> str:
-    """Return whether the ellipsoids hold as many draws as they should."""
+    """Return whether the ellipsoids contain as many draws as expected."""
     found = set()
     for level, radius in zip(LEVELS, ellipsoid_radii(np.array(LEVELS), dimension), strict=True):
-        larger, error = distances.share(lambda r, R=radius: r < SCALE * R, level)  # type: ignore[misc]
+        larger, error = distances.below(SCALE * radius, level)
         if larger < level - ERRORS * error:
             found.add(NARROW)
-        smaller, error = distances.share(lambda r, R=radius: r < R / SCALE, level)  # type: ignore[misc]
+        smaller, error = distances.below(radius / SCALE, level)
         if smaller > level + ERRORS * error:
             found.add(WIDE)
     return found.pop() if len(found) == 1 else SHAPE if found else FINE
 
 
 def _widest(covariance: np.ndarray) -> np.ndarray:
-    """Return the direction along which draws, in units of their sds, spread most."""
+    """Return the direction of largest spread of the draws, in units of their sds."""
     scale = np.sqrt(np.diag(covariance))
-    safe = np.where(scale > 0.0, scale, 1.0)
-    return np.linalg.eigh(covariance / np.outer(safe, safe))[1][:, -1] / safe
+    scale = np.where(scale > 0.0, scale, 1.0)
+    return covariance_eigh(covariance, scale)[1][:, -1] / scale

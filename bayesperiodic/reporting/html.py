@@ -1,113 +1,103 @@
-"""What a page is made of: sections, and in them words, tables, figures and equations."""
+"""Elements of the page (paragraphs, tables, figures, equations) and the formatting of numbers and units."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import groupby
 from math import floor, isfinite, isinf, isnan, log10
-from typing import ClassVar
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-# Badges say by a word and a sign what they say by a colour.
 GOOD, CAUTION, BAD, NEUTRAL = "good", "caution", "bad", "neutral"
+# A badge shows its tone by a sign as well as by a colour.
+SIGNS = {GOOD: "✓", CAUTION: "!", BAD: "✕", NEUTRAL: "•"}
 
 
 @dataclass(frozen=True)
 class Paragraph:
-    """Some sentences."""
+    """A few sentences."""
 
     text: str
-    kind: ClassVar[str] = "paragraph"
 
 
 @dataclass(frozen=True)
 class Note:
-    """What a reader must not miss."""
+    """A highlighted warning."""
 
     tone: str
     text: str
-    kind: ClassVar[str] = "note"
 
 
 @dataclass(frozen=True)
 class Heading:
-    """The heading of a part of a section."""
+    """A heading within a section."""
 
     id: str
     text: str
-    kind: ClassVar[str] = "heading"
 
 
 @dataclass(frozen=True)
 class Badge:
-    """A verdict in a word or two, with its tone; a cell of a table or the head of an answer."""
+    """A verdict of one or two words with its tone."""
 
     tone: str
     text: str
 
 
-@dataclass(frozen=True)
-class Column:
-    """The head of a column; neighbours of the same group share a second head above them."""
-
-    title: str
-    numeric: bool = True
-    group: str = ""
-
-
-Row = tuple[str | Markup | Badge, ...]
+class Number(str):
+    """A formatted number; columns that hold one are aligned to the right."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table whose first column heads the rows."""
+    """A table: rows as mappings from column titles to cells, where the first cell heads the row.
+
+    A title such as "Laplace: sd" places the column "sd" under the common head "Laplace".
+    """
 
     id: str
     caption: str
-    columns: tuple[Column, ...]
-    rows: tuple[Row, ...]
-    kind: ClassVar[str] = "table"
+    rows: Sequence[Mapping[str, str | Markup | Badge]]
+
+    @property
+    def columns(self) -> list[tuple[str, bool]]:
+        """The title of each column, and whether it holds numbers."""
+        titles = self.rows[0] if self.rows else ()
+        return [(t.rpartition(": ")[2], any(isinstance(row[t], Number) for row in self.rows)) for t in titles]
 
     @property
     def groups(self) -> list[tuple[str, int]]:
-        """The second heads, with the number of columns that each spans; empty if there are none."""
-        found: list[tuple[str, int]] = []
-        for column in self.columns:
-            if found and column.group and found[-1][0] == column.group:
-                found[-1] = (column.group, found[-1][1] + 1)
-            else:
-                found.append((column.group, 1))
-        return found if any(name for name, _ in found) else []
+        """The common heads with the number of columns below each; empty without any."""
+        heads = [title.rpartition(": ")[0] for title in (self.rows[0] if self.rows else ())]
+        return [(head, len(list(columns))) for head, columns in groupby(heads)] if any(heads) else []
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture within the page; `alt` says what it shows to those who do not see it."""
+    """An image within the page, with a description for screen readers."""
 
     id: str
     source: str
     alt: str
     caption: str
     wide: bool = False
-    kind: ClassVar[str] = "figure"
 
 
 @dataclass(frozen=True)
 class Equations:
-    """Equations as MathML, and as LaTeX to be copied."""
+    """Equations as MathML, and optionally as LaTeX source."""
 
     id: str
     label: str
     rows: tuple[Markup, ...]
     latex: str = ""
-    kind: ClassVar[str] = "equations"
 
 
 @dataclass(frozen=True)
-class Answer:
-    """The answer to one of the questions that a reader has."""
+class Finding:
+    """A question about the identification and its result."""
 
     question: str
     badge: Badge
@@ -115,14 +105,13 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Answers:
-    """Answers side by side."""
+class Findings:
+    """Results in a row of boxes."""
 
-    items: tuple[Answer, ...]
-    kind: ClassVar[str] = "answers"
+    items: tuple[Finding, ...]
 
 
-Block = Paragraph | Note | Heading | Table | Figure | Equations | Answers
+Block = Paragraph | Note | Heading | Table | Figure | Equations | Findings
 
 
 @dataclass(frozen=True)
@@ -135,17 +124,17 @@ class Section:
 
 
 def code(name: str) -> Markup:
-    """Return a name as the user wrote it, set apart from words."""
+    """Return a name in the type of source code."""
     return Markup("<code>{}</code>").format(name)
 
 
 NOTHING = "–"
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-SMALLEST, LARGEST = 1e-3, 1e6
+SMALLEST, LARGEST = 1e-2, 1e6
 
 
-def number(value: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits, powers of ten raised.
+def number(value: float, digits: int = 3) -> Number:
+    """Format a number with a count of significant digits and a raised power of ten.
 
     Examples
     --------
@@ -154,42 +143,34 @@ def number(value: float, digits: int = 3) -> str:
     ('−0.5', '1.23×10⁻⁹', '–')
     """
     if isnan(value):
-        return NOTHING
+        return Number(NOTHING)
     if isinf(value):
-        return "∞" if value > 0 else "−∞"
+        return Number("∞" if value > 0 else "−∞")
     mantissa, _, exponent = f"{value:.{digits}g}".partition("e")
-    return mantissa.replace("-", "−") + (power_of_ten(int(exponent)) if exponent else "")
+    return Number(mantissa.replace("-", "−") + (_power_of_ten(int(exponent)) if exponent else ""))
 
 
-def power_of_ten(exponent: int) -> str:
-    """Return "×10⁻³" and the like."""
+def _power_of_ten(exponent: int) -> str:
     return f"×10{str(exponent).translate(RAISED)}"
 
 
-def percent(share: float) -> str:
-    """Return a share in per cent, with three significant digits."""
-    return NOTHING if isnan(share) else f"{number(100.0 * share)}\u00a0%"
+def percent(fraction: float) -> Number:
+    """Format a fraction in per cent with three significant digits."""
+    return Number(NOTHING if isnan(fraction) else f"{number(100.0 * fraction)}\u00a0%")
 
 
-def p_value(p: float) -> str:
-    """Return a p-value; what is below 10⁻³⁰⁰ is said to be so.
-
-    Examples
-    --------
-    >>> from bayesperiodic.reporting.html import p_value
-    >>> p_value(0.0), p_value(0.0312)
-    ('< 10⁻³⁰⁰', '0.031')
-    """
-    return "< 10⁻³⁰⁰" if p < 1e-300 else number(p, 2)
+def p_value(p: float) -> Number:
+    """Format a p-value; values below 10⁻³⁰⁰ are given as such."""
+    return Number("< 10⁻³⁰⁰") if p < 1e-300 else number(p, 2)
 
 
 def counted(what: str, count: int) -> str:
-    """Return a number of things in words."""
+    """Format a count with its noun."""
     return f"{count} {what}{'s' if count != 1 else ''}"
 
 
 def unit(text: str) -> str:
-    """Return a unit with its powers raised, on one line.
+    """Format a unit with raised powers, without line breaks.
 
     Examples
     --------
@@ -197,18 +178,22 @@ def unit(text: str) -> str:
     >>> unit("m/s^2"), unit("")
     ('m/s²', '–')
     """
-    return re.sub(r"\^(-?\d+)", lambda found: found[1].translate(RAISED), text).replace(" ", "\u00a0") or NOTHING
+    raised = re.sub(r"\^(-?\d+)", lambda found: found[1].translate(RAISED), text).replace(" ", "\u00a0")
+    return raised or NOTHING
 
 
 @dataclass(frozen=True)
 class Rounding:
-    """How the numbers of one quantity are rounded, so that all of them can be compared.
+    """Common rounding of the values of one quantity: a power of ten and a number of decimals.
 
-    Attributes
-    ----------
-    exponent : int
-        Of the power of ten that is written behind.
-    decimals : int
+    Examples
+    --------
+    >>> from bayesperiodic.reporting.html import Rounding
+    >>> rounding = Rounding.of(768.123, 4.5678)
+    >>> rounding.text(768.123), rounding.text(-4.5678), Rounding.of(5e-3, 2e-6).text(5e-3)
+    ('768.12', '−4.57', '5.00000×10⁻³')
+    >>> Rounding(-3, 1).interval(4e-3, 5.1e-3), Rounding(0, 1).interval(-1.0, 2.0)
+    ('(4.0 … 5.1)×10⁻³', '−1.0 … 2.0')
     """
 
     exponent: int
@@ -216,57 +201,36 @@ class Rounding:
 
     @classmethod
     def of(cls, value: float, sd: float) -> "Rounding":
-        """Return the rounding that shows three significant digits of the standard deviation.
-
-        Examples
-        --------
-        >>> from bayesperiodic.reporting.html import Rounding
-        >>> rounding = Rounding.of(768.123, 4.5678)
-        >>> rounding.text(768.123), rounding.text(-4.5678)
-        ('768.12', '−4.57')
-        >>> Rounding.of(5e-3, 2e-6).text(5e-3)
-        '5.00000×10⁻³'
-        """
+        """Return the rounding that shows three significant digits of the standard deviation."""
         known = [abs(x) for x in (value, sd) if isfinite(x) and x != 0.0]
         if not known:
             return cls(0, 3)
         size, step = max(known), abs(sd) if isfinite(sd) and sd != 0.0 else 1e-2 * max(known)
-        exponent = 0 if 10.0 * SMALLEST <= size < LARGEST else floor(log10(size))
+        exponent = 0 if SMALLEST <= size < LARGEST else floor(log10(size))
         return cls(exponent, max(0, 2 - floor(log10(step)) + exponent))
 
-    def text(self, value: float) -> str:
-        """Return one number."""
+    def text(self, value: float) -> Number:
+        """Format one value."""
         if not isfinite(value):
             return number(value)
         shown = f"{value / 10.0**self.exponent:.{self.decimals}f}".replace("-", "−")
-        return shown + (power_of_ten(self.exponent) if self.exponent else "")
+        return Number(shown + (_power_of_ten(self.exponent) if self.exponent else ""))
 
-    def sd(self, value: float) -> str:
-        """Return a standard deviation; beside numbers with a power of ten it has its own."""
+    def sd(self, value: float) -> Number:
+        """Format a standard deviation, with its own power of ten if the values have one."""
         return number(value) if self.exponent else self.text(value)
 
-    def interval(self, low: float, high: float) -> str:
-        """Return the two ends of an interval.
-
-        Examples
-        --------
-        >>> from bayesperiodic.reporting.html import Rounding
-        >>> Rounding(-3, 1).interval(4e-3, 5.1e-3), Rounding(0, 1).interval(-1.0, 2.0)
-        ('(4.0 … 5.1)×10⁻³', '−1.0 … 2.0')
-        """
+    def interval(self, low: float, high: float) -> Number:
+        """Format the two ends of an interval."""
         if not isfinite(low) or not isfinite(high):
-            return NOTHING
-        plain = Rounding(0, self.decimals)
-        ends = f"{plain.text(low / 10.0**self.exponent)} … {plain.text(high / 10.0**self.exponent)}"
-        return f"({ends}){power_of_ten(self.exponent)}" if self.exponent else ends
-
-
-SIGNS = {"good": "✓", "caution": "!", "bad": "✕", "neutral": "•"}
+            return Number(NOTHING)
+        plain, scale = Rounding(0, self.decimals), 10.0**self.exponent
+        ends = f"{plain.text(low / scale)} … {plain.text(high / scale)}"
+        return Number(f"({ends}){_power_of_ten(self.exponent)}" if self.exponent else ends)
 
 
 @cache
-def environment() -> Environment:
-    """Return the template engine; whatever it is given is escaped."""
+def _environment() -> Environment:
     made = Environment(
         loader=PackageLoader("bayesperiodic.reporting"),
         autoescape=True,
@@ -275,22 +239,23 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     made.tests["badge"] = lambda value: isinstance(value, Badge)
+    made.filters["kind"] = lambda block: type(block).__name__.lower()
     return made
 
 
 def page(title: str, subtitle: str, badges: Sequence[Badge], sections: Sequence[Section], written: str) -> str:
-    """Return the page.
+    """Render the page; all text is escaped.
 
     Parameters
     ----------
     title, subtitle : str
     badges : sequence of Badge
-        Shown beside the title.
+        Shown below the title.
     sections : sequence of Section
     written : str
-        When.
+        Date and time.
     """
-    template = environment().get_template("page.html")
+    template = _environment().get_template("page.html")
     return template.render(
         title=title, subtitle=subtitle, badges=badges, sections=sections, written=written, signs=SIGNS
     )

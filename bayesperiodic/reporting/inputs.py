@@ -1,11 +1,13 @@
-"""All that a report is about, gathered before a word is written."""
+"""Inputs of the report, and the sections on the data and the model."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import sympy as sp
 from markupsafe import Markup
 from sympy.printing.mathml import MathMLPresentationPrinter
@@ -22,18 +24,21 @@ from bayesperiodic.posterior import labels
 from bayesperiodic.posterior.parameters import SHIFT
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.reporting import html
-from bayesperiodic.reporting.html import CAUTION, Block, Column, Equations, Note, Paragraph, Section, Table, code
+from bayesperiodic.reporting.html import CAUTION, Block, Equations, Note, Paragraph, Section, Table, code
 from bayesperiodic.sampling.posterior import Posterior
+
+# Level of the whiteness test, and the ratio of robust to Laplace sd above which the report warns.
+NOT_WHITE, LARGE_RATIO = 0.01, 1.5
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """A problem, what was found, and the verdicts; draws, and what rests on them, may be lacking.
+class ReportInputs:
+    """A problem, its estimate, and the draws and diagnostics that the report shows; those that are missing are None.
 
     Attributes
     ----------
-    unpredicted : str
-        Why there is no prediction although there are draws; "" otherwise.
+    no_prediction : str
+        Reason why there is no prediction although there are draws; "" otherwise.
     """
 
     problem: Problem
@@ -42,7 +47,7 @@ class Evidence:
     identifiability: Identifiability
     comparison: Comparison | None
     prediction: Prediction | None
-    unpredicted: str
+    no_prediction: str
 
     @classmethod
     def of(
@@ -53,42 +58,52 @@ class Evidence:
         found: Identifiability | None,
         comparison: Comparison | None,
         prediction: Prediction | None,
-    ) -> "Evidence":
-        """Return the evidence, with verdicts that were not given computed.
-
-        Raises
-        ------
-        ValueError
-            If the fit, the posterior or a verdict is of another problem.
-        """
+    ) -> "ReportInputs":
+        """Check that all inputs belong to one problem, and compute the diagnostics that are not given."""
+        runs, no_prediction = [e.name for e in problem.experiments], ""
         _checks.same_names("fit", fit.theta, problem.names)
-        _checks.same_names("fit", fit.residuals, [e.name for e in problem.experiments])
-        if posterior is not None and not _is_of(posterior, problem):
-            raise ValueError("posterior: it is not allowed; it is of other parameters or data than the problem's.")
-        unpredicted = ""
-        if posterior is not None and comparison is None:
-            comparison = compare(problem, fit, posterior)
-        if posterior is not None and prediction is None:
+        _checks.same_names("fit", fit.residuals, runs)
+        if posterior is not None:
+            _check_data(posterior, problem)
+            comparison = compare(problem, fit, posterior) if comparison is None else comparison
             try:
-                prediction = predict(problem, posterior)
+                prediction = predict(problem, posterior) if prediction is None else prediction
             except RuntimeError as error:
-                unpredicted = str(error)
+                no_prediction = str(error)
         found = identifiability(problem, fit, posterior, profile=False) if found is None else found
         _checks.same_names("identifiability", dict.fromkeys(found.table.index), problem.names)
         if comparison is not None:
             remedy = "give the one of this problem, compare(problem, fit, posterior)"
             _checks.holds("comparison", comparison.table.index, problem.names, remedy)
         if prediction is not None:
-            _checks.same_names("prediction", prediction.median, [e.name for e in problem.experiments])
-        return cls(problem, fit, posterior, found, comparison, prediction, unpredicted)
+            _checks.same_names("prediction", prediction.median, runs)
+        return cls(problem, fit, posterior, found, comparison, prediction, no_prediction)
 
     @property
     def synthetic(self) -> bool:
         """Whether any of the data were simulated."""
         return any(e.synthetic for e in self.problem.experiments)
 
+    @cached_property
+    def summary(self) -> pd.DataFrame:
+        """Mean, sd, interval and diagnostics of the draws by name; empty without draws."""
+        return pd.DataFrame() if self.posterior is None else self.posterior.summary()
+
+    @cached_property
+    def robust_ratios(self) -> dict[str, float]:
+        """Robust over Laplace standard deviation where it exceeds 1.5 although some residual is not white."""
+        if not self.coloured:
+            return {}
+        ratios = {name: self.fit.robust_sd[name] / sd for name, sd in self.fit.sd.items() if sd > 0.0}
+        return {name: ratio for name, ratio in ratios.items() if np.isfinite(ratio) and ratio > LARGE_RATIO}
+
+    @property
+    def coloured(self) -> list[str]:
+        """The channels whose residual is not white."""
+        return [channel for channel, white in self.fit.whiteness.items() if white.p < NOT_WHITE]
+
     def unit(self, name: str) -> str:
-        """Return the unit of a parameter, a channel or a noise parameter, by its full name, as it is read."""
+        """Return the formatted unit of a parameter, a channel or a noise parameter, by its full name."""
         units, (plain, _, place) = self.problem.model.units, name.partition("[")
         if plain == SHIFT:
             return "s"
@@ -98,93 +113,73 @@ class Evidence:
         return html.unit(units.get(plain, ""))
 
 
-def _is_of(posterior: Posterior, problem: Problem) -> bool:
-    """Return whether draws are of a problem's parameters, and were made from its data."""
-    if set(posterior.names) != {*problem.names, *problem.free_noise}:
-        return False
+def _check_data(posterior: Posterior, problem: Problem) -> None:
+    """Raise a ValueError unless the draws are of the problem's parameters and were made from its data."""
     data = posterior.data["observed_data"]
     measured = {f"{e.name} {channel}": values for e in problem.experiments for channel, values in e.outputs.items()}
-    return set(data.data_vars) == set(measured) and all(
-        np.array_equal(data[name].to_numpy(), values) for name, values in measured.items()
-    )
-
-
-def data_section(evidence: Evidence) -> Section:
-    """Return what was measured, experiment by experiment and channel by channel."""
-    blocks: list[Block] = []
-    if evidence.synthetic:
-        blocks.append(Note(CAUTION, "Some or all of these data are synthetic: they were simulated, not measured."))
-    return Section("data", "Data", [*blocks, _experiments(evidence), _channels(evidence)])
-
-
-def _experiments(evidence: Evidence) -> Table:
-    columns = (
-        Column("Experiment", numeric=False),
-        Column("Data", numeric=False),
-        Column("Frequency [Hz]"),
-        Column("Standard error [Hz]"),
-        Column("Cycles"),
-        Column("Periods a response"),
-        Column("Points a period"),
-        Column("Periodicity"),
-    )
-    rows = [
-        (
-            e.name,
-            "synthetic" if e.synthetic else "measured",
-            html.number(e.frequency, 7),
-            html.number(e.frequency_se, 2) if e.frequency_se else html.NOTHING,
-            str(e.cycles),
-            str(e.periods),
-            str(e.samples),
-            html.number(e.periodicity, 5),
+    if (
+        set(posterior.names) != {*problem.names, *problem.free_noise}
+        or set(data.data_vars) != set(measured)
+        or not all(np.array_equal(data[name].to_numpy(), values) for name, values in measured.items())
+    ):
+        raise ValueError(
+            "posterior: must be of the parameters and data of `problem`, got draws of other parameters or data. Give "
+            "sample(problem, fit)."
         )
-        for e in evidence.problem.experiments
+
+
+def data_section(given: ReportInputs) -> Section:
+    """Return the section on the data, by experiment and by channel."""
+    experiments = [
+        {
+            "Experiment": e.name,
+            "Data": "synthetic" if e.synthetic else "measured",
+            "Frequency [Hz]": html.number(e.frequency, 7),
+            "Standard error [Hz]": html.number(e.frequency_se, 2) if e.frequency_se else html.NOTHING,
+            "Cycles": html.Number(e.cycles),
+            "Forcing periods per response": html.Number(e.periods),
+            "Points per period": html.Number(e.samples),
+            "Periodicity": html.number(e.periodicity, 5),
+        }
+        for e in given.problem.experiments
     ]
-    caption = "Experiments. The periodicity is the share of the variance that the mean period explains."
-    return Table("table-experiments", caption, columns, tuple(rows))
-
-
-def _channels(evidence: Evidence) -> Table:
-    columns = (
-        Column("Channel", numeric=False),
-        Column("Experiment", numeric=False),
-        Column("Kind", numeric=False),
-        Column("Unit", numeric=False),
-        Column("Smallest"),
-        Column("Largest"),
-        Column("Harmonics kept"),
-        Column("Independent values"),
-        Column("Scatter of one cycle"),
-    )
-    rows = [
-        _channel(evidence, e, channel, kind)
-        for e in evidence.problem.experiments
+    channels = [
+        _channel(given, e, channel, kind)
+        for e in given.problem.experiments
         for kind, channels in (("input", e.inputs), ("output", e.outputs))
         for channel in channels
     ]
-    caption = "Channels: what was prescribed (inputs) and what the model is compared with (outputs)."
-    return Table("table-channels", caption, columns, tuple(rows))
+    blocks: list[Block] = [
+        Table(
+            "table-experiments",
+            "Experiments. The periodicity is the fraction of the variance that the mean period explains.",
+            experiments,
+        ),
+        Table("table-channels", "Channels: prescribed (inputs) and compared with the model (outputs).", channels),
+    ]
+    if given.synthetic:
+        blocks.insert(0, Note(CAUTION, "Some or all of these data are synthetic: they were simulated, not measured."))
+    return Section("data", "Data", blocks)
 
 
-def _channel(evidence: Evidence, e: Experiment, channel: str, kind: str) -> tuple:
+def _channel(given: ReportInputs, e: Experiment, channel: str, kind: str) -> dict[str, str]:
     values = (e.inputs if kind == "input" else e.outputs)[channel]
     measured = values if e.mask is None or kind == "input" else values[e.mask]
-    return (
-        code(channel),
-        e.name,
-        kind if e.mask is None or kind == "input" else f"{kind}, at {measured.size} points",
-        evidence.unit(channel),
-        html.number(float(measured.min()), 4),
-        html.number(float(measured.max()), 4),
-        str(e.harmonics[channel]) if channel in e.harmonics else "all",
-        str(e.independent[channel]) if channel in e.independent else html.NOTHING,
-        html.number(e.scatter[channel]) if channel in e.scatter else html.NOTHING,
-    )
+    return {
+        "Channel": code(channel),
+        "Experiment": e.name,
+        "Kind": kind if e.mask is None or kind == "input" else f"{kind}, at {measured.size} points",
+        "Unit": given.unit(channel),
+        "Minimum": html.number(float(measured.min()), 4),
+        "Maximum": html.number(float(measured.max()), 4),
+        "Harmonics kept": html.Number(e.harmonics.get(channel, "all")),
+        "Independent values": html.Number(e.independent.get(channel, html.NOTHING)),
+        "Standard deviation of one cycle": html.number(e.scatter.get(channel, np.nan)),
+    }
 
 
 DOTS = ("", "˙", "¨")
-# A little space between factors, as some of them are words.
+# Space between factors, because some of them are words.
 AS_READ = {
     "<mo>-</mo>": "<mo>−</mo>",
     "<mo>&InvisibleTimes;</mo>": '<mo lspace="0.08em" rspace="0.08em">\u2062</mo>',
@@ -195,15 +190,7 @@ FUNCTIONS = {"sign": "sgn", "Max": "max", "Min": "min", "log": "ln"}
 
 
 def equations(model: Model) -> tuple[Markup, ...]:
-    """Return the equations of motion, one a state; what no state enters stands on the right-hand side.
-
-    Examples
-    --------
-    >>> import bayesperiodic as bp
-    >>> from bayesperiodic.reporting.inputs import equations
-    >>> equations(bp.models.duffing)[0].count("<mover")
-    2
-    """
+    """Return the equations of motion, one per state, with the terms that contain no state on the right-hand side."""
     printer, states = _Printer(model), set(model.state_symbols.values())
     rows = []
     for equation in model.equations:
@@ -215,40 +202,26 @@ def equations(model: Model) -> tuple[Markup, ...]:
 
 
 def outputs(model: Model) -> tuple[Markup, ...]:
-    """Return what the model says of the measured channels, an equation a channel."""
+    """Return the output equations, one per channel."""
     printer = _Printer(model)
     each = zip(model.outputs, model.output_expressions, strict=True)
     return tuple(_block(printer, sp.Symbol(name), expression) for name, expression in each)
 
 
 def symbol(name: str) -> Markup:
-    """Return a name as it is typeset: Greek letters, digits and what follows an underscore as subscripts.
-
-    Examples
-    --------
-    >>> from bayesperiodic.reporting.inputs import symbol
-    >>> print(symbol("theta16"))
-    <math><msub><mi>θ</mi><mn>16</mn></msub></math>
-    """
+    """Typeset a name: Greek letters, and digits and the parts after underscores as subscripts."""
     return Markup(f"<math>{_Printer.text_of(_Printer().named(name))}</math>")
 
 
 def parts(name: str) -> tuple[str, tuple[str, ...]]:
-    """Return what a name has on the line, and its subscripts.
-
-    Examples
-    --------
-    >>> from bayesperiodic.reporting.inputs import parts
-    >>> parts("k_alpha2"), parts("Kx"), parts("omega0")
-    (('k', ('α', '2')), ('Kx', ()), ('ω', ('0',)))
-    """
+    """Split a name into its base and its subscripts."""
     pieces = [piece for part in name.split("_") for piece in re.findall(r"\d+|\D+", part)]
     base, *below = (greek_unicode.get(piece, piece) for piece in pieces)
     return base, tuple(below)
 
 
 class _Printer(MathMLPresentationPrinter):
-    """Prints the symbols of a model by their names, with dots for time derivatives."""
+    """Printer of the symbols of a model by their names, with dots for time derivatives."""
 
     def __init__(self, model: Model | None = None):
         super().__init__()
@@ -263,21 +236,21 @@ class _Printer(MathMLPresentationPrinter):
 
     @staticmethod
     def text_of(node: Any) -> str:
-        """Return a node as text, with signs and entities as the characters they stand for."""
+        """Return a node as text, with entities replaced by characters."""
         text = node.toxml()
         for printed, wanted in AS_READ.items():
             text = text.replace(printed, wanted)
         return text
 
     def node(self, tag: str, *children: Any) -> Any:
-        """Return an element with a text or other elements in it."""
+        """Create an element with text or elements in it."""
         made = self.dom.createElement(tag)
         for child in children:
             made.appendChild(self.dom.createTextNode(child) if isinstance(child, str) else child)
         return made
 
     def named(self, name: str, order: int = 0) -> Any:
-        """Return a name with dots and subscripts."""
+        """Typeset a name with dots and subscripts."""
         base, below = parts(name)
         line = self.node("mi", base)
         if order:
@@ -289,7 +262,7 @@ class _Printer(MathMLPresentationPrinter):
         return self.node("msub", line, marks[0] if len(marks) == 1 else self.node("mrow", *marks))
 
     def mathml_tag(self, e: Any) -> str:
-        """Return the name of a function as it is written."""
+        """Return the tag or name of a function."""
         return FUNCTIONS.get(type(e).__name__) or super().mathml_tag(e)
 
     def _print_Symbol(self, sym: sp.Symbol, style: str = "plain") -> Any:
@@ -316,7 +289,7 @@ class _Printer(MathMLPresentationPrinter):
         return self.node("mrow", self._print(e.lhs), self.node("mo", sign), self._print(e.rhs))
 
     def _as_ordered_terms(self, expr: sp.Expr, order: Any = None) -> list[sp.Expr]:
-        """Return the terms by the highest derivative in them, and within these those with a minus sign last."""
+        """Sort terms by their highest derivative, negative ones last."""
         terms = super()._as_ordered_terms(expr, order)
         return sorted(terms, key=lambda term: (-self._height(term), term.could_extract_minus_sign()))
 
@@ -325,88 +298,64 @@ class _Printer(MathMLPresentationPrinter):
 
 
 def _block(printer: _Printer, *sides: sp.Expr) -> Markup:
-    """Return an equation on a line of its own."""
-    return Markup(f'<math display="block">{"<mo>=</mo>".join(_written(printer, sides))}</math>')
-
-
-def _written(printer: _Printer, sides: Iterable[sp.Expr]) -> list[str]:
-    return [printer.text_of(printer._print(side)) for side in sides]
+    """Return a displayed equation."""
+    printed = "<mo>=</mo>".join(printer.text_of(printer._print(side)) for side in sides)
+    return Markup(f'<math display="block">{printed}</math>')
 
 
 LONGEST = 120
+NOISE_MODELS = {
+    "independent": "independent errors, with an unknown variance for each {}.",
+    "measured": "the scatter of the measured cycles, and an independent model error with a variance for each {}.",
+    "circulant": "errors correlated along the period and stationary on the circle, with a variance for each {}.",
+}
 
 
-def model_section(evidence: Evidence) -> Section:
-    """Return the model's equations, its parameters and what is assumed of the noise."""
-    model, problem = evidence.problem.model, evidence.problem
-    states = ", ".join(f"{name} [{evidence.unit(name)}]" for name in model.states)
+def model_section(given: ReportInputs) -> Section:
+    """Return the section on the equations, the parameters and the noise model."""
+    problem, model, noise = given.problem, given.problem.model, given.problem.noise
+    states = ", ".join(f"{name} [{given.unit(name)}]" for name in model.states)
     used = set().union(*(e.free_symbols for e in (*model.equations, *model.output_expressions)))
-    said = {"tau": "τ is the time in forcing periods", "frequency": "f is the frequency in Hz"}
-    clocks = [words for name, words in said.items() if model.time_symbols[name] in used]
+    symbols = {"tau": "; τ is the time in forcing periods", "frequency": "; f is the frequency in Hz"}
+    clocks = "".join(words for name, words in symbols.items() if model.time_symbols[name] in used)
+    own = "channel" if noise.per == "channel" else "channel of each experiment"
+    noise_model = NOISE_MODELS.get(noise.name, f"user-defined, with parameters for each {noise.per}.").format(own)
+    parameters = [
+        {
+            "Parameter": code(name),
+            "Symbol": symbol(name.partition("[")[0]),
+            "Unit": given.unit(name),
+            "Role": role,
+            "Prior, value or expression": known,
+        }
+        for plain in (*model.parameters, SHIFT)
+        for name, role, known in _roles(problem, plain)
+    ]
     blocks: list[Block] = [
         Paragraph(
-            f"The model {model.name} has the state{'s' if len(model.states) > 1 else ''} {states}. "
-            f"{'; '.join(['A dot is a derivative by time, per second', *clocks])}."
+            f"The model {model.name} has the state{'s' if len(model.states) > 1 else ''} {states}. A dot is a "
+            f"derivative with respect to time, per second{clocks}."
         ),
         Equations("equations", "Equations of motion", equations(model), model.latex()),
-        Equations("outputs", "Measured channels as the model has them", outputs(model)),
-        _parameters(evidence),
-        Paragraph(
-            f"The noise model is “{problem.noise.name}”: {_noise_words(problem)} What is said of a variance rests on "
-            f"the {problem.noise.prior_text}."
-        ),
+        Equations("outputs", "Output equations", outputs(model)),
+        Table("table-parameters", "Parameters with their priors, fixed values or expressions.", parameters),
+        Paragraph(f"Noise model “{noise.name}”: {noise_model} Prior of the variances: {noise.prior_text}."),
     ]
     return Section("model", "Model", blocks)
 
 
-def _noise_words(problem: Problem) -> str:
-    own = "each channel" if problem.noise.per == "channel" else "each channel of each experiment"
-    return {
-        "independent": f"independent errors, with an unknown variance for {own}.",
-        "measured": f"the scatter of the measured cycles, and an independent model error with a variance for {own}.",
-        "circulant": f"errors correlated along the period and stationary on the circle, with a variance for {own}.",
-    }.get(problem.noise.name, f"one of the user's own, by {problem.noise.per}.")
-
-
-def _parameters(evidence: Evidence) -> Table:
-    problem = evidence.problem
-    columns = (
-        Column("Parameter", numeric=False),
-        Column("Symbol", numeric=False),
-        Column("Unit", numeric=False),
-        Column("Role", numeric=False),
-        Column("Prior, value or expression", numeric=False),
-    )
-    rows = [
-        (code(name), symbol(name.partition("[")[0]), evidence.unit(name), role, known)
-        for name, role, known in _roles(problem)
-    ]
-    caption = "Parameters, and what was known of them before the data."
-    return Table("table-parameters", caption, columns, tuple(rows))
-
-
-def _roles(problem: Problem) -> list[tuple[str, str, str]]:
-    """Return of every parameter its full name, whether it is free, and what is known of it."""
-    priors, found = problem.joint_prior.marginals, []
+def _roles(problem: Problem, plain: str) -> Iterator[tuple[str, str, str]]:
+    """Yield the full names of a parameter with its role and its prior, value or expression."""
     partners = {name: key for key in problem.priors if isinstance(key, tuple) for name in key}
-    for plain in (*problem.model.parameters, SHIFT):
-        for name in (n for n in problem.names if n.partition("[")[0] == plain):
-            others = [other for other in partners.get(name, ()) if other != name]
-            known = _shortened(repr(priors[name])) + (f", jointly with {', '.join(others)}" if others else "")
-            found.append((name, "free", known))
-        if plain in problem.tied:
-            found.append((plain, "tied", problem.tied[plain]))
-        found += _fixed(problem, plain)
-    return found
-
-
-def _fixed(problem: Problem, plain: str) -> list[tuple[str, str, str]]:
-    """Return the fixed values of a parameter: one, or those of the experiments where they differ."""
+    for name in (n for n in problem.names if n.partition("[")[0] == plain):
+        prior = repr(problem.joint_prior.marginals[name])
+        prior = prior if len(prior) <= LONGEST else f"{prior[:LONGEST]}…"
+        others = ", ".join(other for other in partners.get(name, ()) if other != name)
+        yield name, "free", prior + (f", jointly with {others}" if others else "")
+    if plain in problem.tied:
+        yield plain, "tied", problem.tied[plain]
     by_run = problem.fixed.get(plain, {})
     if len(by_run) == len(problem.experiments) and len(set(by_run.values())) == 1:
-        return [(plain, "fixed", html.number(next(iter(by_run.values())), 6))]
-    return [(f"{plain}[{run}]", "fixed", html.number(value, 6)) for run, value in by_run.items()]
-
-
-def _shortened(words: str) -> str:
-    return words if len(words) <= LONGEST else f"{words[:LONGEST]}…"
+        by_run = {"": next(iter(by_run.values()))}
+    for run, value in by_run.items():
+        yield (f"{plain}[{run}]" if run else plain), "fixed", str(html.number(value, 6))

@@ -1,13 +1,20 @@
-"""The section on the estimates: MAP, Laplace and MCMC side by side."""
+"""Sections of the report on estimates, residuals and verdicts, with their figures."""
 
+import base64
+import io
+from collections.abc import Iterator
+
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure as Drawing
 
-from bayesperiodic.diagnostics.adequacy import ADEQUATE, LEVEL, MISSPECIFIED
+from bayesperiodic import plot
+from bayesperiodic.diagnostics.adequacy import ADEQUATE, LEVEL, MISSPECIFIED, TESTS, UNTESTED
 from bayesperiodic.diagnostics.comparison import Comparison
 from bayesperiodic.diagnostics.identifiability import DETERMINED, NOTHING
-from bayesperiodic.diagnostics.predictive import Prediction
+from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction
 from bayesperiodic.diagnostics.verdicts import FINE, MODE, UNCONVERGED
-from bayesperiodic.reporting import figures, html
+from bayesperiodic.reporting import html
 from bayesperiodic.reporting.html import (
     BAD,
     CAUTION,
@@ -15,116 +22,18 @@ from bayesperiodic.reporting.html import (
     NEUTRAL,
     Badge,
     Block,
-    Column,
+    Figure,
     Heading,
     Note,
     Paragraph,
-    Row,
     Section,
     Table,
     code,
 )
-from bayesperiodic.reporting.inputs import Evidence
+from bayesperiodic.reporting.inputs import ReportInputs
+from bayesperiodic.sampling.posterior import Posterior
 
-PROBABILITY = 0.9
-
-
-def estimates_section(evidence: Evidence) -> Section:
-    """Return the estimates of all free parameters and noise parameters."""
-    blocks: list[Block] = [Note(CAUTION, f"Not determined by the data: {said}.") for said in evidence.fit.undetermined]
-    blocks += [_parameters(evidence), _noise(evidence)]
-    sentence = (
-        "The MAP estimate is the maximum of the posterior density, the Laplace approximation the normal distribution "
-        "around it; its intervals are Student’s t. The robust standard deviation holds also where the residual is not "
-        "as the noise model says; far from the other one, the noise model is too sure of itself, or not sure enough."
-    )
-    if evidence.posterior is None:
-        return Section("estimates", "Estimates", [*blocks, Paragraph(f"{sentence} There are no draws (MCMC).")])
-    blocks += [
-        Paragraph(f"{sentence} MCMC is the distribution of the draws."),
-        figures.corner(evidence, evidence.posterior),
-    ]
-    return Section("estimates", "Estimates", blocks)
-
-
-def _parameters(evidence: Evidence) -> Table:
-    columns = (
-        Column("Parameter", numeric=False),
-        Column("Unit", numeric=False),
-        Column("MAP"),
-        Column("sd", group="Laplace"),
-        Column("90 % interval", group="Laplace"),
-        Column("robust sd", group="Laplace"),
-        *_mcmc_columns(evidence),
-    )
-    fit, intervals = evidence.fit, evidence.fit.interval(PROBABILITY)
-    rows = []
-    for name, value in fit.theta.items():
-        rounding = html.Rounding.of(value, fit.sd[name])
-        rows.append(
-            (
-                code(name),
-                evidence.unit(name),
-                rounding.text(value),
-                rounding.sd(fit.sd[name]),
-                rounding.interval(*intervals[name]),
-                rounding.sd(fit.robust_sd[name]),
-                *mcmc_cells(evidence, name, rounding),
-            )
-        )
-    return Table("table-estimates", "Estimates of the free parameters.", columns, tuple(rows))
-
-
-def _noise(evidence: Evidence) -> Table:
-    columns = (
-        Column("Noise parameter", numeric=False),
-        Column("Unit", numeric=False),
-        Column("Independent values"),
-        Column("Estimate (eq. 7)"),
-        Column("relative sd", group="Laplace"),
-        *_mcmc_columns(evidence),
-    )
-    fit, rows = evidence.fit, []
-    for name, value in fit.noise.items():
-        free = name in evidence.problem.free_noise
-        place = list(fit.joint_covariance.index).index(name) if free else -1
-        relative = np.sqrt(float(fit.joint_covariance.to_numpy()[place, place])) if free else np.nan
-        rounding = html.Rounding.of(value, value * relative)
-        rows.append(
-            (
-                code(name),
-                evidence.unit(name),
-                html.number(_independent(evidence, name), 6),
-                rounding.text(value) if free else f"{html.number(value, 6)} (known)",
-                html.percent(relative),
-                *mcmc_cells(evidence, name, rounding),
-            )
-        )
-    return Table("table-noise", "Estimates of the noise parameters.", columns, tuple(rows))
-
-
-def _independent(evidence: Evidence, name: str) -> float:
-    """Return the independent values behind a variance; the fit has those of a channel by the channel's name."""
-    short = name.removeprefix("variance[").removesuffix("]")
-    return evidence.fit.independent.get(short, evidence.fit.independent.get(name, np.nan))
-
-
-def _mcmc_columns(evidence: Evidence) -> tuple[Column, ...]:
-    titles = () if evidence.posterior is None else ("mean", "sd", "90 % interval")
-    return tuple(Column(title, group="MCMC") for title in titles)
-
-
-def mcmc_cells(evidence: Evidence, name: str, rounding: html.Rounding) -> tuple[str, ...]:
-    """Return mean, standard deviation and 90 % interval of the draws; nothing where there are none."""
-    if evidence.posterior is None:
-        return ()
-    if name not in evidence.posterior.names:
-        return (html.NOTHING,) * 3
-    draws = evidence.posterior.draws(name)
-    low, high = np.quantile(draws, [0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY])
-    return rounding.text(draws.mean()), rounding.sd(draws.std(ddof=1)), rounding.interval(low, high)
-
-
+MOST_PANELS = 7
 TONES = {
     FINE: GOOD,
     DETERMINED: GOOD,
@@ -133,184 +42,288 @@ TONES = {
     MODE: BAD,
     UNCONVERGED: BAD,
     NOTHING: BAD,
-    "not tested": NEUTRAL,
+    UNTESTED: NEUTRAL,
 }
 
 
 def badge(verdict: str) -> Badge:
-    """Return a verdict with its tone; what is neither good nor bad is a caution."""
+    """Return the badge of a verdict; verdicts without a tone of their own get "caution"."""
     return Badge(TONES.get(verdict, CAUTION), verdict)
 
 
-def verdicts_section(evidence: Evidence) -> Section:
-    """Return what the data determine, whether Laplace will do, and whether the model explains the data."""
-    blocks = _identifiability(evidence)
-    blocks.append(Heading("laplace", "Is the Laplace approximation good enough?"))
-    blocks += [Paragraph("Without draws this cannot be told.")] if evidence.comparison is None else _laplace(evidence)
-    blocks.append(Heading("adequacy", "Does the model explain the data?"))
-    if evidence.prediction is None:
-        blocks.append(Paragraph(evidence.unpredicted or "Without draws this is not tested."))
+def embedded(drawing: Drawing, name: str) -> str:
+    """Return a figure as a data URL of an SVG image, reproducibly, and close it."""
+    buffer = io.BytesIO()
+    with plt.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
+        drawing.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    plt.close(drawing)
+    return f"data:image/svg+xml;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+
+
+def estimates_section(given: ReportInputs) -> Section:
+    """Return the section on the estimates: MAP, Laplace and MCMC side by side."""
+    text = (
+        "The MAP estimate is the maximum of the posterior density. The Laplace approximation is the normal "
+        "distribution around it; its intervals are those of Student’s t. The robust standard deviation remains valid "
+        "if the residual violates the noise model; a large difference between the two indicates such a violation. "
+    )
+    blocks: list[Block] = [Note(CAUTION, f"Not determined by the data: {t}.") for t in given.fit.undetermined]
+    blocks.append(_parameters(given))
+    if given.fit.noise:
+        blocks.append(_noise(given))
+    if given.posterior is None:
+        blocks.append(Paragraph(f"{text}The posterior was not sampled. There are no draws (MCMC)."))
     else:
-        blocks += _adequacy(evidence.prediction)
+        blocks += [
+            Paragraph(f"{text}MCMC refers to the distribution of the posterior draws."),
+            _corner(given, given.posterior),
+        ]
+    return Section("estimates", "Estimates", blocks)
+
+
+def _parameters(given: ReportInputs) -> Table:
+    fit, intervals, rows = given.fit, given.fit.interval(PROBABILITY), []
+    for name, value in fit.theta.items():
+        rounding = html.Rounding.of(value, fit.sd[name])
+        rows.append(
+            {
+                "Parameter": code(name),
+                "Unit": given.unit(name),
+                "MAP": rounding.text(value),
+                "Laplace: sd": rounding.sd(fit.sd[name]),
+                "Laplace: 90 % interval": rounding.interval(*intervals[name]),
+                "Laplace: robust sd": rounding.sd(fit.robust_sd[name]),
+                **mcmc_cells(given, name, rounding),
+            }
+        )
+    return Table("table-estimates", "Estimates of the free parameters.", rows)
+
+
+def _noise(given: ReportInputs) -> Table:
+    fit, rows = given.fit, []
+    variances = dict(zip(fit.joint_covariance.index, np.diag(fit.joint_covariance), strict=True))
+    for name, value in fit.noise.items():
+        free = name in given.problem.free_noise
+        relative = np.sqrt(float(variances[name])) if free else np.nan
+        rounding = html.Rounding.of(value, value * relative)
+        channel = name.removeprefix("variance[").removesuffix("]")
+        independent = fit.independent.get(channel, fit.independent.get(name, np.nan))
+        rows.append(
+            {
+                "Noise parameter": code(name),
+                "Unit": given.unit(name),
+                "Independent values": html.number(independent, 6),
+                "Estimate (eq. 7)": rounding.text(value) if free else html.Number(f"{html.number(value, 6)} (known)"),
+                "Laplace: relative sd": html.percent(relative),
+                **mcmc_cells(given, name, rounding),
+            }
+        )
+    return Table("table-noise", "Estimates of the noise parameters.", rows)
+
+
+def mcmc_cells(given: ReportInputs, name: str, rounding: html.Rounding) -> dict[str, str]:
+    """Return mean, standard deviation and 90 % interval of the draws; no columns without draws."""
+    if given.posterior is None:
+        return {}
+    cells = dict.fromkeys(("MCMC: mean", "MCMC: sd", "MCMC: 90 % interval"), html.Number(html.NOTHING))
+    if name not in given.summary.index:
+        return cells
+    mean, sd, low, high = given.summary.loc[name, ["mean", "sd", "q05", "q95"]]
+    return dict(zip(cells, (rounding.text(mean), rounding.sd(sd), rounding.interval(low, high)), strict=True))
+
+
+def _corner(given: ReportInputs, posterior: Posterior) -> Figure:
+    names = posterior.names
+    correlations = np.atleast_2d(np.corrcoef(np.stack([posterior.draws(name) for name in names])))
+    np.fill_diagonal(correlations, 0.0)
+    correlations = np.nan_to_num(correlations)
+    kept = np.sort(np.argsort(-np.abs(correlations).max(axis=0), kind="stable")[:MOST_PANELS])
+    shown = [names[i] for i in kept]
+    selection = "" if len(shown) == len(names) else f" Shown are the {len(shown)} most correlated of {len(names)}."
+    strongest = ""
+    if len(names) > 1:
+        i, j = sorted(np.unravel_index(np.argmax(np.abs(correlations)), correlations.shape))
+        value = html.number(float(correlations[i, j]), 2)
+        strongest = f" The strongest correlation is {value}, between {names[i]} and {names[j]}."
+    return Figure(
+        "figure-corner",
+        embedded(plot.corner(posterior, laplace=given.fit, names=shown), "corner"),
+        f"Matrix of plots: marginal distributions of {', '.join(shown)} on the diagonal, contours of their pairs below "
+        f"it, from the draws and from the Laplace approximation.{strongest}",
+        "Posterior distribution of parameters and noise parameters: draws (MCMC) and Laplace approximation, with the "
+        f"regions of 50 and 90 % probability.{strongest}{selection}",
+        wide=True,
+    )
+
+
+def residuals_section(given: ReportInputs) -> Section:
+    """Return the section on the fit and the residual of every channel."""
+    fit, problem, rows = given.fit, given.problem, []
+    for channel, rms in fit.rms.items():
+        split, white = fit.noise_split.get(channel), fit.whiteness[channel]
+        noise, error = (np.nan, np.nan) if split is None else (split.measurement, split.model)
+        rows.append(
+            {
+                "Channel": code(channel),
+                "Unit": given.unit(channel),
+                "rms of the residual": html.number(rms),
+                "Unexplained variance": html.percent(fit.fvu[channel]),
+                "Measurement noise": html.number(noise),
+                "Model error": html.number(np.nan if np.isnan(noise) else error),
+                "Input noise": html.number(fit.input_noise.get(channel, np.nan)),
+                "Whiteness p": html.p_value(white.p),
+                "Autocorrelation": html.number(white.lag1, 2),
+            }
+        )
+    caption = "Residual of each channel, measured minus MAP; standard deviations in the unit of the channel."
+    blocks: list[Block] = [Table("table-residuals", caption, rows)]
+    blocks += [Note(CAUTION, warning) for warning in underestimated_sds(given)]
+    blocks.append(
+        Paragraph(
+            "Measurement noise is the part of the residual that the scatter of the measured cycles explains, model "
+            "error is the remainder. The whiteness p is the probability that white noise deviates at least as much "
+            "from a flat spectrum; the autocorrelation is that of successive independent values."
+        )
+    )
+    blocks += _fits(given)
+    if problem.model.inputs:
+        axes = f"{problem.channels[0]} against {problem.model.inputs[0]}, and against its rate"
+        blocks.append(
+            Figure(
+                "figure-loops",
+                embedded(plot.loops(problem, fit), "loops"),
+                f"Closed curves of {axes}, measured and fitted, for {len(problem.experiments)} experiments.",
+                f"Measured and fitted: {axes}.",
+                wide=True,
+            )
+        )
+    return Section("fit", "Fit and residual", blocks)
+
+
+def underestimated_sds(given: ReportInputs) -> list[str]:
+    """Return a warning if standard deviations are too small because a residual is not white."""
+    ratios = given.robust_ratios
+    if not ratios:
+        return []
+    worst = max(ratios, key=lambda name: ratios[name])
+    return [
+        f"The residual of {', '.join(given.coloured)} is not white, so the standard deviations and intervals of "
+        f"{', '.join(ratios)} are too small; the robust ones are up to {html.number(ratios[worst], 2)} times as large "
+        f"({worst})."
+    ]
+
+
+def _fits(given: ReportInputs) -> Iterator[Figure]:
+    problem, fit, prediction = given.problem, given.fit, given.prediction
+    for place, e in enumerate(problem.experiments):
+        channels = ", ".join(f"{channel} [{given.unit(channel)}]" for channel in e.outputs)
+        band = f", the {prediction.probability:.0%} predictive band of the draws" if prediction else ""
+        residual = ", ".join(
+            f"{html.number(float(np.sqrt(np.mean(fit.residuals[e.name][channel] ** 2))))} {given.unit(channel)}"
+            for channel in e.outputs
+        )
+        yield Figure(
+            f"figure-fit-{place + 1}",
+            embedded(plot.fit(problem, fit, prediction, experiments=[e.name]), f"fit {place}"),
+            f"Line plot over one period of experiment {e.name}: measured {channels}, the MAP fit on top{band}, and the "
+            f"residual below; its root mean square is {residual}.",
+            f"{e.name}: one period of {', '.join(e.outputs)}, measured and fitted, and the residual.",
+        )
+
+
+def verdicts_section(given: ReportInputs) -> Section:
+    """Return the section on identifiability, the Laplace approximation and the adequacy of the model."""
+    blocks = _identifiability(given)
+    blocks.append(Heading("laplace", "Is the Laplace approximation accurate?"))
+    blocks += (
+        [Paragraph("Not tested: this requires draws.")] if given.comparison is None else _laplace(given.comparison)
+    )
+    blocks.append(Heading("adequacy", "Does the model explain the data?"))
+    if given.prediction is None:
+        blocks.append(Paragraph(given.no_prediction or "Not tested: this requires draws."))
+    else:
+        blocks += _adequacy(given.prediction)
     return Section("verdicts", "Verdicts", blocks)
 
 
-def _identifiability(evidence: Evidence) -> list[Block]:
-    found = evidence.identifiability
-    columns = [Column(title, numeric=False) for title in ("Parameter", "Verdict", "Evidence", "What to do")]
+def _identifiability(given: ReportInputs) -> list[Block]:
+    found = given.identifiability
     rows = [
-        (code(str(name)), badge(row["verdict"]), row["evidence"], row["remedy"] or html.NOTHING)
+        {
+            "Parameter": code(str(name)),
+            "Verdict": badge(row["verdict"]),
+            "Evidence": row["evidence"],
+            "Recommendation": row["remedy"] or html.NOTHING,
+        }
         for name, row in found.table.iterrows()
     ]
-    caption = "What the data say of each parameter, against what the prior says."
     blocks: list[Block] = [
-        Heading("identifiability", "What do the data determine?"),
-        Table("table-identifiability", caption, tuple(columns), tuple(rows)),
+        Heading("identifiability", "Which parameters do the data determine?"),
+        Table("table-identifiability", "Identifiability of each parameter: data against prior.", rows),
         Paragraph(
-            "The contraction is 1 − (posterior sd / prior sd)²: 1 where the data say all, 0 where they say nothing. "
-            f"Condition number of the Fisher information: {html.number(found.condition)}."
+            "The contraction is 1 − (posterior sd / prior sd)²: 1 if the parameter is determined by the data, 0 if its "
+            "posterior equals its prior. The condition number of the Fisher information is "
+            f"{html.number(found.condition)}."
         ),
     ]
     if found.structure.symmetries:
-        blocks.append(Paragraph("What the equations leave open whatever is measured:"))
+        blocks.append(Paragraph("Structural symmetries, which no measurement of these channels can resolve:"))
         blocks += [Paragraph(f"{symmetry!r}.") for symmetry in found.structure.symmetries]
     return blocks
 
 
-def _laplace(evidence: Evidence) -> list[Block]:
-    found = evidence.comparison
-    assert found is not None
-    columns = (
-        Column("Coordinate", numeric=False),
-        Column("Verdict", numeric=False),
-        Column("Shift"),
-        Column("Ratio of sds"),
-        Column("Skewness"),
-        Column("Distance"),
-        Column("What to do", numeric=False),
-    )
+def _laplace(found: Comparison) -> list[Block]:
+    two = html.Rounding(0, 2)
+    columns = {"Shift": "shift", "Ratio of sds": "sd_ratio", "Skewness": "skewness", "Distance": "wasserstein"}
     rows = [
-        (
-            code(row["coordinate"]),
-            badge(row["verdict"]),
-            *(_with_error(row[c], row[f"{c}_mcse"]) for c in ("shift", "sd_ratio", "skewness", "wasserstein")),
-            row["recommendation"],
-        )
+        {
+            "Coordinate": code(row["coordinate"]),
+            "Verdict": badge(row["verdict"]),
+            **{t: html.Number(f"{two.text(row[c])} ± {two.text(row[f'{c}_mcse'])}") for t, c in columns.items()},
+            "Recommendation": row["recommendation"],
+        }
         for _, row in found.table.iterrows()
     ]
     caption = (
-        f"Laplace against MCMC in {found.coordinates} coordinates (± Monte Carlo error). Shift (mean − MAP) and "
-        "distance (Wasserstein) in standard deviations of the draws; Laplace’s sd over that of the draws."
+        f"Laplace against MCMC in {found.coordinates} coordinates (± Monte Carlo error). Shift: mean of the draws "
+        "minus MAP, in standard deviations of the draws. Ratio: Laplace sd over sd of the draws. Distance: Wasserstein "
+        "distance in standard deviations of the draws."
     )
-    table = Table("table-laplace", caption, columns, tuple(rows))
-    return [Paragraph(jointly(found)), table, figures.comparison(evidence)]
-
-
-def jointly(found: Comparison) -> str:
-    """Return the joint verdict on Laplace in words."""
-    shares = ", ".join(html.percent(float(found.joint[f"share_{level}"])) for level in (50, 90, 95))
-    return (
-        f"Jointly: {found.joint['verdict']}; {found.joint['recommendation']}. Laplace’s ellipsoids of 50, 90 and 95 % "
-        f"hold {shares} of the draws; Pareto k̂ {html.number(float(found.joint['pareto_k']), 2)}."
+    inside = ", ".join(html.percent(float(found.joint[f"share_{level}"])) for level in (50, 90, 95))
+    verdicts = ", ".join(f"{name} {verdict}" for name, verdict in found.table["verdict"].items())
+    joint = (
+        f"Joint verdict: {found.joint['verdict']}; {found.joint['recommendation']}. Laplace ellipsoids of 50, 90 and "
+        f"95 % contain {inside} of the draws; Pareto k̂ {html.number(float(found.joint['pareto_k']), 2)}."
     )
-
-
-def _with_error(value: float, error: float) -> str:
-    return f"{html.Rounding(0, 2).text(value)} ± {html.Rounding(0, 2).text(error)}"
+    figure = Figure(
+        "figure-comparison",
+        embedded(plot.comparison(found), "comparison"),
+        "Marginal distributions of the draws with the Laplace approximation on top, their quantiles against each "
+        f"other, and the fraction of draws in Laplace ellipsoids. Verdicts: {verdicts}; jointly "
+        f"{found.joint['verdict']}.",
+        "The Laplace approximation against the draws: marginal distributions, quantiles (grey: tolerance) and "
+        "ellipsoids.",
+        wide=True,
+    )
+    return [Paragraph(joint), Table("table-laplace", caption, rows), figure]
 
 
 def _adequacy(found: Prediction) -> list[Block]:
-    tests = ("whiteness", "harmonics", "size", "amplitude", "consistency")
-    columns = (
-        Column("Experiment and channel", numeric=False),
-        Column("Verdict", numeric=False),
-        *(Column(test, group="p-values") for test in tests),
-        Column("Model error’s share"),
-    )
-    rows: list[Row] = [
-        (
-            str(label),
-            badge(row["verdict"]),
-            *(html.p_value(row[test]) for test in tests),
-            html.percent(row["model_error_share"]),
-        )
+    rows = [
+        {
+            "Experiment and channel": str(label),
+            "Verdict": badge(row["verdict"]),
+            **{f"p-values: {test}": html.p_value(row[test]) for test in TESTS},
+            "Fraction of model error": html.percent(row["model_error_share"]),
+        }
         for label, row in found.table.iterrows()
     ]
     caption = (
-        f"Tests of the model. A verdict weighs all p-values of the table at once (Holm), false alarms {LEVEL:.0%}; the "
-        "last column is the share of the residual’s variance beyond the measured noise."
+        "Tests of the model. Verdicts use p-values adjusted for all tests of the table (Holm), with a false alarm rate "
+        f"of {LEVEL:.0%}; the last column is the fraction of the residual variance beyond the measured noise."
     )
-    said = [Paragraph(f"{label}: {words}.") for label, words in found.findings.items()]
-    blocks: list[Block] = [Table("table-adequacy", caption, columns, tuple(rows)), *said]
+    blocks: list[Block] = [Table("table-adequacy", caption, rows)]
+    blocks += [Paragraph(f"{label}: {words}.") for label, words in found.findings.items()]
     if found.failed:
         blocks.append(Paragraph(f"Of {found.draws} draws {found.failed} had no periodic solution."))
     return [*blocks, Paragraph(found.note)] if found.note else blocks
-
-
-NOT_WHITE, MUCH = 0.01, 1.5
-
-
-def residuals_section(evidence: Evidence) -> Section:
-    """Return the residual of every channel in numbers, and the figures."""
-    blocks: list[Block] = [_channels(evidence)]
-    if said := too_sure(evidence):
-        blocks.append(Note(CAUTION, said))
-    blocks.append(
-        Paragraph(
-            "Measurement noise is what the scatter of the measured cycles explains of the residual, model error what "
-            "is left. The whiteness p is the probability of a residual at least as far from white noise; the "
-            "autocorrelation is that from one independent value to the next."
-        )
-    )
-    blocks += figures.fits(evidence)
-    if evidence.problem.model.inputs:
-        blocks.append(figures.loops(evidence))
-    return Section("fit", "Fit and residual", blocks)
-
-
-def too_sure(evidence: Evidence) -> str:
-    """Return by how much standard deviations are too small where a residual is not white; nothing if they are not."""
-    fit = evidence.fit
-    colours = [channel for channel, white in fit.whiteness.items() if white.p < NOT_WHITE]
-    ratios = {name: fit.robust_sd[name] / sd for name, sd in fit.sd.items() if sd > 0.0}
-    wider = {name: ratio for name, ratio in ratios.items() if np.isfinite(ratio) and ratio > MUCH}
-    if not colours or not wider:
-        return ""
-    worst = max(wider, key=lambda name: wider[name])
-    return (
-        f"The residual of {', '.join(colours)} is not white, so the standard deviations and intervals of "
-        f"{', '.join(wider)} are too small; the robust ones are up to {html.number(wider[worst], 2)} times as large "
-        f"({worst})."
-    )
-
-
-def _channels(evidence: Evidence) -> Table:
-    columns = (
-        Column("Channel", numeric=False),
-        Column("Unit", numeric=False),
-        Column("rms of the residual"),
-        Column("Unexplained variance"),
-        Column("Measurement noise"),
-        Column("Model error"),
-        Column("Noise of the inputs"),
-        Column("Whiteness p"),
-        Column("Autocorrelation"),
-    )
-    fit, rows = evidence.fit, []
-    for channel, rms in fit.rms.items():
-        split, white = fit.noise_split.get(channel), fit.whiteness[channel]
-        rows.append(
-            (
-                code(channel),
-                evidence.unit(channel),
-                html.number(rms),
-                html.percent(fit.fvu[channel]),
-                html.number(np.nan if split is None else split.measurement),
-                html.number(np.nan if split is None or np.isnan(split.measurement) else split.model),
-                html.number(fit.input_noise.get(channel, np.nan)),
-                html.p_value(white.p),
-                html.number(white.lag1, 2),
-            )
-        )
-    caption = "The residual of each channel, measured minus MAP; standard deviations in the channel’s unit."
-    return Table("table-residuals", caption, columns, tuple(rows))

@@ -17,7 +17,7 @@ import bayesperiodic as bp
 from bayesperiodic import _parallel as resumed_module
 from bayesperiodic.diagnostics import campaigns
 from bayesperiodic.diagnostics.calibration import FILE, summary
-from bayesperiodic.diagnostics.campaigns import Campaign, position, refuse, replicate
+from bayesperiodic.diagnostics.campaigns import Campaign, check_supported, position, replicate
 from tests.known import LINEAR, RUNAWAY, grid, linear_regressors
 from tests.posterior.observed import cycle_run
 
@@ -132,20 +132,20 @@ def test_failures_are_counted_by_kind():
     ("problem", "said"),
     [
         (lambda: bp.Problem(LINEAR, [run()], priors=PRIORS),
-         r"the Jeffreys prior 1/v of 'variance\[force\]' is not allowed; it is improper"),
+         r"must have proper priors, got the Jeffreys prior 1/v of 'variance\[force\]'"),
         (lambda: bp.Problem(LINEAR, [run()], priors=PRIORS, noise=FLAT), "the flat prior"),
-        (lambda: bp.Problem(LINEAR, [run()], priors=PRIORS, noise="circulant"), "noise='circulant' is not allowed"),
-        (lambda: linear().with_experiments([masked()]), "a mask is not allowed"),
+        (lambda: bp.Problem(LINEAR, [run()], priors=PRIORS, noise="circulant"), "got 'circulant'"),
+        (lambda: linear().with_experiments([masked()]), "got .* with a mask"),
         (lambda: bp.Problem(LINEAR, [run()], priors=PRIORS | {"shift": bp.Normal(0.0, 1e-3)}, noise=INVERSE_GAMMA),
-         r"a delay \(shift\) is not allowed"),
+         r"got .* with a delay \(shift\)"),
         (lambda: bp.Problem(bp.models.van_der_pol, [cycle_run()], priors={"mu": bp.LogNormal(1.5, 0.3)},
-                            fixed={"omega": 1.0}, noise=INVERSE_GAMMA), "the autonomous model 'van_der_pol'"),
+                            fixed={"omega": 1.0}, noise=INVERSE_GAMMA), "got the autonomous 'van_der_pol'"),
     ],
     ids=["jeffreys", "flat", "circulant", "mask", "shift", "autonomous"],
 )  # fmt: skip
 def test_what_cannot_be_simulated_is_refused_by_name(problem, said):
     with pytest.raises(ValueError, match=f"problem: .*{said}"):
-        refuse(problem())
+        check_supported(problem())
 
 
 def masked() -> bp.Experiment:

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics.laplace_check import importance_k
+from bayesperiodic.diagnostics.comparison import importance_k
 from bayesperiodic.diagnostics.verdicts import Sample, joint_verdict, marginal_verdict
 from bayesperiodic.sampling.coordinates import SamplingDensity
 from bayesperiodic.sampling.posterior import gather, tree
@@ -315,7 +315,7 @@ def test_what_is_not_determined_is_too_wide(solved):
     assert found.table.loc["k", "recommendation"] == "report a combination that the data determine"
     assert found.joint["verdict"] == "too wide"
     assert np.isnan([found.joint["share_90"], found.joint["pareto_k"]]).all()
-    with pytest.raises(ValueError, match="coordinates: 'sampling' is not allowed; this estimate has no joint Laplace"):
+    with pytest.raises(ValueError, match="coordinates: must be 'natural' for an estimate without a joint Laplace"):
         bp.compare(problem, blind, posterior, coordinates="sampling")
 
 
@@ -332,7 +332,7 @@ def test_a_comparison_reads_well_as_text_and_as_html(solved):
     found = bp.compare(problem, fit, posterior)
     text = repr(found)
     assert "Laplace against MCMC in natural coordinates" in text
-    assert "jointly: the 50, 90 and 95% ellipsoids hold" in text and "Pareto k̂" in text
+    assert "The 50, 90 and 95% Laplace ellipsoids contain" in text and "Pareto k̂" in text
     table = found.table.rename(index={"k": "theta[<b>]"}).replace({"coordinate": {"k": "theta[<b>]"}})
     page = replace(found, table=table)._repr_html_()
     tree_ = ElementTree.fromstring(f"<div>{page}</div>")

@@ -53,7 +53,7 @@ def test_verdicts_are_told_in_words(solved, scored, page):
     verdicts = {name: cells[0].split(" ", 1)[1] for name, cells in page.rows("table-laplace").items()}
     assert verdicts == scored.table["verdict"].to_dict()
     assert page.rows("table-adequacy")["all"][0] == "✓ adequate"
-    answers = page.text[page.text.index("In short") : page.text.index("Data Experiments")]
+    answers = page.text[page.text.index("Summary") : page.text.index("Data Experiments")]
     for words in ("3 of 3", "No test contradicts the model", "Every free parameter is determined by the data"):
         assert words in answers
 
@@ -103,7 +103,7 @@ def test_a_fit_that_cannot_be_trusted_is_said_to_be_so(solved, tmp_path):
     text = Page(bp.report(problem, fit, None, tmp_path / "r.html").read_text(encoding="utf-8")).text
     for words in ("! synthetic data", "✕ stalled", "lies at the end of its prior's support", "3 times as large (k)"):
         assert words in text
-    assert "robust 90 % interval" in text
+    assert "Robust 90 % interval" in text
 
 
 def test_single_points_are_told_as_such(solved, tmp_path):
@@ -187,7 +187,7 @@ def test_what_belongs_to_another_problem_is_refused(solved, tmp_path):
     problem, fit, posterior = solved
     other = problem.with_experiments([linear_experiment(np.array([900.0, 40.0, 25.0]), 3.0, seed=2)])
     path = tmp_path / "report.html"
-    with pytest.raises(ValueError, match="posterior: it is not allowed; it is of other parameters or data"):
+    with pytest.raises(ValueError, match="posterior: must be of the parameters and data"):
         bp.report(other, fit, posterior, path)
     with pytest.raises(ValueError, match="fit: missing 'k'"):
         bp.report(problem, replace(fit, theta={}), None, path)
