@@ -1,5 +1,6 @@
 """find_orbits: unstable periodic orbits of a chaotic section, without a model."""
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -17,25 +18,24 @@ from bayesperiodic.orbits.cycles import (
     refine,
     shift_between,
 )
-from bayesperiodic.orbits.local import REACH, Atlas, LocalMaps, check_chaos, noise_of
 from bayesperiodic.orbits.orbit import Orbit, Orbits
+from bayesperiodic.orbits.return_map import REACH, Atlas, ReturnMap, check_chaos, estimate_noise
 from bayesperiodic.orbits.section import PoincareSection, wrapped
 
 METHODS = ("chained", "boxes")
-QUALITY_DEGREE = 3
-FEWEST_NEIGHBOURS = 32
-# Of a local fit in the search, in standard deviations of the noise.
+QUALITY_DEGREE, FEWEST_NEIGHBOURS = 3, 32
+# Bandwidth of the local fits of the search, in standard deviations of the noise.
 SEARCH_WIDTH = 4.0
-# Beyond, a point with this standard deviation is nowhere in particular; in units of the attractor's size.
+# Largest standard deviation of a point, in units of the attractor's size.
 LARGEST_SD = 0.02
-# Beyond, the delta method says nothing of an eigenvalue.
+# The delta method is not used for log|eigenvalue| beyond this standard deviation.
 LARGEST_LOGARITHM_SD = 0.5
-# A state of rest moves by less than this share of the whole motion, and some standard deviations of the noise.
+# Largest range of a state of rest: fraction of the range of the motion, and standard deviations of the noise.
 STILL, SPREAD = 0.02, 20.0
 
 
 @dataclass(frozen=True)
-class _Scaled:
+class _ScaledSection:
     """A section in units of the attractor's size.
 
     Attributes
@@ -43,18 +43,15 @@ class _Scaled:
     points : array (count, 2)
     size : array (2,)
         The unit.
-    maps : LocalMaps
+    maps : ReturnMap
     extent : array (2,) or None
         Ranges of the recorded signals.
-    quality_count : int
-        Neighbours of the local fits that the quality of an orbit is judged by, at least.
     """
 
     points: np.ndarray
     size: np.ndarray
-    maps: LocalMaps
+    maps: ReturnMap
     extent: np.ndarray | None
-    quality_count: int
 
 
 @in_one_thread
@@ -68,16 +65,15 @@ def find_orbits(
 ) -> Orbits:
     """Find the unstable periodic orbits in a section of a chaotic motion, without a model.
 
-    "chained": a motion that nearly comes back after p returns is near an orbit of period p. The return map is fitted
-    locally (quadratically) at its p points, and Newton's method moves all p points together until the chain of these
-    maps closes. The orbits that this leads to are fitted once more with cubic polynomials in neighbourhoods that are
-    as wide as the map's curvature allows; errors in the arguments do not bias these fits (deconvoluting kernels, see
-    `LocalMaps`). Eigenvalues are those of the chained slopes. Covariances are sandwich estimates over runs of
-    consecutive pairs, and hold the estimated bias.
+    "chained": points that nearly recur after p returns are near an orbit of period p. Local quadratic polynomials
+    approximate the return map at the p points, and Newton's method moves all points together until the maps close the
+    chain. The orbits found are fitted once more, with cubic polynomials in neighbourhoods as wide as the curvature of
+    the map allows. Deconvoluting kernels remove the bias due to noise in the arguments. Eigenvalues are those of the
+    product of the derivatives along the chain. Covariances are sandwich estimates over runs of consecutive points and
+    include the estimated bias.
 
-    "boxes": the recipe of [1]_ as a baseline: boxes of 1 % of the attractor, recurrence to the own or a neighbouring
-    box, and one linear fit of the map over the whole period, whose eigenvalues are biased where the noise or the
-    curvature is felt.
+    "boxes": the method of [1]_ as a baseline: boxes of 1 % of the attractor, recurrence to the same or an adjacent box,
+    and one linear fit of the map over the whole period. Noise and curvature bias its eigenvalues.
 
     Parameters
     ----------
@@ -86,22 +82,22 @@ def find_orbits(
         Prime periods in returns.
     method : {"chained", "boxes"}
     neighbours : int
-        Fewest (effective) neighbours of a local fit, at least 16.
+        Smallest effective number of neighbours of a local fit, at least 16.
     box : float
         Size of a box for "boxes", as a fraction of the attractor's size.
 
     Returns
     -------
     Orbits
-        In the order of period, then of search. States of rest are found like others and marked `equilibrium`. The
-        covariance of log|eigenvalue| is NaN ("not estimated") where the estimated bias exceeds the standard deviation,
-        or the latter 0.5.
+        Ordered by period. States of rest are found like other orbits and marked `equilibrium`. The covariance of
+        log|eigenvalue| is NaN ("not estimated") where the estimated bias exceeds the standard deviation, or the
+        standard deviation exceeds 0.5.
 
     Raises
     ------
     ValueError
-        For a section that is periodic, quasi-periodic or has no return map (which says which), for unknown methods,
-        for periods that are no whole numbers.
+        For a section that is periodic, quasi-periodic or shows no return map (the message names which), for an unknown
+        method, and for periods that are not whole numbers.
 
     References
     ----------
@@ -131,54 +127,43 @@ def find_orbits(
     else:
         atlas = Atlas(scaled.maps, _search_count(scaled.maps, neighbours))
         found = [pair for p in wanted for pair in _chained(scaled, atlas, p, neighbours)]
-    orbits = [_orbit(section, scaled, candidate, estimate) for candidate, estimate in found]
-    orbits = _named(_with_partners(orbits, scaled))
-    return Orbits(tuple(orbits), values=section.values, method=method)
+    quality_count = _search_count(scaled.maps, FEWEST_NEIGHBOURS)
+    orbits = [_orbit(section, scaled, *pair, _quality(scaled, *pair, quality_count)) for pair in found]
+    return Orbits(tuple(_named(_with_partners(orbits, scaled))), values=section.values, method=method)
 
 
 def _periods(periods: Iterable[int], count: int) -> list[int]:
     try:
         wanted = sorted({_checks.integer("periods", p, 1) for p in periods})
     except TypeError:
-        raise ValueError(f"periods: {periods!r} is not allowed; it is a collection such as range(1, 6).") from None
+        raise ValueError(f"periods: must be a collection such as range(1, 6), got {periods!r}.") from None
     if not wanted or wanted[-1] > count // 20:
         raise ValueError(
-            f"periods: {wanted} is not allowed; one at least is needed and, with {count} points, none above "
-            f"{count // 20}."
+            f"periods: must have at least one entry and, with {count} points, none above {count // 20}, got {wanted}."
         )
     return wanted
 
 
-def _chained(scaled: _Scaled, atlas: Atlas, period: int, neighbours: int) -> list[tuple[Candidate, Estimate]]:
-    maps = scaled.maps
-    found: list[tuple[Candidate, Estimate]] = []
-    for candidate in candidates(maps, atlas, scaled.points, period):
-        estimate = refine(maps, candidate.points, neighbours)
-        if estimate is None or not _sound(maps, estimate):
-            continue
-        if not any(_same(maps, estimate, other) for _, other in found):
-            found.append((candidate, estimate))
-    return found
-
-
-def _scaled(section: PoincareSection, neighbours: int) -> _Scaled:
+def _scaled(section: PoincareSection, neighbours: int) -> _ScaledSection:
     size = np.ptp(section.points, axis=0)
     if not np.all(size > 0.0):
-        raise ValueError("section: a motion of period 1 is not allowed; a coordinate is the same at all points.")
+        raise ValueError(
+            "section: must be of a chaotic motion, got one of period 1: a coordinate is equal at all points."
+        )
     turn = np.array([2.0 * np.pi if name in section.angles else np.inf for name in section.coordinates]) / size
     points = section.points / size
     noise = np.zeros(2) if section.noise is None else section.noise / size
-    maps = LocalMaps(points[:-1], section.increments / size, turn, section.winds, noise)
+    maps = ReturnMap(points[:-1], section.increments / size, turn, section.winds, noise)
     check_chaos(maps, points)
     if section.noise is None:
-        noise = noise_of(maps, neighbours)
-        maps = LocalMaps(points[:-1], section.increments / size, turn, section.winds, noise)
+        noise = estimate_noise(maps, neighbours)
+        maps = ReturnMap(points[:-1], section.increments / size, turn, section.winds, noise)
     extent = None if section.signals is None else np.ptp(section.signals, axis=0)
-    return _Scaled(points, size, maps, extent, _search_count(maps, FEWEST_NEIGHBOURS))
+    return _ScaledSection(points, size, maps, extent)
 
 
-def _search_count(maps: LocalMaps, neighbours: int) -> int:
-    """Return the neighbours of a local fit in the search: enough to be wide against the noise."""
+def _search_count(maps: ReturnMap, neighbours: int) -> int:
+    """Return the neighbours of a local fit in the search: enough for a bandwidth well above the noise."""
     centres = maps.arguments[:: max(1, len(maps.arguments) // 500)]
     count = int(2.25 * neighbours)
     while count < len(maps.arguments) // 100:
@@ -188,40 +173,55 @@ def _search_count(maps: LocalMaps, neighbours: int) -> int:
     return count
 
 
-def _sound(maps: LocalMaps, estimate: Estimate) -> bool:
-    size = estimate.points.size
-    sd = np.sqrt(np.diag(estimate.covariance)[:size])
-    tolerance = max(2e-3, 3.0 * float(sd.max()))
-    return bool(sd.max() < LARGEST_SD and not has_shorter_period(estimate.points, maps.wrap, tolerance))
+def _chained(scaled: _ScaledSection, atlas: Atlas, period: int, neighbours: int) -> list[tuple[Candidate, Estimate]]:
+    maps = scaled.maps
+    found: list[tuple[Candidate, Estimate]] = []
+    for candidate in candidates(maps, atlas, scaled.points, period):
+        estimate = refine(maps, candidate.points, neighbours)
+        if estimate is None or not _acceptable(maps, estimate):
+            continue
+        if not any(_same(maps, estimate, other) for _, other in found):
+            found.append((candidate, estimate))
+    return found
 
 
-def _same(maps: LocalMaps, one: Estimate, other: Estimate) -> bool:
+def _largest_sd(estimate: Estimate) -> float:
+    return float(np.sqrt(np.diag(estimate.covariance)[: estimate.points.size].max()))
+
+
+def _acceptable(maps: ReturnMap, estimate: Estimate) -> bool:
+    sd = _largest_sd(estimate)
+    return sd < LARGEST_SD and not has_shorter_period(estimate.points, maps.wrap, max(2e-3, 3.0 * sd))
+
+
+def _same(maps: ReturnMap, one: Estimate, other: Estimate) -> bool:
     distance, _ = shift_between(one.points, other.points, maps.wrap)
-    sd = np.sqrt(max(np.diag(e.covariance)[: one.points.size].max() for e in (one, other)))
-    return distance < max(1e-3, 2.0 * float(sd))
+    return distance < max(1e-3, 2.0 * max(_largest_sd(one), _largest_sd(other)))
 
 
-def _orbit(section: PoincareSection, scaled: _Scaled, candidate: Candidate, estimate: Estimate) -> Orbit:
+def _orbit(
+    section: PoincareSection, scaled: _ScaledSection, candidate: Candidate, estimate: Estimate, quality: float
+) -> Orbit:
     period = len(estimate.points)
+    size = 2 * period
+    # The orbit starts at the point that belongs to the start of the measured cycle.
     order = (np.arange(period) + candidate.shift) % period
-    estimate = _begun_at(estimate, order)
-    points = estimate.points * scaled.size
-    for k, name in enumerate(section.coordinates):
-        if name in section.angles:
-            points[:, k] = wrapped(points[:, k])
+    index = np.concatenate([(2 * order[:, None] + np.arange(2)).ravel(), [size, size + 1]])
+    points = estimate.points[order] * scaled.size
     units = np.concatenate([np.tile(scaled.size, period), np.ones(2)])
-    bias = estimate.bias * units
-    covariance = estimate.covariance * np.outer(units, units)
+    bias = estimate.bias[index] * units
+    covariance = estimate.covariance[np.ix_(index, index)] * np.outer(units, units)
     sd = np.sqrt(np.diag(covariance))
     covariance += np.outer(bias, bias)
-    for k in (2 * period, 2 * period + 1):
+    for k in (size, size + 1):
         if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
-    if cycle is not None:
-        for k, name in enumerate(section.coordinates):
-            if name in section.angles:
-                cycle[name] = cycle[name] + 2.0 * np.pi * np.round((points[0, k] - cycle[name][0]) / (2.0 * np.pi))
+    for k, name in enumerate(section.coordinates):
+        if name in section.angles:
+            points[:, k] = wrapped(points[:, k])
+            if cycle is not None:
+                cycle[name] += 2.0 * np.pi * np.round((points[0, k] - cycle[name][0]) / (2.0 * np.pi))
     return Orbit(
         name="",
         coordinates=section.coordinates,
@@ -232,57 +232,44 @@ def _orbit(section: PoincareSection, scaled: _Scaled, candidate: Candidate, esti
         points=points,
         joint_covariance=covariance,
         eigenvalues=estimate.eigenvalues,
-        eigenvalue_bias=bias[2 * period :],
+        eigenvalue_bias=bias[size:],
         returns=candidate.returns,
-        quality=_quality(scaled, candidate, estimate),
+        quality=quality,
         cycle=cycle,
         equilibrium=cycle is not None and _at_rest(section, scaled, cycle),
         synthetic=section.synthetic,
     )
 
 
-def _at_rest(section: PoincareSection, scaled: _Scaled, cycle: dict[str, np.ndarray]) -> bool:
-    """Return whether a measured cycle shows no motion but noise and the distance to the orbit."""
+def _at_rest(section: PoincareSection, scaled: _ScaledSection, cycle: dict[str, np.ndarray]) -> bool:
+    """Return whether a measured cycle moves no more than by noise and its distance to the orbit."""
     assert scaled.extent is not None
-    extent = np.where(np.isfinite(scaled.maps.turn), np.minimum(scaled.extent, 2.0 * np.pi), scaled.extent)
+    extent = np.where(scaled.maps.angle, np.minimum(scaled.extent, 2.0 * np.pi), scaled.extent)
     limit = (STILL + SPREAD * scaled.maps.noise) * extent
     return all(np.ptp(cycle[name]) < limit[k] for k, name in enumerate(section.coordinates))
 
 
-def _begun_at(estimate: Estimate, order: np.ndarray) -> Estimate:
-    """Return the estimate with the orbit's points in another cyclic order."""
-    size = 2 * len(order)
-    index = np.concatenate([(2 * order[:, None] + np.arange(2)).ravel(), [size, size + 1]])
-    return replace(
-        estimate,
-        points=estimate.points[order],
-        covariance=estimate.covariance[np.ix_(index, index)],
-        bias=estimate.bias[index],
-    )
-
-
-def _quality(scaled: _Scaled, candidate: Candidate, estimate: Estimate) -> float:
+def _quality(scaled: _ScaledSection, candidate: Candidate, estimate: Estimate, neighbours: int) -> float:
     """Return the p-value of the closest return under the maps along the orbit."""
     maps, period = scaled.maps, len(estimate.points)
-    steps = candidate.closest + np.arange(period + 1)
-    away = maps.wrap(scaled.points[steps] - np.take(estimate.points, np.arange(period + 1), 0, mode="wrap"))
+    steps = np.arange(period + 1)
+    away = maps.wrap(scaled.points[candidate.closest + steps] - estimate.points[(steps + candidate.shift) % period])
     statistic = 0.0
-    for point, here, there in zip(estimate.points, away[:-1], away[1:], strict=True):
-        count = scaled.quality_count
+    for point, here, there in zip(np.roll(estimate.points, -candidate.shift, 0), away[:-1], away[1:], strict=True):
+        count = neighbours
         while maps.nearest(point[None], count)[0][0, -1] < 1.5 * np.abs(here).max() and 4 * count < len(maps.arguments):
             count *= 2
         fit = maps.fit(point[None], count, QUALITY_DEGREE, influence=False)
-        left = maps.wrap(there - (maps.predict(fit, here[None])[0] - fit.value[0]))
-        statistic += float(np.sum(left**2 / maps.rest(point[None], fit)[0]))
+        residual = maps.wrap(there - (maps.predict(fit, here[None])[0] - fit.value[0]))
+        statistic += float(np.sum(residual**2 / maps.residual_variance(point[None], fit)[0]))
     return float(chi2.sf(statistic, 2 * period))
 
 
-def _with_partners(orbits: list[Orbit], scaled: _Scaled) -> list[Orbit]:
-    """Return the orbits with the position of the one that has all signs changed."""
+def _with_partners(orbits: list[Orbit], scaled: _ScaledSection) -> list[Orbit]:
+    """Return the orbits with the positions of their mirror images under the change of all signs."""
     result: list[Orbit] = []
     for orbit in orbits:
-        partner = None
-        closest = np.inf
+        partner, closest = None, np.inf
         for k, other in enumerate(orbits):
             if other.period != orbit.period:
                 continue
@@ -290,18 +277,18 @@ def _with_partners(orbits: list[Orbit], scaled: _Scaled) -> list[Orbit]:
             sd = np.sqrt([np.diag(o.covariance).reshape(-1, 2).max(0) / scaled.size**2 for o in (orbit, other)]).max()
             if distance < max(2e-3, 4.0 * sd) and distance < closest:
                 partner, closest = k, distance
-        # Points alone do not show whether there is motion between them.
+        # Without a measured cycle, a symmetric fixed point is taken for a state of rest.
         rest = orbit.equilibrium or (orbit.cycle is None and orbit.period == 1 and partner == len(result))
         result.append(replace(orbit, partner=partner, equilibrium=rest))
     return result
 
 
 def _named(orbits: list[Orbit]) -> list[Orbit]:
-    counts: dict[tuple[int, int | None], int] = {}
+    counts: Counter[tuple[int, int | None]] = Counter()
     result = []
     for orbit in orbits:
         key = (orbit.period, orbit.winding)
-        counts[key] = counts.get(key, 0) + 1
+        counts[key] += 1
         winding = "" if orbit.winding is None else f", winding {orbit.winding}"
         result.append(replace(orbit, name=f"period {orbit.period}{winding}, orbit {counts[key]}"))
     return result

@@ -1,15 +1,17 @@
-"""`polish_orbits`: orbits of a section become periodic solutions of a model, or are rejected with a reason."""
+"""polish_orbits: orbits of a section become periodic solutions of a model, or are rejected with a reason."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
-from bayesperiodic import _checks
+from bayesperiodic import _checks, _fourier
 from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.models.integrate import integrate
 from bayesperiodic.models.model import Model
-from bayesperiodic.orbits.orbit import Orbit, Orbits, seeds
+from bayesperiodic.orbits.cycles import shift_between
+from bayesperiodic.orbits.orbit import TURN, Orbit, Orbits, counted_turns, resampled_cycle
 from bayesperiodic.orbits.section import wrapped
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations
@@ -17,234 +19,14 @@ from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import describe
 from bayesperiodic.periodic.solve import solve_forced
 
-STILL = 1e-6
-
-
-def section_points(outputs: np.ndarray, samples: int, angles: np.ndarray) -> np.ndarray:
-    """Return outputs (points, coordinates) at tau = 0, 1, …, angles in (−π, π]."""
-    points = np.array(outputs[::samples])
-    points[:, angles] = wrapped(points[:, angles])
-    return points
-
-
-def differences(points: np.ndarray, others: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Return points − others, (…, coordinates), angles by the shorter way."""
-    result = points - others
-    result[..., angles] = wrapped(result[..., angles])
-    return result
-
-
-def nearest_shift(points: np.ndarray, others: np.ndarray, angles: np.ndarray, scales: np.ndarray) -> tuple[int, float]:
-    """Return the cyclic shift of others (period, coordinates) that is nearest to points, and their largest distance.
-
-    Distances are in units of `scales` (coordinates,).
-    """
-    distances = [
-        float(np.max(np.abs(differences(points, np.roll(others, -shift, axis=0), angles)) / scales))
-        for shift in range(len(points))
-    ]
-    best = int(np.argmin(distances))
-    return best, distances[best]
-
-
-def is_still(outputs: np.ndarray, scales: np.ndarray) -> bool:
-    """Return whether outputs (points, coordinates) move by no more than a millionth of `scales` (coordinates,)."""
-    return bool(np.all(np.ptp(outputs, axis=0) <= STILL * scales))
-
-
-def times_repeated(equations: PeriodicEquations, z: np.ndarray) -> int:
-    """Return how many times an orbit repeats itself within its forcing periods."""
-    return int(equations.kernels.repetitions(z, equations.grid.periods))
-
-
-def once_round(orbit: Orbit, times: int, angles: np.ndarray) -> Orbit:
-    """Return an orbit that goes `times` round within its period as one of its prime period.
-
-    Points are averaged, log|eigenvalue| is divided by `times`, and the covariance follows. An even number of times
-    leaves the signs of the eigenvalues open; the moduli are given.
-
-    Parameters
-    ----------
-    orbit : Orbit
-    times : int
-        A divisor of its period.
-    angles : bool array (coordinates,)
-    """
-    period, coordinates = orbit.period // times, orbit.points.shape[1]
-    rounds = orbit.points.reshape(times, period, coordinates)
-    mean = rounds[0] + differences(rounds, rounds[0], angles).mean(axis=0)
-    size = orbit.points.size
-    average = np.zeros((mean.size + 2, size + 2))
-    average[: mean.size, :size] = np.tile(np.eye(mean.size), times) / times
-    average[mean.size :, size:] = np.eye(2) / times
-    moduli = np.abs(orbit.eigenvalues) ** (1.0 / times)
-    kept = times % 2 and not np.iscomplexobj(orbit.eigenvalues)
-    cycle = orbit.cycle and {name: values[: len(values) // times] for name, values in orbit.cycle.items()}
-    return replace(
-        orbit,
-        name=f"{orbit.name}, once round",
-        period=period,
-        winding=None if orbit.winding is None else orbit.winding // times,
-        points=differences(mean, np.zeros(coordinates), angles),
-        joint_covariance=_sandwich(average, orbit.joint_covariance),
-        eigenvalues=np.sign(orbit.eigenvalues) * moduli if kept else moduli,
-        eigenvalue_bias=orbit.eigenvalue_bias / times,
-        partner=None,
-        cycle=cycle,
-    )
-
-
-def _sandwich(matrix: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return M C Mᵀ, NaN only where an unknown entry has a weight."""
-    known = np.where(np.isnan(covariance), 0.0, covariance)
-    unknown = np.abs(matrix) @ np.isnan(covariance) @ np.abs(matrix.T) > 0
-    return np.where(unknown, np.nan, matrix @ known @ matrix.T)
-
-
+# In units of the attractor's size: solutions that coincide, the largest range of a state of rest.
+SAME, STILL = 1e-5, 1e-6
+# Largest distance of a solution from the measured orbit, in standard errors.
 MOST_ERRORS = 5.0
+# Signs of multipliers are compared up to this standard deviation of log|μ| and this phase.
 SURE, REAL = 0.3, 1e-6
-
-
-@dataclass(frozen=True)
-class Polisher:
-    """A model at certain parameters, and the section whose orbits it polishes; see `polish_orbits`."""
-
-    model: Model
-    orbits: tuple[Orbit, ...]
-    parameters: Mapping[str, float]
-    inputs: Mapping[str, np.ndarray]
-    parameter_sd: Mapping[str, float]
-    samples: int
-    scheme: str | Scheme
-    tolerance: float
-
-    def __post_init__(self) -> None:
-        if self.model.autonomous:
-            raise ValueError(
-                f"model: {self.model.name!r} is not allowed; it is autonomous, and a section needs forcing periods."
-            )
-        _checks.integer("samples", self.samples, 4)
-        _checks.positive("tolerance", self.tolerance)
-        _checks.same_names("parameters", self.parameters, self.model.parameters)
-        for name, sd in self.parameter_sd.items():
-            _checks.one_of("parameter_sd", name, self.model.parameters)
-            _checks.positive(f"parameter_sd[{name!r}]", sd)
-        _checks.same_names("inputs", self.inputs, self.model.inputs)
-        for name, values in self.inputs.items():
-            _checks.finite_vector(f"inputs[{name!r}]", values, self.samples, "samples")
-        for orbit in self.orbits:
-            for name in orbit.coordinates:
-                _checks.one_of("coordinates", name, self.model.outputs)
-            if (orbit.coordinates, orbit.angles) != (self.orbits[0].coordinates, self.orbits[0].angles):
-                raise ValueError(f"orbits: {orbit.name!r} is not allowed; all must be of one section.")
-
-    @cached_property
-    def theta(self) -> np.ndarray:
-        """The parameters, (parameters,)."""
-        values = [_checks.finite_number(f"parameters[{n!r}]", self.parameters[n]) for n in self.model.parameters]
-        return np.array(values)
-
-    @cached_property
-    def angles(self) -> np.ndarray:
-        """Which coordinates are angles, (coordinates,)."""
-        return np.array([name in self.orbits[0].angles for name in self.orbits[0].coordinates])
-
-    @cached_property
-    def scales(self) -> np.ndarray:
-        """The attractor's size, (coordinates,): a turn for angles, the range of what was measured for others."""
-        measured = [orbit.points for orbit in self.orbits]
-        for orbit in self.orbits:
-            if orbit.cycle is not None:
-                measured.append(np.stack([orbit.cycle[name] for name in orbit.coordinates], axis=-1))
-        spread = np.ptp(np.concatenate(measured), axis=0)
-        spread[spread == 0.0] = 1.0
-        return np.where(self.angles, 2 * np.pi, spread)
-
-    def polish(self, orbit: Orbit) -> tuple[Orbit, str]:
-        """Return the orbit with its solution and no reason, or as it was with the reason why it is rejected."""
-        reasons = []
-        for equations, z in seeds(orbit, lambda winding: self._equations(orbit, winding), self.theta):
-            found, reason = self._from_seed(orbit, equations, z)
-            if not reason:
-                return found, ""
-            reasons.append(reason)
-        return orbit, reasons[0] if reasons else "the model's states grow beyond all bounds from its section points"
-
-    def points(self, orbit: Orbit) -> np.ndarray:
-        """Return the section points of a polished orbit's solution, (period, coordinates)."""
-        assert orbit.solution is not None
-        outputs = np.stack([orbit.solution.outputs[name] for name in orbit.coordinates], axis=-1)
-        return section_points(outputs, self.samples, self.angles)
-
-    def _equations(self, orbit: Orbit, winding: int) -> PeriodicEquations:
-        return PeriodicEquations.build(
-            self.model,
-            {name: np.tile(values, orbit.period) for name, values in self.inputs.items()},
-            frequency=orbit.frequency,
-            samples=self.samples,
-            scheme=self.scheme,
-            periods=orbit.period,
-            winding=winding,
-        )
-
-    def _from_seed(self, orbit: Orbit, equations: PeriodicEquations, z: np.ndarray) -> tuple[Orbit, str]:
-        turning = z + equations.drift * equations.grid.tau[:, None]
-        solved, found_by = solve_forced(equations, self.theta, dict(zip(self.model.states, turning.T, strict=True)))
-        if solved.code not in (CONVERGED, OTHER_ORBIT):
-            return orbit, f"the periodic solve ended with {STATUSES[solved.code]!r}"
-        still = self._is_still(orbit, equations, solved.z)
-        times = orbit.period if still else times_repeated(equations, solved.z)
-        winding = sum(equations.winding.values()) // times
-        if times > 1:
-            orbit = once_round(orbit, times, self.angles)
-            equations = self._equations(orbit, winding)
-            solved = equations.solve(self.theta, solved.z[: equations.grid.points])
-        solution = describe(equations, self.theta, solved._replace(code=CONVERGED), found_by)
-        if not solution.converged:
-            return orbit, f"the periodic solve ended with {solution.status!r}"
-        if times % 2 == 0:
-            orbit = replace(orbit, eigenvalues=np.copysign(np.abs(orbit.eigenvalues), solution.multipliers.real))
-        orbit = replace(orbit, winding=winding, solution=solution, equilibrium=still)
-        return orbit, self._elsewhere(orbit)
-
-    def _is_still(self, orbit: Orbit, equations: PeriodicEquations, z: np.ndarray) -> bool:
-        columns = [self.model.outputs.index(name) for name in orbit.coordinates]
-        return not equations.drift.any() and is_still(equations.outputs(z, self.theta)[:, columns], self.scales)
-
-    def _elsewhere(self, orbit: Orbit) -> str:
-        """Return what tells a solution from the measured orbit; nothing where they agree."""
-        solution, own = orbit.solution, self.points(orbit)
-        assert solution is not None
-        variance = np.diag(orbit.covariance).reshape(own.shape) + (self.tolerance * self.scales) ** 2
-        for name, sd in self.parameter_sd.items():
-            slopes = [solution.sensitivities[c][name][:: self.samples] for c in orbit.coordinates]
-            variance = variance + (sd * np.stack(slopes, axis=-1)) ** 2
-        off = np.abs(differences(own, orbit.points, self.angles)) / np.sqrt(variance)
-        at, coordinate = np.unravel_index(int(np.argmax(off)), off.shape)
-        if off.max() <= MOST_ERRORS:
-            return self._flipped(orbit)
-        kind = "a state of rest" if orbit.equilibrium else f"another orbit of period {orbit.period}"
-        return (
-            f"the solve landed on {kind}: {orbit.coordinates[coordinate]!r} at point {at} is {off.max():.3g} standard "
-            "errors from the measured one"
-        )
-
-    def _flipped(self, orbit: Orbit) -> str:
-        """Return that the solution's multiplier has another sign than the measured one; nothing where it has not.
-
-        The sign of a multiplier above 1 cannot change while an orbit is followed in the parameters.
-        """
-        assert orbit.solution is not None
-        measured, own = orbit.eigenvalues[0], orbit.solution.multipliers[0]
-        sd = np.sqrt(orbit.joint_covariance[orbit.points.size, orbit.points.size])
-        both_real = max(abs(np.angle(value**2)) for value in (measured, own)) < REAL
-        sure = both_real and sd < SURE and min(abs(measured), abs(own)) > 1.0
-        if not sure or measured.real * own.real > 0.0:
-            return ""
-        return f"the solve landed on another orbit, of multiplier {own.real:.4g} where {measured.real:.4g} was measured"
-
-
-SAME = 1e-5
+# Number of winding numbers tried for an orbit whose turns are not counted.
+MOST_TRIED = 12
 
 
 @in_one_thread
@@ -259,37 +41,37 @@ def polish_orbits(
     scheme: str | Scheme = "central4",
     tolerance: float = 0.01,
 ) -> Orbits:
-    """Solve a model for every orbit of a section, and keep those that are still the measured ones.
+    """Solve a model for every orbit of a section, and accept the solutions that agree with the measured orbits.
 
-    Newton's method starts from the whole measured cycle with its winding number; from section points alone, from the
-    model integrated over one forcing period from each of them, for the winding numbers that this leaves open. A
-    solution that repeats itself is brought to its prime period, and the measured points with it. It is accepted if
-    every section point lies within five standard errors of the measured one: the covariance of the points, the floor
-    `tolerance` and the doubt about the parameters taken together, and if its unstable multiplier has the sign of the
-    measured eigenvalue, where that is known to 30 %. Of several on one orbit (cyclic shifts included) the
-    one with the most returns is kept. An orbit and its mirror image under the change of all signs are two orbits, whose
-    noise is independent; they know each other as partners.
+    Newton's method starts from the measured cycle with its winding number. For points alone it starts from the model
+    integrated over one forcing period from each section point, for all winding numbers that this leaves possible. A
+    solution that repeats itself is reduced to its prime period, and the measured points with it. It is accepted if
+    every section point is within five standard errors of the measured one, and if its unstable multiplier has the sign
+    of the measured eigenvalue, where that is known to 30 %. The standard error combines the covariance of the points,
+    `tolerance` and the uncertainty of the parameters. Of several candidates for one orbit (cyclic shifts included), the
+    one with the most returns is kept. An orbit and its mirror image under the change of all signs are two orbits with
+    independent noise; each has the other as its partner.
 
     Parameters
     ----------
     model : Model
-        A forced one, whose states (and rates, where there is no measured cycle) follow from the section's coordinates.
+        A forced one, whose states (and rates, if there is no measured cycle) follow from the section's coordinates.
     orbits : Orbits, or sequence of Orbit
-        From `find_orbits`; what was rejected before stays rejected.
+        From `find_orbits`; those rejected before stay rejected.
     parameters : mapping of str to float
         A value for every parameter.
     inputs : mapping of str to array (samples,), optional
         Every input over one forcing period.
     parameter_sd : mapping of str to float, optional
-        Standard deviations of parameters that are but a rough guess: section points may be off by as much more as these
-        would move them, to first order.
+        Standard deviations of uncertain parameters. They widen the accepted distances by their effect on the section
+        points, to first order.
     samples : int
         Grid points per forcing period.
     scheme : str or Scheme
         See `solve_periodic`.
     tolerance : float
-        Standard error that every measured coordinate may have beyond its covariance, as a fraction of the range of all
-        that was measured, of a turn for an angle.
+        Additional standard error of every measured coordinate, as a fraction of the range of all measured values, of a
+        turn for an angle.
 
     Returns
     -------
@@ -300,8 +82,8 @@ def polish_orbits(
     Raises
     ------
     ValueError
-        For an autonomous model, unknown names, coordinates that do not tell the model's states, and arguments that
-        `solve_periodic` refuses.
+        For an autonomous model, unknown names, coordinates that do not determine the model's states, and arguments that
+        `solve_periodic` does not accept.
 
     Examples
     --------
@@ -316,8 +98,8 @@ def polish_orbits(
     -1.706
     """
     given = orbits if isinstance(orbits, Orbits) else Orbits(tuple(orbits))
-    polisher = Polisher(model, given.orbits, parameters, inputs or {}, parameter_sd or {}, samples, scheme, tolerance)
-    rejected: list[tuple[Orbit, str]] = []
+    polisher = _Polisher(model, given.orbits, parameters, inputs or {}, parameter_sd or {}, samples, scheme, tolerance)
+    rejected = list(given.rejected)
     polished: list[Orbit] = []
     for orbit in given:
         found, reason = polisher.polish(orbit)
@@ -325,39 +107,284 @@ def polish_orbits(
             rejected.append((orbit, reason))
         else:
             polished.append(found)
-    accepted, doubles = _without_doubles(polished, polisher)
-    return replace(given, orbits=_with_partners(accepted, polisher), rejected=(*given.rejected, *rejected, *doubles))
-
-
-def _without_doubles(orbits: list[Orbit], polisher: Polisher) -> tuple[list[Orbit], list[tuple[Orbit, str]]]:
-    """Return each orbit once, as the candidate with the most returns, and the other candidates with the reason."""
     kept: list[int] = []
-    doubles: list[tuple[Orbit, str]] = []
-    for i in sorted(range(len(orbits)), key=lambda i: -orbits[i].returns):
+    for i in sorted(range(len(polished)), key=lambda i: -polished[i].returns):
         for k in kept:
-            shift = _shift(orbits[i], orbits[k], polisher)
+            shift = polisher.shift(polished[i], polished[k])
             if shift is not None:
                 how = f", shifted by {shift} forcing periods" if shift else ""
-                doubles.append((orbits[i], f"the same orbit as {orbits[k].name!r}{how}"))
+                rejected.append((polished[i], f"the same orbit as {polished[k].name!r}{how}"))
                 break
         else:
             kept.append(i)
-    return [orbits[i] for i in sorted(kept)], doubles
+    accepted = [polished[i] for i in sorted(kept)]
+    partners = [
+        next((j for j, other in enumerate(accepted) if polisher.shift(one, other, sign=-1) is not None), None)
+        for one in accepted
+    ]
+    final = tuple(replace(orbit, partner=partner) for orbit, partner in zip(accepted, partners, strict=True))
+    return replace(given, orbits=final, rejected=tuple(rejected))
 
 
-def _shift(one: Orbit, other: Orbit, polisher: Polisher, sign: int = 1) -> int | None:
-    """Return the cyclic shift under which two polished orbits, all signs of one changed, are the same; None if none."""
-    if one.period != other.period or one.winding is None or one.winding * sign != other.winding:
-        return None
-    shift, distance = nearest_shift(
-        sign * polisher.points(one), polisher.points(other), polisher.angles, polisher.scales
-    )
-    return shift if distance <= SAME else None
+class _Polisher:
+    """A model with given parameters, and the section to which the orbits belong; see `polish_orbits`."""
+
+    def __init__(
+        self,
+        model: Model,
+        orbits: Sequence[Orbit],
+        parameters: Mapping[str, float],
+        inputs: Mapping[str, np.ndarray],
+        parameter_sd: Mapping[str, float],
+        samples: int,
+        scheme: str | Scheme,
+        tolerance: float,
+    ):
+        if model.autonomous:
+            raise ValueError(f"model: must be a forced one, got {model.name!r}, which is autonomous.")
+        _checks.integer("samples", samples, 4)
+        _checks.positive("tolerance", tolerance)
+        _checks.same_names("parameters", parameters, model.parameters)
+        for name, sd in parameter_sd.items():
+            _checks.one_of("parameter_sd", name, model.parameters)
+            _checks.positive(f"parameter_sd[{name!r}]", sd)
+        _checks.same_names("inputs", inputs, model.inputs)
+        for name, values in inputs.items():
+            _checks.finite_vector(f"inputs[{name!r}]", values, samples, "samples")
+        for orbit in orbits:
+            for name in orbit.coordinates:
+                _checks.one_of("coordinates", name, model.outputs)
+            if (orbit.coordinates, orbit.angles) != (orbits[0].coordinates, orbits[0].angles):
+                raise ValueError(f"orbits: must be of one section, got {orbit.name!r} with other coordinates.")
+        self.model, self.inputs, self.parameter_sd = model, inputs, parameter_sd
+        self.samples, self.scheme, self.tolerance = samples, scheme, tolerance
+        self.theta = np.array([_checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
+        if orbits:
+            coordinates = orbits[0].coordinates
+            self.angles = np.array([name in orbits[0].angles for name in coordinates])
+            # The attractor's size: a turn for angles, the range of all measured values for others.
+            measured = [orbit.points for orbit in orbits]
+            measured += [np.stack([o.cycle[n] for n in coordinates], axis=-1) for o in orbits if o.cycle is not None]
+            spread = np.ptp(np.concatenate(measured), axis=0)
+            self.scales = np.where(self.angles, TURN, np.where(spread == 0.0, 1.0, spread))
+
+    def polish(self, orbit: Orbit) -> tuple[Orbit, str]:
+        """Return the orbit with its solution and an empty reason, or unchanged with the reason for its rejection."""
+        reasons = []
+        for winding, states in self._starts(orbit):
+            found, reason = self._solve(orbit, winding, states)
+            if not reason:
+                return found, ""
+            reasons.append(reason)
+        return orbit, reasons[0] if reasons else "the model's states diverge from its section points"
+
+    def shift(self, one: Orbit, other: Orbit, sign: int = 1) -> int | None:
+        """Return the cyclic shift under which two polished orbits, one of them times `sign`, coincide; None if none."""
+        if one.period != other.period or one.winding is None or one.winding * sign != other.winding:
+            return None
+        points, others = sign * self._section_points(one), self._section_points(other)
+        distance, shift = shift_between(points, others, lambda away: self._wrap(away) / self.scales)
+        return shift if distance <= SAME else None
+
+    def _wrap(self, points: np.ndarray) -> np.ndarray:
+        """Return points or differences (…, coordinates) with angles in (−π, π]."""
+        result = np.array(points)
+        result[..., self.angles] = wrapped(result[..., self.angles])
+        return result
+
+    def _section_points(self, orbit: Orbit) -> np.ndarray:
+        assert orbit.solution is not None
+        outputs = np.stack([orbit.solution.outputs[name] for name in orbit.coordinates], axis=-1)
+        return self._wrap(outputs[:: self.samples])
+
+    def _equations(self, orbit: Orbit, winding: int) -> PeriodicEquations:
+        return PeriodicEquations.build(
+            self.model,
+            {name: np.tile(values, orbit.period) for name, values in self.inputs.items()},
+            frequency=orbit.frequency,
+            samples=self.samples,
+            scheme=self.scheme,
+            periods=orbit.period,
+            winding=winding,
+        )
+
+    def _solve(self, orbit: Orbit, winding: int, states: np.ndarray) -> tuple[Orbit, str]:
+        equations = self._equations(orbit, winding)
+        solved, found_by = solve_forced(equations, self.theta, dict(zip(self.model.states, states.T, strict=True)))
+        if solved.code not in (CONVERGED, OTHER_ORBIT):
+            return orbit, f"the periodic solve ended with {STATUSES[solved.code]!r}"
+        columns = [self.model.outputs.index(name) for name in orbit.coordinates]
+        outputs = equations.outputs(solved.z, self.theta)[:, columns]
+        still = not equations.drift.any() and bool(np.all(np.ptp(outputs, axis=0) <= STILL * self.scales))
+        repetitions = int(equations.kernels.repetitions(solved.z, equations.grid.periods))
+        times = orbit.period if still else repetitions
+        winding = sum(equations.winding.values()) // times
+        if times > 1:
+            orbit = self._reduced(orbit, times)
+            equations = self._equations(orbit, winding)
+            solved = equations.solve(self.theta, solved.z[: equations.grid.points])
+        solution = describe(equations, self.theta, solved._replace(code=CONVERGED), found_by)
+        if not solution.converged:
+            return orbit, f"the periodic solve ended with {solution.status!r}"
+        if times % 2 == 0:
+            orbit = replace(orbit, eigenvalues=np.copysign(np.abs(orbit.eigenvalues), solution.multipliers.real))
+        orbit = replace(orbit, winding=winding, solution=solution, equilibrium=still)
+        return orbit, self._mismatch(orbit) or _sign_mismatch(orbit)
+
+    def _reduced(self, orbit: Orbit, times: int) -> Orbit:
+        """Return an orbit that repeats itself `times` times within its period with its prime period.
+
+        Points are averaged, log|eigenvalue| is divided by `times`, and the covariance is propagated. An even number of
+        repetitions leaves the signs of the eigenvalues undetermined; the moduli are given.
+        """
+        period, coordinates = orbit.period // times, orbit.points.shape[1]
+        repeats = orbit.points.reshape(times, period, coordinates)
+        mean = repeats[0] + self._wrap(repeats - repeats[0]).mean(axis=0)
+        size = orbit.points.size
+        average = np.zeros((mean.size + 2, size + 2))
+        average[: mean.size, :size] = np.tile(np.eye(mean.size), times) / times
+        average[mean.size :, size:] = np.eye(2) / times
+        unknown = np.isnan(orbit.joint_covariance)
+        covariance = average @ np.where(unknown, 0.0, orbit.joint_covariance) @ average.T
+        moduli = np.abs(orbit.eigenvalues) ** (1.0 / times)
+        signed = times % 2 and not np.iscomplexobj(orbit.eigenvalues)
+        return replace(
+            orbit,
+            name=f"{orbit.name}, reduced to period {period}",
+            period=period,
+            winding=None if orbit.winding is None else orbit.winding // times,
+            points=self._wrap(mean),
+            joint_covariance=np.where(average @ unknown @ average.T > 0, np.nan, covariance),
+            eigenvalues=np.sign(orbit.eigenvalues) * moduli if signed else moduli,
+            eigenvalue_bias=orbit.eigenvalue_bias / times,
+            partner=None,
+            cycle=orbit.cycle and {name: values[: len(values) // times] for name, values in orbit.cycle.items()},
+        )
+
+    def _mismatch(self, orbit: Orbit) -> str:
+        """Return how the section points of the solution differ from the measured ones; empty if they agree."""
+        solution = orbit.solution
+        assert solution is not None
+        variance = np.diag(orbit.covariance).reshape(orbit.points.shape) + (self.tolerance * self.scales) ** 2
+        for name, sd in self.parameter_sd.items():
+            slopes = [solution.sensitivities[c][name][:: self.samples] for c in orbit.coordinates]
+            variance = variance + (sd * np.stack(slopes, axis=-1)) ** 2
+        off = np.abs(self._wrap(self._section_points(orbit) - orbit.points)) / np.sqrt(variance)
+        at, coordinate = np.unravel_index(int(np.argmax(off)), off.shape)
+        if off.max() <= MOST_ERRORS:
+            return ""
+        kind = "a state of rest" if orbit.equilibrium else f"another orbit of period {orbit.period}"
+        return (
+            f"the solution is {kind}: {orbit.coordinates[coordinate]!r} at point {at} is {off.max():.3g} standard "
+            "errors from the measured one"
+        )
+
+    def _starts(self, orbit: Orbit) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield winding numbers and states (points, states), whole turns included, from which to solve.
+
+        The measured cycle comes first. If there is none, or it does not lead to the orbit, the model is integrated over
+        one forcing period from each section point, and the segments are corrected so that they meet. If the turns of an
+        angle are unknown, winding numbers follow in the order of the corrections they need.
+        """
+        winding = counted_turns(orbit)
+        equations = self._equations(orbit, 0)
+        if orbit.cycle is not None:
+            assert winding is not None
+            values = resampled_cycle(orbit, winding, self.samples)
+            phases = self._phases(orbit, equations, values, equations.grid.tau, equations.inputs)
+            yield winding, phases[:, : equations.count]
+        for turns, states in self._integrated(orbit, equations):
+            if winding is None or turns == winding:
+                yield turns, states
+
+    def _integrated(self, orbit: Orbit, equations: PeriodicEquations) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield winding numbers and states (points, states), whole turns included, through the section points."""
+        samples, periods, count = self.samples, orbit.period, equations.count
+        tau = np.arange(periods, dtype=float)
+        starts = self._phases(orbit, equations, orbit.points, tau, equations.inputs[::samples], rates=True)
+        half = _fourier.on_grid(_fourier.coefficients(equations.inputs[:samples].T), 2 * samples).T
+        steps = {"samples": samples, "steps": samples + 1, "kept": samples + 1}
+        paths = [
+            integrate(self.model, start, half, self.theta, frequency=equations.frequency, **steps) for start in starts
+        ]
+        segments = [path[:, :count] for path in paths if path is not None]
+        if len(segments) < periods:
+            return
+        missed = np.stack([segment[-1] for segment in segments]) - np.roll(starts[:, :count], -1, axis=0)
+        angle = next((i for i, state in enumerate(self.model.states) if state in self.model.angles), None)
+        if angle is None:
+            yield 0, _connected(np.stack(segments), missed, np.zeros((periods, count)))
+            return
+        exact = missed[:, angle] / TURN
+        choices = [(np.floor(turns), np.ceil(turns)) for turns in exact]
+        ranked = sorted(product(*choices), key=lambda turns: float(np.sum((exact - np.array(turns)) ** 2)))
+        for turns in ranked[:MOST_TRIED]:
+            whole = np.zeros((periods, count))
+            whole[:, angle] = TURN * np.array(turns)
+            yield int(sum(turns)), _connected(np.stack(segments), missed, whole)
+
+    def _phases(
+        self,
+        orbit: Orbit,
+        equations: PeriodicEquations,
+        values: np.ndarray,
+        tau: np.ndarray,
+        inputs: np.ndarray,
+        rates: bool = False,
+    ) -> np.ndarray:
+        """Return the states, then the rates of the second-order ones, (points, size), from the section's coordinates.
+
+        The rates are valid only if they are requested.
+        """
+        model, count = self.model, equations.count
+        columns = [model.outputs.index(name) for name in orbit.coordinates]
+        second = [i for i, state in enumerate(model.states) if model.orders[state] == 2]
+        places = [*range(count), *(count + i for i in second)]
+        here = np.ascontiguousarray(inputs)
+
+        def outputs(phase: np.ndarray) -> np.ndarray:
+            states = np.zeros((tau.size, 3 * count))
+            states[:, places] = phase
+            return model.kernels.evaluate("outputs", states, here, self.theta, tau, equations.frequency)[:, columns]
+
+        offset = outputs(np.zeros(len(places)))
+        slopes = np.stack([outputs(unit) - offset for unit in np.eye(len(places))], axis=-1)
+        inverse = np.linalg.pinv(slopes)
+        wanted = len(places) if rates else count
+        phases = np.einsum("nip,np->ni", inverse, values - offset)
+        unique = np.allclose((inverse @ slopes)[:, :wanted], np.eye(len(places))[:wanted], atol=1e-6)
+        if not unique or not np.allclose(outputs(phases), values, rtol=1e-6, atol=1e-9):
+            what = "states and rates" if rates else "states"
+            raise ValueError(
+                f"coordinates: must determine the {what} of {model.name!r}, {list(model.states)}, by linear equations, "
+                f"got {orbit.coordinates}. Make the section of outputs such as a state and its rate."
+            )
+        return phases
 
 
-def _with_partners(orbits: list[Orbit], polisher: Polisher) -> tuple[Orbit, ...]:
-    found = []
-    for one in orbits:
-        partner = next((j for j, other in enumerate(orbits) if _shift(one, other, polisher, -1) is not None), None)
-        found.append(replace(one, partner=partner))
-    return tuple(found)
+def _connected(segments: np.ndarray, missed: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Return the segments (periods, samples + 1, states), corrected so that each ends where the next one starts.
+
+    `missed` and `turns`, (periods, states), are the distances to the next start and the whole turns in them.
+    """
+    periods, length, count = segments.shape
+    before = np.concatenate([np.zeros((1, count)), np.cumsum(turns, axis=0)[:-1]])
+    # Errors grow along an unstable orbit, so most of the correction belongs to the end of a segment.
+    fraction = (np.arange(length - 1) / (length - 1)) ** 2
+    corrected = segments[:, :-1] - fraction[:, None] * (missed - turns)[:, None] + before[:, None]
+    return corrected.reshape(-1, count)
+
+
+def _sign_mismatch(orbit: Orbit) -> str:
+    """Return that the solution's multiplier has another sign than the measured one; empty if it has not.
+
+    The sign of a multiplier with modulus above 1 cannot change along a branch.
+    """
+    assert orbit.solution is not None
+    measured, own = orbit.eigenvalues[0], orbit.solution.multipliers[0]
+    sd = np.sqrt(orbit.joint_covariance[orbit.points.size, orbit.points.size])
+    both_real = max(abs(np.angle(value**2)) for value in (measured, own)) < REAL
+    sure = both_real and sd < SURE and min(abs(measured), abs(own)) > 1.0
+    if not sure or measured.real * own.real > 0.0:
+        return ""
+    return f"the solution is another orbit: its multiplier is {own.real:.4g}, the measured one {measured.real:.4g}"

@@ -1,4 +1,4 @@
-"""`select_orbits`: the orbits worth having as data, the information in them weighed against their noise."""
+"""select_orbits: the orbits that contain information about the parameters."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -9,9 +9,11 @@ from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.models.model import Model
 from bayesperiodic.orbits.orbit import Orbit, Orbits
+from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.periodic.stability import multiplier_sensitivities
 
-DIRECTIONS = 1e-10
+# Directions with less information than this fraction of the largest are ignored.
+LEAST_EIGENVALUE = 1e-10
 
 
 @in_one_thread
@@ -26,39 +28,38 @@ def select_orbits(
 ) -> Orbits:
     """Choose polished orbits as data for the estimation of some parameters.
 
-    Left out are states of rest, orbits that their own returns speak against, and orbits so unstable that nothing near
-    them is linear any more: a return map that stretches by ``|μ|`` = 50 takes points from 1 % of the attractor's size
-    half across it within one period, so that closer and ever fewer returns must tell the points, and their error bars
-    are not to be trusted. Of the others, those go that tell hardly anything: the information of an orbit about the
-    parameters is SᵀC⁻¹S, with the sensitivities S of its section points (and unstable eigenvalues) and their covariance
-    C; one by one the least informative is dropped, as long as without all those dropped the standard deviation of no
-    combination of the parameters rises by more than `least_gain`. Both of a pair of symmetric partners may stay, for
-    their noise is independent.
+    States of rest, orbits that disagree with their own returns, and very unstable orbits are left out. A return map
+    with ``|μ|`` = 50 stretches 1 % of the attractor to half its size within one period; linear maps do not hold over
+    such distances, few close returns remain, and the error estimates become unreliable. Of the others, those with
+    little information are left out. The information of an orbit about the parameters is SᵀC⁻¹S, with the sensitivities
+    S of its section points (and unstable eigenvalues) and their covariance C. The least informative orbit is removed
+    repeatedly, as long as the standard deviation of no combination of the parameters rises by more than `least_gain` in
+    total. Both of a pair of symmetric partners may remain, because their noise is independent.
 
     Parameters
     ----------
     orbits : Orbits
         From `polish_orbits`.
     parameters : iterable of str
-        Those to be estimated.
+        The parameters to be estimated.
     model : Model, optional
-        With it, unstable eigenvalues count too, as in ``orbit.experiment(multipliers=True)``.
+        If given, unstable eigenvalues are included, as in ``orbit.experiment(multipliers=True)``.
     largest_multiplier : float
-        Limit of the largest multiplier's modulus, of the model's orbit.
+        Limit of the modulus of the largest multiplier of the model's orbit.
     least_quality : float
-        Limit of `Orbit.quality`.
+        Lower limit of `Orbit.quality`.
     least_gain : float
-        The rise of a standard deviation that is put up with.
+        Largest acceptable relative rise of a standard deviation.
 
     Returns
     -------
     Orbits
-        With those left out, and the reasons, added to `.rejected`; partners are counted anew.
+        Those left out are added to `.rejected` with the reasons; partners are positions among the selected ones.
 
     Raises
     ------
     ValueError
-        For an orbit that is not polished, an unknown parameter, a negative limit.
+        For an orbit that is not polished, an unknown parameter, or a limit that is not positive.
 
     Examples
     --------
@@ -75,31 +76,38 @@ def select_orbits(
     _checks.finite_number("least_quality", least_quality)
     _checks.positive("least_gain", least_gain)
     kept: list[Orbit] = []
-    left: list[tuple[Orbit, str]] = []
+    rejected = list(orbits.rejected)
     for orbit in orbits:
-        reason = _unfit(orbit, largest_multiplier, least_quality)
+        reason = _unsuitable(orbit, largest_multiplier, least_quality)
         if reason:
-            left.append((orbit, reason))
+            rejected.append((orbit, reason))
         else:
             kept.append(orbit)
     dropped = _uninformative([orbit_information(orbit, names, model) for orbit in kept], least_gain)
     for i, rise in dropped.items():
-        left.append((kept[i], f"tells little more: without it, standard deviations rise by {rise:.2%} at most"))
-    chosen = [i for i in range(len(kept)) if i not in dropped]
-    return replace(orbits, orbits=_renumbered(orbits, [kept[i] for i in chosen]), rejected=(*orbits.rejected, *left))
+        rejected.append((kept[i], f"little information: without it, standard deviations rise by {rise:.2%} at most"))
+    chosen = [orbit for i, orbit in enumerate(kept) if i not in dropped]
+    position = {orbit.name: i for i, orbit in enumerate(chosen)}
+    partners = [None if orbit.partner is None else position.get(orbits[orbit.partner].name) for orbit in chosen]
+    selected = tuple(replace(orbit, partner=partner) for orbit, partner in zip(chosen, partners, strict=True))
+    return replace(orbits, orbits=selected, rejected=tuple(rejected))
+
+
+def _polished(orbit: Orbit) -> PeriodicSolution:
+    if orbit.solution is None:
+        raise ValueError(f"orbits: must be polished, got {orbit.name!r} without a solution. Use polish_orbits first.")
+    return orbit.solution
 
 
 def orbit_information(orbit: Orbit, parameters: list[str], model: Model | None = None) -> np.ndarray:
-    """Return SᵀC⁻¹S (parameters, parameters), the derivatives S taken by relative changes of the parameters."""
-    solution = orbit.solution
-    if solution is None:
-        raise ValueError(f"orbits: {orbit.name!r} is not allowed; it is not polished, see polish_orbits.")
+    """Return SᵀC⁻¹S (parameters, parameters), with the derivatives S by relative changes of the parameters."""
+    solution = _polished(orbit)
     for name in parameters:
         _checks.one_of("parameters", name, solution.parameters)
-    columns = []
     experiment = orbit.experiment(samples=solution.samples, multipliers=model is not None)
     by_name = multiplier_sensitivities(model, solution) if model is not None else {}
     count = 0 if experiment.multipliers is None else experiment.multipliers.size
+    columns = []
     for name in parameters:
         by = [solution.sensitivities[c][name][:: solution.samples] for c in orbit.coordinates]
         column = np.stack(by, axis=-1).ravel()
@@ -111,41 +119,31 @@ def orbit_information(orbit: Orbit, parameters: list[str], model: Model | None =
     return slopes.T @ np.linalg.solve(experiment.covariance, slopes)
 
 
-def _unfit(orbit: Orbit, largest_multiplier: float, least_quality: float) -> str:
-    """Return why an orbit is no data at all; nothing if it is."""
-    if orbit.solution is None:
-        raise ValueError(f"orbits: {orbit.name!r} is not allowed; it is not polished, see polish_orbits.")
+def _unsuitable(orbit: Orbit, largest_multiplier: float, least_quality: float) -> str:
+    """Return why an orbit cannot be used as data; empty if it can."""
+    modulus = float(np.abs(_polished(orbit).multipliers).max())
     if orbit.equilibrium:
         return "a state of rest"
     if orbit.quality < least_quality:
-        return f"its returns speak against it (quality {orbit.quality:.2g} < {least_quality:g})"
-    modulus = float(np.abs(orbit.solution.multipliers).max())
+        return f"disagrees with its returns: quality {orbit.quality:.2g} < {least_quality:g}"
     return f"too unstable: |μ| = {modulus:.4g} > {largest_multiplier:g}" if modulus > largest_multiplier else ""
 
 
 def _uninformative(information: list[np.ndarray], most: float) -> dict[int, float]:
-    """Return which orbits may go, and by how much standard deviations rise without them and all that went before."""
+    """Return the orbits to leave out, with the rise of standard deviations without them and all before them."""
     dropped: dict[int, float] = {}
     if not information:
         return dropped
-    total = np.sum(information, axis=0)
-    values, vectors = np.linalg.eigh(total)
-    told = values > DIRECTIONS * values.max()
-    white = vectors[:, told] / np.sqrt(values[told])
-    parts = [white.T @ one @ white for one in information]
-    now = np.eye(white.shape[1])
+    values, vectors = np.linalg.eigh(np.sum(information, axis=0))
+    informed = values > LEAST_EIGENVALUE * values.max()
+    whitening = vectors[:, informed] / np.sqrt(values[informed])
+    parts = [whitening.T @ one @ whitening for one in information]
+    remaining = np.eye(whitening.shape[1])
     while len(dropped) < len(parts) - 1:
-        left = {i: np.linalg.eigvalsh(now - part)[0] for i, part in enumerate(parts) if i not in dropped}
-        best = max(left, key=lambda i: left[i])
-        rise = float(1.0 / np.sqrt(left[best]) - 1.0) if left[best] > 0.0 else np.inf
+        least = {i: np.linalg.eigvalsh(remaining - part)[0] for i, part in enumerate(parts) if i not in dropped}
+        best = max(least, key=least.__getitem__)
+        rise = float(1.0 / np.sqrt(least[best]) - 1.0) if least[best] > 0.0 else np.inf
         if rise > most:
             break
-        dropped[best], now = rise, now - parts[best]
+        dropped[best], remaining = rise, remaining - parts[best]
     return dropped
-
-
-def _renumbered(before: Orbits, chosen: list[Orbit]) -> tuple[Orbit, ...]:
-    """Return the chosen orbits, partners as positions among them."""
-    places = {orbit.name: i for i, orbit in enumerate(chosen)}
-    partners = [None if o.partner is None else places.get(before[o.partner].name) for o in chosen]
-    return tuple(replace(o, partner=partner) for o, partner in zip(chosen, partners, strict=True))

@@ -43,7 +43,7 @@ def test_the_residual_of_exact_points_vanishes():
     assert float(problem.log_likelihood({"l": 0.3}, {"scale": 1.0})) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_unstable_eigenvalues_bring_the_covariance_they_share_with_the_points(polished):
+def test_unstable_eigenvalues_keep_their_covariance_with_the_points(polished):
     joint = polished.joint_covariance.copy()
     joint[-2, :8] = joint[:8, -2] = 1e-6
     run = replace(polished, joint_covariance=joint).experiment(samples=200, multipliers=True)
@@ -55,22 +55,22 @@ def test_unstable_eigenvalues_bring_the_covariance_they_share_with_the_points(po
     ("change", "why"),
     [
         ({"joint_covariance": np.diag([*np.ones(8), np.nan, np.nan])}, "not estimated"),
-        ({"eigenvalue_bias": np.array([0.011, 0.0])}, "biased by more than sd/2"),
+        ({"eigenvalue_bias": np.array([0.011, 0.0])}, "its bias exceeds half its standard deviation"),
         ({"eigenvalues": np.array([2.0 + 1.0j, 2.0 - 1.0j])}, "complex"),
     ],
 )
-def test_eigenvalues_that_are_no_data_are_left_out_and_named(polished, change, why):
-    with pytest.warns(UserWarning, match=f"The eigenvalue .* is left out; it is .*{why}"):
+def test_unusable_eigenvalues_are_left_out_with_a_warning(polished, change, why):
+    with pytest.warns(UserWarning, match=f"The eigenvalue .* is left out: it is .*{why}"):
         run = replace(polished, **change).experiment(samples=200, multipliers=True)
     assert run.multipliers is None and run.covariance.shape == (8, 8)
 
 
-def test_a_stable_eigenvalue_is_no_data_and_not_worth_a_word(polished):
+def test_a_stable_eigenvalue_is_left_out_without_a_warning(polished):
     stable = replace(polished, eigenvalues=np.array([0.5, 0.1]))
     assert stable.experiment(samples=200, multipliers=True).multipliers is None
 
 
-def test_the_whole_cycle_is_compared_where_it_was_measured(polished):
+def test_the_whole_cycle_is_compared_at_its_measured_points(polished):
     run = polished.experiment(samples=2 * SAMPLES, whole=True, multipliers=True)
     assert run.covariance is None and np.flatnonzero(run.mask).tolist() == list(range(0, 800, 2))
     assert run.outputs["rate"][::2] == pytest.approx(polished.cycle["rate"])
@@ -79,16 +79,16 @@ def test_the_whole_cycle_is_compared_where_it_was_measured(polished):
     assert abs(fit.theta["l"] - 0.3) < 4 * fit.sd["l"] < 1e-3
 
 
-def test_what_is_missing_is_asked_for():
+def test_missing_information_raises():
     bare = measured(shooting.UNSTABLE[0], cycle=False)
-    with pytest.raises(ValueError, match="winding: that of .* is not known; polish the orbit"):
+    with pytest.raises(ValueError, match="winding: must be known, got None for .* Use polish_orbits"):
         bare.experiment()
-    with pytest.raises(ValueError, match="states: they are needed; .* is not polished"):
+    with pytest.raises(ValueError, match="states: must name the coordinate .*, got None; .* is not polished"):
         measured(GENTLE[0]).experiment()
     with pytest.raises(ValueError, match="states: 'rat' is not known; allowed: 'angle', 'rate'"):
         measured(GENTLE[0]).experiment(states={"phi": "rat"})
     polished = bp.polish_orbits(bp.models.pendulum, [bare], PENDULUM, samples=400)[0]
-    with pytest.raises(ValueError, match="whole: True is not allowed; .* has no measured cycle"):
+    with pytest.raises(ValueError, match="whole: must be False, got True; .* has no measured cycle"):
         polished.experiment(whole=True)
-    with pytest.raises(ValueError, match="samples: 150 is not allowed; the cycle has 100 a forcing period"):
+    with pytest.raises(ValueError, match="samples: must be a multiple of the cycle's 100 a forcing period, got 150"):
         measured(GENTLE[0]).experiment(samples=150, whole=True, states=PHI)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bayesperiodic.orbits.local import Atlas, LocalMaps
+from bayesperiodic.orbits.return_map import Atlas, ReturnMap
 
 MATRIX = np.array([[1.2, -0.4], [0.3, 0.8]])
 BEND = 0.7
@@ -15,7 +15,7 @@ def image(points):
 def quadratic():
     """Return local maps of a quadratic map on the unit square, without noise, and their atlas."""
     points = np.random.default_rng(1).uniform(0.0, 1.0, (4000, 2))
-    maps = LocalMaps(points, image(points) - points, np.full(2, np.inf), True, np.zeros(2))
+    maps = ReturnMap(points, image(points) - points, np.full(2, np.inf), True, np.zeros(2))
     return maps, Atlas(maps, 72)
 
 

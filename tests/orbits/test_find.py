@@ -67,7 +67,7 @@ def wrapped(difference):
     return difference
 
 
-def test_henon_has_these_cycles_and_no_others():
+def test_the_henon_map_has_the_known_numbers_of_cycles():
     # Known numbers of prime cycles at a = 1.4, b = 0.3 on the attractor: 1, 1, 0, 1, 0, 2 for periods 1 to 6.
     orbits = bp.find_orbits(henon_section(5000), periods=range(1, 7))
     assert [sum(o.period == p for o in orbits) for p in range(1, 7)] == [1, 1, 0, 1, 0, 2]
@@ -116,10 +116,10 @@ def coupled_orbit(guess):
     return points, np.abs(np.linalg.eigvals(product)).max()
 
 
-def test_error_bars_cover_at_a_tenth_of_a_percent_of_noise():
+def test_intervals_have_nominal_coverage_at_a_tenth_of_a_percent_of_noise():
     """Nominal 90 % intervals; false alarms: 1 % for log|eigenvalue| (two-sided binomial band), 0.5 % for the points.
 
-    The points' covariance holds an allowance for bias that this map has no need of, so they may be covered more often.
+    The points' covariance includes an allowance for bias, so their coverage may be higher.
     """
     inside, total, points, values = 0, 0, 0, 0
     for seed in range(14):
@@ -136,14 +136,14 @@ def test_error_bars_cover_at_a_tenth_of_a_percent_of_noise():
     assert binom.ppf(0.005, values, 0.9) <= points <= 0.98 * values
 
 
-def test_error_bars_hold_where_the_density_of_returns_varies():
-    """Both fixed points with |μ| = 11.119 in six recordings; twelve squared pulls, false-alarm rate 1 %.
+def test_intervals_hold_where_the_density_of_returns_varies():
+    """Both fixed points with |μ| = 11.119 in six recordings; twelve squared standardised errors, false-alarm rate 1 %.
 
-    Returns are dense at these points and sparse beside them, so that the number of neighbours says little of how far
-    they reach, and bias was once taken for a quarter of what it is.
+    Returns are dense at these points and sparse beside them, so that the number of neighbours does not determine the
+    bandwidth; neighbourhoods chosen by number underestimated the bias by a factor of four.
     """
     known = next(k for k in KNOWN if len(k.section) == 1 and abs(k.multipliers[0] - 11.119) < 1e-2)
-    pulls = []
+    standardised = []
     for seed in range(6):
         section = bp.PoincareSection.from_recording(
             chaos.recording(12_000, 40, 0.001, seed), ("angle", "rate"), frequency=chaos.FREQUENCY, angles=("angle",)
@@ -152,11 +152,11 @@ def test_error_bars_hold_where_the_density_of_returns_varies():
         for sign in (1, -1):
             estimate = refine(scaled.maps, sign * np.array(known.section) / scaled.size, 32)
             error = np.log(abs(estimate.eigenvalues[0] / known.multipliers[0]))
-            pulls.append(error / np.hypot(np.sqrt(estimate.covariance[2, 2]), estimate.bias[2]))
-    assert np.sum(np.square(pulls)) < chi2.ppf(0.99, len(pulls))
+            standardised.append(error / np.hypot(np.sqrt(estimate.covariance[2, 2]), estimate.bias[2]))
+    assert np.sum(np.square(standardised)) < chi2.ppf(0.99, len(standardised))
 
 
-def test_orbits_of_the_pendulum_are_those_of_shooting():
+def test_orbits_of_the_pendulum_agree_with_shooting():
     _, orbits = pendulum_orbits()
     found = 0
     for known in [k for k in KNOWN if len(k.section) <= 3 and abs(k.multipliers[0]) < 200]:
@@ -174,7 +174,7 @@ def test_orbits_of_the_pendulum_are_those_of_shooting():
     assert found >= 6
 
 
-def test_nothing_is_reported_that_is_no_orbit():
+def test_every_reported_orbit_is_one_of_the_model():
     _, orbits = pendulum_orbits()
     assert len(orbits) >= 16
     for orbit in orbits:
@@ -188,7 +188,7 @@ def test_nothing_is_reported_that_is_no_orbit():
         assert np.abs((shot.states - running) / SCALE).max() < 0.02
 
 
-def test_states_of_rest_are_labelled():
+def test_states_of_rest_are_marked():
     section, orbits = pendulum_orbits()
     rest = [o for o in orbits if o.equilibrium]
     assert {round(abs(o.points[0, 0]), 1) for o in rest} <= {0.0, 3.1}
@@ -199,7 +199,7 @@ def test_states_of_rest_are_labelled():
     assert all(o.winding is None and o.cycle is None for o in again)
 
 
-def test_partners_are_mirrors():
+def test_partners_are_mirror_images():
     _, orbits = pendulum_orbits()
     assert sum(o.partner is not None for o in orbits) > len(orbits) // 2
     for orbit in orbits:
@@ -226,7 +226,7 @@ def test_orbits_and_their_table_are_saved(tmp_path):
     assert orbits.values == 2 * (9000 * 40 + 1)
 
 
-def test_boxes_find_the_strongest_orbits():
+def test_boxes_find_the_orbits_of_lowest_period():
     orbits = bp.find_orbits(henon_section(20000), periods=[1, 2], method="boxes")
     assert [o.period for o in orbits] == [1, 2]
     for orbit in orbits:
@@ -234,17 +234,15 @@ def test_boxes_find_the_strongest_orbits():
         np.testing.assert_allclose(orbit.eigenvalues[0], henon_eigenvalues(henon_orbit(orbit.points))[0], rtol=0.1)
 
 
-def test_the_noise_of_points_is_seen_in_them():
-    from bayesperiodic.orbits.find import _scaled
-
+def test_the_noise_is_estimated_from_the_points():
     for noise in (0.001, 0.004):
         section = bp.PoincareSection.from_points(
             chaos.points(9000, noise), ("angle", "rate"), frequency=1.0, angles=("angle",)
         )
-        np.testing.assert_allclose(_scaled(section, 32).maps.noise, noise, rtol=0.35)
+        np.testing.assert_allclose(find._scaled(section, 32).maps.noise, noise, rtol=0.35)
 
 
-def test_sections_without_chaos_are_refused():
+def test_sections_without_chaos_raise():
     turn = np.arange(4000)
     noise = 0.001 * np.random.default_rng(0).standard_normal((4000, 2))
     ratio = 2 * np.pi * (np.sqrt(2) - 1)
@@ -258,7 +256,7 @@ def test_sections_without_chaos_are_refused():
 
 
 @pytest.mark.parametrize("factor", [1.0005, 0.98, 1.1])
-def test_a_wrong_frequency_is_suspected(factor):
+def test_a_wrong_frequency_is_named(factor):
     section = bp.PoincareSection.from_recording(
         chaos.recording(9000, 40, 0.0005),
         ("angle", "rate"),
@@ -269,13 +267,13 @@ def test_a_wrong_frequency_is_suspected(factor):
         bp.find_orbits(section, periods=[1])
 
 
-def test_bad_arguments_are_refused():
+def test_invalid_arguments_raise():
     section = henon_section(500)
     with pytest.raises(ValueError, match="method: 'box' is not known.*'boxes'"):
         bp.find_orbits(section, periods=[1], method="box")
     with pytest.raises(ValueError, match="periods: 0 is not allowed"):
         bp.find_orbits(section, periods=[0])
-    with pytest.raises(ValueError, match="periods: 3 is not allowed; it is a collection"):
+    with pytest.raises(ValueError, match="periods: must be a collection such as range"):
         bp.find_orbits(section, periods=3)
     with pytest.raises(ValueError, match="none above 25"):
         bp.find_orbits(section, periods=[30])

@@ -36,20 +36,20 @@ def test_an_eigenvalue_adds_information(polished):
     assert more == pytest.approx(np.outer(slopes, slopes) / 0.02**2, rel=1e-9)
 
 
-def test_rest_wild_and_doubtful_orbits_are_left_out_with_the_reason(polished):
+def test_unsuitable_orbits_are_left_out_with_the_reason(polished):
     doubtful = replace(polished, orbits=(replace(polished[0], quality=1e-5), *polished[1:]))
     chosen = bp.select_orbits(doubtful, ["m", "l"], least_gain=1e-9)
     reasons = {orbit.name: reason for orbit, reason in chosen.rejected}
-    assert reasons[polished[0].name] == "its returns speak against it (quality 1e-05 < 0.001)"
+    assert reasons[polished[0].name] == "disagrees with its returns: quality 1e-05 < 0.001"
     assert reasons["rest"] == "a state of rest"
     assert reasons[polished[-1].name].startswith("too unstable: |μ| = ")
     assert [orbit.name for orbit in chosen] == [orbit.name for orbit in polished[1:9]]
 
 
-def test_what_is_left_out_costs_no_combination_more_than_was_agreed(polished):
+def test_no_standard_deviation_rises_by_more_than_the_limit(polished):
     names = ["m", "l"]
     chosen = bp.select_orbits(polished, names, least_gain=0.05)
-    left = [orbit for orbit, reason in chosen.rejected if reason.startswith("tells little more")]
+    left = [orbit for orbit, reason in chosen.rejected if reason.startswith("little information")]
     assert left and len(left) + len(chosen) == 9
     every = sum(orbit_information(orbit, names) for orbit in polished[:9])
     some = sum(orbit_information(orbit, names) for orbit in chosen)
@@ -60,22 +60,22 @@ def test_what_is_left_out_costs_no_combination_more_than_was_agreed(polished):
         assert np.sqrt(np.linalg.eigvals(np.linalg.solve(fewer, every)).real).max() - 1 > 0.05
 
 
-def test_parameters_that_only_come_in_combination_do_not_stop_the_selection(polished):
-    """Of m, k1, k2 and k3 only the ratios k/m act: the information is singular."""
+def test_unidentifiable_parameters_do_not_stop_the_selection(polished):
+    """Of m, k1, k2 and k3 only the ratios k/m are identifiable: the information is singular."""
     assert len(bp.select_orbits(polished, ["m", "k1", "k2", "k3"])) >= 4
 
 
-def test_partners_may_both_stay(polished):
+def test_both_partners_may_be_selected(polished):
     pair = [measured(GENTLE[1]), mirrored(measured(GENTLE[1], seed=1)), measured(GENTLE[0])]
     both = bp.polish_orbits(bp.models.pendulum, [at_rest(), *pair], PENDULUM, samples=400)
     chosen = bp.select_orbits(both, ["m", "l"], least_gain=1e-6)
     assert [orbit.partner for orbit in chosen] == [1, 0, None]
 
 
-def test_bad_arguments_are_refused(polished):
+def test_invalid_arguments_raise(polished):
     with pytest.raises(ValueError, match="parameters: 'mass' is not known"):
         bp.select_orbits(polished, ["mass"])
     with pytest.raises(ValueError, match="largest_multiplier: -1 is not allowed"):
         bp.select_orbits(polished, ["m"], largest_multiplier=-1)
-    with pytest.raises(ValueError, match="it is not polished"):
+    with pytest.raises(ValueError, match="orbits: must be polished, got"):
         bp.select_orbits(bp.Orbits((measured(GENTLE[0]),)), ["m"])

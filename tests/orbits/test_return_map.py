@@ -1,7 +1,7 @@
 import numpy as np
 
 from bayesperiodic.orbits.cycles import eigenvalues, has_shorter_period, newton_step, shift_between
-from bayesperiodic.orbits.local import LocalMaps
+from bayesperiodic.orbits.return_map import ReturnMap
 
 OPEN = np.array([np.inf, np.inf])
 
@@ -22,7 +22,7 @@ def maps(count, noise, seed, width=None):
         clean[:, 0] = width * generator.standard_normal(count)
     arguments = clean + noise * generator.standard_normal(clean.shape)
     images = quadratic(clean) + noise * generator.standard_normal(clean.shape)
-    return LocalMaps(arguments, images - arguments, OPEN, True, np.full(2, noise))
+    return ReturnMap(arguments, images - arguments, OPEN, True, np.full(2, noise))
 
 
 def test_a_quadratic_map_is_recovered_exactly():
@@ -63,11 +63,11 @@ def test_angles_wrap():
     folded = np.stack([(angle + 0.37) % 1.0 - 0.37, other], axis=1)
     run = image - arguments
     turn = np.array([1.0, np.inf])
-    known = LocalMaps(folded, run, turn, True, np.zeros(2)).fit(np.array([[0.5, 0.0]]), 60, 1)
+    known = ReturnMap(folded, run, turn, True, np.zeros(2)).fit(np.array([[0.5, 0.0]]), 60, 1)
     np.testing.assert_allclose(known.value[0] - [0.5, 0.0], [0.6, 0.0], atol=1e-12)
     modulo = run.copy()
     modulo[:, 0] -= np.round(modulo[:, 0])
-    alone = LocalMaps(folded, modulo, turn, False, np.zeros(2)).fit(np.array([[0.5, 0.0]]), 60, 1)
+    alone = ReturnMap(folded, modulo, turn, False, np.zeros(2)).fit(np.array([[0.5, 0.0]]), 60, 1)
     np.testing.assert_allclose(alone.jacobian, known.jacobian, atol=1e-12)
     np.testing.assert_allclose((alone.value - known.value) % 1.0 % 1.0, [[0.0, 0.0]], atol=1e-12)
 

@@ -1,0 +1,330 @@
+"""Local polynomial regression of the return map, corrected for noise in its arguments.
+
+All coordinates are in units of the attractor's size.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import nnls
+from scipy.spatial import cKDTree
+
+# Powers of the two coordinates, degree by degree, and the factorials that make the coefficients derivatives.
+POWERS = np.array([(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)])
+FACTORIALS = np.array([1.0, 1.0, 1.0, 2.0, 1.0, 2.0, 6.0, 2.0, 2.0, 6.0])
+TERMS = {1: 3, 2: 6, 3: 10}
+# Neighbours are used up to this many bandwidths, where the kernel is 1.1 % of its maximum.
+REACH = 3.0
+# Largest noise as a fraction of the bandwidth; deconvolution needs less than one.
+MOST_NOISE = 0.75
+MOST_LEVERAGE = 0.9
+# Limits of memory: products of regressors in one call, neighbours of all fits of an atlas.
+BLOCK, MOST_NEIGHBOURS = 4_000_000, 6_000_000
+
+
+class LocalFit(NamedTuple):
+    """Polynomials of the return map about m centres.
+
+    Attributes
+    ----------
+    value : array (m, 2)
+        Image of the centre, angles continuous from the centre.
+    derivatives : array (m, terms, 2)
+        Of the image by the argument (u, v): orders 0 (relative), u, v, uu, uv, vv, …
+    bandwidth : array (m,)
+    neighbours : array (m, n)
+        Positions among the arguments.
+    influence : array (m, n, terms, 2)
+        Contribution of each neighbour to the error of `derivatives`.
+    effective : array (m,)
+        Effective number of neighbours.
+    """
+
+    value: np.ndarray
+    derivatives: np.ndarray
+    bandwidth: np.ndarray
+    neighbours: np.ndarray
+    influence: np.ndarray
+    effective: np.ndarray
+
+    @property
+    def jacobian(self) -> np.ndarray:
+        """Derivatives of the image by the argument, (m, image, argument)."""
+        return self.derivatives[:, 1:3].transpose(0, 2, 1)
+
+    @property
+    def hessian(self) -> np.ndarray:
+        """Second derivatives (m, image, argument, argument); zero for linear fits."""
+        result = np.zeros((len(self.derivatives), 2, 2, 2))
+        if self.derivatives.shape[1] > 3:
+            for term, (row, column) in zip((3, 4, 4, 5), ((0, 0), (0, 1), (1, 0), (1, 1)), strict=True):
+                result[:, :, row, column] = self.derivatives[:, term]
+        return result
+
+
+class ReturnMap:
+    """The return map of a section, fitted locally on request.
+
+    Neighbours are weighted by a Gaussian kernel. The normal equations are sums of the kernel times powers of noise-free
+    arguments. For normal noise in the arguments, of known variance below the kernel's, there are functions of the noisy
+    arguments with exactly these expectations: a narrower Gaussian times Hermite polynomials, the deconvoluting kernels
+    of [1]_. They make the normal equations unbiased and so remove the attenuation of the slopes.
+
+    Parameters
+    ----------
+    arguments : array (n, 2)
+        Points with a known image.
+    increments : array (n, 2)
+        Image minus argument; angles with whole turns, or modulo a turn.
+    turn : array (2,)
+        One turn in these units; infinite for coordinates that are not angles.
+    winds : bool
+        Whether the increments of angles include whole turns.
+    noise : array (2,)
+        Standard deviation of the arguments.
+
+    References
+    ----------
+    .. [1] J. Fan, Y. K. Truong, Nonparametric regression with errors in variables, Annals of Statistics 21, 1993.
+    """
+
+    def __init__(self, arguments: np.ndarray, increments: np.ndarray, turn: np.ndarray, winds: bool, noise: np.ndarray):
+        self.arguments, self.increments, self.turn, self.winds, self.noise = arguments, increments, turn, winds, noise
+        self.angle = np.isfinite(turn)
+        self._tree = self.tree(arguments)
+
+    def tree(self, points: np.ndarray) -> cKDTree:
+        """Return a search tree of points, periodic in the angles."""
+        return cKDTree(self.wrap_points(points), boxsize=np.where(self.angle, self.turn, 0.0))
+
+    def wrap_points(self, points: np.ndarray) -> np.ndarray:
+        """Return points with angles in [0, turn)."""
+        result = np.array(points)
+        result[:, self.angle] %= self.turn[self.angle]
+        # The remainder of a tiny negative number is the turn itself, which the tree does not accept.
+        result[:, self.angle] = np.where(result[:, self.angle] >= self.turn[self.angle], 0.0, result[:, self.angle])
+        return result
+
+    def wrap(self, difference: np.ndarray) -> np.ndarray:
+        """Return differences (…, 2) with angles in half a turn either way."""
+        result = np.array(difference)
+        for column in np.flatnonzero(self.angle):
+            turn = self.turn[column]
+            result[..., column] -= turn * np.round(result[..., column] / turn)
+        return result
+
+    def distance(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Return the largest coordinate differences (n,) of points (n, 2)."""
+        return np.abs(self.wrap(one - other)).max(axis=1)
+
+    def nearest(self, centres: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return distances and positions of the nearest arguments, (m, count) each."""
+        distance, index = self._tree.query(self.wrap_points(centres), np.arange(1, count + 1))
+        return np.asarray(distance), np.asarray(index)
+
+    def count_within(self, centres: np.ndarray, bandwidths: np.ndarray) -> np.ndarray:
+        """Return the number of neighbours (m,) of fits about the centres (m, 2) with the bandwidths (m,)."""
+        radii = REACH * bandwidths
+        return np.asarray(self._tree.query_ball_point(self.wrap_points(centres), radii, return_length=True))
+
+    def fit(self, centres: np.ndarray, count: int, degree: int, *, influence: bool = True) -> LocalFit:
+        """Fit polynomials about the centres (m, 2) to their `count` nearest neighbours; faster without `influence`."""
+        rows = max(1, BLOCK // (count * TERMS[degree] ** 2))
+        parts = [self._fit(centres[k : k + rows], count, degree, influence) for k in range(0, len(centres), rows)]
+        return LocalFit(*map(np.concatenate, zip(*parts, strict=True)))
+
+    @staticmethod
+    def predict(fit: LocalFit, away: np.ndarray) -> np.ndarray:
+        """Return images (m, …, 2) at displacements (m, …, 2) from the centres."""
+        terms = fit.derivatives.shape[1]
+        monomials = np.stack([away[..., 0] ** a * away[..., 1] ** b for a, b in POWERS[1:terms]], axis=-1)
+        slopes = fit.derivatives[:, 1:] / FACTORIALS[1:terms, None]
+        shape = (len(away), *(1,) * (away.ndim - 2), 2)
+        return fit.value.reshape(shape) + np.einsum("m...t,mtc->m...c", monomials, slopes)
+
+    def residual_variance(self, centres: np.ndarray, fit: LocalFit) -> np.ndarray:
+        """Return the weighted residual variances (m, 2) of the neighbours' images."""
+        away = self.wrap(self.arguments[fit.neighbours] - centres[:, None])
+        residual = away + self.increments[fit.neighbours] + centres[:, None] - self.predict(fit, away)
+        residual = residual if self.winds else self.wrap(residual)
+        weight = np.exp(-0.5 * np.sum(away**2, axis=-1) / fit.bandwidth[:, None] ** 2)
+        free = np.maximum(fit.effective - fit.derivatives.shape[1], 1.0) / fit.effective
+        return np.einsum("mn,mnc->mc", weight, residual**2) / weight.sum(1)[:, None] / free[:, None]
+
+    def _fit(self, centres: np.ndarray, count: int, degree: int, wants_influence: bool) -> LocalFit:
+        distance, index = self.nearest(centres, count)
+        bandwidth = np.maximum(distance[:, -1] / REACH, np.max(self.noise) / MOST_NOISE)
+        away = self.wrap(self.arguments[index] - centres[:, None])
+        image = away + self.increments[index]
+        reference = image[:, :1]
+        image = image - reference
+        if not self.winds:
+            image = self.wrap(image)
+        moments, weight = _deconvoluted(away / bandwidth[:, None, None], self.noise / bandwidth[:, None], 2 * degree)
+        powers = POWERS[: TERMS[degree]]
+        sums = powers[:, None] + powers[None]
+        weighted = weight[..., None] * moments[0]
+        normal = (weighted.transpose(0, 2, 1) @ moments[1])[:, sums[..., 0], sums[..., 1]]
+        regressors = weighted[..., powers[:, 0]] * moments[1][..., powers[:, 1]]
+        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+        solution = inverse @ (regressors.transpose(0, 2, 1) @ image)
+        effective = weight.sum(1) ** 2 / (weight**2).sum(1)
+        scale = (FACTORIALS[: len(powers)] / bandwidth[:, None] ** powers.sum(1))[..., None]
+        influence = np.empty((len(centres), 0, len(powers), 2))
+        if wants_influence:
+            # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
+            product = weighted[..., sums[..., 0]] * moments[1][..., sums[..., 1]]
+            residual = regressors[..., None] * image[:, :, None] - product @ solution[:, None]
+            leverage = np.clip(np.einsum("mab,mnab->mn", inverse, product), 0.0, MOST_LEVERAGE)
+            influence = (inverse[:, None] @ residual) * scale[:, None] / (1.0 - leverage)[..., None, None]
+        derivatives = solution * scale
+        value = centres + reference[:, 0] + derivatives[:, 0]
+        return LocalFit(value, derivatives, bandwidth, index, influence, effective)
+
+
+def _deconvoluted(
+    away: np.ndarray, noise: np.ndarray, highest: int
+) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Return, by coordinate, functions whose expectation is (kernel ×) power, and the kernel, for unit bandwidth.
+
+    x^a exp(−x²/2) is the expectation, over noise of variance s², of the Gaussian of variance 1 − s² times the a-th
+    moment of a normal distribution with mean x/(1 − s²) and the negative variance −s²/(1 − s²).
+    """
+    left = 1.0 - noise[:, None] ** 2
+    weight = np.exp(-0.5 * np.sum(away**2 / left, axis=-1)) / np.sqrt(left.prod(-1))
+    moments = []
+    for k in range(2):
+        mean, variance = away[..., k] / left[..., k], -(1.0 - left[..., k]) / left[..., k]
+        rows = [np.ones_like(mean), mean]
+        for order in range(2, highest + 1):
+            rows.append(mean * rows[-1] + (order - 1) * variance * rows[-2])
+        moments.append(np.stack(rows[: highest + 1], axis=-1))
+    return (moments[0], moments[1]), weight
+
+
+class Atlas:
+    """Quadratic polynomials of the return map about points of the section, each valid up to its bandwidth.
+
+    Parameters
+    ----------
+    maps : ReturnMap
+    count : int
+        Neighbours of each fit.
+    """
+
+    def __init__(self, maps: ReturnMap, count: int):
+        self._maps, self._count = maps, count
+        self._centres = maps.arguments[:: -(-len(maps.arguments) * count // MOST_NEIGHBOURS)]
+        fit = maps.fit(self._centres, count, 2, influence=False)
+        self._value, self._jacobian, self._hessian = fit.value, fit.jacobian, fit.hessian
+        self._bandwidth = fit.bandwidth
+        self._tree = maps.tree(self._centres)
+
+    def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return images (m, 2), derivatives (m, image, argument) and bandwidths (m,) at points (m, 2).
+
+        The bandwidth is infinite where a point is farther from the nearest centre than that.
+        """
+        _, nearest = self._tree.query(self._maps.wrap_points(points))
+        away = self._maps.wrap(points - self._centres[nearest])
+        curved = np.einsum("mijk,mk->mij", self._hessian[nearest], away)
+        jacobian = self._jacobian[nearest]
+        image = self._value[nearest] + np.einsum("mij,mj->mi", jacobian + 0.5 * curved, away)
+        bandwidth = self._bandwidth[nearest]
+        outside = np.sqrt(np.sum(away**2, axis=-1)) > bandwidth
+        return image, jacobian + curved, np.where(outside, np.inf, bandwidth)
+
+    def exactly(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the same from fits about the points themselves."""
+        fit = self._maps.fit(points, self._count, 2, influence=False)
+        return fit.value, fit.jacobian, fit.bandwidth
+
+
+NOISE_CENTRES, ROUNDS = 600, 8
+# Smallest bandwidth of a quadratic return map, in standard deviations of the noise.
+ROOM = 4.0
+
+
+def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
+    """Return the standard deviations (2,) of independent errors of the two coordinates.
+
+    Where the return map is quadratic, the residual variance of an image is the variance of its own error plus that of
+    the argument's error, propagated by the map. The densest neighbourhoods are used, where curvature matters least, and
+    widened until they are large compared with the noise.
+    """
+    centres = maps.arguments[:: max(1, len(maps.arguments) // NOISE_CENTRES)]
+    noise, count = np.zeros(2), int(2.25 * neighbours)
+    for _ in range(3):
+        width = maps.nearest(centres, count)[0][:, -1]
+        noise = _noise_at(maps, centres[width <= np.median(width)], count)
+        if np.median(width) / REACH > ROOM * noise.max() or count * 2 > len(maps.arguments) // 8:
+            break
+        count *= 2
+    return noise
+
+
+def _noise_at(maps: ReturnMap, centres: np.ndarray, count: int) -> np.ndarray:
+    fit = maps.fit(centres, count, 2, influence=False)
+    rows = (np.eye(2) + fit.jacobian**2).reshape(-1, 2)
+    target = maps.residual_variance(centres, fit).reshape(-1)
+    weight = 1.0 / np.maximum(target, 1e-30)
+    solution = np.zeros(2)
+    for _ in range(ROUNDS):
+        solution, _ = nnls(rows * weight[:, None], target * weight)
+        predicted = rows @ solution
+        # Residuals far above the prediction are curvature, not noise.
+        weight = np.where(target < 4.0 * predicted, 1.0, 0.0) / np.maximum(predicted, 1e-30)
+    return np.sqrt(solution)
+
+
+LONGEST_PERIOD = 32
+# As fractions of the median distance between two random points: points that coincide, unpredictable images.
+SAME_POINT, UNPREDICTED = 0.05, 0.2
+# Neighbours that diverge by less than this factor in this many steps show no chaos.
+DIVERGED, DIVERGING_STEPS = 2.5, 6
+PROBES = 400
+NEIGHBOUR = 8
+
+
+def check_chaos(maps: ReturnMap, section: np.ndarray) -> None:
+    """Raise a ValueError, which names the kind of motion, unless the section shows a chaotic return map.
+
+    Parameters
+    ----------
+    maps : ReturnMap
+    section : array (n, 2)
+        All points in the order of time.
+    """
+    generator = np.random.default_rng(0)
+    one, other = generator.integers(len(section), size=(2, 4 * PROBES))
+    random = np.median(maps.distance(section[one], section[other]))
+    for period in range(1, min(LONGEST_PERIOD, len(section) // 10) + 1):
+        if np.median(maps.distance(section[period:], section[:-period])) < SAME_POINT * random:
+            raise ValueError(
+                f"section: must be of a chaotic motion, got one of period {period}. Use recording.fold with "
+                f"periods={period} instead."
+            )
+    centre = generator.choice(len(maps.arguments) - DIVERGING_STEPS, min(PROBES, len(section) // 4), replace=False)
+    neighbour = _neighbours(maps, centre)
+    now = np.median(maps.distance(section[centre], section[neighbour]))
+    images = np.median(maps.distance(section[centre + 1], section[neighbour + 1]))
+    if images > UNPREDICTED * random:
+        raise ValueError(
+            f"section: must show a return map, got images of neighbouring points {images / random:.0%} as far apart as "
+            "random points. Check for a wrong frequency and for noise as large as the motion."
+        )
+    later = np.median(maps.distance(section[centre + DIVERGING_STEPS], section[neighbour + DIVERGING_STEPS]))
+    if later < DIVERGED * now:
+        raise ValueError(
+            "section: must be of a chaotic motion, got a quasi-periodic one, whose neighbouring points do not diverge. "
+            "Record the system where it is chaotic."
+        )
+
+
+def _neighbours(maps: ReturnMap, centre: np.ndarray) -> np.ndarray:
+    """Return a neighbour of each point that is distant in time and has later points."""
+    _, index = maps.nearest(maps.arguments[centre], NEIGHBOUR + 2 * DIVERGING_STEPS)
+    far = (np.abs(index - centre[:, None]) > DIVERGING_STEPS) & (index < len(maps.arguments) - DIVERGING_STEPS)
+    rank = np.cumsum(far, axis=1)
+    column = np.argmax(rank >= np.minimum(NEIGHBOUR, rank[:, -1:]), axis=1)
+    return index[np.arange(len(centre)), column]
