@@ -3,7 +3,7 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
-from tests import shooting
+from studies import shooting
 from tests.known import grid
 
 OSCILLATOR = {"m": 1.3, "c": 0.4, "k": 20.0, "k3": 0.0}

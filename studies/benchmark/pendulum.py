@@ -10,7 +10,8 @@ from scipy.integrate import solve_ivp
 import bayesperiodic as bp
 from studies.benchmark.equations import NUMPY, FirstOrder
 from studies.pendulum.recording import FREQUENCY, OMEGA, QUICK_PERIODS, TRUTH, section_of, simulate
-from studies.pendulum.shooting import TURN, shoot
+from studies.pendulum.shooting import shoot
+from studies.shooting import TURN
 
 PERIOD, SAMPLES = 3, 800
 ORBITS, TOLERANCE = 12, 1e-12

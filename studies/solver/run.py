@@ -1,8 +1,7 @@
 """The periodic solver against independent references: orders, unstable and rotating orbits, branches with their folds.
 
 Nothing is measured here; all is computed from the models' equations. The references come from multiple shooting and
-Taylor series that share nothing with the package; tests/shooting.py computes them and says how far they are to be
-trusted.
+Taylor series that share no code with the package; studies/shooting.py states their accuracy.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from studies import common
+from studies import common, shooting
 
 SCHEMES = {"backward2": "#D55E00", "central2": "#E69F00", "central4": "#009E73", "fourier": "#0072B2"}
 LINES = {"central2": "--", "central4": "-", "backward2": ":", "fourier": "-."}
@@ -31,61 +30,18 @@ FITTED = (200, 400, 800)
 LEVELS = (0.5, 1.5, 3.0)
 SWEEP = (5.0, 12.0)
 
-# Periods for omega = 1 rad/s, from a Taylor series of order 40 with 36 digits.
-VAN_DER_POL = {
-    0.1: 6.287111272288727,
-    0.5: 6.380675801773584,
-    1.0: 6.663286859323130,
-    2.0: 7.629874479674842,
-    3.0: 8.859095499719917,
-    5.0: 11.61223066771957,
-}
 SHOWN = {1.0: "o", 5.0: "s"}
 
 PENDULUM = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
 LOCKED, CHAOTIC, LOWEST = 13.0, 9.09, 4.5
 INTEGRATED = (12.6, 12.2, 11.2, 10.4, 9.8, 9.7, 9.57, 9.5, 9.434, 9.39)
-# Angular frequencies [rad/s] where a multiplier passes −1 on the branches of periods 1, 2 and 4, and on that of
-# period 1 far below, where it then turns in a fold; multiple shooting.
-DOUBLINGS = {1: 11.777800948492088, 2: 9.626472743642093, 4: 9.452278937446584}
-LOW_DOUBLING, LOW_FOLD = 4.938500543025602, 4.915146579405625
-# Floquet multipliers at 9.09 rad/s, multiple shooting: the two rotations of period 1, then what the branches of periods
-# 1, 2 and 4 have become.
-ROTATIONS = {"first": (-1.70590040864403, -0.3021074360814437), "second": (11.119076795981467, 0.04634963928408056)}
-BRANCHES = {
-    1: ROTATIONS["first"],
-    2: (-2.609047713053087, -0.10180008846405883),
-    4: (-7.068828572869245, -0.009979594703394542),
-}
-# Prime orbits at 9.09 rad/s, multiple shooting: winding number, multipliers, and (φ [rad], φ' [rad/s]) at tau = 0, 1, …
-# rounded, which is enough for a guess.
-Known = tuple[int, tuple[float, float], list[tuple[float, float]]]
-ORBITS: list[Known] = [
-    (2, (-941.3743340323356, -0.0002725575285283573), [(-2.74532, 4.29605), (2.91341, 2.89434), (5.92453, 11.68171)]),
-    (1, (-122.77506891268857, -0.0018950249029012344), [(1.30178, -0.76224), (-2.25737, 2.35324), (3.16479, 4.10531)]),
-    (0, (1074.3035032595035, 0.0002971684531551172), [(-2.71145, 2.95416), (2.06522, -1.31187), (-2.84988, -1.97254)]),
-    (1, (15933.586725656596, 3.014061474872196e-05), [(-2.63377, 3.57527), (2.82581, 2.29399), (3.14683, 0.13266)]),
-    (
-        3,
-        (-227.9016230370968, -0.0003245737304103312),
-        [(1.05880, 0.73544), (-1.42209, 5.36060), (4.37714, 10.66914), (13.11889, 13.34969), (15.90176, 2.30858)],
-    ),
-    (
-        -2,
-        (-419.523599424354, -0.00021747828172510988),
-        [(1.59966, -11.62990), (-6.76177, -13.11434), (-9.24136, 0.32008), (-6.19921, 10.01200), (-5.27641, -9.24868)],
-    ),
-    (
-        1,
-        (1617.961583244552, 5.9566759827580105e-05),
-        [(1.32493, -0.97443), (-2.37435, 1.72195), (2.40979, -0.18801), (-1.47794, 2.38242), (3.23115, 3.71306)],
-    ),
-    (
-        0,
-        (9098.815454703239, 1.1977681555073508e-05),
-        [(2.99016, -4.59147), (-2.00942, 1.22892), (2.87480, 2.07023), (3.53493, 2.87145), (8.16254, -1.77568)],
-    ),
-]
+# Angular frequencies [rad/s] where a multiplier passes −1 on the branches of periods 1, 2 and 4.
+DOUBLINGS = dict(zip((1, 2, 4), (known.omega for known in shooting.DOUBLINGS), strict=True))
+# Floquet multipliers at 9.09 rad/s on the branches of periods 1, 2 and 4, and of both rotations of period 1.
+BRANCHES = dict(zip((1, 2, 4), (known.multipliers for known in shooting.UNSTABLE[:3]), strict=True))
+ROTATIONS = {"first": BRANCHES[1], "second": shooting.UNSTABLE[3].multipliers}
+# Prime orbits of periods 3 and 5 at 9.09 rad/s.
+ORBITS = shooting.UNSTABLE[4:12]
 
 
 def run(options: argparse.Namespace) -> None:
@@ -98,7 +54,7 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("orders", "errors of every scheme on smooth forced Duffing"):
         results["orders"] = measure_orders()
     with watch.part("van_der_pol", "periods of van der Pol's oscillator"):
-        results["van_der_pol"] = measure_periods((0.1, *SHOWN) if quick else tuple(VAN_DER_POL))
+        results["van_der_pol"] = measure_periods((0.1, *SHOWN) if quick else tuple(shooting.VAN_DER_POL))
     with watch.part("duffing", "frequency responses of the Duffing oscillator"):
         responses, results["duffing"] = follow_duffing(quick)
     with watch.part("pendulum", f"the pendulum from {LOCKED:g} down to {CHAOTIC:g} rad/s"):
@@ -203,7 +159,7 @@ def measure_periods(values: tuple[float, ...]) -> dict[str, Any]:
     """Return the relative errors of van der Pol's period for some mu, two schemes and every number of points."""
     table: dict[str, Any] = {}
     for mu in values:
-        period, parameters = VAN_DER_POL[mu], {"mu": mu, "omega": 1.0}
+        period, parameters = shooting.VAN_DER_POL[mu][0], {"mu": mu, "omega": 1.0}
         start = bp.solve_periodic(bp.models.van_der_pol, parameters, frequency=0.15, samples=256, scheme="fourier")
         table[str(mu)] = {"reference": period}
         for scheme, grids in (("central4", GRIDS), ("fourier", (16, 24, 32, 48, 64, 96, 128, 192, 256))):
@@ -296,9 +252,9 @@ def follow_pendulum(quick: bool) -> tuple[dict[int, bp.Branch], dict[str, Any]]:
         "multipliers": {str(p): compared(branches[p][-1], BRANCHES[p]) for p in BRANCHES},
         "below": {
             "doubling": doubling.frequency * TURN,
-            "doubling_difference": abs(doubling.frequency * TURN - LOW_DOUBLING),
+            "doubling_difference": abs(doubling.frequency * TURN - shooting.RETURN.omega),
             "fold": fold.frequency * TURN,
-            "fold_difference": abs(fold.frequency * TURN - LOW_FOLD),
+            "fold_difference": abs(fold.frequency * TURN - shooting.FOLD.omega),
             "back_at": down[-1].frequency * TURN,
         },
         "rotations": measure_rotations({"first": branches[1][-1], "second": down[-1]}),
@@ -323,7 +279,7 @@ def joined(back: bp.Branch, ahead: bp.Branch) -> bp.Branch:
     )
 
 
-def compared(solution: bp.PeriodicSolution, reference: tuple[float, float]) -> dict[str, Any]:
+def compared(solution: bp.PeriodicSolution, reference: tuple[complex, ...]) -> dict[str, Any]:
     """Return real multipliers with their largest relative difference to a reference."""
     found = solution.multipliers
     return {
@@ -364,16 +320,18 @@ def solve_pendulum(
     )
 
 
-def measure_orbits(orbits: list[Known]) -> list[dict[str, Any]]:
+def measure_orbits(orbits: list[shooting.Known]) -> list[dict[str, Any]]:
     """Return unstable orbits by the central schemes, from guesses of which each period is integrated from its start."""
     frequency, samples, table = CHAOTIC / TURN, 800, []
-    for winding, reference, section in orbits:
+    for known in orbits:
+        # Five digits are enough for a guess.
+        section, winding = np.round(known.section, 5), known.winding
         parts = [integrate(frequency, phi, rate, 1.0, samples)["angle"][:samples] for phi, rate in section]
         entry: dict[str, Any] = {"period": len(section), "winding": winding}
         for scheme in ("central2", "central4"):
             guess = {"phi": np.concatenate(parts)}
             solution = solve_pendulum(guess, samples, scheme, winding=winding, periods=len(section))
-            entry[scheme] = compared(solution, reference)
+            entry[scheme] = compared(solution, known.multipliers)
         table.append(entry)
     return table
 

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 import bayesperiodic as bp
-from tests.shooting import PENDULUM
+from studies.shooting import PENDULUM
 
 OMEGA = 9.09
 FREQUENCY = OMEGA / (2.0 * np.pi)

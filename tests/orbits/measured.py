@@ -7,7 +7,7 @@ import numpy as np
 
 import bayesperiodic as bp
 from bayesperiodic.orbits.orbit import Orbit
-from tests import shooting
+from studies import shooting
 from tests.periodic.test_orbits import PENDULUM, TURN
 
 SIZE = np.array([TURN, 32.6])  # of the attractor, rad and rad/s

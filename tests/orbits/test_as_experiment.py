@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from tests import shooting
+from studies import shooting
 from tests.orbits.measured import GENTLE, PENDULUM, SAMPLES, measured, section_problem
 from tests.periodic.test_orbits import rates_and_angles
 

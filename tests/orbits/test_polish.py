@@ -5,7 +5,7 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.orbits.orbit import Orbits
-from tests import shooting
+from studies import shooting
 from tests.known import LINEAR
 from tests.orbits.measured import GENTLE, PENDULUM, at_rest, measured, mirrored, repeated, shifted, wrapped
 

@@ -5,7 +5,7 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.orbits.select import orbit_information
-from tests import shooting
+from studies import shooting
 from tests.orbits.measured import GENTLE, PENDULUM, at_rest, measured, mirrored, section_problem
 
 

@@ -3,7 +3,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import bayesperiodic as bp
-from tests import shooting
+from studies import shooting
 from tests.known import grid
 
 VAN_DER_POL = bp.models.van_der_pol

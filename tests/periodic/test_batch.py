@@ -5,7 +5,7 @@ import bayesperiodic as bp
 from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT
 from bayesperiodic.periodic.equations import PeriodicEquations
-from tests import shooting
+from studies import shooting
 from tests.known import grid
 from tests.periodic.test_orbits import PENDULUM, pendulum_solution
 

@@ -7,7 +7,7 @@ import sympy as sp
 from scipy.optimize import brentq, root
 
 import bayesperiodic as bp
-from tests import shooting
+from studies import shooting
 from tests.known import grid
 from tests.periodic.test_orbits import PENDULUM, pendulum_solution, rates_and_angles
 

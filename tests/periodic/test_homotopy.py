@@ -7,7 +7,7 @@ import sympy as sp
 from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
-from tests import shooting
+from studies import shooting
 from tests.known import grid
 from tests.periodic.test_orbits import PENDULUM
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from tests import shooting
+from studies import shooting
 from tests.known import grid
 
 TURN = 2 * np.pi

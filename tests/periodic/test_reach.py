@@ -6,7 +6,7 @@ from bayesperiodic.periodic.batch import Anchor
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.family import reach
 from bayesperiodic.periodic.solve import solve_free
-from tests import shooting
+from studies import shooting
 from tests.known import CYCLE, SADDLE_NODE, grid
 from tests.periodic.test_orbits import PENDULUM, TURN, pendulum_solution
 

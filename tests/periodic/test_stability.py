@@ -7,7 +7,7 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
-from tests import shooting
+from studies import shooting
 from tests.known import grid
 from tests.periodic.test_autonomous import LORENZ
 from tests.periodic.test_orbits import ROTATIONS, pendulum_solution

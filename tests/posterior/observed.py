@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 import bayesperiodic as bp
-from tests import shooting
+from studies import shooting
 from tests.known import grid
 from tests.periodic.test_orbits import PENDULUM, pendulum_solution
 

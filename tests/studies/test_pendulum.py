@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
+from studies import shooting
 from studies.__main__ import main
 from studies.pendulum import orbits
 from studies.pendulum import recording as pendulum_recording
 from studies.pendulum.shooting import shoot
-from tests import shooting
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_figures_are_drawn(quick):
     assert {path.stem for path in folder.glob("*.png")} == {"section", "orbits", "corner", "ridge", "eigenvalues"}
 
 
-def test_shooting_of_the_study_is_that_of_the_tests():
+def test_shooting_from_disturbed_points_returns_to_the_tabulated_orbits():
     for known in (shooting.UNSTABLE[0], shooting.UNSTABLE[3], shooting.UNSTABLE[5]):
         points = np.array(known.section)
         shot = shoot(pendulum_recording.TRUTH, known.omega, points + 1e-4)

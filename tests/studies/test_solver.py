@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from studies import shooting
 from studies.__main__ import main
 from studies.solver import run as solver
-from tests import shooting
 
 
 @pytest.fixture(scope="module")
@@ -42,20 +42,10 @@ def test_orders_are_those_of_the_schemes(done):
     assert done[1]["orders"]["reference_error"] < 1e-12
 
 
-def test_the_copied_references_are_those_of_the_shooting_tables():
-    for mu, period in solver.VAN_DER_POL.items():
-        assert period == shooting.VAN_DER_POL[mu][0]
-    assert list(solver.DOUBLINGS.values()) == [known.omega for known in shooting.DOUBLINGS]
-    assert (solver.LOW_DOUBLING, solver.LOW_FOLD) == (shooting.RETURN.omega, shooting.FOLD.omega)
-    by_period = [known.multipliers for known in shooting.UNSTABLE]
-    long = shooting.UNSTABLE[4 : 4 + len(solver.ORBITS)]
-    assert [solver.BRANCHES[1], solver.BRANCHES[2], solver.BRANCHES[4]] == by_period[:3]
-    assert solver.ROTATIONS["second"] == by_period[3]
-    for (winding, multipliers, section), known in zip(solver.ORBITS, long, strict=True):
-        assert (winding, multipliers) == (known.winding, known.multipliers)
-        assert np.abs(np.subtract(section, known.section)).max() < 1e-5
+def test_the_pendulum_of_the_study_is_that_of_the_shooting_tables():
     c = {name: solver.PENDULUM[f"k{i}"] / (0.1 * 0.3**2) for i, name in enumerate(("c1", "c2", "c3"), start=1)}
     assert {name: shooting.PENDULUM[name] for name in c} == pytest.approx(c)
+    assert sorted({len(known.section) for known in solver.ORBITS}) == [3, 5]
 
 
 @pytest.mark.slow
