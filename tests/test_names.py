@@ -14,7 +14,7 @@ def test_every_public_name_is_there_and_documented(name):
 
 
 def test_unknown_name_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+    with pytest.raises(AttributeError, match="bayesperiodic attribute nothing"):
         bp.nothing  # noqa: B018
 
 

@@ -1,1 +1,3 @@
-"""Problem, priors, noise models and the posterior density."""
+"""Priors, noise models, and the posterior density of the parameters."""
+
+from bayesperiodic.posterior import noise as noise
