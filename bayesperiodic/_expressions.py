@@ -1,4 +1,4 @@
-"""Expressions that come as text: read through a whitelist, evaluated by a small interpreter, never by Python's own."""
+"""Arithmetic expressions in text form: parsed by a whitelist and evaluated without Python's `eval`."""
 
 import ast
 import unicodedata
@@ -23,9 +23,9 @@ class Operation:
     Attributes
     ----------
     value : callable
-        Of the operands.
+        The function of the operands.
     slopes : tuple of callable
-        Its derivative by each operand, of the same operands.
+        Its derivatives with respect to each operand, as functions of the operands.
     """
 
     value: Callable[..., Any]
@@ -68,7 +68,7 @@ ALLOWED = f"numbers, names, pi, + - * / **, parentheses and {', '.join(FUNCTIONS
 
 @dataclass(frozen=True)
 class Expression:
-    """A function of named numbers, as `parse` reads it.
+    """A function of named numbers; made by `parse`.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Expression:
     names : tuple of str
         The names that appear, in order of appearance.
     steps : tuple of float, str or Operation
-        In postfix order: a number, a name, or an operation on what precedes.
+        Numbers, names and operations in postfix order.
     """
 
     text: str
@@ -87,7 +87,7 @@ class Expression:
         return parse, ("expression", self.text, self.names)
 
     def value(self, values: Mapping[str, Any]) -> np.ndarray:
-        """Return the value at numbers or arrays, NumPy's rules of broadcasting; NaN or infinite where undefined."""
+        """Return the value at numbers or arrays, which are broadcast; NaN or infinite where undefined."""
         given, shape = self._given(values)
         stack: list[Any] = []
         with np.errstate(all="ignore"):
@@ -102,10 +102,10 @@ class Expression:
         return result
 
     def gradient(self, values: Mapping[str, Any], by: Iterable[str] | None = None) -> dict[str, np.ndarray]:
-        """Return the exact derivatives by the names `by`, by default those that appear.
+        """Return the derivatives with respect to the names `by`, by default those that appear.
 
-        They are carried along with the values (forward mode). Where a derivative does not exist it is NaN or infinite,
-        such as those of abs and sqrt at 0.
+        They are computed by forward differentiation. A derivative that does not exist is NaN or infinite, such as those
+        of abs and sqrt at 0.
         """
         wanted = self.names if by is None else tuple(by)
         given, shape = self._given(values)
@@ -134,33 +134,33 @@ class Expression:
     def _given(self, values: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
         """Return the values of the names that appear, and the shape of the result."""
         if missing := [name for name in self.names if name not in values]:
-            raise ValueError(f"values: missing {', '.join(map(repr, missing))}; {self.text!r} needs them.")
+            raise ValueError(f"values: must have {list(self.names)} for {self.text!r}, got no {missing}.")
         given = {name: np.asarray(values[name], dtype=float) for name in self.names}
         shapes = {value.shape for value in given.values()}
         return given, shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
 
 
 def parse(argument: str, text: Any, names: Iterable[str], note: str = "") -> Expression:
-    """Read a text such as ``"k1/(m*l**2)"``.
+    """Parse a text such as ``"k1/(m*l**2)"``.
 
-    Only numbers, `names`, pi, + - * / **, parentheses and the functions of `FUNCTIONS` are let through. Numbers are
-    floats from the start, and parts without names are evaluated at once.
+    Only numbers, `names`, pi, + - * / **, parentheses and `FUNCTIONS` are accepted. Numbers are floats, and parts
+    without names are evaluated when the text is parsed.
 
     Parameters
     ----------
     argument : str
-        What the text is, for error messages.
+        Name of the argument, for error messages.
     text : str
     names : iterable of str
-        Those that the text may contain; one that is called pi hides the constant.
+        Names that the text may contain; a name pi replaces the constant.
     note : str
         Added to the message about an unknown name.
 
     Raises
     ------
     ValueError
-        For anything else, a text of more than 1000 characters, a number or part without names that is not finite, an
-        exponent without names beyond ±1000.
+        For anything else, more than 1000 characters, a number or a part without names that is not finite, and a
+        constant exponent beyond ±1000.
 
     Examples
     --------
@@ -182,43 +182,39 @@ def parse(argument: str, text: Any, names: Iterable[str], note: str = "") -> Exp
 def parse_all(
     argument: str, expressions: Any, names: Iterable[str], reserved: Iterable[str] = (), note: str = ""
 ) -> dict[str, Expression]:
-    """Read a mapping of new names to texts; the new names must be identifiers, and neither `names` nor `reserved`.
+    """Parse a mapping of new names to texts; see `parse`.
 
-    See `parse`. A text cannot refer to another of the new names.
+    The new names must be identifiers that are neither in `names` nor in `reserved`. A text cannot refer to a new name.
     """
-    if not isinstance(expressions, Mapping):
-        raise ValueError(
-            f"{argument}: {expressions!r} is not allowed; it must be a mapping of names to texts, such as "
-            "{'c1': 'k1/(m*l**2)'}."
-        )
+    _checks.mapping(argument, expressions, "{'c1': 'k1/(m*l**2)'}")
     known = tuple(names)
     _checks.identifiers(argument, expressions, (*known, *reserved))
     return {name: parse(f"{argument}[{name!r}]", text, known, note) for name, text in expressions.items()}
 
 
 class _Reader:
-    """Collects the steps of one text, node by node in postfix order."""
+    """Collects the steps of one text from its nodes in postfix order."""
 
     def __init__(self, argument: str, text: Any, names: Iterable[str], note: str):
         if not isinstance(text, str):
-            raise ValueError(f"{argument}: {text!r} is not allowed; it must be a text of {ALLOWED}.")
+            raise ValueError(f"{argument}: must be a text of {ALLOWED}, got {text!r}.")
         self.text = text.strip()
         shown = text if len(text) <= SHOWN else f"{text[:SHOWN]}…"
-        self.label = f"{argument}: {shown!r}"
-        # Python's parser normalises names, µ (micro) to μ (mu) for one.
+        self.argument, self.shown = argument, repr(shown)
+        # Python's parser normalises names, for example µ (micro) to μ (mu).
         self.names = {unicodedata.normalize("NFKC", name): name for name in names}
         self.note = note
         self.steps: list[float | str | Operation] = []
         self._numbers: list[bool] = []
         if len(text) > MAX_LENGTH:
-            self.refuse(f"it has {len(text)} characters, more than {MAX_LENGTH}")
+            self.refuse(f"which has {len(text)} characters, more than {MAX_LENGTH}")
 
     def refuse(self, reason: str) -> None:
         """Raise the ValueError."""
-        raise ValueError(f"{self.label} is not allowed, {reason}; it must consist of {ALLOWED}.") from None
+        raise ValueError(f"{self.argument}: must consist of {ALLOWED}, got {self.shown}, {reason}.") from None
 
     def children(self, node: ast.AST) -> list[ast.expr]:
-        """Return the operands of a node; refuse one that is not on the whitelist."""
+        """Return the operands of a node; raise a ValueError unless the node is on the whitelist."""
         if isinstance(node, ast.Constant | ast.Name):
             return []
         if isinstance(node, ast.UnaryOp) and type(node.op) in OPERATORS:
@@ -226,22 +222,22 @@ class _Reader:
         if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
             return [node.left, node.right]
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-            self.known(node.func.id, FUNCTIONS, " (as a function)")
+            self.known(node.func.id, FUNCTIONS, "functions")
             if node.keywords or len(node.args) != 1:
-                self.refuse(f"{node.func.id} takes one argument")
+                self.refuse(f"in which {node.func.id} has not exactly one argument")
             return node.args
-        self.refuse(f"it contains {_described(node)}")
+        self.refuse(f"which contains {_described(node)}")
         return []
 
-    def known(self, name: str, allowed: Iterable[str], role: str = "") -> None:
+    def known(self, name: str, allowed: Iterable[str], kind: str = "names") -> None:
         """Raise the ValueError of `_checks.one_of`, with the note, unless a name is allowed."""
         try:
-            _checks.one_of(f"{self.label}{role}", name, allowed)
+            _checks.one_of(f"{self.argument}: {kind} in {self.shown}", name, allowed)
         except ValueError as error:
             raise ValueError(f"{error} {self.note}".strip()) from None
 
     def read(self, node: ast.AST) -> None:
-        """Append the step of a node whose operands were read."""
+        """Append the step of a node after those of its operands."""
         if isinstance(node, ast.Constant):
             self._append(self._number(node.value), True)
         elif isinstance(node, ast.Name) and node.id not in self.names:
@@ -254,7 +250,7 @@ class _Reader:
             self._operate(FUNCTIONS[node.func.id])
         elif isinstance(node, ast.BinOp | ast.UnaryOp):
             if isinstance(node.op, ast.Pow) and self._numbers[-1] and abs(self._last_number()) > MAX_EXPONENT:
-                self.refuse(f"the exponent {self._last_number():g} is beyond ±{MAX_EXPONENT:g}")
+                self.refuse(f"whose exponent {self._last_number():g} is beyond ±{MAX_EXPONENT:g}")
             self._operate(OPERATORS[type(node.op)])
 
     def _append(self, step: float | str, number: bool) -> None:
@@ -267,7 +263,7 @@ class _Reader:
         return last
 
     def _operate(self, operation: Operation) -> None:
-        """Append an operation; evaluate it at once if all its operands are numbers."""
+        """Append an operation, or its value if all operands are numbers."""
         arity = len(operation.slopes)
         if not all(self._numbers[-arity:]):
             self.steps.append(operation)
@@ -276,19 +272,19 @@ class _Reader:
         with np.errstate(all="ignore"):
             result = float(operation.value(*self.steps[-arity:]))
         if not np.isfinite(result):
-            self.refuse("a part of it that has no names is not finite")
+            self.refuse("in which a part without names is not finite")
         self.steps[-arity:] = [result]
         self._numbers[-arity:] = [True]
 
     def _number(self, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
-            self.refuse(f"it contains {value!r}")
+            self.refuse(f"which contains {value!r}")
         try:
             number = float(value)
         except OverflowError:
             number = np.inf
         if not np.isfinite(number):
-            self.refuse("it contains a number beyond the largest float")
+            self.refuse("which contains a number beyond the largest float")
         return number
 
 
@@ -298,14 +294,14 @@ def _tree(reader: _Reader) -> ast.expr:
             warnings.simplefilter("ignore")
             return ast.parse(reader.text, mode="eval").body
     except (SyntaxError, ValueError):
-        reader.refuse("it is no expression" if reader.text else "it is empty")
+        reader.refuse("which is not an expression" if reader.text else "which is empty")
     except (RecursionError, MemoryError):
-        reader.refuse("it is nested too deeply")
+        reader.refuse("which is nested too deeply")
     raise AssertionError("unreachable")
 
 
 def _postfix(reader: _Reader, tree: ast.expr) -> list[ast.expr]:
-    """Return the nodes, operands before what operates on them, without recursion."""
+    """Return the nodes in postfix order, without recursion."""
     found, pending = [], [tree]
     while pending:
         node = pending.pop()
@@ -315,7 +311,7 @@ def _postfix(reader: _Reader, tree: ast.expr) -> list[ast.expr]:
 
 
 def _pop(stack: list[Any], operation: Operation) -> list[Any]:
-    """Take the operands of an operation off the stack."""
+    """Remove the operands of an operation from the stack and return them."""
     arity = len(operation.slopes)
     operands = stack[-arity:]
     del stack[-arity:]
@@ -328,7 +324,7 @@ def _described(node: ast.AST) -> str:
     words = {
         "Attribute": "an attribute (a dot)",
         "BitXor": "^ (powers are written **)",
-        "Call": "a call of something else than a function's name",
+        "Call": "a call of something other than a function name",
         "Compare": "a comparison",
         "Subscript": "a subscript",
     }

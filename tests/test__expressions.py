@@ -164,38 +164,38 @@ def test_anything_else_is_a_value_error_at_once(text):
     with pytest.raises(ValueError, match="^tied: ") as caught:
         parse("tied", text, ["k", "m", "k1", "k2"])
     assert time.perf_counter() - begin < 0.5
-    assert len(str(caught.value)) < 600 and "allowed" in str(caught.value)
+    assert len(str(caught.value)) < 600 and "must" in str(caught.value)
 
 
 def test_messages_name_the_text_and_what_is_allowed():
-    with pytest.raises(
-        ValueError, match=r"^c1: 'k\.real' is not allowed, it contains an attribute .*; it must consist"
-    ):
+    with pytest.raises(ValueError, match=r"^c1: must consist of .*, got 'k\.real', which contains an attribute"):
         parse("c1", "k.real", ["k"])
-    with pytest.raises(ValueError, match=r"^c1: 'stifness/m': 'stifness' is not known; .*Did you mean 'stiffness'\?$"):
+    with pytest.raises(
+        ValueError, match=r"^c1: names in 'stifness/m': must be .*got 'stifness'.*Did you mean 'stiffness'\?$"
+    ):
         parse("c1", "stifness/m", ["stiffness", "m"])
-    with pytest.raises(ValueError, match=r"^c1: 'sinus\(k\)' \(as a function\): 'sinus' is not known.* mean 'sin'\?$"):
+    with pytest.raises(ValueError, match=r"^c1: functions in 'sinus\(k\)': must be .*got 'sinus'.* mean 'sin'\?$"):
         parse("c1", "sinus(k)", ["k"])
     with pytest.raises(ValueError, match="powers are written"):
         parse("c1", "k^2", ["k"])
     with pytest.raises(ValueError, match="exponent 3.8742e.08 is beyond"):
         parse("c1", "k**9**9", ["k"])
-    with pytest.raises(ValueError, match="'m' is not known; allowed: 'k', 'pi'. Only k.$"):
+    with pytest.raises(ValueError, match="must be one of 'k', 'pi', got 'm'. Only k.$"):
         parse("c1", "k*m", ["k"], note="Only k.")
 
 
 def test_new_names_are_identifiers_of_their_own():
     assert list(parse_all("derived", {"a": "k", "b": "k*2"}, ["k"])) == ["a", "b"]
-    with pytest.raises(ValueError, match="derived: 'k' is reserved or used twice"):
+    with pytest.raises(ValueError, match="derived: must be neither reserved nor repeated, got 'k'"):
         parse_all("derived", {"k": "2*k"}, ["k"])
-    with pytest.raises(ValueError, match="derived: 'a b' is not allowed"):
+    with pytest.raises(ValueError, match="derived: must be Python identifiers .*got 'a b'"):
         parse_all("derived", {"a b": "2*k"}, ["k"])
-    with pytest.raises(ValueError, match=r"derived\['b'\]: 'a': 'a' is not known"):
+    with pytest.raises(ValueError, match=r"derived\['b'\]: names in 'a': must be .*got 'a'"):
         parse_all("derived", {"a": "k", "b": "a"}, ["k"])
-    with pytest.raises(ValueError, match="derived: 'k' is not allowed; it must be a mapping"):
+    with pytest.raises(ValueError, match="derived: must be a mapping, .*got 'k'"):
         parse_all("derived", "k", ["k"])
 
 
 def test_a_missing_value_is_named():
-    with pytest.raises(ValueError, match="values: missing 'm'; 'k/m' needs them"):
+    with pytest.raises(ValueError, match="values: must have .*for 'k/m', got no \\['m'\\]"):
         parse("e", "k/m", ["k", "m"]).value({"k": 1.0})

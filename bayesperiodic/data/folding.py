@@ -1,10 +1,7 @@
-"""Folding: from a long recording to its mean steady period, with an honest count of what stands behind it."""
-
-from __future__ import annotations
+"""Estimation of the mean steady period of sampled signals, and of its uncertainty."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
@@ -12,14 +9,50 @@ from scipy.ndimage import uniform_filter1d
 from scipy.special import fdtrc
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic.data.experiment import Experiment
 
-if TYPE_CHECKING:
-    from bayesperiodic.data.recording import Recording
+MAXIMUM_HARMONICS = 600
+SIGNIFICANT_POWER = 10.0
+MINIMUM_CYCLES = 3
+MINIMUM_PERIODICITY = 0.5
+FALSE_ALARM_RATE = 0.01
+CROSSING = "crossing"
 
 
-MOST_HARMONICS = 600
-CLEAR = 10.0
+@dataclass(frozen=True)
+class Signals:
+    """Channels sampled at the same times.
+
+    Attributes
+    ----------
+    name : str
+        Of the recording, for messages.
+    time : array (samples,)
+    channels : tuple of str
+        Inputs first.
+    values : array (channels, samples)
+    inputs : int
+        Number of inputs.
+    """
+
+    name: str
+    time: np.ndarray
+    channels: tuple[str, ...]
+    values: np.ndarray
+    inputs: int
+
+    def __post_init__(self) -> None:
+        for i, (channel, values) in enumerate(zip(self.channels, self.values, strict=True)):
+            if np.ptp(values) == 0.0:
+                kind, remedy = "outputs", ""
+                if i < self.inputs:
+                    kind, remedy = "inputs", ", and write it in the model as a parameter with its value in `fixed`"
+                raise ValueError(
+                    f"{kind}[{channel!r}]: must vary, got the constant {values[0]:g}; leave the channel out{remedy}."
+                )
+
+    def part(self, samples: np.ndarray) -> "Signals":
+        """Return the signals at the selected samples."""
+        return replace(self, time=self.time[samples], values=self.values[:, samples])
 
 
 @dataclass(frozen=True)
@@ -31,7 +64,7 @@ class HarmonicFit:
     frequency : float
         Fundamental frequency [Hz].
     amplitudes : array (channels, harmonics + 1), complex
-        As in `fourier`, phases counted from the time origin of the fit.
+        As in `_fourier`, with phases relative to time 0.
     residuals : array (channels, samples)
     """
 
@@ -53,8 +86,8 @@ class HarmonicFit:
 def fit_harmonics(time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int) -> HarmonicFit:
     """Fit harmonics 0 … `harmonics` of `frequency` to channels (channels, samples) by least squares.
 
-    The normal equations of the exponentials exp(2πi h f t), h = −H … H, form a Hermitian Toeplitz matrix; it is well
-    conditioned as long as the samples resolve the highest harmonic.
+    The matrix of the normal equations of the exponentials exp(2πi h f t), h = −H … H, is Hermitian Toeplitz, and well
+    conditioned if the samples resolve the highest harmonic.
     """
     turn = np.exp(-2j * np.pi * frequency * time)
     power = np.ones_like(turn)
@@ -78,10 +111,10 @@ def refine_frequency(
 ) -> tuple[HarmonicFit, float]:
     """Return the fit at the least-squares frequency, and that frequency's standard error [Hz].
 
-    Gauss-Newton on the fundamental with the amplitudes projected out; every channel is weighted by its residual
-    variance. The standard error adds the scores of one cycle before squaring, so that correlation within a cycle is
-    accounted for; it is never below that for independent samples. Only harmonics whose squared amplitude is ten times
-    its noise, and the largest, take part in the slope, where noise would pass for information.
+    Gauss-Newton iteration for the fundamental, with the amplitudes projected out and every channel weighted by its
+    residual variance. The standard error is robust to correlation within a cycle, because the scores are summed over
+    each cycle before they are squared; it is at least that for independent samples. The slope contains the largest
+    harmonic and those whose squared amplitude is ten times its noise; noise in the others would count as information.
     """
     for _ in range(iterations):
         fit, slope, weights = _linearised(time, channels, frequency, harmonics)
@@ -105,7 +138,7 @@ def _linearised(
     noise = 4.0 * fit.variances[:, None] / time.size
     power = np.abs(fit.amplitudes) ** 2
     largest = power[:, 1:].max(axis=1, keepdims=True)
-    clear = np.where((power > CLEAR * noise) | (power == largest), fit.amplitudes, 0.0)
+    clear = np.where((power > SIGNIFICANT_POWER * noise) | (power == largest), fit.amplitudes, 0.0)
     rate = _fourier.derivative(clear, 1.0)
     slope = np.stack([_fourier.at_times(c, frequency * time) for c in rate]) * (time - time.mean())
     slope = fit_harmonics(time, slope, frequency, harmonics).residuals
@@ -114,10 +147,10 @@ def _linearised(
 
 
 def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
-    """Return the fundamental frequency [Hz] that the autocorrelation suggests, None where it has no positive peak.
+    """Estimate the fundamental frequency [Hz] from the autocorrelation; None if it has no positive peak.
 
-    The smallest lag whose peak reaches 90 % of the highest is taken, then multiples of its frequency are preferred
-    where they explain the signals as well.
+    The lag is the smallest one whose peak reaches 90 % of the highest. A multiple of its frequency is preferred if it
+    explains the signals equally well.
     """
     samples = time.size
     step = (time[-1] - time[0]) / (samples - 1)
@@ -148,7 +181,7 @@ def _largest_equivalent(time: np.ndarray, channels: np.ndarray, frequency: float
     last = time >= time[-1] - 6.0 / frequency
     time, channels = time[last], channels[:, last]
     nyquist = 0.5 * (time.size - 1) / np.ptp(time)
-    top = min(0.95 * nyquist, MOST_HARMONICS * frequency)
+    top = min(0.95 * nyquist, MAXIMUM_HARMONICS * frequency)
 
     def unexplained(candidate: float) -> float:
         fit = fit_harmonics(time, channels, candidate, max(int(top / candidate), 1))
@@ -162,15 +195,9 @@ def _largest_equivalent(time: np.ndarray, channels: np.ndarray, frequency: float
     return frequency
 
 
-MINIMUM_CYCLES = 3
-MINIMUM_PERIODICITY = 0.5
-FALSE_ALARM_RATE = 0.01
-CROSSING = "crossing"
-
-
 @dataclass(frozen=True)
 class CycleScatter:
-    """How the cycles of one channel differ from their mean, harmonic by harmonic.
+    """Differences between the cycles of one channel and their mean, by harmonic.
 
     Attributes
     ----------
@@ -184,110 +211,117 @@ class CycleScatter:
     mean: np.ndarray
 
 
-def fold(
-    recording: Recording,
-    samples: int = 800,
+@dataclass(frozen=True)
+class MeanPeriod:
+    """Mean period of steady signals.
+
+    Attributes
+    ----------
+    frequency, frequency_se : float
+        Fundamental frequency and its standard error [Hz].
+    amplitudes : dict of str to array (harmonics + 1,), complex
+        Harmonics that each channel keeps, phases relative to the origin.
+    sd : dict of str to float
+        Standard deviation of one cycle about the mean, within the kept harmonics.
+    amplitude_variance : dict of str to array (harmonics + 1,)
+        Variance of the mean's amplitudes.
+    cycles, samples : int
+        Numbers of cycles and samples used.
+    periodicity : float
+        Fraction of the variance that the mean period explains, of the channel with the smallest one.
+    drift : dict of str to float
+        Relative growth of each channel's fundamental over the signals.
+    origin : float
+        Time [s] at which τ = 0.
+    """
+
+    frequency: float
+    frequency_se: float
+    amplitudes: dict[str, np.ndarray]
+    sd: dict[str, float]
+    amplitude_variance: dict[str, np.ndarray]
+    cycles: int
+    samples: int
+    periodicity: float
+    drift: dict[str, float]
+    origin: float
+
+
+def mean_period(
+    signals: Signals,
+    points: int,
     *,
-    frequency: float | None = None,
-    periods: int = 1,
-    harmonics: int | Mapping[str, int] | None = None,
-    origin: float | str = 0.0,
-    largest_drift: float | None = None,
-    name: str | None = None,
-) -> Experiment:
-    """Fold the steady part of a recording into its mean period on an equidistant grid; see `Recording.fold`."""
-    periods = _checks.integer("periods", periods, 1)
-    samples = _checks.integer("samples", samples, 4)
+    frequency: float | None,
+    periods: int,
+    harmonics: int | Mapping[str, int] | None,
+    origin: float | str,
+    largest_drift: float | None,
+) -> MeanPeriod:
+    """Estimate the mean period of the steady part of signals; see `Recording.fold`."""
     start = _checked_origin(origin)
-    names = [*recording.inputs, *recording.outputs]
-    signals = np.stack([*recording.inputs.values(), *recording.outputs.values()])
-    for channel, values in zip(names, signals, strict=True):
-        if np.ptp(values) == 0.0:
-            kind = "inputs" if channel in recording.inputs else "outputs"
-            further = ", and write it in the model as a parameter with its value in `fixed`" if kind == "inputs" else ""
-            raise ValueError(
-                f"{kind}[{channel!r}]: the constant {values[0]:g} is not allowed; a channel must vary, so leave it out"
-                f"{further}."
-            )
-    time = recording.time - start
-
-    fundamental = _first_guess(recording, time, signals, frequency, periods)
+    signals = replace(signals, time=signals.time - start)
+    fundamental = _first_guess(signals, frequency, periods)
     if frequency is None:
-        fundamental = _track(time, signals, fundamental)
-    cycle, shape = _cycles_apart(time, signals, fundamental)
-    drift = dict(zip(names, _drift(shape[::-1]), strict=True))
-    _refuse_drift(recording, drift, largest_drift)
-    steady = _steady_part(cycle, shape)
-    time, signals = time[steady], signals[:, steady]
-    limit = _resolved(time, fundamental, samples * periods)
+        fundamental = _track(signals, fundamental)
+    cycle, shape = _cycles_apart(signals, fundamental)
+    drift = dict(zip(signals.channels, _drift(shape[::-1]), strict=True))
+    _refuse_drift(signals.name, drift, largest_drift)
+    steady = signals.part(_steady_part(cycle, shape))
+    limit = _resolved(steady.time, fundamental, points)
     if frequency is None:
-        fit, fundamental_se = refine_frequency(time, signals, fundamental, limit)
+        fit, fundamental_se = refine_frequency(steady.time, steady.values, fundamental, limit)
     else:
-        fit, fundamental_se = fit_harmonics(time, signals, fundamental, limit), 0.0
-    periodicity = _periodicity(recording, names, signals, fit)
-
-    cycles = round(np.ptp(time) * fit.frequency)
-    scatter = [_cycle_scatter(time, fit, channel, cycles) for channel in range(len(names))]
+        fit, fundamental_se = fit_harmonics(steady.time, steady.values, fundamental, limit), 0.0
+    periodicity = _periodicity(steady, fit)
+    cycles = round(np.ptp(steady.time) * fit.frequency)
+    scatter = [_cycle_scatter(steady.time, fit, channel, cycles) for channel in range(len(signals.channels))]
     kept = {
-        channel: _last_significant(fit.amplitudes[i], scatter[i].mean, cycles) for i, channel in enumerate(names)
-    } | _chosen(harmonics, names, limit)
+        channel: _last_significant(fit.amplitudes[i], scatter[i].mean, cycles)
+        for i, channel in enumerate(signals.channels)
+    } | _chosen(harmonics, signals.channels, limit)
+    amplitudes = fit.amplitudes
     if origin == CROSSING:
-        start = _crossing(fit.amplitudes[len(recording.inputs), 1], fit.frequency)
-        turn = np.exp(2j * np.pi * fit.frequency * start * np.arange(fit.amplitudes.shape[1]))
-        fit = replace(fit, amplitudes=fit.amplitudes * turn)
-    mean = {
-        channel: _fourier.on_grid(fit.amplitudes[i, : kept[channel] + 1], samples * periods)
-        for i, channel in enumerate(names)
-    }
-    return Experiment(
-        name or recording.name,
-        fit.frequency * periods,
-        {channel: mean[channel] for channel in recording.outputs},
-        {channel: mean[channel] for channel in recording.inputs},
-        samples=samples,
-        periods=periods,
-        scatter={
-            channel: float(np.sqrt(_power(scatter[i].one_cycle[: kept[channel] + 1])))
-            for i, channel in enumerate(names)
-        },
+        start = _crossing(amplitudes[signals.inputs, 1], fit.frequency)
+        amplitudes = amplitudes * np.exp(2j * np.pi * fit.frequency * start * np.arange(amplitudes.shape[1]))
+    used = {channel: slice(kept[channel] + 1) for channel in signals.channels}
+    return MeanPeriod(
+        frequency=fit.frequency,
+        frequency_se=fundamental_se,
+        amplitudes={channel: amplitudes[i, own] for i, (channel, own) in enumerate(used.items())},
+        sd={c: float(np.sqrt(_power(scatter[i].one_cycle[own]))) for i, (c, own) in enumerate(used.items())},
+        amplitude_variance={channel: scatter[i].mean[own] for i, (channel, own) in enumerate(used.items())},
         cycles=cycles,
-        independent={channel: min(2 * kept[channel] + 1, time.size) for channel in recording.outputs},
-        frequency_se=fundamental_se * periods,
-        harmonics=kept,
-        amplitude_variance={channel: scatter[i].mean[: kept[channel] + 1] for i, channel in enumerate(names)},
+        samples=steady.time.size,
         periodicity=periodicity,
         drift=drift,
         origin=start,
-        synthetic=recording.synthetic,
     )
 
 
 def _checked_origin(origin: float | str) -> float:
-    """Return the time of τ = 0 [s], 0 where an event shall tell it."""
+    """Return the time of τ = 0 [s]; 0 if a crossing defines it later."""
     if origin == CROSSING:
         return 0.0
     if isinstance(origin, str):
-        raise ValueError(f"origin: {origin!r} is not allowed; it must be a time [s], or {CROSSING!r}.")
+        raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     return _checks.finite_number("origin", origin)
 
 
-def _first_guess(
-    recording: Recording, time: np.ndarray, signals: np.ndarray, frequency: float | None, periods: int
-) -> float:
+def _first_guess(signals: Signals, frequency: float | None, periods: int) -> float:
     if frequency is not None:
         fundamental: float | None = _checks.positive("frequency", frequency) / periods
-    elif recording.inputs:
-        guess = guess_frequency(time, signals[: len(recording.inputs)])
+    elif signals.inputs:
+        guess = guess_frequency(signals.time, signals.values[: signals.inputs])
         fundamental = guess / periods if guess else None
     else:
-        fundamental = guess_frequency(time, signals)
-    if fundamental is None or _cycles(time, fundamental) < MINIMUM_CYCLES:
-        found = "no period was found" if fundamental is None else f"it has {_cycles(time, fundamental):.2f} cycles"
-        given = f"check frequency = {frequency!r} Hz and periods = {periods}"
+        fundamental = guess_frequency(signals.time, signals.values)
+    if fundamental is None or _cycles(signals.time, fundamental) < MINIMUM_CYCLES:
+        found = "no period" if fundamental is None else f"{_cycles(signals.time, fundamental):.2f} cycles"
+        remedy = f"check frequency = {frequency!r} Hz and periods = {periods}"
         raise ValueError(
-            f"recording: {recording.name!r} of {np.ptp(time):g} s is not allowed; {found}, and at least "
-            f"{MINIMUM_CYCLES} cycles are needed. Record longer, or "
-            f"{'give the forcing frequency' if frequency is None else given}."
+            f"recording: must have at least {MINIMUM_CYCLES} cycles, got {found} in {signals.name!r} of "
+            f"{np.ptp(signals.time):g} s; record longer, or "
+            f"{'give the forcing frequency' if frequency is None else remedy}."
         )
     return fundamental
 
@@ -297,13 +331,14 @@ def _cycles(time: np.ndarray, fundamental: float) -> float:
     return float(np.ptp(time) * time.size / (time.size - 1) * fundamental * (1 + 1e-9))
 
 
-def _track(time: np.ndarray, signals: np.ndarray, fundamental: float) -> float:
-    """Refine a frequency on the last few cycles, then on more and more, so that no cycle is miscounted."""
+def _track(signals: Signals, fundamental: float) -> float:
+    """Refine a frequency on the last few cycles, then on more and more of them, so that no cycle is miscounted."""
+    time = signals.time
     cycles, total = MINIMUM_CYCLES, np.ptp(time) * fundamental
     while True:
-        part = time >= time[-1] - cycles / fundamental
-        few = min(10, _resolved(time[part], fundamental, time.size))
-        fundamental = refine_frequency(time[part], signals[:, part], fundamental, few)[0].frequency
+        last = signals.part(time >= time[-1] - cycles / fundamental)
+        few = min(10, _resolved(last.time, fundamental, time.size))
+        fundamental = refine_frequency(last.time, last.values, fundamental, few)[0].frequency
         if cycles >= total / 2:
             return fundamental
         cycles = min(2 * cycles, total / 2)
@@ -314,41 +349,44 @@ def _resolved(time: np.ndarray, fundamental: float, points: int) -> int:
     resolved = min(int((per_cycle - 1.0) / 2.0), _fourier.highest_harmonic(points), (time.size - 2) // 2)
     if resolved < 1:
         raise ValueError(
-            f"recording: {per_cycle:.1f} samples a cycle are not allowed; at least 3 are needed to resolve the "
-            "fundamental. Sample faster, or check the frequency."
+            f"recording: must have at least 3 samples per cycle, to resolve the fundamental, got {per_cycle:.1f}; "
+            "sample faster, or check the frequency."
         )
     return resolved
 
 
-def _cycles_apart(time: np.ndarray, signals: np.ndarray, fundamental: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return in which cycle, counted back from the end, each sample is, and their amplitudes in units of the scatter.
+def _cycles_apart(signals: Signals, fundamental: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cycle of each sample, counted back from the end, and the amplitudes of the whole cycles.
 
-    The amplitudes (cycles, channels, harmonics + 1) are of the whole cycles, the last one first.
+    The amplitudes (cycles, channels, harmonics + 1) are relative to each channel's standard deviation; the last cycle
+    comes first.
     """
+    time, values = signals.time, signals.values
     period = 1.0 / fundamental
     total = int(_cycles(time, fundamental))
     back = np.minimum(((time[-1] - time) / period + 1e-9).astype(int), total)
     harmonics = min(5, _resolved(time, fundamental, time.size))
-    scale = signals.std(axis=1)[:, None]
-    fits = [fit_harmonics(time[back == k], signals[:, back == k] / scale, fundamental, harmonics) for k in range(total)]
+    scale = values.std(axis=1)[:, None]
+    fits = [fit_harmonics(time[back == k], values[:, back == k] / scale, fundamental, harmonics) for k in range(total)]
     return back, np.array([fit.amplitudes for fit in fits])
 
 
 def _drift(shape: np.ndarray) -> list[float]:
-    """Return by what fraction the fundamental of each channel grows from the first cycle to the last one."""
+    """Return the relative growth of each channel's fundamental from the first cycle to the last."""
     size = np.abs(shape[:, :, 1])
     number = np.arange(len(size)) - 0.5 * (len(size) - 1)
     return (number @ size / (number @ number) * len(size) / size.mean(axis=0)).tolist()
 
 
-def _refuse_drift(recording: Recording, drift: Mapping[str, float], largest: float | None) -> None:
+def _refuse_drift(name: str, drift: Mapping[str, float], largest: float | None) -> None:
     if largest is None:
         return
     worst = max(drift, key=lambda channel: abs(drift[channel]))
     if abs(drift[worst]) > _checks.positive("largest_drift", largest):
         raise ValueError(
-            f"recording: {recording.name!r} is not steady; the fundamental of {worst!r} changes by {drift[worst]:+.1%} "
-            f"over it, and at most {largest:.1%} is allowed. Leave it out, or cut out a steady part with `between`."
+            f"recording: must be steady, got {name!r}, in which the fundamental of {worst!r} changes by "
+            f"{drift[worst]:+.1%}, more than largest_drift = {largest:.1%}; leave it out, or select a steady part with "
+            "`between`."
         )
 
 
@@ -358,7 +396,7 @@ def _crossing(amplitude: complex, frequency: float) -> float:
 
 
 def _steady_part(cycle: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Return a mask of the last whole cycles, without the first ones that differ from the later half."""
+    """Return a mask of the last whole cycles, without the first ones if they differ from the later half."""
     total = len(shape)
     half = max(total // 2, MINIMUM_CYCLES)
     middle = np.median(shape[:half].real, axis=0) + 1j * np.median(shape[:half].imag, axis=0)
@@ -370,16 +408,16 @@ def _steady_part(cycle: np.ndarray, shape: np.ndarray) -> np.ndarray:
     return cycle < used
 
 
-def _periodicity(recording: Recording, names: list[str], signals: np.ndarray, fit: HarmonicFit) -> float:
-    share = 1.0 - fit.variances / np.var(signals, axis=1, ddof=1)
-    worst = int(np.argmin(share))
-    if not share[worst] >= MINIMUM_PERIODICITY:
+def _periodicity(signals: Signals, fit: HarmonicFit) -> float:
+    explained = 1.0 - fit.variances / np.var(signals.values, axis=1, ddof=1)
+    worst = int(np.argmin(explained))
+    if not explained[worst] >= MINIMUM_PERIODICITY:
         raise ValueError(
-            f"recording: {recording.name!r} is not periodic; at {fit.frequency:.6g} Hz the mean period explains only "
-            f"{max(share[worst], 0.0):.1%} of the variance of {names[worst]!r} (periodicity {share[worst]:.3f}), at "
-            f"least {MINIMUM_PERIODICITY:.0%} is needed. Check the frequency and `periods`."
+            f"recording: must be periodic, got {signals.name!r}, whose mean period at {fit.frequency:.6g} Hz explains "
+            f"only {max(explained[worst], 0.0):.1%} of the variance of {signals.channels[worst]!r} (periodicity "
+            f"{explained[worst]:.3f}, at least {MINIMUM_PERIODICITY} is needed); check the frequency and `periods`."
         )
-    return float(share[worst])
+    return float(explained[worst])
 
 
 def _cycle_scatter(time: np.ndarray, fit: HarmonicFit, channel: int, cycles: int) -> CycleScatter:
@@ -399,7 +437,7 @@ def _cycle_scatter(time: np.ndarray, fit: HarmonicFit, channel: int, cycles: int
 
 
 def _inflation(follow: np.ndarray, total: np.ndarray) -> np.ndarray:
-    """Return (1 + r) / (1 − r) for the lag-one correlation r between cycles, pooled over five harmonics."""
+    """Return (1 + r) / (1 − r), where r is the lag-one correlation between cycles, pooled over five harmonics."""
     pooled = uniform_filter1d(total, 5)
     r = np.divide(uniform_filter1d(follow, 5), pooled, out=np.zeros_like(pooled), where=pooled > 0)
     r = np.clip(r, 0.0, 0.9)
@@ -414,7 +452,7 @@ def _last_significant(amplitudes: np.ndarray, variance: np.ndarray, cycles: int)
     return int(np.flatnonzero(significant)[-1]) + 1 if significant.any() else 1
 
 
-def _chosen(harmonics: int | Mapping[str, int] | None, names: list[str], limit: int) -> dict[str, int]:
+def _chosen(harmonics: int | Mapping[str, int] | None, names: tuple[str, ...], limit: int) -> dict[str, int]:
     if harmonics is None:
         return {}
     given = harmonics if isinstance(harmonics, Mapping) else dict.fromkeys(names, harmonics)
@@ -422,7 +460,7 @@ def _chosen(harmonics: int | Mapping[str, int] | None, names: list[str], limit: 
         _checks.one_of("harmonics", channel, names)
         if _checks.integer(f"harmonics[{channel!r}]", count, 1) > limit:
             raise ValueError(
-                f"harmonics[{channel!r}]: {count} is not allowed; samples and grid resolve at most {limit} harmonics."
+                f"harmonics[{channel!r}]: must be at most {limit}, which the samples and the grid resolve, got {count}."
             )
     return {channel: int(count) for channel, count in given.items()}
 

@@ -1,20 +1,17 @@
-"""Recording: long measured signals, before they are folded into periods."""
+"""Recordings: measured signals over time."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from bayesperiodic import _checks
+from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic.data import reading
-from bayesperiodic.data.reading import convert
-
-if TYPE_CHECKING:
-    from bayesperiodic.data.experiment import Experiment
-
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.data.folding import Signals, mean_period
 
 Units = Mapping[str, float | Sequence[str]]
 
@@ -277,7 +274,7 @@ class Recording(Result):
 
         def channel(key: str, column: str) -> np.ndarray:
             values = _checks.finite_vector(f"{key} (column {column!r} of {Path(path).name})", columns[column])
-            return convert(key, values, units[key]) if key in units else values
+            return reading.convert(key, values, units[key]) if key in units else values
 
         signals = {key: channel(key, column) for key, column in (*outputs.items(), *inputs.items())}
         if time:
@@ -332,7 +329,7 @@ class Recording(Result):
         origin: float | str = 0.0,
         largest_drift: float | None = None,
         name: str | None = None,
-    ) -> "Experiment":
+    ) -> Experiment:
         """Fold the steady part of the recording into its mean period on an equidistant grid.
 
         The fundamental frequency is found by least squares over the whole steady part, the mean period is a
@@ -385,17 +382,38 @@ class Recording(Result):
         >>> print(f"{run.frequency:.4f} Hz, {run.independent['displacement']} independent values")
         0.1000 Hz, 19 independent values
         """
-        from bayesperiodic.data.folding import fold
-
-        return fold(
-            self,
-            samples,
+        periods = _checks.integer("periods", periods, 1)
+        points = _checks.integer("samples", samples, 4) * periods
+        channels = self.inputs | self.outputs
+        signals = Signals(self.name, self.time, tuple(channels), np.stack([*channels.values()]), len(self.inputs))
+        mean = mean_period(
+            signals,
+            points,
             frequency=frequency,
             periods=periods,
             harmonics=harmonics,
             origin=origin,
             largest_drift=largest_drift,
-            name=name,
+        )
+        folded = {channel: _fourier.on_grid(amplitudes, points) for channel, amplitudes in mean.amplitudes.items()}
+        kept = {channel: amplitudes.size - 1 for channel, amplitudes in mean.amplitudes.items()}
+        return Experiment(
+            name or self.name,
+            mean.frequency * periods,
+            {channel: folded[channel] for channel in self.outputs},
+            {channel: folded[channel] for channel in self.inputs},
+            samples=samples,
+            periods=periods,
+            scatter=mean.sd,
+            cycles=mean.cycles,
+            independent={channel: min(2 * kept[channel] + 1, mean.samples) for channel in self.outputs},
+            frequency_se=mean.frequency_se * periods,
+            harmonics=kept,
+            amplitude_variance=mean.amplitude_variance,
+            periodicity=mean.periodicity,
+            drift=mean.drift,
+            origin=mean.origin,
+            synthetic=self.synthetic,
         )
 
     def __repr__(self) -> str:

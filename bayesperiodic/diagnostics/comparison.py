@@ -200,7 +200,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     """
     _checks.one_of("coordinates", coordinates, COORDINATES)
     every = (*problem.names, *problem.free_noise)
-    _checks.holds("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
+    _checks.contains("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
     both = {kind: approximation(problem, fit, kind) for kind in COORDINATES}
     laplace = both[coordinates]
     if laplace is None:

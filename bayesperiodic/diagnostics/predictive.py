@@ -355,7 +355,7 @@ def predict(
     if experiment is not None and run is None:
         raise ValueError(f"experiment: {experiment!r} is not allowed without run, whose parameters it chooses.")
     every = (*problem.names, *problem.free_noise)
-    _checks.holds("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
+    _checks.contains("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
     columns = {name: posterior.draws(name) for name in posterior.names}
     chosen = np.linspace(0, next(iter(columns.values())).size - 1, count).astype(int)
     best = int(np.argmax(posterior.data["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()))

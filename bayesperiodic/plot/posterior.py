@@ -152,7 +152,7 @@ def chosen(names: Sequence[str] | None, every: tuple[str, ...], argument: str = 
 
 def normal_approximation(names: tuple[str, ...], fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean (names,) and covariance (names, names) in natural values; NaN where there are none."""
-    _checks.holds("laplace", [*fit.theta, *fit.noise], names, "give an estimate of the same problem")
+    _checks.contains("laplace", [*fit.theta, *fit.noise], names, "give an estimate of the same problem")
     theta, noise = [n for n in names if n in fit.theta], [n for n in names if n not in fit.theta]
     mean = np.array([fit.theta[n] if n in fit.theta else fit.joint_mode.get(n, np.nan) for n in names])
     covariance = pd.DataFrame(0.0, index=[*names], columns=[*names])

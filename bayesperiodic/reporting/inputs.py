@@ -74,7 +74,7 @@ class ReportInputs:
         _checks.same_names("identifiability", dict.fromkeys(found.table.index), problem.names)
         if comparison is not None:
             remedy = "give the one of this problem, compare(problem, fit, posterior)"
-            _checks.holds("comparison", comparison.table.index, problem.names, remedy)
+            _checks.contains("comparison", comparison.table.index, problem.names, remedy)
         if prediction is not None:
             _checks.same_names("prediction", prediction.median, runs)
         return cls(problem, fit, posterior, found, comparison, prediction, no_prediction)

@@ -159,7 +159,7 @@ def sample(
     _checks.one_of("sampler", sampler, (EMCEE, NUTS))
     _checks.same_names("fit", fit.theta, problem.names)
     runs = [e.name for e in problem.experiments]
-    _checks.holds("fit", fit.solutions, runs, "give the estimate of this problem, map_estimate(problem)")
+    _checks.contains("fit", fit.solutions, runs, "give the estimate of this problem, map_estimate(problem)")
     executor = checked_executor(executor)
     plain = SamplingDensity(problem, coordinates=coordinates, variances=variances)
     if variances == COLLAPSED and not plain.collapsed:

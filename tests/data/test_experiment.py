@@ -44,8 +44,8 @@ def test_only_the_harmonics_given_are_compared():
         ({"outputs": {"x": "abc"}}, r"outputs\['x'\]: 'abc' is not allowed; it must be an array of complex"),
         ({"inputs": {"u": [[1.0]]}}, r"inputs\['u'\]: .* is not allowed"),
         ({"samples": 6}, r"samples: 6 is not allowed; harmonic 3 of outputs\['x'\] needs at least 7"),
-        ({"samples": 2}, "samples: 2 is not allowed"),
-        ({"frequency": -1.0}, "frequency: -1.0 is not allowed"),
+        ({"samples": 2}, "samples: must be .*got 2"),
+        ({"frequency": -1.0}, "frequency: must be .*got -1.0"),
     ],
 )
 def test_bad_harmonics_are_named(changes, message):

@@ -92,11 +92,11 @@ def test_numbers_may_be_names_of_columns(tmp_path):
 
 
 def test_channels_that_are_no_mapping_are_told_what_one_is(csv):
-    with pytest.raises(ValueError, match="outputs: 'x' is not allowed; it must be a mapping, such as {'force': "):
+    with pytest.raises(ValueError, match="outputs: must be a mapping, such as .*got 'x'"):
         bp.Recording.from_csv(csv, time="t", outputs="x")
-    with pytest.raises(ValueError, match="inputs: .* is not allowed; it must be a mapping"):
+    with pytest.raises(ValueError, match="inputs: must be a mapping, .*"):
         bp.Recording.from_arrays(TIME, {"force": FORCE}, DISPLACEMENT)
-    with pytest.raises(ValueError, match="outputs: .* is not allowed; it must be a mapping"):
+    with pytest.raises(ValueError, match="outputs: must be a mapping, .*"):
         bp.Experiment("run", 1.0, DISPLACEMENT, samples=TIME.size)
 
 
@@ -117,7 +117,7 @@ def test_between_cuts_by_time():
 
 
 def test_missing_column_is_answered_with_the_nearest(csv):
-    with pytest.raises(ValueError, match=r"column of run 7\.csv: 'F \[M\]' is not known; .*Did you mean 'F \[N\]'"):
+    with pytest.raises(ValueError, match=r"column of run 7\.csv: must be .*got 'F \[M\]'.*Did you mean 'F \[N\]'"):
         bp.Recording.from_csv(csv, time="t", outputs={"force": "F [M]"})
 
 
@@ -131,7 +131,7 @@ def test_non_numeric_cell_is_located(csv):
 def test_samples_that_are_not_finite_are_located(csv, text):
     rewrite(csv, 5, "x", text)
     with pytest.raises(
-        ValueError, match=r"displacement \(column 'x' of run 7.csv\): (nan|inf) at index 5 .*must be finite"
+        ValueError, match=r"displacement \(column 'x' of run 7.csv\): must be finite, got (nan|inf) at index 5"
     ):
         bp.Recording.from_csv(csv, time="t", **CHANNELS)
 
@@ -151,7 +151,7 @@ def test_time_that_does_not_increase_is_located(csv):
         ({"units": {"force": ("N", "m")}}, ValueError, r"units\['force'\]: \('N', 'm'\) is not allowed"),
         ({"units": {"force": ("N", "newtown")}}, ValueError, r"units\['force'\]"),
         ({"units": {"force": 0}}, ValueError, "a factor must differ from zero"),
-        ({"units": {"forc": 1}}, ValueError, "units: 'forc' is not known.*Did you mean 'force'"),
+        ({"units": {"forc": 1}}, ValueError, "units: must be .*got 'forc'.*Did you mean 'force'"),
         ({"outputs": {}}, ValueError, "at least one measured output"),
     ],
 )
@@ -166,5 +166,5 @@ def test_file_that_is_no_mat_file_is_refused(csv):
 
 
 def test_lengths_must_agree():
-    with pytest.raises(ValueError, match=r"outputs\['force'\]: 199 values are not allowed; there must be 200"):
+    with pytest.raises(ValueError, match=r"outputs\['force'\]: must have 200 values .*got 199"):
         bp.Recording.from_arrays(TIME, {"force": FORCE[1:]})

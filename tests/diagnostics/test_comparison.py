@@ -321,9 +321,9 @@ def test_what_is_not_determined_is_too_wide(solved):
 
 def test_wrong_arguments_are_told(solved):
     problem, fit, posterior = solved
-    with pytest.raises(ValueError, match="coordinates: 'ridge' is not known; allowed: 'natural', 'sampling'"):
+    with pytest.raises(ValueError, match="coordinates: must be one of 'natural', 'sampling', got 'ridge'"):
         bp.compare(problem, fit, posterior, coordinates="ridge")
-    with pytest.raises(ValueError, match="posterior: it has no 'a'.*; give draws of this problem"):
+    with pytest.raises(ValueError, match="posterior: must have 'a'.*; give draws of this problem"):
         bp.compare(case("edge")[0], case("edge")[1], posterior)
 
 

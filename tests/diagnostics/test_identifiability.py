@@ -165,7 +165,7 @@ def test_own_candidates_are_ranked_and_unknown_runs_refused(linear):
     problem, fit = linear
     found = bp.identifiability(problem, fit, profile=False, candidates=[("run", 1.0, 0.5), ("run", 3.0, 2.0)])
     assert list(found.experiments["frequency"]) == [3.0, 1.0]
-    with pytest.raises(ValueError, match="candidates: 'ran' is not known"):
+    with pytest.raises(ValueError, match="candidates: must be .*got 'ran'"):
         bp.identifiability(problem, fit, profile=False, candidates=[("ran", 1.0, 0.5)])
 
 

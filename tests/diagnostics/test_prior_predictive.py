@@ -78,7 +78,7 @@ def test_well_behaved_prior_has_nothing_to_tell():
 
 
 def test_bad_arguments_and_priors_without_any_orbit_are_told():
-    with pytest.raises(ValueError, match="draws: 5 is not allowed"):
+    with pytest.raises(ValueError, match="draws: must be .*got 5"):
         bp.prior_predictive(saddle_node(bp.Normal(1.0, 1.0)), draws=5)
     with pytest.raises(RuntimeError, match="none of 20 draws from its priors has a periodic solution"):
         bp.prior_predictive(saddle_node(bp.Normal(-9.0, 1.0)), draws=20, progress=False)

@@ -91,7 +91,7 @@ def test_intervals_are_students():
     low, high = fit.interval(0.9)["k"]
     assert fit.degrees_of_freedom == 4
     assert (high - low) / 2 / fit.sd["k"] == pytest.approx(2.1318, rel=1e-4)
-    with pytest.raises(ValueError, match="probability: 1.2 is not allowed"):
+    with pytest.raises(ValueError, match="probability: must be .*got 1.2"):
         fit.interval(1.2)
 
 
@@ -143,7 +143,7 @@ def test_start_outside_the_support_is_refused():
     )
     with pytest.raises(ValueError, match=r"start: k = 2000 is not allowed; .* support is \(0, 1000\)"):
         bp.map_estimate(problem, start={"k": 2000.0, "c": 1.0, "coulomb": 1.0})
-    with pytest.raises(ValueError, match="start: 'kk' is not known.*Did you mean 'k'"):
+    with pytest.raises(ValueError, match="start: must be .*got 'kk'.*Did you mean 'k'"):
         bp.map_estimate(problem, start={"kk": 2000.0, "c": 1.0, "coulomb": 1.0})
 
 

@@ -299,7 +299,7 @@ def test_the_table_holds_both_intervals(linear):
 
 def test_what_cannot_be_profiled_is_told(linear):
     problem, fit, profile = linear
-    with pytest.raises(ValueError, match="names: 'kk' is not known.*Did you mean 'k'"):
+    with pytest.raises(ValueError, match="names: must be .*got 'kk'.*Did you mean 'k'"):
         bp.profile(problem, fit, ["kk"])
     for names in ("k", []):
         with pytest.raises(ValueError, match="names: .* is not allowed; it must be a sequence of names"):
@@ -311,5 +311,5 @@ def test_what_cannot_be_profiled_is_told(linear):
     with pytest.raises(ValueError, match=r"fit: k = .* is not allowed; the log-posterior is not finite there"):
         bp.profile(other, fit)
     fewer = bp.Problem(LINEAR, [run], priors={"k": PRIORS["k"]}, fixed={"c": 40.0, "coulomb": 25.0})
-    with pytest.raises(ValueError, match="fit.theta: 'c' is not known"):
+    with pytest.raises(ValueError, match="fit.theta: must be .*got 'c'"):
         bp.profile(fewer, fit)

@@ -380,12 +380,12 @@ def test_the_same_request_gives_the_same_object():
     [
         (
             lambda: bp.models.landing_gear("forces"),
-            "drive: 'forces' is not known; allowed: 'force', 'displacement'. Did you mean 'force'",
+            "drive: must be one of 'force', 'displacement', got 'forces'. Did you mean 'force'",
         ),
-        (lambda: bp.models.landing_gear(None), "drive: None is not known"),
-        (lambda: bp.models.chain(0), "masses: 0 is not allowed; it must be a whole number of at least 1"),
-        (lambda: bp.models.chain(2.0), "masses: 2.0 is not allowed"),
-        (lambda: bp.models.chain([3]), r"masses: \[3\] is not allowed"),
+        (lambda: bp.models.landing_gear(None), "drive: must be .*got None"),
+        (lambda: bp.models.chain(0), "masses: must be an integer >= 1, got 0"),
+        (lambda: bp.models.chain(2.0), "masses: must be .*got 2.0"),
+        (lambda: bp.models.chain([3]), r"masses: must be .*got \[3\]"),
     ],
 )
 def test_bad_arguments_are_named(call, message):

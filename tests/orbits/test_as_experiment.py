@@ -85,7 +85,7 @@ def test_missing_information_raises():
         bare.experiment()
     with pytest.raises(ValueError, match="states: must name the coordinate .*, got None; .* is not polished"):
         measured(GENTLE[0]).experiment()
-    with pytest.raises(ValueError, match="states: 'rat' is not known; allowed: 'angle', 'rate'"):
+    with pytest.raises(ValueError, match="states: must be one of 'angle', 'rate', got 'rat'"):
         measured(GENTLE[0]).experiment(states={"phi": "rat"})
     polished = bp.polish_orbits(bp.models.pendulum, [bare], PENDULUM, samples=400)[0]
     with pytest.raises(ValueError, match="whole: must be False, got True; .* has no measured cycle"):

@@ -269,13 +269,13 @@ def test_a_wrong_frequency_is_named(factor):
 
 def test_invalid_arguments_raise():
     section = henon_section(500)
-    with pytest.raises(ValueError, match="method: 'box' is not known.*'boxes'"):
+    with pytest.raises(ValueError, match="method: must be .*got 'box'.*'boxes'"):
         bp.find_orbits(section, periods=[1], method="box")
-    with pytest.raises(ValueError, match="periods: 0 is not allowed"):
+    with pytest.raises(ValueError, match="periods: must be .*got 0"):
         bp.find_orbits(section, periods=[0])
     with pytest.raises(ValueError, match="periods: must be a collection such as range"):
         bp.find_orbits(section, periods=3)
     with pytest.raises(ValueError, match="none above 25"):
         bp.find_orbits(section, periods=[30])
-    with pytest.raises(ValueError, match="neighbours: 3 is not allowed"):
+    with pytest.raises(ValueError, match="neighbours: must be .*got 3"):
         bp.find_orbits(section, periods=[1], neighbours=3)

@@ -145,11 +145,11 @@ def test_polished_orbits_are_saved_and_read_back(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"parameters": {"m": 1.0}}, "parameters: missing 'l'"),
-        ({"parameter_sd": {"lenght": 1.0}}, "parameter_sd: 'lenght' is not known"),
-        ({"parameter_sd": {"l": 0.0}}, r"parameter_sd\['l'\]: 0.0 is not allowed; it must be > 0"),
-        ({"tolerance": 0.0}, "tolerance: 0.0 is not allowed"),
-        ({"inputs": {"force": np.zeros(800)}}, "inputs: 'force' is not known"),
+        ({"parameters": {"m": 1.0}}, "parameters: must have .*got no 'l'"),
+        ({"parameter_sd": {"lenght": 1.0}}, "parameter_sd: must be .*got 'lenght'"),
+        ({"parameter_sd": {"l": 0.0}}, r"parameter_sd\['l'\]: must be > 0, got 0.0"),
+        ({"tolerance": 0.0}, "tolerance: must be .*got 0.0"),
+        ({"inputs": {"force": np.zeros(800)}}, "inputs: must be .*got 'force'"),
     ],
 )
 def test_invalid_arguments_raise(changes, message):
@@ -159,7 +159,7 @@ def test_invalid_arguments_raise(changes, message):
 
 def test_models_that_do_not_match_the_section_raise():
     orbit = measured(GENTLE[0])
-    with pytest.raises(ValueError, match="coordinates: 'angle' is not known; allowed: 'force'"):
+    with pytest.raises(ValueError, match="coordinates: must be 'force', got 'angle'"):
         bp.polish_orbits(LINEAR, [orbit], {"k": 1, "c": 1, "coulomb": 1}, inputs={"x": np.zeros(800)})
     with pytest.raises(ValueError, match="model: must be a forced one, got 'van_der_pol'"):
         bp.polish_orbits(bp.models.van_der_pol, [orbit], {"mu": 1.0, "omega": 1.0})

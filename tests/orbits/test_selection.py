@@ -73,9 +73,9 @@ def test_both_partners_may_be_selected(polished):
 
 
 def test_invalid_arguments_raise(polished):
-    with pytest.raises(ValueError, match="parameters: 'mass' is not known"):
+    with pytest.raises(ValueError, match="parameters: must be .*got 'mass'"):
         bp.select_orbits(polished, ["mass"])
-    with pytest.raises(ValueError, match="largest_multiplier: -1 is not allowed"):
+    with pytest.raises(ValueError, match="largest_multiplier: must be .*got -1"):
         bp.select_orbits(polished, ["m"], largest_multiplier=-1)
     with pytest.raises(ValueError, match="orbits: must be polished, got"):
         bp.select_orbits(bp.Orbits((measured(GENTLE[0]),)), ["m"])

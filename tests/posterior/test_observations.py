@@ -277,12 +277,12 @@ def test_the_phase_of_a_cycle_is_the_likeliest_one_of_all_channels():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"local": ["coulom"]}, "local: 'coulom' is not known.*Did you mean 'coulomb'"),
+        ({"local": ["coulom"]}, "local: must be .*got 'coulom'.*Did you mean 'coulomb'"),
         (
             {"local": "coulomb"},
             r"local: 'coulomb' is not allowed; it must be a sequence of names, such as \['coulomb'\]",
         ),
-        ({"priors": PRIORS | {"coulomb[run 1]": PRIORS["k"]}}, r"priors: 'coulomb\[run 1\]' is not known"),
+        ({"priors": PRIORS | {"coulomb[run 1]": PRIORS["k"]}}, r"priors: must be .*got 'coulomb\[run 1\]'"),
         ({"local": ["k"], "fixed": {"k": {"run 1": 1.0}}, "priors": PRIORS | {"k[run 1]": PRIORS["k"]}}, "fixed: 'k"),
         ({"local": ["k"], "priors": {k: v for k, v in PRIORS.items() if k != "k"}}, "'k' has neither a prior nor"),
         (
@@ -293,10 +293,10 @@ def test_the_phase_of_a_cycle_is_the_likeliest_one_of_all_channels():
             {"local": ["c"], "tied": {"c": "k/20"}, "priors": {k: v for k, v in PRIORS.items() if k != "c"}},
             "local: 'c' is tied; it follows what it is tied to",
         ),
-        ({"noise": "white"}, "noise: 'white' is not known; allowed: 'independent', 'measured', 'circulant'"),
+        ({"noise": "white"}, "noise: must be one of 'independent', 'measured', 'circulant', got 'white'"),
         ({"noise": "measured"}, "noise: 'measured' is not allowed; experiment 'run 1' has no scatter of 'force'"),
         ({"noise": 3}, "noise: 3 is not allowed; it must be a name or a model such as noise.Independent()"),
-        ({"fixed": {"lengthscale[force]": 1.0}}, r"fixed: 'lengthscale\[force\]' is not known"),
+        ({"fixed": {"lengthscale[force]": 1.0}}, r"fixed: must be .*got 'lengthscale\[force\]'"),
     ],
 )
 def test_what_does_not_fit_is_refused_by_name(changes, message):

@@ -57,13 +57,13 @@ def test_ties_are_part_of_the_fingerprint():
 @pytest.mark.parametrize(
     ("tied", "fixed", "message"),
     [
-        ({"c": "k2/20"}, {}, r"tied\['c'\].*'k2' is not known.*Did you mean 'k'"),
+        ({"c": "k2/20"}, {}, r"tied\['c'\].*got 'k2'.*Did you mean 'k'"),
         ({"c": "2*c"}, {}, "tied: .* come back to themselves"),
-        ({"damping": "k"}, {}, "tied: 'damping' is not known"),
+        ({"damping": "k"}, {}, "tied: must be .*got 'damping'"),
         ({"c": "k", "k": "c"}, {}, "tied: 'k' is in priors too"),
         ({"c": "k"}, {"c": 1.0}, "tied: 'c' is in fixed too"),
-        ({"c": "__import__('os')"}, {}, r"tied\['c'\].* is not"),
-        ({"c": 3.0}, {}, r"tied\['c'\]: 3.0 is not allowed"),
+        ({"c": "__import__('os')"}, {}, r"tied\['c'\]: functions in .*: must be one of"),
+        ({"c": 3.0}, {}, r"tied\['c'\]: must be .*got 3.0"),
         ({}, {}, "'c' has neither a prior nor a value"),
     ],
 )

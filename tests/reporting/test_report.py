@@ -189,7 +189,7 @@ def test_what_belongs_to_another_problem_is_refused(solved, tmp_path):
     path = tmp_path / "report.html"
     with pytest.raises(ValueError, match="posterior: must be of the parameters and data"):
         bp.report(other, fit, posterior, path)
-    with pytest.raises(ValueError, match="fit: missing 'k'"):
+    with pytest.raises(ValueError, match="fit: must have .*got no 'k'"):
         bp.report(problem, replace(fit, theta={}), None, path)
     with pytest.raises(FileNotFoundError, match="path: .* there is no folder"):
         bp.report(problem, fit, None, tmp_path / "nowhere" / "report.html")

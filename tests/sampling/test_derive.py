@@ -61,16 +61,16 @@ def test_an_infinite_covariance_gives_no_finite_sd(fixed_c):
 
 
 def test_refused_for_the_estimate(fixed_c):
-    with pytest.raises(ValueError, match=r"expressions\['a'\]: 'kk/c': 'kk' is not known; .*Did you mean 'k'"):
+    with pytest.raises(ValueError, match=r"expressions\['a'\]: names in 'kk/c': must be .*got 'kk'.*Did you mean 'k'"):
         fixed_c.derive({"a": "kk/c"})
     for name in ("k", "c"):
-        with pytest.raises(ValueError, match=f"expressions: '{name}' is reserved or used twice"):
+        with pytest.raises(ValueError, match=f"expressions: must be neither reserved nor repeated, got '{name}'"):
             fixed_c.derive({name: "2*coulomb"})
     with pytest.raises(ValueError, match=r"expressions\['a'\]: 'log\(-k\)' is not allowed; it is nan at the estimate"):
         fixed_c.derive({"a": "log(-k)"})
-    with pytest.raises(ValueError, match="it contains an attribute"):
+    with pytest.raises(ValueError, match="which contains an attribute"):
         fixed_c.derive({"a": "k.__class__"})
-    with pytest.raises(ValueError, match="expressions: 'k' is not allowed; it must be a mapping"):
+    with pytest.raises(ValueError, match="expressions: must be a mapping, .*got 'k'"):
         fixed_c.derive("k")
 
 
@@ -117,14 +117,12 @@ def test_posterior_and_estimate_agree_where_both_are_normal(solved):
 
 def test_refused_for_the_posterior(solved):
     posterior = solved[2]
-    with pytest.raises(
-        ValueError, match="'m' is not known; allowed: 'k', 'c', 'coulomb', 'pi'.*Only sampled parameters"
-    ):
+    with pytest.raises(ValueError, match="must be one of 'k', 'c', 'coulomb', 'pi', got 'm'.*Only sampled parameters"):
         posterior.derive({"a": "k/m"})
-    with pytest.raises(ValueError, match="it contains a subscript"):
+    with pytest.raises(ValueError, match="which contains a subscript"):
         posterior.derive({"a": "variance[force]"})
     for name in ("k", "variance"):
-        with pytest.raises(ValueError, match=f"expressions: '{name}' is reserved or used twice"):
+        with pytest.raises(ValueError, match=f"expressions: must be neither reserved nor repeated, got '{name}'"):
             posterior.derive({name: "2*c"})
     median = np.median(posterior.draws("k"))
     with pytest.raises(ValueError, match=r"'log\(k - .*' is not allowed; it is NaN or infinite at \d+ of \d+ draws"):

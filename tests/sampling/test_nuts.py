@@ -225,13 +225,13 @@ def test_error_in_the_density_ends_all_chains(linear, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"sampler": "hmc"}, "sampler: 'hmc' is not known; allowed: 'emcee', 'nuts'"),
+        ({"sampler": "hmc"}, "sampler: must be one of 'emcee', 'nuts', got 'hmc'"),
         ({"walkers": 32}, "walkers: 32 is not allowed with sampler='nuts'; a chain has no walkers"),
         ({"variances": "collapsed"}, "variances: 'collapsed' is not allowed with sampler='nuts'"),
         ({"checkpoint": "run.h5"}, "checkpoint: 'run.h5' is not allowed with sampler='nuts'; its chains cannot be"),
         ({"executor": 2}, "executor: 2 is not allowed with sampler='nuts'; its chains run in threads"),
-        ({"ensembles": 1}, "ensembles: 1 is not allowed"),
-        ({"max_steps": 10}, "max_steps: 10 is not allowed"),
+        ({"ensembles": 1}, "ensembles: must be .*got 1"),
+        ({"max_steps": 10}, "max_steps: must be .*got 10"),
     ],
 )
 def test_what_nuts_does_not_take_is_named(linear, arguments, message):

@@ -234,9 +234,9 @@ def test_each_quantity_is_one_variable_with_the_dims_of_its_names():
     there = group["variance"].sel(channel="rate", experiment=FIRST)
     assert np.array_equal(there.values.ravel(), posterior.draws(f"variance[rate, {FIRST}]"))
     assert np.isnan(group["variance"].sel(channel="rate", experiment=SECOND)).all()
-    with pytest.raises(ValueError, match=r"name: 'variance\[rate, run 8, 14.5 Hz\]' is not known; .*Did you mean"):
+    with pytest.raises(ValueError, match=r"name: must be .*got 'variance\[rate, run 8, 14.5 Hz\]'.*Did you mean"):
         posterior.draws(f"variance[rate, {SECOND}]")
-    with pytest.raises(ValueError, match=r"name: 'c' is not known; allowed: 'k', 'c\[run 7\]'"):
+    with pytest.raises(ValueError, match=r"name: must be one of 'k', 'c\[run 7\]', got 'c'"):
         posterior.draws("c")
 
 
@@ -309,11 +309,11 @@ def test_expressions_mean_the_local_parameters_of_one_experiment(local):
         assert linear.loc["sum", "sd"] == pytest.approx(np.sqrt(weights @ fit.covariance.to_numpy() @ weights))
     for result in (fit, posterior):
         assert list(result.derive({"rate": "k/c"}).index) == ["rate"]
-        with pytest.raises(ValueError, match=r"'coulomb' is not known; .*own coulomb; derive\(…, experiment=…\)"):
+        with pytest.raises(ValueError, match=r"got 'coulomb'.*own coulomb; derive\(…, experiment=…\)"):
             result.derive({"a": "2*coulomb"})
-        with pytest.raises(ValueError, match="experiment: 'run 9' is not known; allowed: 'run 7', 'run 8, 14.5 Hz'"):
+        with pytest.raises(ValueError, match="experiment: must be one of 'run 7', 'run 8, 14.5 Hz', got 'run 9'"):
             result.derive({"a": "2*coulomb"}, experiment="run 9")
-        with pytest.raises(ValueError, match="expressions: 'coulomb' is reserved or used twice"):
+        with pytest.raises(ValueError, match="expressions: must be neither reserved nor repeated, got 'coulomb'"):
             result.derive({"coulomb": "2*k"})
 
 
@@ -333,7 +333,7 @@ def test_constants_and_ties_of_one_experiment_enter_an_estimate():
     assert at.loc["rate"].tolist() == pytest.approx([910.0 / coulomb, 910.0 / coulomb**2 * sd])
     assert at.loc["tie", "value"] == pytest.approx(1.6 * coulomb) and np.isnan(at.loc["tie", "sd"])
     single = bp.Problem(LINEAR, runs()[:1], priors=PRIORS, local=["coulomb"])
-    with pytest.raises(ValueError, match="'coulomb' is not known"):
+    with pytest.raises(ValueError, match="got 'coulomb'"):
         bp.map_estimate(single, **QUIET).derive({"a": "coulomb"})
 
 
@@ -367,15 +367,13 @@ def test_what_cannot_be_a_prior_is_told(solved, local):
         for names in ("k", ["k", "c"], ()):
             with pytest.raises(ValueError, match=r"names: .* is not allowed; it must be a tuple of names"):
                 result.as_prior(names)
-        with pytest.raises(
-            ValueError, match="names: 'kk' is not known; allowed: 'k', 'c', 'coulomb'. Did you mean 'k'"
-        ):
+        with pytest.raises(ValueError, match="names: must be one of 'k', 'c', 'coulomb', got 'kk'. Did you mean 'k'"):
             result.as_prior(("kk", "c"))
         with pytest.raises(ValueError, match=r"names: \('k', 'k'\) is not allowed; 'k' is in it twice"):
             result.as_prior(("k", "k"))
         with pytest.raises(ValueError, match=r"names: 'variance\[force\]' is not allowed; it belongs to the noise"):
             result.as_prior(("k", "variance[force]"))
-    with pytest.raises(ValueError, match="'coulomb' is not known; allowed: 'k', 'c', 'coulomb.run 7.'"):
+    with pytest.raises(ValueError, match="must be one of 'k', 'c', 'coulomb.run 7.', .*got 'coulomb'"):
         local[2].as_prior(("coulomb",))
     with pytest.warns(UserWarning, match="The draws have not converged"):
         replace(posterior, converged=False).as_prior(("k",))

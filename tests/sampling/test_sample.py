@@ -201,11 +201,11 @@ def test_summary_names_its_interval(posterior):
             "walkers: 4 is not allowed; it must be even and at least twice the dimension, 6 for k, c, coulomb",
         ),
         ({"walkers": 9}, "walkers: 9 is not allowed"),
-        ({"ensembles": 1}, "ensembles: 1 is not allowed"),
-        ({"max_steps": 10}, "max_steps: 10 is not allowed"),
-        ({"seed": -1}, "seed: -1 is not allowed"),
-        ({"start": "laplac"}, "start: 'laplac' is not known; allowed: 'laplace', 'prior', 'overdispersed'"),
-        ({"coordinates": "log"}, "coordinates: 'log' is not known; allowed: 'ridge', 'natural'"),
+        ({"ensembles": 1}, "ensembles: must be .*got 1"),
+        ({"max_steps": 10}, "max_steps: must be .*got 10"),
+        ({"seed": -1}, "seed: must be .*got -1"),
+        ({"start": "laplac"}, "start: must be one of 'laplace', 'prior', 'overdispersed', got 'laplac'"),
+        ({"coordinates": "log"}, "coordinates: must be one of 'ridge', 'natural', got 'log'"),
         ({"variances": "collapsed"}, "variances: 'collapsed' is not allowed; there is no unknown variance"),
     ],
 )
@@ -227,9 +227,9 @@ def test_an_estimate_of_another_problem_is_refused(known_variance):
     problem, fit = known_variance
     others = [replace(e, name="other") for e in problem.experiments]
     other = bp.Problem(LINEAR, others, priors=PRIORS, fixed={"variance[force]": 9.0})
-    with pytest.raises(ValueError, match="fit: it has no 'other', only .*; give the estimate of this problem"):
+    with pytest.raises(ValueError, match="fit: must have 'other', got only .*; give the estimate of this problem"):
         bp.sample(other, fit, seed=1, **PAIR)
-    with pytest.raises(ValueError, match="fit: missing 'k'"):
+    with pytest.raises(ValueError, match="fit: must have .*got no 'k'"):
         bp.sample(problem, replace(fit, theta={n: v for n, v in fit.theta.items() if n != "k"}), seed=1, **PAIR)
 
 
