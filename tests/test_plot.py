@@ -125,7 +125,7 @@ def test_corner_draws_the_names_asked_for_and_no_ellipse_where_there_is_no_appro
     with pytest.raises(ValueError, match="names: must be one of 'k', 'c', got 'kk'"):
         bp.plot.corner(posterior, names=["kk"])
     for names in ("k", [], ["k", "k"]):
-        with pytest.raises(ValueError, match="names: .* is not allowed"):
+        with pytest.raises(ValueError, match="names: must be .*, got"):
             bp.plot.corner(posterior, names=names)
     with pytest.raises(
         ValueError, match="laplace: must have 'k', 'c'.*, got only 'm'.*; give an estimate of the same problem"
@@ -218,9 +218,9 @@ def test_what_cannot_be_drawn_of_branches_is_told(response):
         bp.plot.branch(response, output="force")
     with pytest.raises(ValueError, match="measure: must be .*got 'size'"):
         bp.plot.branch(response, measure="size")
-    with pytest.raises(ValueError, match="labels: 2 are not allowed; there must be 1"):
+    with pytest.raises(ValueError, match="labels: must be 1, one per branch, got 2"):
         bp.plot.branch(response, labels=["a", "b"])
-    with pytest.raises(ValueError, match="more: .'k3'. is not allowed; all must vary 'frequency'"):
+    with pytest.raises(ValueError, match="more: branches must all vary 'frequency', got .'k3'."):
         bp.plot.branch(response, replace(response, vary="k3"))
 
 

@@ -1,4 +1,4 @@
-"""Whether a model explains its data: discrepancy tests of every experiment and channel, and the verdict."""
+"""Tests of the model: discrepancy of every experiment and channel, and the verdict."""
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 from scipy.fft import dct
+from scipy.linalg import orth
 
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.estimation.result import of_periodogram
@@ -20,23 +21,23 @@ NOT_TESTED = float("nan")
 
 
 class Unexplained:
-    """The part of whitened residual components that no change of the parameters explains.
+    """Whitened residual components, projected orthogonally to the changes under the parameters.
 
     Parameters
     ----------
     components : array (size,)
-        Independent, with one variance, where the model holds.
+        Independent with equal variances under the model.
     changes : array (parameters, size)
-        Their derivatives by the parameters; rows may be dependent or zero.
+        Their derivatives with respect to the parameters; rows may be dependent or zero.
     harmonic : int array (size,)
-        To which each component belongs.
+        Harmonic of each component.
 
     Attributes
     ----------
     square : float
         Sum of squares.
     freedom : int
-        Degrees of freedom behind it.
+        Its degrees of freedom.
     """
 
     def __init__(self, components: np.ndarray, changes: np.ndarray, harmonic: np.ndarray):
@@ -55,23 +56,18 @@ class Unexplained:
         return gram, each @ (b * e[:, None]), each @ e**2, each.sum(axis=1)
 
     def explained(self, sets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the sum of squares (sets,) that free amplitudes of sets of harmonics would explain, and their number.
-
-        Parameters
-        ----------
-        sets : bool array (sets, harmonics)
-        """
+        """Return the sums of squares (sets,) explained by sets (sets, harmonics) of harmonics, and their sizes."""
         gram, along, square, size = (np.tensordot(sets.astype(float), part, 1) for part in self._sums)
         values, vectors = np.linalg.eigh(gram)
         left = 1.0 - values
-        # Combinations of the set's components that the parameters can produce themselves hold no information.
+        # Combinations of the components of a set that the parameters can produce have no information.
         absorbed = left < ABSORBED
         turned = np.einsum("srj,sr->sj", vectors, along) ** 2
         ratio = np.where(absorbed, -1.0 / np.maximum(values, 0.5), 1.0 / np.maximum(left, ABSORBED))
         return square + np.sum(turned * ratio, axis=1), np.rint(size - absorbed.sum(axis=1)).astype(int)
 
     def whiteness(self) -> float:
-        """Return p of Bartlett's test: the cumulative power of the harmonics, the highest first, on a straight line."""
+        """Return p of Bartlett's test of the cumulative power of the harmonics, the highest first."""
         tails = np.tri(self.harmonics.size, dtype=bool)[:, ::-1]
         square, freedom = self.explained(tails)
         pairs = np.diff(freedom, prepend=0) == 2
@@ -79,10 +75,7 @@ class Unexplained:
         return of_periodogram(np.maximum(power, 0.0)).p if power.size >= 2 else NOT_TESTED
 
     def harmonic_content(self) -> tuple[float, float]:
-        """Return p of too much power in one harmonic or in the lowest 2ᵏ + 1, and the harmonic that has most.
-
-        The smallest p of the F tests, times their number.
-        """
+        """Return p of excess power in one harmonic or in the lowest 2ᵏ + 1 (Bonferroni), and the strongest harmonic."""
         count = self.harmonics.size
         lowest = np.array([np.arange(count) <= 2**k for k in range(count.bit_length()) if 2**k < count - 1], dtype=bool)
         sets = np.concatenate([np.eye(count, dtype=bool), lowest.reshape(-1, count)])
@@ -98,17 +91,16 @@ class Unexplained:
 
 
 def column_space(changes: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (size, rank) of the span of rows (parameters, size), each taken at its own size."""
+    """Return an orthonormal basis (size, rank) of the span of rows (parameters, size), normalised to unit length."""
     length = np.linalg.norm(changes, axis=1)
     rows = changes[length > 0.0] / length[length > 0.0, None]
     if not rows.size:
         return np.empty((changes.shape[1], 0))
-    _, values, basis = np.linalg.svd(rows, full_matrices=False)
-    return basis[values > RANK * values[0]].T
+    return orth(rows.T, rcond=RANK)
 
 
 def excess(variance: float, freedom: float, known: float, known_freedom: float) -> float:
-    """Return p of a variance at least so far above a known one, which may itself have been estimated."""
+    """Return p of the one-sided test of a variance against a known or independently estimated one."""
     if not freedom > 0.0 or not known > 0.0:
         return NOT_TESTED
     if np.isinf(known_freedom):
@@ -117,12 +109,12 @@ def excess(variance: float, freedom: float, known: float, known_freedom: float) 
 
 
 def consistency(parts: Sequence[tuple[np.ndarray, np.ndarray, str]], known: frozenset[str]) -> float:
-    """Return p of residuals that parameters of their own would explain far better than common ones: Chow's test.
+    """Return p of Chow's test of common parameters against separate ones.
 
     Parameters
     ----------
     parts : sequence of (array (size,), array (parameters, size), str)
-        Whitened components of each block, their derivatives, and the group of blocks with one unknown variance.
+        Whitened components of each block, their derivatives, and the group of blocks with a common variance.
     known : set of str
         Groups whose whitened variance is known to be 1.
 
@@ -150,7 +142,7 @@ def consistency(parts: Sequence[tuple[np.ndarray, np.ndarray, str]], known: froz
 
 
 def holm(p: np.ndarray) -> np.ndarray:
-    """Return p-values adjusted for their number; NaN for those not tested, which do not count.
+    """Return p-values adjusted by Holm's method; NaN is not counted.
 
     References
     ----------
@@ -165,7 +157,7 @@ def holm(p: np.ndarray) -> np.ndarray:
 
 
 def _f_test(square: np.ndarray, freedom: np.ndarray, other: np.ndarray, other_freedom: np.ndarray) -> np.ndarray:
-    """Return p of a mean square at least so far above another."""
+    """Return p of the one-sided F tests of mean squares."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = square / freedom / (np.maximum(other, 0.0) / other_freedom)
     return np.asarray(stats.f.sf(np.nan_to_num(ratio, nan=0.0, posinf=np.inf), freedom, other_freedom))
@@ -181,7 +173,7 @@ ALL = "all"
 def adequacy(
     problem: Problem, here: Linearisation, noise: np.ndarray, replicates: Mapping[tuple[str, str], np.ndarray]
 ) -> pd.DataFrame:
-    """Return the table of `Prediction`: the p-values of all tests, and what they say together.
+    """Return the table of `Prediction`: the p-values of all tests and the verdicts.
 
     Parameters
     ----------
@@ -191,7 +183,7 @@ def adequacy(
     noise : array (draws, noise_names)
         Draws of the noise parameters.
     replicates : mapping of (str, str) to array (draws, points)
-        Of the data, by experiment and channel; NaN outside the mask and where a solve failed.
+        Of the data, by experiment and channel; NaN outside the mask and for failed solves.
     """
     likelihood = problem.likelihood
     shapes = np.median(noise, axis=0)[None] if problem.noise.flat else noise[:: max(1, len(noise) // SHAPES)]
@@ -201,7 +193,7 @@ def adequacy(
         if block.kind == KNOWN:
             continue
         row: dict[str, float | str] = {"experiment": block.experiment, "channel": block.channel}
-        # The spectrum of correlated noise is known by its draws alone: their mean p is that of the realised residual.
+        # The spectrum of correlated noise is known from draws only: the p of the realised residual is their mean.
         found = [w.spectral_tests(i) for w in white]
         whiteness, harmonics, harmonic = np.array(found).T
         row |= {"whiteness": float(whiteness.mean()), "harmonics": float(harmonics.mean()), "harmonic": harmonic[0]}
@@ -215,12 +207,11 @@ def adequacy(
 
 
 def adjusted_p(table: pd.DataFrame) -> np.ndarray:
-    """Return the p-values (rows, tests) of a table, adjusted for the number of all of them."""
+    """Return the p-values (rows, tests) of a table, adjusted for their total number."""
     return holm(table[[*TESTS]].to_numpy(dtype=float).ravel()).reshape(len(table), -1)
 
 
 def _judged(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the table with each row's smallest adjusted p, and its verdict."""
     adjusted = adjusted_p(table)
     smallest = np.min(np.where(np.isnan(adjusted), np.inf, adjusted), axis=1)
     smallest[-1] = min(smallest)
@@ -230,10 +221,10 @@ def _judged(table: pd.DataFrame) -> pd.DataFrame:
 
 
 class _Whitened:
-    """Residual components and their derivatives in units of the noise at one value (names,) of its parameters.
+    """Residual components and their derivatives in units of the noise for parameters (names,) of the noise model.
 
-    Where fewer values are independent than there are components, the measured period is a smooth curve, and the
-    components are those of the lowest harmonics, as many as independent values.
+    If there are fewer independent values than components, the measured period is a smooth curve, and only the
+    components of the lowest harmonics are used, as many as independent values.
     """
 
     def __init__(self, problem: Problem, here: Linearisation, noise: np.ndarray):
@@ -252,7 +243,7 @@ class _Whitened:
         ]
 
     def spectral_tests(self, index: int) -> tuple[float, float, float]:
-        """Return p of whiteness and of the harmonic content of a block, and the harmonic with most power."""
+        """Return p of whiteness and of the harmonic content of a block, and the strongest harmonic."""
         r, j, harmonic = self.parts[index]
         if self.blocks[index].kind == CORRELATED or not _testable(r, j):
             return NOT_TESTED, NOT_TESTED, NOT_TESTED
@@ -270,14 +261,14 @@ def _testable(r: np.ndarray, j: np.ndarray) -> bool:
 
 
 def kept(block: Block, components: np.ndarray) -> np.ndarray:
-    """Return the components (…, kept) that the tests take, points as cosine components along the period."""
+    """Return the components (…, kept) used in the tests; points as cosine components along the period."""
     if block.kind == POINTS:
         components = dct(components, norm="ortho", axis=-1)
     return components[..., _order(block)]
 
 
 def labels(block: Block) -> np.ndarray:
-    """Return the harmonics (kept,) of the components that the tests take."""
+    """Return the harmonics (kept,) of the components used in the tests."""
     return _harmonic(block)[_order(block)]
 
 
@@ -293,7 +284,7 @@ def _harmonic(block: Block) -> np.ndarray:
 
 
 def _size(problem: Problem, here: Linearisation, block: Block, index: int, white: _Whitened) -> dict[str, float | str]:
-    """Return p of a residual larger than the measured noise, or the known one, and the share that is model error."""
+    """Return p of a residual larger than the measured or known noise, and the fraction of model error."""
     nothing: dict[str, float | str] = {"size": NOT_TESTED, "model_error_share": NOT_TESTED}
     r, j = (np.sqrt(block.weight) * kept(block, part[index]) for part in (here.residuals, here.changes))
     if not _testable(r, j):
@@ -306,7 +297,7 @@ def _size(problem: Problem, here: Linearisation, block: Block, index: int, white
     else:
         unexplained, measured = Unexplained(r, j, labels(block)), block.measured
         e = next(e for e in problem.experiments if e.name == block.experiment)
-        # A sum of squares of unequal variances has fewer degrees of freedom.
+        # Unequal variances reduce the degrees of freedom of a sum of squares.
         evenness = _evenness(e, block)
         freedom = unexplained.freedom * evenness
         behind = (e.cycles - 1) * block.count * evenness if e.cycles > 1 else np.inf
@@ -320,7 +311,7 @@ def _size(problem: Problem, here: Linearisation, block: Block, index: int, white
 
 
 def _evenness(experiment: Experiment, block: Block) -> float:
-    """Return the effective share of degrees of freedom where the variance differs between harmonics (Satterthwaite)."""
+    """Return the effective fraction of degrees of freedom for unequal variances of the harmonics (Satterthwaite)."""
     if block.channel not in experiment.amplitude_variance:
         return 1.0
     variance = experiment.amplitude_variance[block.channel]
@@ -329,7 +320,7 @@ def _evenness(experiment: Experiment, block: Block) -> float:
 
 
 def _amplitude(problem: Problem, block: Block, replicates: Mapping[tuple[str, str], np.ndarray]) -> float:
-    """Return the two-sided posterior predictive p of the rms about the mean, normal between the replicates."""
+    """Return the two-sided posterior predictive p of the rms about the mean, assumed normal."""
     if (block.experiment, block.channel) not in replicates:
         return NOT_TESTED
     e = next(e for e in problem.experiments if e.name == block.experiment)

@@ -1,4 +1,4 @@
-"""What the data say at the estimate, measured against what the prior says: Fisher information in prior units."""
+"""Fisher information of the data in prior units, and the expected gain of further experiments."""
 
 import warnings
 from collections.abc import Iterable
@@ -11,6 +11,7 @@ import pandas as pd
 from scipy.special import ndtr
 
 from bayesperiodic import _checks
+from bayesperiodic._linalg import hessian_eigh
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.estimation.laplace import logarithmic
 from bayesperiodic.estimation.result import MapEstimate
@@ -23,18 +24,10 @@ SMALLEST, HARDLY = 1e-12, 1e-3
 
 @dataclass(frozen=True)
 class Information:
-    """The Fisher information of the data in the logarithms of positive parameters and in signed ones as they are.
+    """The Fisher information matrix of the data at an estimate theta.
 
-    Attributes
-    ----------
-    names : tuple of str
-    theta : array (names,)
-        The estimate.
-    logarithmic : bool array (names,)
-    matrix : array (names, names)
-        −∂² log-likelihood, its expectation, by these coordinates.
-    prior_sd : array (names,)
-        Half the central 68 % interval of each prior, in these coordinates.
+    Coordinates are the logarithms of positive parameters (`logarithmic`) and the values of signed ones; `prior_sd` is
+    half the central 68 % interval of each prior in these coordinates.
     """
 
     names: tuple[str, ...]
@@ -45,7 +38,7 @@ class Information:
 
     @classmethod
     def of(cls, problem: Problem, fit: MapEstimate) -> "Information":
-        """Return the information at an estimate, its noise parameters taken as known."""
+        """Compute the information at an estimate with known noise parameters."""
         theta, logs = problem.vector(fit.theta), logarithmic(problem)
         guesses = {name: solution.states for name, solution in fit.solutions.items()}
         here = problem.anchored(theta, guesses).linearised(theta)
@@ -57,8 +50,7 @@ class Information:
     @cached_property
     def _relative(self) -> tuple[np.ndarray, np.ndarray]:
         """Eigenvalues, ascending, and eigenvectors of the information per unit of the prior's precision."""
-        scaled = self.matrix * np.outer(self.prior_sd, self.prior_sd)
-        values, vectors = np.linalg.eigh(scaled)
+        values, vectors, _ = hessian_eigh(self.matrix, self.prior_sd)
         return np.maximum(values, 0.0), vectors
 
     @property
@@ -68,47 +60,47 @@ class Information:
 
     @property
     def directions(self) -> np.ndarray:
-        """The directions, columns, in the coordinates themselves (names, directions)."""
+        """The directions, in columns (names, directions), in the coordinates."""
         return self._relative[1] * self.prior_sd[:, None]
 
     @property
     def spectrum(self) -> np.ndarray:
-        """Eigenvalues of the information, descending: per unit of the logarithm, or of the prior's sd if signed."""
+        """Eigenvalues of the information, descending, in units of the logarithm or of the prior sd if signed."""
         return self._scaled_eigenvalues[::-1]
 
     @property
     def condition(self) -> float:
-        """The largest over the smallest of these."""
+        """Ratio of the largest to the smallest of these."""
         values = self._scaled_eigenvalues
         return float(values[-1] / values[0]) if values[0] > 0.0 else np.inf
 
     @cached_property
     def _scaled_eigenvalues(self) -> np.ndarray:
         scale = np.where(self.logarithmic, 1.0, self.prior_sd)
-        values = np.linalg.eigvalsh(self.matrix * np.outer(scale, scale))
+        values, _, _ = hessian_eigh(self.matrix, scale)
         return np.where(values > SMALLEST * values[-1], values, 0.0)
 
     @property
     def alone(self) -> np.ndarray:
-        """Standard deviation that the data alone leave each parameter if all others are known, in prior sds."""
+        """Standard deviation left by the data alone if all other parameters are known, in prior sds."""
         with np.errstate(divide="ignore"):
             return 1.0 / (np.sqrt(np.diag(self.matrix)) * self.prior_sd)
 
     @property
     def together(self) -> np.ndarray:
-        """The same if the others are unknown too; infinite for what a direction without information moves.
+        """The same if the others are unknown; infinite if a direction without information changes the parameter.
 
-        It does not move a parameter that changes by less than 0.1 % of its prior's sd where others do by all of theirs.
+        A change below 0.1 % of the prior sd along a unit direction does not count.
         """
         values, vectors = self._relative
-        told = values > SMALLEST * max(values[-1], np.finfo(float).tiny)
-        known = np.sum(vectors[:, told] ** 2 / values[told], axis=1)
-        unseen = np.any(np.abs(vectors[:, ~told]) > HARDLY, axis=1)
-        return np.where(unseen, np.inf, np.sqrt(known))
+        informed = values > SMALLEST * max(values[-1], np.finfo(float).tiny)
+        variance = np.sum(vectors[:, informed] ** 2 / values[informed], axis=1)
+        unseen = np.any(np.abs(vectors[:, ~informed]) > HARDLY, axis=1)
+        return np.where(unseen, np.inf, np.sqrt(variance))
 
     @property
     def collinearity(self) -> np.ndarray:
-        """By how much the others make each standard deviation longer; 1 for a parameter that none is like."""
+        """Factor by which the unknown others increase each standard deviation; 1 without collinearity."""
         with np.errstate(invalid="ignore"):
             return self.together / self.alone
 
@@ -118,7 +110,7 @@ class Information:
 
 
 def prior_sds(problem: Problem, logs: np.ndarray) -> np.ndarray:
-    """Return half the central 68 % interval of each prior, of the logarithm where that is the coordinate."""
+    """Return half the central 68 % interval of each prior in its coordinate."""
     result = np.empty(len(problem.names))
     for i, name in enumerate(problem.names):
         low, high = problem.joint_prior.marginals[name].quantile(np.array([1.0 - ONE_SD, ONE_SD]))
@@ -131,7 +123,7 @@ MOST_RUNS = 5
 
 
 class Candidate(NamedTuple):
-    """An experiment that might be done: a run's inputs, their variation scaled, at another frequency [Hz]."""
+    """A possible experiment: the inputs of a run with scaled variation at another frequency [Hz]."""
 
     run: str
     frequency: float
@@ -139,9 +131,9 @@ class Candidate(NamedTuple):
 
 
 def default_candidates(problem: Problem) -> list[Candidate]:
-    """Return half, the same and twice the frequency and the amplitude of a few runs, those least alike in frequency.
+    """Return half, once and twice the frequency and the amplitude of runs spread over the frequencies.
 
-    Of all runs if some parameters are local to them.
+    These are all runs if some parameters are local.
     """
     runs = sorted(problem.experiments, key=lambda e: e.frequency)
     most = len(runs) if any("[" in name for name in problem.names) else MOST_RUNS
@@ -153,15 +145,11 @@ def default_candidates(problem: Problem) -> list[Candidate]:
 def rank_candidates(
     problem: Problem, fit: MapEstimate, information: Information, candidates: Iterable[Candidate]
 ) -> pd.DataFrame:
-    """Return what each candidate would add: nats of information in all, and each parameter's sd over today's.
+    """Return the expected gain [nats] of each candidate and the ratio of each sd after it to the present one.
 
-    The noise is taken as white with today's variances, the number of independent values as that of the run, and the
-    orbit as the one that follows from the run's; a candidate whose orbit cannot be found has NaN.
-
-    Returns
-    -------
-    DataFrame
-        Columns run, frequency, scale, gain and one a parameter; most informative first.
+    The noise is assumed white with the estimated variances, with as many independent values as in the run; the orbit is
+    the one found from that of the run as the initial guess. Candidates without an orbit have NaN. Columns: run,
+    frequency, scale, gain and one per parameter; the most informative first.
     """
     runs = {e.name: e for e in problem.experiments}
     scale = information.prior_sd
@@ -183,13 +171,13 @@ def rank_candidates(
 def _added(
     problem: Problem, fit: MapEstimate, information: Information, run: Experiment, candidate: Candidate
 ) -> np.ndarray:
-    """Return the information of a candidate in the coordinates of `information`; NaN where it has no orbit."""
+    """Return the information of a candidate in the coordinates of `information`; NaN without an orbit."""
     theta = problem.vector(fit.theta)
     parameter_map = problem.parameter_maps[run.name]
     values = parameter_map.values(theta[None])[0]
     inputs = {name: u.mean() + candidate.scale * (u - u.mean()) for name, u in run.inputs.items()}
     with warnings.catch_warnings():
-        # The grid is the run's, and how fine it is has been said of the run.
+        # The estimate has already warned about a coarse grid.
         warnings.simplefilter("ignore", UserWarning)
         solution = solve_periodic(
             problem.model,

@@ -1,4 +1,4 @@
-"""What the data determine, what only the prior does, and what to do about it: a verdict for each parameter."""
+"""Identifiability of each parameter: verdict, evidence and recommendation."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -26,10 +26,10 @@ from bayesperiodic.symmetry.system import system_of
 
 
 def structure_of(problem: Problem) -> Structure:
-    """Return the structure of a problem's model for its measured channels, free parameters and ties.
+    """Return the structural identifiability of a problem: its model, measured channels, free parameters and ties.
 
-    A parameter that is fixed at zero in every experiment is left out of the equations, any other fixed one is known.
-    One that experiments have their own of is taken as one parameter.
+    A parameter that is fixed at zero in every experiment is removed from the equations, any other fixed one is known. A
+    local parameter counts as one.
     """
     free = {name for name in problem.names if "[" not in name} | set(local_names(problem.names))
     fixed = {name: set(values.values()) for name, values in problem.fixed.items() if name not in free}
@@ -50,7 +50,7 @@ def _structure(
 ) -> Structure:
     symbols = model.parameter_symbols
     values = {symbols[name]: sp.S.Zero for name in zeros}
-    # The text has passed the whitelist of `expressions` before it gets here.
+    # The text has been validated by `_expressions`.
     ties = {symbols[n]: sp.nsimplify(sp.parse_expr(text, local_dict=dict(symbols)), rational=True) for n, text in tied}
     for _ in ties:
         ties = {symbol: expression.subs(ties | values) for symbol, expression in ties.items()}
@@ -63,12 +63,13 @@ MOST_DRAWS = 20_000
 
 
 def power_scaling(problem: Problem, posterior: Posterior) -> dict[str, tuple[float, float]]:
-    """Return the sensitivity of each parameter's posterior to the prior and to the likelihood ([1]_).
+    """Return the sensitivity of each parameter's posterior to power-scaling of the prior and of the likelihood ([1]_).
 
-    Draws are weighted by the prior of θ, or the likelihood, to the powers 0.25 and −0.2; the cumulative Jensen-Shannon
-    distance between the weighted and the plain distribution, per doubling of the weight, is averaged over the two. A
-    value above 0.05 is noticeable: of a normal distribution, a mean that moves by a sixth of its standard deviation as
-    the weight doubles. Both large tell of a conflict; only that to the prior large, of data that say little.
+    The draws are weighted by the prior of θ, or the likelihood, to the powers 0.25 and −0.2. The sensitivity is the
+    cumulative Jensen-Shannon distance between the weighted and the unweighted distribution per doubling of the weight,
+    averaged over the two powers. A value above 0.05 is noticeable: for a normal distribution, it is a shift of the mean
+    by a sixth of its standard deviation. If both are large, prior and likelihood are in conflict; if only the first is,
+    the data are uninformative. The two series of ArviZ that the package supports scale this diagnostic differently.
 
     References
     ----------
@@ -80,12 +81,10 @@ def power_scaling(problem: Problem, posterior: Posterior) -> dict[str, tuple[flo
     lp = posterior.data["sample_stats"]["lp"].transpose("chain", "draw").to_numpy().ravel()[::step]
     prior = np.asarray(problem.log_prior(theta))
     logs = SamplingDensity(problem).logarithmic
-    free = [name for name in problem.free_noise]
-    noise = problem.likelihood.complete(
-        np.array([posterior.draws(name)[::step] for name in free]).reshape(len(free), -1).T
-        if free
-        else np.empty((len(theta), 0))
-    )
+    free = np.empty((len(theta), len(problem.free_noise)))
+    for i, name in enumerate(problem.free_noise):
+        free[:, i] = posterior.draws(name)[::step]
+    noise = problem.likelihood.complete(free)
     likelihood = lp - prior - problem.likelihood.log_prior(noise) - np.log(theta[:, logs]).sum(axis=1)
     return {
         name: (_sensitivity(theta[:, i], prior), _sensitivity(theta[:, i], likelihood))
@@ -94,7 +93,6 @@ def power_scaling(problem: Problem, posterior: Posterior) -> dict[str, tuple[flo
 
 
 def _sensitivity(values: np.ndarray, log_density: np.ndarray) -> float:
-    """Return the mean distance per doubling between draws and draws weighted by a density to small powers."""
     distances = []
     for power in (POWER - 1.0, 1.0 / POWER - 1.0):
         logarithm = power * (log_density - log_density.max())
@@ -104,9 +102,9 @@ def _sensitivity(values: np.ndarray, log_density: np.ndarray) -> float:
 
 
 def cumulative_jensen_shannon(values: np.ndarray, weights: np.ndarray) -> float:
-    """Return the distance, 0 to 1, of draws from the same draws with weights; the larger of both directions.
+    """Return the normalised cumulative Jensen-Shannon distance, 0 to 1, between unweighted and weighted draws.
 
-    The root of the cumulative Jensen-Shannon divergence of the distribution functions over its largest value.
+    It is the larger one of the distances in the two directions of the axis.
 
     References
     ----------
@@ -135,52 +133,52 @@ def _one_sided(x: np.ndarray, plain: np.ndarray, weighted: np.ndarray) -> float:
 
 DETERMINED, PRIOR_ONLY = "determined", "only with the prior"
 COMBINATION, SIGN, NOTHING = "only in combination", "sign undetermined", "not determined"
-# In prior sds: what the data alone may leave for a parameter to be determined (a contraction of 0.9), and from where on
-# they say nothing (1 % of the prior's information).
+# Standard deviations left by the data alone, in prior sds: the largest one of determined parameters (a contraction of
+# 0.9), and the smallest one of undetermined parameters (1 % of the information of the prior).
 ENOUGH, SILENT = 1.0 / 3.0, 10.0
 COLLINEAR = 5.0
 ONE_SIGN = 0.975
 MONTE_CARLO_ERRORS = 3.0
 NULL = 1e-13
 PRIOR_DRAWS = 20_000
-BOTH_SIGNS = "both signs fit the data: take a prior of one sign, or measure an output that is odd in it"
+BOTH_SIGNS = "both signs fit the data: use a prior of one sign, or measure an output that is odd in it"
 
 
 @dataclass(frozen=True)
 class Identifiability(Result):
-    """What the data say about each parameter and each direction, against what the prior says.
+    """Identifiability of each parameter and each direction, relative to the prior.
 
     Attributes
     ----------
     table : DataFrame
-        A row a parameter. ``verdict``: "determined", "only with the prior", "only in combination", "sign undetermined"
-        or "not determined". ``contraction``: 1 − (posterior sd / prior sd)², of the logarithm of positive parameters,
-        with its Monte Carlo error ``contraction_mcse``. ``alone`` and ``together``: the sd that the data alone leave,
-        in prior sds, if the other parameters are known and if they are not; ``collinearity`` their ratio. ``profile``:
-        its shape. ``structural``: the parameters with which the equations let it change unseen, if any. ``p_negative``
-        and ``p_negative_mcse``: probability of a value below zero; NaN for positive parameters. ``prior_sensitivity``
-        and ``likelihood_sensitivity``: see `power_scaling`. ``evidence`` and ``remedy`` in words.
+        One row per parameter. ``verdict``: "determined", "only with the prior", "only in combination", "sign
+        undetermined" or "not determined". ``contraction``: 1 − (posterior sd / prior sd)², of the logarithm of positive
+        parameters, with its Monte Carlo error ``contraction_mcse``. ``alone`` and ``together``: the sd left by the data
+        alone, in prior sds, if the other parameters are known and if they are unknown; ``collinearity``: their ratio.
+        ``profile``: its shape. ``structural``: the parameters of a structural symmetry that contains it, if any.
+        ``p_negative`` and ``p_negative_mcse``: probability of a value below zero; NaN for positive parameters.
+        ``prior_sensitivity`` and ``likelihood_sensitivity``: distance per doubling of the prior or the likelihood
+        (power-scaling). ``evidence`` and ``remedy``: summary and recommendation.
     directions : DataFrame
-        A row a direction in parameter space, the one that the data say least about first: information of the data over
-        that of the prior, contraction, the direction in words, and combinations that do not change along it.
+        One row per direction in parameter space, in ascending order of information: information of the data over that
+        of the prior, contraction, the direction in words, its parameters, and combinations invariant along it.
     spectrum : array (names,)
-        Eigenvalues of the Fisher information, descending, per unit of the logarithm of positive parameters and of the
-        prior's sd of signed ones.
+        Eigenvalues of the Fisher information, descending, in units of the logarithm of positive parameters and of the
+        prior sd of signed ones.
     condition : float
-        The largest over the smallest.
+        The ratio of the largest to the smallest.
     experiments : DataFrame
-        Candidates for a further experiment, the most informative first: gain in nats, and what would be left of each
-        parameter's sd.
+        Candidates for a further experiment, the most informative first: expected gain in nats, and the remaining
+        fraction of each parameter's sd.
     structure : Structure
-        What the equations and the measured channels could determine at all, of the free parameters.
+        Structural identifiability of the free parameters from the measured channels.
     converged : bool
-        False if the draws, where there are any, have not converged.
+        False if there are draws that have not converged.
 
     Examples
     --------
-    With the mass free too, a weak motion at one frequency tells k − m·ω² and little more:
+    If the mass is free too, a weak motion at one frequency determines k − m·ω² and little more:
 
-    >>> import numpy as np, bayesperiodic as bp
     >>> force = {"force": 0.3 * np.cos(2 * np.pi * np.arange(32) / 32)}
     >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
     ...                   sampling_rate=4, noise={"displacement": 0.03}, seed=1).fold(32, harmonics=3)
@@ -207,12 +205,13 @@ class Identifiability(Result):
         return dict(self.table["verdict"])
 
     def __repr__(self) -> str:
-        lines = [] if self.converged else ["The draws have NOT CONVERGED; neither has what follows."]
+        lines = ["Identifiability of the parameters"]
         for name, row in self.table.iterrows():
-            lines.append(f"{name}: {row['verdict']}; {row['evidence']}.")
-            if row["remedy"]:
-                lines.append(f"    {row['remedy']}.")
-        lines.append(f"Fisher information: condition number {self.condition:.3g}.")
+            remedy = f"\n    Recommendation: {row['remedy']}." if row["remedy"] else ""
+            lines.append(f"{name}: {row['verdict']}; {row['evidence']}.{remedy}")
+        lines.append(f"The condition number of the Fisher information is {self.condition:.3g}.")
+        if not self.converged:
+            lines.append("The draws have NOT CONVERGED; these results are provisional.")
         return "\n".join(lines)
 
 
@@ -225,16 +224,19 @@ def identifiability(
     profile: Profile | bool = True,
     candidates: Iterable[tuple[str, float, float]] | None = None,
 ) -> Identifiability:
-    """Say of each parameter whether the data determine it, with the evidence and a remedy.
+    """Classify the identifiability of each parameter, with evidence and a recommendation.
 
-    Widths are those of the draws, or of the Laplace approximation where there are none, relative to the prior. In this
-    order: a signed parameter whose size is determined and whose sign is not (probability of either above 2.5 %, by more
-    than three Monte Carlo errors) has its "sign undetermined". One whose profile ([1]_) ends at the prior's support on
-    one side, and not because of other parameters, is determined "only with the prior". Where the data, with all else
-    known, have less than 1 % of the prior's information, it is "not determined". One that the equations themselves let
-    change together with others unseen, see `structure`, is determined "only in combination". Where the data alone, the
-    others unknown, leave less than a third of the prior's sd, it is "determined". For the rest, it is so "only in
-    combination" if the other parameters make it at least five times wider, else "only with the prior".
+    Widths are those of the draws, or of the Laplace approximation without draws, relative to the prior. The first
+    criterion that applies determines the verdict:
+
+    1. "sign undetermined": the size of a signed parameter is determined, but both signs have a probability above 2.5 %
+       (by more than three Monte Carlo errors).
+    2. "only with the prior": the profile ([1]_) ends at the support of the prior on one side, although the parameter is
+       not collinear with others.
+    3. "not determined": with all other parameters known, the data have less than 1 % of the information of the prior.
+    4. "only in combination": a structural symmetry of the equations contains the parameter, see `structure`.
+    5. "determined": with the other parameters unknown, the data alone leave less than a third of the prior sd.
+    6. "only in combination" if the other parameters increase its sd at least fivefold, otherwise "only with the prior".
 
     Parameters
     ----------
@@ -242,10 +244,10 @@ def identifiability(
     fit : MapEstimate
     posterior : Posterior, optional
     profile : Profile or bool
-        The profiles of all parameters, True to compute them, False to do without.
+        The profiles of all parameters, True to compute them, False to omit them.
     candidates : iterable of (run, frequency [Hz], scale), optional
-        Experiments that could be done: the inputs of a run, their variation scaled, at another frequency. By default
-        half, the same and twice the frequency and the amplitude of up to five runs.
+        Possible further experiments: the inputs of a run with scaled variation at another frequency. By default half,
+        once and twice the frequency and the amplitude of up to five runs.
 
     Returns
     -------
@@ -264,13 +266,6 @@ def identifiability(
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
     >>> bp.identifiability(problem, fit, profile=False).verdicts
     {'c': 'determined', 'k': 'determined'}
     """
@@ -310,7 +305,7 @@ def identifiability(
 
 
 def _partners(structure: Structure, name: str) -> list[str]:
-    """Return the parameters with which the equations let one change unseen, itself among them; none if they do not."""
+    """Return the parameters of the structural symmetries that contain one, itself included."""
     plain = name.partition("[")[0]
     found = [p for symmetry in structure.symmetries if plain in symmetry.parameters for p in symmetry.parameters]
     return list(dict.fromkeys(found))
@@ -319,7 +314,7 @@ def _partners(structure: Structure, name: str) -> list[str]:
 def _widths(
     problem: Problem, fit: MapEstimate, posterior: Posterior | None, information: Information
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return posterior over prior sd of each parameter in its coordinate, and the contraction's Monte Carlo error."""
+    """Return the ratio of posterior to prior sd of each coordinate, and the Monte Carlo error of the contraction."""
     if posterior is None:
         labels = list(problem.names)
         variances = np.diag(fit.joint_covariance.loc[labels, labels])
@@ -329,7 +324,7 @@ def _widths(
     for i, name in enumerate(problem.names):
         values = information.coordinate(name, posterior.draws(name))
         widths[i] = _half_width(values) / _half_width(information.coordinate(name, prior[:, i]))
-        # The error of half the central 68 % interval of a normal sample is 1.1 times that of its sd.
+        # The standard error of half the central 68 % interval of a normal sample is 1.1 times that of its sd.
         errors[i] = 2.0 * widths[i] ** 2 * 1.1 / np.sqrt(2.0 * posterior.ess[name])
     return widths, errors
 
@@ -357,7 +352,7 @@ def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, n
 
 
 def _size_known(problem: Problem, fit: MapEstimate, posterior: Posterior | None, name: str) -> bool:
-    """Return whether the data halve, at least, the prior's spread of a signed parameter's absolute value."""
+    """Return whether the data at least halve the width of the absolute value of a signed parameter."""
     if not _is_signed(problem, name):
         return False
     column = problem.names.index(name)
@@ -387,24 +382,23 @@ def _evidence(row: dict) -> str:
     error = f" ± {row['contraction_mcse']:.2g}" if row["contraction_mcse"] else ""
     text = f"contraction {row['contraction']:.3g}{error}"
     if row["collinearity"] >= COLLINEAR:
-        wider = "without limit" if not row["collinearity"] < 1e6 else f"{row['collinearity']:.3g} times"
-        text += f", the other parameters widen it {wider}"
+        factor = "infinitely" if not row["collinearity"] < 1e6 else f"{row['collinearity']:.3g} times"
+        text += f", the other parameters widen it {factor}"
     if row["structural"]:
-        text += ", by the equations themselves"
+        text += ", by a structural symmetry"
     if row["alone"] > ENOUGH and row["profile"] != ONE_SIDED:
-        text += f", the data alone would leave {row['alone']:.3g} prior sds with all else known"
+        text += f", the data alone would leave {row['alone']:.3g} prior sds with all other parameters known"
     if row["profile"] and row["profile"] != "closed":
-        text += f", its profile is {row['profile']}"
+        text += f", profile {row['profile']}"
     if np.isfinite(row["p_negative"]):
         text += f", P(negative) = {row['p_negative']:.3g}"
         text += f" ± {row['p_negative_mcse']:.2g}" if row["p_negative_mcse"] else ""
     if np.isfinite(row["prior_sensitivity"]) and row["prior_sensitivity"] > 0.05:
-        text += f", sensitive to the prior ({row['prior_sensitivity']:.2g} a doubling)"
+        text += f", sensitive to the prior ({row['prior_sensitivity']:.2g} per doubling)"
     return text
 
 
 def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame, structure: Structure) -> str:
-    """Return what to do about a parameter: what to fix, what to report, what to measure."""
     if row["verdict"] == DETERMINED:
         return ""
     if row["verdict"] == COMBINATION and row["structural"]:
@@ -424,21 +418,21 @@ def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.Data
             best = ranked.iloc[0]
             return (
                 f"measure {best['run']} at {best['frequency']:.3g} Hz with {best['scale']:.3g} times its amplitude: "
-                f"that would leave {best[name]:.0%} of the sd"
+                f"this would leave {best[name]:.0%} of the sd"
             )
-    return "report it with its prior, or fix it; no candidate for a further experiment narrows it by a tenth"
+    return "report it with its prior, or fix it; no candidate experiment would reduce its sd by 10 %"
 
 
 def _directions(information: Information) -> pd.DataFrame:
-    """Return the directions of parameter space by what the data say about them, the least first.
+    """Return the directions of parameter space in ascending order of information.
 
-    Directions about which they say nothing are shown with as few parameters each as possible.
+    Directions without information are reduced to as few parameters as possible.
     """
     gains, vectors = information.gains, information.directions.T
-    silent = gains < NULL * gains.max()
+    uninformed = gains < NULL * gains.max()
     shown = vectors.copy()
-    if silent.sum() > 1:
-        shown[silent] = reduced(vectors[silent])
+    if uninformed.sum() > 1:
+        shown[uninformed] = reduced(vectors[uninformed])
     rows = []
     for gain, vector in zip(gains, shown, strict=True):
         natural = np.where(np.abs(vector) > 0.05 * np.abs(vector).max(), vector, 0.0)

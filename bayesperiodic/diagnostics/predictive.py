@@ -1,4 +1,4 @@
-"""Posterior predictive checks: bands, on periods and on transients, and whether the model explains the data at all."""
+"""Posterior predictions of periods and transients, and tests of the model."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -19,25 +19,25 @@ from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
 
 PROBABILITY = 0.9
+# Of the median and of the ends of the central band.
+QUANTILES = (0.5, 0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY)
 NOISE_LEVELS = 21
 
 
 @dataclass(frozen=True)
 class Bands(Result):
-    """What is expected of the mean period of each experiment.
+    """Predictive bands of the mean period of each experiment.
 
     Attributes
     ----------
     median, low, high : dict of str to dict of str to array (points,)
-        By experiment and channel: the median and the central 90 % band of the mean period, residual variance included
-        and taken as normal at each point, within the harmonics kept. Section values with a covariance of their own have
-        the band of the model alone.
+        By experiment and channel: median and central 90 % band of the mean period within the kept harmonics, including
+        the residual variance, assumed normal at each point. Section values with a covariance of their own have the band
+        of the model alone.
     probability : float
         Of the band.
-    draws : int
-        Draws used.
-    failed : int
-        Of these, how many had no periodic solution.
+    draws, failed : int
+        Number of draws, and of those without a periodic solution.
     """
 
     median: dict[str, dict[str, np.ndarray]]
@@ -48,27 +48,13 @@ class Bands(Result):
     failed: int
 
 
-def quantiles() -> tuple[float, float, float]:
-    """Return the levels of the median and of the ends of the central band."""
-    return 0.5, 0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY
-
-
 def bands(
     problem: Problem,
     outputs: dict[str, dict[str, np.ndarray]],
     converged: np.ndarray,
     variances: dict[tuple[str, str], np.ndarray],
 ) -> Bands:
-    """Return the bands of outputs (draws, points), by experiment and channel, at the draws that converged.
-
-    Parameters
-    ----------
-    problem : Problem
-    outputs : dict of str to dict of str to array (draws, points)
-    converged : bool array (draws,)
-    variances : dict of (str, str) to array (draws,)
-        Of the residual, by experiment and channel; zero where there is none.
-    """
+    """Return the bands of outputs (draws, points) and residual variances (draws,) at the draws that converged."""
     count = converged.size
     scores = ndtri((np.arange(NOISE_LEVELS) + 0.5) / NOISE_LEVELS)
     found: list[dict[str, dict[str, np.ndarray]]] = [{}, {}, {}]
@@ -78,7 +64,7 @@ def bands(
             expected = e.project(channel, outputs[e.name][channel])
             noise = np.sqrt(variance)[:, None, None] * scores[:, None]
             values = (expected[:, None] + noise)[converged].reshape(-1, expected.shape[1])
-            for band, q in zip(found, quantiles(), strict=True):
+            for band, q in zip(found, QUANTILES, strict=True):
                 level = np.median(expected[converged], axis=0) if q == 0.5 else np.quantile(values, q, axis=0)
                 band.setdefault(e.name, {})[channel] = level
     median, low, high = found
@@ -90,21 +76,21 @@ Run = Callable[[dict[str, float]], Recording]
 
 @dataclass(frozen=True)
 class Transient(Result):
-    """What the posterior expects of a recording that is not periodic.
+    """Predictive bands of a transient recording.
 
     Attributes
     ----------
     time : array (samples,)
         [s].
     median, low, high : dict of str to array (samples,)
-        By output: the median and the central 90 % band, point by point, of the signals themselves: of the uncertainty
-        of the parameters alone, without measurement noise, unless `run` adds some.
+        By output: pointwise median and central 90 % band of the signals, for the uncertainty of the parameters alone,
+        without measurement noise unless `run` adds it.
     probability : float
         Of the band.
     draws : int
-        Runs made, one a draw.
+        Number of runs, one per draw.
     failures : dict of str to int
-        How many of them failed, by reason; they are left out.
+        Number of failed runs by reason; they are excluded.
     """
 
     time: np.ndarray
@@ -117,7 +103,7 @@ class Transient(Result):
 
     @property
     def failed(self) -> int:
-        """How many runs failed."""
+        """Number of failed runs."""
         return sum(self.failures.values())
 
     def __repr__(self) -> str:
@@ -130,44 +116,35 @@ class Transient(Result):
 
 
 def transient(problem: Problem, theta: np.ndarray, run: Run, experiment: str | None) -> Transient:
-    """Return the bands over time of the recordings that `run` makes at draws θ (draws, names).
-
-    Raises
-    ------
-    ValueError
-        If experiments differ in their parameters and none is named, an unknown experiment, anything else than a
-        recording, recordings whose times or outputs differ.
-    RuntimeError
-        If every run fails.
-    """
-    name = _whose(problem, experiment)
+    """Return the bands of the recordings that `run` returns at draws θ (draws, names)."""
+    name = _experiment_of(problem, experiment)
     names, time = problem.model.parameters, np.empty(0)
     signals: dict[str, list[np.ndarray]] = {}
     failures: Counter[str] = Counter()
     for row in problem.parameters(theta, name):
         try:
             recording = run(dict(zip(names, row.tolist(), strict=True)))
-        # An integrator that gives up raises one of these, and so does a recording of values that are not finite.
+        # Raised by integrators that fail, and by recordings of values that are not finite.
         except (RuntimeError, ArithmeticError, ValueError) as error:
             failures[f"{type(error).__name__}: {error}"] += 1
             last = error
             continue
         if not isinstance(recording, Recording):
-            raise ValueError(f"run: it returned a {type(recording).__name__}; it must return a Recording.")
+            raise ValueError(f"run: must return a Recording, got a {type(recording).__name__}.")
         if not signals:
             time, signals = recording.time, {output: [] for output in recording.outputs}
         _check_same(recording, time, signals)
         for output, values in recording.outputs.items():
             signals[output].append(values)
     if not signals:
-        raise RuntimeError(f"run: it failed at all {len(theta)} draws, last with: {last}") from last
-    levels = {output: np.quantile(values, quantiles(), axis=0) for output, values in signals.items()}
+        raise RuntimeError(f"run: failed at all {len(theta)} draws, last with: {last}") from last
+    levels = {output: np.quantile(values, QUANTILES, axis=0) for output, values in signals.items()}
     median, low, high = ({output: found[i] for output, found in levels.items()} for i in range(3))
     return Transient(time, median, low, high, PROBABILITY, len(theta), dict(failures))
 
 
-def _whose(problem: Problem, experiment: str | None) -> str:
-    """Return the experiment whose parameters the runs get; a ValueError where it matters and is not given."""
+def _experiment_of(problem: Problem, experiment: str | None) -> str:
+    """Return the experiment whose parameters the runs use; raise a ValueError if it is ambiguous."""
     names = [e.name for e in problem.experiments]
     if experiment is not None:
         _checks.one_of("experiment", experiment, names)
@@ -177,8 +154,8 @@ def _whose(problem: Problem, experiment: str | None) -> str:
         sources = {(m.columns.get(parameter), m.fixed.get(parameter)) for m in maps}
         if len(sources) > 1:
             raise ValueError(
-                f"experiment: None is not allowed with run; experiments differ in {parameter!r}, so name the one whose "
-                f"value the runs take: {', '.join(map(repr, names))}."
+                f"experiment: must be one of {', '.join(map(repr, names))} with `run`, got None. The experiments "
+                f"differ in {parameter!r}."
             )
     return names[0]
 
@@ -187,61 +164,53 @@ def _check_same(recording: Recording, time: np.ndarray, outputs: Mapping[str, li
     _checks.same_names("run: outputs of the recordings", recording.outputs, outputs)
     if recording.time.size != time.size or not np.allclose(recording.time, time, rtol=1e-9, atol=0.0):
         raise ValueError(
-            f"run: recordings of {time.size} and {recording.time.size} samples, from {time[0]:g} to {time[-1]:g} s and "
-            f"from {recording.time[0]:g} to {recording.time[-1]:g} s, are not allowed; all must have the same times."
+            f"run: all recordings must have the same times, got {time.size} and {recording.time.size} samples, from "
+            f"{time[0]:g} to {time[-1]:g} s and from {recording.time[0]:g} to {recording.time[-1]:g} s."
         )
 
 
-SAID = {
-    "whiteness": "its residual is not white",
-    "harmonics": "its residual has too much power in some harmonics",
-    "size": "its residual is larger than the measured noise",
-    "amplitude": "its amplitude is not what the posterior expects",
-    "consistency": "no common parameters explain what each experiment and channel allows on its own",
+REJECTIONS = {
+    "whiteness": "the residual is not white",
+    "harmonics": "the residual has excess power in some harmonics",
+    "size": "the residual is larger than the measured noise",
+    "amplitude": "the amplitude differs from the predicted one",
+    "consistency": "the experiments and channels are inconsistent with common parameters",
 }
 
 
 @dataclass(frozen=True)
 class Prediction(Bands):
-    """What the posterior expects of the mean period of each experiment, and whether that is what was measured.
+    """Posterior prediction of the mean period of each experiment, and tests of the model.
 
-    The verdict is on the model, not on how much the data determine: parameters that the data leave open can still fit
-    them ("adequate"), and parameters known to many digits can belong to a model that does not ("misspecified").
+    The verdict concerns the model, not the identifiability of its parameters: undetermined parameters can fit the data
+    ("adequate"), and precisely determined ones can belong to a wrong model ("misspecified").
 
     Attributes
     ----------
     median, low, high : dict of str to dict of str to array (points,)
-        By experiment and channel, in the channel's unit: the median and the central 90 % band of the mean period,
-        residual variance included and taken as normal at each point, within the harmonics kept. Section values with a
+        By experiment and channel, in the unit of the channel: median and central 90 % band of the mean period within
+        the kept harmonics, including the residual variance, assumed normal at each point. Section values with a
         covariance of their own have the band of the model alone.
     probability : float
         Of the band.
     draws, failed : int
-        Draws used, and how many of these had no periodic solution.
+        Number of draws, and of those without a periodic solution.
     table : DataFrame
-        A row for every experiment and channel, and the row "all". p-values, NaN where a test is not possible:
-        ``whiteness`` and ``harmonics`` of the residual along the period, in units of the noise model; ``size``, the
-        residual's variance against the measured scatter of the cycles (taken as exact with one cycle) or a variance
-        that was given; ``amplitude``, the rms of the period against replicates; ``consistency`` (row "all"), one set of
-        parameters against one for each experiment and channel. ``harmonic``: where the residual has most power in units
-        of the noise; of a mask's points it counts cosine waves. ``model_error_share``: the fraction of the residual's
-        variance beyond that of ``size``, NaN where none is known. ``p``: the row's smallest, adjusted by Holm's method
-        for all tests of the table; ``verdict``: "misspecified" where it is below 1 %, "adequate", or "not tested".
+        One row per experiment and channel, and the row "all". p-values, NaN if a test is not possible: ``whiteness``
+        and ``harmonics`` of the residual along the period, in units of the noise model; ``size``, the residual variance
+        against the measured scatter of the cycles (assumed exact for one cycle) or a given variance; ``amplitude``, the
+        rms of the period against replicates; ``consistency`` (row "all"), common parameters against separate ones for
+        each experiment and channel. ``harmonic``: the one with the largest residual power in units of the noise (the
+        index of the cosine wave for masked data). ``model_error_share``: the fraction of the residual variance beyond
+        that of ``size``, NaN if unknown. ``p``: the smallest of the row, adjusted by Holm's method for all tests of the
+        table; ``verdict``: "misspecified" if it is below 1 %, "adequate", or "not tested".
     transient : Transient or None
-        Bands on the recordings that `run` makes.
+        Bands of the recordings of `run`.
     note : str
-        What the noise model hides from the tests, and whether the draws have not converged; "" if nothing.
+        Limitations: misfit that the noise model absorbs, draws that have not converged; "" without any.
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
-    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
     >>> found = bp.predict(problem, posterior, draws=50)
     >>> found.verdict, found.failed, found.median["synthetic duffing"]["displacement"].shape
     ('adequate', 0, (32,))
@@ -255,33 +224,35 @@ class Prediction(Bands):
 
     @property
     def verdict(self) -> str:
-        """The verdict on the model as a whole."""
+        """Verdict on the model as a whole."""
         return str(self.table.loc[ALL, "verdict"])
 
     @property
     def findings(self) -> dict[str, str]:
-        """What the tests found, in words, by the rows of the table; without those that found nothing."""
+        """Rejections in words, by row of the table."""
         found = {}
         for (label, row), small in zip(self.table.iterrows(), adjusted_p(self.table) < LEVEL, strict=True):
-            said = [
-                f"{SAID[test]} (p = {row[test]:.2g})" for test, is_small in zip(TESTS, small, strict=True) if is_small
+            reasons = [
+                f"{REJECTIONS[test]} (p = {row[test]:.2g})"
+                for test, rejected in zip(TESTS, small, strict=True)
+                if rejected
             ]
-            if said:
-                share = row["model_error_share"]
-                error = "" if np.isnan(share) else f"; {share:.1%} of its variance is model error"
-                found[str(label)] = f"{', '.join(said)}{error}"
+            if reasons:
+                error = row["model_error_share"]
+                text = "" if np.isnan(error) else f"; {error:.1%} of the residual variance is model error"
+                found[str(label)] = f"{', '.join(reasons)}{text}"
         return found
 
     def __repr__(self) -> str:
-        head = f"Prediction from {self.draws} draws, {self.failed} without a periodic solution: "
-        if self.verdict == UNTESTED:
-            head += "too few values to test the model."
-        else:
-            head += f"the model is {self.verdict} (all tests together give a false alarm in {LEVEL:.0%})."
-        lines = [head, *(f"  {label}: {text}" for label, text in self.findings.items())]
-        lines += [self.note] if self.note else []
-        lines += [repr(self.transient)] if self.transient else []
-        return "\n".join([*lines, self.table.to_string(float_format="{:.2g}".format, na_rep="-")])
+        lines = [
+            f"Tests of the model from {self.draws} draws, {self.failed} without a periodic solution",
+            self.table.to_string(float_format="{:.2g}".format, na_rep="-"),
+            "There are too few values to test the model."
+            if self.verdict == UNTESTED
+            else f"The model is {self.verdict} (overall false alarm rate {LEVEL:.0%}).",
+            *(f"{label}: {text}." for label, text in self.findings.items()),
+        ]
+        return "\n".join([*lines, *filter(None, [self.note]), *([repr(self.transient)] if self.transient else [])])
 
 
 @in_one_thread
@@ -293,17 +264,17 @@ def predict(
     run: Run | None = None,
     experiment: str | None = None,
 ) -> Prediction:
-    """Predict the mean period of every experiment, and test whether the measured one could have come from the model.
+    """Predict the mean period of every experiment, and test the model against the measured one.
 
-    The tests are made where their p-values are known: on the residual at the draw with the highest density, without all
-    that a change of the parameters, in that experiment and channel alone, could explain. They are exact for models
-    linear in the parameters, whatever the priors, and do not depend on how well the data determine the parameters. The
-    amplitude is compared with replicates [1]_, whose parameters were fitted to the data: its p is conservative [2]_.
+    The tests use the residual at the draw with the highest density, projected orthogonally to its changes under the
+    parameters of that experiment and channel, so that their null distributions are known. They are exact for models
+    linear in the parameters, for any prior, and independent of the identifiability of the parameters. The amplitude is
+    compared with replicates [1]_ whose parameters were fitted to the data: its p is conservative [2]_.
 
-    What is meant by noise decides what can be seen. Noise of unknown variance takes a misfit of any size as noise, so
-    only its shape along the period, or the scatter of the measured cycles, gives it away. Circulant noise takes a
-    correlated misfit as noise too, and then only the scatter does. A wrong prior is not a wrong model; only the
-    amplitude responds to it.
+    The noise model determines which misfit is detectable. With unknown variance, misfit of any size is taken as noise,
+    and only its shape along the period or the scatter of the measured cycles reveals it. Circulant noise also absorbs
+    correlated misfit; then only the scatter reveals it. The tests do not detect a wrong prior, except that of the
+    amplitude.
 
     Parameters
     ----------
@@ -312,11 +283,11 @@ def predict(
     draws : int
         Equally spaced posterior draws, at least 20.
     run : callable, optional
-        Makes the recording of a transient from the value of every parameter of the model at one draw, such as
-        ``lambda p: bp.simulate(model, p, inputs, frequency=1.0, duration=30.0, sampling_rate=100.0)``. Called once a
+        Returns the recording of a transient for a mapping of all parameters of the model, such as
+        ``lambda p: bp.simulate(model, p, inputs, frequency=1.0, duration=30.0, sampling_rate=100.0)``. Called once per
         draw; all recordings must have the same times and outputs.
     experiment : str, optional
-        Whose parameters `run` gets, where experiments differ in some.
+        The experiment whose parameters `run` gets; required if experiments differ in some.
 
     Returns
     -------
@@ -325,10 +296,10 @@ def predict(
     Raises
     ------
     ValueError
-        For too few draws, a posterior of another problem, an `experiment` that is needed and not given, or without
-        `run`, recordings that differ in their times or outputs.
+        For too few draws, a posterior of another problem, an `experiment` that is missing, unknown or given without
+        `run`, or recordings that differ in their times or outputs.
     RuntimeError
-        If no draw, or not the one with the highest density, has a periodic solution, or no run succeeds.
+        If no draw or not the one with the highest density has a periodic solution, or if all runs fail.
 
     References
     ----------
@@ -338,30 +309,22 @@ def predict(
 
     Examples
     --------
-    A spring that hardens, and a model without that term:
+    Data of a hardening spring, and a model without that term:
 
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
-    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
-    >>> bp.predict(problem, posterior, draws=50).verdict
+    >>> linear = bp.Problem(bp.models.duffing, [run], priors=problem.priors, fixed={"m": 1, "k3": 0}, scheme="fourier")
+    >>> draws = bp.sample(linear, bp.map_estimate(linear, progress=False), seed=1, max_steps=250, progress=False)
+    >>> bp.predict(linear, draws, draws=50).verdict
     'misspecified'
     """
     count = _checks.integer("draws", draws, 20)
     if experiment is not None and run is None:
-        raise ValueError(f"experiment: {experiment!r} is not allowed without run, whose parameters it chooses.")
+        raise ValueError(f"experiment: must be given together with `run`, got {experiment!r} without `run`.")
     every = (*problem.names, *problem.free_noise)
     _checks.contains("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
     columns = {name: posterior.draws(name) for name in posterior.names}
     chosen = np.linspace(0, next(iter(columns.values())).size - 1, count).astype(int)
     best = int(np.argmax(posterior.data["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()))
-    free = (
-        np.stack([columns[n][chosen] for n in problem.free_noise], -1) if problem.free_noise else np.empty((count, 0))
-    )
+    free = np.array([columns[name][chosen] for name in problem.free_noise]).reshape(-1, count).T
     noise = problem.likelihood.complete(free)
     points = np.stack([columns[name][chosen] for name in problem.names], axis=-1)
     peak = np.array([columns[name][best] for name in problem.names])
@@ -370,10 +333,7 @@ def predict(
     solved = anchored.responses.solve(points)
     converged = np.all([s.status == CONVERGED for s in solved.values()], axis=0)
     if not converged.any():
-        raise RuntimeError(
-            "posterior: none of its draws has a periodic solution, so nothing can be predicted. Give draws of this "
-            "problem."
-        )
+        raise RuntimeError("posterior: none of its draws has a periodic solution. Give draws of this problem.")
     outputs = {name: o.predicted(solved[name].response) for name, o in problem.observations.items()}
     predicted = bands(problem, outputs, converged, problem.likelihood.value_variances(noise))
     components = problem.likelihood.simulate(noise, np.random.default_rng(posterior.seed))
@@ -386,8 +346,7 @@ def predict(
     here = anchored.linearised(peak)
     if not here.converged:
         raise RuntimeError(
-            "posterior: its draw of the highest density has no periodic solution, so nothing is tested. Give draws of "
-            "this problem."
+            "posterior: its draw of highest density has no periodic solution. Give draws of this problem."
         )
     table = adequacy(problem, here, noise, replicates)
     recorded = None if run is None else transient(problem, points, run, experiment)
@@ -396,13 +355,13 @@ def predict(
 
 
 def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:
-    """Return what the noise model hides, and whether the draws can be trusted."""
-    said = []
+    """Return the limitations of the tests."""
+    notes = []
     if not posterior.converged:
-        said.append(f"The draws have not converged ({posterior.reason}), so bands and p-values are provisional.")
+        notes.append(f"The draws have not converged ({posterior.reason}), so bands and p-values are provisional.")
     if not problem.noise.flat and table["size"].drop(ALL).isna().any():
-        said.append(
+        notes.append(
             f"{problem.noise.name.capitalize()} noise takes a correlated misfit as noise; only the scatter of the "
-            "measured cycles would give it away, and it is not known everywhere."
+            "measured cycles would reveal it, and it is not known for all channels."
         )
-    return " ".join(said)
+    return " ".join(notes)

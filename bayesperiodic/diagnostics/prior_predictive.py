@@ -1,4 +1,4 @@
-"""Before any sampling: how much of the prior has the periodic orbit at all, and what outputs it expects."""
+"""Prior predictive check: existence of the periodic orbit, and predicted outputs."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -20,35 +20,33 @@ ENDS = {
     family.FOLD: (NO_ORBIT, "the branch ends in a fold"),
     family.EQUILIBRIUM: (NO_ORBIT, "the cycle shrinks to an equilibrium"),
     family.SHORTER: (NO_ORBIT, "the orbit merges with one of a shorter period"),
-    family.ROUND_FOLDS: (OTHER, "the branch folds and comes back, another orbit of it exists"),
+    family.ROUND_FOLDS: (OTHER, "the branch folds back to another orbit at the same parameters"),
     family.ARRIVED: (FAILED, "the orbit exists"),
-    family.LOST: (FAILED, "nor can the branch be followed"),
+    family.LOST: (FAILED, "the branch cannot be followed"),
 }
 
 
 @dataclass(frozen=True)
 class PriorPredictive(Result):
-    """What the prior expects of the periodic solves and of the outputs.
+    """Periodic solves and outputs over the prior.
 
     Attributes
     ----------
     table : DataFrame
-        A row an experiment: the shares of the draws whose solve converged, that have another orbit than the one small
-        steps from the prior's medians lead to, that have no orbit, and at which the solver failed although nothing
-        shows that there is none; and the share of the measured values ``inside`` the central 90 % of the draws'
-        outputs. In the row "all" a draw counts by its worst experiment, in this order.
+        One row per experiment: the fractions of draws whose solve converged, with another orbit than the one that
+        continues the orbit at the prior medians, without an orbit, and with a failed solve although no reason for the
+        absence of an orbit was found; and the fraction of the measured values ``inside`` the central 90 % of the
+        outputs of the draws. In the row "all" a draw counts by its worst experiment, in this order.
     causes : dict of str to float
-        Share of all solves, draws times experiments, by cause.
+        Fraction of all solves (draws times experiments) by cause of failure.
     outputs : Bands
         Median and central 90 % band of the outputs over the draws, without noise.
     draws : int
 
     Examples
     --------
-    With a prior of k this wide, one draw in 25 belongs to another branch of the resonance:
+    With a wide prior of k near resonance, one draw in 25 belongs to another branch:
 
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
     >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.2, duration=200,
     ...                   sampling_rate=8, noise={"displacement": 0.01}, seed=1).fold(32)
     >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 1.5)},
@@ -57,7 +55,7 @@ class PriorPredictive(Result):
     >>> expected.table.loc["all", ["converged", "other orbit", "no orbit"]].to_dict()
     {'converged': 0.96, 'other orbit': 0.04, 'no orbit': 0.0}
     >>> list(expected.causes)
-    ['other orbit (stalled): the branch folds and comes back, another orbit of it exists']
+    ['other orbit (stalled): the branch folds back to another orbit at the same parameters']
     >>> expected.outputs.low["synthetic duffing"]["displacement"].shape
     (32,)
     """
@@ -68,20 +66,20 @@ class PriorPredictive(Result):
     draws: int
 
     def __repr__(self) -> str:
-        causes = "".join(f"\n  {share:.1%}: {cause}" for cause, share in self.causes.items())
+        causes = "".join(f"\n  {fraction:.1%}: {cause}" for cause, fraction in self.causes.items())
         table = self.table.to_string(float_format="{:.1%}".format)
-        return f"PriorPredictive of {self.draws} draws\n{table}" + (f"\nfailed solves:{causes}" if causes else "")
+        head = f"Periodic solves and outputs for {self.draws} draws from the prior"
+        return f"{head}\n{table}" + (f"\nfailed solves:{causes}" if causes else "")
 
 
 @in_one_thread
 def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progress: bool = True) -> PriorPredictive:
-    """Solve every experiment for draws from the prior, and find out why some solves fail.
+    """Solve every experiment for draws from the prior, and classify failed solves.
 
-    The solves start from the orbits at the prior's medians. Where one fails, the branch of orbits through there is
-    followed by arclength along the straight line to the draw: where the branch ends in a fold, shrinks to an
-    equilibrium or merges with an orbit of a shorter period, there is no orbit of its kind at the draw; where it leads
-    there after all, there is one and the solver failed. The sampler gives both the density zero, so the first share
-    belongs to the model and the second is a defect to be counted.
+    The solves start from the orbits at the prior medians. After a failure, the branch of orbits is continued by
+    arclength along the straight line to the draw: if it ends in a fold, shrinks to an equilibrium or merges with an
+    orbit of a shorter period, the model has no such orbit at the draw; if it reaches the draw, the solver has failed.
+    The sampler assigns zero density in both cases, correctly in the first and wrongly in the second.
 
     Parameters
     ----------
@@ -90,7 +88,7 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
         At least 20.
     seed : int
     progress : bool
-        Show a progress bar while failed solves are looked into.
+        Show a progress bar over the failed solves.
 
     Returns
     -------
@@ -105,14 +103,8 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
 
     Examples
     --------
-    Priors that are wide enough to hold the measured period:
+    Priors that contain the measured period:
 
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
     >>> expected = bp.prior_predictive(problem, draws=50, progress=False)
     >>> float(expected.table.loc["synthetic duffing", "inside"])
     1.0
@@ -131,7 +123,7 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     if not converged.any():
         raise RuntimeError(
             f"problem: none of {count} draws from its priors has a periodic solution in all experiments. Narrow the "
-            "priors about values at which problem.solve(theta) converges."
+            "priors around values at which problem.solve(theta) converges."
         )
     prediction = bands(problem, outputs, converged, {})
     order = [STATUSES[CONVERGED], OTHER, NO_ORBIT, FAILED]
@@ -140,12 +132,12 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     rows = {name: {what: float(np.mean(row == what)) for what in order} for name, row in verdicts.items()}
     table = pd.DataFrame.from_dict(rows, orient="index")
     table["inside"] = [*(_inside(problem, prediction, e) for e in range(len(problem.experiments))), np.nan]
-    shares = {cause: number / (count * len(solved)) for cause, number in causes.most_common()}
-    return PriorPredictive(table, shares, prediction, count)
+    fractions = {cause: number / (count * len(solved)) for cause, number in causes.most_common()}
+    return PriorPredictive(table, fractions, prediction, count)
 
 
 def _inside(problem: Problem, prediction: Bands, index: int) -> float:
-    """Return the share of an experiment's measured values within the band."""
+    """Return the fraction of the measured values within the band."""
     e = problem.experiments[index]
     within = [
         (values >= prediction.low[e.name][channel]) & (values <= prediction.high[e.name][channel])

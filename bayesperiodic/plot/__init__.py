@@ -1,4 +1,4 @@
-"""Figures; every function takes the data and returns the matplotlib Figure."""
+"""Figures of data, estimates, posteriors, branches and orbits; every function returns the matplotlib Figure."""
 
 from bayesperiodic.plot.branches import branch, orbits, section
 from bayesperiodic.plot.data import fit, loops

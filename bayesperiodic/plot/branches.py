@@ -1,4 +1,4 @@
-"""Branches of periodic solutions."""
+"""Figures of branches of periodic solutions, Poincaré sections and orbits."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
@@ -30,25 +30,24 @@ def branch(
     figure: Figure | None = None,
     ax: Axes | None = None,
 ) -> Figure:
-    """Draw branches of periodic solutions: stable parts solid, unstable ones dashed, folds and period doublings marked.
+    """Draw branches of periodic solutions: stable parts solid, unstable ones dashed, with folds and period doublings.
 
     Parameters
     ----------
     branch, *more : Branch
-        Followed in the same quantity; each gets its own colour.
+        Continued in the same quantity, one colour per branch.
     measure : {"amplitude", "maximum", "section", "period"} or callable
-        What is drawn of each solution. Of the output: half of its range, its largest value, or its values at
-        tau = 0, 1, …, which tell an orbit of period p by p lines; or the response period; or a function of the
-        solution that returns a number or an array (a line for each component). The turns of a rotating angle do not
-        count.
+        Ordinate: half the range of the output, its maximum, or its values at tau = 0, 1, … (p lines for an orbit of
+        period p), without the turns of a rotating angle; or the response period; or a function of the solution that
+        returns a number or an array (one line per component).
     output : str, optional
         By default the first one.
     unit : str, optional
-        That of what is drawn; by default the output's, or s for the period.
+        Of the ordinate; by default that of the output, or s for the period.
     labels : sequence of str, optional
-        One for each branch, for the legend.
+        One per branch, for the legend.
     angular : bool
-        Show a frequency as the angular frequency in rad/s.
+        Show frequencies as angular frequencies in rad/s.
     figure : Figure, optional
         An empty figure to draw into.
     ax : Axes, optional
@@ -61,14 +60,12 @@ def branch(
     Raises
     ------
     ValueError
-        For an unknown output or measure, branches followed in different quantities, or a wrong number of labels.
+        For an unknown output or measure, branches in different quantities, or a wrong number of labels.
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
-    >>> start = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
-    ...                           frequency=0.1, samples=50, scheme="central4")
+    >>> start = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force,
+    ...                           frequency=0.1, samples=32, scheme="central4")
     >>> response = bp.continue_periodic(bp.models.duffing, start, "frequency", until=0.4, step=0.05, progress=False)
     >>> figure = bp.plot.branch(response)
     >>> figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()
@@ -76,9 +73,9 @@ def branch(
     """
     branches = (branch, *more)
     if len({b.vary for b in branches}) > 1:
-        raise ValueError(f"more: {[b.vary for b in more]} is not allowed; all must vary {branch.vary!r}.")
+        raise ValueError(f"more: branches must all vary {branch.vary!r}, got {[b.vary for b in more]}.")
     if labels is not None and len(labels) != len(branches):
-        raise ValueError(f"labels: {len(labels)} are not allowed; there must be {len(branches)}, one for each branch.")
+        raise ValueError(f"labels: must be {len(branches)}, one per branch, got {len(labels)}.")
     output = next(iter(branch[0].outputs)) if output is None else output
     _checks.one_of("output", output, branch[0].outputs)
     if not callable(measure):
@@ -104,7 +101,7 @@ def branch(
 
 
 def _measures(branch: Branch, measure: str | Callable, output: str) -> np.ndarray:
-    """Return what is drawn of a branch, (points, lines)."""
+    """Return the ordinates of a branch, (points, lines)."""
     if callable(measure):
         return np.array([np.ravel(measure(solution)) for solution in branch])
     if measure == "period":
@@ -122,7 +119,7 @@ def _measures(branch: Branch, measure: str | Callable, output: str) -> np.ndarra
 
 
 def _turns(solution: PeriodicSolution, output: str) -> np.ndarray:
-    """Return the steady advance of an output that is a rotating angle, zero for any other."""
+    """Return the uniform rotation of an output that is a rotating angle, zero for any other."""
     values = solution.outputs[output]
     for state, turns in solution.winding.items():
         if turns and np.ptp(values - solution.states[state]) < 1e-6:
@@ -131,10 +128,7 @@ def _turns(solution: PeriodicSolution, output: str) -> np.ndarray:
 
 
 def _runs(branch: Branch) -> list[tuple[bool, slice]]:
-    """Return the stretches of the branch that are stable or unstable, each from its first to its last point.
-
-    A fold or a period doubling belongs to both neighbours; its own verdict is rounding.
-    """
+    """Return the stable and unstable parts of the branch; folds and period doublings belong to both neighbours."""
     plain = [None if kind else solution.stable for solution, kind in zip(branch, branch.kinds, strict=True)]
     between = [True in pair and False not in pair for pair in zip(plain[:-1], plain[1:], strict=True)]
     starts = [i for i in range(len(between)) if i == 0 or between[i] != between[i - 1]]
@@ -180,12 +174,12 @@ def section(
     figure: Figure | None = None,
     ax: Axes | None = None,
 ) -> Figure:
-    """Draw a Poincaré section, and the points of periodic orbits by their period (de Kraker et al. 1997, fig. 5).
+    """Draw a Poincaré section with the points of periodic orbits by period (de Kraker et al. 1997, fig. 5).
 
     Parameters
     ----------
     section : PoincareSection
-        Of more than 20,000 points every so many are drawn.
+        At most 20,000 points are drawn.
     orbits : Orbits or sequence of Orbit
     units : mapping of str to str, optional
         Of the coordinates; angles are in rad.
@@ -200,13 +194,7 @@ def section(
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> points = [[0.1, 0.2]]
-    >>> for _ in range(400):
-    ...     x, y = points[-1]
-    ...     points.append([1 - 1.4 * x * x + y, 0.3 * x])
-    >>> henon = bp.PoincareSection.from_points(np.array(points), ("x", "y"), frequency=1.0)
-    >>> bp.plot.section(henon, units={"x": "m", "y": "m/s"}).axes[0].get_xlabel()
+    >>> bp.plot.section(henon_section, units={"x": "m", "y": "m/s"}).axes[0].get_xlabel()
     'x [m]'
     """
     if ax is None:
@@ -226,7 +214,8 @@ def section(
         handles.append(
             plt.Line2D([], [], mec="black", mew=0.5, label=f"period {period}: {len(members)} {noun}", **style)
         )
-    _label(ax, section.coordinates, section.angles, units)
+    ax.set_xlabel(_name(section.coordinates[0], section.angles, units))
+    ax.set_ylabel(_name(section.coordinates[1], section.angles, units))
     ax.legend(handles=handles, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=1.3)
     return cast(Figure, ax.figure)
 
@@ -237,7 +226,7 @@ def orbits(
     units: Mapping[str, str] | None = None,
     figure: Figure | None = None,
 ) -> Figure:
-    """Draw the phase portrait of each orbit: the measured cycle, the model's where polished, and the section points.
+    """Draw the phase portrait of each orbit: measured cycle, polished orbit of the model, and section points.
 
     Parameters
     ----------
@@ -259,17 +248,12 @@ def orbits(
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> x = np.zeros((2000, 2))
-    >>> for k in range(1999):
-    ...     x[k + 1] = 1 - 1.4 * x[k, 0] ** 2 + x[k, 1], 0.3 * x[k, 0]
-    >>> section = bp.PoincareSection.from_points(x[100:], ("x", "y"), frequency=1.0)
-    >>> figure = bp.plot.orbits(bp.find_orbits(section, periods=[1, 2]))
+    >>> figure = bp.plot.orbits(bp.find_orbits(henon_section, periods=[1, 2]))
     >>> [axes.get_title().splitlines()[0] for axes in figure.axes]
     ['period 1, winding 0', 'period 2, winding 0']
     """
     if not len(orbits):
-        raise ValueError("orbits: none is not allowed; at least one must be given.")
+        raise ValueError("orbits: must be at least one, got none.")
     columns = min(COLUMNS, len(orbits))
     rows = -(-len(orbits) // columns)
     figure = figure or plt.figure(figsize=(1.9 * columns + 0.6, 1.85 * rows + 0.7), layout="constrained")
@@ -279,7 +263,7 @@ def orbits(
     for ax in axes.flat[len(orbits) :]:
         ax.set_axis_off()
     for number, ax in enumerate(axes.flat[: len(orbits)]):
-        # The last panel of a column may stand above an empty one.
+        # The last panel of a column may be above an empty one.
         ax.tick_params(labelbottom=number + columns >= len(orbits))
     first = orbits[0]
     figure.supxlabel(_name(first.coordinates[0], first.angles, units), fontsize="medium")
@@ -290,8 +274,8 @@ def orbits(
 
 def _portrait(ax: Axes, orbit: Orbit) -> None:
     for signals, style in _cycles(orbit):
-        x, y = (_wrapped(signals[c]) if c in orbit.angles else signals[c] for c in orbit.coordinates)
-        # An angle that passes ±π jumps; nothing else moves by half its range between samples.
+        x, y = (np.angle(np.exp(1j * signals[c])) if c in orbit.angles else signals[c] for c in orbit.coordinates)
+        # Angles jump at ±π.
         jump = np.flatnonzero(np.abs(np.diff(x)) > np.pi) + 1 if orbit.angles else np.empty(0, dtype=int)
         ax.plot(np.insert(x, jump, np.nan), np.insert(y, jump, np.nan), **style)
     ax.plot(*orbit.points.T, "o", color=ENSEMBLES[1], mec="black", mew=0.6, ms=4.5, zorder=4)
@@ -301,7 +285,7 @@ def _portrait(ax: Axes, orbit: Orbit) -> None:
 
 
 def _cycles(orbit: Orbit) -> list[tuple[Mapping[str, np.ndarray], dict]]:
-    """Return the measured cycle and the model's, each closed, with how it is drawn."""
+    """Return the measured cycle and that of the model, closed, with their styles."""
     found: list[tuple[Mapping[str, np.ndarray], dict]] = []
     if orbit.cycle is not None:
         found.append((orbit.cycle, {"color": COLOURS["measured"], "lw": 2.2, "alpha": 0.45}))
@@ -309,10 +293,6 @@ def _cycles(orbit: Orbit) -> list[tuple[Mapping[str, np.ndarray], dict]]:
         closed = {c: np.append(v, v[0]) for c, v in orbit.solution.outputs.items() if c in orbit.coordinates}
         found.append((closed, {"color": COLOURS["map"], "lw": 1.0}))
     return found
-
-
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    return np.angle(np.exp(1j * angle))
 
 
 def _multiplier(orbit: Orbit) -> str:
@@ -329,13 +309,8 @@ def _handles(orbits: Orbits | Sequence[Orbit]) -> list[plt.Line2D]:
             plt.Line2D([], [], color=COLOURS["measured"], lw=2.2, alpha=0.45, label="closest measured cycle")
         )
     if any(orbit.solution is not None for orbit in orbits):
-        handles.append(plt.Line2D([], [], color=COLOURS["map"], lw=1.0, label="model's orbit"))
+        handles.append(plt.Line2D([], [], color=COLOURS["map"], lw=1.0, label="orbit of the model"))
     return handles
-
-
-def _label(ax: Axes, coordinates: Sequence[str], angles: Sequence[str], units: Mapping[str, str] | None) -> None:
-    ax.set_xlabel(_name(coordinates[0], angles, units))
-    ax.set_ylabel(_name(coordinates[1], angles, units))
 
 
 def _name(coordinate: str, angles: Sequence[str], units: Mapping[str, str] | None) -> str:

@@ -1,4 +1,4 @@
-"""Measured and fitted periods: over time, and as loops of an output against an input."""
+"""Figures of measured and fitted periods: over time, and as loops of an output against an input."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -33,7 +33,7 @@ def fit(
     estimate : MapEstimate
     prediction : Prediction, optional
     experiments : sequence of str, optional
-        Names of those to draw; by default all.
+        By default all.
     figure : Figure, optional
         An empty figure to draw into.
 
@@ -48,13 +48,6 @@ def fit(
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
     >>> figure = bp.plot.fit(problem, fit)
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['displacement [m]', 'residual [m]']
@@ -89,7 +82,7 @@ def fit(
 
 
 def _line(axes: Axes, e: Experiment, values: np.ndarray, marker: str, **look: Any) -> None:
-    """Draw values over time; single points where only these were measured."""
+    """Draw values over time, as points for masked data."""
     if e.mask is None:
         axes.plot(e.time, values, **look)
     else:
@@ -111,7 +104,7 @@ def loops(
     input: str | None = None,
     figure: Figure | None = None,
 ) -> Figure:
-    """Draw an output against an input and against that input's rate, measured and fitted, for every experiment.
+    """Draw an output against an input and against the rate of the input, measured and fitted, for every experiment.
 
     Parameters
     ----------
@@ -132,13 +125,6 @@ def loops(
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
     >>> figure = bp.plot.loops(problem, fit)
     >>> [axes.get_xlabel() for axes in figure.axes]
     ['force [N]', 'rate of force [N/s]']
@@ -169,15 +155,11 @@ def loops(
 
 
 def _loop(axes: Axes, e: Experiment, across: np.ndarray, values: np.ndarray, marker: str, **look: Any) -> None:
-    """Draw a closed curve; single points where only these were measured."""
+    """Draw a closed curve, or points for masked data."""
     if e.mask is None:
-        axes.plot(_closed(across), _closed(values), **look)
+        axes.plot(np.append(across, across[0]), np.append(values, values[0]), **look)
     else:
         axes.plot(across[e.mask], values[e.mask], **look | {"ls": "none", "marker": marker})
-
-
-def _closed(values: np.ndarray) -> np.ndarray:
-    return np.append(values, values[0])
 
 
 def _measured(problem: Problem, cycles: int) -> str:

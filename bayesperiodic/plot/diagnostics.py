@@ -1,6 +1,7 @@
-"""Where truths lie among the answers: histograms, distribution functions, coverage."""
+"""Figures of calibrations, comparisons of Laplace with MCMC, and profiles."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -8,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import ndtri
 
-from bayesperiodic import _checks
 from bayesperiodic.diagnostics.calibration import (
     Calibration,
     bin_count,
@@ -22,27 +22,27 @@ from bayesperiodic.diagnostics.comparison import Comparison
 from bayesperiodic.diagnostics.verdicts import END_SHIFT, ERRORS, FINE, LEVELS
 from bayesperiodic.estimation.profile import CLOSED, Profile
 from bayesperiodic.plot.posterior import chosen, draw_marginal, panel_grid
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, said_of, wrapped_label
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, caveats, wrapped_label
 
 LEVEL = 0.99
-# Of the histograms' axes, for the legend.
+# Factor on the height of the histogram axes, for the legend.
 HEADROOM = 1.45
 COLUMNS = {
-    "truths in each bin / expected": "position of the truth in the posterior",
+    "count per bin / expected": "position of the truth in the posterior",
     "distribution function − diagonal": "position of the truth in the posterior",
     "coverage − probability": "probability of the interval",
 }
 LABELS = {"mcmc": "MCMC", "laplace": "Laplace"}
 LINES = {"mcmc": "-", "laplace": "--"}
+BAND: dict[str, Any] = {"color": "grey", "alpha": 0.25, "lw": 0}
 
 
 def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
-    """Draw rank histograms, empirical distribution functions and coverage of every quantity, MCMC and Laplace together.
+    """Draw rank histograms, empirical distribution functions and coverage of every quantity, for MCMC and Laplace.
 
-    A row a quantity. Left the histogram of where the truth lies among the answers, flat if calibrated, with the band of
-    99 % of each bin; a ∪ means intervals that are too narrow. In the middle the distribution function less the
-    diagonal, with the band that holds all of it with 99 %. Right the coverage of central intervals less their
-    probability, with the pointwise band of 99 %.
+    One row per quantity. Left: histogram of the positions of the truth, flat if calibrated, with the 99 % band of each
+    bin; a ∪ shape indicates intervals that are too narrow. Middle: distribution function minus the diagonal, with its
+    simultaneous 99 % band. Right: coverage of central intervals minus their probability, with the pointwise 99 % band.
 
     Parameters
     ----------
@@ -56,15 +56,8 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = np.cos(2 * np.pi * np.arange(32) / 32)
-    >>> run = bp.Experiment("run", 0.1, {"displacement": force}, {"force": force}, samples=32, cycles=4,
-    ...                     harmonics={"displacement": 5, "force": 5})
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"k": bp.LogNormal(1, 0.1)}, scheme="fourier",
-    ...                      fixed={"m": 1, "c": 0.2, "k3": 0.5, "variance[displacement]": 1e-4})
-    >>> found = bp.calibrate(problem, replicates=2, seed=1, max_steps=250, progress=False)
-    >>> [axes.get_title() for axes in bp.plot.ranks(found).axes]
-    ['truths in each bin / expected', 'distribution function − diagonal', 'coverage − probability']
+    >>> [axes.get_title() for axes in bp.plot.ranks(calibration).axes]
+    ['count per bin / expected', 'distribution function − diagonal', 'coverage − probability']
     """
     names = calibration.names
     figure = figure or plt.figure(figsize=(10.5, 2.1 * len(names) + 1.0), layout="constrained")
@@ -74,10 +67,12 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
         for method in METHODS:
             values = calibration.positions[method][name]
             values = np.sort(values[np.isfinite(values)])
-            said = f"{LABELS[method]}: {verdicts[method, name]}"
-            _histogram(row[0], values, method, said)
-            _distribution(row[1], values, method)
-            _coverage(row[2], values, method)
+            _histogram(row[0], values, method, f"{LABELS[method]}: {verdicts[method, name]}")
+            points, size, banded = evaluation_points(), values.size, method == METHODS[0] and values.size
+            steps = np.searchsorted(values, points, side="right") / max(size, 1)
+            _deviation(row[1], steps, ecdf_band(size, LEVEL) if banded else None, method)
+            covered = np.array([coverage(values, level) for level in points])
+            _deviation(row[2], covered, binomial_band(size, points, 1.0 - LEVEL) if banded else None, method)
         row[0].set_ylim(0.0, HEADROOM * row[0].get_ylim()[1])
         row[0].set_ylabel(wrapped_label(name, ""))
         row[0].legend(frameon=False, fontsize="small", loc="upper center")
@@ -94,49 +89,37 @@ def _histogram(axes: Axes, values: np.ndarray, method: str, label: str) -> None:
     expected = max(values.size, 1) / bins
     if method == METHODS[0] and values.size:
         low, high = binomial_band(values.size, np.array(1.0 / bins), 1.0 - LEVEL)
-        axes.axhspan(float(low) * bins, float(high) * bins, color="grey", alpha=0.25, lw=0)
+        axes.axhspan(float(low) * bins, float(high) * bins, **BAND)
     axes.stairs(counts / expected, edges, color=COLOURS[method], ls=LINES[method], lw=1.6, label=label)
     axes.set_xlim(0.0, 1.0)
 
 
-def _distribution(axes: Axes, values: np.ndarray, method: str) -> None:
+def _deviation(axes: Axes, values: np.ndarray, band: tuple[np.ndarray, np.ndarray] | None, method: str) -> None:
+    """Draw a function of the evaluation points minus the points themselves, with its band."""
     points = evaluation_points()
-    if method == METHODS[0] and values.size:
-        low, high = ecdf_band(values.size, LEVEL)
-        axes.fill_between(points, low - points, high - points, color="grey", alpha=0.25, lw=0)
-    steps = np.searchsorted(values, points, side="right") / max(values.size, 1)
-    axes.plot(points, steps - points, color=COLOURS[method], ls=LINES[method], lw=1.4)
+    if band is not None:
+        axes.fill_between(points, band[0] - points, band[1] - points, **BAND)
+    axes.plot(points, values - points, color=COLOURS[method], ls=LINES[method], lw=1.4)
     axes.set_xlim(0.0, 1.0)
 
 
-def _coverage(axes: Axes, values: np.ndarray, method: str) -> None:
-    levels = evaluation_points()
-    if method == METHODS[0] and values.size:
-        low, high = binomial_band(values.size, levels, 1.0 - LEVEL)
-        axes.fill_between(levels, low - levels, high - levels, color="grey", alpha=0.25, lw=0)
-    axes.plot(
-        levels, [coverage(values, level) - level for level in levels], color=COLOURS[method], ls=LINES[method], lw=1.4
-    )
-    axes.set_xlim(0.0, 1.0)
-
-
-# Those of several lines that mean nothing else.
+# Looks of several lines, in colours without another meaning.
 LOOKS = [(colour, style) for style in ("-", "-.") for colour in ENSEMBLES if colour not in COLOURS.values()]
 LIMIT = 4.0
 
 
 def comparison(comparison: Comparison, *, names: Sequence[str] | None = None, figure: Figure | None = None) -> Figure:
-    """Draw a comparison of Laplace with MCMC: marginals, quantiles against quantiles, and ellipsoid coverage.
+    """Draw a comparison of Laplace with MCMC: marginals, quantile-quantile plot, and coverage of the ellipsoids.
 
-    Quantiles are distances from the MAP in sds of the draws; the grey band is as far as an end may be off. Named are
-    the parameters with a verdict other than "fine", the six farthest from Laplace. Ellipsoids are those of all
-    coordinates together, whatever names are drawn; their band is three Monte Carlo errors wide to each side.
+    Quantiles are distances from the MAP in sds of the draws; the grey band is the tolerance of the ends of an interval.
+    The legend names parameters with another verdict than "fine", at most six with the largest distances from Laplace.
+    Ellipsoids are those of all coordinates, independent of `names`; their band is ± three Monte Carlo errors.
 
     Parameters
     ----------
     comparison : Comparison
     names : sequence of str, optional
-        Those to draw; by default all.
+        By default all.
     figure : Figure, optional
         An empty figure with a constrained layout to draw into.
 
@@ -151,17 +134,9 @@ def comparison(comparison: Comparison, *, names: Sequence[str] | None = None, fi
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
-    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
     >>> figure = bp.plot.comparison(bp.compare(problem, fit, posterior))
     >>> [axes.get_xlabel().splitlines()[0] for axes in figure.axes]
-    ['c', 'k', 'Laplace quantile − MAP [posterior sd]', "probability of Laplace's ellipsoid"]
+    ['c', 'k', 'Laplace quantile − MAP [posterior sd]', 'probability of the Laplace ellipsoid']
     """
     names = chosen(names, tuple(comparison.table.index))
     columns, rows = panel_grid(len(names))
@@ -177,8 +152,8 @@ def comparison(comparison: Comparison, *, names: Sequence[str] | None = None, fi
     for axes in panels[len(names) :]:
         axes.remove()
     top.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
-    if said := said_of(comparison.synthetic, comparison.converged):
-        top.suptitle(said, x=0.99, ha="right", fontsize="medium")
+    if text := caveats(comparison.synthetic, comparison.converged):
+        top.suptitle(text, x=0.99, ha="right", fontsize="medium")
     left, right = below.subplots(1, 2)
     _quantiles(left, comparison, names)
     _interval_coverage(right, comparison)
@@ -197,7 +172,7 @@ def _quantiles(axes: Axes, comparison: Comparison, names: Sequence[str]) -> None
     wrong = table[table["verdict"] != FINE].sort_values("wasserstein", ascending=False).index[: len(LOOKS)]
     axes.axline((0.0, 0.0), slope=1.0, color=COLOURS["laplace"], lw=1.4, ls="--")
     reach = np.array([-LIMIT, LIMIT])
-    axes.fill_between(reach, reach - END_SHIFT, reach + END_SHIFT, color="grey", alpha=0.25, lw=0)
+    axes.fill_between(reach, reach - END_SHIFT, reach + END_SHIFT, **BAND)
     unnamed = "fine" if set(table["verdict"]) == {FINE} or len(wrong) == sum(table["verdict"] != FINE) else "others"
     for name in [*table.index.difference(wrong, sort=False), *wrong]:
         line = table.loc[name]
@@ -230,8 +205,8 @@ def _interval_coverage(axes: Axes, comparison: Comparison) -> None:
     axes.set_xlim(0.0, 1.0)
     axes.set_ylim(0.0, 1.0)
     axes.set_aspect("equal")
-    axes.set_xlabel("probability of Laplace's ellipsoid")
-    axes.set_ylabel("share of the draws inside")
+    axes.set_xlabel("probability of the Laplace ellipsoid")
+    axes.set_ylabel("fraction of the draws inside")
     axes.set_title(
         rf"jointly: {comparison.joint['verdict']}, $\hat{{k}}$ = {comparison.joint['pareto_k']:.2f}", fontsize="medium"
     )
@@ -244,17 +219,16 @@ AT_90, DEEPEST = -0.5 * 1.6449**2, -4.2
 
 
 def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Figure | None = None) -> Figure:
-    """Draw each profile over the Laplace approximation's parabola, with the level that a 90 % interval reaches down to.
+    """Draw each profile with the parabola of the Laplace approximation and the level of a 90 % interval.
 
-    Where the parabola leaves the profile, the standard deviation misleads; a profile that does not come down is named.
-    Values over more than two decades have a logarithmic axis. A parabola without a finite standard deviation is left
-    out.
+    If the parabola departs from the profile, the standard deviation is misleading. Profiles that are not closed are
+    labelled. Axes over more than two decades are logarithmic. Parabolas without a finite sd are omitted.
 
     Parameters
     ----------
     profile : Profile
     names : sequence of str, optional
-        Those to draw; by default all.
+        By default all.
     figure : Figure, optional
         An empty figure to draw into.
 
@@ -269,23 +243,12 @@ def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Fig
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
-    >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
-    ...                          frequency=0.1, samples=50)
-    >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5, "variance[displacement]": 0.01})
-    >>> followed = bp.profile(problem, bp.map_estimate(problem, progress=False), ["k"])
-    >>> figure = bp.plot.profile(followed)
+    >>> figure = bp.plot.profile(bp.profile(problem, fit, ["k"]))
     >>> figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()
     ('k [N/m]', 'relative log-density')
     """
-    shown = profile.names if names is None else tuple(names)
-    for name in shown:
-        _checks.one_of("names", name, profile.names)
-    columns = min(len(shown), PROFILES_ACROSS)
-    rows = -(-len(shown) // columns)
+    shown = chosen(names, profile.names)
+    columns, rows = panel_grid(len(shown), PROFILES_ACROSS)
     figure = figure or plt.figure(figsize=(3.0 * columns + 0.8, 2.7 * rows + 0.6), layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
     for axes, name in zip(panels, shown, strict=False):
@@ -329,7 +292,7 @@ def _profile_panel(axes: Axes, profile: Profile, name: str) -> None:
 
 
 def _laplace_range(profile: Profile, name: str) -> np.ndarray:
-    """Return values as far as three standard deviations, where that is within the support and not far beyond."""
+    """Return values within three standard deviations, limited by the support and half the drawn range beyond it."""
     values, reach, (low, high) = profile.values[name], 3.0 * profile.sd[name], profile.limits[name]
     margin = 0.5 * np.ptp(values)
     return np.linspace(

@@ -1,4 +1,4 @@
-"""All pairs of parameters: draws, and the Laplace approximation on top."""
+"""Figures of posterior draws: corner plot, marginals and traces, with the Laplace approximation."""
 
 from collections.abc import Sequence
 
@@ -8,15 +8,16 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
+from scipy.stats import norm
 
 from bayesperiodic import _checks
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, caveats, unit_of, wrapped_label
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, caveats_of, unit_of, wrapped_label
 from bayesperiodic.sampling.posterior import Posterior
 
 LEVELS = (0.5, 0.9)
 FEWEST_BINS, MOST_BINS = 35, 200
-# Powers of ten from and to which ticks are written out.
+# Range of the powers of ten of ticks without an offset or a common factor.
 WHOLE = (-5, 10)
 
 
@@ -27,11 +28,11 @@ def corner(
     names: Sequence[str] | None = None,
     figure: Figure | None = None,
 ) -> Figure:
-    """Draw all pairs of parameters, with the Laplace approximation's ellipses on top.
+    """Draw all pairs of parameters, with the ellipses of the Laplace approximation on top.
 
-    Contours of draws and ellipses hold 50 and 90 % of the probability. The ellipses of parameters are those of
-    `MapEstimate.covariance`. Noise parameters are drawn as v ± v·sd(ln v) around the mode in sampling coordinates,
-    independent of the parameters; what has no Laplace approximation has no ellipse.
+    Contours and ellipses contain 50 and 90 % of the probability. The ellipses of parameters are those of
+    `MapEstimate.covariance`. Those of noise parameters are v ± v·sd(ln v) around the mode in sampling coordinates,
+    independent of the parameters. Quantities without a Laplace approximation have no ellipse.
 
     Parameters
     ----------
@@ -52,14 +53,6 @@ def corner(
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
-    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
     >>> figure = bp.plot.corner(posterior, laplace=fit, names=["c", "k"])
     >>> len(figure.axes), figure.axes[2].get_xlabel().splitlines()
     (4, ['c', '[N s/m]'])
@@ -90,7 +83,7 @@ def corner(
         labelpad=0.12,
         fig=figure or plt.figure(figsize=(size, size)),
     )
-    _with_whole_values(figure)
+    _write_out_ticks(figure)
     if laplace is not None:
         mean, covariance = normal_approximation(names, laplace)
         _laplace_on_corner(np.array(figure.axes).reshape(len(names), len(names)), mean, covariance)
@@ -102,16 +95,16 @@ def corner(
 
 
 def _bins(draws: np.ndarray) -> int:
-    """Return how many bins it takes for a ridge to be drawn no wider than it is."""
+    """Return the number of bins that resolves the narrowest ridge."""
     correlation = np.corrcoef(draws.T) if draws.shape[1] > 1 else np.zeros((1, 1))
     np.fill_diagonal(correlation, 0.0)
     across = np.sqrt(1.0 - np.nanmax(correlation**2, initial=0.0))
-    # The range holds 6.6 standard deviations, of which three bins should span one across the ridge.
+    # The range spans 6.6 standard deviations; three bins should span one standard deviation across the ridge.
     return int(np.clip(20.0 / max(across, 1e-9), FEWEST_BINS, MOST_BINS))
 
 
-def _with_whole_values(figure: Figure) -> None:
-    """Let ticks have whole values: what they are to be added to or multiplied by would stand on another panel."""
+def _write_out_ticks(figure: Figure) -> None:
+    """Remove offsets and common factors of ticks, which would appear on another panel."""
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             formatter = axis.get_major_formatter()
@@ -130,28 +123,26 @@ def _corner_legend(figure: Figure, posterior: Posterior, laplace: bool, fontsize
         bbox_to_anchor=(0.97, 0.97),
         frameon=False,
         fontsize=fontsize,
-        title=caveats(posterior) or None,
+        title=caveats_of(posterior) or None,
         title_fontsize=fontsize,
     )
 
 
 def chosen(names: Sequence[str] | None, every: tuple[str, ...], argument: str = "names") -> tuple[str, ...]:
-    """Return the names to draw, checked."""
+    """Return the validated names to draw, by default all."""
     if names is None:
         return every
     if isinstance(names, str) or not len(names):
-        raise ValueError(
-            f"{argument}: {names!r} is not allowed; it must be a sequence of names, such as [{every[0]!r}]."
-        )
+        raise ValueError(f"{argument}: must be a sequence of names, such as [{every[0]!r}], got {names!r}.")
     for name in names:
         _checks.one_of(argument, name, every)
     if len(set(names)) < len(names):
-        raise ValueError(f"{argument}: {list(names)} is not allowed; a name is in it twice.")
+        raise ValueError(f"{argument}: must be different names, got {list(names)}.")
     return tuple(names)
 
 
 def normal_approximation(names: tuple[str, ...], fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean (names,) and covariance (names, names) in natural values; NaN where there are none."""
+    """Return the mean (names,) and covariance (names, names) in natural values; NaN if undefined."""
     _checks.contains("laplace", [*fit.theta, *fit.noise], names, "give an estimate of the same problem")
     theta, noise = [n for n in names if n in fit.theta], [n for n in names if n not in fit.theta]
     mean = np.array([fit.theta[n] if n in fit.theta else fit.joint_mode.get(n, np.nan) for n in names])
@@ -168,8 +159,7 @@ def _laplace_on_corner(axes: np.ndarray, mean: np.ndarray, covariance: np.ndarra
     for i in drawn:
         left, right = axes[i, i].get_xlim()
         x = np.linspace(left, right, 200)
-        sd = np.sqrt(variances[i])
-        density = np.exp(-0.5 * ((x - mean[i]) / sd) ** 2) / (sd * np.sqrt(2 * np.pi))
+        density = norm.pdf(x, mean[i], np.sqrt(variances[i]))
         axes[i, i].plot(x, density, color=COLOURS["laplace"], lw=1.6, ls="--")
         axes[i, i].set_ylim(0.0, 1.1 * max(density.max(), axes[i, i].get_ylim()[1] / 1.1))
         for j in drawn[drawn < i]:
@@ -178,7 +168,7 @@ def _laplace_on_corner(axes: np.ndarray, mean: np.ndarray, covariance: np.ndarra
 
 
 def _ellipses(axes: Axes, centre: np.ndarray, sds: np.ndarray, correlation: float) -> None:
-    """Draw the ellipses that hold the levels of a normal distribution of two quantities."""
+    """Draw the ellipses of the probability levels of a bivariate normal distribution."""
     turn = np.linspace(0.0, 2 * np.pi, 200)
     across = np.cos(turn)
     up = correlation * across + np.sqrt(max(1.0 - correlation**2, 0.0)) * np.sin(turn)
@@ -202,13 +192,13 @@ def marginals(
     names: Sequence[str] | None = None,
     figure: Figure | None = None,
 ) -> Figure:
-    """Draw the marginal distribution of every parameter, with the Laplace approximation's on top.
+    """Draw the marginal distribution of every parameter, with the Laplace approximation on top.
 
     Parameters
     ----------
     posterior : Posterior
     laplace : MapEstimate, optional
-        What it says of noise parameters is told at `corner`.
+        For noise parameters see `corner`.
     names : sequence of str, optional
         Full names such as "k", "theta16[run 7]" and "variance[force]"; by default all.
     figure : Figure, optional
@@ -225,14 +215,6 @@ def marginals(
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
-    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
     >>> figure = bp.plot.marginals(posterior, laplace=fit)
     >>> [axes.get_xlabel().splitlines()[0] for axes in figure.axes]
     ['c', 'k', 'variance[displacement]']
@@ -253,26 +235,25 @@ def marginals(
     for axes in panels[len(names) :]:
         axes.remove()
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
-    if said := caveats(posterior):
-        figure.suptitle(said, x=0.99, ha="right", fontsize="medium")
+    if text := caveats_of(posterior):
+        figure.suptitle(text, x=0.99, ha="right", fontsize="medium")
     return figure
 
 
-def panel_grid(count: int) -> tuple[int, int]:
-    """Return how many columns and rows hold so many panels."""
-    columns = min(count, ACROSS)
+def panel_grid(count: int, across: int = ACROSS) -> tuple[int, int]:
+    """Return the numbers of columns and rows of so many panels."""
+    columns = min(count, across)
     return columns, -(-count // columns)
 
 
 def draw_marginal(axes: Axes, edges: np.ndarray, density: np.ndarray, mean: float, sd: float) -> None:
-    """Draw a histogram of draws, and a normal density where its sd is finite."""
+    """Draw a histogram of draws, and a normal density if its sd is finite."""
     axes.stairs(density, edges, color=COLOURS["mcmc"], alpha=0.45, fill=True)
     axes.stairs(density, edges, color=COLOURS["mcmc"], lw=1.4, label="MCMC")
     if np.isfinite(sd) and sd > 0.0:
         width, reach = edges[-1] - edges[0], 3.0 * sd
         x = np.linspace(max(mean - reach, edges[0] - 0.5 * width), min(mean + reach, edges[-1] + 0.5 * width), 300)
-        normal = np.exp(-0.5 * ((x - mean) / sd) ** 2) / (sd * np.sqrt(2 * np.pi))
-        axes.plot(x, normal, color=COLOURS["laplace"], lw=1.6, ls="--", label="Laplace")
+        axes.plot(x, norm.pdf(x, mean, sd), color=COLOURS["laplace"], lw=1.6, ls="--", label="Laplace")
     axes.set_ylim(bottom=0.0)
     axes.set_yticks([])
     axes.locator_params(axis="x", nbins=4)
@@ -280,13 +261,13 @@ def draw_marginal(axes: Axes, edges: np.ndarray, density: np.ndarray, mean: floa
 
 
 def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = None) -> Figure:
-    """Draw, for every parameter, the paths of a few walkers of each ensemble.
+    """Draw the traces of a few walkers of each ensemble for every parameter.
 
     Parameters
     ----------
     posterior : Posterior
     walkers : int
-        Shown of each ensemble.
+        Number of walkers per ensemble.
     figure : Figure, optional
 
     Returns
@@ -296,18 +277,10 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
     Raises
     ------
     ValueError
-        For less than one walker.
+        For fewer than one walker.
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
-    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
     >>> figure = bp.plot.traces(posterior, walkers=2)
     >>> [axes.get_ylabel().splitlines()[0] for axes in figure.axes]
     ['c', 'k', 'variance[displacement]']
@@ -335,7 +308,7 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
             fontsize=7,
             bbox={"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1.5},
         )
-    rows[-1].set_xlabel("step after burn-in; a colour is an independent ensemble")
-    if said := caveats(posterior):
-        figure.suptitle(said)
+    rows[-1].set_xlabel("step after burn-in (one colour per ensemble)")
+    if text := caveats_of(posterior):
+        figure.suptitle(text)
     return figure
