@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesperiodic import plot
 from bayesperiodic._io import in_folder, written_whole
-from bayesperiodic.diagnostics.adequacy import ADEQUATE, MISSPECIFIED
+from bayesperiodic.diagnostics.adequacy import ADEQUATE, MISSPECIFIED, UNTESTED
 from bayesperiodic.diagnostics.comparison import Comparison
 from bayesperiodic.diagnostics.identifiability import DETERMINED, Identifiability
 from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction
@@ -19,23 +19,6 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.periodic.schemes import find_scheme
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.reporting import html, inputs, results
-from bayesperiodic.reporting.html import (
-    BAD,
-    CAUTION,
-    GOOD,
-    NEUTRAL,
-    Badge,
-    Block,
-    Figure,
-    Finding,
-    Findings,
-    Note,
-    Paragraph,
-    Section,
-    Table,
-    code,
-    page,
-)
 from bayesperiodic.reporting.inputs import ReportInputs
 from bayesperiodic.reporting.results import badge, embedded, mcmc_cells, underestimated_sds
 from bayesperiodic.sampling.checkpoint import fingerprint
@@ -44,71 +27,71 @@ from bayesperiodic.sampling.posterior import Posterior
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "xarray", "matplotlib")
 
 
-def summary_section(given: ReportInputs) -> Section:
+def summary_section(given: ReportInputs) -> html.Section:
     """Return the summary: the main findings, the warnings and the free parameters."""
-    blocks: list[Block] = [
-        Findings((_estimate(given), _draws(given), _data(given), _laplace(given), _model(given))),
-        *(Note(CAUTION, text) for text in (*remarks(given.problem, given.fit), *underestimated_sds(given))),
+    blocks: list[html.Block] = [
+        html.Findings((_estimate(given), _draws(given), _data(given), _laplace(given), _model(given))),
+        *(html.Note(html.CAUTION, text) for text in (*remarks(given.problem, given.fit), *underestimated_sds(given))),
         _parameters(given),
     ]
-    return Section("summary", "Summary", blocks)
+    return html.Section("summary", "Summary", blocks)
 
 
-def _estimate(given: ReportInputs) -> Finding:
+def _estimate(given: ReportInputs) -> html.Finding:
     fit = given.fit
     unexplained = ", ".join(f"{html.percent(f)} of the variance of {channel}" for channel, f in fit.fvu.items())
-    return Finding(
+    return html.Finding(
         "Did the search converge?",
-        Badge(GOOD if fit.converged else BAD, fit.status),
+        html.Badge(html.GOOD if fit.converged else html.BAD, fit.status),
         f"The search took {len(fit.history) - 1} steps. The fit leaves {unexplained} unexplained.",
     )
 
 
-def _draws(given: ReportInputs) -> Finding:
+def _draws(given: ReportInputs) -> html.Finding:
     question, posterior = "Have the draws converged?", given.posterior
     if posterior is None:
         text = "The posterior was not sampled; intervals are those of the Laplace approximation."
-        return Finding(question, Badge(NEUTRAL, "no draws"), text)
+        return html.Finding(question, html.Badge(html.NEUTRAL, "no draws"), text)
     failed = sum(posterior.failures.values())
-    return Finding(
+    return html.Finding(
         question,
-        Badge(GOOD, "converged") if posterior.converged else Badge(BAD, "not converged"),
+        html.Badge(html.GOOD, "converged") if posterior.converged else html.Badge(html.BAD, "not converged"),
         f"Stopped: {posterior.reason}; effective sample size at least {given.summary['ess'].min():.0f}, R-hat at most "
         f"{given.summary['rhat'].max():.4f}, {html.percent(failed) if failed else 'none'} of the proposals failed.",
     )
 
 
-def _data(given: ReportInputs) -> Finding:
+def _data(given: ReportInputs) -> html.Finding:
     verdicts = given.identifiability.verdicts
     others = [f"{name}: {verdict}" for name, verdict in verdicts.items() if verdict != DETERMINED]
-    return Finding(
+    return html.Finding(
         "Do the data determine the parameters?",
-        Badge(CAUTION if others else GOOD, f"{len(verdicts) - len(others)} of {len(verdicts)}"),
+        html.Badge(html.CAUTION if others else html.GOOD, f"{len(verdicts) - len(others)} of {len(verdicts)}"),
         f"{'; '.join(others) or 'Every free parameter is determined by the data'}.",
     )
 
 
-def _laplace(given: ReportInputs) -> Finding:
+def _laplace(given: ReportInputs) -> html.Finding:
     question, found = "Is the Laplace approximation accurate?", given.comparison
     if found is None:
-        return Finding(question, Badge(NEUTRAL, "not tested"), "This requires draws.")
+        return html.Finding(question, badge(UNTESTED), "This requires draws.")
     others = [f"{name}: {verdict}" for name, verdict in found.table["verdict"].items() if verdict != FINE]
-    marginal = f" Marginally {'; '.join(others)}." if others else ""
-    return Finding(question, badge(str(found.joint["verdict"])), f"Jointly: {found.joint['recommendation']}.{marginal}")
+    text = f"Jointly: {found.joint['recommendation']}." + (f" Marginally {'; '.join(others)}." if others else "")
+    return html.Finding(question, badge(str(found.joint["verdict"])), text)
 
 
-def _model(given: ReportInputs) -> Finding:
+def _model(given: ReportInputs) -> html.Finding:
     question, found = "Does the model explain the data?", given.prediction
     if found is None:
-        return Finding(question, Badge(NEUTRAL, "not tested"), given.no_prediction or "This requires draws.")
+        return html.Finding(question, badge(UNTESTED), given.no_prediction or "This requires draws.")
     text = {
         MISSPECIFIED: f"The tests reject the model for {', '.join(found.findings)}.",
         ADEQUATE: "No test contradicts the model.",
     }.get(found.verdict, "There are too few values for a test.")
-    return Finding(question, badge(found.verdict), text)
+    return html.Finding(question, badge(found.verdict), text)
 
 
-def _parameters(given: ReportInputs) -> Table:
+def _parameters(given: ReportInputs) -> html.Table:
     fit, intervals, rows = given.fit, given.fit.interval(PROBABILITY), []
     robust = fit.interval(PROBABILITY, robust=True) if given.robust_ratios else {}
     laplace = {} if given.comparison is None else dict(given.comparison.table["verdict"])
@@ -116,7 +99,7 @@ def _parameters(given: ReportInputs) -> Table:
         rounding = html.Rounding.of(value, fit.sd[name])
         drawn = mcmc_cells(given, name, rounding)
         row = {
-            "Parameter": code(name),
+            "Parameter": html.code(name),
             "Unit": given.unit(name),
             "MAP": rounding.text(value),
             "90 % interval": drawn["MCMC: 90 % interval"] if drawn else rounding.interval(*intervals[name]),
@@ -126,19 +109,19 @@ def _parameters(given: ReportInputs) -> Table:
         row |= {"Laplace approximation": badge(laplace[name])} if laplace else {}
         rows.append(row)
     source = "the Laplace approximation (Student’s t)" if given.posterior is None else "MCMC"
-    return Table("table-summary", f"Free parameters; 90 % intervals from {source}.", rows)
+    return html.Table("table-summary", f"Free parameters; 90 % intervals from {source}.", rows)
 
 
-def sampling_section(given: ReportInputs, posterior: Posterior) -> Section:
+def sampling_section(given: ReportInputs, posterior: Posterior) -> html.Section:
     """Return the section on the convergence of the draws."""
-    blocks: list[Block] = []
+    blocks: list[html.Block] = []
     if not posterior.converged:
         text = f"The draws have NOT CONVERGED, and all results from them are provisional: {posterior.reason}."
-        blocks.append(Note(BAD, text))
+        blocks.append(html.Note(html.BAD, text))
     failed = ", ".join(f"{status} {html.percent(rate)}" for status, rate in posterior.failures.items() if rate)
     rows = [
         {
-            "Quantity": code(str(name)),
+            "Quantity": html.code(str(name)),
             "Effective sample size": html.Number(f"{row['ess']:.0f}"),
             "Autocorrelation time [steps]": html.number(row["tau"], 3),
             "R-hat between ensembles": html.Number(f"{row['rhat']:.4f}"),
@@ -146,13 +129,13 @@ def sampling_section(given: ReportInputs, posterior: Posterior) -> Section:
         for name, row in given.summary.iterrows()
     ]
     blocks += [
-        Paragraph(
+        html.Paragraph(
             f"Stopped: {posterior.reason}; {posterior.log_posterior_calls} evaluations of the posterior density, "
             f"{html.percent(posterior.acceptance)} of the proposals accepted. Proposals with a failed periodic solve: "
             f"{failed or 'none'}."
         ),
-        Table("table-sampling", "Convergence of the draws, in sampling coordinates.", rows),
-        Figure(
+        html.Table("table-sampling", "Convergence of the draws, in sampling coordinates.", rows),
+        html.Figure(
             "figure-traces",
             embedded(plot.traces(posterior, walkers=2), "traces"),
             f"Traces of some walkers of each ensemble for {', '.join(posterior.names)}; the largest R-hat is "
@@ -161,10 +144,10 @@ def sampling_section(given: ReportInputs, posterior: Posterior) -> Section:
             wide=True,
         ),
     ]
-    return Section("sampling", "Sampling", blocks)
+    return html.Section("sampling", "Sampling", blocks)
 
 
-def record_section(given: ReportInputs) -> Section:
+def record_section(given: ReportInputs) -> html.Section:
     """Return the section on settings and versions."""
     problem, fit, posterior = given.problem, given.fit, given.posterior
     shifts = {name: abs(shift) for name, shift in fit.doubling_shift.items() if np.isfinite(shift)}
@@ -191,14 +174,14 @@ def record_section(given: ReportInputs) -> Section:
             "Drawn with": ", ".join(programs),
         }
     versions = {"Python": platform.python_version()} | {name: importlib.metadata.version(name) for name in PACKAGES}
-    rows = [{"Setting": name, "Value": code(value)} for name, value in settings.items()]
-    programs_used = [{"Program": name, "Version": code(value)} for name, value in versions.items()]
-    return Section(
+    rows = [{"Setting": name, "Value": html.code(value)} for name, value in settings.items()]
+    programs_used = [{"Program": name, "Version": html.code(value)} for name, value in versions.items()]
+    return html.Section(
         "record",
         "Settings and versions",
         [
-            Table("table-settings", "Settings.", rows),
-            Table("table-versions", "Versions in use when this page was written.", programs_used),
+            html.Table("table-settings", "Settings.", rows),
+            html.Table("table-versions", "Versions in use when this page was written.", programs_used),
         ],
     )
 
@@ -273,10 +256,9 @@ def report(
         record_section(given),
     ]
     written = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    text = html.page(title or problem.model.name, _subtitle(problem), _badges(given), sections, written)
     with written_whole(target) as draft:
-        draft.write_text(
-            page(title or problem.model.name, _subtitle(problem), _badges(given), sections, written), encoding="utf-8"
-        )
+        draft.write_text(text, encoding="utf-8")
     return target
 
 
@@ -287,12 +269,13 @@ def _subtitle(problem: Problem) -> str:
     return f"Model {problem.model.name}, {free}, {runs} with {values}"
 
 
-def _badges(given: ReportInputs) -> list[Badge]:
-    found = [Badge(CAUTION, "synthetic data") if given.synthetic else Badge(NEUTRAL, "measured data")]
+def _badges(given: ReportInputs) -> list[html.Badge]:
+    tone, data = (html.CAUTION, "synthetic") if given.synthetic else (html.NEUTRAL, "measured")
+    found = [html.Badge(tone, f"{data} data")]
     if not given.fit.converged:
-        found.append(Badge(BAD, f"fit {given.fit.status}"))
+        found.append(html.Badge(html.BAD, f"fit {given.fit.status}"))
     if given.posterior is None:
-        found.append(Badge(NEUTRAL, "no draws"))
+        found.append(html.Badge(html.NEUTRAL, "no draws"))
     elif not given.posterior.converged:
-        found.append(Badge(BAD, "draws NOT CONVERGED"))
+        found.append(html.Badge(html.BAD, "draws NOT CONVERGED"))
     return found

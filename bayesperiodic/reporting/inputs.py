@@ -24,7 +24,6 @@ from bayesperiodic.posterior import labels
 from bayesperiodic.posterior.parameters import SHIFT
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.reporting import html
-from bayesperiodic.reporting.html import CAUTION, Block, Equations, Note, Paragraph, Section, Table, code
 from bayesperiodic.sampling.posterior import Posterior
 
 # Level of the whiteness test, and the ratio of robust to Laplace sd above which the report warns.
@@ -128,7 +127,7 @@ def _check_data(posterior: Posterior, problem: Problem) -> None:
         )
 
 
-def data_section(given: ReportInputs) -> Section:
+def data_section(given: ReportInputs) -> html.Section:
     """Return the section on the data, by experiment and by channel."""
     experiments = [
         {
@@ -149,24 +148,26 @@ def data_section(given: ReportInputs) -> Section:
         for kind, channels in (("input", e.inputs), ("output", e.outputs))
         for channel in channels
     ]
-    blocks: list[Block] = [
-        Table(
+    blocks: list[html.Block] = [
+        html.Table(
             "table-experiments",
             "Experiments. The periodicity is the fraction of the variance that the mean period explains.",
             experiments,
         ),
-        Table("table-channels", "Channels: prescribed (inputs) and compared with the model (outputs).", channels),
+        html.Table("table-channels", "Channels: prescribed (inputs) and compared with the model (outputs).", channels),
     ]
     if given.synthetic:
-        blocks.insert(0, Note(CAUTION, "Some or all of these data are synthetic: they were simulated, not measured."))
-    return Section("data", "Data", blocks)
+        blocks.insert(
+            0, html.Note(html.CAUTION, "Some or all of these data are synthetic: they were simulated, not measured.")
+        )
+    return html.Section("data", "Data", blocks)
 
 
 def _channel(given: ReportInputs, e: Experiment, channel: str, kind: str) -> dict[str, str]:
     values = (e.inputs if kind == "input" else e.outputs)[channel]
     measured = values if e.mask is None or kind == "input" else values[e.mask]
     return {
-        "Channel": code(channel),
+        "Channel": html.code(channel),
         "Experiment": e.name,
         "Kind": kind if e.mask is None or kind == "input" else f"{kind}, at {measured.size} points",
         "Unit": given.unit(channel),
@@ -311,7 +312,7 @@ NOISE_MODELS = {
 }
 
 
-def model_section(given: ReportInputs) -> Section:
+def model_section(given: ReportInputs) -> html.Section:
     """Return the section on the equations, the parameters and the noise model."""
     problem, model, noise = given.problem, given.problem.model, given.problem.noise
     states = ", ".join(f"{name} [{given.unit(name)}]" for name in model.states)
@@ -322,7 +323,7 @@ def model_section(given: ReportInputs) -> Section:
     noise_model = NOISE_MODELS.get(noise.name, f"user-defined, with parameters for each {noise.per}.").format(own)
     parameters = [
         {
-            "Parameter": code(name),
+            "Parameter": html.code(name),
             "Symbol": symbol(name.partition("[")[0]),
             "Unit": given.unit(name),
             "Role": role,
@@ -331,17 +332,17 @@ def model_section(given: ReportInputs) -> Section:
         for plain in (*model.parameters, SHIFT)
         for name, role, known in _roles(problem, plain)
     ]
-    blocks: list[Block] = [
-        Paragraph(
+    blocks: list[html.Block] = [
+        html.Paragraph(
             f"The model {model.name} has the state{'s' if len(model.states) > 1 else ''} {states}. A dot is a "
             f"derivative with respect to time, per second{clocks}."
         ),
-        Equations("equations", "Equations of motion", equations(model), model.latex()),
-        Equations("outputs", "Output equations", outputs(model)),
-        Table("table-parameters", "Parameters with their priors, fixed values or expressions.", parameters),
-        Paragraph(f"Noise model “{noise.name}”: {noise_model} Prior of the variances: {noise.prior_text}."),
+        html.Equations("equations", "Equations of motion", equations(model), model.latex()),
+        html.Equations("outputs", "Output equations", outputs(model)),
+        html.Table("table-parameters", "Parameters with their priors, fixed values or expressions.", parameters),
+        html.Paragraph(f"Noise model “{noise.name}”: {noise_model} Prior of the variances: {noise.prior_text}."),
     ]
-    return Section("model", "Model", blocks)
+    return html.Section("model", "Model", blocks)
 
 
 def _roles(problem: Problem, plain: str) -> Iterator[tuple[str, str, str]]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure as Drawing
+from matplotlib.figure import Figure
 
 from bayesperiodic import plot
 from bayesperiodic.diagnostics.adequacy import ADEQUATE, LEVEL, MISSPECIFIED, TESTS, UNTESTED
@@ -15,43 +15,28 @@ from bayesperiodic.diagnostics.identifiability import DETERMINED, NOTHING
 from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction
 from bayesperiodic.diagnostics.verdicts import FINE, MODE, UNCONVERGED
 from bayesperiodic.reporting import html
-from bayesperiodic.reporting.html import (
-    BAD,
-    CAUTION,
-    GOOD,
-    NEUTRAL,
-    Badge,
-    Block,
-    Figure,
-    Heading,
-    Note,
-    Paragraph,
-    Section,
-    Table,
-    code,
-)
 from bayesperiodic.reporting.inputs import ReportInputs
 from bayesperiodic.sampling.posterior import Posterior
 
 MOST_PANELS = 7
 TONES = {
-    FINE: GOOD,
-    DETERMINED: GOOD,
-    ADEQUATE: GOOD,
-    MISSPECIFIED: BAD,
-    MODE: BAD,
-    UNCONVERGED: BAD,
-    NOTHING: BAD,
-    UNTESTED: NEUTRAL,
+    FINE: html.GOOD,
+    DETERMINED: html.GOOD,
+    ADEQUATE: html.GOOD,
+    MISSPECIFIED: html.BAD,
+    MODE: html.BAD,
+    UNCONVERGED: html.BAD,
+    NOTHING: html.BAD,
+    UNTESTED: html.NEUTRAL,
 }
 
 
-def badge(verdict: str) -> Badge:
+def badge(verdict: str) -> html.Badge:
     """Return the badge of a verdict; verdicts without a tone of their own get "caution"."""
-    return Badge(TONES.get(verdict, CAUTION), verdict)
+    return html.Badge(TONES.get(verdict, html.CAUTION), verdict)
 
 
-def embedded(drawing: Drawing, name: str) -> str:
+def embedded(drawing: Figure, name: str) -> str:
     """Return a figure as a data URL of an SVG image, reproducibly, and close it."""
     buffer = io.BytesIO()
     with plt.rc_context({"svg.hashsalt": name, "svg.fonttype": "path"}):
@@ -60,34 +45,34 @@ def embedded(drawing: Drawing, name: str) -> str:
     return f"data:image/svg+xml;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 
-def estimates_section(given: ReportInputs) -> Section:
+def estimates_section(given: ReportInputs) -> html.Section:
     """Return the section on the estimates: MAP, Laplace and MCMC side by side."""
     text = (
         "The MAP estimate is the maximum of the posterior density. The Laplace approximation is the normal "
         "distribution around it; its intervals are those of Student’s t. The robust standard deviation remains valid "
         "if the residual violates the noise model; a large difference between the two indicates such a violation. "
     )
-    blocks: list[Block] = [Note(CAUTION, f"Not determined by the data: {t}.") for t in given.fit.undetermined]
-    blocks.append(_parameters(given))
+    notes = [html.Note(html.CAUTION, f"Not determined by the data: {found}.") for found in given.fit.undetermined]
+    blocks: list[html.Block] = [*notes, _parameters(given)]
     if given.fit.noise:
         blocks.append(_noise(given))
     if given.posterior is None:
-        blocks.append(Paragraph(f"{text}The posterior was not sampled. There are no draws (MCMC)."))
+        blocks.append(html.Paragraph(f"{text}The posterior was not sampled. There are no draws (MCMC)."))
     else:
         blocks += [
-            Paragraph(f"{text}MCMC refers to the distribution of the posterior draws."),
+            html.Paragraph(f"{text}MCMC refers to the distribution of the posterior draws."),
             _corner(given, given.posterior),
         ]
-    return Section("estimates", "Estimates", blocks)
+    return html.Section("estimates", "Estimates", blocks)
 
 
-def _parameters(given: ReportInputs) -> Table:
+def _parameters(given: ReportInputs) -> html.Table:
     fit, intervals, rows = given.fit, given.fit.interval(PROBABILITY), []
     for name, value in fit.theta.items():
         rounding = html.Rounding.of(value, fit.sd[name])
         rows.append(
             {
-                "Parameter": code(name),
+                "Parameter": html.code(name),
                 "Unit": given.unit(name),
                 "MAP": rounding.text(value),
                 "Laplace: sd": rounding.sd(fit.sd[name]),
@@ -96,10 +81,10 @@ def _parameters(given: ReportInputs) -> Table:
                 **mcmc_cells(given, name, rounding),
             }
         )
-    return Table("table-estimates", "Estimates of the free parameters.", rows)
+    return html.Table("table-estimates", "Estimates of the free parameters.", rows)
 
 
-def _noise(given: ReportInputs) -> Table:
+def _noise(given: ReportInputs) -> html.Table:
     fit, rows = given.fit, []
     variances = dict(zip(fit.joint_covariance.index, np.diag(fit.joint_covariance), strict=True))
     for name, value in fit.noise.items():
@@ -110,7 +95,7 @@ def _noise(given: ReportInputs) -> Table:
         independent = fit.independent.get(channel, fit.independent.get(name, np.nan))
         rows.append(
             {
-                "Noise parameter": code(name),
+                "Noise parameter": html.code(name),
                 "Unit": given.unit(name),
                 "Independent values": html.number(independent, 6),
                 "Estimate (eq. 7)": rounding.text(value) if free else html.Number(f"{html.number(value, 6)} (known)"),
@@ -118,7 +103,7 @@ def _noise(given: ReportInputs) -> Table:
                 **mcmc_cells(given, name, rounding),
             }
         )
-    return Table("table-noise", "Estimates of the noise parameters.", rows)
+    return html.Table("table-noise", "Estimates of the noise parameters.", rows)
 
 
 def mcmc_cells(given: ReportInputs, name: str, rounding: html.Rounding) -> dict[str, str]:
@@ -132,7 +117,7 @@ def mcmc_cells(given: ReportInputs, name: str, rounding: html.Rounding) -> dict[
     return dict(zip(cells, (rounding.text(mean), rounding.sd(sd), rounding.interval(low, high)), strict=True))
 
 
-def _corner(given: ReportInputs, posterior: Posterior) -> Figure:
+def _corner(given: ReportInputs, posterior: Posterior) -> html.Figure:
     names = posterior.names
     correlations = np.atleast_2d(np.corrcoef(np.stack([posterior.draws(name) for name in names])))
     np.fill_diagonal(correlations, 0.0)
@@ -145,7 +130,7 @@ def _corner(given: ReportInputs, posterior: Posterior) -> Figure:
         i, j = sorted(np.unravel_index(np.argmax(np.abs(correlations)), correlations.shape))
         value = html.number(float(correlations[i, j]), 2)
         strongest = f" The strongest correlation is {value}, between {names[i]} and {names[j]}."
-    return Figure(
+    return html.Figure(
         "figure-corner",
         embedded(plot.corner(posterior, laplace=given.fit, names=shown), "corner"),
         f"Matrix of plots: marginal distributions of {', '.join(shown)} on the diagonal, contours of their pairs below "
@@ -156,7 +141,7 @@ def _corner(given: ReportInputs, posterior: Posterior) -> Figure:
     )
 
 
-def residuals_section(given: ReportInputs) -> Section:
+def residuals_section(given: ReportInputs) -> html.Section:
     """Return the section on the fit and the residual of every channel."""
     fit, problem, rows = given.fit, given.problem, []
     for channel, rms in fit.rms.items():
@@ -164,7 +149,7 @@ def residuals_section(given: ReportInputs) -> Section:
         noise, error = (np.nan, np.nan) if split is None else (split.measurement, split.model)
         rows.append(
             {
-                "Channel": code(channel),
+                "Channel": html.code(channel),
                 "Unit": given.unit(channel),
                 "rms of the residual": html.number(rms),
                 "Unexplained variance": html.percent(fit.fvu[channel]),
@@ -176,10 +161,10 @@ def residuals_section(given: ReportInputs) -> Section:
             }
         )
     caption = "Residual of each channel, measured minus MAP; standard deviations in the unit of the channel."
-    blocks: list[Block] = [Table("table-residuals", caption, rows)]
-    blocks += [Note(CAUTION, warning) for warning in underestimated_sds(given)]
+    blocks: list[html.Block] = [html.Table("table-residuals", caption, rows)]
+    blocks += [html.Note(html.CAUTION, warning) for warning in underestimated_sds(given)]
     blocks.append(
-        Paragraph(
+        html.Paragraph(
             "Measurement noise is the part of the residual that the scatter of the measured cycles explains, model "
             "error is the remainder. The whiteness p is the probability that white noise deviates at least as much "
             "from a flat spectrum; the autocorrelation is that of successive independent values."
@@ -189,7 +174,7 @@ def residuals_section(given: ReportInputs) -> Section:
     if problem.model.inputs:
         axes = f"{problem.channels[0]} against {problem.model.inputs[0]}, and against its rate"
         blocks.append(
-            Figure(
+            html.Figure(
                 "figure-loops",
                 embedded(plot.loops(problem, fit), "loops"),
                 f"Closed curves of {axes}, measured and fitted, for {len(problem.experiments)} experiments.",
@@ -197,7 +182,7 @@ def residuals_section(given: ReportInputs) -> Section:
                 wide=True,
             )
         )
-    return Section("fit", "Fit and residual", blocks)
+    return html.Section("fit", "Fit and residual", blocks)
 
 
 def underestimated_sds(given: ReportInputs) -> list[str]:
@@ -213,7 +198,7 @@ def underestimated_sds(given: ReportInputs) -> list[str]:
     ]
 
 
-def _fits(given: ReportInputs) -> Iterator[Figure]:
+def _fits(given: ReportInputs) -> Iterator[html.Figure]:
     problem, fit, prediction = given.problem, given.fit, given.prediction
     for place, e in enumerate(problem.experiments):
         channels = ", ".join(f"{channel} [{given.unit(channel)}]" for channel in e.outputs)
@@ -222,7 +207,7 @@ def _fits(given: ReportInputs) -> Iterator[Figure]:
             f"{html.number(float(np.sqrt(np.mean(fit.residuals[e.name][channel] ** 2))))} {given.unit(channel)}"
             for channel in e.outputs
         )
-        yield Figure(
+        yield html.Figure(
             f"figure-fit-{place + 1}",
             embedded(plot.fit(problem, fit, prediction, experiments=[e.name]), f"fit {place}"),
             f"Line plot over one period of experiment {e.name}: measured {channels}, the MAP fit on top{band}, and the "
@@ -231,53 +216,53 @@ def _fits(given: ReportInputs) -> Iterator[Figure]:
         )
 
 
-def verdicts_section(given: ReportInputs) -> Section:
+def verdicts_section(given: ReportInputs) -> html.Section:
     """Return the section on identifiability, the Laplace approximation and the adequacy of the model."""
     blocks = _identifiability(given)
-    blocks.append(Heading("laplace", "Is the Laplace approximation accurate?"))
+    blocks.append(html.Heading("laplace", "Is the Laplace approximation accurate?"))
     blocks += (
-        [Paragraph("Not tested: this requires draws.")] if given.comparison is None else _laplace(given.comparison)
+        [html.Paragraph("Not tested: this requires draws.")] if given.comparison is None else _laplace(given.comparison)
     )
-    blocks.append(Heading("adequacy", "Does the model explain the data?"))
+    blocks.append(html.Heading("adequacy", "Does the model explain the data?"))
     if given.prediction is None:
-        blocks.append(Paragraph(given.no_prediction or "Not tested: this requires draws."))
+        blocks.append(html.Paragraph(given.no_prediction or "Not tested: this requires draws."))
     else:
         blocks += _adequacy(given.prediction)
-    return Section("verdicts", "Verdicts", blocks)
+    return html.Section("verdicts", "Verdicts", blocks)
 
 
-def _identifiability(given: ReportInputs) -> list[Block]:
+def _identifiability(given: ReportInputs) -> list[html.Block]:
     found = given.identifiability
     rows = [
         {
-            "Parameter": code(str(name)),
+            "Parameter": html.code(str(name)),
             "Verdict": badge(row["verdict"]),
             "Evidence": row["evidence"],
             "Recommendation": row["remedy"] or html.NOTHING,
         }
         for name, row in found.table.iterrows()
     ]
-    blocks: list[Block] = [
-        Heading("identifiability", "Which parameters do the data determine?"),
-        Table("table-identifiability", "Identifiability of each parameter: data against prior.", rows),
-        Paragraph(
+    blocks: list[html.Block] = [
+        html.Heading("identifiability", "Which parameters do the data determine?"),
+        html.Table("table-identifiability", "Identifiability of each parameter: data against prior.", rows),
+        html.Paragraph(
             "The contraction is 1 − (posterior sd / prior sd)²: 1 if the parameter is determined by the data, 0 if its "
             "posterior equals its prior. The condition number of the Fisher information is "
             f"{html.number(found.condition)}."
         ),
     ]
     if found.structure.symmetries:
-        blocks.append(Paragraph("Structural symmetries, which no measurement of these channels can resolve:"))
-        blocks += [Paragraph(f"{symmetry!r}.") for symmetry in found.structure.symmetries]
+        blocks.append(html.Paragraph("Structural symmetries, which no measurement of these channels can resolve:"))
+        blocks += [html.Paragraph(f"{symmetry!r}.") for symmetry in found.structure.symmetries]
     return blocks
 
 
-def _laplace(found: Comparison) -> list[Block]:
+def _laplace(found: Comparison) -> list[html.Block]:
     two = html.Rounding(0, 2)
     columns = {"Shift": "shift", "Ratio of sds": "sd_ratio", "Skewness": "skewness", "Distance": "wasserstein"}
     rows = [
         {
-            "Coordinate": code(row["coordinate"]),
+            "Coordinate": html.code(row["coordinate"]),
             "Verdict": badge(row["verdict"]),
             **{t: html.Number(f"{two.text(row[c])} ± {two.text(row[f'{c}_mcse'])}") for t, c in columns.items()},
             "Recommendation": row["recommendation"],
@@ -295,7 +280,7 @@ def _laplace(found: Comparison) -> list[Block]:
         f"Joint verdict: {found.joint['verdict']}; {found.joint['recommendation']}. Laplace ellipsoids of 50, 90 and "
         f"95 % contain {inside} of the draws; Pareto k̂ {html.number(float(found.joint['pareto_k']), 2)}."
     )
-    figure = Figure(
+    figure = html.Figure(
         "figure-comparison",
         embedded(plot.comparison(found), "comparison"),
         "Marginal distributions of the draws with the Laplace approximation on top, their quantiles against each "
@@ -305,10 +290,10 @@ def _laplace(found: Comparison) -> list[Block]:
         "ellipsoids.",
         wide=True,
     )
-    return [Paragraph(joint), Table("table-laplace", caption, rows), figure]
+    return [html.Paragraph(joint), html.Table("table-laplace", caption, rows), figure]
 
 
-def _adequacy(found: Prediction) -> list[Block]:
+def _adequacy(found: Prediction) -> list[html.Block]:
     rows = [
         {
             "Experiment and channel": str(label),
@@ -322,8 +307,8 @@ def _adequacy(found: Prediction) -> list[Block]:
         "Tests of the model. Verdicts use p-values adjusted for all tests of the table (Holm), with a false alarm rate "
         f"of {LEVEL:.0%}; the last column is the fraction of the residual variance beyond the measured noise."
     )
-    blocks: list[Block] = [Table("table-adequacy", caption, rows)]
-    blocks += [Paragraph(f"{label}: {words}.") for label, words in found.findings.items()]
+    blocks: list[html.Block] = [html.Table("table-adequacy", caption, rows)]
+    blocks += [html.Paragraph(f"{label}: {words}.") for label, words in found.findings.items()]
     if found.failed:
-        blocks.append(Paragraph(f"Of {found.draws} draws {found.failed} had no periodic solution."))
-    return [*blocks, Paragraph(found.note)] if found.note else blocks
+        blocks.append(html.Paragraph(f"Of {found.draws} draws {found.failed} had no periodic solution."))
+    return [*blocks, html.Paragraph(found.note)] if found.note else blocks
