@@ -5,8 +5,8 @@ together until the maps along the chain close it.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import label
@@ -39,58 +39,29 @@ Wrap = Callable[[np.ndarray], np.ndarray]
 Images = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A cycle of the local maps, not yet refined.
+class Candidate(NamedTuple):
+    """A cycle of the local maps, not yet refined."""
 
-    Attributes
-    ----------
-    points : array (period, 2)
-    returns : int
-        Close returns that led to it.
-    closest : int
-        Position of the first point of the closest measured cycle.
-    shift : int
-        The cycle's point that this first point belongs to.
-    """
-
-    points: np.ndarray
-    returns: int
-    closest: int
-    shift: int
+    points: np.ndarray  # (period, 2)
+    returns: int  # number of close returns that led to it
+    closest: int  # position of the first point of the closest measured cycle
+    shift: int  # the cycle's point that this first point belongs to
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A refined cycle of the local maps.
+class Estimate(NamedTuple):
+    """A refined cycle of the local maps."""
 
-    Attributes
-    ----------
-    points : array (period, 2)
-    eigenvalues : array (2,)
-    covariance : array (2·period + 2, 2·period + 2)
-        Of the points and of log|eigenvalue|.
-    bias : array (2·period + 2,)
-        Estimated.
-    turns : float
-        Turns of the angle, from the fits.
-    """
-
-    points: np.ndarray
-    eigenvalues: np.ndarray
-    covariance: np.ndarray
-    bias: np.ndarray
-    turns: float
+    points: np.ndarray  # (period, 2)
+    eigenvalues: np.ndarray  # (2,)
+    covariance: np.ndarray  # of the points and of log|eigenvalue|, (2·period + 2, 2·period + 2)
+    bias: np.ndarray  # estimated, (2·period + 2,)
+    turns: float  # of the angle, from the fits
 
 
 def newton_step(defect: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
     """Return the corrections (m, p, 2) that close m chains of p linearised maps.
 
-    Parameters
-    ----------
-    defect : array (m, p, 2)
-        Image of each point minus the next point.
-    jacobian : array (m, p, 2, 2)
+    The defects (m, p, 2) are the images minus the next points; the derivatives of the maps are (m, p, 2, 2).
     """
     m, p = defect.shape[:2]
     system = _closing_matrix(jacobian) + 1e-14 * np.eye(2 * p)
@@ -136,16 +107,7 @@ def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool
 
 
 def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) -> list[Candidate]:
-    """Return the cycles of a prime period to which close returns lead.
-
-    Parameters
-    ----------
-    maps : ReturnMap
-    atlas : Atlas
-    section : array (n, 2)
-        All points in the order of time.
-    period : int
-    """
+    """Return the cycles of a prime period to which close returns in the section (n, 2) lead."""
     starts, members = _close_returns(maps, section, period)
     chains = section[starts[:, None] + np.arange(period)]
     step, heir = _converge(maps, atlas, chains)
@@ -324,14 +286,13 @@ def _along(fit: LocalFit, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarr
 
 def _eigenvectors(jacobian: np.ndarray, which: int) -> tuple[np.ndarray, np.ndarray]:
     """Return right and left eigenvectors (p, 2) of the monodromy matrix at each point, largest eigenvalue first."""
-    right: list[np.ndarray] = []
-    left: list[np.ndarray] = []
-    for j in range(len(jacobian)):
-        monodromy = _monodromy(np.roll(jacobian, -j, axis=0))
-        for matrix, vectors in ((monodromy, right), (monodromy.T, left)):
-            values, columns = np.linalg.eig(matrix)
-            vectors.append(columns[:, np.argsort(-np.abs(values), kind="stable")[which]])
-    return np.array(right), np.array(left)
+    monodromy = np.stack([_monodromy(np.roll(jacobian, -j, axis=0)) for j in range(len(jacobian))])
+    vectors = []
+    for matrices in (monodromy, monodromy.transpose(0, 2, 1)):
+        values, columns = np.linalg.eig(matrices)
+        chosen = np.argsort(-np.abs(values), axis=1, kind="stable")[:, which]
+        vectors.append(columns[np.arange(len(columns)), :, chosen])
+    return vectors[0], vectors[1]
 
 
 def _joint_covariance(fits: list[LocalFit], cycle: np.ndarray) -> np.ndarray:
@@ -365,16 +326,11 @@ def _joint_covariance(fits: list[LocalFit], cycle: np.ndarray) -> np.ndarray:
 def box_orbits(
     maps: ReturnMap, section: np.ndarray, period: int, neighbours: int, box: float
 ) -> list[tuple[Candidate, Estimate]]:
-    """Return the orbits of one period by the method of [1]_, section 5.
+    """Return the orbits of one period by the method of de Kraker et al. (1997), section 5; see `find_orbits`.
 
     The section is divided into boxes. A point that is in its own or an adjacent box again after `period` steps is
     recurrent; adjacent boxes with several recurrent points are a candidate. The nearest points and their images after
     `period` steps give a linear map, whose fixed point and eigenvalues are the orbit's.
-
-    References
-    ----------
-    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
-       equilibrium states, 1997.
     """
     count = int(2.25 * neighbours)
     iterates = [_iterated(maps, section, k) for k in range(1, period + 1)]

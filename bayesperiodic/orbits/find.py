@@ -2,7 +2,8 @@
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -34,24 +35,12 @@ LARGEST_LOGARITHM_SD = 0.5
 STILL, SPREAD = 0.02, 20.0
 
 
-@dataclass(frozen=True)
-class _ScaledSection:
-    """A section in units of the attractor's size.
+class _ScaledSection(NamedTuple):
+    """A section in units of the attractor's size."""
 
-    Attributes
-    ----------
-    points : array (count, 2)
-    size : array (2,)
-        The unit.
-    maps : ReturnMap
-    extent : array (2,) or None
-        Ranges of the recorded signals.
-    """
-
-    points: np.ndarray
-    size: np.ndarray
+    points: np.ndarray  # (count, 2)
+    size: np.ndarray  # the unit, (2,)
     maps: ReturnMap
-    extent: np.ndarray | None
 
 
 @in_one_thread
@@ -158,8 +147,7 @@ def _scaled(section: PoincareSection, neighbours: int) -> _ScaledSection:
     if section.noise is None:
         noise = estimate_noise(maps, neighbours)
         maps = ReturnMap(points[:-1], section.increments / size, turn, section.winds, noise)
-    extent = None if section.signals is None else np.ptp(section.signals, axis=0)
-    return _ScaledSection(points, size, maps, extent)
+    return _ScaledSection(points, size, maps)
 
 
 def _search_count(maps: ReturnMap, neighbours: int) -> int:
@@ -243,8 +231,9 @@ def _orbit(
 
 def _at_rest(section: PoincareSection, scaled: _ScaledSection, cycle: dict[str, np.ndarray]) -> bool:
     """Return whether a measured cycle moves no more than by noise and its distance to the orbit."""
-    assert scaled.extent is not None
-    extent = np.where(scaled.maps.angle, np.minimum(scaled.extent, 2.0 * np.pi), scaled.extent)
+    assert section.signals is not None
+    extent = np.ptp(section.signals, axis=0)
+    extent = np.where(scaled.maps.angle, np.minimum(extent, 2.0 * np.pi), extent)
     limit = (STILL + SPREAD * scaled.maps.noise) * extent
     return all(np.ptp(cycle[name]) < limit[k] for k, name in enumerate(section.coordinates))
 

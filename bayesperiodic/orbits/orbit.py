@@ -166,14 +166,11 @@ class Orbit(Result):
         if winding is None:
             raise ValueError(f"winding: must be known, got None for {self.name!r}. Use polish_orbits first.")
         points = samples * self.period
-        covariance: np.ndarray | None = None
-        if whole:
-            outputs, mask = _measured_cycle(self, samples)
-        else:
-            covariance, mask = self.covariance, np.arange(points) % samples == 0
-            outputs = {name: np.zeros(points) for name in self.coordinates}
-            for name, values in zip(self.coordinates, self.points.T, strict=True):
-                outputs[name][mask] = values
+        measured = _measured_cycle(self, samples) if whole else dict(zip(self.coordinates, self.points.T, strict=True))
+        mask = np.arange(points) % (points // len(measured[self.coordinates[0]])) == 0
+        outputs = {name: np.zeros(points) for name in measured}
+        for name, values in measured.items():
+            outputs[name][mask] = values
         inputs = {} if self.solution is None else self.solution.inputs
         experiment = Experiment(
             self.name,
@@ -184,7 +181,7 @@ class Orbit(Result):
             periods=self.period,
             winding=winding if self.solution is None else self.solution.winding,
             mask=mask,
-            covariance=covariance,
+            covariance=None if whole else self.covariance,
             guess=_guess(self, samples, winding, states),
             synthetic=self.synthetic,
         )
@@ -295,18 +292,14 @@ def _on_grid(values: np.ndarray, points: int) -> np.ndarray:
     return values if values.size == points else _fourier.on_grid(_fourier.coefficients(values), points)
 
 
-def _measured_cycle(orbit: Orbit, samples: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return the measured cycle on the grid, and the mask of its points."""
+def _measured_cycle(orbit: Orbit, samples: int) -> Mapping[str, np.ndarray]:
+    """Return the measured cycle, whose samples are grid points."""
     if orbit.cycle is None:
         raise ValueError(f"whole: must be False, got True; {orbit.name!r} has no measured cycle.")
     measured = len(orbit.cycle[orbit.coordinates[0]]) // orbit.period
     if samples % measured:
         raise ValueError(f"samples: must be a multiple of the cycle's {measured} a forcing period, got {samples}.")
-    every, points = samples // measured, samples * orbit.period
-    outputs = {name: np.zeros(points) for name in orbit.coordinates}
-    for name in orbit.coordinates:
-        outputs[name][::every] = orbit.cycle[name]
-    return outputs, np.arange(points) % every == 0
+    return orbit.cycle
 
 
 def _guess(orbit: Orbit, samples: int, winding: int, states: Mapping[str, str] | None) -> dict[str, np.ndarray]:

@@ -23,29 +23,14 @@ BLOCK, MOST_NEIGHBOURS = 4_000_000, 6_000_000
 
 
 class LocalFit(NamedTuple):
-    """Polynomials of the return map about m centres.
+    """Polynomials of the return map about m centres."""
 
-    Attributes
-    ----------
-    value : array (m, 2)
-        Image of the centre, angles continuous from the centre.
-    derivatives : array (m, terms, 2)
-        Of the image by the argument (u, v): orders 0 (relative), u, v, uu, uv, vv, …
-    bandwidth : array (m,)
-    neighbours : array (m, n)
-        Positions among the arguments.
-    influence : array (m, n, terms, 2)
-        Contribution of each neighbour to the error of `derivatives`.
-    effective : array (m,)
-        Effective number of neighbours.
-    """
-
-    value: np.ndarray
-    derivatives: np.ndarray
-    bandwidth: np.ndarray
-    neighbours: np.ndarray
-    influence: np.ndarray
-    effective: np.ndarray
+    value: np.ndarray  # image of the centre, angles continuous from the centre, (m, 2)
+    derivatives: np.ndarray  # of the image by the argument: order 0 (relative), u, v, uu, uv, vv, …, (m, terms, 2)
+    bandwidth: np.ndarray  # (m,)
+    neighbours: np.ndarray  # positions among the arguments, (m, n)
+    influence: np.ndarray  # contribution of each neighbour to the error of `derivatives`, (m, n, terms, 2)
+    effective: np.ndarray  # effective number of neighbours, (m,)
 
     @property
     def jacobian(self) -> np.ndarray:
@@ -203,21 +188,13 @@ def _deconvoluted(
 
 
 class Atlas:
-    """Quadratic polynomials of the return map about points of the section, each valid up to its bandwidth.
-
-    Parameters
-    ----------
-    maps : ReturnMap
-    count : int
-        Neighbours of each fit.
-    """
+    """Quadratic polynomials of the return map about points of the section, from `count` neighbours each."""
 
     def __init__(self, maps: ReturnMap, count: int):
         self._maps, self._count = maps, count
         self._centres = maps.arguments[:: -(-len(maps.arguments) * count // MOST_NEIGHBOURS)]
-        fit = maps.fit(self._centres, count, 2, influence=False)
-        self._value, self._jacobian, self._hessian = fit.value, fit.jacobian, fit.hessian
-        self._bandwidth = fit.bandwidth
+        self._fit = maps.fit(self._centres, count, 2, influence=False)
+        self._hessian = self._fit.hessian
         self._tree = maps.tree(self._centres)
 
     def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -228,9 +205,9 @@ class Atlas:
         _, nearest = self._tree.query(self._maps.wrap_points(points))
         away = self._maps.wrap(points - self._centres[nearest])
         curved = np.einsum("mijk,mk->mij", self._hessian[nearest], away)
-        jacobian = self._jacobian[nearest]
-        image = self._value[nearest] + np.einsum("mij,mj->mi", jacobian + 0.5 * curved, away)
-        bandwidth = self._bandwidth[nearest]
+        jacobian = self._fit.jacobian[nearest]
+        image = self._fit.value[nearest] + np.einsum("mij,mj->mi", jacobian + 0.5 * curved, away)
+        bandwidth = self._fit.bandwidth[nearest]
         outside = np.sqrt(np.sum(away**2, axis=-1)) > bandwidth
         return image, jacobian + curved, np.where(outside, np.inf, bandwidth)
 
@@ -287,14 +264,7 @@ NEIGHBOUR = 8
 
 
 def check_chaos(maps: ReturnMap, section: np.ndarray) -> None:
-    """Raise a ValueError, which names the kind of motion, unless the section shows a chaotic return map.
-
-    Parameters
-    ----------
-    maps : ReturnMap
-    section : array (n, 2)
-        All points in the order of time.
-    """
+    """Raise a ValueError, which names the kind of motion, unless the section (n, 2) shows a chaotic return map."""
     generator = np.random.default_rng(0)
     one, other = generator.integers(len(section), size=(2, 4 * PROBES))
     random = np.median(maps.distance(section[one], section[other]))

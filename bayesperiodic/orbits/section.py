@@ -249,19 +249,11 @@ class PoincareSection(Result):
                 points[:, k] = wrapped(values[:, k])
                 if signals is None:
                     increments[:, k] = wrapped(increments[:, k])
+        winds = signals is not None or not angles
+        count = values.size if signals is None else signals.size
+        time, synthetic = (None, False) if recording is None else (recording.time, recording.synthetic)
         return cls(
-            points=points,
-            coordinates=names,
-            angles=angles,
-            frequency=frequency,
-            increments=increments,
-            winds=signals is not None or not angles,
-            noise=noise,
-            instants=instants,
-            time=None if recording is None else recording.time,
-            signals=signals,
-            values=values.size if signals is None else signals.size,
-            synthetic=recording is not None and recording.synthetic,
+            points, names, angles, frequency, increments, winds, noise, instants, time, signals, count, synthetic
         )
 
     def __len__(self) -> int:
