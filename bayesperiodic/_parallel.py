@@ -1,4 +1,4 @@
-"""Independent tasks on the cores of this machine or the workers of a cluster: the one seam behind `executor=`."""
+"""Independent tasks on the cores of this machine or on the workers of a cluster: the implementation of `executor=`."""
 
 import hashlib
 import json
@@ -25,21 +25,22 @@ from bayesperiodic._linalg import in_one_thread
 Item = TypeVar("Item")
 Value = TypeVar("Value")
 
-ALLOWED = (
-    "None, a number of processes of at least 1, a Dask Client, or an executor with the interface of concurrent.futures "
-    "(submit), such as mpi4py.futures.MPIPoolExecutor"
+EXECUTORS = (
+    "None, a number of processes >= 1, a Dask Client, or an executor with the interface of concurrent.futures, such as "
+    "mpi4py.futures.MPIPoolExecutor"
 )
-GUARD = "A script that asks for processes must have its calls below: if __name__ == '__main__'."
-QUEUED_EACH = 2
+MAIN_GUARD = "A script that uses processes must have its calls below: if __name__ == '__main__'."
+QUEUED_PER_WORKER = 2
+# Shared objects that a process keeps unpickled.
 KEPT = 4
 
 
 class WorkersLost(RuntimeError):
-    """The workers behind an executor died, or cannot be reached any more."""
+    """The workers of an executor died or cannot be reached."""
 
 
 def available_cores() -> int:
-    """Return the number of cores that this process may use; 1 within a task, whose neighbours use the others."""
+    """Return the number of cores that this process may use; 1 within a task, because others run at the same time."""
     return 1 if getattr(_TASK, "inside", False) else _cores()
 
 
@@ -50,19 +51,19 @@ def _cores() -> int:
 
 
 def in_threads(function: Callable[[Item], Value], items: Sequence[Item], threads: int) -> list[Value]:
-    """Return function(item) of every item, in order, worked off by this thread and `threads` − 1 others."""
+    """Return function(item) of every item, in order, computed by this thread and `threads` − 1 others."""
     if min(threads, len(items)) <= 1:
         return [function(item) for item in items]
     results: list[Any] = [None] * len(items)
-    waiting = iter(list(enumerate(items)))
+    pending = iter(list(enumerate(items)))
 
     def work() -> None:
-        for index, item in waiting:
+        for index, item in pending:
             results[index] = function(item)
 
-    elsewhere = [_threads().submit(work) for _ in range(min(threads, len(items)) - 1)]
+    others = [_threads().submit(work) for _ in range(min(threads, len(items)) - 1)]
     work()
-    for future in elsewhere:
+    for future in others:
         future.result()
     return results
 
@@ -73,87 +74,88 @@ def _threads() -> ThreadPoolExecutor:
 
 
 if hasattr(os, "register_at_fork"):
-    # A forked process has the pool without its threads, and would wait for them for ever.
+    # A forked process inherits the pool without its threads.
     os.register_at_fork(after_in_child=_threads.cache_clear)
 
 
 def checked_executor(executor: Any) -> Any:
-    """Return what was given as `executor`; raise a ValueError unless tasks can be handed to it."""
+    """Return `executor`; raise a ValueError unless it takes tasks."""
     if executor is None or (callable(getattr(executor, "submit", None)) and not isinstance(executor, type)):
         return executor
     with suppress(ValueError):
         return _checks.integer("executor", executor, 1)
-    raise ValueError(f"executor: {executor!r} is not allowed; it must be {ALLOWED}.")
+    raise ValueError(f"executor: must be {EXECUTORS}, got {executor!r}.")
 
 
-@contextmanager
-def team(executor: Any, shared: Any) -> Iterator["Team"]:
-    """Provide those who work on the tasks of one job; what was given as `executor` stays open, the rest is closed.
+def _ignore_interrupts() -> None:
+    """Leave Ctrl-C, which all processes of a terminal receive, to the main process, which saves the results."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
-    None means threads of this process, which share its memory. A number of processes means that many fresh ones: a fork
-    would inherit the locks of the threads that run kernels, and hang on them.
+
+class TaskPool:
+    """Workers for independent tasks that need the same data; a context manager.
+
+    The executor that is given stays open; one that is made here is closed at the end. None stands for threads of this
+    process, which share its memory. A number stands for new processes; they are spawned, because forked processes
+    would inherit the locks of threads that run kernels, and wait for them forever.
+
+    The shared object is pickled once. It is sent with the first tasks, one per worker that the executor reports. Each
+    process keeps it under its digest; a process that lacks it returns a marker, and the task is sent again with the
+    object. With Dask the object is a result on the cluster, which workers pass to each other and which the scheduler
+    computes again if all workers that held it are lost. Threads use the object directly.
 
     Parameters
     ----------
     executor : None, int, Dask Client, or executor
     shared : object
-        What all tasks need. It travels once to each worker, and is unpickled once in each process.
+        What all tasks need.
 
     Raises
     ------
     ValueError
-        If tasks cannot be handed to the executor, or the shared data cannot be pickled.
-    """
-    given = checked_executor(executor)
-    with ExitStack() as stack:
-        if given is None:
-            given = stack.enter_context(ThreadPoolExecutor(available_cores()))
-        elif isinstance(given, int):
-            given = stack.enter_context(ProcessPoolExecutor(given, get_context("spawn"), _ignore_interrupts))
-        crew = Team(given, shared, GUARD if given is not executor and executor is not None else "")
-        stack.callback(crew.cancel)
-        yield crew
-
-
-def _ignore_interrupts() -> None:
-    """Leave Ctrl-C, which reaches all processes of a terminal, to the one that can save what is there."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-class Team:
-    """Workers with the same shared data, for independent tasks.
-
-    The pickled data go with the first tasks, one for each worker that the executor knows of. Every process keeps them,
-    named by their digest; one that gets a task without having them says so, and the task is sent again with them. With
-    Dask they are a result on the cluster, which workers pass on among themselves and the scheduler has made again if
-    all who had it are gone. Threads take them as they are.
-
-    Parameters
-    ----------
-    executor : Dask Client, or executor
-    shared : object
-    hint : str
-        Added to the message if the workers are lost before any has given a result.
+        If the executor takes no tasks, or the shared object cannot be pickled.
     """
 
-    def __init__(self, executor: Any, shared: Any, hint: str = ""):
-        self._submit, self._hint = executor.submit, hint
+    def __init__(self, executor: Any, shared: Any):
+        self._executor, self._shared = checked_executor(executor), shared
+        self._hint = MAIN_GUARD if isinstance(self._executor, int) else ""
         self._running: dict[int, tuple[Any, Any]] = {}
-        self._key, self._content, self._carriers, self._at_once = "", shared, 0, None
+        self._key, self._content, self._unsent, self._at_once = "", shared, 0, None
+        self._always_sent = True
+        self._stack = ExitStack()
+
+    def __enter__(self) -> "TaskPool":
+        executor = self._executor
+        if executor is None:
+            executor = self._stack.enter_context(ThreadPoolExecutor(available_cores()))
+        elif isinstance(executor, int):
+            executor = self._stack.enter_context(
+                ProcessPoolExecutor(executor, get_context("spawn"), _ignore_interrupts)
+            )
+        self._stack.callback(self._cancel)
+        with self._stack:
+            self._connect(executor)
+            self._stack = self._stack.pop_all()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._stack.close()
+
+    def _connect(self, executor: Any) -> None:
+        self._submit = executor.submit
         if isinstance(executor, ThreadPoolExecutor):
-            self._always = True
             return
-        payload = _pickled(shared)
+        payload = _pickled(self._shared)
         self._key, self._content = hashlib.sha256(payload).hexdigest(), payload
-        self._always = _is_dask(executor) and hasattr(executor, "scatter")
-        if self._always:
+        self._always_sent = _is_dask(executor) and hasattr(executor, "scatter")
+        if self._always_sent:
             self._submit = partial(executor.submit, pure=False)
             with warnings.catch_warnings(), _losses(RuntimeError, OSError):
-                warnings.simplefilter("ignore")  # of a large task graph: it is large once
-                self._content = self._submit(_same, payload)
+                warnings.simplefilter("ignore")  # about the size of the task graph
+                self._content = self._submit(_identity, payload)
             return
         workers = getattr(executor, "num_workers", None) or getattr(executor, "_max_workers", None)
-        self._carriers, self._at_once = workers or 1, workers and QUEUED_EACH * workers
+        self._unsent, self._at_once = workers or 1, workers and QUEUED_PER_WORKER * workers
 
     def run(
         self,
@@ -161,19 +163,19 @@ class Team:
         tasks: Iterable[Any],
         then: Callable[[int, Any], Any] | None = None,
     ) -> Iterator[tuple[int, Any]]:
-        """Yield the number and the result of every task as it is done: function(shared, task).
+        """Yield the number and the result function(shared, task) of every task when it is finished.
 
-        An exception that the function raises comes out here. A task must be a pure function of what it is given:
-        clusters do those of a lost worker again.
+        Exceptions of the function are raised here. A task must depend on its arguments only, because clusters repeat
+        the tasks of a lost worker.
 
         Parameters
         ----------
         function : callable
-            Of a module, so that workers can import it.
+            Defined in a module, so that workers can import it.
         tasks : iterable
-            Read as workers become free.
+            Consumed as workers become free.
         then : callable, optional
-            Of a number and its result: the task that follows under the same number, or None.
+            Function of a number and its result that returns the next task with the same number, or None.
 
         Raises
         ------
@@ -181,17 +183,17 @@ class Team:
             If the workers died or cannot be reached.
         """
         finished: SimpleQueue[int] = SimpleQueue()
-        waiting = enumerate(tasks)
+        pending = enumerate(tasks)
 
         def start(number: int, task: Any, again: bool = False) -> None:
-            content = self._content if self._always or again or self._carriers > 0 else None
-            self._carriers -= content is not None
+            content = self._content if self._always_sent or again or self._unsent > 0 else None
+            self._unsent -= content is not None
             with _losses(RuntimeError, OSError, hint=self._hint):
                 future = self._submit(_call, function, task, self._key, content)
             self._running[number] = future, task
             future.add_done_callback(lambda _: finished.put(number))
 
-        for number, task in islice(waiting, self._at_once):
+        for number, task in islice(pending, self._at_once):
             start(number, task)
         while self._running:
             number = finished.get()
@@ -203,13 +205,12 @@ class Team:
                 start(number, task, again=True)
                 continue
             following = None if then is None else then(number, result)
-            upcoming = next(waiting, None) if following is None else (number, following)
+            upcoming = next(pending, None) if following is None else (number, following)
             if upcoming is not None:
                 start(*upcoming)
             yield number, result
 
-    def cancel(self) -> None:
-        """Withdraw the tasks that have not begun, and forget the others."""
+    def _cancel(self) -> None:
         for future, _ in self._running.values():
             with suppress(Exception):
                 future.cancel()
@@ -221,10 +222,10 @@ def _pickled(shared: Any) -> bytes:
 
     try:
         return cloudpickle.dumps(shared)
-    except Exception as error:  # whatever an object of the user's answers to pickle
+    except Exception as error:  # objects of the user may raise anything
         raise ValueError(
-            f"executor: it is not allowed here, the problem cannot be pickled ({type(error).__name__}: {error}); leave "
-            "the executor out, or give what is in the problem (priors, noise model) a form that can."
+            f"executor: must be None, because the problem cannot be pickled ({type(error).__name__}: {error}); or make "
+            "its contents (priors, noise model) picklable."
         ) from error
 
 
@@ -234,7 +235,7 @@ def _is_dask(thing: Any) -> bool:
 
 @contextmanager
 def _losses(*more: type[Exception], hint: str = "") -> Iterator[None]:
-    """Turn what executors raise for dead or unreachable workers into one exception."""
+    """Convert what executors raise for dead or unreachable workers to `WorkersLost`."""
     try:
         yield
     except Exception as error:
@@ -246,18 +247,18 @@ def _losses(*more: type[Exception], hint: str = "") -> Iterator[None]:
 
 
 class _Missing:
-    """The answer of a process that has not got the shared data."""
+    """Returned by a process that lacks the shared object."""
 
 
 _TASK = threading.local()
-_OPENED: OrderedDict[str, Any] = OrderedDict()
-_OPENING = threading.Lock()
+_UNPICKLED: OrderedDict[str, Any] = OrderedDict()
+_UNPICKLING = threading.Lock()
 
 
 @in_one_thread
 def _call(function: Callable[[Any, Any], Any], task: Any, key: str, content: Any) -> Any:
-    """Do one task; the shared data come as they are (without a key), pickled, or have come before (None)."""
-    shared = _opened(key, content) if key else content
+    """Run one task; `content` is the shared object itself (no key), pickled, or None if it was sent before."""
+    shared = _unpickled(key, content) if key else content
     if isinstance(shared, _Missing):
         return shared
     outside, _TASK.inside = getattr(_TASK, "inside", False), True
@@ -267,28 +268,28 @@ def _call(function: Callable[[Any, Any], Any], task: Any, key: str, content: Any
         _TASK.inside = outside
 
 
-def _opened(key: str, content: bytes | None) -> Any:
-    with _OPENING:
-        if key not in _OPENED:
+def _unpickled(key: str, content: bytes | None) -> Any:
+    with _UNPICKLING:
+        if key not in _UNPICKLED:
             if content is None:
                 return _Missing()
             import cloudpickle
 
-            _OPENED[key] = cloudpickle.loads(content)
-            while len(_OPENED) > KEPT:
-                _OPENED.popitem(last=False)
-        _OPENED.move_to_end(key)
-        return _OPENED[key]
+            _UNPICKLED[key] = cloudpickle.loads(content)
+            while len(_UNPICKLED) > KEPT:
+                _UNPICKLED.popitem(last=False)
+        _UNPICKLED.move_to_end(key)
+        return _UNPICKLED[key]
 
 
-def _same(content: bytes) -> bytes:
+def _identity(content: bytes) -> bytes:
     return content
 
 
 Line = dict[str, Any]
 
 
-def resumed(
+def checkpointed_tasks(
     path: Path | None,
     tasks: Sequence[Any],
     work: Callable[[Any, Any], Line],
@@ -299,48 +300,49 @@ def resumed(
     executor: Any = None,
     progress: bool = True,
 ) -> list[Line]:
-    """Do the tasks that a file lacks, and return the lines of all in their order.
+    """Run the tasks whose results a file lacks, and return the results (lines) of all in the order of the tasks.
 
-    A line is written as soon as its task is done. Whatever is killed, and whenever, what was written counts once, and
-    the same call does the rest; a last line that was cut off is taken out.
+    A line is written when its task is finished. After an interruption at any time, the same call runs the rest; an
+    incomplete last line is removed.
 
     Parameters
     ----------
     path : Path, optional
-        A JSON line a task; those of another source stay in it and do not count. Without a path nothing is kept.
+        File with one JSON line per task. Lines of another source remain in it and are ignored. By default nothing is
+        stored.
     tasks : sequence
-        Different ones, that can be compared and pickled.
+        Distinct, hashable and picklable.
     work : callable
-        Of a module; returns a task's line, with "source" in it, from the shared data and the task alone.
+        Function of the shared object and a task, defined in a module, that returns the line, with the key "source".
     task_of : callable
-        Returns the task that a line is of.
+        Returns the task of a line.
     source : str
-        Tells results of another version or other settings apart.
+        Identifies the version and the settings of a result.
     shared : object
-        What all tasks need; it travels once to each worker.
+        What all tasks need; sent once to each worker.
     executor : None, int, Dask Client, or executor with the interface of concurrent.futures
-        None does one task after the other in this process.
+        None runs the tasks one after the other in this process.
     progress : bool
         Show a progress bar.
 
     Raises
     ------
     ValueError
-        If another process has the file in use, or the executor takes no tasks.
+        If another process uses the file, or the executor takes no tasks.
     WorkersLost
-        If the executor's workers died (a RuntimeError); what was done is in the file.
+        If the executor's workers died (a RuntimeError); finished tasks are in the file.
     """
     given = checked_executor(executor)
-    with nullcontext() if path is None else _alone(path):
+    with nullcontext() if path is None else _locked(path):
         done = {task_of(line): line for line in _read(path) if line["source"] == source}
         missing = [task for task in tasks if task not in done]
         with (
             nullcontext() if path is None else path.open("a", encoding="utf-8") as file,
             ThreadPoolExecutor(1) if given is None else nullcontext(given) as executor,
-            team(executor, shared) as crew,
+            TaskPool(executor, shared) as pool,
             tqdm(total=len(tasks), initial=len(tasks) - len(missing), unit="task", disable=not progress) as bar,
         ):
-            for _, line in crew.run(work, missing):
+            for _, line in pool.run(work, missing):
                 done[task_of(line)] = line
                 if file is not None:
                     file.write(json.dumps(line, ensure_ascii=False) + "\n")
@@ -349,7 +351,7 @@ def resumed(
     return [done[task] for task in tasks]
 
 
-def _alone(path: Path) -> Any:
+def _locked(path: Path) -> Any:
     from filelock import FileLock, Timeout
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -357,12 +359,12 @@ def _alone(path: Path) -> Any:
         return FileLock(path.with_name(f".{path.name}.lock")).acquire(timeout=0.0)
     except Timeout:
         raise ValueError(
-            f"folder: {str(path.parent)!r} is in use by another run; wait for it, or name another folder."
+            f"folder: must not be in use by another run, got {str(path.parent)!r}; wait, or choose another folder."
         ) from None
 
 
 def _read(path: Path | None) -> list[Line]:
-    """Return the lines of a file, without a last one that was cut off; that one is taken out of it."""
+    """Return the complete lines of a file; remove an incomplete last line from it."""
     if path is None or not path.is_file():
         return []
     content = path.read_bytes()

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import cloudpickle
 
 from bayesperiodic import _parallel as kept
-from bayesperiodic._parallel import team
+from bayesperiodic._parallel import TaskPool
 
 Task = tuple[Any, ...]
 Line = dict[str, Any]
@@ -39,7 +39,7 @@ def resumed(
         Tells results of another version apart.
     """
     with workers() as pool:
-        return kept.resumed(path, tasks, _do, task_of, source, shared=work, executor=pool)
+        return kept.checkpointed_tasks(path, tasks, _do, task_of, source, shared=work, executor=pool)
 
 
 def _do(work: Callable[[Task], Line], task: Task) -> Line:
@@ -83,9 +83,9 @@ def each(work: Callable[..., Value], tasks: Sequence[Task], *, here: bool = Fals
         yield from (work(*task) for task in tasks)
         return
     done: dict[int, bytes] = {}
-    with workers() as pool, team(pool, work) as crew:
+    with workers() as pool, TaskPool(pool, work) as task_pool:
         following = 0
-        for number, result in crew.run(_one, tasks):
+        for number, result in task_pool.run(_one, tasks):
             done[number] = result
             while following in done:
                 yield cloudpickle.loads(done.pop(following))

@@ -1,4 +1,4 @@
-"""The executor seam by itself: who works, what travels, what happens when it does not."""
+"""Task pools: which workers run the tasks, what is sent to them, and what happens when they fail."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ from multiprocessing import get_context
 import pytest
 
 from bayesperiodic import _parallel
-from bayesperiodic._parallel import WorkersLost, available_cores, checked_executor, in_threads, team
+from bayesperiodic._parallel import TaskPool, WorkersLost, available_cores, checked_executor, in_threads
 
 LOADS: Counter[str] = Counter()
 
@@ -68,7 +68,7 @@ class Forgetful:
     def submit(self, function, /, *arguments) -> Future:  # noqa: D102
         self.carried.append(arguments[3] is not None)
         if len(self.carried) % 3 == 0:
-            _parallel._OPENED.clear()
+            _parallel._UNPICKLED.clear()
         future: Future = Future()
         future.set_result(function(*arguments))
         return future
@@ -86,8 +86,8 @@ def executor(request):
 
 
 def test_every_task_is_done_once_and_keeps_its_number(executor):
-    with team(executor, 2) as crew:
-        found = list(crew.run(power, range(20)))
+    with TaskPool(executor, 2) as tasks:
+        found = list(tasks.run(power, range(20)))
     assert sorted(found) == [(n, 2**n) for n in range(20)]
 
 
@@ -100,22 +100,22 @@ def test_a_task_may_be_followed_by_another(executor):
         done[number] += 1
         return done[number] + 1 if done[number] < lengths[number] else None
 
-    with team(executor, 3) as crew:
-        found = list(crew.run(power, [1] * 4, then))
+    with TaskPool(executor, 3) as tasks:
+        found = list(tasks.run(power, [1] * 4, then))
     assert [max(value for n, value in found if n == number) for number in range(4)] == [3**length for length in lengths]
     assert len(found) == sum(lengths)
 
 
 def test_what_a_task_raises_comes_out(executor):
-    with pytest.raises(ArithmeticError, match="task 7"), team(executor, None) as crew:
-        list(crew.run(fail, [7]))
+    with pytest.raises(ArithmeticError, match="task 7"), TaskPool(executor, None) as tasks:
+        list(tasks.run(fail, [7]))
 
 
 @pytest.mark.parametrize("which", ["processes", "dask"])
 def test_shared_data_are_unpickled_once_in_each_process_and_tasks_have_one_core(which, request):
     executor = request.getfixturevalue(which)
-    with team(executor, Cargo()) as crew:
-        found = [report for _, report in crew.run(report, [0.02] * 20)]
+    with TaskPool(executor, Cargo()) as tasks:
+        found = [report for _, report in tasks.run(report, [0.02] * 20)]
     assert {loads for _, loads, _ in found} == {1}
     assert {cores for *_, cores in found} == {1}
     assert len({process for process, *_ in found}) <= 2 and os.getpid() not in {process for process, *_ in found}
@@ -125,31 +125,31 @@ def test_shared_data_are_unpickled_once_in_each_process_and_tasks_have_one_core(
 def test_shared_data_travel_about_once_a_worker_and_own_threads_take_them_as_they_are():
     """Two carriers for two workers; a process that starts late asks for them, at most once for each queued task."""
     cargo = Cargo()
-    with Recording(2) as pool, team(pool, cargo) as crew:
-        assert len(list(crew.run(report, [0.01] * 40))) == 40
-    assert 2 <= sum(pool.carried) <= 2 + 2 * _parallel.QUEUED_EACH
-    with team(None, cargo) as crew:
-        assert {loads for _, (_, loads, _) in crew.run(report, [0.0] * 4)} == {0}
+    with Recording(2) as pool, TaskPool(pool, cargo) as tasks:
+        assert len(list(tasks.run(report, [0.01] * 40))) == 40
+    assert 2 <= sum(pool.carried) <= 2 + 2 * _parallel.QUEUED_PER_WORKER
+    with TaskPool(None, cargo) as tasks:
+        assert {loads for _, (_, loads, _) in tasks.run(report, [0.0] * 4)} == {0}
 
 
 def test_who_has_lost_the_shared_data_gets_them_again():
     executor = Forgetful()
-    with team(executor, 2) as crew:
-        assert sorted(crew.run(power, range(12))) == [(n, 2**n) for n in range(12)]
+    with TaskPool(executor, 2) as tasks:
+        assert sorted(tasks.run(power, range(12))) == [(n, 2**n) for n in range(12)]
     assert 1 < sum(executor.carried) < len(executor.carried)
 
 
 def test_dead_workers_are_one_clear_error():
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         with pytest.raises(WorkersLost, match=r"executor: its workers were lost \(BrokenProcessPool: "):
-            with team(pool, None) as crew:
-                list(crew.run(die, [0]))
-        with pytest.raises(WorkersLost, match="BrokenProcessPool"), team(pool, None) as crew:
-            list(crew.run(power, [0]))
+            with TaskPool(pool, None) as tasks:
+                list(tasks.run(die, [0]))
+        with pytest.raises(WorkersLost, match="BrokenProcessPool"), TaskPool(pool, None) as tasks:
+            list(tasks.run(power, [0]))
     closed = ThreadPoolExecutor(1)
     closed.shutdown()
-    with pytest.raises(WorkersLost, match="cannot schedule new futures after shutdown"), team(closed, 2) as crew:
-        list(crew.run(power, [1]))
+    with pytest.raises(WorkersLost, match="cannot schedule new futures after shutdown"), TaskPool(closed, 2) as tasks:
+        list(tasks.run(power, [1]))
 
 
 def test_a_task_that_kills_dask_workers_ends_the_run(dask, monkeypatch):
@@ -157,16 +157,16 @@ def test_a_task_that_kills_dask_workers_ends_the_run(dask, monkeypatch):
     monkeypatch.setattr(dask.cluster.scheduler, "allowed_failures", 0)
     with (
         pytest.raises(WorkersLost, match=r"executor: its workers were lost \(KilledWorker: "),
-        team(dask, None) as crew,
+        TaskPool(dask, None) as tasks,
     ):
-        list(crew.run(die, [0]))
+        list(tasks.run(die, [0]))
 
 
 def test_a_script_without_its_guard_is_told_so(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        "import operator\nfrom bayesperiodic._parallel import team\n"
-        "with team(1, 2) as crew:\n    print(list(crew.run(operator.pow, [3])))\n"
+        "import operator\nfrom bayesperiodic._parallel import TaskPool\n"
+        "with TaskPool(1, 2) as tasks:\n    print(list(tasks.run(operator.pow, [3])))\n"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or "." for path in sys.path)}
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, env=environment)
@@ -175,13 +175,16 @@ def test_a_script_without_its_guard_is_told_so(tmp_path):
 
 @pytest.mark.parametrize("bad", [0, -2, True, 1.5, "2", ThreadPoolExecutor, [2], get_context("spawn")])
 def test_what_takes_no_tasks_is_refused(bad):
-    with pytest.raises(ValueError, match=r"executor: .* is not allowed; it must be None, a number of processes of at"):
+    with pytest.raises(ValueError, match=r"executor: must be None, a number of processes >= 1, .*got"):
         checked_executor(bad)
 
 
 def test_what_cannot_be_pickled_is_refused(processes):
-    with pytest.raises(ValueError, match=r"executor: .* the problem cannot be pickled \(TypeError: cannot pickle '_th"):
-        with team(processes, threading.Lock()):
+    with pytest.raises(
+        ValueError,
+        match=r"executor: must be None, because the problem cannot be pickled \(TypeError: cannot pickle '_th",
+    ):
+        with TaskPool(processes, threading.Lock()):
             pass
 
 

@@ -17,7 +17,7 @@ from scipy.special import ndtri
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic._parallel import resumed
+from bayesperiodic._parallel import checkpointed_tasks
 from bayesperiodic.diagnostics.adequacy import holm
 from bayesperiodic.diagnostics.campaigns import (
     APART,
@@ -263,7 +263,7 @@ def calibrate(
     settings = f"{fingerprint(problem)}, seed {seed}, {ensembles} x {walkers} walkers, {max_steps} steps, {APART} apart"
     source = hashlib.sha256(f"{importlib.metadata.version('bayesperiodic')}, {settings}".encode()).hexdigest()[:16]
     campaign = Campaign(problem, seed, source, ensembles, walkers, max_steps)
-    lines = resumed(
+    lines = checkpointed_tasks(
         None if folder is None else Path(folder) / FILE,
         range(replicates),
         replicate,

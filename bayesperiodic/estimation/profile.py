@@ -14,7 +14,7 @@ from scipy.special import ndtri
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic._parallel import checked_executor, team
+from bayesperiodic._parallel import TaskPool, checked_executor
 from bayesperiodic.estimation.gauss_newton import PRESSED, Iterate, Objective, bias_correction, climb
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.density import Linearisation
@@ -402,8 +402,8 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     chosen = _checked_names(problem, names)
     executor = checked_executor(executor)
     objective, peak = _at_estimate(problem, fit)
-    with team(executor, (objective, peak)) as crew:
-        found = dict(crew.run(_followed, [problem.names.index(name) for name in chosen]))
+    with TaskPool(executor, (objective, peak)) as pool:
+        found = dict(pool.run(_followed, [problem.names.index(name) for name in chosen]))
     top, best = peak.objective, peak.theta
     values, density, paths, limits = {}, {}, {}, {}
     for number, name in enumerate(chosen):

@@ -125,7 +125,7 @@ class Ensemble:
 
 
 class InStep:
-    """Provides for ensembles what `parallel.Team` does, each in a thread that waits for the others at every proposal.
+    """Provides for ensembles what `TaskPool` does, each in a thread that waits for the others at every proposal.
 
     A small call costs as much for what surrounds its periodic solves as for these; and the cores are better shared by
     the solves of one large call than by several small ones.

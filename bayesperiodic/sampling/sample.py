@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic._parallel import Team, WorkersLost, available_cores, checked_executor, team
+from bayesperiodic._parallel import TaskPool, WorkersLost, available_cores, checked_executor
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling import convergence
@@ -259,8 +259,8 @@ class _Run:
                 self._walk(max_steps, store, InStep(Ground(self.density.evaluate, self.map)), progress)
                 return
             alone = self._density(self.density.problem, 1)
-            with team(executor, Ground(alone.evaluate, self.map)) as crew:
-                self._walk(max_steps, store, crew, progress)
+            with TaskPool(executor, Ground(alone.evaluate, self.map)) as pool:
+                self._walk(max_steps, store, pool, progress)
         except KeyboardInterrupt:
             if not self._stopped("interrupted", store):
                 raise
@@ -283,11 +283,11 @@ class _Run:
             self._save(store, now=True)
         return enough
 
-    def _walk(self, max_steps: int, store: Checkpoint | None, crew: Team | InStep, progress: bool) -> None:
+    def _walk(self, max_steps: int, store: Checkpoint | None, pool: TaskPool | InStep, progress: bool) -> None:
         state = self.state
         with tqdm(total=max_steps, unit="step", desc="sampling", disable=not progress) as bar:
             for steps in range(state["checked"] + BLOCK, max_steps + 1, BLOCK):
-                self._advance(steps, crew, bar)
+                self._advance(steps, pool, bar)
                 kept = self._kept(steps)
                 tau = convergence.autocorrelation_time(kept)
                 missing = shortfall(kept, tau, np.array(state["tau"]), self.plain.labels)
@@ -304,7 +304,7 @@ class _Run:
         left = ", ".join(state["missing"]) or "the stop rule passed only once"
         state |= {"steps": state["checked"], "reason": f"max_steps = {max_steps} reached with {left}"}
 
-    def _advance(self, steps: int, crew: Team | InStep, bar: tqdm) -> None:
+    def _advance(self, steps: int, pool: TaskPool | InStep, bar: tqdm) -> None:
         """Walk all ensembles to a number of steps, each piece by piece."""
         behind = [number for number, ensemble in enumerate(self.ensembles) if ensemble.steps < steps]
 
@@ -313,7 +313,7 @@ class _Run:
             self.ensembles[number] = self.ensembles[number].after(walked)
             return self.ensembles[number].piece(steps)
 
-        for _ in crew.run(walk, [self.ensembles[number].piece(steps) for number in behind], then):
+        for _ in pool.run(walk, [self.ensembles[number].piece(steps) for number in behind], then):
             bar.update(self._done - bar.n)
 
     def _account(self, kept: np.ndarray, tau: np.ndarray) -> str:

@@ -18,7 +18,7 @@ import cloudpickle
 import numpy as np
 
 import bayesperiodic as bp
-from bayesperiodic._parallel import team
+from bayesperiodic._parallel import TaskPool
 from studies.calibration.cases import duffing
 
 ROUNDS, EACH, LOOP = 7, 6, 20_000_000
@@ -72,8 +72,8 @@ def _overhead(client: Any) -> float:
     """Return seconds a task that does nothing, of many at once on two workers."""
 
     def empty() -> None:
-        with team(client, None) as crew:
-            for _ in crew.run(_nothing, range(EMPTY)):
+        with TaskPool(client, None) as pool:
+            for _ in pool.run(_nothing, range(EMPTY)):
                 pass
 
     empty()

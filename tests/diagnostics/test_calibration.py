@@ -14,7 +14,7 @@ import pytest
 from tqdm import tqdm
 
 import bayesperiodic as bp
-from bayesperiodic import _parallel as resumed_module
+from bayesperiodic import _parallel as parallel
 from bayesperiodic.diagnostics import campaigns
 from bayesperiodic.diagnostics.calibration import FILE, summary
 from bayesperiodic.diagnostics.campaigns import Campaign, check_supported, position, replicate
@@ -167,7 +167,7 @@ def test_replicates_are_kept_one_by_one_and_only_missing_ones_are_done(without_d
     for _ in range(2):
         again = bp.calibrate(linear(), replicates=6, seed=1, folder=tmp_path, progress=False)
         assert same(again, whole) and len(path.read_bytes().splitlines()) == 7
-    with resumed_module._alone(path), pytest.raises(ValueError, match="in use by another run"):
+    with parallel._locked(path), pytest.raises(ValueError, match="in use by another run"):
         bp.calibrate(linear(), replicates=6, seed=1, folder=tmp_path, progress=False)
 
 
@@ -199,7 +199,7 @@ def test_a_dask_worker_killed_in_the_middle_changes_nothing(serial, dask, tmp_pa
                 killed.append(self.n)
 
     killed: list[int] = []
-    monkeypatch.setattr(resumed_module, "tqdm", Bar)
+    monkeypatch.setattr(parallel, "tqdm", Bar)
     shortest = SHORTEST | {"progress": True}
     found = bp.calibrate(linear(known=False), replicates=4, seed=4, executor=dask, folder=tmp_path, **shortest)
     assert killed == [2] and same(found, serial)

@@ -191,7 +191,7 @@ def test_profiles_do_not_depend_on_the_executor(posed, which, request):
 def test_bad_executors_are_refused(posed):
     for call in (bp.sample, bp.profile):
         arguments = {"seed": 1} if call is bp.sample else {}
-        with pytest.raises(ValueError, match="executor: 0 is not allowed; it must be None, a number of processes"):
+        with pytest.raises(ValueError, match="executor: must be None, a number of processes .*got 0"):
             call(*posed, executor=0, **arguments)
 
 
