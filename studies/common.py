@@ -1,20 +1,134 @@
-"""What every study needs: where the data are, steps that say what they do, results and figures written whole."""
+"""What every study needs: where the data are, steps that say what they do, results and figures written whole.
+
+Tasks for all cores, and long runs that go on where they were ended, by tasks (a line each in a file) or by parts.
+
+Rows of the sampling study: what must show, the value found, the limits allowed, and whether they are met.
+"""
 
 import hashlib
 import importlib.metadata
 import json
+import math
+import multiprocessing
 import os
+import pickle
 import platform
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import cloudpickle
 import matplotlib
+import pandas as pd
 from matplotlib.figure import Figure
 from PIL import Image
+
+from bayesperiodic import _parallel as kept
+from bayesperiodic._parallel import team
+
+Row = dict[str, Any]
+
+
+def row(what: str, value: float | None, low: float, high: float | None, note: str = "") -> Row:
+    """Return a row of results.json, `high` None if nothing is too high; without a value there is no verdict."""
+    value = None if value is None or math.isnan(value) else float(value)
+    met = None if value is None else value >= low and (high is None or value <= high)
+    return {"what": what, "value": value, "low": low, "high": high, "met": met, "note": note}
+
+
+def unjudged(entry: Row, why: str) -> Row:
+    """Return a row that keeps its value and has no verdict."""
+    return entry | {"met": None, "note": why}
+
+
+def table_of_rows(rows: list[Row]) -> str:
+    """Return rows as text, notes below."""
+    verdicts, lines = {True: "yes", False: "NO", None: "-"}, []
+    notes = list(dict.fromkeys(entry["note"] for entry in rows if entry["note"]))
+    for entry in rows:
+        mark = f" ({notes.index(entry['note']) + 1})" if entry["note"] else ""
+        low, high = entry["low"], entry["high"]
+        value = "-" if entry["value"] is None else f"{entry['value']:.4g}"
+        if low == high:
+            allowed = f"{low:g}"
+        elif high is None:
+            allowed = f"≥ {low:g}"
+        else:
+            allowed = f"≤ {high:g}" if low == 0.0 else f"{low:g} … {high:g}"
+        lines.append({"": verdicts[entry["met"]], "what": entry["what"] + mark, "found": value, "allowed": allowed})
+    shown = pd.DataFrame(lines).to_string(index=False)
+    return "\n".join([shown, *(f"  ({i}) {note}" for i, note in enumerate(notes, start=1))])
+
+
+Task = tuple[Any, ...]
+Line = dict[str, Any]
+Part = TypeVar("Part")
+Value = TypeVar("Value")
+
+
+def resumed(
+    path: Path, tasks: Sequence[Task], work: Callable[[Task], Line], task_of: Callable[[Line], Task], source: str
+) -> list[Line]:
+    """Do the tasks that a file lacks, all cores at it, and return the lines of all in their order.
+
+    `path`: A JSON line a task; those of another source stay in it and do not count. `work`: Returns a task's line, with
+    "source" in it. `task_of`: Returns the task that a line is of. `source`: Tells results of another version apart.
+    """
+    with workers() as pool:
+        return kept.resumed(path, tasks, _do_task, task_of, source, shared=work, executor=pool)
+
+
+def _do_task(work: Callable[[Task], Line], task: Task) -> Line:
+    return work(task)
+
+
+def remembered(path: Path, source: str, make: Callable[[], Part]) -> Part:
+    """Return a part of a study from the file of an earlier run, or make it and keep it there.
+
+    `source`: Tells parts of another version, or with other settings, apart.
+    """
+    if path.is_file():
+        saved, part = pickle.loads(path.read_bytes())
+        if saved == source:
+            return part
+    part = make()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".unfinished")
+    unfinished.write_bytes(cloudpickle.dumps((source, part)))
+    unfinished.replace(path)
+    return part
+
+
+def each(work: Callable[..., Value], tasks: Sequence[Task], *, here: bool = False) -> Iterator[Value]:
+    """Yield work(*task) of every task, in their order.
+
+    `work`: Of a module. `here`: One after the other in this process; else in processes, each task on one core.
+    """
+    if here:
+        yield from (work(*task) for task in tasks)
+        return
+    done: dict[int, bytes] = {}
+    with workers() as pool, team(pool, work) as crew:
+        following = 0
+        for number, result in crew.run(_run_task, tasks):
+            done[number] = result
+            while following in done:
+                yield cloudpickle.loads(done.pop(following))
+                following += 1
+
+
+def _run_task(work: Callable[..., Value], task: Task) -> bytes:
+    return cloudpickle.dumps(work(*task))
+
+
+def workers() -> ProcessPoolExecutor:
+    """Return a pool of as many fresh processes as there are cores."""
+    return ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn"))
+
 
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "corner", "matplotlib", "xarray")
 DOTS_PER_INCH = 100

@@ -51,7 +51,7 @@ def pendulum():
 
 def gear():
     """Two experiments of the landing gear, and what is known of it."""
-    from studies.landing_gear.truth import GEAR
+    from studies.landing_gear.rig import GEAR
 
     model, wave = bp.models.landing_gear("displacement"), np.cos(2 * np.pi * np.arange(200) / 200)
     found = []

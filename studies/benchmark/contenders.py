@@ -1,7 +1,5 @@
 """One log-posterior, and its gradient, by every contender on one problem: how right it is and what it takes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -10,12 +8,21 @@ from typing import Any
 import numpy as np
 
 import bayesperiodic as bp
-from studies.benchmark.gradient import gradient_error
-from studies.benchmark.integration import EQUILIBRIUM, ESTIMATE, PREDICTED, SHOOTING, STARTS, STEADY, Method, tune
+from studies.benchmark.integration import (
+    ALLOWED,
+    EQUILIBRIUM,
+    ESTIMATE,
+    PREDICTED,
+    SHOOTING,
+    STARTS,
+    STEADY,
+    Method,
+    Reference,
+    tune,
+)
 from studies.benchmark.problems import SCHEMES, Setting
-from studies.benchmark.reference import ALLOWED, Reference
 from studies.benchmark.scipy import BVP, INITIAL, Initial, tune_boundary, tune_initial
-from studies.benchmark.timing import Action, interleaved, ratio, spread
+from studies.timing import Action, gradient_error, interleaved, ratio, spread
 
 OWN_WARM, OWN_CALL, OWN_BATCHED, OWN_COLD = (
     "this package, warm", "this package, warm, all cores", "this package, batched, all cores", "this package, cold",
@@ -30,37 +37,18 @@ Compiled = dict[tuple[str, str], list[Method]]
 
 @dataclass(frozen=True)
 class Row:
-    """One contender.
-
-    Attributes
-    ----------
-    name : str
-    error : float
-        The largest |Δ log-posterior| at the draws.
-    action : Action or None
-        None where it is not installed or never right enough.
-    note : str
-        How it was set, or why there is no time.
-    gradient_error : float or None
-        The largest of any component, relative to the largest component.
-    """
+    """One contender."""
 
     name: str
-    error: float
-    action: Action | None
-    note: str = ""
-    gradient_error: float | None = None
+    error: float  # The largest |Δ log-posterior| at the draws
+    action: Action | None  # None where it is not installed or never right enough
+    note: str = ""  # How it was set, or why there is no time
+    gradient_error: float | None = None  # The largest of any component, relative to the largest component
 
 
 @dataclass
 class Contest:
-    """All contenders of one problem.
-
-    Attributes
-    ----------
-    reference : Reference
-    rows : list of Row
-    """
+    """All contenders of one problem."""
 
     reference: Reference
     rows: list[Row] = field(default_factory=list)

@@ -7,8 +7,6 @@ y holds the states, each of second order followed by its rate; u the inputs and 
 the model's parameters, then the frequency.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,17 +25,10 @@ PRINTERS: dict[str, Any] = {NUMBA: PythonCodePrinter, NUMPY: NumPyPrinter, JAX: 
 
 @dataclass(frozen=True)
 class FirstOrder:
-    """A model with the parameters by which derivatives are wanted.
-
-    Attributes
-    ----------
-    model : Model
-    moving : tuple of str
-        Names of parameters.
-    """
+    """A model with the parameters by which derivatives are wanted."""
 
     model: bp.Model
-    moving: tuple[str, ...]
+    moving: tuple[str, ...]  # Names of parameters
 
     @cached_property
     def states(self) -> list[sp.Symbol]:

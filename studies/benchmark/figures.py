@@ -1,7 +1,5 @@
 """The benchmark in one figure."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

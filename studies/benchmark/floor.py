@@ -4,8 +4,6 @@ The floor is one compiled sweep for residual and Jacobian, and LAPACK's factoris
 each of the 14 experiments with its own matrix, restored between passes and not while the clock runs.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial
@@ -16,10 +14,10 @@ import numpy as np
 from scipy.linalg import lapack
 
 import bayesperiodic as bp
-from studies.benchmark.gradient import gradient_error
-from studies.benchmark.problems import SCHEMES, Setting, gear_priors
-from studies.benchmark.timing import Action, interleaved, ratio, spread
+from studies.benchmark.problems import SCHEMES, Setting
+from studies.gear import gear_priors
 from studies.solver.cost import lapack_band
+from studies.timing import Action, gradient_error, interleaved, ratio, spread
 
 WALKERS = 64
 COPIED = 64 * 2**20
@@ -32,11 +30,7 @@ STAGES = ("priors", "periodic solves, sums of squares", "likelihood", "the rest 
 class Floor:
     """The matrices of all experiments at the estimate.
 
-    Parameters
-    ----------
-    warm : Problem
-        Anchored at θ.
-    theta : array (names,)
+    `warm`: Anchored at θ. `theta` (names,).
     """
 
     def __init__(self, warm: bp.Problem, theta: np.ndarray):

@@ -1,13 +1,16 @@
-"""Time integration and shooting of one experiment, each with the cheapest settings that are right enough."""
+"""Time integration and shooting of one experiment, each with the cheapest settings that are right enough.
 
-from __future__ import annotations
+The common reference of a problem: log-posteriors at the draws by fully converged, fine shooting.
+"""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 
-from studies.benchmark.problems import Case
+from studies.benchmark.problems import Case, Setting
 
 STEADY, SHOOTING = "Runge-Kutta until steady", "shooting"
 EQUILIBRIUM, ESTIMATE, PREDICTED = "from equilibrium", "from the estimate's orbit", "from the predicted orbit"
@@ -25,13 +28,7 @@ TIGHT, LOOSE = 1e-11, 1e-9
 
 @dataclass(frozen=True)
 class Discretised:
-    """An experiment with so many Runge-Kutta steps a period, and its orbit at the estimate.
-
-    Attributes
-    ----------
-    case : Case
-    steps : int
-    """
+    """An experiment with so many Runge-Kutta steps a period, and its orbit at the estimate."""
 
     case: Case
     steps: int
@@ -147,29 +144,14 @@ class Discretised:
 
 @dataclass(frozen=True)
 class Method:
-    """One way to the log-likelihood of one experiment.
-
-    Attributes
-    ----------
-    discretised : Discretised
-    kind : str
-        `STEADY` or `SHOOTING`.
-    start : str
-        One of `STARTS`.
-    tolerance : float
-        Of the last change of y(0), of its scale.
-    error : float
-        The largest at any draw.
-    sweeps : float
-        Cycles integrated, in the mean.
-    """
+    """One way to the log-likelihood of one experiment."""
 
     discretised: Discretised
-    kind: str
-    start: str
-    tolerance: float
-    error: float = np.inf
-    sweeps: float = 0.0
+    kind: str  # `STEADY` or `SHOOTING`
+    start: str  # One of `STARTS`
+    tolerance: float  # Of the last change of y(0), of its scale
+    error: float = np.inf  # The largest at any draw
+    sweeps: float = 0.0  # Cycles integrated, in the mean
 
     def __call__(self, p: np.ndarray) -> float:
         """Return the log-likelihood; NaN where no orbit is found."""
@@ -180,7 +162,7 @@ class Method:
         settle = self.discretised.settle if self.kind == STEADY else self.discretised.shoot
         return settle(p, self.start, self.tolerance)
 
-    def judged(self, parameters: np.ndarray, exact: np.ndarray) -> Method:
+    def judged(self, parameters: np.ndarray, exact: np.ndarray) -> "Method":
         """Return the same with its error and its sweeps at the draws; the error is infinite where it fails."""
         values, sweeps = [], []
         for p in parameters:
@@ -232,3 +214,82 @@ def tune(
         if found.error <= allowed:
             return found
     return None
+
+
+Way = TypeVar("Way", bound=Callable[[np.ndarray], float])
+
+ALLOWED = 1e-2
+# What experiments may be off, of what it were if their errors had either sign.
+TRIES = (1.0, 0.5, 0.25, 0.1)
+# Steps take a part of what an experiment may be off, the way to the steady state the rest.
+SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What every contender is held against."""
+
+    setting: Setting
+    parameters: list[np.ndarray]  # (draws, parameters + 1): One an experiment
+    exact: list[np.ndarray]  # (draws,): Log-likelihoods, one an experiment
+    uncertainty: float  # By how much steps twice as long would change a log-posterior
+
+    @property
+    def each(self) -> float:
+        """What an experiment may be off, so that errors of either sign add up to what is allowed."""
+        return ALLOWED / np.sqrt(len(self.exact))
+
+    @property
+    def log_posteriors(self) -> np.ndarray:
+        """At the draws."""
+        return self.log_priors + np.sum(self.exact, axis=0)
+
+    @property
+    def log_priors(self) -> np.ndarray:
+        """At the draws."""
+        return np.array([self.setting.log_prior(theta) for theta in self.setting.theta])
+
+    def discretised(self) -> list[Discretised]:
+        """Return every experiment with the fewest steps that are right enough."""
+        return [
+            discretise(case, p, e, SHARE * self.each)
+            for case, p, e in zip(self.setting.cases, self.parameters, self.exact, strict=True)
+        ]
+
+    def tuned(
+        self, choose: Callable[[int, np.ndarray, np.ndarray, float], Way | None], draws: int | None = None
+    ) -> tuple[list[Way], float] | None:
+        """Return the cheapest way to every experiment's log-likelihood that together are right, and their error.
+
+        `choose`: From the experiment's number, parameters and log-likelihoods at the draws and what it may be off, to
+        the cheapest way, None if there is none. `draws`: The first so many alone, for what takes long. None where an
+        experiment has none.
+        """
+        at = slice(draws)
+        for share in TRIES:
+            found = []
+            for k, (p, e) in enumerate(zip(self.parameters, self.exact, strict=True)):
+                one = choose(k, p[at], e[at], share * self.each)
+                if one is None:
+                    return None
+                found.append(one)
+            values = np.array([[one(row) for row in p[at]] for one, p in zip(found, self.parameters, strict=True)])
+            error = self.error(self.log_priors[at] + values.sum(axis=0))
+            if error <= ALLOWED:
+                return found, error
+        return found, error
+
+    def error(self, log_posteriors: np.ndarray) -> float:
+        """Return the largest error of log-posteriors at the first so many draws, infinite where one is not finite."""
+        off = np.abs(log_posteriors - self.log_posteriors[: len(log_posteriors)])
+        return float(off.max()) if np.isfinite(off).all() else np.inf
+
+
+def refer(setting: Setting) -> Reference:
+    """Return the reference of a problem."""
+    parameters = [setting.parameters(setting.theta, case) for case in setting.cases]
+    found = [exact(case, p) for case, p in zip(setting.cases, parameters, strict=True)]
+    reference = Reference(setting, parameters, [values for values, _ in found], sum(off for _, off in found))
+    if not reference.uncertainty < 0.1 * ALLOWED:
+        raise RuntimeError(f"{setting.name}: the reference is uncertain by {reference.uncertainty:.1e}.")
+    return reference

@@ -4,8 +4,6 @@ What the strongest competitor would write for a given model: the right-hand side
 straight-line code, sizes are constants, nothing is allocated within a cycle, and no call holds the interpreter's lock.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
@@ -25,36 +23,22 @@ compiled = numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "ns
 class Integrators(NamedTuple):
     """Compiled functions of one model; all take p, the table of u at half steps, the seconds of a period, and y.
 
-    Attributes
-    ----------
-    steady : callable
-        (p, u, period, y, scale, tolerance, path, rates) -> cycles until a cycle changes y by less than the tolerance,
-        0 for never.
-    chord : callable
-        (p, u, period, y, inverse, scale, tolerance, most, path, rates) -> sweeps of shooting with a fixed matrix.
-    newton : callable
-        (p, u, period, y, scale, tolerance, most, path, rates, wide, wide_rates) -> sweeps of shooting with the
-        variational equations, whose last one leaves the derivatives by y(0) and by p in `wide`.
-    dense : callable
-        (path, rates, step, out): cubic Hermite interpolation at equidistant points.
-    outputs : callable
-        (p, u, states, out).
-    pulled : callable
-        (p, u, states, changes, weights, out): Σ weights · d outputs / dp, from the derivatives of the states by p.
-    rates_in_time : callable
-        (t, y, p, u, period) -> rates, the inputs interpolated in a fine table.
-    jacobian_in_time : callable
-        The same for the derivatives by y.
+    `steady`: (p, u, period, y, scale, tolerance, path, rates) -> cycles until a cycle changes y by less than the
+    tolerance, 0 for never. `chord`: (p, u, period, y, inverse, scale, tolerance, most, path, rates) -> sweeps of
+    shooting with a fixed matrix. `newton`: (p, u, period, y, scale, tolerance, most, path, rates, wide, wide_rates) ->
+    sweeps of shooting with the variational equations, whose last one leaves the derivatives by y(0) and by p in `wide`.
+    `pulled`: (p, u, states, changes, weights, out): Σ weights · d outputs / dp, from the derivatives of the states by
+    p.
     """
 
     steady: Callable[..., int]
     chord: Callable[..., int]
     newton: Callable[..., int]
-    dense: Callable[..., None]
-    outputs: Callable[..., None]
+    dense: Callable[..., None]  # (path, rates, step, out): cubic Hermite interpolation at equidistant points
+    outputs: Callable[..., None]  # (p, u, states, out)
     pulled: Callable[..., None]
-    rates_in_time: Callable[..., np.ndarray]
-    jacobian_in_time: Callable[..., np.ndarray]
+    rates_in_time: Callable[..., np.ndarray]  # (t, y, p, u, period) -> rates, the inputs interpolated in a fine table
+    jacobian_in_time: Callable[..., np.ndarray]  # The same for the derivatives by y
 
 
 @cache

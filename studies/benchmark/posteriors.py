@@ -5,8 +5,6 @@ the same. emcee in natural coordinates walks around the fastest contender once. 
 chain, because their densities agree, so that its effective samples a log-posterior are divided by the time of theirs.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +15,7 @@ import emcee
 import numpy as np
 
 import bayesperiodic as bp
-from studies.benchmark import diffrax
+from studies.benchmark import peers
 from studies.benchmark.integration import LOOSE, Method
 from studies.benchmark.problems import Setting
 
@@ -45,15 +43,8 @@ Density = Callable[[np.ndarray], float]
 def measure(setting: Setting, contest: Mapping[str, Any], methods: Sequence[Method], seed: int) -> dict[str, Any]:
     """Return samplers, and emcee around every contender that was timed.
 
-    Parameters
-    ----------
-    setting : Setting
-        With one channel, all harmonics, and positive parameters that are the model's own.
-    contest : dict
-        What `benchmark_contenders.measured` returned.
-    methods : sequence of Method
-        The fastest contender's, one an experiment.
-    seed : int
+    `setting`: With one channel, all harmonics, and positive parameters that are the model's own. `contest`: What
+    `benchmark_contenders.measured` returned. `methods`: The fastest contender's, one an experiment.
     """
     walked = _emcee(setting, methods, seed)
     found = {name: _own(setting, seed, options) for name, options in OWN.items()}
@@ -177,13 +168,13 @@ def _pints(setting: Setting, name: str, seed: int) -> dict[str, Any]:
 
 def _numpyro(setting: Setting, methods: Sequence[Method], seed: int) -> dict[str, Any]:
     """Run numpyro's NUTS along the axes of the Laplace approximation; neither compilation nor tuning is timed."""
-    lacking = [name for name in (*diffrax.NEEDED, "numpyro") if importlib.util.find_spec(name) is None]
+    lacking = [name for name in (*peers.NEEDED, "numpyro") if importlib.util.find_spec(name) is None]
     if lacking:
         return {"note": f"{lacking[0]} is {MISSING}"}
     import jax
     from numpyro.infer import MCMC, NUTS
 
-    tuned = [diffrax.Integrated(method.discretised, 1e-6) for method in methods]
+    tuned = [peers.Integrated(method.discretised, 1e-6) for method in methods]
     centre, factor = np.log(setting.estimate), _axes(setting)
     kernel = NUTS(potential_fn=_potential(setting, tuned, centre, factor), adapt_mass_matrix=False)
     run = MCMC(kernel, num_warmup=WARMUP, num_samples=DRAWS, progress_bar=False)
@@ -205,7 +196,7 @@ def _axes(setting: Setting) -> np.ndarray:
 
 
 def _potential(
-    setting: Setting, tuned: Sequence[diffrax.Integrated], middle: np.ndarray, factor: np.ndarray
+    setting: Setting, tuned: Sequence[peers.Integrated], middle: np.ndarray, factor: np.ndarray
 ) -> Callable[[Any], Any]:
     """Return minus the log-density over z, as JAX traces it, ln θ = middle + factor · z; priors are log-normal."""
     import jax.numpy as jnp
@@ -213,7 +204,7 @@ def _potential(
     priors = [setting.problem.priors[name] for name in setting.problem.names]
     centre = np.log([prior.median for prior in priors])
     spread = np.array([prior.spread for prior in priors])
-    value = diffrax.log_likelihood(setting.problem.model)
+    value = peers.log_likelihood(setting.problem.model)
     count = sum(case.experiment.samples for case in setting.cases)
 
     def potential(z: Any) -> Any:

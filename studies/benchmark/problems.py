@@ -4,8 +4,6 @@ The draws are those of the Laplace approximation at the MAP estimate, and as man
 deviations. Variances stay at their estimates, so that log-posteriors differ by the periodic states alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,17 +16,14 @@ import bayesperiodic as bp
 from studies.benchmark.equations import table
 from studies.benchmark.kernels import Integrators, integrators, misfit
 from studies.damper import run as damper
+from studies.gear import FINE, GEAR, gear_at_rest, gear_problem, measured
 from studies.silverbox import data as silverbox_data
-from studies.silverbox import problem as silverbox_problem
-from studies.solver.cost import GEAR, RIG
 
 FORCE, DISPLACEMENT, DUFFING, DAMPER, SILVERBOX = (
     "landing gear, force given", "landing gear, displacement given", "Duffing, damping ratio 0.5 %", "damper",
     "Silverbox",
 )  # fmt: skip
 SCHEMES = ("central2", "central4")
-FINE = "central4"
-SAMPLES, NOISE = 800, 3e-3
 WIDE = 3.0
 DUFFING_TRUTH = {"m": 1.0, "c": 0.01, "k": 1.0, "k3": 0.5}
 # [Hz] and [N]: below the resonance, where only one motion is stable.
@@ -41,36 +36,17 @@ DAMPER_SAMPLES = 1600
 
 @dataclass(frozen=True)
 class Case:
-    """One experiment of a problem as an integrator sees it.
-
-    Attributes
-    ----------
-    experiment : Experiment
-    model : Model
-    moving : tuple of str
-        The model's parameters that move with θ.
-    slopes : array (moving, names)
-        Their derivatives by θ at the estimate.
-    estimate : array (parameters + 1,)
-        At the MAP estimate, the frequency last.
-    variances : array (channels,)
-    start : array (size,)
-        Static equilibrium.
-    first : array (size,)
-        About y(0) at the estimate.
-    scale : array (size,)
-        Of the states.
-    """
+    """One experiment of a problem as an integrator sees it."""
 
     experiment: bp.Experiment
     model: Any
-    moving: tuple[str, ...]
-    slopes: np.ndarray
-    estimate: np.ndarray
-    variances: np.ndarray
-    start: np.ndarray
-    first: np.ndarray
-    scale: np.ndarray
+    moving: tuple[str, ...]  # The model's parameters that move with θ
+    slopes: np.ndarray  # (moving, names): Their derivatives by θ at the estimate
+    estimate: np.ndarray  # (parameters + 1,): At the MAP estimate, the frequency last
+    variances: np.ndarray  # (channels,)
+    start: np.ndarray  # (size,): Static equilibrium
+    first: np.ndarray  # (size,): About y(0) at the estimate
+    scale: np.ndarray  # (size,): Of the states
 
     @property
     def period(self) -> float:
@@ -156,21 +132,12 @@ class Case:
 class Setting:
     """A posterior density and the points at which contenders have to be right.
 
-    Attributes
-    ----------
-    name : str
-    problem : Problem
-        With the scheme `FINE`.
-    fit : MapEstimate
-    theta : array (draws, names)
-        The first half at the posterior's standard deviations, the second at three times these.
-    synthetic : bool
-    start : callable
-        Static equilibrium of an experiment: from it and its parameters to y.
+    `theta` (draws, names): The first half at the posterior's standard deviations, the second at three times these.
+    `start`: Static equilibrium of an experiment: from it and its parameters to y.
     """
 
     name: str
-    problem: bp.Problem
+    problem: bp.Problem  # With the scheme `FINE`
     fit: bp.MapEstimate
     theta: np.ndarray
     synthetic: bool
@@ -247,72 +214,11 @@ def _setting(
     return Setting(name, problem, fit, draws(problem, fit, count, seed), synthetic, start)
 
 
-def measured(
-    model: Any, truth: Mapping[str, float], runs: Any, samples: int, seed: int, scheme: str = FINE
-) -> list[bp.Experiment]:
-    """Return synthetic experiments with independent noise of 0.3 % of the range, a run being (frequency, inputs)."""
-    generator, found = np.random.default_rng(seed), []
-    for frequency, inputs in runs:
-        solved = bp.solve_periodic(model, truth, inputs, frequency=frequency, samples=samples, scheme=scheme)
-        noisy = {c: y + NOISE * np.ptp(y) * generator.standard_normal(samples) for c, y in solved.outputs.items()}
-        found.append(
-            bp.Experiment(f"{frequency} Hz", frequency, noisy, inputs, samples=samples, synthetic=True)
-        )  # fmt: skip
-    return found
-
-
-def gear_runs(drive: str, samples: int = SAMPLES) -> list[tuple[float, dict[str, np.ndarray]]]:
-    """Return frequencies and inputs of the 14 experiments."""
-    wave = np.cos(2 * np.pi * np.arange(samples) / samples)
-    return [
-        (frequency, {drive: 4500.0 + force * wave if drive == "force" else 0.12 + stroke * wave})
-        for frequency, force, stroke in RIG
-    ]
-
-
-def gear_priors(free: int) -> dict[str, Any]:
-    """Return priors, ties and fixed values of theta4, theta6 and theta16, or of all 15 parameters."""
-    if free == 15:
-        scale = GEAR | {"theta2": 9.81, "theta7": 1 / 293, "theta12": 0.1}
-        return {"priors": {name: bp.Normal(value, 0.01 * abs(scale[name])) for name, value in GEAR.items()}}
-    priors = {
-        "theta4": bp.LogNormal(GEAR["theta4"], 1.0),
-        "theta6": bp.Normal(GEAR["theta6"], 2.5),
-        "theta16": bp.Normal(GEAR["theta16"], 4.0),
-    }
-    tied = {"theta11": "-1e5*theta4"}
-    fixed = {name: value for name, value in GEAR.items() if name not in (*priors, *tied)}
-    return {"priors": priors, "tied": tied, "fixed": fixed}
-
-
-def gear_problem(drive: str, seed: int, *, free: int = 3, samples: int = SAMPLES, runs: int = 14) -> bp.Problem:
-    """Return the problem of theta4, theta6 and theta16, or of all 15 parameters under priors."""
-    model = bp.models.landing_gear(drive)
-    experiments = measured(model, GEAR, gear_runs(drive, samples)[:runs], samples, seed)
-    return bp.Problem(model, experiments, **gear_priors(free), scheme=FINE)
-
-
 def gear(drive: str, count: int, seed: int, **other: Any) -> Setting:
     """Return the landing gear with one direction given."""
     problem = gear_problem(drive, seed, **other)
     start = {name: GEAR[name] for name in problem.names}
-    return _setting(FORCE if drive == "force" else DISPLACEMENT, problem, count, seed, _gear_at_rest, start)
-
-
-def _gear_at_rest(experiment: bp.Experiment, p: Mapping[str, float]) -> np.ndarray:
-    """Return static equilibrium under the mean input, the gas as warm as the wall."""
-    from scipy.optimize import brentq
-
-    wall = -p["theta17"]
-    if "displacement" in experiment.inputs:
-        return np.array([wall])
-    mean = float(experiment.inputs["force"].mean())
-
-    def balance(q: float) -> float:
-        pressure = p["theta5"] * wall / (1.0 + p["theta6"] * q + p["theta7"] * wall)
-        return p["theta4"] * pressure + p["theta11"] + p["theta1"] * p["theta2"] - mean
-
-    return np.array([brentq(balance, -0.1, -0.99 / p["theta6"]), 0.0, wall])
+    return _setting(FORCE if drive == "force" else DISPLACEMENT, problem, count, seed, gear_at_rest, start)
 
 
 def duffing(count: int, seed: int) -> Setting:
@@ -335,5 +241,5 @@ def damped(data: Path | None, count: int, seed: int) -> Setting:
 def silverbox(data: Path | None, count: int, seed: int) -> Setting:
     """Return the measured Silverbox, or a synthetic one."""
     (recording, _), about = silverbox_data.read_steady_parts(data, seed)
-    problem = silverbox_problem.problem(silverbox_problem.fold(recording, SILVERBOX_SAMPLES))
+    problem = silverbox_data.problem(silverbox_data.fold(recording, SILVERBOX_SAMPLES))
     return _setting(SILVERBOX, problem, count, seed, lambda *_: np.zeros(2), synthetic=about["synthetic"])

@@ -4,9 +4,9 @@ Every contender has to be right before its time counts: |Δ log-posterior| ≤ 0
 times their spread, against fully converged, fine shooting; each at its own cheapest step count or tolerance. Ratios
 are of times taken side by side in one run, with linear algebra in one thread. Peers that are not installed are rows
 that say so.
-"""
 
-from __future__ import annotations
+An unstable period-3 orbit of the pendulum: time integration, begun on it to ten digits, leaves it.
+"""
 
 import argparse
 import json
@@ -17,9 +17,73 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.integrate import solve_ivp
 from threadpoolctl import threadpool_limits
 
-from studies import common, tasks
+import bayesperiodic as bp
+from studies import common
+from studies.benchmark.equations import NUMPY, FirstOrder
+from studies.pendulum.orbits import shoot
+from studies.pendulum.recording import FREQUENCY, OMEGA, QUICK_PERIODS, TRUTH, section_of, simulate
+from studies.shooting import TURN
+
+PERIOD, SAMPLES = 3, 800
+ORBITS, TOLERANCE = 12, 1e-12
+# Of the distance at which the orbit is called left: rad, with rates in units of 5 rad/s a rad.
+LEFT = 0.1
+
+
+def measure(seed: int) -> dict[str, Any]:
+    """Return the orbit's multiplier and how far the integration is from it after each of its periods (SYNTHETIC)."""
+    found = bp.find_orbits(section_of(simulate(QUICK_PERIODS, seed)), periods=[PERIOD])
+    polished = bp.polish_orbits(bp.models.pendulum, found, TRUTH, samples=SAMPLES)
+    orbit = next(one for one in polished if one.period == PERIOD and not one.equilibrium)
+    shot = shoot(TRUTH, OMEGA, orbit.points)
+    if not shot.converged or orbit.solution is None:
+        raise RuntimeError("The period-3 orbit of the pendulum is not confirmed by shooting.")
+    off = distances(shot.points[0])
+    left = next((k + 1 for k, d in enumerate(off) if d > LEFT), None)
+    return {
+        "synthetic": True,
+        "status": orbit.solution.status,
+        "multipliers": orbit.solution.multipliers.real.tolist(),
+        "multipliers_by_shooting": shot.multipliers.real.tolist(),
+        "distances": off,
+        "left_after_periods": left,
+    }
+
+
+def distances(start: np.ndarray) -> list[float]:
+    """Return how far the integration is from its start after each of the orbit's periods, angles modulo a turn."""
+    model = bp.models.pendulum
+    rates, p = FirstOrder(model, ()), np.array([*(TRUTH[name] for name in model.parameters), FREQUENCY])
+    function = rates.function(NUMPY, rates.rates)
+
+    def slope(t: float, y: np.ndarray) -> np.ndarray:
+        out = np.empty(2)
+        function(y, [t * FREQUENCY], p, out)
+        return out
+
+    span = PERIOD / FREQUENCY
+    path = solve_ivp(
+        slope, (0.0, ORBITS * span), start, "DOP853", span * np.arange(1, ORBITS + 1), rtol=TOLERANCE, atol=TOLERANCE
+    )
+    angle, rate = path.y - start[:, None]
+    turned = np.abs((angle + np.pi) % TURN - np.pi)
+    return np.maximum(turned, np.abs(rate) / 5.0).tolist()
+
+
+def account(found: dict[str, Any]) -> str:
+    """Return what is printed."""
+    steps = ", ".join(f"{d:.0e}" for d in found["distances"])
+    largest = max(map(abs, found["multipliers"]))
+    return (
+        f"  period-3 orbit (SYNTHETIC), multiplier {largest:.4g}: this package {found['status']}; DOP853 at 1e-12, "
+        f"begun on the orbit, is off by {steps} rad after each of its periods; it has left it after "
+        f"{found['left_after_periods']}"
+    )
+
 
 # What the guard compares with.
 KEPT = Path("figures/benchmark/results.json")
@@ -30,8 +94,8 @@ PARTS = "parts"
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
-    from studies.benchmark import figures, tables, targets  # compiles
-    from studies.sampling.rows import table
+    from studies.benchmark import figures, targets
+    from studies.common import table_of_rows
 
     before = read_kept(KEPT) if options.guard else None
     if options.guard:
@@ -44,19 +108,19 @@ def run(options: argparse.Namespace) -> None:
     for number, (name, make) in enumerate(problems(options).items()):
         with watch.part(name, f"{name}: every contender"):
             work = partial(_of_problem, name, make, options)
-            one = tasks.remembered(kept / f"{number}.pkl", _source(options, name), work)
+            one = common.remembered(kept / f"{number}.pkl", _source(options, name), work)
         found["problems"][name] = one["contest"]
-        print(tables.problem(name, one["contest"]), flush=True)
+        print(targets.problem(name, one["contest"]), flush=True)
         if "posterior" in one:
             found["posterior"] = one["posterior"]
-            print(tables.posterior(one["posterior"]), flush=True)
+            print(targets.posterior(one["posterior"]), flush=True)
         if "floor" in one:
             found["floor"][name] = one["floor"]
-            print(tables.floor(name, one["floor"]), flush=True)
+            print(targets.floor(name, one["floor"]), flush=True)
     if not options.quick:
         _rest(found, options, watch)
     found["checks"] = targets.rows(found)
-    print("\nWhat must show\n" + table(found["checks"]) + "\n")
+    print("\nWhat must show\n" + table_of_rows(found["checks"]) + "\n")
     with watch.part("figure", "drawing"):
         paths = common.save_figures(options.out, {"benchmark": figures.draw(found)})
     path = common.write_results(options.out, found | {"seconds": watch.total(), "versions": common.versions()})
@@ -91,11 +155,11 @@ def _source(options: argparse.Namespace, name: str) -> str:
 
 def _rest(found: dict[str, Any], options: argparse.Namespace, watch: common.Stopwatch) -> None:
     """Measure the pendulum's unstable orbit and how time and memory grow."""
-    from studies.benchmark import pendulum, scaling
+    from studies.benchmark import scaling
 
     with watch.part("pendulum", "an unstable orbit of the pendulum, by time integration"):
-        found["pendulum"] = pendulum.measure(options.seed)
-    print(pendulum.account(found["pendulum"]), flush=True)
+        found["pendulum"] = measure(options.seed)
+    print(account(found["pendulum"]), flush=True)
     with watch.part("scaling", "growth of time and memory"):
         found["scaling"] = scaling.measure(options.seed)
     print(scaling.account(found["scaling"]), flush=True)
@@ -110,10 +174,10 @@ def read_kept(path: Path) -> dict[str, Any]:
 
 def guard(found: dict[str, Any], before: dict[str, Any]) -> None:
     """Compare ratios, never seconds, with those kept; raise a RuntimeError if any is worse."""
-    from studies.benchmark import guard as benchmark_guard
+    from studies.benchmark import targets
 
-    lines = benchmark_guard.worse(found, before)
-    print(f"guard: {benchmark_guard.compared(found, before)} ratios compared, tolerance {benchmark_guard.TOLERANCE:g}")
+    lines = targets.worse(found, before)
+    print(f"guard: {targets.compared(found, before)} ratios compared, tolerance {targets.TOLERANCE:g}")
     if lines:
         raise RuntimeError("ratios are worse than those kept:\n" + "\n".join(lines))
 
@@ -145,8 +209,7 @@ def contest(setting: Any, quick: bool) -> tuple[dict[str, Any], Any]:
     A quick run leaves out other packages and those of SciPy's methods that integrate.
     """
     from studies.benchmark import contenders, peers
-    from studies.benchmark.integration import PREDICTED, SHOOTING
-    from studies.benchmark.reference import refer
+    from studies.benchmark.integration import PREDICTED, SHOOTING, refer
 
     contest = contenders.Contest(refer(setting))
     scheme = contenders.add_own(contest)

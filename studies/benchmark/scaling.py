@@ -1,7 +1,5 @@
 """How time and memory grow with samples, experiments, walkers and parameters; what starting takes."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -15,9 +13,8 @@ from typing import Any
 import numpy as np
 
 import bayesperiodic as bp
-from studies.benchmark.problems import NOISE, gear_problem
-from studies.benchmark.timing import Action, interleaved, slope
-from studies.solver.cost import GEAR
+from studies.gear import GEAR, NOISE, gear_problem
+from studies.timing import Action, interleaved, slope
 
 SIZES = {"samples": (800, 1600, 3200), "experiments": (2, 4, 7, 14), "walkers": (16, 32, 64, 128)}
 FREE = (1, 3, 7, 15)

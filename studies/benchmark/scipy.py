@@ -1,7 +1,5 @@
 """SciPy's methods on one experiment: solve_ivp on compiled right-hand sides, solve_bvp on those of NumPy."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,20 +23,11 @@ NODES, MOST_NODES = 201, 50_000
 
 @dataclass(frozen=True)
 class Initial:
-    """solve_ivp through cycles of one experiment.
+    """solve_ivp through cycles of one experiment."""
 
-    Attributes
-    ----------
-    discretised : Discretised
-        Where starts come from.
-    method : str
-    relative : float
-        The relative tolerance, and the absolute one of the states' sizes.
-    """
-
-    discretised: Discretised
+    discretised: Discretised  # Where starts come from
     method: str
-    relative: float
+    relative: float  # The relative tolerance, and the absolute one of the states' sizes
 
     @property
     def _case(self) -> Case:
@@ -97,13 +86,7 @@ def tune_initial(
 
 
 class Boundary:
-    """solve_bvp with periodic conditions on one experiment.
-
-    Parameters
-    ----------
-    case : Case
-    tolerance : float
-    """
+    """solve_bvp with periodic conditions on one experiment."""
 
     def __init__(self, case: Case, tolerance: float):
         self.case, self.tolerance, first = case, tolerance, FirstOrder(case.model, case.moving)
@@ -149,20 +132,12 @@ class Boundary:
 
 @dataclass(frozen=True)
 class Solved:
-    """solve_bvp from a mesh and the states on it, those of the estimate or of equilibrium.
-
-    Attributes
-    ----------
-    boundary : Boundary
-    start : str
-    times : array (nodes,)
-    guess : array (size, nodes)
-    """
+    """solve_bvp from a mesh and the states on it, those of the estimate or of equilibrium."""
 
     boundary: Boundary
     start: str
-    times: np.ndarray
-    guess: np.ndarray
+    times: np.ndarray  # (nodes,)
+    guess: np.ndarray  # (size, nodes)
 
     def __call__(self, p: np.ndarray) -> float:
         """Return the log-likelihood."""

@@ -1,6 +1,9 @@
-"""What the benchmark should show, each beside what was measured."""
+"""What the benchmark should show, each beside what was measured.
 
-from __future__ import annotations
+Regression guard: the ratios of a quick run against those kept. Seconds are never compared.
+
+The benchmark's results as text.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,7 +15,105 @@ from studies.benchmark.peers import BALANCE, DIFFRAX_ROWS
 from studies.benchmark.posteriors import NUMPYRO
 from studies.benchmark.problems import DISPLACEMENT, DUFFING, FORCE
 from studies.benchmark.scipy import BVP, INITIAL
-from studies.sampling.rows import Row, row
+from studies.common import Row, row
+
+
+def problem(name: str, found: Mapping[str, Any]) -> str:
+    """Return the contenders of one problem."""
+    kind = "SYNTHETIC data" if found["synthetic"] else "measured data"
+    experiments = "1 experiment" if found["experiments"] == 1 else f"{found['experiments']} experiments"
+    lines = [
+        f"{name} ({kind}, {experiments}, {found['samples']} samples; |Δ log-posterior| ≤ {found['allowed']:g} at "
+        f"{found['draws']} draws, reference uncertain by {found['reference_uncertainty']:.0e})",
+        f"  {'contender':52s}{'ms':>10s}{'/ warm (least … largest)':>34s}{'error':>9s}  settings",
+    ]
+    return "\n".join([*lines, *(_row(entry) for entry in found["rows"])])
+
+
+def _row(entry: Mapping[str, Any]) -> str:
+    error = "-" if entry["error"] is None else f"{entry['error']:.0e}"
+    time = "-" if entry["milliseconds"] is None else f"{entry['milliseconds']['median']:.3g}"
+    return f"  {entry['name']:52s}{time:>10s}{between(entry['ratio']):>34s}{error:>9s}  {entry['note']}"
+
+
+def between(values: Mapping[str, float] | None) -> str:
+    """Return a median with its range."""
+    return "-" if values is None else f"{values['median']:.3g} ({values['least']:.3g} … {values['largest']:.3g})"
+
+
+def posterior(found: Mapping[str, Any]) -> str:
+    """Return samplers, and emcee around the contenders."""
+    lines = ["Effective samples a second, Duffing (SYNTHETIC data), the smallest of any parameter"]
+    for name, entry in found["samplers"].items():
+        value = f"{entry['ess_per_second']:.3g}" if "ess_per_second" in entry else "-"
+        lines.append(f"  {name:60s}{value:>10s}  {entry.get('note', '')}")
+    lines.append(f"  {found['split']['best']} over emcee around:  ratio = sampler × solver")
+    for name, entry in found["split"]["against"].items():
+        lines.append(f"    {name:58s}{entry['ratio']:>10.3g} = {entry['sampler']:.3g} × {entry['solver']:.3g}")
+    return "\n".join(lines)
+
+
+def floor(name: str, found: Mapping[str, Any]) -> str:
+    """Return floor and stages of one problem."""
+    lines = [f"{name}: the floor, and what a warm log-posterior takes on one core [µs]"]
+    for scheme, entry in found["schemes"].items():
+        parts = ", ".join(f"{part} {value['median']:.0f}" for part, value in entry["floor_us"].items() if part != "sum")
+        stages = ", ".join(f"{stage} {value:.0f}" for stage, value in entry["stages_us"].items())
+        lines.append(f"  {scheme}: floor {entry['floor_us']['sum']['median']:.0f} ({parts})")
+        lines.append(f"    stages: {stages}")
+        ratios = "; ".join(f"{what} {between(value)}" for what, value in entry["ratio"].items())
+        lines.append(f"    over the floor: {ratios}")
+    lines.append(
+        f"  memory {between(found['bandwidth_gb_per_s'])} GB/s on one core; emcee itself {between(found['emcee_us'])} "
+        "µs a log-posterior"
+    )
+    return "\n".join(lines)
+
+
+# By which factor a median may be worse; on a shared machine those of a quick run stray by a third, some by more, and
+# then the ranges over the repeats overlap.
+TOLERANCE = 1.6
+OWN = "this package"
+
+
+def worse(now: Mapping[str, Any], kept: Mapping[str, Any], tolerance: float = TOLERANCE) -> list[str]:
+    """Return a line for every ratio whose median is worse now by more than the tolerance, and its best than any kept.
+
+    Contenders are compared by their time over this package's, which must not fall, and this package by its time over
+    the floor, which must not rise.
+    """
+    lines = []
+    for name, (new, old) in _pairs(now, kept).items():
+        rises = "/ floor" in name
+        factor = new["median"] / old["median"] if rises else old["median"] / new["median"]
+        apart = new["least"] > old["largest"] if rises else new["largest"] < old["least"]
+        if factor > tolerance and apart:
+            lines.append(f"{name}: {new['median']:.3g}, kept {old['median']:.3g}, worse by a factor {factor:.2f}")
+    return lines
+
+
+def _pairs(now: Mapping[str, Any], kept: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    new, old = _ratios(now), _ratios(kept)
+    return {name: (value, old[name]) for name, value in new.items() if name in old}
+
+
+def _ratios(found: Mapping[str, Any]) -> dict[str, Mapping[str, float]]:
+    result = {
+        f"{problem}: {row['name']} / {OWN}": row["ratio"]
+        for problem, entry in found["problems"].items()
+        for row in entry["rows"]
+        if row["ratio"] and not row["name"].startswith(OWN)
+    }
+    for problem, floor in found["floor"].items():
+        for scheme, entry in floor["schemes"].items():
+            result |= {f"{problem}, {scheme}: {what} / floor": v for what, v in entry["ratio"].items()}
+    return result
+
+
+def compared(now: Mapping[str, Any], kept: Mapping[str, Any]) -> int:
+    """Return how many ratios both runs have."""
+    return len(_pairs(now, kept))
+
 
 # Least ratios to one warm log-posterior.
 LEAST = (

@@ -7,21 +7,114 @@ smaller. Replicates are saved as they end, results after each case, and the same
 ``--processes N`` has the replicates done by N processes, ``--dask ADDRESS`` by a Dask cluster, ``--mpi`` by the
 processes of ``mpiexec -n 3 python -m mpi4py.futures -m studies calibration --mpi``. ``--scaling`` measures what a
 second worker gains, and nothing else.
+
+The problems whose intervals the calibration study counts; of their recordings only the settings are used.
+
+Every truth is drawn from the priors, so these are problems and not results: parameters of the size of the measured
+magneto-rheological damper, a hardening Duffing oscillator below its resonance, and eq. (9) of the landing gear with the
+displacement given. Noise is white, with the variance of the folded mean drawn from its prior too.
+
+What a second worker gains, what a task costs, and what that means for a thousand workers.
+
+Campaigns of the Duffing oscillator are farmed out to Dask clusters of one and of two processes on this machine. Between
+them the same number of plain loops, that share nothing, run in processes of their own: what two of these gain is what
+the machine has to give at that moment, and the farm is measured against it.
 """
 
-from __future__ import annotations
-
 import argparse
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
+from multiprocessing import get_context
 from typing import Any
 
+import cloudpickle
 import numpy as np
 
 import bayesperiodic as bp
+from bayesperiodic._parallel import team
 from studies import common
-from studies.calibration.cases import OVERCOUNT, damper, duffing, landing_gear, miscounted
-from studies.calibration.scaling import scaling
+
+CYCLES = 10
+OVERCOUNT = 1.25
+
+
+def damper() -> bp.Problem:
+    """Return the problem of the damper: Dahl friction, 0.5 mm at 8 Hz, force measured to some newtons."""
+    run = _run("8 Hz 0.5 mm", 8.0, {"displacement": (0.0, 5e-4)}, {"force": 20}, 256)
+    priors = {"Kx": bp.LogNormal(800.0, 0.2), "Kw": bp.LogNormal(60.0, 0.2), "rho": bp.LogNormal(2.8e4, 0.3)}
+    return _problem(bp.models.dahl, run, priors, {"K": 0.0, "F0": 0.0}, 3.0**2)
+
+
+def miscounted() -> bp.Problem:
+    """Return that of the Duffing oscillator with a likelihood that counts a quarter more independent values.
+
+    The displacement is measured so well, to 0.02 mm, that the priors hardly matter.
+    """
+    return duffing(2e-5, OVERCOUNT)
+
+
+def duffing(sd: float = 1e-4, overcount: float = 1.0) -> bp.Problem:
+    """Return the problem of the Duffing oscillator: 10 N at 5 Hz, displacement measured to a tenth of a millimetre."""
+    run = _run("5 Hz 10 N", 5.0, {"force": (0.0, 10.0)}, {"displacement": 10}, 64, overcount)
+    priors = {"c": bp.LogNormal(1.2, 0.3), "k": bp.LogNormal(900.0, 0.1), "k3": bp.LogNormal(4e5, 0.4)}
+    return _problem(bp.models.duffing, run, priors, {"m": 0.45}, sd**2)
+
+
+def landing_gear() -> bp.Problem:
+    """Return the problem of the landing gear: 80 mm about 120 mm at 0.2 Hz, force and pressure measured.
+
+    Both variances have the same prior, one in N², the other in Pa²: about 50 N of 10 kN and 50 Pa of 2 MPa.
+    """
+    run = _run("0.2 Hz 80 mm", 0.2, {"displacement": (0.12, 0.08)}, {"force": 30, "pressure": 15}, 128)
+    priors = {
+        "theta4": bp.LogNormal(5.2e-3, 0.1),
+        "theta6": bp.Normal(-2.3, 0.15),
+        "theta16": bp.LogNormal(2.0, 0.5),
+    }
+    fixed = {
+        "theta1": 80.0, "theta2": 0.0, "theta3": 8e3, "theta5": 1e6 / 293, "theta7": 0.0, "theta8": 150.0,
+        "theta9": 1e-4, "theta10": 300.0, "theta12": 0.0, "theta15": 17.0, "theta17": -293.0,
+    }  # fmt: skip
+    return bp.Problem(
+        bp.models.landing_gear("displacement"),
+        [run],
+        priors=priors,
+        fixed=fixed,
+        tied={"theta11": "-1e5*theta4"},
+        noise=bp.noise.Independent(prior=bp.LogNormal(50.0**2, 0.5)),
+        scheme="central4",
+    )
+
+
+def _problem(model: bp.Model, run: bp.Experiment, priors: Any, fixed: Any, variance: float) -> bp.Problem:
+    noise = bp.noise.Independent(prior=bp.LogNormal(variance, 0.5))
+    return bp.Problem(model, [run], priors=priors, fixed=fixed, noise=noise, scheme="central4")
+
+
+def _run(
+    name: str,
+    frequency: float,
+    inputs: dict[str, tuple[float, float]],
+    harmonics: dict[str, int],
+    samples: int,
+    overcount: float = 1.0,
+) -> bp.Experiment:
+    """Return an experiment's settings, with the mean and the amplitude of each input; its outputs are never used."""
+    wave = np.sin(2 * np.pi * np.arange(samples) / samples)
+    return bp.Experiment(
+        name,
+        frequency,
+        {channel: wave for channel in harmonics},
+        {channel: mean + amplitude * wave for channel, (mean, amplitude) in inputs.items()},
+        samples=samples,
+        cycles=CYCLES,
+        harmonics=harmonics | dict.fromkeys(inputs, 1),
+        independent={channel: round(overcount * (2 * kept + 1)) for channel, kept in harmonics.items()},
+        synthetic=True,
+    )
+
 
 CASES: dict[str, Callable[[], bp.Problem]] = {
     "duffing": duffing,
@@ -93,4 +186,91 @@ def collect(one: bp.Calibration) -> dict[str, Any]:
             method: {name: np.histogram(values, BINS, (0.0, 1.0))[0].tolist() for name, values in by_name.items()}
             for method, by_name in one.positions.items()
         },
+    }
+
+
+ROUNDS, EACH, LOOP = 7, 6, 20_000_000
+EMPTY = 500
+SCALING_STEPS = 250
+
+
+def scaling(seed: int) -> dict[str, Any]:
+    """Return the gains of two workers, seconds a replicate, the cost of a task, and sizes of what travels."""
+    from distributed import Client, LocalCluster
+
+    problem = duffing()
+    with ExitStack() as stack:
+        pool = stack.enter_context(ProcessPoolExecutor(2, get_context("spawn")))
+        clients = {}
+        for workers in (1, 2):
+            cluster = stack.enter_context(LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None))
+            clients[workers] = stack.enter_context(Client(cluster))
+
+        def farm(workers: int, each: int, first: int) -> None:
+            bp.calibrate(
+                problem, replicates=each * workers, seed=first, executor=clients[workers], max_steps=SCALING_STEPS,
+                progress=False,
+            )  # fmt: skip
+
+        def loops(workers: int) -> None:
+            for done in [pool.submit(plain_loop, LOOP) for _ in range(workers)]:
+                done.result()
+
+        for workers in (1, 2):
+            farm(workers, 2, seed)
+            loops(workers)
+        times: dict[str, list[float]] = {"farm 1": [], "farm 2": [], "loop 1": [], "loop 2": []}
+        for number in range(ROUNDS):
+            for workers in (1, 2):
+                times[f"loop {workers}"].append(_seconds(lambda w=workers: loops(w)))  # type: ignore[misc]
+                times[f"farm {workers}"].append(_seconds(lambda w=workers, n=number: farm(w, EACH, n)))  # type: ignore[misc]
+        overhead = _overhead(clients[2])
+    return _account(times, overhead, problem)
+
+
+def plain_loop(count: int) -> int:
+    """Count in plain Python."""
+    total = 0
+    for k in range(count):
+        total += k
+    return total
+
+
+def _overhead(client: Any) -> float:
+    """Return seconds a task that does nothing, of many at once on two workers."""
+
+    def empty() -> None:
+        with team(client, None) as crew:
+            for _ in crew.run(_nothing, range(EMPTY)):
+                pass
+
+    empty()
+    return float(np.median([_seconds(empty) for _ in range(3)])) / EMPTY
+
+
+def _nothing(_: None, task: int) -> int:
+    return task
+
+
+def _seconds(action: Callable[[], Any]) -> float:
+    before = time.perf_counter()
+    action()
+    return time.perf_counter() - before
+
+
+def _account(times: dict[str, list[float]], overhead: float, problem: bp.Problem) -> dict[str, Any]:
+    gains = {what: 2.0 * np.array(times[f"{what} 1"]) / np.array(times[f"{what} 2"]) for what in ("farm", "loop")}
+    ratio = gains["farm"] / gains["loop"]
+    replicate = float(np.median(times["farm 1"])) / EACH
+    return {
+        "gain_of_two_workers": float(np.median(gains["farm"])),
+        "gain_of_two_plain_loops": float(np.median(gains["loop"])),
+        "ratio": float(np.median(gains["farm"]) / np.median(gains["loop"])),
+        "ratios_of_rounds": ratio.tolist(),
+        "seconds_a_replicate": replicate,
+        "overhead_a_task_seconds": overhead,
+        "problem_bytes": len(cloudpickle.dumps(problem)),
+        "rounds": ROUNDS,
+        "replicates_a_round_and_worker": EACH,
+        "workers_one_scheduler_feeds": int(replicate / overhead),
     }

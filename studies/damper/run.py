@@ -5,8 +5,6 @@ github.com/labcontrol-data/mr-damper, mr_damper_4.1.csv). Model: F = Kx·v + K·
 in SI units; the source has mm, s and N.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ records, folded and fitted as these are, but for the noise: with a true model th
 there is in each record (`bp.noise.Measured`). The sensors' scales are known, since they and the stiffnesses are one.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import warnings
@@ -18,10 +16,10 @@ from scipy.stats import binom
 
 import bayesperiodic as bp
 from studies import common
-from studies.flutter import data, rig
+from studies.common import resumed
+from studies.flutter import rig
 from studies.flutter.questions import FREE_SCALES, errors
 from studies.flutter.rig import TRUE, estimate
-from studies.tasks import resumed
 
 FILE = "campaigns.jsonl"
 FIRST_SEED = 100_000
@@ -48,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
 
 def source() -> str:
     """Return what tells campaigns of another version apart."""
-    files = [Path(__file__), *(Path(str(module.__file__)) for module in (data, rig))]
+    files = [Path(__file__), Path(str(rig.__file__))]
     text = common.versions()["bayesperiodic"] + "".join(common.sha256(path) for path in files)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -57,8 +55,8 @@ def campaign(task: Task) -> dict[str, Any]:
     """Return what one campaign says."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        records = data.generate(task[0])
-        experiments, refused = data.usable(records)
+        records = rig.generate(task[0])
+        experiments, refused = rig.usable(records)
         speeds = {record.recording.name: record.speed for record in records}
         try:
             known = {name: TRUE[name] for name in FREE_SCALES}

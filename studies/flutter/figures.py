@@ -1,7 +1,5 @@
 """Figures of the flutter study."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

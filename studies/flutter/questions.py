@@ -1,7 +1,5 @@
 """What the flutter study asks of the fits: what unstable cycles add, what is predicted, how large the misfit is."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -150,16 +148,8 @@ def predictions(
 ) -> dict[str, Any]:
     """Return the errors of cycles that were not fitted: in per cent, in posterior sds, and with the model's error.
 
-    Parameters
-    ----------
-    fitted : Fitted
-        Without them.
-    experiments : mapping of str to Experiment
-    speeds : mapping of str to float
-        [m/s].
-    left : sequence of str
-    draws : int
-        From the Laplace approximation; there are none where the MAP point itself has no such cycle.
+    `fitted`: Without them. `speeds`: [m/s]. `draws`: From the Laplace approximation; there are none where the MAP point
+    itself has no such cycle.
     """
     fit, along = fitted.fit, cycles(RIG | fitted.fit.theta)
     every = laplace_draws(fit, draws)

@@ -1,7 +1,5 @@
 """The flutter rig by other means: matrices in numbers, eigenvalues, time integration; nothing of the package."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cache
 

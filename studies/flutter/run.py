@@ -4,22 +4,241 @@ An aerofoil on springs in a wind, whose stable limit cycles and unstable ones (h
 measured at wind speeds from 14.9 to 17.3 m/s (K. H. Lee, D. A. W. Barton, L. Renson, Mechanical Systems and Signal
 Processing 191, 2023, 110173). Asked: what the unstable cycles add, whether the model predicts cycles that it was not
 fitted to, and what cannot be known as long as the sensors' scales are free.
+
+The authors' values by continuation, against eigenvalues and a long time integration that know nothing of it.
+
+What the flutter study writes and prints.
 """
 
-from __future__ import annotations
-
 import argparse
+from collections.abc import Mapping
 from typing import Any, NamedTuple
+
+import numpy as np
 
 import bayesperiodic as bp
 from studies import common
-from studies import tasks as common_resumed
 from studies.flutter import campaigns, questions
-from studies.flutter import checks as flutter_checks
 from studies.flutter import figures as flutter_figures
-from studies.flutter import results as flutter_results
-from studies.flutter.data import read_records, usable
-from studies.flutter.rig import AUTHORS, MODEL, RIG, SENSORS, Fitted, cycles, estimate, problem
+from studies.flutter.reference import hopf, settled
+from studies.flutter.rig import (
+    ADDRESS,
+    AUTHORS,
+    LARGEST_DRIFT,
+    MODEL,
+    RIG,
+    RULE,
+    SAMPLES,
+    SENSORS,
+    SHA256,
+    TRUE,
+    Fitted,
+    Record,
+    cycles,
+    estimate,
+    problem,
+    read_records,
+    spectral_frequency,
+    usable,
+)
+
+
+def introduction(
+    data: dict[str, Any], records: list[Record], experiments: dict[str, bp.Experiment], refused: dict[str, str]
+) -> str:
+    """Return what is said about the records before anything is fitted."""
+    lines = [f"  {'SYNTHETIC records' if data['synthetic'] else 'measured records'} {data['path']}; {RULE}"]
+    for record in records:
+        name = record.recording.name
+        if name in experiments:
+            e = experiments[name]
+            lines.append(
+                f"  {name:17s} {record.speed:5.1f} m/s  {e.frequency:.5f} Hz ± {e.frequency_se / e.frequency:.4%}  "
+                f"{e.cycles} cycles, drift of pitch {e.drift['pitch']:+.1%}"
+            )
+    lines += [f"  left out: {why}" for why in refused.values()]
+    if data["synthetic"]:
+        lines.append(f"  the measured file was not found; it is at {ADDRESS}, sha256 {SHA256}; true values {TRUE}")
+    return "\n".join(lines)
+
+
+def of_records(records: list[Record], experiments: dict[str, bp.Experiment], refused: dict[str, str]) -> dict[str, Any]:
+    """Return what each record is, used or not, and why."""
+    found: dict[str, Any] = {}
+    for record in records:
+        name = record.recording.name
+        found[name] = {"wind_speed": record.speed, "control": record.control, "used": name in experiments}
+        if name in experiments:
+            e = experiments[name]
+            found[name] |= {
+                "frequency": e.frequency,
+                "frequency_se": e.frequency_se,
+                "spectral_frequency": spectral_frequency(record, e),
+                "cycles": e.cycles,
+                "periodicity": e.periodicity,
+                "drift": dict(e.drift),
+                "largest_drift": LARGEST_DRIFT,
+                "scatter_of_one_cycle": dict(e.scatter),
+                "amplitude": questions.sizes(e.outputs),
+            }
+    return {"rule": RULE, "refused": refused, "records": found}
+
+
+def of_fits(fits: dict[str, Fitted], experiments: dict[str, bp.Experiment], authors: dict[str, Any]) -> dict[str, Any]:
+    """Return what comes from the fits."""
+    both = fits["both"]
+    fit, found = both.fit, questions.errors(both, experiments)
+    return {
+        "units": {name: MODEL.units[name] for name in fit.theta},
+        "map": fit.theta,
+        "sd": fit.sd,
+        "robust_sd": fit.robust_sd,
+        "status": fit.status,
+        "noise": fit.noise,
+        "frequency_error_allowed": both.frequency_error,
+        "undetermined": list(fit.undetermined),
+        "doubling_shift": fit.doubling_shift,
+        "misfit": {
+            "rms": fit.rms,
+            "unexplained_variance": fit.fvu,
+            "measurement_noise": {c: split.measurement for c, split in fit.noise_split.items()},
+            "model_error": {c: split.model for c, split in fit.noise_split.items()},
+            "whiteness": {c: test.p for c, test in fit.whiteness.items()},
+        },
+        "errors": found,
+        "errors_rms": questions.mean_size(found),
+        "branches_kept_apart": all(one["as_measured"] for one in found.values()),
+        "authors_errors": authors,
+        "authors_errors_rms_where_a_cycle_exists": questions.mean_size(authors),
+        "contraction": questions.contraction(fits),
+    }
+
+
+def of_posterior(
+    structure: bp.Structure,
+    fit: bp.MapEstimate,
+    posterior: bp.Posterior | None,
+    verdict: bp.Identifiability | None,
+    compared: bp.Comparison | None,
+) -> dict[str, Any]:
+    """Return what the equations leave open, and what the draws say."""
+    return {
+        "structure": {"text": str(structure), "free_scales": questions.FREE_SCALES},
+        "verdicts": verdict and verdict.table["verdict"].to_dict(),
+        "posterior": posterior and compared and draws_of(posterior, fit, compared),
+    }
+
+
+def draws_of(posterior: bp.Posterior, fit: bp.MapEstimate, compared: bp.Comparison) -> dict[str, Any]:
+    """Return what the draws say, beside Laplace."""
+    names = list(fit.theta)
+    return {
+        "converged": posterior.converged,
+        "reason": posterior.reason,
+        "failures": posterior.failures,
+        "mean": {n: float(posterior.draws(n).mean()) for n in names},
+        "sd": {n: float(posterior.draws(n).std()) for n in names},
+        "laplace_sd": {n: fit.sd[n] for n in names},
+        "correlation_of_logarithms": _correlation(posterior, "k_alpha2", "gain_pitch"),
+        "laplace_verdicts": compared.table["verdict"].to_dict(),
+    }
+
+
+def _correlation(posterior: bp.Posterior, one: str, other: str) -> float:
+    """Return the correlation of two parameters' logarithms: that of a ridge on which their ratio stays is 1."""
+    return float(np.corrcoef(*(np.log(posterior.draws(name).ravel()) for name in (one, other)))[0, 1])
+
+
+def tables(results: dict[str, Any]) -> str:
+    """Return the tables, with what must be said about them."""
+    kind = "SYNTHETIC data" if results["data"]["synthetic"] else "measured data"
+    lines = [f"Flutter rig, {kind}: errors of amplitudes (heave, pitch) and of the frequency", ""]
+    for name, one in results["errors"].items():
+        theirs = results["authors_errors"][name]
+        lines.append(
+            f"  {name:17s} fitted {_per_cent(one)}    authors' values "
+            + (_per_cent(theirs) if theirs["amplitude_error"] else "no cycle")
+        )
+    misfit = results["misfit"]
+    lines.append(
+        f"  rms of the amplitudes' errors {results['errors_rms']:.1%}; the authors' "
+        f"{results['authors_errors_rms_where_a_cycle_exists']:.1%} where they have a cycle"
+    )
+    for channel, error in misfit["model_error"].items():
+        lines.append(
+            f"  {channel}: model error {error:.3g}, measurement noise {misfit['measurement_noise'][channel]:.3g} "
+            f"(sensor units), whitened residual p = {misfit['whiteness'][channel]:.2g}"
+        )
+    lines += ["", "sd over the prior's sd by data (stable, unstable, both)"]
+    for name, by in results["contraction"].items():
+        lines.append(f"  {name:20s}" + "  ".join(f"{by[k]['estimate']:10.5g} ({by[k]['over_prior']:.3f})" for k in by))
+    lines += ["", "cycles that were not fitted: error, in posterior sds, in sds with the model's error"]
+    for case, found in results["predictions"].items():
+        for name, one in found.items():
+            said = [_missed(c, one[c]) for c in ("heave", "pitch") if c in one]
+            lines.append(f"  {case:22s} {name:17s} " + (", ".join(said) or "no cycle"))
+    return "\n".join(lines)
+
+
+def _missed(channel: str, one: dict[str, float]) -> str:
+    if "posterior_sds" not in one:
+        return f"{channel} {one['error']:+.1%} (few draws have the cycle)"
+    return f"{channel} {one['error']:+.1%} ({one['posterior_sds']:+.1f}, {one['sds_with_model_error']:+.1f})"
+
+
+def _per_cent(one: dict[str, Any]) -> str:
+    size = one["amplitude_error"]
+    return f"{size['heave']:+6.1%} {size['pitch']:+6.1%} {one['frequency_error']:+6.2%}"
+
+
+SPEEDS = (15.6, 16.5, 17.3)
+STATES = ("h", "alpha", "w")
+# The study's grid, and one on which the series has converged.
+GRIDS = (SAMPLES, 2 * SAMPLES)
+CURVE = 4000
+
+
+def account() -> dict[str, Any]:
+    """Return the Hopf point and the stable cycles by both ways, and by how much they differ, by points of the grid."""
+    by_grid = {points: cycles(RIG | AUTHORS | SENSORS, points) for points in GRIDS}
+    point, (speed, frequency) = by_grid[SAMPLES].hopf, hopf()
+    return {
+        "hopf_speed": {"continuation": point.value, "eigenvalues": speed},
+        "hopf_frequency": {"continuation": point.frequency, "eigenvalues": frequency},
+        "stable_cycles": {
+            f"{points} points": {f"{at:g} m/s": _differences(along.at("stable", at), at) for at in SPEEDS}
+            for points, along in by_grid.items()
+        },
+    }
+
+
+def _differences(orbit: bp.PeriodicSolution, speed: float) -> dict[str, float]:
+    """Return the relative differences of the frequency and of each state's amplitude from a time integration's."""
+    frequency, states = settled(speed)
+    return {"frequency": float(orbit.frequency / frequency) - 1.0} | {
+        name: half_range(orbit.states[name]) / half_range(own) - 1.0 for name, own in zip(STATES, states, strict=True)
+    }
+
+
+def half_range(values: np.ndarray) -> float:
+    """Return half the range of a periodic signal, between its samples too, by its Fourier series."""
+    return 0.5 * float(np.ptp(np.fft.irfft(np.fft.rfft(values), CURVE))) * CURVE / values.size
+
+
+def line(found: Mapping[str, Any]) -> str:
+    """Return what is printed."""
+    speed, frequency = found["hopf_speed"], found["hopf_frequency"]
+    off = {
+        points: max(abs(one[name]) for one in by_speed.values() for name in STATES)
+        for points, by_speed in found["stable_cycles"].items()
+    }
+    told = ", ".join(f"{most:.1e} with {points}" for points, most in off.items())
+    return (
+        f"  the authors' values: Hopf point {speed['continuation']:.4f} m/s, {frequency['continuation']:.5f} Hz "
+        f"(eigenvalues {speed['eigenvalues']:.4f}, {frequency['eigenvalues']:.5f}); amplitudes of stable cycles off a "
+        f"time integration's by at most {told}"
+    )
+
 
 SAMPLING: dict[str, Any] = {
     "ensembles": 2,
@@ -61,7 +280,7 @@ def run(options: argparse.Namespace) -> None:
         records, data = read_records(options.data, options.seed)
         experiments, refused = usable(records)
         speeds = {r.recording.name: r.speed for r in records if r.recording.name in experiments}
-    print(flutter_results.introduction(data, records, experiments, refused))
+    print(introduction(data, records, experiments, refused))
     found = answers(watch, experiments, speeds, options.quick)
     sampled = sample(watch, found.fits["both"], experiments, speeds, options)
     with watch.part("figures", "drawing"):
@@ -70,12 +289,12 @@ def run(options: argparse.Namespace) -> None:
         paths = common.save_figures(options.out, figures)
 
     results = {"data": data, "seed": options.seed, "quick": options.quick}
-    results |= flutter_results.of_records(records, experiments, refused)
-    results |= flutter_results.of_fits(found.fits, experiments, found.authors)
+    results |= of_records(records, experiments, refused)
+    results |= of_fits(found.fits, experiments, found.authors)
     results |= {"checks": found.checks, "authors_branch": found.authors_branch, "predictions": found.left_out}
-    results |= flutter_results.of_posterior(found.structure, sampled.fit, *sampled[1:])
+    results |= of_posterior(found.structure, sampled.fit, *sampled[1:])
     results |= {"seconds": watch.total(), "versions": common.versions()}
-    print("\n" + flutter_results.tables(results) + f"\n{found.structure}\n{sampled.verdict or ''}")
+    print("\n" + tables(results) + f"\n{found.structure}\n{sampled.verdict or ''}")
     print(f"{sampled.compared or ''}\n")
     path = common.write_results(options.out, results)
     print(f"figures{' (synthetic data)' if data['synthetic'] else ''}: {', '.join(map(str, paths))}\nresults: {path}")
@@ -86,8 +305,8 @@ def answers(
 ) -> Answers:
     """Return what the fits say: of the authors' values, to all cycles, to some of them, and of those left out."""
     with watch.part("authors", "following the cycles of the authors' values from the Hopf point"):
-        checks = flutter_checks.account()
-        print(flutter_checks.line(checks), flush=True)
+        checks = account()
+        print(line(checks), flush=True)
         authors = questions.authors_errors(experiments, speeds)
         branch = hopf_and_fold()
     with watch.part("map", "estimating from all cycles"):
@@ -142,7 +361,7 @@ def parts(
         left_out[f"without {label} m/s"] = group
     draws, theta = 20 if quick else 200, dict(both.fit.theta)
     tasks = [(experiments, speeds, theta, names, draws) for names in left_out.values()]
-    found = dict(zip(left_out, common_resumed.each(questions.leave_out, tasks), strict=True))
+    found = dict(zip(left_out, common.each(questions.leave_out, tasks), strict=True))
     fits = dict(zip(KINDS, (fitted for fitted, _ in found.values()), strict=False)) | {"both": both}
     return fits, {label: predicted for label, (_, predicted) in found.items()}
 

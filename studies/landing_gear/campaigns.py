@@ -4,8 +4,6 @@ Every campaign has its own noise. Each of its experiments is sampled briefly (tw
 600 steps), which is enough for intervals and signs; the Laplace approximation is counted beside it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
@@ -17,13 +15,11 @@ from scipy.stats import binom
 
 import bayesperiodic as bp
 from studies import common
+from studies.common import resumed
 from studies.landing_gear import identification, rig, verdicts
-from studies.landing_gear import truth as landing_gear_truth
 from studies.landing_gear.identification import DISPLACEMENT, PRIORS, Identified, estimate, fold
-from studies.landing_gear.rig import RUNS, Run, measure
-from studies.landing_gear.truth import GEAR, TRUTHS
+from studies.landing_gear.rig import GEAR, RUNS, TRUTHS, Run, measure
 from studies.landing_gear.verdicts import CONDUCTION, NEGATIVE, judge
-from studies.tasks import resumed
 
 FILE = "campaigns.jsonl"
 FIRST_SEED = 100_000
@@ -42,7 +38,7 @@ def campaigns(folder: Path, count: int, seed: int, truth: str = "A") -> list[dic
 
 def source() -> str:
     """Return what tells campaigns of another version apart."""
-    modules = (identification, rig, landing_gear_truth, verdicts)
+    modules = (identification, rig, verdicts)
     files = [Path(__file__), *(Path(str(module.__file__)) for module in modules)]
     text = common.versions()["bayesperiodic"] + "".join(common.sha256(path) for path in files)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -5,8 +5,6 @@ side. Each gets, experiment by experiment, the largest steps and the loosest tol
 is further off than allowed, of its range, from the integration at its finest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -36,22 +34,12 @@ Integrate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]
 
 @dataclass(frozen=True)
 class Gear:
-    """One experiment as the integrators see it.
-
-    Attributes
-    ----------
-    drive : str
-    experiment : Experiment
-    parameters : array (draws, parameters)
-        In the order of `landing_gear_integrators.NAMES`.
-    estimate : array (parameters,)
-        The MAP estimate.
-    """
+    """One experiment as the integrators see it."""
 
     drive: str
     experiment: bp.Experiment
-    parameters: np.ndarray
-    estimate: np.ndarray
+    parameters: np.ndarray  # (draws, parameters): In the order of `landing_gear_integrators.NAMES`
+    estimate: np.ndarray  # (parameters,): The MAP estimate
 
     def still(self, parameters: np.ndarray) -> np.ndarray:
         """Return static equilibrium under the mean input, the gas as warm as the wall."""
@@ -144,26 +132,13 @@ class Gear:
 
 @dataclass(frozen=True)
 class Contender:
-    """A method with the settings that an experiment needs.
-
-    Attributes
-    ----------
-    integrate : callable
-    fineness : float
-        Steps a cycle, or relative error of a step.
-    tolerance : float
-        Of the steady temperature [K].
-    error : float
-        The largest of any draw's outputs, of their range.
-    cycles : float
-        The mean that it takes from static equilibrium.
-    """
+    """A method with the settings that an experiment needs."""
 
     integrate: Integrate
-    fineness: float
-    tolerance: float
-    error: float
-    cycles: float
+    fineness: float  # Steps a cycle, or relative error of a step
+    tolerance: float  # Of the steady temperature [K]
+    error: float  # The largest of any draw's outputs, of their range
+    cycles: float  # The mean that it takes from static equilibrium
 
 
 def error(outputs: np.ndarray, exact: np.ndarray) -> float:

@@ -5,8 +5,6 @@ the periodic solver, of the others the integration alone, each as accurate as th
 asks of them depends on its scheme, so that each direction has the study's own, and the smoother one the finer one too.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -95,12 +93,7 @@ def draws(
     At theta16 ≤ 0 the gas has no steady state that an integration could reach. Of those with every theta16 positive
     some need more cycles than anybody would wait for.
 
-    Parameters
-    ----------
-    identified : Identified
-    count, seed : int
-    steady : callable
-        Of a draw (1, names).
+    `steady`: Of a draw (1, names).
     """
     posterior, names = identified.posterior, identified.problem.names
     assert posterior is not None

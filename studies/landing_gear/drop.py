@@ -7,8 +7,6 @@ gear is held are chosen so that pressures and strokes are those of the shaker's 
 on what the instruments show; the frame is too heavy to mind half a millimetre.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -19,7 +17,7 @@ import sympy as sp
 
 import bayesperiodic as bp
 from studies.landing_gear.identification import DISPLACEMENT, ENSEMBLES, Identified, draw, estimate, fold
-from studies.landing_gear.truth import parameters
+from studies.landing_gear.rig import parameters
 
 FRAME, HEIGHT, WIDTH = 2.02, 1.16, 0.58
 MASS, GRAVITY, HELD = 690.0, 9.81, 0.02
@@ -31,21 +29,11 @@ CHANNELS = ("displacement", "force", "pressure")
 
 @dataclass(frozen=True)
 class Dropped:
-    """One truth's drop test.
+    """One truth's drop test."""
 
-    Attributes
-    ----------
-    identified : Identified
-        All shaker experiments with theta4, theta6 and theta16 in common.
-    true : Recording
-        What happens, without noise.
-    band : Transient
-        What the posterior expects.
-    """
-
-    identified: Identified
-    true: bp.Recording
-    band: Any
+    identified: Identified  # All shaker experiments with theta4, theta6 and theta16 in common
+    true: bp.Recording  # What happens, without noise
+    band: Any  # What the posterior expects
 
 
 @cache

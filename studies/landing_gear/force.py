@@ -6,19 +6,26 @@ pressure have the covariance B S Bᵀ + J F Jᵀ, with S and F the variances of 
 scatter of the cycles shows, B the harmonics kept, and J the derivatives of the steady motion by the force's amplitudes,
 at an estimate that is made twice; up to one common factor, which is 1 where the model holds. (Errors in variables, to
 first order: W. A. Fuller, Measurement Error Models, Wiley, 1987.)
+
+All experiments of the landing gear at once: theta4 and theta6 in common, theta16 each experiment's own.
+
+How steep the friction of the landing gear may be: theta10 from 30 to 3000 s/m, solved from static equilibrium.
 """
 
-from __future__ import annotations
-
 import warnings
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
 import bayesperiodic as bp
 from studies.landing_gear.identification import (
+    DISPLACEMENT,
+    DRIVES,
+    ENSEMBLES,
     FIXED,
     FORCE,
     KEPT,
@@ -30,7 +37,57 @@ from studies.landing_gear.identification import (
     estimate,
     fold,
 )
-from studies.landing_gear.verdicts import FALSE_ALARM, Verdict
+from studies.landing_gear.rig import GEAR, HARMONICS, MEAN_COMPRESSION, Run
+from studies.landing_gear.verdicts import CONDUCTION, FALSE_ALARM, Verdict, laplace
+
+SLOPES = (30.0, 100.0, 300.0, 1000.0, 3000.0)
+
+
+def solve(run: Run, slope: float, drive: str) -> tuple[bp.PeriodicSolution, bool]:
+    """Return the gear's motion in an experiment, and whether the solver warned that the grid is too coarse."""
+    gear = GEAR | {"theta10": slope}
+    phase = np.exp(2j * np.pi * np.outer(np.arange(SAMPLES) / SAMPLES, list(HARMONICS)))
+    moved = MEAN_COMPRESSION + run.stroke * (phase @ list(HARMONICS.values())).real
+    found, warned = _solve(run, gear, DISPLACEMENT, moved)
+    if drive == FORCE:
+        amplitudes = np.fft.rfft(found.outputs["force"])
+        amplitudes[KEPT[FORCE]["force"] + 1 :] = 0.0
+        found, warned = _solve(run, gear, FORCE, np.fft.irfft(amplitudes, SAMPLES))
+    return found, warned
+
+
+def _solve(run: Run, gear: Mapping[str, float], drive: str, signal: np.ndarray) -> tuple[bp.PeriodicSolution, bool]:
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        found = bp.solve_periodic(
+            bp.models.landing_gear(drive), gear, {drive: signal}, frequency=run.frequency, samples=SAMPLES
+        )
+    return found, any("steps of the grid" in str(warning.message) for warning in told)
+
+
+def slope_account(runs: Sequence[Run]) -> dict[str, Any]:
+    """Return by direction and slope how the solves of all experiments ended, and how many warned."""
+    result: dict[str, Any] = {}
+    for drive in DRIVES:
+        result[drive] = {}
+        for slope in SLOPES:
+            every = [solve(run, slope, drive) for run in runs]
+            statuses = Counter(found.status for found, _ in every)
+            result[drive][f"{slope:g}"] = {"status": dict(statuses), "warned": sum(warned for _, warned in every)}
+    return result
+
+
+def slope_line(found: Mapping[str, Any]) -> str:
+    """Return what is printed."""
+    every = [one for by_slope in found.values() for one in by_slope.values()]
+    total = sum(sum(one["status"].values()) for one in every)
+    converged = sum(one["status"].get("converged", 0) for one in every)
+    warned = ", ".join(f"{one['warned']} at {slope} s/m" for slope, one in found[FORCE].items() if one["warned"])
+    return (
+        f"  friction slope 30 to 3000 s/m: {converged} of {total} solves converged on {SAMPLES} points; force given, "
+        f"the solver warned that this is too coarse for {warned or 'none'}"
+    )
+
 
 # Points compared: as many as the harmonics kept allow, but for one. They are compared with the whole motion, so that
 # harmonics must be kept as long as there are any.
@@ -113,3 +170,67 @@ def amplitudes(experiment: bp.Experiment, channel: str) -> np.ndarray:
     sd = np.sqrt(0.5 * np.mean(variance[1 : harmonics + 1]))
     phase = 2 * np.pi * np.outer(np.arange(SAMPLES) / SAMPLES, np.arange(1, harmonics + 1))
     return sd * np.hstack([np.full((SAMPLES, 1), np.sqrt(0.5)), np.cos(phase), np.sin(phase)])
+
+
+# With the force given a log-posterior costs more, and the draws are fewer than the stop rule asks for.
+STEPS_WITH_FORCE = 1000
+
+
+def given_displacement(recordings: Iterable[bp.Recording], seed: int, *, quick: bool) -> Identified:
+    """Return estimate and draws with the displacement given."""
+    found = estimate([fold(recording, DISPLACEMENT) for recording in recordings], DISPLACEMENT)
+    return draw(found, seed, quick=quick, executor=ENSEMBLES)
+
+
+def given_force(forced: Mapping[str, Verdict], seed: int, *, quick: bool) -> Identified | None:
+    """Return estimate and draws with the force given, its noise carried along as by the single fits.
+
+    None for one experiment.
+    """
+    experiments = [verdict.identified.problem.experiments[0] for verdict in forced.values()]
+    if len(experiments) < 2:
+        return None
+    stated = bp.Problem(
+        bp.models.landing_gear(FORCE),
+        experiments,
+        priors=PRIORS,
+        fixed=FIXED,
+        tied=TIED,
+        local=[CONDUCTION],
+        scheme=SCHEME,
+    )
+    found = Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0)
+    return draw(found, seed, quick=quick, max_steps=STEPS_WITH_FORCE, executor=ENSEMBLES)
+
+
+def account(identified: Identified) -> dict[str, Any]:
+    """Return what results.json holds."""
+    posterior = identified.posterior
+    assert posterior is not None
+    table = posterior.summary()
+    return laplace(identified) | {
+        "posterior": {
+            name: {key: float(table[key][name]) for key in ("mean", "sd", "q05", "q50", "q95", "ess", "rhat")}
+            for name in identified.problem.names
+        },
+        "p_negative": {
+            name: float((posterior.draws(name) < 0.0).mean())
+            for name in identified.problem.names
+            if name.startswith(CONDUCTION)
+        },
+        "converged": posterior.converged,
+        "reason": posterior.reason,
+        "log_posterior_calls": posterior.log_posterior_calls,
+        "failures": posterior.failures,
+        "seconds": identified.seconds,
+    }
+
+
+def line(drive: str, found: Mapping[str, Any]) -> str:
+    """Return what is printed."""
+    sds = found["posterior"]
+    common = ", ".join(f"{name} {sds[name]['mean']:.6g} ± {sds[name]['sd']:.1g}" for name in ("theta4", "theta6"))
+    drawn = found["reason"]
+    if found["converged"]:
+        drawn = "converged"
+    return f"  jointly, {drive} given: {common}; {found['log_posterior_calls']} log-posteriors, {drawn}"

@@ -4,14 +4,12 @@ The other parameters are at their true values, theta11 follows theta4 (it stands
 harmonics kept are chosen beforehand, so that the number of independent values does not depend on the noise.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import bayesperiodic as bp
-from studies.landing_gear.truth import GEAR
+from studies.landing_gear.rig import GEAR
 
 DISPLACEMENT, FORCE = "displacement", "force"
 DRIVES = (DISPLACEMENT, FORCE)
@@ -32,22 +30,12 @@ MAX_STEPS, QUICK_STEPS = 20_000, 250
 
 @dataclass(frozen=True)
 class Identified:
-    """What one problem led to.
-
-    Attributes
-    ----------
-    problem : Problem
-    fit : MapEstimate
-    posterior : Posterior or None
-        None where no draws were asked for.
-    seconds : float
-        That the draws took.
-    """
+    """What one problem led to."""
 
     problem: bp.Problem
     fit: bp.MapEstimate
-    posterior: bp.Posterior | None
-    seconds: float
+    posterior: bp.Posterior | None  # None where no draws were asked for
+    seconds: float  # That the draws took
 
 
 def fold(recording: bp.Recording, drive: str) -> bp.Experiment:

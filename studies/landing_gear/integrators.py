@@ -9,14 +9,12 @@ States are the gas temperature T [K], and with the force given also compression 
 Parameters come as an array in the order of `NAMES`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba
 import numpy as np
 
-from studies.landing_gear.truth import GEAR
+from studies.landing_gear.rig import GEAR
 
 NAMES = tuple(GEAR)
 MAX_CYCLES = 5000

@@ -7,8 +7,6 @@ The reference is measured several times, so that its own error does not decide o
 machined and known; the gas's heat capacity theta15 follows its amount, theta5/theta6.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,10 +15,9 @@ import numpy as np
 from scipy.stats import binom, norm
 
 import bayesperiodic as bp
-from studies import tasks as common_resumed
+from studies import common
 from studies.landing_gear.identification import DISPLACEMENT, fold
-from studies.landing_gear.rig import RUNS, SAME, Changed, measure
-from studies.landing_gear.truth import GEAR
+from studies.landing_gear.rig import GEAR, RUNS, SAME, Changed, measure
 
 CAMPAIGN = ("0.2 Hz 80 mm", "1 Hz 36 mm", "4 Hz 8 mm")
 PRIORS = {
@@ -62,14 +59,7 @@ REFERENCE_SEED, FIRST_UNIT = 5000, 10_000
 
 @dataclass(frozen=True)
 class Unit:
-    """What is found of one gear.
-
-    Attributes
-    ----------
-    kind : str
-    theta, sd : dict of str to float
-    converged : bool
-    """
+    """What is found of one gear."""
 
     kind: str
     theta: dict[str, float]
@@ -100,7 +90,7 @@ def examine_all(references: int, each: int, seed: int) -> tuple[Unit, list[Unit]
     """Return the reference, measured so many times, and so many units of each kind."""
     tasks = [(GOOD, REFERENCE_SEED * (seed + 1) + k) for k in range(references)]
     tasks += [(kind, FIRST_UNIT * (seed + 1) + k) for k, kind in enumerate(np.repeat(list(FAULTS), each).tolist())]
-    found = list(common_resumed.each(examine, tasks, here=len(tasks) <= SERIALLY))
+    found = list(common.each(examine, tasks, here=len(tasks) <= SERIALLY))
     return _together(found[:references]), found[references:]
 
 

@@ -7,8 +7,6 @@ their sum of squared errors. Errors are correlated along a period, so a score is
 experiment, and the scatter over experiments gives the standard error of the mean difference.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,10 +15,9 @@ import numpy as np
 from scipy.special import ndtr
 
 import bayesperiodic as bp
+from studies.common import each
 from studies.landing_gear.identification import DISPLACEMENT, FIXED, KEPT, PRIORS, TIED, fold
-from studies.landing_gear.rig import NOISE, RECORDED, RUNS, measure
-from studies.landing_gear.truth import STRENGTHS, TRUTHS, damper
-from studies.tasks import each
+from studies.landing_gear.rig import NOISE, RECORDED, RUNS, STRENGTHS, TRUTHS, damper, measure
 
 PAPER, BEST = "eq. (9)", "all four"
 MODELS: dict[str, frozenset[str]] = {
@@ -47,13 +44,7 @@ CONDUCTION = "theta16"
 class Task:
     """One fit.
 
-    Attributes
-    ----------
-    model : str
-    runs, held_out : tuple of str
-        Names of experiments; without any held out, theta16 is each experiment's own.
-    truth : str
-    seed : int
+    `runs, held_out`: Names of experiments; without any held out, theta16 is each experiment's own.
     """
 
     model: str
@@ -65,25 +56,14 @@ class Task:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a fit gives.
-
-    Attributes
-    ----------
-    task : Task
-    status : str
-    theta, sd : dict of str to float
-    scores : dict of str to float
-        Of the experiments held out.
-    errors : dict of str to dict of str to float
-        Root mean square of what is predicted wrongly, by experiment and channel.
-    """
+    """What a fit gives."""
 
     task: Task
     status: str
     theta: dict[str, float]
     sd: dict[str, float]
-    scores: dict[str, float]
-    errors: dict[str, dict[str, float]]
+    scores: dict[str, float]  # Of the experiments held out
+    errors: dict[str, dict[str, float]]  # Root mean square of what is predicted wrongly, by experiment and channel
 
 
 def repair(names: Sequence[str], truth: str, seed: int, *, quick: bool) -> list[Fitted]:

@@ -1,20 +1,16 @@
 """What the landing gear study reports: the content of results.json, and what is printed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import bayesperiodic as bp
 from studies.landing_gear import drop as landing_gear_drop
-from studies.landing_gear import joint as landing_gear_joint
-from studies.landing_gear import sensitivity as landing_gear_sensitivity
+from studies.landing_gear import force
 from studies.landing_gear import verdicts as landing_gear_verdicts
 from studies.landing_gear.drop import Dropped
 from studies.landing_gear.identification import PRIORS, Identified
-from studies.landing_gear.rig import FULL_SCALE, NOISE_SHARE, RUNS, SPEED_LIMIT, Run
-from studies.landing_gear.truth import GEAR, STRENGTHS
+from studies.landing_gear.rig import FULL_SCALE, GEAR, NOISE_SHARE, RUNS, SPEED_LIMIT, STRENGTHS, Run
 from studies.landing_gear.verdicts import CONDUCTION, NEGATIVE, POSITIVE, UNDETERMINED, Verdict
 
 LARGE_STROKE, TOLERANCE = 0.06, 0.25
@@ -22,31 +18,14 @@ LARGE_STROKE, TOLERANCE = 0.06, 0.25
 
 @dataclass(frozen=True)
 class OfTruth:
-    """Everything that one truth led to.
+    """Everything that one truth led to."""
 
-    Attributes
-    ----------
-    recordings : dict of str to Recording
-        By experiment.
-    verdicts : dict of str to Verdict
-        The displacement given.
-    joint : dict of str to Identified
-        All experiments, theta4 and theta6 in common, by what is given.
-    sensitivity : dict of str to dict
-        The other parameters under priors, by experiment.
-    exact : dict of str to Identified
-        The force given and taken for exact.
-    forced : dict of str to Verdict
-        The force given, its noise carried along.
-    dropped : Dropped
-    """
-
-    recordings: dict[str, bp.Recording]
-    verdicts: dict[str, Verdict]
-    joint: dict[str, Identified]
-    sensitivity: dict[str, dict[str, Any]]
-    exact: dict[str, Identified]
-    forced: dict[str, Verdict]
+    recordings: dict[str, bp.Recording]  # By experiment
+    verdicts: dict[str, Verdict]  # The displacement given
+    joint: dict[str, Identified]  # All experiments, theta4 and theta6 in common, by what is given
+    sensitivity: dict[str, dict[str, Any]]  # The other parameters under priors, by experiment
+    exact: dict[str, Identified]  # The force given and taken for exact
+    forced: dict[str, Verdict]  # The force given, its noise carried along
     dropped: Dropped
 
 
@@ -67,7 +46,7 @@ def collect(runs: Sequence[Run], found: OfTruth) -> dict[str, Any]:
     """Return the content of results.json on one truth."""
     verdicts = found.verdicts
     return _posteriors(verdicts) | {
-        "joint": {drive: landing_gear_joint.account(joint) for drive, joint in found.joint.items()},
+        "joint": {drive: force.account(joint) for drive, joint in found.joint.items()},
         "others_under_priors": found.sensitivity,
         "force_given": _with_force_given(found),
         "drop": landing_gear_drop.account(found.dropped),
@@ -121,7 +100,7 @@ def account(truth: str, results: Mapping[str, Any]) -> str:
     wrong = sum(e["p_negative_laplace"][CONDUCTION] > 0.975 for e in forced["force_taken_for_exact"].values())
     drop = results["drop"]["displacement"]
     shares = list(drop["share_within_the_band"].values())
-    joint = "\n".join(landing_gear_joint.line(drive, one) for drive, one in results["joint"].items())
+    joint = "\n".join(force.line(drive, one) for drive, one in results["joint"].items())
     pairs = "; ".join(" against ".join(p["pair"]) for p in results["opposite_pairs"]) or "none"
     return (
         f"  truth {truth}: {signs}\n"
@@ -129,7 +108,7 @@ def account(truth: str, results: Mapping[str, Any]) -> str:
         f"  pairs at one frequency that differ in sign: {pairs}\n"
         f"  {results['posteriors_converged']} of {len(results['experiments'])} posteriors converged; "
         f"{results['log_posterior_calls']} log-posteriors in {results['seconds']:.0f} s\n"
-        f"{landing_gear_sensitivity.table(results['others_under_priors'], results['experiments'])}\n{joint}\n"
+        f"{landing_gear_verdicts.table(results['others_under_priors'], results['experiments'])}\n{joint}\n"
         f"  force given: {forced_signs}; misspecified: {', '.join(forced['misspecified']) or 'none'}\n"
         f"  {forced['posteriors_converged']} of {len(forced['experiments'])} posteriors converged in "
         f"{forced['seconds']:.0f} s; taking the force for exact, {wrong} would be negative (Laplace)\n"

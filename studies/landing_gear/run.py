@@ -5,8 +5,6 @@ theta6 and theta16 of eq. (9), experiment by experiment, for a gear that obeys e
 effects that it lacks (truth B). Is a negative theta16 what the data cannot tell, or what the model gets wrong?
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 from collections.abc import Mapping, Sequence
@@ -16,18 +14,13 @@ from typing import Any
 
 import bayesperiodic as bp
 from studies import common
-from studies import tasks as common_resumed
-from studies.landing_gear import campaigns, cost, drop, force, identification, loops, quality, repair, rig, slope
+from studies.landing_gear import campaigns, cost, drop, force, identification, quality, repair, rig
 from studies.landing_gear import figures as landing_gear_figures
-from studies.landing_gear import joint as landing_gear_joint
 from studies.landing_gear import results as landing_gear_results
-from studies.landing_gear import sensitivity as landing_gear_sensitivity
-from studies.landing_gear import truth as landing_gear_truth
 from studies.landing_gear import verdicts as landing_gear_verdicts
 from studies.landing_gear.identification import DISPLACEMENT, FORCE, PRIORS, Identified, draw, estimate, fold
 from studies.landing_gear.results import OfTruth
-from studies.landing_gear.rig import RUNS, Run, measure
-from studies.landing_gear.truth import TRUTHS
+from studies.landing_gear.rig import RUNS, TRUTHS, Run, measure
 from studies.landing_gear.verdicts import Verdict, judge
 
 # What each truth led to is kept here until the study ends.
@@ -48,12 +41,12 @@ def run(options: argparse.Namespace) -> None:
         return
     watch, runs = common.Stopwatch(), QUICK if options.quick else RUNS
     truths = [options.truth] if options.truth else list(TRUTHS)
-    print("All data are SYNTHETIC: a simulated rig, see studies/landing_gear/rig.py and truth.py.")
+    print("All data are SYNTHETIC: a simulated rig, see studies/landing_gear/rig.py.")
     every: dict[str, OfTruth] = {}
     results: dict[str, Any] = {}
     for truth in truths:
         path, source = options.out / PARTS / f"{truth}.pkl", _source(options, truth)
-        every[truth], seconds = common_resumed.remembered(path, source, partial(_of_truth, truth, runs, options))
+        every[truth], seconds = common.remembered(path, source, partial(_of_truth, truth, runs, options))
         watch.seconds |= seconds
         results[truth] = landing_gear_results.collect(runs, every[truth])
         print(landing_gear_results.account(truth, results[truth]))
@@ -72,10 +65,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _source(options: argparse.Namespace, truth: str) -> str:
     """Return what tells kept posteriors of another version, or with other settings, apart."""
-    modules = (
-        drop, force, identification, landing_gear_joint, landing_gear_results,
-        rig, landing_gear_sensitivity, landing_gear_truth, landing_gear_verdicts,
-    )  # fmt: skip
+    modules = drop, force, identification, landing_gear_results, rig, landing_gear_verdicts
     files = [common.sha256(Path(str(module.__file__))) for module in modules]
     return " ".join([common.versions()["bayesperiodic"], truth, str(options.seed), str(options.quick), *files])
 
@@ -88,15 +78,15 @@ def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace) -> t
     with watch.part(f"posteriors {truth}", f"truth {truth}: displacement given, one posterior an experiment"):
         verdicts = _with_displacement_given(recordings, seed, quick)
     with watch.part(f"joint {truth}", f"truth {truth}: all experiments at once, theta4 and theta6 in common"):
-        joint = {DISPLACEMENT: landing_gear_joint.given_displacement(recordings.values(), seed, quick=quick)}
+        joint = {DISPLACEMENT: force.given_displacement(recordings.values(), seed, quick=quick)}
     with watch.part(f"sensitivity {truth}", f"truth {truth}: the other parameters under priors"):
         varied = [r for r in runs if r.name == SMALL] if quick else runs
-        sensitivity = landing_gear_sensitivity.examine_all(varied, truth, seed, quick=quick)
+        sensitivity = landing_gear_verdicts.examine_all(varied, truth, seed, quick=quick)
     with watch.part(f"force {truth}", f"truth {truth}: force given, one posterior an experiment"):
         given = {name: recording for name, recording in recordings.items() if name == SMALL or not quick}
         exact, forced = _with_force_given(given, seed, quick)
     with watch.part(f"force joint {truth}", f"truth {truth}: force given, all experiments at once"):
-        together = landing_gear_joint.given_force(forced, seed, quick=quick)
+        together = force.given_force(forced, seed, quick=quick)
         joint |= {FORCE: together} if together else {}
     with watch.part(f"drop {truth}", f"truth {truth}: the drop test, predicted from all experiments"):
         gear = drop.identify(recordings.values(), seed, quick=quick)
@@ -132,8 +122,8 @@ def _of_all(
     print(quality.table(results["quality"]))
     drawn["quality"] = landing_gear_figures.quality(*units)
     with watch.part("slope", "the friction's slope"):
-        results["friction_slope"] = slope.account(runs)
-    print(slope.line(results["friction_slope"]))
+        results["friction_slope"] = force.slope_account(runs)
+    print(force.slope_line(results["friction_slope"]))
     return drawn
 
 
@@ -150,7 +140,7 @@ def _campaigns(options: argparse.Namespace) -> None:
 def _with_displacement_given(recordings: Mapping[str, bp.Recording], seed: int, quick: bool) -> dict[str, Verdict]:
     verdicts = {}
     tasks = [(recording, seed, quick) for recording in recordings.values()]
-    for name, verdict in zip(recordings, common_resumed.each(_verdict, tasks, here=quick), strict=True):
+    for name, verdict in zip(recordings, common.each(_verdict, tasks, here=quick), strict=True):
         verdicts[name] = verdict
         print(landing_gear_verdicts.line(name, verdict), flush=True)
     return verdicts
@@ -165,7 +155,7 @@ def _with_force_given(
 ) -> tuple[dict[str, Identified], dict[str, Verdict]]:
     exact, verdicts = {}, {}
     tasks = [(recording, seed, quick) for recording in recordings.values()]
-    for name, found in zip(recordings, common_resumed.each(force.judge, tasks, here=quick), strict=True):
+    for name, found in zip(recordings, common.each(force.judge, tasks, here=quick), strict=True):
         exact[name], verdicts[name] = found
         print(landing_gear_verdicts.line(name, verdicts[name]), flush=True)
     return exact, verdicts
@@ -185,7 +175,7 @@ def figures(runs: Sequence[Run], every: Mapping[str, OfTruth], quick: bool) -> d
         "drop": landing_gear_figures.drops({truth: found.dropped for truth, found in every.items()}),
     }
     chosen = {"large": FIGURE_1 if quick else LARGE, "small": SMALL}
-    drawn["loops"] = loops.loops(
+    drawn["loops"] = landing_gear_figures.loops(
         {truth: [by_run[name].identified for name in chosen.values()] for truth, by_run in verdicts.items()}
     )
     for stroke, name in chosen.items():

@@ -4,8 +4,6 @@ The frequency response of a hardening spring is computed; the pendulum's section
 resistance come from synthetic recordings. With all its parameters free only ratios of the mass to the frictions show.
 """
 
-from __future__ import annotations
-
 import argparse
 
 import matplotlib.pyplot as plt

@@ -1,14 +1,18 @@
-"""The pendulum identified from its unstable orbits: m and l, k3, all five; from the paper's errors of the start."""
+"""The pendulum identified from its unstable orbits: m and l, k3, all five; from the paper's errors of the start.
 
-from __future__ import annotations
+All five parameters of the pendulum free: the ridge, by structure, Laplace and MCMC.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+import pandas as pd
+
 import bayesperiodic as bp
-from studies.pendulum.recording import TRUTH
+from studies.pendulum.recording import KNOWN, TRUTH
 
 # Of the start, in table 1 of the paper.
 START_ERRORS = {"m": 0.51, "l": 0.189, "k3": 1.0}
@@ -37,22 +41,14 @@ MOST_DROPPED = 4
 class Identified:
     """What the orbits of one recording say.
 
-    Attributes
-    ----------
-    polished : Orbits
-        At the first estimate of m and l.
-    selected : Orbits
-    problems, fits : dict
-        By what is free.
-    lost : tuple of (str, str)
-        Orbits that the first estimate went without, and why.
+    `problems, fits`: By what is free.
     """
 
-    polished: bp.Orbits
+    polished: bp.Orbits  # At the first estimate of m and l
     selected: bp.Orbits
     problems: dict[str, bp.Problem]
     fits: dict[str, bp.MapEstimate]
-    lost: tuple[tuple[str, str], ...]
+    lost: tuple[tuple[str, str], ...]  # Orbits that the first estimate went without, and why
 
 
 def identify(orbits: bp.Orbits, *, which: Sequence[str] = tuple(FREE)) -> Identified:
@@ -136,3 +132,91 @@ def told(fit: bp.MapEstimate, *, synthetic: bool) -> dict[str, Mapping[str, floa
     """Return estimate and standard deviation of each parameter, and its relative error where the truth is known."""
     found = {name: {"value": value, "sd": fit.sd[name]} for name, value in fit.theta.items()}
     return {n: row | ({"relative_error": errors(fit)[n]} if synthetic else {}) for n, row in found.items()}
+
+
+NATURAL = ("m", "l", "k1", "k2", "k3")
+COMBINATIONS = {f"c{i}": f"k{i}/(m*l**2)" for i in (1, 2, 3)}
+DETERMINED = ("l", *COMBINATIONS)
+DETERMINED_UNITS = {"l": "m", "c1": "1/s^2", "c2": "1/s", "c3": "1"}
+QUICK_STEPS = 250
+
+
+@dataclass(frozen=True)
+class Ridge:
+    """Draws of all five parameters, and what is said of them.
+
+    `natural, sampling`: Of Laplace with the draws, in natural values and in logarithms. `combinations`: Mean and sd of
+    what the data determine, by Laplace (columns value, laplace_sd) and MCMC (mean, sd).
+    """
+
+    problem: bp.Problem
+    fit: bp.MapEstimate
+    posterior: bp.Posterior
+    structure: bp.Structure  # What the equations leave open, before any data
+    identifiability: bp.Identifiability
+    natural: bp.Comparison
+    sampling: bp.Comparison
+    combinations: pd.DataFrame
+
+
+def sample(identified: Identified, seed: int, quick: bool) -> Ridge:
+    """Sample the posterior of all five, and let the package say what it says of it."""
+    problem, fit = identified.problems[ALL], identified.fits[ALL]
+    settings: dict[str, Any] = {"max_steps": QUICK_STEPS} if quick else {}
+    posterior = bp.sample(problem, fit, seed=seed, ensembles=2, variances="collapsed", progress=False, **settings)
+    laplace, draws = fit.derive(COMBINATIONS), posterior.derive(COMBINATIONS)
+    table = laplace.rename(columns={"sd": "laplace_sd"}).join(draws[["mean", "sd"]])
+    l_draws = posterior.draws("l")
+    table.loc["l"] = [fit.theta["l"], fit.sd["l"], l_draws.mean(), l_draws.std()]
+    return Ridge(
+        problem,
+        fit,
+        posterior,
+        bp.structure(bp.models.pendulum, fixed=list(KNOWN)),
+        bp.identifiability(problem, fit, posterior),
+        bp.compare(problem, fit, posterior),
+        bp.compare(problem, fit, posterior, coordinates="sampling"),
+        table.loc[list(DETERMINED)],
+    )
+
+
+def combination_draws(posterior: bp.Posterior) -> dict[str, np.ndarray]:
+    """Return the draws of what the data determine."""
+    mass, length, *torques = (posterior.draws(name) for name in NATURAL)
+    return {"l": length} | {f"c{i}": torque / (mass * length**2) for i, torque in enumerate(torques, 1)}
+
+
+def truths() -> dict[str, float]:
+    """Return the true values of what the data determine."""
+    inertia = TRUTH["m"] * TRUTH["l"] ** 2
+    return {"l": TRUTH["l"]} | {f"c{i}": TRUTH[f"k{i}"] / inertia for i in (1, 2, 3)}
+
+
+def collect(ridge: Ridge) -> dict[str, Any]:
+    """Return what results.json tells of the ridge."""
+    posterior, fit = ridge.posterior, ridge.fit
+    table = ridge.identifiability.table
+    return {
+        "converged": posterior.converged,
+        "sampler": posterior.reason,
+        "smallest_ess": float(min(posterior.ess.values())),
+        "structure": str(ridge.structure),
+        "verdicts": {str(name): str(v) for name, v in table["verdict"].items()},
+        "remedies": {str(name): str(text) for name, text in table["remedy"].items() if text},
+        "natural": {
+            name: {
+                "map": fit.theta[name],
+                "laplace_sd": fit.sd[name],
+                "mcmc_mean": float(posterior.draws(name).mean()),
+                "mcmc_sd": float(posterior.draws(name).std()),
+                "laplace_against_mcmc": str(ridge.natural.table.loc[name, "verdict"]),
+                "in_logarithms": str(ridge.sampling.table.loc[name, "verdict"]),
+            }
+            for name in NATURAL
+        },
+        "combinations": {
+            str(name): {str(k): float(v) for k, v in row.items()} for name, row in ridge.combinations.iterrows()
+        },
+        "joint": {c: str(r.joint["verdict"]) for c, r in (("natural", ridge.natural), ("logarithms", ridge.sampling))},
+        "recommendation": str(ridge.natural.joint["recommendation"]),
+    }

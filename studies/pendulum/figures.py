@@ -1,7 +1,5 @@
 """Figures of the pendulum study."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,9 +8,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from studies.pendulum.estimates import PAPER_ERRORS, Identified
+from studies.pendulum.estimates import (
+    DETERMINED,
+    DETERMINED_UNITS,
+    NATURAL,
+    PAPER_ERRORS,
+    Identified,
+    Ridge,
+    combination_draws,
+    truths,
+)
 from studies.pendulum.recording import TRUTH, UNITS
-from studies.pendulum.ridge import DETERMINED, DETERMINED_UNITS, NATURAL, Ridge, combination_draws, truths
 
 BINS, SHOWN = 45, (0.001, 0.999)
 TRUE = "#009E73"

@@ -1,16 +1,71 @@
-"""The pendulum's periodic orbits: found, polished, held against shooting, eigenvalues by two methods."""
+"""The pendulum's periodic orbits: found, polished, held against shooting, eigenvalues by two methods.
 
-from __future__ import annotations
+The driven pendulum by SciPy's integrator and shooting, as a reference that shares nothing with the package.
+"""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import bayesperiodic as bp
+from studies import shooting
 from studies.pendulum.recording import ANGLES, COORDINATES, FREQUENCY, OMEGA, TRUTH
-from studies.pendulum.shooting import distance, shoot
+from studies.shooting import TURN
+
+TOLERANCE, ACCURACY = 1e-12, 1e-9
+
+
+class Shot(NamedTuple):
+    """Orbit that shooting converges to from given points."""
+
+    points: np.ndarray  # (period, 2): φ in (−π, π] and φ̇ at tau = 0, 1, …
+    winding: int
+    multipliers: np.ndarray  # (2,): Largest modulus first
+    prime: int  # Forcing periods after which the points repeat
+    converged: bool
+
+
+def shoot(parameters: Mapping[str, float], omega: float, points: np.ndarray) -> Shot:
+    """Return the orbit that multiple shooting, one segment per forcing period, converges to from points.
+
+    The turns of each segment are those of its first integration.
+    """
+    p, states = parameters, np.array(points, dtype=float)
+    inertia = p["m"] * p["l"] ** 2
+    changes = {"width": p["v0"], "g": p["g"], "lift": p["a"], "length": p["l"]}
+    changes |= {f"c{i}": p[f"k{i}"] / inertia for i in (1, 2, 3)}
+    slope, jacobian, period = shooting.pendulum(omega, **changes)
+    times = period * np.arange(len(states) + 1)
+    ends = [shooting.flow(slope, jacobian, 0.0, period, state, TOLERANCE)[0][0] for state in states]
+    turns = np.round((np.array(ends) - np.roll(states[:, 0], -1)) / TURN)
+    states[1:, 0] += TURN * np.cumsum(turns)[:-1]
+    winding = int(turns.sum())
+    try:
+        orbit = shooting.shoot(
+            slope, jacobian, times, states, [TURN * winding, 0.0], tolerance=TOLERANCE, accuracy=ACCURACY
+        )
+    except (RuntimeError, np.linalg.LinAlgError):
+        return Shot(states, winding, np.full(2, np.nan), 0, False)
+    wrapped = orbit.states.copy()
+    wrapped[:, 0] = -((-wrapped[:, 0] + np.pi) % TURN - np.pi)
+    return Shot(wrapped, winding, orbit.multipliers, _prime(wrapped), True)
+
+
+def distance(one: np.ndarray, other: np.ndarray) -> float:
+    """Return the largest difference of points (period, 2), angles modulo a turn, rates in units of 5 rad/s a rad."""
+    off = np.asarray(one) - np.asarray(other)
+    return float(max(np.abs((off[:, 0] + np.pi) % TURN - np.pi).max(), np.abs(off[:, 1]).max() / 5.0))
+
+
+def _prime(points: np.ndarray) -> int:
+    period = len(points)
+    for shift in range(1, period):
+        if period % shift == 0 and distance(points, np.roll(points, -shift, axis=0)) < 1e-6:
+            return shift
+    return period
+
 
 SAMPLES = 800
 METHODS = ("chained", "boxes")
@@ -23,24 +78,14 @@ TWO_SIDED_90 = 1.6448536269514722
 
 @dataclass(frozen=True)
 class Reference:
-    """A true orbit, by shooting.
-
-    Attributes
-    ----------
-    period, winding : int
-    points : array (period, 2)
-    multipliers : array (2,)
-    equilibrium : bool
-    off : float
-        By how much the polished orbit's section points differ [rad, 5 rad/s].
-    """
+    """A true orbit, by shooting."""
 
     period: int
     winding: int
-    points: np.ndarray
-    multipliers: np.ndarray
+    points: np.ndarray  # (period, 2)
+    multipliers: np.ndarray  # (2,)
     equilibrium: bool
-    off: float
+    off: float  # By how much the polished orbit's section points differ [rad, 5 rad/s]
 
 
 def references(polished: bp.Orbits) -> tuple[list[Reference], list[str]]:

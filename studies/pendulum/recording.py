@@ -1,7 +1,5 @@
 """The chaotic pendulum's recording: simulated with noise, or read from a file."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Table 1 of the paper over many recordings: errors, coverage, failures; and whether eigenvalues as data do harm."""
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 import os

@@ -3,12 +3,16 @@
 φ'' + c1 tanh(φ'/v0) + c2 φ' + c3 φ'|φ'| + (g + a ω² cos ωt)/l · sin φ = 0 with c_i = k_i/(m l²), at ω = 9.09 rad/s:
 from 42,754 drive periods to orbits with error bars, to m and l, to k3, and to what all five parameters cannot be told.
 With --replicates N: the counterpart of the paper's table 1, over N recordings.
+
+Finding orbits at several noise levels, each on a core.
 """
 
-from __future__ import annotations
-
 import argparse
-from collections.abc import Mapping
+import multiprocessing
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import bayesperiodic as bp
@@ -17,9 +21,40 @@ from studies.pendulum import estimates as pendulum_estimates
 from studies.pendulum import figures as pendulum_figures
 from studies.pendulum import orbits, replicates
 from studies.pendulum import recording as pendulum_recording
-from studies.pendulum import ridge as pendulum_ridge
 from studies.pendulum.estimates import PAPER_ERRORS, START_ERRORS, Identified
-from studies.pendulum.search import Found, search
+from studies.pendulum.recording import section_of, with_noise
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found in one section.
+
+    `chained, boxes`: By the default method and by the paper's recipe.
+    """
+
+    section: bp.PoincareSection
+    chained: bp.Orbits
+    boxes: bp.Orbits
+
+
+def search(recording: bp.Recording, noises: Sequence[float], seed: int, periods: Sequence[int]) -> dict[float, Found]:
+    """Return what is found with each noise added to the recording, as a fraction of the attractor's size."""
+    tasks = [(recording, noise, seed, tuple(periods)) for noise in dict.fromkeys(noises)]
+    if len(tasks) == 1:
+        return {noises[0]: _found(tasks[0])}
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(os.cpu_count() or 1, len(tasks)), mp_context=context) as pool:
+        # The noisiest takes longest.
+        found = dict(zip([t[1] for t in reversed(tasks)], pool.map(_found, reversed(tasks)), strict=True))
+    return {noise: found[noise] for noise in noises}
+
+
+def _found(task: tuple[bp.Recording, float, int, tuple[int, ...]]) -> Found:
+    recording, noise, seed, periods = task
+    section = section_of(with_noise(recording, noise, seed) if noise > 0.0 else recording)
+    every = {method: bp.find_orbits(section, periods=periods, method=method) for method in ("chained", "boxes")}
+    return Found(section, every["chained"], every["boxes"])
+
 
 NOISE_LEVELS = (0.0, 0.001, 0.01)
 PERIODS, QUICK_PERIODS = range(1, 6), range(1, 4)
@@ -58,8 +93,8 @@ def run(options: argparse.Namespace) -> None:
     results |= estimates(about, found[noise], identified, eigenvalue_fits)
     print(estimate_account(results))
     with watch.part("ridge", "sampling the posterior of all five with emcee"):
-        ridge = pendulum_ridge.sample(identified, options.seed, options.quick)
-    results["all_five"] = pendulum_ridge.collect(ridge)
+        ridge = pendulum_estimates.sample(identified, options.seed, options.quick)
+    results["all_five"] = pendulum_estimates.collect(ridge)
     print(f"  {ridge.posterior.reason}\n{ridge.identifiability}\n{ridge.natural}\n{ridge.combinations}")
     with watch.part("figures", "drawing"):
         table = results.get("eigenvalues", {})

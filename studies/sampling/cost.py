@@ -1,13 +1,11 @@
 """What sampling costs beside its log-posteriors: in a pool of workers, and in one vectorised call on several cores."""
 
-from __future__ import annotations
-
 import importlib.util
 import logging
 import os
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -15,20 +13,18 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 import bayesperiodic as bp
 from bayesperiodic._parallel import available_cores
-from studies.sampling.rows import Row, row, unjudged
-from studies.solver.cost import GEAR, RIG
+from studies.common import Row, row, unjudged
+from studies.gear import GEAR, RIG, gear_problem
+from studies.timing import gain_of_cores, plain_loop
 
-SAMPLES = 800
 LOG_POSTERIOR, SHORT = 5e-3, 1e-5
 WALKERS, ENSEMBLES, STEPS, PIECE = 4, 2, 250, 25
 POOLS = ("process", "dask")
 POINTS = 64
-LOOP = 5_000_000
 TURNS = 100_000
 PRIOR = bp.Normal(1.0, 1.0)
 POOL_LIMIT, GAIN_LIMIT = 1.05, 0.9
@@ -80,48 +76,16 @@ def loaded(cost: dict[str, Any]) -> str:
     return f"the machine was busy (load {load[0]:.1f} on {cost['cores']} cores): times are not for quoting"
 
 
-def gear_problem(drive: str) -> bp.Problem:
-    """Return the problem of theta4, theta6 and theta16 of the landing gear with the 14 experiments of `RIG`.
-
-    They are synthetic, with noise of 0.3 % of the range; `drive` is "force" or "displacement".
-    """
-    model, samples = bp.models.landing_gear(drive), SAMPLES
-    wave = np.cos(2 * np.pi * np.arange(samples) / samples)
-    generator, experiments = np.random.default_rng(4), []
-    for frequency, force, stroke in RIG:
-        inputs = {drive: 4500.0 + force * wave if drive == "force" else 0.12 + stroke * wave}
-        truth = bp.solve_periodic(model, GEAR, inputs, frequency=frequency, samples=samples)
-        outputs = {name: y + 3e-3 * np.ptp(y) * generator.standard_normal(samples) for name, y in truth.outputs.items()}
-        run = bp.Experiment(f"{frequency} Hz", frequency, outputs, inputs, samples=samples, synthetic=True)
-        experiments.append(run)
-    priors = {
-        "theta4": bp.LogNormal(GEAR["theta4"], 1.0),
-        "theta6": bp.Normal(GEAR["theta6"], 2.5),
-        "theta16": bp.Normal(GEAR["theta16"], 4.0),
-    }
-    tied = {"theta11": "-1e5*theta4"}
-    fixed = {name: value for name, value in GEAR.items() if name not in (*priors, *tied)}
-    return bp.Problem(model, experiments, priors=priors, fixed=fixed, tied=tied)
-
-
 def estimate(problem: bp.Problem) -> bp.MapEstimate:
     """Return the MAP estimate of a landing-gear problem, started from the truth."""
     return bp.map_estimate(problem, start={name: GEAR[name] for name in problem.names}, progress=False)
 
 
 class Pool(NamedTuple):
-    """An executor with one worker held on a core.
+    """An executor with one worker held on a core."""
 
-    Attributes
-    ----------
-    executor : object
-        None for a thread of this process.
-    clock : callable
-        Returns the processor time [s] that the worker has used.
-    """
-
-    executor: Any
-    clock: Callable[[], float]
+    executor: Any  # None for a thread of this process
+    clock: Callable[[], float]  # Returns the processor time [s] that the worker has used
 
 
 def pool_overhead(repeats: int = 3, pools: tuple[str, ...] = POOLS, seconds: float = LOG_POSTERIOR) -> dict[str, Any]:
@@ -133,22 +97,11 @@ def pool_overhead(repeats: int = 3, pools: tuple[str, ...] = POOLS, seconds: flo
     processes takes seconds whatever the length of a run. A piece, which is what a message carries, is 4 walkers × 25
     steps, an eighth of what the default walkers make it, so that the overhead of a default run is smaller.
 
-    Parameters
-    ----------
-    repeats : int
-        Of each pool, 20 s each.
-    pools : tuple of str
-        "process", "dask"; the latter is left out where it is not installed.
-    seconds : float
-        What a log-posterior shall take.
-
-    Returns
-    -------
-    dict
-        "ratios" by pool: "median" and "quartiles" of wall times over those of the thread, and the median ratio of
-        "processor_time", this process and the worker together, which other load changes little; "milliseconds" a
-        log-posterior takes in the thread, by the wall clock and the processor's; "walkers"; "log_posteriors" a run and
-        a piece.
+    `repeats`: Of each pool, 20 s each. `pools`: "process", "dask"; the latter is left out where it is not installed.
+    `seconds`: What a log-posterior shall take. "ratios" by pool: "median" and "quartiles" of wall times over those of
+    the thread, and the median ratio of "processor_time", this process and the worker together, which other load changes
+    little; "milliseconds" a log-posterior takes in the thread, by the wall clock and the processor's; "walkers";
+    "log_posteriors" a run and a piece.
     """
     kinds = [name for name in pools if name != "dask" or importlib.util.find_spec("distributed")]
     core, *others = sorted(os.sched_getaffinity(0))
@@ -259,7 +212,7 @@ class SlowPrior:
 
     def log_prob(self, x: Any) -> Any:
         """Return the log-density, after the loop."""
-        _loop(self.turns * np.size(x))
+        plain_loop(self.turns * np.size(x))
         return PRIOR.log_prob(x)
 
     def gradient(self, x: Any) -> Any:
@@ -281,8 +234,8 @@ class SlowPrior:
 
 def slow_problem(seconds: float) -> tuple[bp.Problem, bp.MapEstimate]:
     """Return a problem of the Duffing oscillator of which a log-posterior takes so many seconds on one core."""
-    _loop(10)
-    turn = min(_seconds(partial(_loop, TURNS), 1, time.thread_time) for _ in range(10)) / TURNS
+    plain_loop(10)
+    turn = min(_seconds(partial(plain_loop, TURNS), 1, time.thread_time) for _ in range(10)) / TURNS
     values, samples = {"m": 1.0, "c": 0.5, "k": 1.0, "k3": 0.1}, 40
     force = {"force": np.cos(2 * np.pi * np.arange(samples) / samples)}
     truth = bp.solve_periodic(bp.models.duffing, values, force, frequency=0.1, samples=samples, scheme="fourier")
@@ -298,39 +251,18 @@ def slow_problem(seconds: float) -> tuple[bp.Problem, bp.MapEstimate]:
 def vectorised_gain(repeats: int = 15) -> dict[str, Any]:
     """Compare what all cores gain on one call of 64 walkers × 14 experiments with what they gain on a plain loop.
 
-    The call is `Problem.log_likelihood`, on one thread and on as many as there are cores; the plain loop is compiled,
-    needs no memory, and runs once a core. All four are timed in turn within every repeat.
+    The call is `Problem.log_likelihood`, on one thread and on as many as there are cores.
 
-    Returns
-    -------
-    dict
-        "cores", and by drive: "gain" of the call, "plain" (gain of the plain loop), "ratio" (median of their ratios),
-        "ratio_quartiles", "milliseconds" on one core.
+    "cores", and by drive: "gain" of the call, "plain" (gain of the plain loop), "ratio" (median of their ratios),
+    "ratio_quartiles", "milliseconds" on one core.
     """
     cores, result = available_cores(), {}
-    with ThreadPoolExecutor(cores) as pool:
-        list(pool.map(_loop, [10] * cores))
-        for drive in ("force", "displacement"):
-            problem = gear_problem(drive)
-            fit = estimate(problem)
-            anchored, noise = problem.anchored(fit.theta), np.array(list(fit.noise.values()))
-            theta = _draws(fit, POINTS)
-            actions: dict[str, Callable[[], Any]] = {
-                "one": lambda: anchored.log_likelihood(theta, noise, 1),  # noqa: B023
-                "many": lambda: anchored.log_likelihood(theta, noise, cores),  # noqa: B023
-                "loop_one": lambda: [_loop(LOOP) for _ in range(cores)],
-                "loop_many": lambda: list(pool.map(_loop, [LOOP] * cores)),
-            }
-            rounds = [{name: _seconds(action, 1) for name, action in actions.items()} for _ in range(repeats + 1)][1:]
-            times = {name: np.array([one[name] for one in rounds]) for name in actions}
-            gains, plain = times["one"] / times["many"], times["loop_one"] / times["loop_many"]
-            result[drive] = {
-                "gain": float(np.median(gains)),
-                "plain": float(np.median(plain)),
-                "ratio": float(np.median(gains / plain)),
-                "ratio_quartiles": np.quantile(gains / plain, [0.25, 0.75]).tolist(),
-                "milliseconds": float(np.median(times["one"])) * 1e3,
-            }
+    for drive in ("force", "displacement"):
+        problem = gear_problem(drive, 4, scheme="central2")
+        fit = estimate(problem)
+        anchored, noise = problem.anchored(fit.theta), np.array(list(fit.noise.values()))
+        theta = _draws(fit, POINTS)
+        result[drive] = gain_of_cores(partial(anchored.log_likelihood, theta, noise), cores, repeats)
     return {"cores": cores, "walkers": POINTS, "experiments": len(RIG), **result}
 
 
@@ -348,11 +280,3 @@ def _seconds(action: Callable[[], Any], calls: int, clock: Callable[[], float] =
         action()
         times.append(clock() - before)
     return float(np.median(times))
-
-
-@numba.njit(nogil=True)
-def _loop(count: int) -> float:
-    total = 0.0
-    for k in range(count):
-        total += 1.0 / (1.0 + k * total)
-    return total

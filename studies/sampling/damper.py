@@ -1,7 +1,5 @@
 """Three ways to sample the damper's posterior: emcee, emcee with the variance integrated out, and NUTS by gradients."""
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import time
@@ -13,9 +11,9 @@ import numpy as np
 from scipy import stats
 
 import bayesperiodic as bp
+from studies.common import Row, row, unjudged
 from studies.damper import run as damper
-from studies.sampling.batches import BATCHES, standard_error
-from studies.sampling.rows import Row, row, unjudged
+from studies.sampling.ridge import BATCHES, standard_error
 
 SAMPLERS: dict[str, dict[str, Any]] = {
     "emcee": {},
@@ -28,21 +26,11 @@ MISSING = 'nutpie is not installed (pip install "bayesperiodic[nuts]")'
 
 @dataclass(frozen=True)
 class Sampled:
-    """The damper's posterior by several samplers.
-
-    Attributes
-    ----------
-    problem : Problem
-    data : dict
-        Path, digest and whether synthetic.
-    posteriors : dict of str to Posterior
-        By name of the sampler.
-    seconds : dict of str to float
-    """
+    """The damper's posterior by several samplers."""
 
     problem: bp.Problem
-    data: dict[str, Any]
-    posteriors: dict[str, bp.Posterior]
+    data: dict[str, Any]  # Path, digest and whether synthetic
+    posteriors: dict[str, bp.Posterior]  # By name of the sampler
     seconds: dict[str, float]
 
 

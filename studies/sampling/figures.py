@@ -1,7 +1,5 @@
 """Figures of the sampling study."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

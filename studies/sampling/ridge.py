@@ -2,20 +2,40 @@
 
 With b integrated out in closed form the density of a is known but for its scale. Two priors: N(1, 1) for a and b, cut
 at zero, and uncut, which leaves 1.2 % of the mass on a second branch where both are negative.
-"""
 
-from __future__ import annotations
+Monte Carlo errors from the means of batches of draws.
+"""
 
 import time
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import stats
 from scipy.special import log_ndtr
 
 import bayesperiodic as bp
-from studies.sampling.batches import standard_error
-from studies.sampling.rows import Row, row
+from studies.common import Row, row
+
+BATCHES = 5
+
+
+def standard_error(posterior: bp.Posterior, values: np.ndarray) -> float:
+    """Return the Monte Carlo error of the mean of what was computed from the draws, (draws,) as `Posterior.draws`.
+
+    Each ensemble, or chain of NUTS, is cut into consecutive batches. Their means know of the dependence in time, of
+    walkers on each other, and of ensembles that disagree.
+    """
+    group = posterior.data["posterior"]
+    by_chain = values.reshape(group.sizes["chain"], group.sizes["draw"])
+    ensemble = group["ensemble"].to_numpy()
+    means = [
+        batch.mean()
+        for number in np.unique(ensemble)
+        for batch in np.array_split(by_chain[ensemble == number], BATCHES, axis=1)
+    ]
+    return float(stats.sem(means))
+
 
 WIDTH = 0.02
 POINTS = 20
@@ -31,22 +51,16 @@ ERRORS = 4.0
 class Ridge:
     """What was sampled on the ridge, and the truth.
 
-    Attributes
-    ----------
-    default, natural : Posterior
-        Priors cut at zero: the default settings, and a short chain in natural coordinates.
-    uncut, uncut_prior : Posterior
-        Priors over both signs: the default settings but for fewer steps at most, and as many from draws of the priors,
-        which lie on both branches.
-    seconds : dict of str to float
-        Of the four, by name.
+    `default, natural`: Priors cut at zero: the default settings, and a short chain in natural coordinates. `uncut,
+    uncut_prior`: Priors over both signs: the default settings but for fewer steps at most, and as many from draws of
+    the priors, which lie on both branches.
     """
 
     default: bp.Posterior
     natural: bp.Posterior
     uncut: bp.Posterior
     uncut_prior: bp.Posterior
-    seconds: dict[str, float]
+    seconds: dict[str, float]  # Of the four, by name
 
 
 def sample_ridge(seed: int, quick: bool) -> Ridge:

@@ -3,13 +3,11 @@
 The ridge is computed, the damper measured (or generated, and then called synthetic), see studies/damper/run.py.
 """
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 
 from studies import common
-from studies.sampling import damper, rows
+from studies.sampling import damper
 from studies.sampling import figures as sampling_figures
 from studies.sampling import ridge as sampling_ridge
 
@@ -68,5 +66,5 @@ def tables(found: dict[str, Any]) -> str:
             ),
             "",
         ]
-    lines += ["What must show", rows.table(found["checks"])]
+    lines += ["What must show", common.table_of_rows(found["checks"])]
     return "\n".join([*lines, *([f"Note: {found['cost']['note']}."] if found["cost"]["note"] else [])])

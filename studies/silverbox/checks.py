@@ -1,7 +1,5 @@
 """What the Silverbox study's estimates rest on: the grid, the starts, and what of the residual comes again."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -9,26 +7,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import bayesperiodic as bp
-from studies.silverbox.problem import DRIVE_LINES, fold, medians, problem, solve, spread
+from studies.silverbox.data import DRIVE_LINES, fold, medians, problem, solve, spread
 
 OTHER_START = {"c": 0.3, "k1": 1.6, "k2": 1.0, "k3": 20.0, "g": 2.0, "u0": 0.02}
 
 
 class Discretisation(NamedTuple):
-    """The error of the response on the grid, against one with twice the points.
+    """The error of the response on the grid, against one with twice the points."""
 
-    Attributes
-    ----------
-    difference : array (points,)
-    fraction : float
-        Its root mean square over the measured standard deviation.
-    allowed : float
-        A tenth of the standard error of the mean period, over the same.
-    """
-
-    difference: np.ndarray
-    fraction: float
-    allowed: float
+    difference: np.ndarray  # (points,)
+    fraction: float  # Its root mean square over the measured standard deviation
+    allowed: float  # A tenth of the standard error of the mean period, over the same
 
 
 def discretisation(recording: bp.Recording, experiment: bp.Experiment, theta: Mapping[str, float]) -> Discretisation:

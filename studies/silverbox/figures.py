@@ -1,7 +1,5 @@
 """Figures of the Silverbox study."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

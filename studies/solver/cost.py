@@ -5,11 +5,9 @@ This is the one module of the studies that looks inside the package: it times si
 
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
-import numba
 import numpy as np
 from scipy.linalg import lapack
 
@@ -17,23 +15,13 @@ import bayesperiodic as bp
 from bayesperiodic._parallel import available_cores
 from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
+from studies.gear import GEAR, RIG, gear_problem, gear_runs
+from studies.timing import Action, gain_of_cores, interleaved, slope
 
-GEAR = {
-    "theta1": 80.0, "theta2": 0.0, "theta3": 8e3, "theta4": 5e-3, "theta5": 1e6 / 293, "theta6": -2.5, "theta7": 0.0,
-    "theta8": 150.0, "theta9": 1e-4, "theta10": 300.0, "theta11": -500.0, "theta12": 0.0, "theta15": 17.0,
-    "theta16": 2.0, "theta17": -293.0,
-}  # fmt: skip
-# Frequency [Hz], force amplitude about 4.5 kN [N], displacement amplitude about 0.12 m [m].
-RIG = (
-    (0.05, 1500, 0.080), (0.1, 1400, 0.070), (0.15, 1300, 0.060), (0.2, 1200, 0.055), (0.3, 1100, 0.048),
-    (0.4, 1000, 0.041), (0.5, 900, 0.035), (0.7, 800, 0.028), (1.0, 700, 0.021), (1.4, 650, 0.015), (2.0, 600, 0.0097),
-    (3.0, 600, 0.0060), (4.0, 600, 0.0040), (6.0, 600, 0.0021),
-)  # fmt: skip
 SAMPLES = 800
 CHANGE = 0.01
 OFF = 1e-3
 REPEATS = 15
-LOOP = 5_000_000
 CALLS = 20
 LINEAR_SIZES = (200, 400, 800, 1600, 3200, 6400, 12800, 25600, 51200)
 MASSES = (1, 2, 5, 10, 20, 30, 40, 50)
@@ -76,19 +64,13 @@ def _variants() -> list[tuple[str, str]]:
 
 def gear_equations(drive: str, scheme: str) -> list[PeriodicEquations]:
     """Return the equations of the 14 experiments (synthetic inputs, pure sines)."""
-    wave = np.cos(2 * np.pi * np.arange(SAMPLES) / SAMPLES)
     return [
         PeriodicEquations.build(
-            bp.models.landing_gear(drive),
-            {drive: 4500.0 + force * wave if drive == "force" else 0.12 + stroke * wave},
-            frequency=frequency,
-            samples=SAMPLES,
-            scheme=scheme,
-            periods=1,
+            bp.models.landing_gear(drive), inputs, frequency=frequency, samples=SAMPLES, scheme=scheme, periods=1,
             winding=0,
         )
-        for frequency, force, stroke in RIG
-    ]
+        for frequency, inputs in gear_runs(drive)
+    ]  # fmt: skip
 
 
 def newton_iteration(drive: str, scheme: str, repeats: int) -> dict[str, Any]:
@@ -198,26 +180,8 @@ def map_of_the_gear(repeats: int) -> dict[str, Any]:
 
     The data are synthetic: force-driven, displacement and pressure with noise of 0.3 % of their range.
     """
-    model, wave = bp.models.landing_gear("force"), np.cos(2 * np.pi * np.arange(SAMPLES) / SAMPLES)
-    generator, experiments = np.random.default_rng(4), []
-    for frequency, amplitude, _ in RIG:
-        inputs = {"force": 4500.0 + amplitude * wave}
-        truth = bp.solve_periodic(model, GEAR, inputs, frequency=frequency, samples=SAMPLES, scheme="backward2")
-        outputs = {name: y + 3e-3 * np.ptp(y) * generator.standard_normal(SAMPLES) for name, y in truth.outputs.items()}
-        experiments.append(
-            bp.Experiment(f"{frequency} Hz", frequency, outputs, inputs, samples=SAMPLES, synthetic=True)
-        )
-    spread = {"theta4": bp.LogNormal(GEAR["theta4"], 1.0), "theta6": bp.Normal(GEAR["theta6"], 2.5)}
-    priors = spread | {"theta16": bp.Normal(GEAR["theta16"], 4.0)}
-    problem = bp.Problem(
-        model,
-        experiments,
-        priors=priors,
-        fixed={name: value for name, value in GEAR.items() if name not in (*priors, "theta11")},
-        tied={"theta11": "-1e5*theta4"},
-        scheme="backward2",
-    )
-    start = {name: GEAR[name] * (1.3 if name == "theta4" else 0.7) for name in priors}
+    problem = gear_problem("force", 4, scheme="backward2")
+    start = {name: GEAR[name] * (1.3 if name == "theta4" else 0.7) for name in problem.names}
     times = []
     for _ in range(repeats + 1):
         before = time.perf_counter()
@@ -228,7 +192,7 @@ def map_of_the_gear(repeats: int) -> dict[str, Any]:
         "iterations": len(fit.history) - 1,
         "seconds_median": float(np.median(times[1:])),
         "seconds_range": [min(times[1:]), max(times[1:])],
-        "off_in_sds": {name: (fit.theta[name] - GEAR[name]) / fit.sd[name] for name in priors},
+        "off_in_sds": {name: (fit.theta[name] - GEAR[name]) / fit.sd[name] for name in problem.names},
     }
 
 
@@ -249,7 +213,7 @@ def with_samples(sizes: tuple[int, ...], repeats: int) -> dict[str, Any]:
         result[scheme] = {
             "samples": list(sizes),
             "us": times,
-            "slope": _slope(sizes[2:], times[2:]),
+            "slope": slope(sizes[2:], times[2:]),
         }
     return result
 
@@ -266,26 +230,16 @@ def with_systems(repeats: int, systems: int = 512) -> dict[str, Any]:
     times = [
         _interleaved(repeats, calls=1, solves=partial(batch.solve, changed[:c], threads=1))["solves"] for c in counts
     ]
-    with ThreadPoolExecutor(cores) as pool:
-        list(pool.map(_loop, [10] * cores))
-        raw = _timed(
-            2 * repeats + 1,
-            calls=1,
-            one=lambda: batch.solve(changed, threads=1),
-            many=lambda: batch.solve(changed, threads=cores),
-            loop_one=lambda: [_loop(LOOP) for _ in range(cores)],
-            loop_many=lambda: list(pool.map(_loop, [LOOP] * cores)),
-        )
-    gains, plain_gains = raw["one"] / raw["many"], raw["loop_one"] / raw["loop_many"]
+    gains = gain_of_cores(lambda threads: batch.solve(changed, threads=threads), cores, 2 * repeats + 1)
     return {
         "systems": list(counts),
         "us": times,
-        "slope": _slope(counts, times),
+        "slope": slope(counts, times),
         "cores": cores,
-        "gain": float(np.median(gains)),
-        "gain_of_plain_loop": float(np.median(plain_gains)),
-        "ratio": float(np.median(gains / plain_gains)),
-        "ratio_quartiles": np.quantile(gains / plain_gains, [0.25, 0.75]).tolist(),
+        "gain": gains["gain"],
+        "gain_of_plain_loop": gains["plain"],
+        "ratio": gains["ratio"],
+        "ratio_quartiles": gains["ratio_quartiles"],
         "target_ratio": 0.9,
     }
 
@@ -310,39 +264,22 @@ def with_masses(masses: tuple[int, ...], samples: int = 100) -> dict[str, Any]:
     return {
         "masses": list(masses),
         "us": times,
-        "slope": _slope(large, times[-len(large) :]),
+        "slope": slope(large, times[-len(large) :]),
         "slope_from": large[0],
         "predicted_slope": 3.0,
     }
 
 
-@numba.njit(nogil=True)
-def _loop(count: int) -> float:
-    total = 0.0
-    for k in range(count):
-        total += 1.0 / (1.0 + k * total)
-    return total
-
-
 def _interleaved(repeats: int, calls: int = CALLS, **actions: Callable[[], Any]) -> dict[str, float]:
     """Return the median of microseconds a call of each action, all timed in turn within every repeat."""
-    return {name: float(np.median(times)) for name, times in _timed(repeats, calls, **actions).items()}
+    repeated = {name: Action(partial(_repeat, action, calls), calls) for name, action in actions.items()}
+    times = interleaved(repeated, repeats)
+    return {name: 1e6 * float(np.median(seconds)) for name, seconds in times.items()}
 
 
-def _timed(repeats: int, calls: int, **actions: Callable[[], Any]) -> dict[str, np.ndarray]:
-    """Return microseconds a call of each action, (repeats,)."""
-    times: dict[str, list[float]] = {name: [] for name in actions}
-    for _ in range(repeats):
-        for name, action in actions.items():
-            start = time.perf_counter()
-            for _ in range(calls):
-                action()
-            times[name].append((time.perf_counter() - start) / calls * 1e6)
-    return {name: np.array(values) for name, values in times.items()}
-
-
-def _slope(sizes: Any, times: Any) -> float:
-    return float(np.polyfit(np.log(sizes), np.log(times), 1)[0])
+def _repeat(action: Callable[[], Any], calls: int) -> None:
+    for _ in range(calls):
+        action()
 
 
 def lapack_band(equations: PeriodicEquations, columns: np.ndarray) -> tuple[np.ndarray, int]:

@@ -4,8 +4,6 @@ Nothing is measured here; all is computed from the models' equations. The refere
 Taylor series that share no code with the package; studies/shooting.py states their accuracy.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 from typing import Any

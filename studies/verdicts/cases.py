@@ -6,8 +6,6 @@ truncated posterior a prior whose end lies about two standard errors short of th
 for every data set.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -33,34 +31,17 @@ Expected = Mapping[str, Mapping[str, tuple[str, ...]]]
 class Case:
     """A case whose answer is known.
 
-    Attributes
-    ----------
-    title : str
-        What is wrong, in words.
-    truth : dict of str to float
-        Of every parameter, also of those that the fitted model lacks.
-    problem : callable
-        Makes the problem of a data seed.
-    shown : str
-        The parameter of the figure.
-    expected : dict of str to dict of str to tuple of str
-        By tool and parameter: the verdicts that are right.
-    fault : dict of str to tuple of str
-        By tool, the parameters whose verdicts name the fault; empty where nothing is wrong.
-    sampling : dict
-        Arguments of `bp.sample`.
-    drawless : bool
-        Whether the verdicts do not use draws, so that replicates over data seeds do without them.
+    `fault`: By tool, the parameters whose verdicts name the fault; empty where nothing is wrong.
     """
 
-    title: str
-    truth: Mapping[str, float]
-    problem: Callable[[int], bp.Problem]
-    shown: str
-    expected: Expected
+    title: str  # What is wrong, in words
+    truth: Mapping[str, float]  # Of every parameter, also of those that the fitted model lacks
+    problem: Callable[[int], bp.Problem]  # Makes the problem of a data seed
+    shown: str  # The parameter of the figure
+    expected: Expected  # By tool and parameter: the verdicts that are right
     fault: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    sampling: Mapping[str, Any] = field(default_factory=dict)
-    drawless: bool = False
+    sampling: Mapping[str, Any] = field(default_factory=dict)  # Arguments of `bp.sample`
+    drawless: bool = False  # Whether the verdicts do not use draws, so that replicates over data seeds do without them
 
 
 def _driven(name: str, parameters: Mapping[str, str], force: Callable[[Any, Any], sp.Expr]) -> bp.Model:
@@ -103,62 +84,56 @@ def _measured(
     return bp.Experiment("run", frequency, {"force": force}, {"x": displacement}, samples=samples, synthetic=True)
 
 
-def _every(tool: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
-    return {name: (verdict,) for name, verdict in tool.items()}
-
-
 def _expected(**tools: Mapping[str, str]) -> dict[str, dict[str, tuple[str, ...]]]:
-    return {tool: _every(verdicts) for tool, verdicts in tools.items()}
+    return {tool: {name: (verdict,) for name, verdict in verdicts.items()} for tool, verdicts in tools.items()}
 
 
 QUICKLY = {"ensembles": 2, "walkers": 32, "variances": "collapsed", "max_steps": 6000}
 
 
-def product_ridge() -> Case:
-    """Return a·b, measured to 1 %, of two factors known to a factor of two."""
-    truth = {"a": 1.0, "b": 1e4}
+def _one_run(
+    title: str, shown: str, model: bp.Model, truth: Mapping[str, float], priors: Mapping[str, Any],
+    expected: Mapping[str, Mapping[str, tuple[str, ...]]], fault: Mapping[str, tuple[str, ...]], *,
+    fitted: bp.Model | None = None, frequency: float = 2.0, noise: float = 1.0, samples: int = 40,
+    delay: bool = False, fixed: Mapping[str, float] | None = None, sampling: Mapping[str, Any] | None = None,
+) -> Case:  # fmt: skip
+    """Return a case with one synthetic run of a model, fitted with the same model or another one."""
 
     def problem(data_seed: int) -> bp.Problem:
-        run = _measured(PRODUCT, truth, data_seed, frequency=2.0, noise=4.0)
-        return bp.Problem(PRODUCT, [run], priors={"a": bp.LogNormal(1.0, 0.7), "b": bp.LogNormal(1e4, 0.7)})
+        run = _measured(model, truth, data_seed, frequency=frequency, noise=noise, samples=samples)
+        return bp.Problem(fitted or model, [run], priors=priors, fixed=fixed or {})
 
-    return Case(
-        "only the product of a and b shows",
-        truth,
-        problem,
-        "a",
+    known = {**truth, "shift[run]": 0.0} if delay else truth
+    return Case(title, known, problem, shown, expected, fault, {**QUICKLY, **(sampling or {})})
+
+
+STIFFNESS = bp.Normal(8e3, 4e3)
+
+
+def product_ridge() -> Case:
+    """Return a·b, measured to 1 %, of two factors known to a factor of two."""
+    return _one_run(
+        "only the product of a and b is identifiable", "a", PRODUCT, {"a": 1.0, "b": 1e4},
+        {"a": bp.LogNormal(1.0, 0.7), "b": bp.LogNormal(1e4, 0.7)},
         _expected(
-            identifiability={"a": COMBINATION, "b": COMBINATION},
-            compare={"a": SHAPE, "b": SHAPE},
+            identifiability={"a": COMBINATION, "b": COMBINATION}, compare={"a": SHAPE, "b": SHAPE},
             predict={"all": ADEQUATE},
         ),
-        {IDENTIFIABILITY: ("a", "b")},
-        QUICKLY,
-    )
+        {IDENTIFIABILITY: ("a", "b")}, noise=4.0,
+    )  # fmt: skip
 
 
 def sum_ridge() -> Case:
     """Return a + b, measured to 1 %, of two springs side by side."""
-    truth = {"a": 6e3, "b": 4e3}
-
-    def problem(data_seed: int) -> bp.Problem:
-        run = _measured(SUM, truth, data_seed, frequency=2.0, noise=4.0)
-        return bp.Problem(SUM, [run], priors={"a": bp.Normal(5e3, 2e3), "b": bp.Normal(5e3, 2e3)})
-
-    return Case(
-        "only the sum of a and b shows",
-        truth,
-        problem,
-        "a",
+    return _one_run(
+        "only the sum of a and b is identifiable", "a", SUM, {"a": 6e3, "b": 4e3},
+        {"a": bp.Normal(5e3, 2e3), "b": bp.Normal(5e3, 2e3)},
         _expected(
-            identifiability={"a": COMBINATION, "b": COMBINATION},
-            compare={"a": FINE, "b": FINE},
-            joint={"all": FINE},
+            identifiability={"a": COMBINATION, "b": COMBINATION}, compare={"a": FINE, "b": FINE}, joint={"all": FINE},
             predict={"all": ADEQUATE},
         ),
-        {IDENTIFIABILITY: ("a", "b")},
-        QUICKLY,
-    )
+        {IDENTIFIABILITY: ("a", "b")}, noise=4.0,
+    )  # fmt: skip
 
 
 PENDULUM_TRUTH = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4}
@@ -221,143 +196,76 @@ def scaling_symmetry() -> Case:
 def linear() -> Case:
     """Return stiffness, damping and dry friction, each determined by the data."""
     truth = {"k": 1e4, "c": 40.0, "coulomb": 15.0}
-
-    def problem(data_seed: int) -> bp.Problem:
-        run = _measured(RUBBING, truth, data_seed, frequency=2.0, noise=1.0)
-        priors = {"k": bp.Normal(8e3, 4e3), "c": bp.Normal(50.0, 50.0), "coulomb": bp.Normal(10.0, 20.0)}
-        return bp.Problem(RUBBING, [run], priors=priors)
-
-    return Case(
-        "nothing",
-        truth,
-        problem,
-        "c",
+    return _one_run(
+        "nothing", "c", RUBBING, truth,
+        {"k": STIFFNESS, "c": bp.Normal(50.0, 50.0), "coulomb": bp.Normal(10.0, 20.0)},
         _expected(
-            identifiability=dict.fromkeys(truth, DETERMINED),
-            compare=dict.fromkeys(truth, FINE),
-            joint={"all": FINE},
+            identifiability=dict.fromkeys(truth, DETERMINED), compare=dict.fromkeys(truth, FINE), joint={"all": FINE},
             predict={"all": ADEQUATE},
         ),
         {},
-        QUICKLY,
-    )
+    )  # fmt: skip
 
 
 def sign_undetermined() -> Case:
-    """Return a small damping behind a delay of the recording, known to 1 ms, that acts as ±10 N s/m."""
-    truth = {"k": 1e4, "c": 3.0}
-
-    def problem(data_seed: int) -> bp.Problem:
-        run = _measured(DAMPED, truth, data_seed, frequency=2.0, noise=1.0)
-        priors = {"k": bp.Normal(8e3, 4e3), "c": bp.Normal(0.0, 100.0), "shift": bp.Normal(0.0, 1e-3)}
-        return bp.Problem(DAMPED, [run], priors=priors)
-
-    return Case(
-        "a delay of the recording may be the damping",
-        truth | {"shift[run]": 0.0},
-        problem,
-        "c",
+    """Return a small damping and a recording delay, known to 1 ms, that acts as ±10 N s/m."""
+    return _one_run(
+        "a delay of the recording may be the damping", "c", DAMPED, {"k": 1e4, "c": 3.0},
+        {"k": STIFFNESS, "c": bp.Normal(0.0, 100.0), "shift": bp.Normal(0.0, 1e-3)},
         _expected(
-            identifiability={"k": DETERMINED, "c": SIGN},
-            compare=dict.fromkeys(("k", "c", "shift[run]"), FINE),
+            identifiability={"k": DETERMINED, "c": SIGN}, compare=dict.fromkeys(("k", "c", "shift[run]"), FINE),
             predict={"all": ADEQUATE},
         ),
-        {IDENTIFIABILITY: ("c",)},
-        QUICKLY,
-    )
+        {IDENTIFIABILITY: ("c",)}, delay=True,
+    )  # fmt: skip
 
 
 def prior_dominated() -> Case:
     """Return a damping that a slow run leaves ±7 N s/m wide, and the prior ±3."""
-    truth = {"k": 1e4, "c": 20.0}
-
-    def problem(data_seed: int) -> bp.Problem:
-        run = _measured(DAMPED, truth, data_seed, frequency=0.5, noise=1.0)
-        return bp.Problem(DAMPED, [run], priors={"k": bp.Normal(8e3, 4e3), "c": bp.Normal(20.0, 3.0)})
-
-    return Case(
-        "what is known of the damping is its prior",
-        truth,
-        problem,
-        "c",
+    return _one_run(
+        "the damping is determined by its prior", "c", DAMPED, {"k": 1e4, "c": 20.0},
+        {"k": STIFFNESS, "c": bp.Normal(20.0, 3.0)},
         _expected(
-            identifiability={"k": DETERMINED, "c": PRIOR_ONLY},
-            compare={"k": FINE, "c": FINE},
-            joint={"all": FINE},
+            identifiability={"k": DETERMINED, "c": PRIOR_ONLY}, compare={"k": FINE, "c": FINE}, joint={"all": FINE},
             predict={"all": ADEQUATE},
         ),
-        {IDENTIFIABILITY: ("c",)},
-        QUICKLY,
-    )
+        {IDENTIFIABILITY: ("c",)}, frequency=0.5,
+    )  # fmt: skip
 
 
 def truncated() -> Case:
     """Return a damping whose prior ends at 20 N s/m, about two standard errors below the truth."""
-    truth = {"k": 1e4, "c": 24.5}
-
-    def problem(data_seed: int) -> bp.Problem:
-        run = _measured(DAMPED, truth, data_seed, frequency=2.0, noise=1.0)
-        return bp.Problem(DAMPED, [run], priors={"k": bp.Normal(8e3, 4e3), "c": bp.Uniform(0.0, 20.0)})
-
-    return Case(
-        "the prior ends before the data do",
-        truth,
-        problem,
-        "c",
-        {
-            IDENTIFIABILITY: _every({"k": DETERMINED, "c": PRIOR_ONLY}),
-            COMPARE: {"k": (FINE,), "c": (SHAPE, WIDE)},
-            PREDICT: _every({"all": ADEQUATE}),
-        },
+    return _one_run(
+        "the prior excludes the true value", "c", DAMPED, {"k": 1e4, "c": 24.5},
+        {"k": STIFFNESS, "c": bp.Uniform(0.0, 20.0)},
+        _expected(identifiability={"k": DETERMINED, "c": PRIOR_ONLY}, predict={"all": ADEQUATE})
+        | {COMPARE: {"k": (FINE,), "c": (SHAPE, WIDE)}},
         {IDENTIFIABILITY: ("c",), COMPARE: ("c",)},
-        QUICKLY,
-    )
+    )  # fmt: skip
 
 
 def two_modes() -> Case:
     """Return where along a beam a force acts, from the first mode shape alone: p and 1 − p give the same."""
     truth = {"position": 0.25, "k": 1e4}
-
-    def problem(data_seed: int) -> bp.Problem:
-        run = _measured(BEAM, truth, data_seed, frequency=2.0, noise=4.0)
-        return bp.Problem(
-            BEAM, [run], priors={"position": bp.TruncatedNormal(0.4, 0.3, 0.0, 1.0)}, fixed={"k": truth["k"]}
-        )
-
-    return Case(
-        "either side of the beam fits",
-        truth,
-        problem,
-        "position",
+    return _one_run(
+        "two positions on the beam fit equally well", "position", BEAM, truth,
+        {"position": bp.TruncatedNormal(0.4, 0.3, 0.0, 1.0)},
         _expected(compare={"position": MODE}, joint={"all": MODE}, predict={"all": ADEQUATE}),
-        {COMPARE: ("position",)},
-        QUICKLY | {"start": "prior"},
-    )
+        {COMPARE: ("position",)}, noise=4.0, fixed={"k": truth["k"]}, sampling={"start": "prior"},
+    )  # fmt: skip
 
 
 def misspecified() -> Case:
-    """Return dry friction that the fitted model lacks, in plenty of data."""
-    truth = {"k": 1e4, "c": 40.0, "coulomb": 5.0}
-
-    def problem(data_seed: int) -> bp.Problem:
-        run = _measured(RUBBING, truth, data_seed, frequency=2.0, noise=1.0, samples=400)
-        priors = {"k": bp.Normal(8e3, 4e3), "c": bp.Normal(50.0, 50.0)}
-        return bp.Problem(DAMPED, [run], priors=priors)
-
-    return Case(
-        "the model lacks the dry friction",
-        truth,
-        problem,
-        "c",
+    """Return dry friction that the fitted model lacks, with many data."""
+    return _one_run(
+        "the model lacks the dry friction", "c", RUBBING, {"k": 1e4, "c": 40.0, "coulomb": 5.0},
+        {"k": STIFFNESS, "c": bp.Normal(50.0, 50.0)},
         _expected(
-            identifiability={"k": DETERMINED, "c": DETERMINED},
-            compare={"k": FINE, "c": FINE},
-            joint={"all": FINE},
+            identifiability={"k": DETERMINED, "c": DETERMINED}, compare={"k": FINE, "c": FINE}, joint={"all": FINE},
             predict={"all": MISSPECIFIED},
         ),
-        {PREDICT: ("all",)},
-        QUICKLY,
-    )
+        {PREDICT: ("all",)}, fitted=DAMPED, samples=400,
+    )  # fmt: skip
 
 
 CASES: dict[str, Callable[[], Case]] = {

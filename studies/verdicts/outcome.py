@@ -1,7 +1,5 @@
 """What the diagnoses say of one data set of a case, and whether they are right."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -35,24 +33,13 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Estimate, draws, and what every tool says of them.
-
-    Attributes
-    ----------
-    case : Case
-    problem : Problem
-    fit : MapEstimate
-    identifiability : Identifiability
-    sampled : Drawn or None
-        None where the verdicts do without draws.
-    seconds : float
-    """
+    """Estimate, draws, and what every tool says of them."""
 
     case: Case
     problem: bp.Problem
     fit: bp.MapEstimate
     identifiability: bp.Identifiability
-    sampled: Drawn | None
+    sampled: Drawn | None  # None where the verdicts do without draws
     seconds: float
 
     @property

@@ -2,17 +2,226 @@
 
 All data are synthetic, with noise. ``--replicates N`` repeats every case on N data sets and samples the first data set
 with up to 20 seeds. Each replicate is saved in replicates.jsonl as it ends, and the same command does the missing ones.
+
+Figures of the gallery of verdicts.
+
+The gallery again and again: other data, other sampler seeds; resumed where it was interrupted.
 """
 
-from __future__ import annotations
-
 import argparse
+import hashlib
+import textwrap
+import time
+import warnings
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import bayesperiodic as bp
 from studies import common
-from studies.verdicts import figures, replicates
-from studies.verdicts.cases import CASES, FINE
+from studies.common import resumed
+from studies.verdicts import cases
+from studies.verdicts import outcome as verdicts_outcome
+from studies.verdicts.cases import CASES, COMPARE, FINE, IDENTIFIABILITY, PREDICT
 from studies.verdicts.outcome import Outcome, examine, numbers
+
+DATA, SAMPLER = "data", "sampler"
+MOST_SAMPLER_SEEDS = 20
+ALWAYS_SAMPLED = 50
+STRIDE = 1000
+FILE = "replicates.jsonl"
+
+Task = tuple[str, str, int, int]
+
+
+def first_seed(seed: int) -> int:
+    """Return the data seed of the gallery itself, and of the replicates with other sampler seeds."""
+    return STRIDE * seed
+
+
+def replicate(task: Task) -> dict[str, Any]:
+    """Return one replicate: case, what varies, number, seed of the study.
+
+    Where `identifiability` alone names the fault, data sets from number 50 on are judged without draws.
+    """
+    name, kind, number, seed = task
+    found: dict[str, Any] = {"case": name, "kind": kind, "number": number, "seed": seed, "source": source()}
+    data = first_seed(seed) + (number if kind == DATA else 0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            if kind == DATA and number >= ALWAYS_SAMPLED and set(CASES[name]().fault) == {IDENTIFIABILITY}:
+                return found | _before_sampling(name, data).line()
+            return found | examine(name, data, first_seed(seed) + number, drawless=kind == DATA).line()
+        except (RuntimeError, ValueError) as error:
+            return found | {"error": f"{type(error).__name__}: {error}"}
+
+
+def _before_sampling(name: str, data_seed: int) -> Outcome:
+    """Return what is said of the data of one seed from the estimate alone."""
+    start, case = time.perf_counter(), CASES[name]()
+    problem = case.problem(data_seed)
+    fit = bp.map_estimate(problem, progress=False)
+    return Outcome(case, problem, fit, bp.identifiability(problem, fit), None, time.perf_counter() - start)
+
+
+def source() -> str:
+    """Return what tells replicates of other cases, or of another version, apart."""
+    files = [Path(str(module.__file__)) for module in (cases, verdicts_outcome)]
+    text = common.versions()["bayesperiodic"] + "".join(common.sha256(path) for path in files)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def replicates(folder: Path, names: Sequence[str], count: int, seed: int) -> list[dict[str, Any]]:
+    """Do the replicates that the file in the folder lacks, and return all of them."""
+    tasks: list[Task] = []
+    for number in range(count):
+        tasks += [(name, DATA, number, seed) for name in names]
+        tasks += [(name, SAMPLER, number, seed) for name in names if number < MOST_SAMPLER_SEEDS]
+    return resumed(folder / FILE, tasks, replicate, _task, source())
+
+
+def _task(line: Mapping[str, Any]) -> Task:
+    return line["case"], line["kind"], line["number"], line["seed"]
+
+
+def summary(lines: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
+    """Return the counts of each case: other data, and other sampler seeds on the first data set."""
+    found = {}
+    for name, outcome in outcomes.items():
+        own = [line for line in lines if line["case"] == name]
+        by_kind = {kind: [line for line in own if line["kind"] == kind] for kind in (DATA, SAMPLER)}
+        found[name] = {kind: _counts(members) for kind, members in by_kind.items()}
+        found[name][SAMPLER]["verdicts_that_flip"] = _flips(by_kind[SAMPLER], outcome)
+    return found
+
+
+def _counts(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return how many replicates are right, name the fault, warn and converged; shares with their errors."""
+    whole = [line for line in lines if "error" not in line]
+    counts: dict[str, Any] = {"replicates": len(lines), "errors": [line["error"] for line in lines if "error" in line]}
+    for key in ("right", "named", "warned", "converged"):
+        number = sum(line[key] for line in whole)
+        share = number / len(lines)
+        # Laplace's rule of succession keeps the error of a share of 0 or 1 from being zero.
+        smoothed = (number + 1) / (len(lines) + 2)
+        error = float(np.sqrt(smoothed * (1.0 - smoothed) / len(lines)))
+        counts |= {key: number, f"{key}_share": [share, float(f"{error:.2g}")]}
+    counts["sampled"] = sum(COMPARE in line["verdicts"] for line in whole)
+    wrong = Counter(f"{what}: {verdict}" for line in whole for what, verdict in line["wrong"].items())
+    seconds = [line["seconds"] for line in whole]
+    return counts | {"wrong": dict(wrong), "seconds_each": round(float(np.mean(seconds)), 2) if seconds else None}
+
+
+def _flips(lines: Sequence[Mapping[str, Any]], outcome: Outcome) -> dict[str, list[str]]:
+    """Return the verdicts, of those that are expected, that are not the same for every sampler seed."""
+    said: dict[str, set[str]] = {}
+    for line in lines:
+        for tool, rows in outcome.case.expected.items():
+            for name in rows if tool in line.get("verdicts", {}) else ():
+                said.setdefault(f"{tool} {name}", set()).add(line["verdicts"][tool][name])
+    return {what: sorted(verdicts) for what, verdicts in said.items() if len(verdicts) > 1}
+
+
+def account_of_replicates(found: Mapping[str, Any]) -> str:
+    """Return the counts as a table to print."""
+    lines = [f"  {'case':18s} {'kind':8s} replicates sampled right named warned converged  s each"]
+    for name, kinds in found.items():
+        for kind, c in kinds.items():
+            lines.append(
+                f"  {name:18s} {kind:8s} {c['replicates']:10d} {c['sampled']:7d} {c['right']:5d} {c['named']:5d} "
+                f"{c['warned']:6d} {c['converged']:9d}  {c['seconds_each']}"
+            )
+            lines += [f"      {number} times {what}" for what, number in c["wrong"].items()]
+            lines += [f"      flips: {what}: {', '.join(v)}" for what, v in c.get("verdicts_that_flip", {}).items()]
+            lines += [f"      {error}" for error in c["errors"]]
+    return "\n".join(lines)
+
+
+BINS, SHOWN = 50, (0.0005, 0.9995)
+RIDGES = {"product_ridge": None, "sum_ridge": None, "scaling_symmetry": ["m", "k1", "k2", "k3", "l"]}
+WIDTH = 72
+
+
+def figures(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
+    """Return the gallery, and a corner of every ridge."""
+    found = {"gallery": gallery(outcomes)}
+    for name, names in RIDGES.items():
+        if name in outcomes:
+            outcome = outcomes[name]
+            shown = list(outcome.problem.names) if names is None else names
+            found[name] = bp.plot.corner(outcome.drawn.posterior, laplace=outcome.fit, names=shown)
+    return found
+
+
+def gallery(outcomes: Mapping[str, Outcome]) -> Figure:
+    """Draw, for every case, the marginal of one parameter and what was said of it."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(11.0, 1.55 * len(outcomes) + 0.7), layout="constrained")
+    grid = figure.subplots(len(outcomes), 2, squeeze=False, width_ratios=[1.0, 1.35])
+    for (left, right), outcome in zip(grid, outcomes.values(), strict=True):
+        _marginal(left, outcome)
+        _words(right, outcome)
+    handles = {label: h for row in grid for h, label in zip(*row[0].get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles.keys(), loc="outside upper left", ncols=3, frameon=False)
+    figure.suptitle("synthetic data", x=0.99, ha="right", fontsize="medium")
+    return figure
+
+
+def _marginal(axes: Axes, outcome: Outcome) -> None:
+    name, colours = outcome.case.shown, bp.plot.COLOURS
+    draws = outcome.drawn.posterior.draws(name)
+    density, edges = np.histogram(draws, BINS, tuple(np.quantile(draws, SHOWN)), density=True)
+    axes.stairs(density, edges, color=colours["mcmc"], fill=True, label="MCMC")
+    mean, sd, truth = outcome.fit.theta[name], outcome.fit.sd[name], outcome.case.truth[name]
+    low, high = min(edges[0], truth), max(edges[-1], truth)
+    margin = 0.06 * (high - low)
+    x = np.linspace(low - margin, high + margin, 400)
+    if np.isfinite(sd):
+        normal = np.exp(-0.5 * ((x - mean) / sd) ** 2) / (sd * np.sqrt(2 * np.pi))
+        axes.plot(x, normal, color=colours["laplace"], lw=1.8, ls="--", label="Laplace")
+        axes.set_ylim(0.0, 1.1 * max(density.max(), min(normal.max(), 1.6 * density.max())))
+    axes.axvline(truth, color="black", lw=1.6, label="truth")
+    axes.set_xlim(x[0], x[-1])
+    axes.set_yticks([])
+    axes.locator_params(axis="x", nbins=5, steps=[1, 2, 5, 10])
+    axes.spines[["left", "right", "top"]].set_visible(False)
+    unit = outcome.problem.model.units.get(name, "1")
+    axes.set_xlabel(name if unit == "1" else f"{name} [{unit}]")
+
+
+def _words(axes: Axes, outcome: Outcome) -> None:
+    """Write what is wrong and what was said, the verdict that names the fault in bold."""
+    case, said = outcome.case, outcome.verdicts
+    axes.set_axis_off()
+    axes.text(0.0, 1.0, textwrap.fill(f"wrong: {case.title}", WIDTH), va="top", fontsize=11, weight="bold")
+    rows = {
+        IDENTIFIABILITY: _grouped(said[IDENTIFIABILITY]),
+        COMPARE: _grouped(said[COMPARE]),
+        PREDICT: said[PREDICT]["all"],
+    }
+    for place, (tool, text) in zip((0.66, 0.40, 0.14), rows.items(), strict=True):
+        bold = tool in case.fault
+        axes.text(0.0, place, tool, va="center", fontsize=10, color="#555555")
+        weight = "bold" if bold else "normal"
+        axes.text(0.19, place, textwrap.fill(text, WIDTH), va="center", fontsize=9, weight=weight)
+    mark = "as expected" if not outcome.wrong else "NOT AS EXPECTED"
+    axes.text(1.0, 0.14, mark, va="center", ha="right", fontsize=10, style="italic")
+
+
+def _grouped(verdicts: Mapping[str, str]) -> str:
+    """Return verdicts in words, parameters with the same one together."""
+    members: dict[str, list[str]] = {}
+    for name, verdict in verdicts.items():
+        members.setdefault(verdict, []).append(name)
+    return "; ".join(f"{', '.join(names)} {verdict}" for verdict, names in members.items())
+
 
 QUICK = ("product_ridge", "linear", "prior_dominated", "misspecified")
 
@@ -26,16 +235,16 @@ def run(options: argparse.Namespace) -> None:
     outcomes: dict[str, Outcome] = {}
     for name in QUICK if options.quick else CASES:
         with watch.part(name, name.replace("_", " ")):
-            outcomes[name] = examine(name, replicates.first_seed(options.seed), options.seed)
+            outcomes[name] = examine(name, first_seed(options.seed), options.seed)
         print(account(outcomes[name]))
     with watch.part("figures", "drawing"):
-        paths = common.save_figures(options.out, figures.figures(outcomes))
+        paths = common.save_figures(options.out, figures(outcomes))
     results: dict[str, Any] = {name: collect(outcome) for name, outcome in outcomes.items()}
     if options.replicates:
         with watch.part("replicates", f"{options.replicates} replicates of every case"):
-            lines = replicates.replicates(options.out, tuple(outcomes), options.replicates, options.seed)
-        results["replicates"] = replicates.summary(lines, outcomes)
-        print(replicates.account(results["replicates"]))
+            lines = replicates(options.out, tuple(outcomes), options.replicates, options.seed)
+        results["replicates"] = summary(lines, outcomes)
+        print(account_of_replicates(results["replicates"]))
     about = {"synthetic": True, "seed": options.seed, "quick": options.quick, "monte_carlo": "pairs: value, error"}
     results["study"] = about | {"seconds": watch.total(), "versions": common.versions()}
     path = common.write_results(options.out, results)

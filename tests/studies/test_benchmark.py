@@ -9,29 +9,16 @@ from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
 from studies.__main__ import main
-from studies.benchmark import (
-    contenders,
-    diffrax,
-    figures,
-    harmonic_balance,
-    peers,
-    pendulum,
-    posteriors,
-    problems,
-    scaling,
-    tables,
-    targets,
-)
+from studies.benchmark import contenders, figures, peers, posteriors, problems, scaling, targets
 from studies.benchmark import floor as benchmark_floor
-from studies.benchmark import guard as benchmark_guard
 from studies.benchmark import run as benchmark
 from studies.benchmark.equations import NUMPY, FirstOrder, table
-from studies.benchmark.integration import EQUILIBRIUM, PREDICTED, SHOOTING, STARTS, STEADY, Discretised, Method
+from studies.benchmark.integration import EQUILIBRIUM, PREDICTED, SHOOTING, STARTS, STEADY, Discretised, Method, refer
 from studies.benchmark.kernels import dense, eliminate, signals
-from studies.benchmark.problems import DUFFING_TRUTH, Setting, draws, measured
-from studies.benchmark.reference import refer
-from studies.benchmark.timing import Action, interleaved, ratio, slope
+from studies.benchmark.problems import DUFFING_TRUTH, Setting, draws
 from studies.damper import run as damper
+from studies.gear import measured
+from studies.timing import Action, interleaved, ratio, slope
 
 MODELS = ("landing_gear force", "landing_gear displacement", "duffing", "dahl", "pendulum", "silverbox")
 
@@ -222,7 +209,7 @@ def test_a_quick_run_writes_table_and_figure(tmp_path, capsys, setting, monkeypa
 
 
 def test_a_peer_that_is_not_installed_is_a_row_that_says_so(setting, monkeypatch):
-    monkeypatch.setattr(diffrax.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
     contest = contenders.Contest(refer(replace(setting, name=problems.DUFFING)))
     compiled = contenders.add_compiled(contest)
     contest.rows.clear()
@@ -239,7 +226,7 @@ def test_peers_are_right(setting, peer):
     case = setting.cases[0]
     one, p = Discretised(case, 800), setting.parameters(setting.theta, case)
     exact = np.array([Method(one, SHOOTING, PREDICTED, 1e-10)(row) for row in p])
-    tune = {"diffrax": diffrax.tune_diffrax, "harmonicbalance": harmonic_balance.tune_balanced}
+    tune = {"diffrax": peers.tune_diffrax, "harmonicbalance": peers.tune_balanced}
     found = tune[peer](one, p, exact, 1e-3)
     assert found is not None and [found(row) for row in p] == pytest.approx(exact, abs=2e-3)
 
@@ -261,7 +248,7 @@ def test_the_potential_of_jax_is_that_density(setting):
     jax = pytest.importorskip("jax")
     pytest.importorskip("diffrax")
     methods = [Method(Discretised(case, 800), SHOOTING, PREDICTED, 1e-9) for case in setting.cases]
-    tuned = [diffrax.Integrated(method.discretised, 1e-9) for method in methods]
+    tuned = [peers.Integrated(method.discretised, 1e-9) for method in methods]
     density = posteriors.collapsed(setting, methods)
     middle, factor = np.log(setting.estimate), posteriors._axes(setting)
     potential = jax.jit(posteriors._potential(setting, tuned, middle, factor))
@@ -274,10 +261,10 @@ def test_the_potential_of_jax_is_that_density(setting):
 
 def test_integration_leaves_an_unstable_orbit_at_the_rate_of_its_multiplier():
     """The upright equilibrium's perturbation grows; hanging at rest stays."""
-    hanging = pendulum.distances(np.zeros(2))
+    hanging = benchmark.distances(np.zeros(2))
     assert max(hanging) == 0.0
-    upright = pendulum.distances(np.array([np.pi, 1e-9]))
-    assert upright[0] > 1e-8 and max(upright) > pendulum.LEFT
+    upright = benchmark.distances(np.array([np.pi, 1e-9]))
+    assert upright[0] > 1e-8 and max(upright) > benchmark.LEFT
 
 
 def test_the_guard_compares_ratios_only_and_names_those_that_are_worse(tmp_path):
@@ -290,10 +277,10 @@ def test_the_guard_compares_ratios_only_and_names_those_that_are_worse(tmp_path)
         own = {"name": "this package, cold", "ratio": {"median": 9.0}}
         return {"problems": {"damper": {"rows": [row, own]}}, "floor": {"gear": floor}}
 
-    assert benchmark_guard.worse(results(1.0, 0.5), results(1.5, 0.4)) == []
-    lines = benchmark_guard.worse(results(1.0, 0.5), results(2.0, 0.2))
+    assert targets.worse(results(1.0, 0.5), results(1.5, 0.4)) == []
+    lines = targets.worse(results(1.0, 0.5), results(2.0, 0.2))
     assert len(lines) == 2 and "shooting" in lines[0] and "floor" in lines[1]
-    assert benchmark_guard.worse(results(1.0, 0.5, 0.5), results(2.0, 0.2, 0.5)) == []
+    assert targets.worse(results(1.0, 0.5, 0.5), results(2.0, 0.2, 0.5)) == []
     kept = tmp_path / "results.json"
     with pytest.raises(FileNotFoundError, match="run the whole study first"):
         benchmark.read_kept(kept)
@@ -344,6 +331,6 @@ def test_posterior_and_scaling_are_told_and_judged():
     start["peak_mb"] = 600.0
     found = {"problems": {}, "floor": {}, "posterior": posterior, "scaling": {"growth": growth, "start": start}}
     assert [row["met"] for row in targets.rows(found)] == [False, True, None, True, False, *4 * [True], False]
-    assert "jax is not installed" in tables.posterior(posterior)
+    assert "jax is not installed" in targets.posterior(posterior)
     assert "600 MB" in scaling.account(found["scaling"])
     assert len(figures.draw(found).axes) == 1

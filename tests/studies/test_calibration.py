@@ -8,7 +8,7 @@ import pytest
 from bayesperiodic.diagnostics.campaigns import check_supported
 from studies.__main__ import main
 from studies.calibration import run as calibration
-from studies.calibration.cases import OVERCOUNT
+from studies.calibration.run import OVERCOUNT
 
 
 def run(folder, *arguments):

@@ -9,13 +9,13 @@ import pandas as pd
 import pytest
 
 import bayesperiodic as bp
-from studies import common, tasks
+from studies import common
 from studies.__main__ import main
-from studies.flutter import campaigns, checks, questions, rig
-from studies.flutter import data as flutter_data
+from studies.flutter import campaigns, questions, rig
+from studies.flutter import run as flutter
 from studies.flutter.reference import hopf
 
-REAL = common.find_data(None, flutter_data.FILE)
+REAL = common.find_data(None, rig.FILE)
 real_data = pytest.mark.skipif(
     REAL is None, reason="the measured file is not to be had here, see studies/flutter/data.py"
 )
@@ -26,8 +26,8 @@ def run(folder, *arguments):
     """Run the study in this process, synthetic rigs with four kinds of cycles, and return what it printed."""
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
         patch.setattr(common, "find_data", lambda *_: None)
-        patch.setattr(tasks, "workers", lambda: ThreadPoolExecutor(1))
-        patch.setattr(flutter_data, "KINDS", {name: flutter_data.KINDS[name] for name in FOUR})
+        patch.setattr(common, "workers", lambda: ThreadPoolExecutor(1))
+        patch.setattr(rig, "KINDS", {name: rig.KINDS[name] for name in FOUR})
         assert main(["flutter", "--out", str(folder), *arguments]) == 0
     return printed.getvalue()
 
@@ -44,7 +44,7 @@ def test_authors_hopf_point_is_that_of_the_eigenvalues_and_a_speed_without_a_cyc
 
 def test_half_a_range_is_that_of_the_signal_and_not_of_its_samples():
     tau = (np.arange(12) + 0.3) / 12
-    assert checks.half_range(0.2 + np.cos(2 * np.pi * tau)) == pytest.approx(1.0, rel=1e-6)
+    assert flutter.half_range(0.2 + np.cos(2 * np.pi * tau)) == pytest.approx(1.0, rel=1e-6)
 
 
 @pytest.mark.slow
@@ -61,9 +61,9 @@ def test_a_quick_run_tells_what_was_asked_and_says_synthetic(tmp_path):
 
 def test_synthetic_records_are_called_synthetic_and_have_the_cycles_of_the_truth():
     along = rig.cycles(rig.RIG | rig.TRUE)
-    records = flutter_data.generate(1)
-    admitted, refused = flutter_data.usable(records)
-    assert not refused and set(admitted) == set(flutter_data.KINDS)
+    records = rig.generate(1)
+    admitted, refused = rig.usable(records)
+    assert not refused and set(admitted) == set(rig.KINDS)
     for record in records:
         e, orbit = admitted[record.recording.name], along.at(record.recording.name, record.speed)
         assert e.synthetic and e.frequency_se < 0.003 * e.frequency
@@ -82,16 +82,14 @@ def test_campaigns_are_resumed(tmp_path, monkeypatch):
 
 
 def test_records_that_drift_or_are_too_short_are_left_out_with_the_reason():
-    time = flutter_data.STEP * np.arange(2000)
+    time = rig.STEP * np.arange(2000)
     still = np.cos(2 * np.pi * 2.45 * time)
     given = {"steady": still, "growing": still * (1 + 0.04 * time), "short": still[:400]}
     records = [
-        flutter_data.Record(
-            bp.Recording.from_arrays(time[: y.size], {"heave": y, "pitch": np.roll(y, 9)}, name=name), 15.0, {}
-        )
+        rig.Record(bp.Recording.from_arrays(time[: y.size], {"heave": y, "pitch": np.roll(y, 9)}, name=name), 15.0, {})
         for name, y in given.items()
     ]
-    admitted, refused = flutter_data.usable(records)
+    admitted, refused = rig.usable(records)
     assert list(admitted) == ["steady"]
     assert "is not steady" in refused["growing"] and "at least 3 cycles are needed" in refused["short"]
 
@@ -132,14 +130,14 @@ def test_speeds_within_a_quarter_are_left_out_together():
 
 @real_data
 def test_of_the_measured_records_the_one_that_drifts_is_left_out():
-    records, data = flutter_data.read_records(None, 1)
-    admitted, refused = flutter_data.usable(records)
-    assert data["sha256"] == flutter_data.SHA256
-    assert set(admitted) == set(flutter_data.KINDS) and set(refused) == {"unstable_v15_6"}
+    records, data = rig.read_records(None, 1)
+    admitted, refused = rig.usable(records)
+    assert data["sha256"] == rig.SHA256
+    assert set(admitted) == set(rig.KINDS) and set(refused) == {"unstable_v15_6"}
     for record in records:
         name = record.recording.name
         if name in admitted:
             e = admitted[name]
             assert e.frequency_se < 0.003 * e.frequency
-            assert flutter_data.spectral_frequency(record, e) == pytest.approx(e.frequency, rel=0.003)
-            assert record.speed == flutter_data.KINDS[name][0]
+            assert rig.spectral_frequency(record, e) == pytest.approx(e.frequency, rel=0.003)
+            assert record.speed == rig.KINDS[name][0]

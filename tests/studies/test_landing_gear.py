@@ -10,16 +10,26 @@ from matplotlib.text import Text
 from scipy import integrate, linalg, optimize, stats
 
 import bayesperiodic as bp
-from studies import common, tasks
+from studies import common
 from studies.__main__ import main
 from studies.landing_gear import campaigns, force
 from studies.landing_gear import run as landing_gear
-from studies.landing_gear import slope as landing_gear_slope
 from studies.landing_gear.drop import MASS, drop
 from studies.landing_gear.identification import FORCE, fold
 from studies.landing_gear.quality import FAULTS
-from studies.landing_gear.rig import CYCLES, NOISE, RECORDED, RUNS, SPEED_LIMIT, Run, integrate_steady, measure, steady
-from studies.landing_gear.truth import GEAR, TRUTHS
+from studies.landing_gear.rig import (
+    CYCLES,
+    GEAR,
+    NOISE,
+    RECORDED,
+    RUNS,
+    SPEED_LIMIT,
+    TRUTHS,
+    Run,
+    integrate_steady,
+    measure,
+    steady,
+)
 
 SMALL = next(run for run in RUNS if run.name == "6 Hz 4 mm")
 
@@ -104,13 +114,13 @@ def test_the_dropped_gear_comes_to_the_balance_of_moments():
     assert drop(free, duration=600.0).outputs["displacement"][-1] == pytest.approx(compression(psi), abs=1e-5)
 
 
-@pytest.mark.parametrize("slope", landing_gear_slope.SLOPES)
+@pytest.mark.parametrize("slope", force.SLOPES)
 def test_steep_friction_is_solved_and_a_coarse_grid_is_told(slope):
     """The arctan changes over within 2/slope of velocity: 3 steps and more of the grid at 300 s/m, not at 1000."""
     for run in (SMALL, Run(1.0, 18e-3)):
-        found, warned = landing_gear_slope.solve(run, slope, "force")
+        found, warned = force.solve(run, slope, "force")
         assert found.converged and warned == (slope >= 1000.0)
-        assert landing_gear_slope.solve(run, slope, "displacement")[0].converged
+        assert force.solve(run, slope, "displacement")[0].converged
 
 
 def fundamental(signal: np.ndarray) -> complex:
@@ -290,7 +300,7 @@ def test_campaigns_are_counted_and_resumed(tmp_path, monkeypatch):
             "truth": truth, "seed": seed, "source": campaigns.source(), "experiments": experiments
         }  # fmt: skip
 
-    monkeypatch.setattr(tasks, "workers", lambda: ThreadPoolExecutor(1))
+    monkeypatch.setattr(common, "workers", lambda: ThreadPoolExecutor(1))
     monkeypatch.setattr(campaigns, "campaign", fake)
     campaigns.campaigns(tmp_path, 2, 1)
     lines = campaigns.campaigns(tmp_path, 4, 1)

@@ -9,7 +9,7 @@ from studies import shooting
 from studies.__main__ import main
 from studies.pendulum import orbits
 from studies.pendulum import recording as pendulum_recording
-from studies.pendulum.shooting import shoot
+from studies.pendulum.orbits import shoot
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-from studies.tasks import remembered
+from studies.common import remembered
 
 
 def test_a_part_is_made_once_and_again_for_another_source(tmp_path):

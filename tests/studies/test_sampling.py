@@ -11,10 +11,10 @@ from PIL import Image
 from scipy import integrate, stats
 
 from studies.__main__ import main
+from studies.common import row, table_of_rows
 from studies.sampling import cost as sampling_cost
 from studies.sampling import damper as sampling_damper
 from studies.sampling import ridge as sampling_ridge
-from studies.sampling.rows import row, table
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +149,7 @@ def test_gain_has_no_verdict_where_a_plain_loop_gains_nothing():
 def test_rows_keep_their_limits():
     assert [row("x", value, 0.9, 1.1)["met"] for value in (0.8, 1.0, 1.2, None)] == [False, True, False, None]
     assert row("x", 5.0, 0.9, None)["met"] is True
-    text = table([row("x", 5.0, 0.9, None, "why"), row("y", None, 0.0, 1.0, "because")])
+    text = table_of_rows([row("x", 5.0, 0.9, None, "why"), row("y", None, 0.0, 1.0, "because")])
     assert "≥ 0.9" in text and "(2) because" in text
 
 

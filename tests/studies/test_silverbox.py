@@ -8,7 +8,7 @@ import pytest
 import bayesperiodic as bp
 from studies import common
 from studies.__main__ import main
-from studies.silverbox import checks, data, problem
+from studies.silverbox import checks, data
 from studies.silverbox import run as silverbox
 
 REAL = common.find_data(None, data.FILE)
@@ -89,9 +89,9 @@ def test_error_found_by_doubling_is_that_against_time_integration(steady_period)
     drive, response = steady_period
     time = np.arange(3 * drive.size) / data.SAMPLING_RATE
     recording = bp.Recording.from_arrays(time, {"response": np.tile(response, 3)}, {"drive": np.tile(drive, 3)})
-    experiment = problem.fold(recording, 4096, response=335)
+    experiment = data.fold(recording, 4096, response=335)
     grid = checks.discretisation(recording, experiment, data.TRUE)
-    solution = problem.solve(data.TRUE, experiment)
+    solution = data.solve(data.TRUE, experiment)
     true = np.sqrt(np.mean((solution.outputs["response"][::4] - response) ** 2)) / response.std()
     assert grid.fraction == pytest.approx(true, rel=0.15)
     assert grid.difference.size == 4096
@@ -127,8 +127,8 @@ def test_estimates_of_the_measured_silverbox_by_an_independent_route():
     from scipy.optimize import least_squares
 
     (recording, _), _ = data.read_steady_parts(None, 1)
-    experiment = problem.fold(recording, silverbox.SAMPLES)
-    fit = bp.map_estimate(problem.problem(experiment))
+    experiment = data.fold(recording, silverbox.SAMPLES)
+    fit = bp.map_estimate(data.problem(experiment))
     drive, response = (
         np.reshape(signal, (data.PERIODS, -1)).mean(axis=0)
         for signal in (recording.inputs["drive"], recording.outputs["response"])

@@ -5,9 +5,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from studies import tasks
+from studies import common
 from studies.__main__ import main
-from studies.verdicts import replicates
 from studies.verdicts import run as verdicts
 from studies.verdicts.cases import CASES
 from studies.verdicts.outcome import examine
@@ -59,22 +58,22 @@ def test_replicates_are_saved_one_by_one_and_resumed(tmp_path, monkeypatch):
     """A line that was cut off, and one of another version of the cases, are done again; the others are not."""
     calls = []
     fake = {"right": True, "named": True, "warned": False, "converged": True, "wrong": {}, "verdicts": {}, "seconds": 1}
-    monkeypatch.setattr(tasks, "workers", lambda: ThreadPoolExecutor(1))
+    monkeypatch.setattr(common, "workers", lambda: ThreadPoolExecutor(1))
     monkeypatch.setattr(
-        replicates,
+        verdicts,
         "replicate",
         lambda task: (
             calls.append(task)
-            or dict(zip(("case", "kind", "number", "seed"), task, strict=True)) | {"source": replicates.source()} | fake
+            or dict(zip(("case", "kind", "number", "seed"), task, strict=True)) | {"source": verdicts.source()} | fake
         ),
     )
-    first = replicates.replicates(tmp_path, ("linear",), 2, 1)
+    first = verdicts.replicates(tmp_path, ("linear",), 2, 1)
     assert len(first) == len(calls) == 4
-    path = tmp_path / replicates.FILE
+    path = tmp_path / verdicts.FILE
     lines = path.read_text().splitlines()
-    path.write_text("\n".join([lines[0], lines[1].replace(replicates.source(), "other"), lines[2], lines[3][:9]]))
+    path.write_text("\n".join([lines[0], lines[1].replace(verdicts.source(), "other"), lines[2], lines[3][:9]]))
     calls.clear()
-    assert replicates.replicates(tmp_path, ("linear",), 2, 1) == first
+    assert verdicts.replicates(tmp_path, ("linear",), 2, 1) == first
     assert len(calls) == 2
     assert len(path.read_text().splitlines()) == 5
 
@@ -91,23 +90,23 @@ def test_counts_tell_what_is_wrong_and_what_flips(quick):
         "wrong": {"identifiability m": "determined"},
         "verdicts": {"identifiability": line["verdicts"]["identifiability"] | {"m": "determined"}},
     }  # fmt: skip
-    found = replicates.summary([line, line | {"kind": "sampler"}, other], {"scaling_symmetry": outcome})[
+    found = verdicts.summary([line, line | {"kind": "sampler"}, other], {"scaling_symmetry": outcome})[
         "scaling_symmetry"
     ]
     assert found["data"]["right_share"] == [1.0, pytest.approx(0.47, abs=0.01)]
     assert found["sampler"]["right"] == 1 and found["sampler"]["wrong"] == {"identifiability m: determined": 1}
     assert found["sampler"]["verdicts_that_flip"] == {"identifiability m": ["determined", "only in combination"]}
-    assert "1 times identifiability m" in replicates.account({"scaling_symmetry": found})
+    assert "1 times identifiability m" in verdicts.account_of_replicates({"scaling_symmetry": found})
 
 
 def test_a_replicate_that_fails_is_counted_and_told(monkeypatch):
     def fails(*_, **__):
         raise RuntimeError("no orbit")
 
-    monkeypatch.setattr(replicates, "examine", fails)
-    line = replicates.replicate(("linear", "data", 0, 1))
+    monkeypatch.setattr(verdicts, "examine", fails)
+    line = verdicts.replicate(("linear", "data", 0, 1))
     assert line["error"] == "RuntimeError: no orbit"
-    counts = replicates._counts([line])
+    counts = verdicts._counts([line])
     assert counts["right"] == 0 and counts["errors"] == ["RuntimeError: no orbit"] and counts["seconds_each"] is None
 
 

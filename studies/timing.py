@@ -1,0 +1,113 @@
+"""Times measured side by side: every action in turn within every repeat, medians, and ratios repeat by repeat.
+
+How right a gradient of the log-posterior is.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+
+import bayesperiodic as bp
+
+STEP = 0.05
+LOOP = 5_000_000
+
+
+def gradient_error(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> float:
+    """Return the error of the gradient by θ against five-point differences of log-posteriors, of its largest component.
+
+    Components count, and steps are taken, in standard deviations of one parameter with the others known.
+
+    `warm`: The one that the gradient is of; the differences are of the problem anchored at θ. `theta` (names,). `noise`
+    (noise_names,).
+    """
+    sd = _conditional_sd(warm, theta, noise)
+    given = warm.gradient(theta, noise)[: theta.size] * sd
+    shifts = np.concatenate([np.diag(k * STEP * sd) for k in (-2.0, -1.0, 1.0, 2.0)])
+    two, one, minus_one, minus_two = warm.anchored(theta).log_posterior(theta - shifts, noise).reshape(4, -1)
+    differences = (minus_two - 8.0 * minus_one + 8.0 * one - two) / (12.0 * STEP)
+    return float(np.abs(given - differences).max() / np.abs(given).max())
+
+
+def _conditional_sd(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    changes = warm.likelihood.whitened(warm.linearised(theta).changes, noise)
+    information = sum((own**2).sum(axis=-1) for own in changes)
+    return 1.0 / np.sqrt(information + np.diag(warm.joint_prior.curvature(theta)))
+
+
+class Action(NamedTuple):
+    """Something timed."""
+
+    run: Callable[[], Any]  # Returns its own seconds, or anything else where the clock shall be read here
+    of: int = 1  # Of how many log-posteriors it takes the time
+    most: int = 10_000  # Repeats at most; of a slow action fewer are worth their time
+
+
+def interleaved(actions: Mapping[str, Action], repeats: int) -> dict[str, np.ndarray]:
+    """Return seconds (repeats,) a log-posterior of each action, NaN in repeats that leave it out.
+
+    A first round, which fills caches, does not count for the actions that are repeated more than once.
+    """
+    found = {name: np.full(repeats, np.nan) for name in actions}
+    for repeat in range(-1, repeats):
+        for name, action in actions.items():
+            if repeat >= action.most or (repeat < 0 and action.most == 1):
+                continue
+            before = time.perf_counter()
+            own = action.run()
+            seconds = own if isinstance(own, float) else time.perf_counter() - before
+            if repeat >= 0:
+                found[name][repeat] = seconds / action.of
+    return found
+
+
+def spread(values: np.ndarray) -> dict[str, float]:
+    """Return median, least and largest of the values that are there."""
+    there = values[np.isfinite(values)]
+    return {"median": float(np.median(there)), "least": float(there.min()), "largest": float(there.max())}
+
+
+def ratio(over: np.ndarray, under: np.ndarray) -> dict[str, float]:
+    """Return the ratio of two actions repeat by repeat."""
+    return spread(over / under)
+
+
+def slope(sizes: Any, values: Any) -> float:
+    """Return the exponent of a power law fitted by least squares of the logarithms."""
+    return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
+
+
+def gain_of_cores(call: Callable[[int], Any], cores: int, repeats: int) -> dict[str, Any]:
+    """Compare what all cores gain on a call, given its number of threads, with what they gain on a plain loop.
+
+    The plain loop is compiled, needs no memory, and runs once a core. All four are timed in turn within every repeat.
+    """
+    with ThreadPoolExecutor(cores) as pool:
+        list(pool.map(plain_loop, [10] * cores))
+        times = interleaved({
+            "one": Action(lambda: call(1)),
+            "many": Action(lambda: call(cores)),
+            "loop_one": Action(lambda: [plain_loop(LOOP) for _ in range(cores)]),
+            "loop_many": Action(lambda: list(pool.map(plain_loop, [LOOP] * cores))),
+        }, repeats)  # fmt: skip
+    gains, plain = times["one"] / times["many"], times["loop_one"] / times["loop_many"]
+    return {
+        "gain": float(np.median(gains)),
+        "plain": float(np.median(plain)),
+        "ratio": float(np.median(gains / plain)),
+        "ratio_quartiles": np.quantile(gains / plain, [0.25, 0.75]).tolist(),
+        "milliseconds": float(np.median(times["one"])) * 1e3,
+    }
+
+
+@numba.njit(nogil=True)
+def plain_loop(count: int) -> float:
+    """Return the result of so many dependent divisions."""
+    total = 0.0
+    for k in range(count):
+        total += 1.0 / (1.0 + k * total)
+    return total
