@@ -27,8 +27,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from PIL import Image
 
-from bayesperiodic import _parallel as kept
-from bayesperiodic._parallel import team
+from bayesperiodic import _parallel
+from bayesperiodic._parallel import TaskPool, available_cores
 
 Row = dict[str, Any]
 
@@ -79,7 +79,7 @@ def resumed(
     "source" in it. `task_of`: Returns the task that a line is of. `source`: Tells results of another version apart.
     """
     with workers() as pool:
-        return kept.resumed(path, tasks, _do_task, task_of, source, shared=work, executor=pool)
+        return _parallel.checkpointed_tasks(path, tasks, _do_task, task_of, source, shared=work, executor=pool)
 
 
 def _do_task(work: Callable[[Task], Line], task: Task) -> Line:
@@ -112,9 +112,9 @@ def each(work: Callable[..., Value], tasks: Sequence[Task], *, here: bool = Fals
         yield from (work(*task) for task in tasks)
         return
     done: dict[int, bytes] = {}
-    with workers() as pool, team(pool, work) as crew:
+    with workers() as pool, TaskPool(pool, work) as task_pool:
         following = 0
-        for number, result in crew.run(_run_task, tasks):
+        for number, result in task_pool.run(_run_task, tasks):
             done[number] = result
             while following in done:
                 yield cloudpickle.loads(done.pop(following))
@@ -127,7 +127,7 @@ def _run_task(work: Callable[..., Value], task: Task) -> bytes:
 
 def workers() -> ProcessPoolExecutor:
     """Return a pool of as many fresh processes as there are cores."""
-    return ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn"))
+    return ProcessPoolExecutor(available_cores(), mp_context=multiprocessing.get_context("spawn"))
 
 
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "corner", "matplotlib", "xarray")

@@ -33,8 +33,8 @@ import cloudpickle
 import numpy as np
 
 import bayesperiodic as bp
-from bayesperiodic._parallel import team
 from studies import common
+from studies.common import TaskPool
 
 CYCLES = 10
 OVERCOUNT = 1.25
@@ -240,8 +240,8 @@ def _overhead(client: Any) -> float:
     """Return seconds a task that does nothing, of many at once on two workers."""
 
     def empty() -> None:
-        with team(client, None) as crew:
-            for _ in crew.run(_nothing, range(EMPTY)):
+        with TaskPool(client, None) as pool:
+            for _ in pool.run(_nothing, range(EMPTY)):
                 pass
 
     empty()

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import bayesperiodic as bp
-from bayesperiodic._parallel import available_cores
-from studies.common import Row, row, unjudged
+from studies.common import Row, available_cores, row, unjudged
 from studies.gear import GEAR, RIG, gear_problem
 from studies.timing import gain_of_cores, plain_loop
 

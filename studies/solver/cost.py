@@ -12,9 +12,9 @@ import numpy as np
 from scipy.linalg import lapack
 
 import bayesperiodic as bp
-from bayesperiodic._parallel import available_cores
 from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
+from studies.common import available_cores
 from studies.gear import GEAR, RIG, gear_problem, gear_runs
 from studies.timing import Action, gain_of_cores, interleaved, slope
 
