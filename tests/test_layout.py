@@ -1,0 +1,30 @@
+"""Limits of the sizes that ``python -m tests.layout`` prints."""
+
+from statistics import median
+
+from tests import layout
+
+MOST_PARAMETERS = 8
+REASONS = {
+    "Experiment": "one field per measured quantity; four are required, the rest are keywords with defaults",
+    "sample": "settings of the sampler; two arguments and the seed are required, the rest are keywords with defaults",
+    "Model": "the definition of a model: name, variables, equations, outputs, units; five are required",
+    "calibrate": "the settings of a campaign and of the estimates in it; three are required",
+    "plot.branch": "options of a figure; one argument is required",
+    "simulate": "a problem (model, parameters, inputs, frequency), a time grid, and the noise",
+    "solve_periodic": "a problem (model, parameters, inputs, frequency), a grid, and a guess",
+}
+
+
+def test_the_median_file_has_one_idea():
+    assert 120 <= median(layout.lines("bayesperiodic").values()) <= 320
+
+
+def test_functions_fit_on_a_screen():
+    too_long = {name: length for name, length in layout.longest_functions().items() if length > 60}
+    assert not too_long
+
+
+def test_public_functions_have_few_parameters_or_a_reason():
+    many = {name for name, count in layout.public_parameters().items() if count > MOST_PARAMETERS}
+    assert many == REASONS.keys()
