@@ -1,19 +1,40 @@
-"""Models and answers that are known from outside the package, shared by the tests."""
+"""Models with closed-form answers, independent solutions, and experiments shared by the tests."""
+
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import sympy as sp
 
 import bayesperiodic as bp
 
-# A dummy state w and outputs that are linear in the parameters: posterior and Laplace are known in closed form.
-LINEAR = bp.Model(
+# Weights of the central first difference of eighth order, antisymmetric.
+EIGHTH_ORDER = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
+
+
+def formula_model(
+    name: str, parameters: Sequence[str] | Mapping[str, str], outputs: Callable, **changes: object
+) -> bp.Model:
+    """Return a model whose outputs are formulas of the parameters and the input x; its state w filters x.
+
+    `outputs` takes parameters, inputs and states.
+    """
+    return bp.Model(
+        name,
+        states=["w"],
+        inputs=["x"],
+        parameters=parameters,
+        equations=lambda s, p, u: [s.dw + s.w - u.x],
+        outputs=lambda s, p, u: outputs(p, u, s),
+        **changes,
+    )
+
+
+# The output is linear in the parameters, so that posterior and Laplace approximation have closed forms.
+LINEAR = formula_model(
     "linear",
-    states=["w"],
-    inputs=["x"],
-    parameters={"k": "N/m", "c": "N s/m", "coulomb": "N"},
+    {"k": "N/m", "c": "N s/m", "coulomb": "N"},
+    lambda p, u, s: {"force": p.k * u.x + p.c * u.dx + p.coulomb * sp.tanh(u.dx / 0.1)},
     units={"x": "m", "force": "N"},
-    equations=lambda s, p, u: [s.dw + s.w - u.x],
-    outputs=lambda s, p, u: {"force": p.k * u.x + p.c * u.dx + p.coulomb * sp.tanh(u.dx / 0.1)},
 )
 
 # It has no equilibrium and no periodic solution.
@@ -83,6 +104,20 @@ def linear_experiment(
         samples=samples,
         independent=None if independent is None else {"force": independent},
     )
+
+
+def normal_posterior(
+    design: np.ndarray, values: np.ndarray, variance: float, mean: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and covariance of θ for values = design · θ + noise and the prior N(mean, covariance)."""
+    precision = np.linalg.inv(covariance)
+    posterior = np.linalg.inv(design.T @ design / variance + precision)
+    return posterior @ (design.T @ values / variance + precision @ mean), posterior
+
+
+def difference(function: Callable, x: np.ndarray | float = 0.0, step: np.ndarray | float = 1e-2):
+    """Return the first derivative by central differences of eighth order."""
+    return sum(w * (function(x + k * step) - function(x - k * step)) for k, w in EIGHTH_ORDER.items()) / step
 
 
 def complex_step_sensitivities(

@@ -6,7 +6,7 @@ import bayesperiodic as bp
 from bayesperiodic.diagnostics.design import Candidate, Information, rank_candidates
 from bayesperiodic.diagnostics.identifiability import cumulative_jensen_shannon, structure_of
 from tests.known import GEAR, LINEAR, grid, linear_experiment, linear_regressors
-from tests.periodic.test_orbits import PENDULUM
+from tests.pendulum import PENDULUM
 from tests.posterior.observed import pendulum_run
 from tests.posterior.test_targets import known, model, run
 

@@ -8,27 +8,17 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic.estimation.laplace import undetermined
 from bayesperiodic.sampling.coordinates import SamplingDensity
-from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+from tests.known import LINEAR, formula_model, grid, linear_experiment, linear_regressors
 from tests.posterior.observed import DUFFING, DUFFING_PRIORS, duffing_run
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}
-PRODUCT = bp.Model(
+PRODUCT = formula_model(
     "product",
-    states=["w"],
-    inputs=["x"],
-    parameters=["a", "b", "shift_a", "shift_b", "idle"],
-    equations=lambda s, p, u: [s.dw + s.w - u.x],
-    outputs=lambda s, p, u: {"force": p.a * p.b**2 * u.x + (p.shift_a + 2 * p.shift_b) * u.dx},
+    ["a", "b", "shift_a", "shift_b", "idle"],
+    lambda p, u, s: {"force": p.a * p.b**2 * u.x + (p.shift_a + 2 * p.shift_b) * u.dx},
 )
-SIGNED = bp.Model(
-    "signed",
-    states=["w"],
-    inputs=["x"],
-    parameters=["a"],
-    equations=lambda s, p, u: [s.dw + s.w - u.x],
-    outputs=lambda s, p, u: {"force": p.a**2 * u.x + 0.05 * p.a * u.dx},
-)
+SIGNED = formula_model("signed", ["a"], lambda p, u, s: {"force": p.a**2 * u.x + 0.05 * p.a * u.dx})
 
 
 def sine_run(force) -> bp.Experiment:

@@ -9,7 +9,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic.estimation.initial import all_at_once
 from tests.known import LINEAR, linear_experiment
-from tests.orbits.measured import FREQUENCY, GENTLE, PENDULUM, measured, section_problem
+from tests.pendulum import FREQUENCY, GENTLE, PENDULUM, measured, section_problem
 from tests.posterior.observed import cycle_run
 
 PHI = {"phi": "angle"}

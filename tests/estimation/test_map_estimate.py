@@ -5,25 +5,18 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.estimation.result import whiteness
-from tests.known import LINEAR, RUNAWAY, grid, linear_experiment, linear_regressors
+from tests.known import LINEAR, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors, normal_posterior
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
-MEAN, PRECISION = np.array([800.0, 30.0, 20.0]), np.diag([60.0**-2, 20.0**-2, 10.0**-2])
-
-
-def closed_form(experiment, variance, weight=1.0):
-    """Return mean and covariance of the normal posterior of a linear model."""
-    design = linear_regressors(0.05, 2.0, grid(experiment.samples))
-    covariance = np.linalg.inv(weight * design.T @ design / variance + PRECISION)
-    mean = covariance @ (weight * design.T @ experiment.outputs["force"] / variance + PRECISION @ MEAN)
-    return mean, covariance
+MEAN, COVARIANCE = np.array([800.0, 30.0, 20.0]), np.diag([60.0, 20.0, 10.0]) ** 2
+DESIGN = linear_regressors(0.05, 2.0, grid(40))
 
 
 def test_known_variance_gives_the_closed_form():
     experiment = linear_experiment(TRUTH, 3.0, seed=1)
     fit = bp.map_estimate(bp.Problem(LINEAR, [experiment], priors=PRIORS, fixed={"variance[force]": 9.0}))
-    mean, covariance = closed_form(experiment, 9.0)
+    mean, covariance = normal_posterior(DESIGN, experiment.outputs["force"], 9.0, MEAN, COVARIANCE)
     assert list(fit.theta.values()) == pytest.approx(mean, rel=1e-10)
     assert fit.covariance.to_numpy() == pytest.approx(covariance, rel=1e-10)
     assert list(fit.sd.values()) == pytest.approx(np.sqrt(np.diag(covariance)), rel=1e-10)
@@ -42,7 +35,7 @@ def test_progress_is_shown_unless_unwanted(capsys):
 def test_independent_values_weigh_the_samples():
     experiment = linear_experiment(TRUTH, 3.0, seed=2, independent=11)
     fit = bp.map_estimate(bp.Problem(LINEAR, [experiment], priors=PRIORS, fixed={"variance[force]": 9.0}))
-    mean, covariance = closed_form(experiment, 9.0, weight=11 / 40)
+    mean, covariance = normal_posterior(DESIGN, experiment.outputs["force"], 9.0 * 40 / 11, MEAN, COVARIANCE)
     assert list(fit.theta.values()) == pytest.approx(mean, rel=1e-10)
     assert fit.covariance.to_numpy() == pytest.approx(covariance, rel=1e-10)
 
@@ -51,13 +44,11 @@ def test_unknown_variance_is_that_of_equation_7():
     """V = s Σe² / (nNs − l) with s = 1 channel, N = 2 experiments, n = 40 samples, l = 3 parameters."""
     experiments = [replace(linear_experiment(TRUTH, 3.0, seed=s), name=f"run {s}") for s in (3, 4)]
     fit = bp.map_estimate(bp.Problem(LINEAR, experiments, priors=PRIORS))
-    design = linear_regressors(0.05, 2.0, grid(40))
-    total = sum(np.sum((e.outputs["force"] - design @ list(fit.theta.values())) ** 2) for e in experiments)
+    design, values = np.tile(DESIGN, (2, 1)), np.concatenate([e.outputs["force"] for e in experiments])
+    total = np.sum((values - design @ list(fit.theta.values())) ** 2)
     assert fit.variances["force"] == pytest.approx(total / (40 * 2 - 3), rel=1e-9)
-    v = fit.variances["force"]
-    covariance = np.linalg.inv(2 * design.T @ design / v + PRECISION)
-    right = sum(design.T @ e.outputs["force"] for e in experiments) / v + PRECISION @ MEAN
-    assert list(fit.theta.values()) == pytest.approx(covariance @ right, rel=1e-7)
+    mean, _ = normal_posterior(design, values, fit.variances["force"], MEAN, COVARIANCE)
+    assert list(fit.theta.values()) == pytest.approx(mean, rel=1e-7)
 
 
 def test_estimate_maximises_equation_6_with_the_corrected_count():
@@ -68,7 +59,7 @@ def test_estimate_maximises_equation_6_with_the_corrected_count():
     best = np.array(list(fit.theta.values()))
 
     def objective(theta):
-        residual = experiment.outputs["force"] - linear_regressors(0.05, 2.0, grid(40)) @ theta
+        residual = experiment.outputs["force"] - DESIGN @ theta
         return -0.5 * (40 - 3) * np.log(np.sum(residual**2)) + problem.log_prior(theta)
 
     for direction in np.eye(3) * np.array(list(fit.sd.values())):
@@ -108,14 +99,7 @@ def test_white_residuals_pass_and_smooth_ones_do_not():
 
 def test_noise_of_differentiated_inputs_is_carried_to_the_output():
     """Force = c·ẋ with x of known amplitude noise: sd of the force from its closed form, and the warning."""
-    model = bp.Model(
-        "dashpot",
-        states=["w"],
-        inputs=["x"],
-        parameters=["c"],
-        equations=lambda s, p, u: [s.dw + s.w - u.x],
-        outputs=lambda s, p, u: {"force": p.c * u.dx + s.w},
-    )
+    model = formula_model("dashpot", ["c"], lambda p, u, s: {"force": p.c * u.dx + s.w})
     tau = grid(200)
     x = np.sin(2 * np.pi * tau)
     variance = np.array([0.0, 1e-4, 4e-4])

@@ -7,24 +7,12 @@ from scipy.special import ndtri
 
 import bayesperiodic as bp
 from bayesperiodic.estimation.profile import Ridge
-from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+from tests.known import LINEAR, formula_model, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
 WIDE = {name: bp.Uniform(-1e5, 1e5) for name in PRIORS}
 WAVE, RATE = np.sin(2 * np.pi * grid(40)), 2 * np.pi * np.cos(2 * np.pi * grid(40))
-
-
-def instant(name, parameters, outputs):
-    """Return a model whose output is a formula of the input x and its rate; the state is there because one must be."""
-    return bp.Model(
-        name,
-        states=["w"],
-        inputs=["x"],
-        parameters=parameters,
-        equations=lambda s, p, u: [s.dw + s.w - u.x],
-        outputs=lambda s, p, u: {"y": outputs(p, u)},
-    )
 
 
 def posed(model, y, variance, priors, *, wave=WAVE):
@@ -83,7 +71,7 @@ def test_unknown_variance_gives_the_logarithm_of_the_misfit():
 
 def test_only_a_product_is_determined():
     """Of a·b alone, a is as good anywhere in its support, b where a's support lets it be; c does not mind."""
-    model = instant("product", ["a", "b", "c"], lambda p, u: p.a * p.b * u.x + p.c * u.dx)
+    model = formula_model("product", ["a", "b", "c"], lambda p, u, s: {"y": p.a * p.b * u.x + p.c * u.dx})
     priors = {"a": bp.LogUniform(0.1, 10.0), "b": bp.LogUniform(1e-4, 1e4), "c": bp.Normal(0.0, 10.0)}
     problem = posed(model, 2 * WAVE + 0.7 * RATE, 0.01, priors)
     fit = fitted(problem)
@@ -104,7 +92,7 @@ def test_only_a_product_is_determined():
 def test_a_saturating_parameter_is_bounded_on_one_side():
     """Y = a/(1 + a)·x measured as 0.98 ± 0.02: a ≥ 17.9, and nothing above."""
     sd = 0.02
-    model = instant("saturating", ["a"], lambda p, u: p.a / (1 + p.a) * u.x)
+    model = formula_model("saturating", ["a"], lambda p, u, s: {"y": p.a / (1 + p.a) * u.x})
     problem = posed(model, 0.98 * WAVE, sd**2 * WAVE @ WAVE, {"a": bp.Uniform(0.0, 1e6)})
     profile = bp.profile(problem, fitted(problem, {"a": 40.0}))
     z = (profile.values["a"] / (1 + profile.values["a"]) - 0.98) / sd
@@ -144,7 +132,7 @@ def test_a_skewed_profile_is_that_of_brute_force():
 
 def double_well(mean):
     """Return a problem where b jumps from near 1 to near −1 as a grows, later on the way up than on the way down."""
-    model = instant("wells", ["a", "b"], lambda p, u: p.b**2 * u.x + (p.a + p.b) * u.dx / (2 * np.pi))
+    model = formula_model("wells", ["a", "b"], lambda p, u, s: {"y": p.b**2 * u.x + (p.a + p.b) * u.dx / (2 * np.pi)})
     wave = WAVE * np.sqrt(2 / 40)
     priors = {"a": bp.Normal(mean, 2.0), "b": bp.Normal(0.0, 5.0)}
     return posed(model, wave, 0.3, priors, wave=wave)
@@ -167,10 +155,10 @@ def test_the_way_back_finds_the_branch_that_the_way_out_misses(monkeypatch):
 
 def test_an_end_lifted_by_another_branch_is_followed_further():
     """Outwards a stays in a narrow well of b; the jump at its upper end leads into a wide one, back past the peak."""
-    model = instant(
+    model = formula_model(
         "unlike_wells",
         ["a", "b"],
-        lambda p, u: (p.b**2 + 0.6 * p.a) * u.x + p.a * (2 + 1.5 * p.b) * u.dx / (2 * np.pi),
+        lambda p, u, s: {"y": (p.b**2 + 0.6 * p.a) * u.x + p.a * (2 + 1.5 * p.b) * u.dx / (2 * np.pi)},
     )
     wave, priors = WAVE * np.sqrt(2 / 40), {"a": bp.Normal(0.0, 5.0), "b": bp.Normal(-1.0, 2.0)}
     problem = posed(model, wave, 0.3, priors, wave=wave)
@@ -205,7 +193,9 @@ def test_a_better_point_than_the_estimate_is_told_and_helps():
 @pytest.mark.parametrize("support", [(1.99, 2.01), (2.01, 2.05), (1.8, 1.99)])
 def test_a_parameter_at_the_end_of_its_support_does_not_hold_the_others(support):
     """Against bounded least squares: b presses against the ends of its support as a moves, and c makes up for it."""
-    model = instant("bounded", ["a", "b", "c"], lambda p, u: p.a * u.x + p.b * (u.x + u.dx + u.x**2) + p.c * u.dx)
+    model = formula_model(
+        "bounded", ["a", "b", "c"], lambda p, u, s: {"y": p.a * u.x + p.b * (u.x + u.dx + u.x**2) + p.c * u.dx}
+    )
     design = np.stack([WAVE, WAVE + RATE + WAVE**2, RATE], axis=-1) / 0.1
     y = design @ [1.0, 2.0, 0.5] + np.random.default_rng(3).standard_normal(40)
     priors = {"a": bp.Uniform(-10.0, 10.0), "b": bp.Uniform(*support), "c": bp.Uniform(-10.0, 10.0)}

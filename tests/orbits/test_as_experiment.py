@@ -5,8 +5,7 @@ import pytest
 
 import bayesperiodic as bp
 from studies import shooting
-from tests.orbits.measured import GENTLE, PENDULUM, SAMPLES, measured, section_problem
-from tests.periodic.test_orbits import rates_and_angles
+from tests.pendulum import GENTLE, PENDULUM, SAMPLES, measured, rates_and_angles, section_problem
 
 PHI = {"phi": "angle"}
 

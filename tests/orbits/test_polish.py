@@ -7,7 +7,7 @@ import bayesperiodic as bp
 from bayesperiodic.orbits.orbit import Orbits
 from studies import shooting
 from tests.known import LINEAR
-from tests.orbits.measured import GENTLE, PENDULUM, at_rest, measured, mirrored, repeated, shifted, wrapped
+from tests.pendulum import GENTLE, PENDULUM, at_rest, measured, mirrored, repeated, shifted, wrapped
 
 WILD = [k for k in shooting.UNSTABLE if abs(k.multipliers[0]) > 50]
 

@@ -6,7 +6,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic.orbits.select import orbit_information
 from studies import shooting
-from tests.orbits.measured import GENTLE, PENDULUM, at_rest, measured, mirrored, section_problem
+from tests.pendulum import GENTLE, PENDULUM, at_rest, measured, mirrored, section_problem
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT
 from bayesperiodic.periodic.equations import PeriodicEquations
 from studies import shooting
 from tests.known import grid
-from tests.periodic.test_orbits import PENDULUM, pendulum_solution
+from tests.pendulum import PENDULUM, pendulum_solution
 
 DUFFING = np.array([0.45, 1.3, 900.0, 4e5])
 

@@ -9,7 +9,7 @@ from scipy.optimize import brentq, root
 import bayesperiodic as bp
 from studies import shooting
 from tests.known import grid
-from tests.periodic.test_orbits import PENDULUM, pendulum_solution, rates_and_angles
+from tests.pendulum import PENDULUM, pendulum_solution, rates_and_angles
 
 DUFFING = {"m": 1.0, "c": 0.2, "k": 1.0, "k3": 0.5}
 TURN = 2 * np.pi

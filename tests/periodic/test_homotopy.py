@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 import bayesperiodic as bp
 from studies import shooting
 from tests.known import grid
-from tests.periodic.test_orbits import PENDULUM
+from tests.pendulum import PENDULUM
 
 RESONANT = {"m": 1.0, "c": 0.05, "k": 1.0, "k3": 1.0}
 RESONANCE = [(1.0, 0.25), (3.0, 0.3), (10.0, 0.4)]

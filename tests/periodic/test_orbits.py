@@ -4,34 +4,10 @@ import pytest
 import bayesperiodic as bp
 from studies import shooting
 from tests.known import grid
+from tests.pendulum import PENDULUM, ROTATIONS, TURN, pendulum_solution, rates_and_angles
 
-TURN = 2 * np.pi
-# The torques of shooting.PENDULUM for m = 0.1 kg: k = c m l².
-PENDULUM = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
-ROTATIONS = [k for k in shooting.UNSTABLE if len(k.section) == 1]
 LONG = [k for k in shooting.UNSTABLE if len(k.section) in (3, 5) and abs(k.multipliers[0]) > 100]
 IDS = [f"period {len(k.section)}, winding {k.winding}, multiplier {k.multipliers[0]:.0f}" for k in LONG]
-
-
-def rates_and_angles(known: shooting.Known, samples: int) -> np.ndarray:
-    """Return (φ, φ') of a tabulated orbit on a grid, integrated period by period."""
-    points = samples * len(known.section)
-    return shooting.pendulum_grid(known.omega, known.section, np.arange(points) / samples)
-
-
-def pendulum_solution(
-    known: shooting.Known, samples: int, scheme: str, angle: np.ndarray | None = None, **changes
-) -> bp.PeriodicSolution:
-    """Return the solver's orbit near a tabulated one, or near another angle."""
-    angle = rates_and_angles(known, samples)[:, 0] if angle is None else angle
-    arguments = {
-        "frequency": known.omega / TURN,
-        "samples": samples,
-        "scheme": scheme,
-        "periods": len(known.section),
-        "winding": known.winding,
-    }
-    return bp.solve_periodic(bp.models.pendulum, PENDULUM, **(arguments | changes), guess={"phi": angle})
 
 
 def disturbed(known: shooting.Known, angle: np.ndarray) -> np.ndarray:

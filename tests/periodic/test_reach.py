@@ -8,7 +8,7 @@ from bayesperiodic.periodic.family import reach
 from bayesperiodic.periodic.solve import solve_free
 from studies import shooting
 from tests.known import CYCLE, SADDLE_NODE, grid
-from tests.periodic.test_orbits import PENDULUM, TURN, pendulum_solution
+from tests.pendulum import PENDULUM, TURN, pendulum_solution
 
 
 def built(model: bp.Model, inputs: dict, frequency: float, **changes) -> PeriodicEquations:

@@ -8,11 +8,10 @@ import sympy as sp
 
 import bayesperiodic as bp
 from studies import shooting
-from tests.known import grid
+from tests.known import EIGHTH_ORDER, grid
+from tests.pendulum import ROTATIONS, pendulum_solution
 from tests.periodic.test_autonomous import LORENZ
-from tests.periodic.test_orbits import ROTATIONS, pendulum_solution
 
-CENTRAL8 = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 DUFFING = {"m": 1.1, "c": 0.1, "k": 1.2, "k3": 0.9}
 MIXED = bp.Model(
     "mixed_orders",
@@ -74,7 +73,7 @@ def neighbours(
 
 
 def difference(near: dict[int, bp.PeriodicSolution], step: float, quantity):
-    return sum(w * (quantity(near[k]) - quantity(near[-k])) for k, w in CENTRAL8.items()) / step
+    return sum(w * (quantity(near[k]) - quantity(near[-k])) for k, w in EIGHTH_ORDER.items()) / step
 
 
 def largest(values: np.ndarray) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 import bayesperiodic as bp
 from studies import shooting
 from tests.known import grid
-from tests.periodic.test_orbits import PENDULUM, pendulum_solution
+from tests.pendulum import PENDULUM, pendulum_solution
 
 SAMPLES = 200
 DUFFING = {"m": 1.0, "c": 0.2, "k": 1.0, "k3": 0.5}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+from tests.known import LINEAR, grid, linear_experiment, linear_regressors, normal_posterior
 
 COULOMB = {"light": 10.0, "heavy": 40.0}
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(40.0, 20.0)}
@@ -28,12 +28,11 @@ def test_each_experiment_has_its_own_constant():
     """The closed posterior of k and c, each run's own friction taken off its force."""
     fit = bp.map_estimate(problem(COULOMB), progress=False)
     x = linear_regressors(0.05, 2.0, grid(40))
-    precision = 2 * x[:, :2].T @ x[:, :2] / 9.0 + np.diag([60.0**-2, 20.0**-2])
-    right = np.array([800 / 60.0**2, 40 / 20.0**2])
-    for e in experiments():
-        right += x[:, :2].T @ (e.outputs["force"] - COULOMB[e.name] * x[:, 2]) / 9.0
-    assert list(fit.theta.values()) == pytest.approx(np.linalg.solve(precision, right), rel=1e-9)
-    assert fit.covariance.to_numpy() == pytest.approx(np.linalg.inv(precision), rel=1e-8)
+    values = np.concatenate([e.outputs["force"] - COULOMB[e.name] * x[:, 2] for e in experiments()])
+    prior = np.diag([60.0, 20.0]) ** 2
+    mean, covariance = normal_posterior(np.tile(x[:, :2], (2, 1)), values, 9.0, [800.0, 40.0], prior)
+    assert list(fit.theta.values()) == pytest.approx(mean, rel=1e-9)
+    assert fit.covariance.to_numpy() == pytest.approx(covariance, rel=1e-8)
     assert {name: s.parameters["coulomb"] for name, s in fit.solutions.items()} == COULOMB
     with pytest.raises(ValueError, match="got 'coulomb'"):
         fit.derive({"share": "coulomb/k"})
@@ -55,13 +54,11 @@ def test_a_tie_may_name_what_differs():
     assert tied.parameters(np.array([[450.0]]), "heavy")[0] == pytest.approx([450.0, 20.0, 40.0])
     fit = bp.map_estimate(tied, progress=False)
     x = linear_regressors(0.05, 2.0, grid(40))
-    precision, right = 60.0**-2, 800 / 60.0**2
-    for e in experiments():
-        regressor = x[:, 0] + x[:, 1] * COULOMB[e.name] / 900
-        precision += regressor @ regressor / 9.0
-        right += regressor @ (e.outputs["force"] - COULOMB[e.name] * x[:, 2]) / 9.0
-    assert fit.theta["k"] == pytest.approx(right / precision, rel=1e-9)
-    assert fit.sd["k"] == pytest.approx(precision**-0.5, rel=1e-8)
+    design = np.concatenate([x[:, 0] + x[:, 1] * coulomb / 900 for coulomb in COULOMB.values()])[:, None]
+    values = np.concatenate([e.outputs["force"] - COULOMB[e.name] * x[:, 2] for e in experiments()])
+    (mean,), ((variance,),) = normal_posterior(design, values, 9.0, [800.0], np.array([[60.0**2]]))
+    assert fit.theta["k"] == pytest.approx(mean, rel=1e-9)
+    assert fit.sd["k"] == pytest.approx(np.sqrt(variance), rel=1e-8)
     assert np.isnan(fit.tied["c"]["k"])
 
 

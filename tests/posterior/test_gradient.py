@@ -5,6 +5,7 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.periodic.batch import Batch
+from tests.known import EIGHTH_ORDER
 from tests.posterior.observed import (
     DUFFING_PRIORS,
     PENDULUM_PRIORS,
@@ -16,7 +17,6 @@ from tests.posterior.observed import (
     section_run,
 )
 
-EIGHTH_ORDER = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
 DELAY = {"shift": bp.Normal(0.0, 0.1)}
 POINTS = np.arange(SAMPLES) % 20 == 3
 

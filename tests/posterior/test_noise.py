@@ -11,7 +11,7 @@ from bayesperiodic import noise
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, climb
 from bayesperiodic.posterior.likelihood import Likelihood, estimate_noise
 from bayesperiodic.posterior.noise import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
-from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+from tests.known import LINEAR, difference, formula_model, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
@@ -20,13 +20,8 @@ LOG_2PI = np.log(2.0 * np.pi)
 SHAPES = {"exponential": {"lengthscale": 0.04}, "matern": {"lengthscale": 0.04, "floor": 0.02}}
 KERNELS = list(SHAPES)
 
-TWO = bp.Model(
-    "two",
-    states=["w"],
-    inputs=["x"],
-    parameters=["k", "c"],
-    equations=lambda s, p, u: [s.dw + s.w - u.x],
-    outputs=lambda s, p, u: {"force": p.k * u.x + p.c * u.dx, "moment": p.k * u.dx - 2.0 * p.c * u.x},
+TWO = formula_model(
+    "two", ["k", "c"], lambda p, u, s: {"force": p.k * u.x + p.c * u.dx, "moment": p.k * u.dx - 2.0 * p.c * u.x}
 )
 TWO_PRIORS = {"k": bp.Normal(0.5, 2.0), "c": bp.Normal(2.0, 3.0)}
 
@@ -278,9 +273,9 @@ def test_points_and_multipliers_have_their_joint_normal_density(with_joint_covar
     """The linear model's multiplier is exp(−1/frequency), the dummy state w obeying ẇ + w = x."""
     experiment, covariance = section(with_joint_covariance)
     problem = bp.Problem(LINEAR, [experiment], priors=PRIORS, fixed={"scale": 1.0})
-    difference = np.append(residual(experiment)[experiment.mask], np.log(0.4) + 0.5)
+    off = np.append(residual(experiment)[experiment.mask], np.log(0.4) + 0.5)
     normal = stats.multivariate_normal(np.zeros(4), covariance)
-    expected = normal.logpdf(difference) - normal.logpdf(np.zeros(4))
+    expected = normal.logpdf(off) - normal.logpdf(np.zeros(4))
     assert problem.log_likelihood(POINT, {}) == pytest.approx(expected, rel=1e-6)
 
 
@@ -322,13 +317,6 @@ def situation(model) -> tuple[Likelihood, list[np.ndarray], np.ndarray]:
     return likelihood, residuals, start * np.exp(0.5 * generator.standard_normal(start.size))
 
 
-def slope(function, step: float = 1e-2) -> float:
-    """Return the derivative at zero by central differences of order eight."""
-    weights = np.array([4 / 5, -1 / 5, 4 / 105, -1 / 280])
-    ends = [function(i * step) - function(-i * step) for i in range(1, 5)]
-    return float(weights @ ends) / step
-
-
 @pytest.mark.parametrize("share", [1.0, 0.8])
 @pytest.mark.parametrize("model", MODELS, ids=repr)
 def test_gradients_are_those_of_high_order_differences(model, share):
@@ -340,7 +328,7 @@ def test_gradients_are_those_of_high_order_differences(model, share):
 
     for i in range(values.size):
         unit = np.eye(values.size)[i]
-        expected = slope(lambda t, unit=unit: total(residuals, values * np.exp(t * unit)))
+        expected = difference(lambda t, unit=unit: total(residuals, values * np.exp(t * unit)))
         assert by_noise[i] == pytest.approx(expected, rel=1e-8, abs=1e-8)
     for b, r in enumerate(residuals):
         for unit, found in zip(np.eye(r.size), by_residual[b], strict=True):
@@ -348,7 +336,7 @@ def test_gradients_are_those_of_high_order_differences(model, share):
             def moved(t, b=b, unit=unit):
                 return total([*residuals[:b], residuals[b] + t * unit, *residuals[b + 1 :]], values)
 
-            expected = slope(moved)
+            expected = difference(moved)
             assert found == pytest.approx(expected, rel=1e-8, abs=1e-8)
 
 
@@ -519,7 +507,7 @@ def test_the_best_spectrum_is_higher_than_any_on_a_grid(kernel, points):
     scanned = density(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, found.size))
     assert density(found[None])[0] > scanned.max()
     for unit in np.eye(found.size):
-        assert slope(lambda t, unit=unit: float(density(found[None] * np.exp(t * unit))[0])) == pytest.approx(
+        assert difference(lambda t, unit=unit: float(density(found[None] * np.exp(t * unit))[0])) == pytest.approx(
             0, abs=1e-5
         )
 

@@ -8,6 +8,7 @@ from scipy import integrate, stats
 
 import bayesperiodic as bp
 from bayesperiodic.posterior.joint_priors import FromScipy, JointPrior, as_prior
+from tests.known import difference
 
 INFINITY = math.inf
 CASES = {
@@ -67,20 +68,14 @@ def test_quantile_is_the_inverse_of_the_distribution_function(prior, reference):
     assert np.isnan(prior.quantile(np.array([-0.1, 1.1, np.nan]))).all()
 
 
-def eighth_order_difference(function, x, h):
-    """Return the first derivative by central differences of eighth order."""
-    weights = {1: 4 / 5, 2: -1 / 5, 3: 4 / 105, 4: -1 / 280}
-    return sum(w * (function(x + k * h) - function(x - k * h)) for k, w in weights.items()) / h
-
-
 @cases()
 def test_gradient_and_curvature_match_eighth_order_differences(prior, reference):
     x = prior.quantile(np.array([0.01, 0.2, 0.5, 0.9, 0.999]))
     low, high = prior.support
     width = reference.ppf(0.75) - reference.ppf(0.25)
     h = 0.02 * np.minimum(np.minimum(x - low, high - x), width)
-    first = eighth_order_difference(prior.log_prob, x, h)
-    second = eighth_order_difference(prior.gradient, x, h)
+    first = difference(prior.log_prob, x, h)
+    second = difference(prior.gradient, x, h)
     assert np.all(np.abs(prior.gradient(x) - first) < 1e-7 * (np.abs(first) + 1 / width))
     assert np.all(np.abs(prior.curvature(x) + second) < 1e-7 * (np.abs(second) + 1 / width**2))
 

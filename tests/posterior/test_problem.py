@@ -7,7 +7,7 @@ from scipy import stats
 import bayesperiodic as bp
 from bayesperiodic.sampling.checkpoint import fingerprint
 from bayesperiodic.sampling.coordinates import SamplingDensity
-from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+from tests.known import LINEAR, grid, linear_experiment, linear_regressors, normal_posterior
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.4), "coulomb": bp.Uniform(0.0, 50.0)}
@@ -237,13 +237,10 @@ def test_priors_must_be_a_mapping(experiment):
         bp.Problem(LINEAR, [experiment], priors=["k"])
 
 
-def normal_posterior(experiments, variance, mean, covariance):
-    """Return the closed form of a linear model with a joint normal prior."""
-    design = linear_regressors(0.05, 2.0, grid(40))
-    precision = np.linalg.inv(covariance)
-    posterior = np.linalg.inv(len(experiments) * design.T @ design / variance + precision)
-    data = sum(design.T @ e.outputs["force"] for e in experiments) / variance
-    return posterior @ (data + precision @ mean), posterior
+def closed_form(experiments, covariance):
+    """Return mean and covariance of the posterior with a joint normal prior and the noise variance 9."""
+    design = np.tile(linear_regressors(0.05, 2.0, grid(40)), (len(experiments), 1))
+    return normal_posterior(design, np.concatenate([e.outputs["force"] for e in experiments]), 9.0, MEAN, covariance)
 
 
 NAMES = ("k", "c", "coulomb")
@@ -256,10 +253,10 @@ def test_a_correlated_prior_gives_the_closed_form(experiment):
         LINEAR, [experiment], priors={NAMES: bp.MultivariateNormal(MEAN, COVARIANCE)}, fixed={"variance[force]": 9.0}
     )
     fit = bp.map_estimate(problem, progress=False)
-    mean, covariance = normal_posterior([experiment], 9.0, MEAN, COVARIANCE)
+    mean, covariance = closed_form([experiment], COVARIANCE)
     assert list(fit.theta.values()) == pytest.approx(mean, rel=1e-10)
     assert fit.covariance.to_numpy() == pytest.approx(covariance, rel=1e-9)
-    uncorrelated, _ = normal_posterior([experiment], 9.0, MEAN, np.diag(np.diag(COVARIANCE)))
+    uncorrelated, _ = closed_form([experiment], np.diag(np.diag(COVARIANCE)))
     assert not np.allclose(mean, uncorrelated, rtol=1e-4)
 
 
@@ -273,7 +270,7 @@ def test_one_posterior_is_the_next_prior():
     between = bp.MultivariateNormal([first.theta[n] for n in key], first.covariance.loc[[*key], [*key]])
     second = bp.map_estimate(bp.Problem(LINEAR, experiments[1:], priors={key: between}, **settings), progress=False)
     together = bp.map_estimate(bp.Problem(LINEAR, experiments, priors=prior, **settings), progress=False)
-    mean, covariance = normal_posterior(experiments, 9.0, MEAN, COVARIANCE)
+    mean, covariance = closed_form(experiments, COVARIANCE)
     for fit in (second, together):
         assert list(fit.theta.values()) == pytest.approx(mean, rel=1e-9)
         assert fit.covariance.to_numpy() == pytest.approx(covariance, rel=1e-8)

@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
-from tests.known import grid
+from tests.known import formula_model, grid
 
 QUIET = {"progress": False}
 PAIR = {"ensembles": 2, "seed": 1, "progress": False}
@@ -18,15 +18,8 @@ ERRORS = 5.0
 
 
 def model(name: str, parameters: Sequence[str], force: Callable) -> bp.Model:
-    """Return a model with a dummy state and the outputs that `force` makes of its parameters, times x."""
-    return bp.Model(
-        name,
-        states=["w"],
-        inputs=["x"],
-        parameters=list(parameters),
-        equations=lambda s, p, u: [s.dw + s.w - u.x],
-        outputs=lambda s, p, u: {channel: value * u.x for channel, value in force(p).items()},
-    )
+    """Return a model with the outputs that `force` makes of its parameters, times x."""
+    return formula_model(name, parameters, lambda p, u, s: {channel: v * u.x for channel, v in force(p).items()})
 
 
 def run(**sizes: float) -> bp.Experiment:

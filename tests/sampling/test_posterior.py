@@ -11,7 +11,15 @@ import bayesperiodic as bp
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.coordinates import SamplingDensity
 from bayesperiodic.sampling.posterior import gather
-from tests.known import LINEAR, SADDLE_NODE, grid, linear_experiment, linear_regressors
+from tests.known import (
+    LINEAR,
+    SADDLE_NODE,
+    formula_model,
+    grid,
+    linear_experiment,
+    linear_regressors,
+    normal_posterior,
+)
 
 FIRST, SECOND = "run 7", "run 8, 14.5 Hz"
 TRUTH = np.array([900.0, 40.0, 25.0])
@@ -22,18 +30,15 @@ PAIR = QUIET | {"ensembles": 2}
 REGRESSORS = linear_regressors(0.05, 2.0, grid(40))
 
 # Two channels, of which an experiment may lack one.
-TWO = bp.Model(
+TWO = formula_model(
     "two",
-    states=["w"],
-    inputs=["x"],
-    parameters={"k": "N/m", "c": "N s/m"},
-    units={"x": "m", "force": "N", "rate": "m/s"},
-    equations=lambda s, p, u: [s.dw + s.w - u.x],
-    outputs=lambda s, p, u: {
+    {"k": "N/m", "c": "N s/m"},
+    lambda p, u, s: {
         "force": p.k * u.x + p.c * u.dx,
         "rate": p.c * s.w,
         "time": p.k * sp.cos(2 * sp.pi * s.tau),
     },
+    units={"x": "m", "force": "N", "rate": "m/s"},
 )
 
 
@@ -65,11 +70,9 @@ def closed_form(experiments):
     for i in range(len(experiments)):
         design[40 * i : 40 * (i + 1), :2] = REGRESSORS[:, :2]
         design[40 * i : 40 * (i + 1), 2 + i] = REGRESSORS[:, 2]
-    count = len(experiments)
-    precision = np.diag([60.0**-2, 20.0**-2, *[10.0**-2] * count])
-    covariance = np.linalg.inv(design.T @ design / 9.0 + precision)
-    data = np.concatenate([e.outputs["force"] for e in experiments])
-    return covariance @ (design.T @ data / 9.0 + precision @ [800.0, 30.0, *[20.0] * count]), covariance
+    count, data = len(experiments), np.concatenate([e.outputs["force"] for e in experiments])
+    prior = np.diag([60.0, 20.0, *[10.0] * count]) ** 2
+    return normal_posterior(design, data, 9.0, [800.0, 30.0, *[20.0] * count], prior)
 
 
 def test_local_parameters_have_their_closed_form_within_monte_carlo_error(local):

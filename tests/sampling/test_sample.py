@@ -6,7 +6,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic.sampling import convergence, sample
 from bayesperiodic.sampling.coordinates import SamplingDensity
-from tests.known import LINEAR, grid, linear_experiment, linear_regressors
+from tests.known import LINEAR, grid, linear_experiment, linear_regressors, normal_posterior
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
@@ -30,10 +30,9 @@ def test_emcee_matches_the_closed_form_within_monte_carlo_error(known_variance, 
     """Means, sds and covariances within 4 Monte Carlo errors: false-alarm rate below 0.1 % over the nine figures."""
     problem, _ = known_variance
     design = linear_regressors(0.05, 2.0, grid(40))
-    precision = np.diag([60.0**-2, 20.0**-2, 10.0**-2])
-    covariance = np.linalg.inv(design.T @ design / 9.0 + precision)
-    right = design.T @ problem.experiments[0].outputs["force"] / 9.0 + precision @ [800.0, 30.0, 20.0]
-    mean, sd = covariance @ right, np.sqrt(np.diag(covariance))
+    values, prior = problem.experiments[0].outputs["force"], np.diag([60.0, 20.0, 10.0]) ** 2
+    mean, covariance = normal_posterior(design, values, 9.0, [800.0, 30.0, 20.0], prior)
+    sd = np.sqrt(np.diag(covariance))
     assert posterior.converged
     draws = np.stack([posterior.draws(name) for name in problem.names], axis=-1)
     error = 4 / np.sqrt(min(posterior.ess.values()))

@@ -1,4 +1,4 @@
-"""Orbits of the pendulum as a section would give them: exact ones by shooting, with noise of a known covariance."""
+"""Orbits of the pendulum: solved from the tabulated ones, and measured on a section with noise of known covariance."""
 
 from dataclasses import replace
 from functools import cache
@@ -8,8 +8,11 @@ import numpy as np
 import bayesperiodic as bp
 from bayesperiodic.orbits.orbit import Orbit
 from studies import shooting
-from tests.periodic.test_orbits import PENDULUM, TURN
 
+TURN = 2 * np.pi
+# The torques of shooting.PENDULUM for m = 0.1 kg: k = c m l².
+PENDULUM = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
+ROTATIONS = [k for k in shooting.UNSTABLE if len(k.section) == 1]
 SIZE = np.array([TURN, 32.6])  # of the attractor, rad and rad/s
 FREQUENCY = 9.09 / TURN
 SAMPLES = 100
@@ -17,9 +20,27 @@ GENTLE = [k for k in shooting.UNSTABLE if abs(k.multipliers[0]) < 50]
 
 
 @cache
-def exact_cycle(known: shooting.Known) -> np.ndarray:
-    """Return (φ, φ') of a tabulated orbit at 100 points a period."""
-    return shooting.pendulum_grid(known.omega, known.section, np.arange(SAMPLES * len(known.section)) / SAMPLES)
+def rates_and_angles(known: shooting.Known, samples: int) -> np.ndarray:
+    """Return (φ, φ') of a tabulated orbit on a grid, integrated period by period."""
+    points = samples * len(known.section)
+    path = shooting.pendulum_grid(known.omega, known.section, np.arange(points) / samples)
+    path.flags.writeable = False
+    return path
+
+
+def pendulum_solution(
+    known: shooting.Known, samples: int, scheme: str, angle: np.ndarray | None = None, **changes
+) -> bp.PeriodicSolution:
+    """Return the solver's orbit near a tabulated one, or near another angle."""
+    angle = rates_and_angles(known, samples)[:, 0] if angle is None else angle
+    arguments = {
+        "frequency": known.omega / TURN,
+        "samples": samples,
+        "scheme": scheme,
+        "periods": len(known.section),
+        "winding": known.winding,
+    }
+    return bp.solve_periodic(bp.models.pendulum, PENDULUM, **(arguments | changes), guess={"phi": angle})
 
 
 def wrapped(points: np.ndarray) -> np.ndarray:
@@ -32,7 +53,7 @@ def measured(known: shooting.Known, *, noise: float = 1e-3, seed: int = 0, cycle
     generator, period = np.random.default_rng([seed, round(1e3 * abs(known.multipliers[0]))]), len(known.section)
     sd = noise * SIZE
     points = wrapped(np.array(known.section) + sd * generator.standard_normal((period, 2)))
-    path = exact_cycle(known) + sd * generator.standard_normal((SAMPLES * period, 2))
+    path = rates_and_angles(known, SAMPLES) + sd * generator.standard_normal((SAMPLES * period, 2))
     covariance = np.diag([*np.tile(sd**2, period), 0.02**2, np.nan])
     orbit = Orbit(
         name=f"period {period}, winding {known.winding}, multiplier {known.multipliers[0].real:.4g}",
@@ -65,7 +86,7 @@ def mirrored(orbit: Orbit) -> Orbit:
 
 
 def shifted(orbit: Orbit, by: int) -> Orbit:
-    """Return the orbit as it is seen some forcing periods later."""
+    """Return the orbit with its section shifted by some forcing periods."""
     rows = np.roll(np.arange(orbit.points.size), -2 * by)
     rows = np.concatenate([rows, orbit.points.size + np.arange(2)])
     angle, rate = (orbit.cycle[name] for name in ("angle", "rate"))
@@ -80,7 +101,7 @@ def shifted(orbit: Orbit, by: int) -> Orbit:
 
 
 def repeated(orbit: Orbit, times: int) -> Orbit:
-    """Return the orbit as a candidate of a multiple of its period."""
+    """Return the orbit repeated, as a candidate of a multiple of its period."""
     angle, rate = (orbit.cycle[name] for name in ("angle", "rate"))
     turns = TURN * orbit.winding * np.repeat(np.arange(times), angle.size)
     size = times * orbit.points.size
@@ -101,7 +122,7 @@ def repeated(orbit: Orbit, times: int) -> Orbit:
 
 
 def at_rest(angle: float = 0.0, noise: float = 1e-3) -> Orbit:
-    """Return a state of rest as a section with noise would show it."""
+    """Return a noisy equilibrium of the section."""
     points, path = np.array([[angle, 0.0]]), np.tile([angle, 0.0], (SAMPLES, 1))
     generator = np.random.default_rng(5)
     path = path + noise * SIZE * generator.standard_normal(path.shape)
