@@ -120,7 +120,7 @@ def test_absolute_value_has_no_derivative_at_zero():
     assert np.array_equal(slopes, [-1.0, np.nan, 1.0], equal_nan=True)
 
 
-def test_powers_of_zero_and_of_negative_numbers():
+def test_powers_of_zero_and_of_negative_numbers_follow_numpy():
     square, zeroth, variable = (parse("e", text, ["k", "m"]) for text in ("k**2", "k**0", "k**m"))
     assert square.gradient({"k": [-3.0, 0.0]})["k"].tolist() == [-6.0, 0.0]
     assert zeroth.gradient({"k": [0.0]})["k"].tolist() == [0.0]
@@ -128,7 +128,7 @@ def test_powers_of_zero_and_of_negative_numbers():
     assert variable.gradient({"k": 0.0, "m": 2.0})["m"] == 0.0
 
 
-def test_arrays_broadcast_and_inputs_stay_as_they_were():
+def test_arrays_broadcast_and_inputs_are_not_modified():
     k, m = np.arange(1.0, 4.0)[:, None], np.arange(1, 3)
     expression = parse("e", "k/m", ["k", "m", "l"])
     assert expression.names == ("k", "m")
@@ -140,26 +140,26 @@ def test_arrays_broadcast_and_inputs_stay_as_they_were():
     assert k.ravel().tolist() == [1.0, 2.0, 3.0]
 
 
-def test_parts_without_names_are_numbers_at_once():
+def test_constant_parts_are_folded_into_numbers():
     assert parse("e", "2*pi*sqrt(4)**-1", []).steps == (np.pi,)
     assert parse("e", "9**9", []).steps == (9.0**9,)
 
 
-def test_names_may_hide_pi_and_functions_and_need_not_be_ascii():
+def test_names_may_shadow_pi_and_functions_and_be_unicode():
     assert parse("e", "pi*2", ["pi"]).value({"pi": 3.0}) == 6.0
     assert parse("e", "exp + exp(exp)", ["exp"]).value({"exp": 0.0}) == 1.0
     micro = "\N{MICRO SIGN}"
     assert parse("e", f"2*{micro}", [micro]).value({micro: 3.0}) == 6.0
 
 
-def test_long_sums_are_no_matter():
+def test_long_sums_are_parsed():
     text = "+".join(["k"] * (MAX_LENGTH // 2))
     assert parse("e", text, ["k"]).value({"k": 1.0}) == MAX_LENGTH // 2
     assert parse("e", "-" * 150 + "k", ["k"]).gradient({"k": 1.0})["k"] == 1.0
 
 
 @pytest.mark.parametrize("text", SILLY, ids=lambda text: repr(text)[:30])
-def test_anything_else_is_a_value_error_at_once(text):
+def test_other_syntax_raises_value_error_on_parsing(text):
     begin = time.perf_counter()
     with pytest.raises(ValueError, match="^tied: ") as caught:
         parse("tied", text, ["k", "m", "k1", "k2"])
@@ -167,7 +167,7 @@ def test_anything_else_is_a_value_error_at_once(text):
     assert len(str(caught.value)) < 600 and "must" in str(caught.value)
 
 
-def test_messages_name_the_text_and_what_is_allowed():
+def test_error_names_the_text_and_the_allowed_names():
     with pytest.raises(ValueError, match=r"^c1: must consist of .*, got 'k\.real', which contains an attribute"):
         parse("c1", "k.real", ["k"])
     with pytest.raises(
@@ -184,7 +184,7 @@ def test_messages_name_the_text_and_what_is_allowed():
         parse("c1", "k*m", ["k"], note="Only k.")
 
 
-def test_new_names_are_identifiers_of_their_own():
+def test_new_names_are_unused_identifiers():
     assert list(parse_all("derived", {"a": "k", "b": "k*2"}, ["k"])) == ["a", "b"]
     with pytest.raises(ValueError, match="derived: must be neither reserved nor repeated, got 'k'"):
         parse_all("derived", {"k": "2*k"}, ["k"])
@@ -196,6 +196,6 @@ def test_new_names_are_identifiers_of_their_own():
         parse_all("derived", "k", ["k"])
 
 
-def test_a_missing_value_is_named():
+def test_error_names_the_missing_value():
     with pytest.raises(ValueError, match="values: must have .*for 'k/m', got no \\['m'\\]"):
         parse("e", "k/m", ["k", "m"]).value({"k": 1.0})

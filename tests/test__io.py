@@ -59,7 +59,7 @@ def test_saved_posterior_opens_in_xarray(solved, tmp_path):
         assert np.array_equal(tree["posterior"]["k"].values, posterior.data["posterior"]["k"].values)
 
 
-def test_a_failed_save_leaves_the_old_file(solved, tmp_path, monkeypatch):
+def test_failed_save_keeps_the_old_file(solved, tmp_path, monkeypatch):
     fit = solved[1]
     fit.save(tmp_path / "fit.h5")
     before = (tmp_path / "fit.h5").read_bytes()
@@ -93,7 +93,7 @@ def test_a_result_of_another_version_is_refused(tmp_path):
         bp.load(path)
 
 
-def test_a_result_from_before_a_field_with_a_default_is_read(tmp_path):
+def test_file_without_a_field_that_has_a_default_is_read(tmp_path):
     path = tmp_path / "run.h5"
     bp.Experiment("run", 2.0, {"x": [0.0, 1.0, 0.0, -1.0]}, samples=4).save(path)
     with h5py.File(path, "a") as file:
@@ -104,13 +104,13 @@ def test_a_result_from_before_a_field_with_a_default_is_read(tmp_path):
     assert bp.load(path).origin == 0.0
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path):
+def test_error_names_the_missing_folder(tmp_path):
     experiment = bp.Experiment("run", 2.0, {"x": [0.0, 1.0, 0.0, -1.0]}, samples=4)
     with pytest.raises(FileNotFoundError, match="path: '.*run.h5' is not allowed; there is no folder '.*nowhere'"):
         experiment.save(tmp_path / "nowhere" / "run.h5")
 
 
-def test_a_file_cannot_name_a_class_from_elsewhere(solved, tmp_path):
+def test_file_cannot_load_classes_of_other_packages(solved, tmp_path):
     solved[1].save(tmp_path / "fit.h5")
     with h5py.File(tmp_path / "fit.h5", "a") as file:
         file.attrs["bayesperiodic_result"] = '{"result": "subprocess:Popen", "fields": {"args": "true"}}'

@@ -31,7 +31,7 @@ def test_hessian_of_different_units_has_the_inverse_of_its_scaled_decomposition(
     assert inverse == pytest.approx(expected, rel=1e-12)
 
 
-def test_zero_rows_stay_finite_and_indefinite_covariances_are_refused():
+def test_zero_rows_stay_finite_and_indefinite_covariances_raise():
     singular = np.diag([2.0, 0.0])
     for decompose in (hessian_eigh, covariance_eigh):
         assert decompose(singular)[0] == pytest.approx([0.0, 1.0], abs=1e-15)

@@ -85,13 +85,13 @@ def executor(request):
     return Forgetful() if request.param == "forgetful" else None
 
 
-def test_every_task_is_done_once_and_keeps_its_number(executor):
+def test_every_task_runs_once_and_keeps_its_number(executor):
     with TaskPool(executor, 2) as tasks:
         found = list(tasks.run(power, range(20)))
     assert sorted(found) == [(n, 2**n) for n in range(20)]
 
 
-def test_a_task_may_be_followed_by_another(executor):
+def test_a_task_may_submit_another(executor):
     """Chains of powers, 3 → 3² → 3⁴ and so on, each as long as its number says."""
     lengths = [1, 3, 2, 4]
     done: Counter[int] = Counter()
@@ -106,7 +106,7 @@ def test_a_task_may_be_followed_by_another(executor):
     assert len(found) == sum(lengths)
 
 
-def test_what_a_task_raises_comes_out(executor):
+def test_exception_of_a_task_is_raised_to_the_caller(executor):
     with pytest.raises(ArithmeticError, match="task 7"), TaskPool(executor, None) as tasks:
         list(tasks.run(fail, [7]))
 
@@ -122,7 +122,7 @@ def test_shared_data_are_unpickled_once_in_each_process_and_tasks_have_one_core(
     assert available_cores() == len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else True
 
 
-def test_shared_data_travel_about_once_a_worker_and_own_threads_take_them_as_they_are():
+def test_shared_data_are_sent_about_once_per_worker_and_not_copied_for_threads():
     """Two carriers for two workers; a process that starts late asks for them, at most once for each queued task."""
     cargo = Cargo()
     with Recording(2) as pool, TaskPool(pool, cargo) as tasks:
@@ -132,14 +132,14 @@ def test_shared_data_travel_about_once_a_worker_and_own_threads_take_them_as_the
         assert {loads for _, (_, loads, _) in tasks.run(report, [0.0] * 4)} == {0}
 
 
-def test_who_has_lost_the_shared_data_gets_them_again():
+def test_worker_that_lost_the_shared_data_receives_them_again():
     executor = Forgetful()
     with TaskPool(executor, 2) as tasks:
         assert sorted(tasks.run(power, range(12))) == [(n, 2**n) for n in range(12)]
     assert 1 < sum(executor.carried) < len(executor.carried)
 
 
-def test_dead_workers_are_one_clear_error():
+def test_dead_workers_raise_one_error():
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         with pytest.raises(WorkersLost, match=r"executor: its workers were lost \(BrokenProcessPool: "):
             with TaskPool(pool, None) as tasks:
@@ -162,7 +162,7 @@ def test_a_task_that_kills_dask_workers_ends_the_run(dask, monkeypatch):
         list(tasks.run(die, [0]))
 
 
-def test_a_script_without_its_guard_is_told_so(tmp_path):
+def test_error_for_a_script_without_main_guard_names_it(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         "import operator\nfrom bayesperiodic._parallel import TaskPool\n"
@@ -174,12 +174,12 @@ def test_a_script_without_its_guard_is_told_so(tmp_path):
 
 
 @pytest.mark.parametrize("bad", [0, -2, True, 1.5, "2", ThreadPoolExecutor, [2], get_context("spawn")])
-def test_what_takes_no_tasks_is_refused(bad):
+def test_object_that_is_no_executor_is_rejected(bad):
     with pytest.raises(ValueError, match=r"executor: must be None, a number of processes >= 1, .*got"):
         checked_executor(bad)
 
 
-def test_what_cannot_be_pickled_is_refused(processes):
+def test_object_that_cannot_be_pickled_is_rejected(processes):
     with pytest.raises(
         ValueError,
         match=r"executor: must be None, because the problem cannot be pickled \(TypeError: cannot pickle '_th",

@@ -20,12 +20,12 @@ def cells(path, kind):
     return ["".join(c["source"]) for c in json.loads(path.read_text("utf-8"))["cells"] if c["cell_type"] == kind]
 
 
-def test_there_are_seven():
+def test_there_are_seven_notebooks():
     assert [path.stem[0] for path in NOTEBOOKS] == list("1234567")
 
 
 @every
-def test_aims_and_exercises_with_answers(path):
+def test_every_notebook_states_its_aims_and_has_exercises_with_answers(path):
     text = "\n".join(cells(path, "markdown"))
     assert text.startswith(f"# {path.stem[0]}. ") and "**Aims.**" in text
     exercises, answers = text.split("## Exercises")[1].split("### Answers")
@@ -34,7 +34,7 @@ def test_aims_and_exercises_with_answers(path):
 
 
 @every
-def test_only_public_names(path):
+def test_notebooks_use_public_names_only(path):
     tree = ast.parse("\n".join(cells(path, "code")))
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -48,7 +48,7 @@ def test_only_public_names(path):
 
 
 @every
-def test_outputs_are_kept_and_small(path):
+def test_stored_outputs_are_present_and_small(path):
     assert path.stat().st_size <= LARGEST
     code = [c for c in json.loads(path.read_text("utf-8"))["cells"] if c["cell_type"] == "code"]
     assert [c["execution_count"] for c in code] == list(range(1, len(code) + 1))

@@ -53,7 +53,7 @@ def test_loops_are_closed_and_against_displacement_and_velocity(solved):
         bp.plot.loops(problem, fit, output="torque")
 
 
-def test_corner_draws_laplace_ellipses_where_the_draws_are(solved):
+def test_corner_laplace_ellipses_cover_the_draws(solved):
     _, fit, posterior = solved
     figure = bp.plot.corner(posterior, laplace=fit)
     axes = np.array(figure.axes).reshape(4, 4)
@@ -213,7 +213,7 @@ def test_rotations_are_drawn_by_their_section_points_without_their_turns():
     assert len(low) == len(branch)
 
 
-def test_what_cannot_be_drawn_of_branches_is_told(response):
+def test_error_names_what_cannot_be_drawn_of_branches(response):
     with pytest.raises(ValueError, match="output: must be .*got 'force'"):
         bp.plot.branch(response, output="force")
     with pytest.raises(ValueError, match="measure: must be .*got 'size'"):
@@ -246,7 +246,7 @@ def test_a_given_figure_is_used_and_returned(solved):
         assert draw(figure) is figure
 
 
-def test_one_colour_means_one_thing():
+def test_colours_have_one_meaning_across_plots():
     assert len(set(COLOURS.values())) == len(COLOURS)
 
 
@@ -272,7 +272,7 @@ def test_profiles_are_drawn_over_their_parabolas_with_the_level_of_the_interval(
         bp.plot.profile(profile, names=["kk"])
 
 
-def test_profiles_that_do_not_come_down_fail_or_lie_above_the_estimate_are_told_apart(solved):
+def test_open_failed_and_improved_profiles_are_distinguished(solved):
     problem, fit, _ = solved
     plain = bp.profile(problem, fit, ["c", "coulomb"])
     c, coulomb = plain.values["c"] ** 12, plain.values["coulomb"]
@@ -335,7 +335,7 @@ def test_a_comparison_shows_marginals_quantiles_and_coverage(solved):
         bp.plot.comparison(found, names=["variance[force]"])
 
 
-def test_a_comparison_names_what_is_wrong_and_says_in_which_coordinates(solved):
+def test_comparison_plot_names_the_verdict_and_the_coordinates(solved):
     problem, fit, posterior = solved
     found = bp.compare(problem, fit, replace(posterior, converged=False), coordinates="sampling")
     table = found.table.assign(verdict=["fine", "too wide", "fine", "wrong shape"])

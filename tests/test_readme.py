@@ -110,6 +110,6 @@ def test_runs(heading, tmp_path, monkeypatch):
         assert len([line for line in code.splitlines() if line]) <= 15
 
 
-def test_shortened_code_is_there():
+def test_code_of_shortened_readme_examples_exists():
     text = "".join(code for codes in BLOCKS.values() for code in codes)
     assert all(text.count(printed) == 1 for printed in SHORTER)

@@ -79,7 +79,7 @@ def test_periodic_solver_and_time_integration_agree_on_the_steady_state():
 
 
 @pytest.mark.parametrize("rate", [7.3, 90.0], ids=["seldom", "often"])
-def test_driven_pendulum_is_that_of_another_integrator(rate):
+def test_driven_pendulum_agrees_with_another_integrator(rate):
     """Six forcing periods with turns over the top; the reference takes SciPy's steps at tolerances of 1e-13."""
     omega, start = 9.09, [1.0, 0.3]
     slope, _, period = shooting.pendulum(omega)
@@ -174,7 +174,7 @@ def test_a_run_that_blows_up_is_an_error():
         ({"inputs": {}}, "inputs: must have .*got no 'force'"),
     ],
 )
-def test_bad_arguments_are_named(changes, message):
+def test_error_names_the_bad_argument(changes, message):
     arguments = {
         "model": bp.models.duffing,
         "parameters": OSCILLATOR,

@@ -20,7 +20,7 @@ def test_a_linear_oscillator_has_its_closed_form_response():
     assert found["displacement"] == pytest.approx(expected, abs=1e-8 * abs(amplitude))
 
 
-def test_heat_that_needs_a_hundred_cycles_has_come_to_its_end():
+def test_slow_thermal_transient_is_integrated_to_the_steady_state():
     """The gas starts at 0 K and its time constant is 8 s: the periodic solver agrees to 1e-8 of the range."""
     stroke, model = 0.12 + 0.01 * WAVE, bp.models.landing_gear("displacement")
     found = steady_cycle(model, GEAR, {"displacement": stroke}, frequency=4.0, samples=200)
@@ -38,6 +38,6 @@ def test_heat_that_needs_a_hundred_cycles_has_come_to_its_end():
     ],
     ids=["no cycle", "an unstable one"],
 )
-def test_what_does_not_settle_is_refused(model, values, inputs):
+def test_motion_that_does_not_settle_raises(model, values, inputs):
     with pytest.raises(NotSettled, match=model.name):
         steady_cycle(model, values, inputs, frequency=0.1, samples=40)

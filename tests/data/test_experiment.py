@@ -16,7 +16,7 @@ def test_harmonics_become_the_signal_they_describe():
     assert run.independent == {"x": 7} and run.harmonics == {"x": 3} and run.frequency == 2.0
 
 
-def test_only_the_harmonics_given_are_compared():
+def test_estimate_compares_only_the_given_harmonics():
     """An estimate from the first harmonics equals that from the folded period projected onto them by least squares."""
     whole = linear_experiment([900.0, 45.0, 25.0], 3.0, seed=4)
     kept = np.fft.rfft(whole.outputs["force"])[:6] * 2 / 40
@@ -48,7 +48,7 @@ def test_only_the_harmonics_given_are_compared():
         ({"frequency": -1.0}, "frequency: must be .*got -1.0"),
     ],
 )
-def test_bad_harmonics_are_named(changes, message):
+def test_error_names_the_bad_harmonics(changes, message):
     arguments = {"name": "run", "frequency": 1.0, "outputs": {"x": AMPLITUDES}, "samples": 50}
     with pytest.raises(ValueError, match=message):
         bp.Experiment.from_harmonics(**(arguments | changes))

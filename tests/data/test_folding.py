@@ -38,14 +38,14 @@ def test_frequency_and_its_standard_error():
     assert abs(np.mean(scores)) < 2.58 / np.sqrt(400)
 
 
-def test_mean_period_is_recovered_on_a_grid_that_the_sampling_does_not_share():
+def test_mean_period_is_exact_on_a_grid_incommensurate_with_the_sampling():
     e = recording(noise=0.0).fold(800)
     assert e.outputs["y"] == pytest.approx(mean_period(2 * np.pi * grid(800)), abs=1e-9)
     assert e.frequency == pytest.approx(FREQUENCY, rel=1e-12)
     assert e.cycles == 20
 
 
-def test_an_input_without_noise_does_not_keep_the_refinement_going(monkeypatch):
+def test_noise_free_input_ends_the_frequency_refinement(monkeypatch):
     """Its frequency is known to rounding, long before a step is small against its standard error."""
     calls, original = [], folding._linearised
     monkeypatch.setattr(folding, "_linearised", lambda *given: calls.append(given) or original(*given))
@@ -61,7 +61,7 @@ def test_harmonics_kept_are_those_that_stand_out():
     assert e.independent == {"y": 11}
 
 
-def test_no_more_harmonics_are_kept_by_chance_than_stated():
+def test_false_alarm_rate_of_kept_harmonics_is_the_nominal_one():
     """1 % false alarms a channel: of 300 channels at most 9 keep one too many (binomial, 99.8 %)."""
     kept = [recording(cycles=10.2, per_cycle=41.3, seed=s).fold(200).harmonics for s in range(150)]
     wrong = sum((k["x"] != 3) + (k["y"] != 5) for k in kept)
@@ -162,7 +162,7 @@ def test_constant_input_is_refused():
         bp.Recording.from_arrays(time, {"y": np.sin(9 * time)}, {"x": np.full(500, 2.0)}).fold()
 
 
-def test_signal_that_is_not_periodic_is_refused_with_its_measure():
+def test_error_for_a_signal_that_is_not_periodic_states_the_periodicity():
     noise = np.random.default_rng(4).standard_normal(4000)
     with pytest.raises(
         ValueError,
@@ -193,12 +193,12 @@ def test_random_walks_are_refused(seed):
         ({"name": "a/b"}, "name: 'a/b' is not allowed"),
     ],
 )
-def test_bad_arguments_are_named(arguments, message):
+def test_error_names_the_bad_argument(arguments, message):
     with pytest.raises(ValueError, match=message):
         recording().fold(**({"samples": 800} | arguments))
 
 
-def test_phase_origin_at_a_crossing_is_the_same_wherever_the_recording_begins():
+def test_phase_origin_at_a_crossing_does_not_depend_on_the_start_of_the_recording():
     """The fundamental of y is cos(2πτ + 0.3) in the recording's time; its upward crossing is τ = 0 here."""
     for offset in (0.0, 3.17):
         e = recording(noise=0.0, channels=("y",), offset=offset).fold(100, origin="crossing")

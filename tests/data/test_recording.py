@@ -70,7 +70,7 @@ def test_pickled_npz_is_refused(tmp_path):
         bp.Recording.from_npz(tmp_path / "run.npz", time="t", outputs={"force": "F"})
 
 
-def test_other_files_than_npz_are_answered_with_what_reads_them(csv, tmp_path):
+def test_error_for_other_files_names_the_right_reader(csv, tmp_path):
     with pytest.raises(ValueError, match=r"is no NPZ file, .* a CSV or MAT file by from_csv or from_mat"):
         bp.Recording.from_npz(csv, time="t", **CHANNELS)
     np.save(tmp_path / "force.npy", FORCE)
@@ -79,7 +79,7 @@ def test_other_files_than_npz_are_answered_with_what_reads_them(csv, tmp_path):
 
 
 @pytest.mark.parametrize("text", ["t;x;F\n0,5;1,5;2,5\n1,0;1,0;2,0\n", "t\tx\n0\t1\n1\t2\n", "0.0,1.5\n0.1,2.5\n"])
-def test_csv_without_commas_or_header_is_told_what_is_needed(tmp_path, text):
+def test_error_for_csv_without_commas_or_header_states_the_expected_format(tmp_path, text):
     (tmp_path / "run.csv").write_text(text)
     with pytest.raises(ValueError, match=r"its first line is read as .* name the columns, separated by commas"):
         bp.Recording.from_csv(tmp_path / "run.csv", time="t", outputs={"x": "x"})
@@ -91,7 +91,7 @@ def test_numbers_may_be_names_of_columns(tmp_path):
     assert recording.outputs["force"] == pytest.approx(FORCE)
 
 
-def test_channels_that_are_no_mapping_are_told_what_one_is(csv):
+def test_error_for_channels_that_are_no_mapping_gives_an_example(csv):
     with pytest.raises(ValueError, match="outputs: must be a mapping, such as .*got 'x'"):
         bp.Recording.from_csv(csv, time="t", outputs="x")
     with pytest.raises(ValueError, match="inputs: must be a mapping, .*"):
@@ -116,19 +116,19 @@ def test_between_cuts_by_time():
         recording.between(7, 8)
 
 
-def test_missing_column_is_answered_with_the_nearest(csv):
+def test_missing_column_error_suggests_the_nearest_name(csv):
     with pytest.raises(ValueError, match=r"column of run 7\.csv: must be .*got 'F \[M\]'.*Did you mean 'F \[N\]'"):
         bp.Recording.from_csv(csv, time="t", outputs={"force": "F [M]"})
 
 
-def test_non_numeric_cell_is_located(csv):
+def test_error_locates_the_non_numeric_cell(csv):
     rewrite(csv, 3, "x", "broken")
     with pytest.raises(ValueError, match=r"column 'x' of run 7\.csv: 'broken' in data row 4 is not allowed"):
         bp.Recording.from_csv(csv, time="t", **CHANNELS)
 
 
 @pytest.mark.parametrize("text", ["nan", "inf", ""])
-def test_samples_that_are_not_finite_are_located(csv, text):
+def test_error_locates_samples_that_are_not_finite(csv, text):
     rewrite(csv, 5, "x", text)
     with pytest.raises(
         ValueError, match=r"displacement \(column 'x' of run 7.csv\): must be finite, got (nan|inf) at index 5"
@@ -136,7 +136,7 @@ def test_samples_that_are_not_finite_are_located(csv, text):
         bp.Recording.from_csv(csv, time="t", **CHANNELS)
 
 
-def test_time_that_does_not_increase_is_located(csv):
+def test_error_locates_time_that_does_not_increase(csv):
     rewrite(csv, 10, "t", "0.1")
     with pytest.raises(ValueError, match=r"time: 0\.1 s after 0\.18 s at index 10 is not allowed; time must increase"):
         bp.Recording.from_csv(csv, time="t", **CHANNELS)
@@ -155,12 +155,12 @@ def test_time_that_does_not_increase_is_located(csv):
         ({"outputs": {}}, ValueError, "at least one measured output"),
     ],
 )
-def test_bad_arguments_are_named(csv, changes, error, message):
+def test_error_names_the_bad_argument(csv, changes, error, message):
     with pytest.raises(error, match=message):
         bp.Recording.from_csv(**({"path": csv, "time": "t", **CHANNELS} | changes))
 
 
-def test_file_that_is_no_mat_file_is_refused(csv):
+def test_file_that_is_not_mat_is_rejected(csv):
     with pytest.raises(ValueError, match="cannot be read as MAT"):
         bp.Recording.from_mat(csv, time="t", outputs={"force": "F"})
 

@@ -55,7 +55,7 @@ def without_draws(monkeypatch):
 
 
 @pytest.mark.slow
-def test_exact_posteriors_hold_the_truth_uniformly_and_a_likelihood_that_is_wrong_is_caught(without_draws):
+def test_ranks_of_exact_posteriors_are_uniform_and_a_wrong_likelihood_is_detected(without_draws):
     """120 linear problems with known variance: Laplace is exact. Counted twice, every θ is called too narrow.
 
     Dispersion is then 2 on average with a standard error of 0.26; the three tests have a false-alarm rate of 1 % each.
@@ -103,7 +103,7 @@ def test_a_variance_with_a_proper_prior_is_ranked_too():
     assert line["truth"]["variance[force]"] > 0 and line["number"] == 0 and line["map"] == "converged"
 
 
-def test_positions_are_uniform_and_ties_are_broken_at_random():
+def test_ranks_are_uniform_and_ties_are_broken_at_random():
     generator = np.random.default_rng(1)
     assert np.mean([position(np.zeros(10), 0.0, generator) for _ in range(2000)]) == pytest.approx(0.5, abs=0.03)
     found = [position(np.arange(9.0), 3.5, generator) for _ in range(2000)]
@@ -143,7 +143,7 @@ def test_failures_are_counted_by_kind():
     ],
     ids=["jeffreys", "flat", "circulant", "mask", "shift", "autonomous"],
 )  # fmt: skip
-def test_what_cannot_be_simulated_is_refused_by_name(problem, said):
+def test_error_names_what_cannot_be_simulated(problem, said):
     with pytest.raises(ValueError, match=f"problem: .*{said}"):
         check_supported(problem())
 
@@ -155,7 +155,7 @@ def masked() -> bp.Experiment:
     return bp.Experiment("run", 2.0, whole.outputs, whole.inputs, samples=32, mask=mask)
 
 
-def test_replicates_are_kept_one_by_one_and_only_missing_ones_are_done(without_draws, tmp_path):
+def test_replicates_are_saved_singly_and_only_missing_ones_are_computed(without_draws, tmp_path):
     """Cut off in the middle of a line, among lines of another seed: the same as without any interruption."""
     whole = bp.calibrate(linear(), replicates=6, seed=1, progress=False)
     bp.calibrate(linear(), replicates=4, seed=1, folder=tmp_path, progress=False)
@@ -221,7 +221,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(find_spec("mpi4py") is None or shutil.which("mpiexec") is None, reason="needs mpi4py and mpiexec")
-def test_the_same_with_mpi(serial, tmp_path):
+def test_calibration_with_mpi_gives_the_same_ranks(serial, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or str(Path.cwd()) for path in sys.path)}

@@ -49,18 +49,18 @@ def test_a_normal_posterior_is_fine(solved):
         (lambda x: x.mean() + x.std() * (np.exp((x - x.mean()) / x.std()) - np.exp(0.5)) / 2.16, "wrong shape"),
     ],
 )
-def test_departures_are_named(solved, change, verdict):
+def test_departures_from_normality_are_named(solved, change, verdict):
     problem, fit, posterior = solved
     assert bp.compare(problem, fit, with_draws(posterior, "k", change)).table.loc["k", "verdict"] == verdict
 
 
-def test_draws_that_have_not_converged_are_no_verdict(solved):
+def test_unconverged_draws_give_no_verdict(solved):
     problem, fit, posterior = solved
     table = bp.compare(problem, fit, replace(posterior, converged=False)).table
     assert set(table["verdict"]) == {"not converged"}
 
 
-def test_every_figure_is_that_of_the_draws(solved):
+def test_every_number_in_the_table_is_that_of_the_draws(solved):
     problem, fit, posterior = solved
     found = bp.compare(problem, fit, posterior).table.loc["c"]
     draws = posterior.draws("c")
@@ -244,7 +244,7 @@ def test_an_unknown_variance_leaves_laplace_a_good_proposal():
         (lambda x, centre, g: x + 8.0 * x.std(axis=(0, 1, 2)) * (g.uniform(size=(*SHAPE, 1)) < 0.2), "wrong mode"),
     ],
 )
-def test_joint_departures_are_named(change, verdict):
+def test_joint_departures_from_normality_are_named(change, verdict):
     """Scaled, shifted, of Student's t with two degrees of freedom, and with a second mode."""
     problem, fit = linear_case(**{"variance[force]": 9.0})
     generator = np.random.default_rng(11)
@@ -294,7 +294,7 @@ def test_the_tail_of_even_importance_weights_does_not_count():
     assert found.joint["efficiency"] == efficiency
 
 
-def test_modes_are_told_before_convergence_only_where_every_ensemble_shows_them():
+def test_modes_are_reported_before_convergence_only_if_every_ensemble_has_them():
     problem, fit, posterior, draw = case("square")
     points = draw(np.random.default_rng(13))
     stuck = np.abs(points)
@@ -304,7 +304,7 @@ def test_modes_are_told_before_convergence_only_where_every_ensemble_shows_them(
         assert (found.table.loc["a", "verdict"], found.joint["verdict"]) == (verdict, verdict)
 
 
-def test_what_is_not_determined_is_too_wide(solved):
+def test_undetermined_parameters_get_the_verdict_too_wide(solved):
     problem, fit, posterior = solved
     covariance = fit.covariance.copy()
     covariance.loc["k"], covariance["k"] = np.nan, np.nan
@@ -319,7 +319,7 @@ def test_what_is_not_determined_is_too_wide(solved):
         bp.compare(problem, blind, posterior, coordinates="sampling")
 
 
-def test_wrong_arguments_are_told(solved):
+def test_error_names_the_bad_argument(solved):
     problem, fit, posterior = solved
     with pytest.raises(ValueError, match="coordinates: must be one of 'natural', 'sampling', got 'ridge'"):
         bp.compare(problem, fit, posterior, coordinates="ridge")
@@ -327,7 +327,7 @@ def test_wrong_arguments_are_told(solved):
         bp.compare(case("edge")[0], case("edge")[1], posterior)
 
 
-def test_a_comparison_reads_well_as_text_and_as_html(solved):
+def test_comparison_has_text_and_html_representations(solved):
     problem, fit, posterior = solved
     found = bp.compare(problem, fit, posterior)
     text = repr(found)

@@ -72,7 +72,7 @@ def test_explained_sums_are_those_of_a_regression_with_free_amplitudes():
     assert list(freedom) == [1, 0, 2, 32, 38]
 
 
-def test_dependent_parameters_count_once_and_idle_ones_not_at_all():
+def test_dependent_parameters_count_once_and_parameters_without_effect_not():
     generator = np.random.default_rng(4)
     changes, components = sensitivities(generator, 2), generator.standard_normal(HARMONIC.size)
     more = np.stack([changes[0], 1e6 * changes[1], changes[0] - changes[1], np.zeros(HARMONIC.size)])
@@ -82,7 +82,7 @@ def test_dependent_parameters_count_once_and_idle_ones_not_at_all():
     assert ridge.whiteness() == pytest.approx(plain.whiteness())
 
 
-def test_nothing_is_tested_where_parameters_take_all_there_is():
+def test_no_test_without_residual_degrees_of_freedom():
     everything = Unexplained(np.ones(3), np.eye(3), np.array([0, 1, 1]))
     assert everything.freedom == 0
     assert np.isnan(everything.whiteness()) and np.isnan(everything.harmonic_content()[0])

@@ -23,7 +23,7 @@ def sample(draws, size=None):
 
 
 @pytest.mark.parametrize("shift", [0.3, -2.0])
-def test_normals_of_equal_sd_are_their_shift_apart(shift):
+def test_distance_of_normals_with_equal_sd_is_their_shift(shift):
     assert wasserstein(5.0 + 2.0 * EXACT, 5.0 - 2.0 * shift, 2.0) / 2.0 == pytest.approx(abs(shift), rel=1e-9)
 
 
@@ -61,7 +61,7 @@ def test_monte_carlo_errors_are_those_of_repeated_chains():
         assert found[:, 1].mean() == pytest.approx(found[:, 0].std(), rel=0.15)
 
 
-def test_batches_are_stretches_of_single_ensembles():
+def test_batches_are_contiguous_draws_of_one_ensemble():
     draws = np.arange(ENSEMBLE.size)[:, None] * 1000 + np.arange(83)
     shuffled = np.random.default_rng(0).permutation(ENSEMBLE.size)
     batches = Sample.of(draws[shuffled].ravel(), ENSEMBLE[shuffled], 100.0).batches

@@ -56,7 +56,7 @@ def test_information_is_that_of_the_regression(linear):
 
 
 @pytest.mark.parametrize(("moved", "left"), [(1e-5, 0.01), (0.1, np.inf)])
-def test_an_open_direction_counts_for_what_it_moves(moved, left):
+def test_undetermined_direction_counts_for_the_parameters_it_moves(moved, left):
     """Nothing is known along (moved, 1, 1); k is known to 0.01 prior sds but for that."""
     nothing = np.array([moved, 1.0, 1.0])
     directions = np.linalg.qr(np.column_stack([nothing, [1.0, 0.0, 0.0], [0.0, 1.0, -1.0]]))[0]
@@ -108,7 +108,7 @@ def test_ridges_are_named(force, prior, combination):
     ],
     ids=["positive", "small", "negative", "sharp prior", "hardly measured", "cut off"],
 )
-def test_a_number_that_is_measured_directly(value, sd, prior, verdict):
+def test_directly_measured_parameter_is_determined(value, sd, prior, verdict):
     """The probability of the wrong sign is Φ(−value/sd), within four Monte Carlo errors."""
     problem, fit = one(lambda p: p.a, value, sd, a=prior)
     assert bp.identifiability(problem, fit).verdicts == {"a": verdict}
@@ -123,7 +123,7 @@ def test_a_number_that_is_measured_directly(value, sd, prior, verdict):
         assert np.isnan(row["p_negative"])
 
 
-def test_a_sign_that_the_data_cannot_see():
+def test_sign_that_the_data_do_not_determine_is_reported():
     """Only a² is measured; the remedy is no further experiment."""
     problem, fit = one(lambda p: p.a**2, 1.0, 0.1, a=WIDE)
     posterior = bp.sample(problem, fit, **SHORT, start="prior")
@@ -133,12 +133,12 @@ def test_a_sign_that_the_data_cannot_see():
     assert not found.converged and "NOT CONVERGED" in repr(found)
 
 
-def test_a_parameter_that_no_output_depends_on():
+def test_parameter_without_effect_is_not_determined():
     problem, fit = one(lambda p: p.a + 0 * p.b, 1.0, 0.05, a=WIDE, b=WIDE)
     assert bp.identifiability(problem, fit, profile=False).verdicts == {"a": "determined", "b": "not determined"}
 
 
-def test_candidates_add_what_the_same_experiment_would(linear):
+def test_candidate_experiment_adds_the_information_of_a_real_one(linear):
     """Doing a run again doubles the information; with twice the amplitude each linear regressor counts four times."""
     problem, fit = linear
     information = Information.of(problem, fit)
@@ -161,7 +161,7 @@ def test_without_candidates_the_verdicts_are_the_same(linear):
     assert bare.verdicts == bp.identifiability(problem, fit, profile=False).verdicts
 
 
-def test_own_candidates_are_ranked_and_unknown_runs_refused(linear):
+def test_given_candidates_are_ranked_and_unknown_runs_rejected(linear):
     problem, fit = linear
     found = bp.identifiability(problem, fit, profile=False, candidates=[("run", 1.0, 0.5), ("run", 3.0, 2.0)])
     assert list(found.experiments["frequency"]) == [3.0, 1.0]
@@ -190,7 +190,7 @@ def test_distance_of_weighted_draws_is_that_of_their_distributions():
     assert cumulative_jensen_shannon(draws, np.full(draws.size, 1.0 / draws.size)) == pytest.approx(0.0, abs=1e-7)
 
 
-def test_power_scaling_tells_the_prior_from_the_data(linear):
+def test_power_scaling_distinguishes_prior_from_likelihood(linear):
     """A posterior that is the prior's reacts to it alone, one that is the data's to them."""
     problem, fit = one(lambda p: p.a, 1.0, 5.0, a=bp.LogNormal(1.0, 0.1))
     table = bp.identifiability(problem, fit, bp.sample(problem, fit, **SHORT), profile=False).table
@@ -200,14 +200,14 @@ def test_power_scaling_tells_the_prior_from_the_data(linear):
     assert table.loc["a", "likelihood_sensitivity"] > 0.05 > table.loc["a", "prior_sensitivity"]
 
 
-def test_it_is_saved_and_loaded(linear, tmp_path):
+def test_result_is_saved_and_loaded(linear, tmp_path):
     found = bp.identifiability(*linear, profile=False)
     found.save(tmp_path / "verdict.h5")
     assert repr(bp.load(tmp_path / "verdict.h5")) == repr(found)
 
 
 @pytest.mark.filterwarnings("ignore:The data do not change under")
-def test_what_the_equations_leave_open_is_named_whatever_the_data():
+def test_structural_symmetries_are_named_for_any_data():
     """In one rotation of the pendulum m, k1, k2 and k3 appear only as k/(m l²), and l is determined by the drive."""
     fixed = {name: PENDULUM[name] for name in ("a", "g", "v0")}
     free = {name: bp.LogNormal(PENDULUM[name], 0.5) for name in ("m", "l", "k1", "k2", "k3")}
@@ -225,7 +225,7 @@ def test_what_the_equations_leave_open_is_named_whatever_the_data():
     assert not structure_of(known).symmetries
 
 
-def test_structure_knows_ties_and_fixed_zeros():
+def test_structural_analysis_uses_ties_and_fixed_zeros():
     """The temperature scaling of the landing gear ends with theta5 fixed, the shift with theta12 at zero."""
     gear = bp.models.landing_gear("displacement")
     wave = np.cos(2 * np.pi * grid(40))

@@ -23,7 +23,7 @@ def sample(draws):
         lambda g: g.gamma(0.3, size=SIZE),
     ],
 )
-def test_one_mode_is_one_however_skewed_flat_or_heavy_tailed(draw):
+def test_skewed_flat_and_heavy_tailed_densities_have_one_mode(draw):
     """None of 50 samples, so fewer than 6 % of them with 95 % confidence; 2000 were tried once, with no false alarm."""
     generator = np.random.default_rng(5)
     samples = [draw(generator) for _ in range(50)]
@@ -31,7 +31,7 @@ def test_one_mode_is_one_however_skewed_flat_or_heavy_tailed(draw):
 
 
 @pytest.mark.parametrize(("apart", "share"), [(4.0, 0.5), (6.0, 0.1), (40.0, 0.3)])
-def test_two_modes_are_seen_from_both_sides_wherever_the_point_is(apart, share):
+def test_two_modes_are_detected_from_any_point(apart, share):
     generator = np.random.default_rng(6)
     x = generator.standard_normal(SIZE) + apart * (generator.uniform(size=SIZE) < share)
     assert has_other_mode(sample(x), 0.0)

@@ -96,7 +96,7 @@ def test_draws_of_another_problem_are_refused(solved):
         bp.predict(other, posterior)
 
 
-def test_draws_that_have_not_converged_are_told(solved):
+def test_unconverged_draws_are_reported(solved):
     problem, _, posterior = solved
     assert bp.predict(problem, posterior, draws=20).note == ""
     unfinished = replace(posterior, converged=False, reason="max_steps = 250 reached")
@@ -114,7 +114,7 @@ def linear_draws(problem: bp.Problem, seed: int) -> bp.Posterior:
     return posterior_of(problem, theta + np.sqrt(variance)[:, None] * spread, variance[:, None], seed)
 
 
-def test_well_determined_linear_problems_raise_no_alarm():
+def test_well_determined_linear_problems_are_adequate():
     """40 problems of two experiments; the level is 1 %, and 3 alarms or more have a probability of 0.7 %."""
     alarms = 0
     for seed in range(40):
@@ -220,7 +220,7 @@ def product_posterior(damping: float):
     return problem, posterior_of(problem, np.stack([a, b], axis=-1), variance[:, None])
 
 
-def test_parameters_that_nothing_determines_are_no_fault_of_the_model():
+def test_undetermined_parameters_do_not_make_the_model_inadequate():
     """On the ridge of an exact symmetry a varies by a factor of 100 between draws, and the model is adequate."""
     problem, posterior = product_posterior(0.0)
     low, high = np.quantile(posterior.draws("a"), [0.05, 0.95])
@@ -251,7 +251,7 @@ def test_a_parameter_fixed_at_a_wrong_value_is_misspecified_and_a_strong_prior_i
         assert prediction.verdict == verdict
 
 
-def test_few_independent_values_behind_a_smooth_curve_are_no_alarm():
+def test_smooth_curve_of_few_independent_values_is_adequate():
     """White noise in harmonics 0 to 5 on 40 points is no harmonic content, once its 11 values are counted."""
     spectrum = np.fft.rfft(50.0 * np.random.default_rng(6).standard_normal(40))
     spectrum[6:] = 0.0
@@ -279,7 +279,7 @@ def test_few_independent_values_behind_a_smooth_curve_are_no_alarm():
     ],
 )
 @pytest.mark.filterwarnings("ignore:Twice as many points")
-def test_every_kind_of_observation_is_tested_where_values_are_left(case, tests):
+def test_every_kind_of_observation_with_residual_degrees_of_freedom_is_tested(case, tests):
     """Data made with the model: no alarm at 1 % a case (fixed seeds)."""
     problem, _ = CASES[case]()
     posterior = draw(problem, bp.map_estimate(problem, progress=False), 1, draws=40)
@@ -307,7 +307,7 @@ def test_a_posterior_without_periodic_solutions_predicts_nothing():
         bp.predict(problem, nothing)
 
 
-def test_it_is_saved_and_loaded(tmp_path, solved):
+def test_result_is_saved_and_loaded(tmp_path, solved):
     problem, _, posterior = solved
     found = bp.predict(problem, posterior, draws=20, run=lambda p: recording(p))
     found.save(tmp_path / "prediction.h5")

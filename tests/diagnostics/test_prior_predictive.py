@@ -49,7 +49,7 @@ def test_measured_values_outside_the_prior_are_seen():
     assert found.table.loc["run 1", "inside"] == 0.0
 
 
-def test_a_cycle_that_the_prior_lets_vanish():
+def test_fraction_of_prior_draws_without_a_cycle_is_reported():
     """The cycle of radius √mu exists for mu > 0 alone."""
     tau = grid(100)
     states = {"x": np.cos(2 * np.pi * tau), "y": np.sin(2 * np.pi * tau)}
@@ -63,28 +63,28 @@ def test_a_cycle_that_the_prior_lets_vanish():
     assert any("shrinks to an equilibrium" in cause for cause in found.causes)
 
 
-def test_a_solver_that_fails_is_told_from_an_orbit_that_is_not_there(monkeypatch):
+def test_solver_failures_are_distinguished_from_missing_orbits(monkeypatch):
     problem = saddle_node(bp.Normal(1.0, 1.0))
     monkeypatch.setattr("bayesperiodic.posterior.simulator.reach", lambda *_: family.ARRIVED)
     found = bp.prior_predictive(problem, draws=40, progress=False)
     assert found.table["no orbit"].max() == 0.0 < found.table.loc["all", "solver failed"]
 
 
-def test_well_behaved_prior_has_nothing_to_tell():
+def test_well_behaved_prior_gives_no_warnings():
     problem = bp.Problem(bp.models.duffing, [duffing_run()], priors=DUFFING_PRIORS, fixed={"m": DUFFING["m"]})
     found = bp.prior_predictive(problem, draws=40, progress=False)
     assert found.table.loc["all", "converged"] == 1.0 and not found.causes
     assert "failed solves" not in repr(found)
 
 
-def test_bad_arguments_and_priors_without_any_orbit_are_told():
+def test_error_names_the_bad_argument_or_the_prior_without_orbits():
     with pytest.raises(ValueError, match="draws: must be .*got 5"):
         bp.prior_predictive(saddle_node(bp.Normal(1.0, 1.0)), draws=5)
     with pytest.raises(RuntimeError, match="none of 20 draws from its priors has a periodic solution"):
         bp.prior_predictive(saddle_node(bp.Normal(-9.0, 1.0)), draws=20, progress=False)
 
 
-def test_it_is_saved_and_loaded(tmp_path):
+def test_result_is_saved_and_loaded(tmp_path):
     found = bp.prior_predictive(saddle_node(bp.Normal(1.0, 1.0)), draws=40, progress=False)
     found.save(tmp_path / "prior.h5")
     again = bp.load(tmp_path / "prior.h5")

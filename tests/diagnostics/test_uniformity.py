@@ -18,7 +18,7 @@ TESTS = {"dispersion": lambda u: dispersion_test(u)[1], "ecdf": ecdf_test, "chi 
 
 
 @pytest.mark.parametrize("which", TESTS)
-def test_false_alarms_are_as_many_as_stated(which):
+def test_false_alarm_rate_is_the_nominal_one(which):
     """Of 1000 uniform samples of 200, within the two-sided 99.9 % binomial band of 5 %."""
     samples = np.random.default_rng(1).uniform(size=(1000, 200))
     alarms = sum(TESTS[which](u) < 0.05 for u in samples)
@@ -26,7 +26,7 @@ def test_false_alarms_are_as_many_as_stated(which):
     assert low <= alarms <= high
 
 
-def test_dispersion_sees_variances_that_are_a_fifth_too_small_where_the_others_see_less():
+def test_dispersion_test_has_more_power_against_small_variances():
     """1000 values, level 1 %: the exact power is that of χ² scaled by 1/0.8; 200 samples, five standard errors."""
     scores = np.random.default_rng(2).standard_normal((200, 1000)) / np.sqrt(0.8)
     seen = {name: np.mean([test(ndtr(z)) < 0.01 for z in scores]) for name, test in TESTS.items()}
@@ -43,7 +43,7 @@ def test_dispersion_is_the_mean_square_of_the_normal_scores():
     assert np.isfinite(normal_scores(np.array([0.0, 1.0]))).all()
 
 
-def test_the_band_holds_the_whole_distribution_function():
+def test_ecdf_band_covers_the_whole_distribution_function():
     """Of 1000 samples of 150, 95 % within the band: five standard errors."""
     low, high = ecdf_band(150, 0.95)
     samples = np.sort(np.random.default_rng(3).uniform(size=(1000, 150)), axis=1)
@@ -52,5 +52,5 @@ def test_the_band_holds_the_whole_distribution_function():
     assert held == pytest.approx(0.95, abs=5 * np.sqrt(0.95 * 0.05 / 1000))
 
 
-def test_a_shift_is_seen_by_the_distribution_function():
+def test_ecdf_band_detects_a_shift():
     assert ecdf_test(ndtr(np.random.default_rng(4).standard_normal(500) + 0.3)) < 1e-3

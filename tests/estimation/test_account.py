@@ -51,7 +51,7 @@ def second_differences(density: SamplingDensity, mode: np.ndarray, steps: np.nda
 @pytest.mark.parametrize(
     ("noise", "known"), [("independent", {}), ("circulant", {}), ("independent", {"variance[displacement]": 3.0})]
 )
-def test_joint_laplace_is_that_of_the_sampled_density(noise, known):
+def test_joint_laplace_equals_mode_and_hessian_of_the_sampled_density(noise, known):
     """Its mode is where the density of the sampling coordinates is stationary, its covariance the inverse Hessian."""
     runs = [duffing_run(harmonics={"displacement": 9}), duffing_run("run 2", 0.13, 2, harmonics={"displacement": 9})]
     problem = bp.Problem(
@@ -70,7 +70,7 @@ def test_joint_laplace_is_that_of_the_sampled_density(noise, known):
 
 
 @pytest.mark.filterwarnings("ignore:Twice as many points")
-def test_doubling_tells_what_twice_as_many_points_do():
+def test_doubling_shift_predicts_the_change_on_twice_as_many_points():
     """The announced shift against the estimate on the finer grid, the data being the same Fourier series."""
     fits = []
     for samples in (60, 120):
@@ -95,7 +95,7 @@ def test_doubling_tells_what_twice_as_many_points_do():
 
 
 @pytest.mark.slow
-def test_a_grid_too_coarse_for_the_posterior_is_announced():
+def test_grid_too_coarse_for_the_posterior_gives_a_warning():
     run = duffing_run(harmonics={"displacement": 9})
     quiet = replace(run, outputs={"displacement": run.outputs["displacement"]})
     problem = bp.Problem(
@@ -133,7 +133,7 @@ def test_directions_without_information_are_named():
     assert fit.correlations.loc["shift_a", "shift_b"] == pytest.approx(-1.0, abs=0.05)
 
 
-def test_without_a_prior_that_decides_the_fit_ends_all_the_same():
+def test_fit_ends_on_a_ridge_with_uniform_priors():
     """Uniform priors leave H singular; the estimate is on the ridge, and the ridge is named."""
     run = sine_run(lambda x, rate: 12.0 * x)
     priors = {"a": bp.Uniform(0.0, 50.0), "b": bp.Uniform(0.0, 50.0)}
@@ -144,7 +144,7 @@ def test_without_a_prior_that_decides_the_fit_ends_all_the_same():
     assert len(fit.undetermined) == 1
 
 
-def test_several_directions_are_told_apart():
+def test_several_undetermined_directions_are_named_separately():
     """Of a sum of four only the sum is known: three directions, each named by one parameter and the last."""
     row = np.ones(4)
     found = undetermined(np.outer(row, row), np.ones(4), list("abcd"), np.ones(4, dtype=bool))
@@ -152,7 +152,7 @@ def test_several_directions_are_told_apart():
 
 
 @pytest.mark.filterwarnings("ignore:Twice as many points")
-def test_residuals_hold_the_harmonics_that_were_kept():
+def test_residuals_contain_only_kept_harmonics():
     run = duffing_run(harmonics={"displacement": 3})
     problem = bp.Problem(bp.models.duffing, [run], priors=DUFFING_PRIORS, fixed={"m": 1.0})
     residual = bp.map_estimate(problem, progress=False).residuals["run 1"]["displacement"]
@@ -160,7 +160,7 @@ def test_residuals_hold_the_harmonics_that_were_kept():
     assert spectrum[4:].max() < 1e-12 < spectrum[:4].max()
 
 
-def test_what_is_determined_keeps_its_sd_beside_what_is_not():
+def test_determined_parameter_keeps_its_sd_beside_undetermined_ones():
     """With uniform priors only a·b² is known, and the sum beside it as if it were alone."""
     run = sine_run(lambda x, rate: 12.0 * x + 0.5 * rate)
     priors = {"a": bp.Uniform(0.0, 50.0), "b": bp.Uniform(0.0, 50.0), "shift_a": bp.Uniform(-5.0, 5.0)}
@@ -172,7 +172,7 @@ def test_what_is_determined_keeps_its_sd_beside_what_is_not():
     assert fit.sd["a"] == fit.sd["b"] == np.inf
 
 
-def test_an_estimate_at_the_end_of_a_support_is_the_best_one_inside():
+def test_estimate_at_a_bound_is_the_bounded_least_squares_solution():
     """Bounded least squares in closed form: the parameter pressed against the end is fixed there."""
     run = linear_experiment(TRUTH, 3.0, seed=1)
     wide = {"k": bp.Normal(800.0, 1e6), "c": bp.Normal(30.0, 1e6), "coulomb": bp.Uniform(0.0, 20.0)}
@@ -189,7 +189,7 @@ def test_an_estimate_at_the_end_of_a_support_is_the_best_one_inside():
     assert fit.theta["coulomb"] == pytest.approx(20.0, abs=0.01)
 
 
-def test_directions_without_information_do_not_end_the_climb():
+def test_directions_without_information_do_not_stop_the_iteration():
     """Three collinear columns: from far away the sum is found all the same, to 1e-6 of its standard deviation."""
     run = sine_run(lambda x, rate: 12.0 * x + 0.5 * rate)
     priors = {"shift_a": bp.Normal(400.0, 1e9), "shift_b": bp.Normal(900.0, 1e9)}
@@ -203,13 +203,13 @@ def test_directions_without_information_do_not_end_the_climb():
     assert found == pytest.approx(best, abs=1e-5 * np.sqrt(0.25 / (rate @ rate)))
 
 
-def test_determined_problems_say_nothing():
+def test_determined_problem_has_no_undetermined_directions():
     fit = bp.map_estimate(bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS), progress=False)
     assert fit.undetermined == ()
 
 
 @pytest.mark.filterwarnings("ignore:Twice as many points")
-def test_the_objective_never_falls():
+def test_objective_increases_in_every_iteration():
     problem = bp.Problem(bp.models.duffing, [duffing_run()], priors=DUFFING_PRIORS, fixed={"m": 1.0})
     fit = bp.map_estimate(problem, start={"c": 0.6, "k": 0.5, "k3": 1.5}, progress=False)
     assert fit.converged and len(fit.history) > 3
@@ -255,7 +255,7 @@ def test_no_step_slips_to_another_periodic_solution():
     assert abs(fit.theta["c"] - 0.1) < 4 * fit.sd["c"] and abs(fit.theta["k3"] - 0.5) < 4 * fit.sd["k3"]
 
 
-def test_noise_is_split_into_measurement_and_model():
+def test_noise_is_split_into_measurement_noise_and_model_error():
     """Scatter of 6 N in 4 cycles is 3 N of the mean; with a residual of 5 N (eq. 7) 4 N are left to the model."""
     run = linear_experiment(TRUTH, 5.0, seed=4)
     fit = bp.map_estimate(bp.Problem(LINEAR, [replace(run, scatter={"force": 6.0}, cycles=4)], priors=PRIORS))
@@ -267,7 +267,7 @@ def test_noise_is_split_into_measurement_and_model():
     assert split.model == pytest.approx(np.sqrt(total - 9.0), rel=1e-9)
 
 
-def test_an_estimate_comes_back_from_its_file(tmp_path):
+def test_estimate_is_read_back_from_its_file(tmp_path):
     fit = bp.map_estimate(bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS), progress=False)
     fit.save(tmp_path / "fit.h5")
     again = bp.load(tmp_path / "fit.h5")

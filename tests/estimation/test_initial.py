@@ -92,7 +92,7 @@ def test_all_orbits_but_one_survive_a_continuation_to_the_papers_start_and_back(
             assert np.ptp([solution.states["phi"] for solution in path], axis=0).max() > 0.05
 
 
-def test_all_five_parameters_under_priors():
+def test_only_combinations_of_the_five_pendulum_parameters_are_well_determined():
     """The combinations that the equations know, k/(m l²), are determined far better than the parameters themselves."""
     names = ("m", "l", "k1", "k2", "k3")
     problem = bp.Problem(
@@ -111,14 +111,14 @@ def test_all_five_parameters_under_priors():
     assert abs(mean - 0.05) < 4 * sd < 4 * 0.05 * 0.05
 
 
-def test_the_density_is_that_of_the_measured_orbits_wherever_the_prior_is():
+def test_log_likelihood_at_the_truth_is_chi_squared_distributed():
     """At the truth −2 log-likelihood is χ² distributed with 46 degrees of freedom; others would give thousands."""
     problem = section_problem(list(runs(1e-3, 2)), "m", "l")
     truth = {"m": PENDULUM["m"], "l": PENDULUM["l"]}
     assert 15 < -2 * float(problem.log_likelihood(truth, {"scale": 1.0})) < 95
 
 
-def test_an_orbit_that_is_none_is_named():
+def test_error_names_the_experiment_that_is_no_orbit():
     """A candidate whose points and cycle no pendulum of this kind could show, among four that are real."""
     tau = np.arange(300) / 100
     angle = 2.0 * np.sin(2 * np.pi * tau / 3) + np.sin(14 * np.pi * tau)
@@ -130,7 +130,7 @@ def test_an_orbit_that_is_none_is_named():
         bp.map_estimate(section_problem(experiments, "m", "l"), start={"m": 0.15, "l": 0.35}, progress=False)
 
 
-def test_without_guesses_or_a_clock_there_is_nothing_to_start_from():
+def test_simultaneous_fit_needs_guesses_and_a_forced_model():
     linear = bp.Problem(
         LINEAR,
         [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)],

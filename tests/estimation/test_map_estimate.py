@@ -24,7 +24,7 @@ def test_known_variance_gives_the_closed_form():
     assert fit.converged
 
 
-def test_progress_is_shown_unless_unwanted(capsys):
+def test_progress_is_shown_unless_disabled(capsys):
     problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS)
     bp.map_estimate(problem, progress=False)
     assert capsys.readouterr().err == ""
@@ -32,7 +32,7 @@ def test_progress_is_shown_unless_unwanted(capsys):
     assert "objective" in capsys.readouterr().err
 
 
-def test_independent_values_weigh_the_samples():
+def test_independent_values_set_the_weight_of_the_samples():
     experiment = linear_experiment(TRUTH, 3.0, seed=2, independent=11)
     fit = bp.map_estimate(bp.Problem(LINEAR, [experiment], priors=PRIORS, fixed={"variance[force]": 9.0}))
     mean, covariance = normal_posterior(DESIGN, experiment.outputs["force"], 9.0 * 40 / 11, MEAN, COVARIANCE)
@@ -77,7 +77,7 @@ def test_positive_parameter_is_estimated_at_the_mode_of_its_natural_density():
     assert values[1] > max(values[0], values[2])
 
 
-def test_intervals_are_students():
+def test_intervals_follow_students_t():
     fit = bp.map_estimate(bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=7, independent=7)], priors=PRIORS))
     low, high = fit.interval(0.9)["k"]
     assert fit.degrees_of_freedom == 4
@@ -97,7 +97,7 @@ def test_white_residuals_pass_and_smooth_ones_do_not():
     assert smooth.p < 1e-6 and smooth.lag1 > 0.5
 
 
-def test_noise_of_differentiated_inputs_is_carried_to_the_output():
+def test_noise_of_differentiated_inputs_is_propagated_to_the_output():
     """Force = c·ẋ with x of known amplitude noise: sd of the force from its closed form, and the warning."""
     model = formula_model("dashpot", ["c"], lambda p, u, s: {"force": p.c * u.dx + s.w})
     tau = grid(200)

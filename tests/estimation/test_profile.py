@@ -69,7 +69,7 @@ def test_unknown_variance_gives_the_logarithm_of_the_misfit():
         assert ends == pytest.approx([-half, half], rel=1e-3)
 
 
-def test_only_a_product_is_determined():
+def test_profile_of_a_factor_of_a_determined_product_is_flat():
     """Of a·b alone, a is as good anywhere in its support, b where a's support lets it be; c does not mind."""
     model = formula_model("product", ["a", "b", "c"], lambda p, u, s: {"y": p.a * p.b * u.x + p.c * u.dx})
     priors = {"a": bp.LogUniform(0.1, 10.0), "b": bp.LogUniform(1e-4, 1e4), "c": bp.Normal(0.0, 10.0)}
@@ -102,7 +102,7 @@ def test_a_saturating_parameter_is_bounded_on_one_side():
     assert profile.interval()["a"] == (pytest.approx(gain / (1 - gain), rel=3e-3), np.inf)
 
 
-def test_a_skewed_profile_is_that_of_brute_force():
+def test_skewed_profile_agrees_with_brute_force_maximisation():
     force = np.cos(2 * np.pi * grid(50))
     true = bp.solve_periodic(
         bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force}, frequency=0.1, samples=50
@@ -138,7 +138,7 @@ def double_well(mean):
     return posed(model, wave, 0.3, priors, wave=wave)
 
 
-def test_the_way_back_finds_the_branch_that_the_way_out_misses(monkeypatch):
+def test_return_sweep_finds_the_branch_that_the_first_sweep_misses(monkeypatch):
     problem = double_well(-0.5)
     fit = fitted(problem, {"a": -1.0, "b": 1.0})
     both = bp.profile(problem, fit, ["a"])
@@ -153,7 +153,7 @@ def test_the_way_back_finds_the_branch_that_the_way_out_misses(monkeypatch):
     assert both.log_density["a"] == pytest.approx(every - problem.log_posterior(fit.theta, {}), abs=1e-6)
 
 
-def test_an_end_lifted_by_another_branch_is_followed_further():
+def test_profile_is_extended_where_another_branch_raises_its_end():
     """Outwards a stays in a narrow well of b; the jump at its upper end leads into a wide one, back past the peak."""
     model = formula_model(
         "unlike_wells",
@@ -173,7 +173,7 @@ def test_an_end_lifted_by_another_branch_is_followed_further():
     assert profile.shape == {"a": "closed"}
 
 
-def test_a_better_point_than_the_estimate_is_told_and_helps():
+def test_point_better_than_the_estimate_is_reported_and_can_be_the_start():
     problem = double_well(0.5)
     fit = fitted(problem, {"a": -1.0, "b": 1.0})
     with pytest.warns(
@@ -191,7 +191,7 @@ def test_a_better_point_than_the_estimate_is_told_and_helps():
 
 @pytest.mark.filterwarnings("ignore:The log-density is higher")
 @pytest.mark.parametrize("support", [(1.99, 2.01), (2.01, 2.05), (1.8, 1.99)])
-def test_a_parameter_at_the_end_of_its_support_does_not_hold_the_others(support):
+def test_profile_with_a_parameter_at_its_bound_equals_bounded_least_squares(support):
     """Against bounded least squares: b presses against the ends of its support as a moves, and c makes up for it."""
     model = formula_model(
         "bounded", ["a", "b", "c"], lambda p, u, s: {"y": p.a * u.x + p.b * (u.x + u.dx + u.x**2) + p.c * u.dx}
@@ -210,7 +210,7 @@ def test_a_parameter_at_the_end_of_its_support_does_not_hold_the_others(support)
     assert profile.log_density["a"] == pytest.approx(np.min(costs) - np.array(costs), abs=1e-5)
 
 
-def test_ends_are_unknown_where_solves_fail():
+def test_interval_end_is_nan_where_solves_fail():
     """A state at rest at √a exists for a > 0 alone, and data this weak do not keep a from zero."""
     model = bp.Model(
         "saddle_node",
@@ -287,7 +287,7 @@ def test_the_table_holds_both_intervals(linear):
     assert "laplace_low" in repr(profile)
 
 
-def test_what_cannot_be_profiled_is_told(linear):
+def test_error_names_what_cannot_be_profiled(linear):
     problem, fit, profile = linear
     with pytest.raises(ValueError, match="names: must be .*got 'kk'.*Did you mean 'k'"):
         bp.profile(problem, fit, ["kk"])

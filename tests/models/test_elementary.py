@@ -22,7 +22,7 @@ def functions():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_errors_are_of_two_units_in_the_last_place_at_most(functions, name):
+def test_errors_are_at_most_two_units_in_the_last_place(functions, name):
     function, exact, worst = functions[name], EXACT[name], 0.0
     for x in np.concatenate([-SIZES, SIZES]):
         if name == "exp" and not -700.0 < x < 709.0:
@@ -34,20 +34,20 @@ def test_errors_are_of_two_units_in_the_last_place_at_most(functions, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_ends_of_the_axis_and_what_is_not_a_number(functions, name):
+def test_infinities_zero_and_nan_give_the_limits_and_nan(functions, name):
     ends = {"exp": (0.0, math.inf, 1.0), "tanh": (-1.0, 1.0, 0.0), "atan": (-math.pi / 2, math.pi / 2, 0.0)}[name]
     assert [functions[name](x) for x in (-math.inf, math.inf, 0.0)] == list(ends)
     assert math.isnan(functions[name](math.nan))
 
 
-def test_exponential_beyond_the_range_of_the_bits_of_one_power(functions):
+def test_exponential_is_exact_near_underflow_and_overflow(functions):
     for x in (-745.0, -720.0, 709.7, 710.0, 1000.0, -1000.0):
         with mpmath.workprec(200):
             true = float(mpmath.exp(mpmath.mpf(x)))
         assert functions["exp"](x) == pytest.approx(true, rel=1e-15, abs=5e-324)
 
 
-def test_a_model_on_the_grid_agrees_with_its_expressions():
+def test_generated_code_agrees_with_the_expressions_of_the_model():
     """The generated code of all three against NumPy's functions."""
     model = bp.Model(
         "elementary",

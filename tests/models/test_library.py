@@ -211,13 +211,13 @@ def test_every_quantity_has_a_unit_and_every_model_a_description_that_runs(name)
 
 
 @pytest.mark.parametrize("name", ["landing_gear_displacement", "chain_3"])
-def test_models_of_functions_travel_to_other_processes(name):
+def test_models_made_by_functions_can_be_pickled(name):
     model = LIBRARY[name]()
     copy = pickle.loads(pickle.dumps(model))
     assert copy.equations == model.equations and copy.__doc__ == model.__doc__
 
 
-def test_names_are_the_promised_ones():
+def test_names_of_states_inputs_outputs_and_parameters_are_those_documented():
     pendulum = bp.models.pendulum
     force, displacement = bp.models.landing_gear("force"), bp.models.landing_gear("displacement")
     assert set(pendulum.parameters) == {"m", "l", "k1", "k2", "k3", "a", "g", "v0"}
@@ -246,7 +246,7 @@ def test_pendulum_swings_at_the_root_of_g_over_l():
 @pytest.mark.parametrize(
     ("phi", "rate", "multiplier"), [(-0.5676231, 13.8571218, -1.71), (-2.9184347, 5.8256325, 11.12)]
 )
-def test_known_unstable_rotations_of_the_pendulum_close(phi, rate, multiplier):
+def test_unstable_rotations_of_the_pendulum_repeat_after_one_period(phi, rate, multiplier):
     """Found by Newton's method on a Runge-Kutta map at 9.09 rad/s, given with seven decimals."""
     f = 9.09 / (2 * np.pi)
     run = bp.simulate(
@@ -287,7 +287,7 @@ def test_scale_of_time_and_offset_of_the_silverbox_are_redundant():
     assert residual(shifted, states - [b, 0, 0]) == pytest.approx(residual(p, states), rel=1e-10)
 
 
-def test_van_der_pol_has_its_known_cycle():
+def test_van_der_pol_has_the_published_period_and_amplitude():
     """At mu = 1, omega = 1 (Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, I.16, exercise 1)."""
     period, amplitude = 6.66328686 / 3.0, 2.00861986
     run = bp.simulate(
@@ -370,7 +370,7 @@ def test_one_mass_is_the_duffing_oscillator():
     assert one.equations[0].subs(swap) == duffing.equations[0]
 
 
-def test_the_same_request_gives_the_same_object():
+def test_repeated_calls_return_the_same_model():
     assert bp.models.landing_gear() is bp.models.landing_gear("force")
     assert bp.models.chain(3) is bp.models.chain(np.int64(3))
 
@@ -388,6 +388,6 @@ def test_the_same_request_gives_the_same_object():
         (lambda: bp.models.chain([3]), r"masses: must be .*got \[3\]"),
     ],
 )
-def test_bad_arguments_are_named(call, message):
+def test_error_names_the_bad_argument(call, message):
     with pytest.raises(ValueError, match=message):
         call()

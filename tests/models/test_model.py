@@ -40,7 +40,7 @@ def test_latex_writes_dots_and_greek():
     assert r"\dot{w}" in text and r"\rho" in text and r"\dot{\mathrm{displacement}}" in text
 
 
-def test_model_travels_to_other_processes():
+def test_model_can_be_pickled():
     copy = pickle.loads(pickle.dumps(spring()))
     assert copy.equations == spring().equations
 
@@ -86,22 +86,22 @@ def test_piecewise_min_and_sign_compile_and_agree_with_sympy():
         ({"units": {"mass": "kg"}}, "units: must be .*got 'mass'"),
     ],
 )
-def test_bad_models_are_refused_by_name(changes, message):
+def test_error_names_the_invalid_part_of_the_model(changes, message):
     with pytest.raises(ValueError, match=message):
         spring(**changes)
 
 
-def test_unknown_parameter_is_answered_with_the_nearest():
+def test_unknown_parameter_error_suggests_the_nearest_name():
     with pytest.raises(AttributeError, match=r"parameters: must be one of 'm', 'k', got 'mm'\. Did you mean 'm'\?"):
         spring(equations=lambda s, p, u: [p.mm * s.ddx])
 
 
-def test_unknown_input_is_answered_with_the_nearest():
+def test_unknown_input_error_suggests_the_nearest_name():
     with pytest.raises(AttributeError, match="inputs: must be .*got 'forces'.*Did you mean 'force'"):
         spring(equations=lambda s, p, u: [s.ddx - u.forces])
 
 
-def test_function_that_cannot_be_compiled_is_named():
+def test_error_names_a_function_that_cannot_be_compiled():
     model = spring(equations=lambda s, p, u: [s.ddx + sp.Function("mystery")(s.x) - u.force])
     with pytest.raises(ValueError, match=r"mystery\(s__x\).*cannot be compiled"):
         model.kernels  # noqa: B018

@@ -38,6 +38,6 @@ def test_exact_fits_agree_with_the_atlas(quadratic):
         assert one == pytest.approx(other, abs=1e-7)
 
 
-def test_far_from_the_data_there_is_no_map(quadratic):
+def test_map_is_undefined_far_from_the_data(quadratic):
     _, atlas = quadratic
     assert np.isinf(atlas.at(np.array([[3.0, 3.0]]))[2]).all()

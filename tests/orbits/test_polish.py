@@ -23,7 +23,7 @@ def points(orbit) -> np.ndarray:
 
 
 @pytest.mark.parametrize("cycle", [True, False], ids=["whole cycle", "points alone"])
-def test_polished_orbits_are_those_of_shooting(cycle):
+def test_polished_orbits_agree_with_shooting(cycle):
     """At a noise of 0.1 % all are found, up to multipliers of 16,000, from points alone with their winding numbers."""
     known = [*GENTLE, *WILD]
     polished = polish(*(measured(k, cycle=cycle) for k in known))

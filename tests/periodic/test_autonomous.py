@@ -106,7 +106,7 @@ def test_guess_as_array_or_as_solution_leads_to_the_same_cycle():
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.3])
-def test_phase_is_the_one_closest_to_the_guess(lag):
+def test_phase_of_a_cycle_is_closest_to_the_guess(lag):
     x = 2 * np.cos(2 * np.pi * (grid(200) - lag))
     solution = cycle(0.1, guess={"x": x})
     shifted = [np.sum((np.roll(solution.states["x"], k) - x) ** 2) for k in (-1, 0, 1)]
@@ -118,7 +118,7 @@ def test_frequency_far_from_the_cycles_own_is_measured():
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
-def test_guess_that_stands_still_is_refused(value):
+def test_constant_guess_is_rejected_for_an_autonomous_model(value):
     with pytest.raises(ValueError, match="guess: states constant in time are not allowed; 'van_der_pol' is autonomous"):
         cycle(0.5, guess={"x": np.full(200, value)})
 

@@ -123,7 +123,7 @@ def test_an_angle_that_turns_has_the_frequency_of_the_closed_form_until_it_locks
     assert found.frequency[0, :3] == pytest.approx(np.sqrt(1 - a[:3] ** 2) / (2 * np.pi), rel=1e-6)
 
 
-def test_results_depend_neither_on_threads_nor_on_company():
+def test_results_do_not_depend_on_threads_or_on_the_other_points():
     theta = np.stack([np.linspace(-0.5, 2.5, 13), np.full(13, 0.3)], axis=-1)
     together = batch("central4", 1.0, 0.6)
     one, several = together.solve(theta, 1), together.solve(theta, 3)
@@ -133,7 +133,7 @@ def test_results_depend_neither_on_threads_nor_on_company():
         assert np.array_equal(part[:, 5:6], single)
 
 
-def test_where_one_orbit_is_lost_all_are_if_they_count_together_only():
+def test_loss_of_one_orbit_rejects_the_others_only_with_whole():
     """With −μ the cycle shrinks through the equilibrium."""
     theta = np.stack([[-0.5, 0.5, 1.2], [0.3, 0.3, 0.3]], axis=-1)
     together = batch("central4", 1.0, 0.6)
@@ -144,7 +144,7 @@ def test_where_one_orbit_is_lost_all_are_if_they_count_together_only():
         assert np.array_equal(part[:, 1:], other[:, 1:])
 
 
-def test_an_anchor_that_is_a_mere_guess_is_good_enough_near_the_orbit():
+def test_unconverged_anchor_near_the_orbit_gives_the_exact_solution():
     equations, anchor = anchor_of(solved(1.0))
     guess = AutonomousBatch([equations], [Anchor(anchor.parameters, anchor.z, anchor.frequency)])
     found = guess.solve(np.array([[1.05, 0.3]]))
@@ -153,7 +153,7 @@ def test_an_anchor_that_is_a_mere_guess_is_good_enough_near_the_orbit():
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-3, 1e-8])
-def test_orbits_that_shrink_or_repeat_themselves_are_seen_as_elsewhere(size):
+def test_shrunk_and_repeated_orbits_are_detected_as_by_the_solver(size):
     tau = grid(60)
     start = np.stack([np.cos(2 * np.pi * tau), np.sin(2 * np.pi * tau) ** 3], axis=-1)
     waves = [np.stack([np.cos(2 * np.pi * k * tau), np.sin(2 * np.pi * 2 * k * tau)], axis=-1) for k in (1, 2, 3)]

@@ -64,7 +64,7 @@ def test_batch_equals_single_solves(equations, batch):
         assert y[:, 0] == pytest.approx(alone(equations, theta), abs=1e-9 * np.ptp(y))
 
 
-def test_solutions_that_are_kept_are_solved_to_rounding(equations, batch):
+def test_kept_solutions_are_converged_to_rounding(equations, batch):
     """Those that are not end where the next chord step would be below 1e-9 of the amplitude."""
     parameters = spread(20, sd=0.005)
     (kept,), *_, (status,), _ = batch.solve(parameters, keep=True)
@@ -99,14 +99,14 @@ def test_small_changes_need_no_factorisation(equations):
     assert np.all(np.ptp(outputs, axis=1) > 0)
 
 
-def test_an_anchor_that_is_a_mere_guess_works(equations):
+def test_unconverged_anchor_gives_the_exact_solution(equations):
     guess = Anchor(DUFFING, equations.static_guess(DUFFING), equations.frequency)
     _, (outputs,), _, (status,), _ = Batch([equations], [guess]).solve(DUFFING[None])
     assert status[0] == 0
     assert outputs[0, :, 0] == pytest.approx(alone(equations, DUFFING), abs=1e-9 * np.ptp(outputs))
 
 
-def test_bits_do_not_depend_on_the_number_of_threads_or_the_company(batch):
+def test_results_do_not_depend_on_threads_or_on_the_other_points(batch):
     parameters = spread(37)
     one = batch.solve(parameters, threads=1)
     for threads in (2, 3, 8):
@@ -116,7 +116,7 @@ def test_bits_do_not_depend_on_the_number_of_threads_or_the_company(batch):
     assert np.array_equal(part[0][0], one[0][0, 5:9])
 
 
-def test_a_failed_solve_leaves_its_neighbours_alone(batch):
+def test_failed_solve_does_not_affect_the_other_points(batch):
     parameters = spread(5)
     parameters[2] = np.nan
     _, (outputs,), _, (status,), _ = batch.solve(parameters)
@@ -124,7 +124,7 @@ def test_a_failed_solve_leaves_its_neighbours_alone(batch):
     assert np.isfinite(outputs[[0, 1, 3, 4]]).all()
 
 
-def test_no_solve_slips_to_another_branch():
+def test_solves_stay_on_the_branch_of_the_anchor():
     """On the bistable Duffing curve, results either continue the anchor's upper branch or say "other orbit"."""
     tau = grid(200)
     equations = build(0.4 * np.cos(2 * np.pi * tau), 0.22)
@@ -149,7 +149,7 @@ def test_no_solve_slips_to_another_branch():
     assert not still
 
 
-def test_distant_solves_arrive_where_a_continuation_in_small_steps_does():
+def test_distant_solves_agree_with_a_continuation_in_small_steps():
     """Spreads by a factor e^0.5 in every parameter: Newton's iteration alone fails or slips on three of 400."""
     tau, theta = grid(200), np.array([1.0, 0.1, 1.0, 0.5])
     equations = build(20.0 * np.cos(2 * np.pi * tau), 0.3)

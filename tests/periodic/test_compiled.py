@@ -25,7 +25,7 @@ def twice(x):
 """
 
 
-def test_a_change_of_what_is_called_reaches_the_caller(monkeypatch, tmp_path):
+def test_changed_kernels_recompile_their_callers(monkeypatch, tmp_path):
     monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path))
     monkeypatch.setattr(compiled, "NAMES", ("newton",))
     for added in (1.0, 3.0, 1.0):

@@ -82,7 +82,7 @@ def test_folds_with_difference_schemes(samples, scheme, tolerance):
     assert branch.complete
 
 
-def test_response_between_the_folds_is_unstable_and_none_other(resonance):
+def test_response_is_unstable_exactly_between_the_folds(resonance):
     assert resonance.complete and resonance[-1].frequency == 0.4
     first, second = (k for k, kind in enumerate(resonance.kinds) if kind == "fold")
     stable = [solution.stable for solution in resonance]
@@ -102,7 +102,7 @@ def test_every_point_of_a_branch_solves_the_equation(resonance):
         assert solution.converged and solution.found_by == "continuation"
 
 
-def test_steps_are_not_longer_than_asked(resonance):
+def test_steps_do_not_exceed_the_given_step(resonance):
     assert np.abs(np.diff(resonance.values)).max() <= 0.3 / 50 * (1 + 1e-9)
 
 
@@ -204,7 +204,7 @@ def test_scale_of_an_input():
     assert branch[-1].states["x"] == pytest.approx(direct.states["x"], abs=1e-9)
 
 
-def test_one_of_several_inputs_is_scaled_alone():
+def test_scaling_one_of_several_inputs_leaves_the_others():
     model = bp.Model(
         "two_inputs",
         states=["x"],
@@ -319,7 +319,7 @@ def test_saved_branch_is_read_back_whole(resonance, tmp_path):
     assert [f.frequency for f in again.folds] == [f.frequency for f in resonance.folds]
 
 
-def test_branch_that_ends_is_told():
+def test_branch_that_ends_early_is_incomplete():
     """The solution x = √a exists for a ≥ 0 only."""
     model = bp.Model(
         "root",
@@ -341,7 +341,7 @@ def test_solution_without_a_multiplier_near_minus_one_is_not_doubled(resonance):
         bp.double_period(bp.models.duffing, resonance[0], "frequency")
 
 
-def test_unknown_quantity_is_not_varied_in_a_doubling(rotation):
+def test_error_names_the_unknown_quantity_of_a_doubling(rotation):
     with pytest.raises(ValueError, match="vary: must be one of 'm', 'l', .*got 'k4'. Did you mean 'k"):
         bp.double_period(bp.models.pendulum, rotation.period_doublings[0], "k4")
 
@@ -358,7 +358,7 @@ def test_unknown_quantity_is_not_varied_in_a_doubling(rotation):
         ({"model": bp.models.dahl}, "model: 'dahl' is not allowed; the solution is one of 'duffing'"),
     ],
 )
-def test_bad_arguments_are_named(resonance, changes, message):
+def test_error_names_the_bad_argument(resonance, changes, message):
     arguments = {"model": bp.models.duffing, "solution": resonance[0], "vary": "frequency", "until": 0.2} | changes
     with pytest.raises(ValueError, match=message):
         bp.continue_periodic(**arguments, progress=False)
@@ -394,7 +394,7 @@ def test_parameters_of_a_forced_model_can_be_varied_too(rotation):
     assert again.iterations <= 1 and again.states["phi"] == pytest.approx(branch[-1].states["phi"], abs=1e-9)
 
 
-def test_a_fold_that_turns_away_from_the_end_wanted_is_told():
+def test_branch_from_a_fold_away_from_its_target_is_incomplete():
     force = {"force": 0.4 * np.cos(2 * np.pi * grid(100))}
     start = bp.solve_periodic(
         bp.models.duffing, {"m": 1, "c": 0.1, "k": 1, "k3": 0.5}, force, frequency=0.08, samples=100, scheme="central4"
@@ -406,7 +406,7 @@ def test_a_fold_that_turns_away_from_the_end_wanted_is_told():
     assert back.complete and back[-1].frequency == pytest.approx(0.25)
 
 
-def test_a_branch_whose_orbit_grows_a_thousandfold_gets_to_its_end():
+def test_branch_through_a_thousandfold_resonance_is_complete():
     """Through a linear resonance from far above it, whose amplitudes are known in closed form."""
     tau = np.arange(16) / 16
     values = {"m": 1.0, "c": 0.02, "k": 1.0, "k3": 0.0}

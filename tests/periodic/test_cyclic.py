@@ -30,7 +30,7 @@ def test_factors_solve_random_systems_that_need_pivoting(half):
     assert right == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
 
 
-def test_singular_and_not_finite_matrices_are_told():
+def test_singular_and_not_finite_matrices_are_detected():
     for bad in (0.0, np.nan):
         band = banded(np.eye(5), 1)
         band[2, 1] = bad
@@ -38,7 +38,7 @@ def test_singular_and_not_finite_matrices_are_told():
 
 
 @pytest.mark.parametrize("exponent", [-40.0, -20.0, 20.0, 40.0])
-def test_folded_band_is_accurate_however_unstable_the_orbit(exponent):
+def test_folded_band_is_accurate_for_stable_and_unstable_orbits(exponent):
     """W' = λ w + u on the cyclic grid of central2, multiplier e^λ over the period, against the discrete closed form."""
     grid = CyclicGrid(central2, 800)
     size, half = grid.points, grid.half_width

@@ -56,7 +56,7 @@ def dense(equations: PeriodicEquations, columns: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("exponent", [-40.0, -20.0, 0.7, 20.0, 40.0])
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_linear_solves_are_right_however_stable_or_unstable_the_orbit(scheme, exponent):
+def test_linear_solves_are_accurate_for_stable_and_unstable_orbits(scheme, exponent):
     """Against the transfer function with the scheme's own symbol for d/dt; multiplier e^λ over the period."""
     samples = 800 if scheme != "fourier" else 100
     equations = equations_of(growing(1), scheme, samples)
@@ -198,7 +198,7 @@ def test_bordered_systems_are_solved_where_the_block_is_singular(scheme, rate):
         assert np.abs(matrix @ null.ravel()).max() < 1e-9
 
 
-def test_plain_solves_are_not_changed_by_bordered_ones():
+def test_bordered_solves_do_not_change_plain_solves():
     equations = equations_of(growing(2), "central2", 40)
     columns = equations.residual_jacobian(np.ones((40, 2)), np.array([1.5]))
     factors = equations.factors(columns)

@@ -44,7 +44,7 @@ def sine(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("points", [800, 801])
-def test_exponents_whose_transfer_matrices_must_not_be_multiplied(points):
+def test_exponents_are_accurate_where_products_of_transfer_matrices_lose_all_digits(points):
     found = floquet(damped_known(points), 2 * np.pi)
     assert found.exponents / (2 * np.pi) == pytest.approx([0.0, -24.0], abs=1e-6)
 
@@ -56,7 +56,7 @@ def test_exponents_from_40_to_minus_40_with_a_complex_pair(points):
     assert found.exponents == pytest.approx(exact, abs=1e-8)
 
 
-def test_multipliers_come_with_their_sign():
+def test_multipliers_have_the_right_sign():
     """A frame that makes half a turn a period: A is periodic, and both multipliers are negative."""
     points = 200
     half = np.pi * grid(points)
@@ -153,7 +153,7 @@ def test_exponents_beyond_the_range_of_floating_point_numbers(exponent):
     assert floquet(a[:, None, None], PERIOD).exponents == pytest.approx([exponent], rel=1e-5)
 
 
-def test_strong_friction_is_told_as_stable():
+def test_solution_with_strong_friction_is_stable():
     """Dahl friction, ẇ = rho (v − |v| w), forgets by exp(−rho · 4 amplitude) a period, here e^−960."""
     displacement = 0.03 * np.sin(2 * np.pi * grid(800))
     theta = {"Kx": 100.0, "K": 1000.0, "F0": 0.0, "Kw": 50.0, "rho": 8000.0}
@@ -192,7 +192,7 @@ def test_equations_that_do_not_determine_the_highest_derivatives_are_refused():
 
 @pytest.mark.parametrize("points", [200, 201])
 @pytest.mark.parametrize(("rate", "tolerance"), [(2e3, 5e-3), (1e4, 0.02)])
-def test_stiff_equations_forget_as_fast_as_they_do(points, rate, tolerance):
+def test_exponent_of_a_stiff_equation_is_its_rate(points, rate, tolerance):
     """For ẇ = −rate (w − u) with up to fifty time constants a step of the grid."""
     matrix = np.full((points, 1, 1), -rate)
     exponent = floquet(matrix, 1.0).exponents[0]
@@ -206,7 +206,7 @@ def test_multipliers_of_overly_stiff_equations_are_stable_and_positive():
         assert 0.0 <= multiplier.real < 1.0 and multiplier.imag == 0.0
 
 
-def test_easy_multipliers_are_exact_and_the_others_left_alone():
+def test_leading_multipliers_are_exact_or_not_returned():
     """Constant matrices, their multipliers known: of either sign, pairs, nearly equal ones; a pair too far from 1."""
     tau = np.arange(100) / 100
     real = np.array([[1.0, 3.0], [0.5, -2.0]])

@@ -39,7 +39,7 @@ def spectral(values: np.ndarray, frequency: float, order: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("amplitude", "frequency"), RESONANCE)
-def test_resonance_is_found_by_raising_the_amplitude(amplitude, frequency):
+def test_resonance_is_found_by_amplitude_continuation(amplitude, frequency):
     """Plain Newton from rest does not get there; with 128 points the equation holds in spectral derivatives."""
     force = amplitude * np.cos(2 * np.pi * grid(128))
     arguments = {"frequency": frequency, "samples": 128, "scheme": "fourier"}
@@ -55,7 +55,7 @@ def test_resonance_is_found_by_raising_the_amplitude(amplitude, frequency):
     assert not from_zero.converged
 
 
-def test_variation_of_the_input_is_raised_about_its_mean():
+def test_amplitude_continuation_scales_the_input_about_its_mean():
     """The force is the logarithm of the input, so that there is none without the input's mean."""
     model = bp.Model(
         "logarithmic",
@@ -99,7 +99,7 @@ def test_model_without_inputs_falls_back_on_a_time_integration():
 @pytest.mark.filterwarnings("ignore:A smooth sign")
 @pytest.mark.parametrize("width", [1e-3, 1e-4])
 @pytest.mark.parametrize("scheme", ["central2", "backward2"])
-def test_dry_friction_is_found_by_sharpening(width, scheme):
+def test_dry_friction_is_solved_by_sharpness_continuation(width, scheme):
     """Stick and slip: against a time integration of the same equation, after its transient."""
     parameters = {"m": 1.0, "c": 0.05, "k": 1.0, "r": 0.6, "v0": width}
     solution = bp.solve_periodic(
@@ -165,7 +165,7 @@ def test_integration_finds_the_locked_rotation_of_the_pendulum():
     assert found == pytest.approx(known.section[0], abs=1e-7)
 
 
-def test_integration_leaves_an_unstable_equilibrium():
+def test_time_integration_fallback_leaves_an_unstable_equilibrium():
     """Two wells: Newton's method from rest stays on the crest, an integration falls into a well."""
     parameters = {"m": 1.0, "c": 0.5, "k": -1.0, "k3": 1.0}
     arguments = {"frequency": 0.15, "samples": 200, "scheme": "central4"}
@@ -187,7 +187,7 @@ def switch(steps: float, samples: int) -> bp.PeriodicSolution:
 
 
 @pytest.mark.parametrize("steps", [0.3, 2.5, 3.9])
-def test_narrow_transition_is_told_with_the_samples_that_resolve_it(steps):
+def test_warning_states_the_samples_that_resolve_a_narrow_transition(steps):
     with pytest.warns(UserWarning, match="A smooth sign of 'switch' changes over within") as caught:
         switch(steps, 100)
     assert len(caught) == 1 and caught[0].filename == __file__
@@ -199,13 +199,13 @@ def test_narrow_transition_is_told_with_the_samples_that_resolve_it(steps):
         switch(steps, int(samples) + 2)
 
 
-def test_resolved_transition_is_not_mentioned():
+def test_resolved_transition_gives_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         switch(4.1, 100)
 
 
-def test_sign_that_is_never_crossed_is_not_mentioned():
+def test_sign_that_is_never_crossed_gives_no_warning():
     """The locked rotation never stops, however narrow the friction's transition."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -64,7 +64,7 @@ def test_stable_cycles_are_those_of_a_time_integration(branch, speed):
         assert found == pytest.approx(np.abs(np.fft.rfft(values))[1:4] / values.size, rel=1e-5, abs=1e-9)
 
 
-def test_a_value_without_an_orbit_is_refused_with_the_fold(branch):
+def test_error_for_a_value_without_an_orbit_names_the_fold(branch):
     with pytest.raises(ValueError, match=r"U = 14.5 m/s is not allowed.*no orbit there, the nearest is at its fold at"):
         bp.solutions_at(bp.models.flutter, branch, 14.5)
     with pytest.raises(ValueError, match=r"U = 20 m/s is not allowed.*the nearest is at its end at 18.07"):

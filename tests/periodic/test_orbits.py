@@ -71,7 +71,7 @@ def test_error_estimate_is_the_error_of_an_unstable_rotation(known, scheme, samp
     assert solution.error_estimate()["phi"] == pytest.approx(error, rel=0.1)
 
 
-def test_stable_orbits_of_periods_one_two_and_four_are_told_as_stable():
+def test_stable_orbits_of_periods_one_two_and_four_are_stable():
     for known, tolerance in zip(shooting.STABLE[1:], (5e-8, 1e-6), strict=True):
         solution = pendulum_solution(known, 400, "central4")
         assert solution.stable
@@ -93,14 +93,14 @@ def test_mirrored_orbit_turns_the_other_way_with_the_same_multipliers(known):
     assert other.multipliers == pytest.approx(one.multipliers, rel=1e-9)
 
 
-def test_whole_turns_in_the_guess_stay():
+def test_solution_keeps_whole_turns_of_the_guess():
     known = ROTATIONS[0]
     angle = rates_and_angles(known, 400)[:, 0] + 6 * np.pi
     solution = pendulum_solution(known, 400, "central4", angle)
     assert solution.states["phi"] == pytest.approx(angle, abs=1e-7)
 
 
-def test_period_two_guess_that_ends_on_the_period_one_orbit_is_told():
+def test_period_two_guess_that_ends_on_the_period_one_orbit_has_status_other_orbit():
     """At 11.9 rad/s, above the first doubling, no orbit of period 2 is near the rotation."""
     once = pendulum_solution(shooting.DOUBLINGS[0]._replace(omega=11.9), 200, "central4")
     assert once.converged
@@ -118,7 +118,7 @@ def test_period_two_guess_that_ends_on_the_period_one_orbit_is_told():
     assert np.sort_complex(asked.multipliers) == pytest.approx(np.sort_complex(once.multipliers**2), rel=1e-6)
 
 
-def test_period_four_guess_of_two_equal_halves_that_ends_on_the_period_one_orbit_is_told():
+def test_period_four_guess_that_ends_on_the_period_one_orbit_has_status_other_orbit():
     once = pendulum_solution(shooting.DOUBLINGS[0]._replace(omega=11.9), 200, "central4")
     tau = np.arange(800) / 200
     tiled = np.tile(once.states["phi"] - TURN * once.tau, 4) + TURN * tau

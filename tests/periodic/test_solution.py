@@ -210,14 +210,14 @@ def test_rotation_keeps_its_turns():
     assert np.mean(solution.outputs["rate"]) == pytest.approx(2 * np.pi * 0.5)
 
 
-def test_no_equilibrium_ends_in_a_status_and_not_in_an_exception():
+def test_solve_without_equilibrium_returns_a_status():
     solution = bp.solve_periodic(RUNAWAY, {"a": 1.0}, {"u": np.cos(2 * np.pi * grid(100))}, frequency=1.0, samples=100)
     assert not solution.converged
     assert solution.status in ("stalled", "singular")
     assert solution.sensitivities == {}
 
 
-def test_overflow_is_told_as_not_finite():
+def test_overflow_has_status_not_finite():
     model = bp.Model(
         "overflow",
         states=["x"],
@@ -275,7 +275,7 @@ def test_a_solution_on_another_grid_or_of_fewer_periods_is_a_guess():
         ({"periods": 0}, "periods: must be .*got 0"),
     ],
 )
-def test_bad_arguments_are_named(changes, message):
+def test_error_names_the_bad_argument(changes, message):
     arguments = {
         "model": bp.models.duffing,
         "parameters": DUFFING,
@@ -287,7 +287,7 @@ def test_bad_arguments_are_named(changes, message):
         bp.solve_periodic(**(arguments | changes))
 
 
-def test_windings_of_two_angles_are_told_by_name():
+def test_windings_of_two_angles_are_given_by_name():
     twin = bp.Model(
         "twin",
         states=["a", "b"],
@@ -308,7 +308,7 @@ def test_windings_of_two_angles_are_told_by_name():
         ({"order": 0}, "order: 0 is not allowed"),
     ],
 )
-def test_schemes_that_do_not_differentiate_are_refused(changes, message):
+def test_inconsistent_schemes_are_rejected(changes, message):
     good = {"order": 2, "first": {-1: -0.5, 1: 0.5}, "second": {-1: 1.0, 0: -2.0, 1: 1.0}}
     with pytest.raises(ValueError, match=message):
         bp.Scheme("mine", **(good | changes))

@@ -39,7 +39,7 @@ def problem():
     return bp.Problem(bp.models.flutter, experiments, priors=priors, fixed=fixed, scheme="fourier")
 
 
-def test_neither_branch_is_ever_taken_for_the_other():
+def test_stable_and_unstable_cycles_are_never_confused():
     """Draws of 12 %: half have their fold above 15 m/s, some no unstable cycle; by continuation, and by multipliers."""
     stated, generator = problem(), np.random.default_rng(1)
     theta = np.array([RIG[name] for name in stated.names]) * np.exp(0.12 * generator.standard_normal((600, len(FREE))))
@@ -58,7 +58,7 @@ def test_neither_branch_is_ever_taken_for_the_other():
                 assert (stated.responses.largest_multipliers(theta[i : i + 1], name, alone)[0] < 1.0) == kind
 
 
-def test_a_fold_between_two_cycles_is_seen():
+def test_determinant_changes_sign_between_cycles_on_both_sides_of_a_fold():
     """The unstable cycle has one real multiplier above 1 more, so that the determinant has the other sign."""
     stated = problem()
     parameters = np.array([(RIG | SENSORS | {"U": SPEED})[n] for n in bp.models.flutter.parameters])
@@ -69,7 +69,7 @@ def test_a_fold_between_two_cycles_is_seen():
     assert found[0] * found[1] == -1.0
 
 
-def test_without_a_cycle_there_is_no_posterior():
+def test_log_likelihood_without_a_cycle_is_minus_infinity():
     """At this c_alpha the equilibrium is stable up to 19 m/s, and the fold is above 15."""
     theta = {name: RIG[name] for name in FREE} | {"c_alpha": 1.5 * RIG["c_alpha"]}
     assert hopf(RIG | {"c_alpha": theta["c_alpha"]})[0] > 19.0

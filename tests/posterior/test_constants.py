@@ -48,7 +48,7 @@ def test_density_agrees_with_one_problem_an_experiment():
     assert together == pytest.approx(sum(p.log_likelihood(theta, {}) for p in apart), rel=1e-12)
 
 
-def test_a_tie_may_name_what_differs():
+def test_tie_may_use_a_constant_that_differs_between_experiments():
     """Damping = coulomb · k/900, k the only free parameter: closed, and no common slope to derive anything from c."""
     tied = problem(COULOMB, tied={"c": "coulomb*k/900"}, priors={"k": PRIORS["k"]})
     assert tied.parameters(np.array([[450.0]]), "heavy")[0] == pytest.approx([450.0, 20.0, 40.0])
@@ -62,7 +62,7 @@ def test_a_tie_may_name_what_differs():
     assert np.isnan(fit.tied["c"]["k"])
 
 
-def test_one_value_for_all_is_as_before():
+def test_one_constant_for_all_experiments_equals_equal_constants():
     both = {"k": 900.0, "c": 45.0}
     one, each = problem(25.0), problem(dict.fromkeys(COULOMB, 25.0))
     assert one.log_likelihood(both, {}) == each.log_likelihood(both, {})
@@ -77,12 +77,12 @@ def test_one_value_for_all_is_as_before():
         ("25 N", r"fixed\['coulomb'\]: must be a real number, got '25 N'"),
     ],
 )
-def test_bad_constants_are_named(coulomb, message):
+def test_error_names_the_bad_constant(coulomb, message):
     with pytest.raises(ValueError, match=message):
         problem(coulomb)
 
 
-def test_some_of_the_experiments_make_a_problem_of_their_own():
+def test_problem_restricted_to_some_experiments_is_the_same_problem():
     """What was said of the others goes with them; constants without a name hold for new data too."""
     runs = [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=i, name=f"run {i}") for i in (1, 2)]
     k, c, other = bp.Normal(800.0, 60.0), bp.LogNormal(30.0, 0.5), bp.LogNormal(50.0, 0.5)

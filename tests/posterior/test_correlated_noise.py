@@ -62,20 +62,20 @@ def all_fitted(correlation: float, cycles: int, model="independent") -> tuple[di
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(TRUTH))
-def test_independent_noise_covers_far_too_little_where_errors_are_correlated(name):
+def test_independent_noise_undercovers_with_correlated_errors(name):
     assert all_fitted(CORRELATION, 20)[0][name, False] < 0.6 * RECORDINGS
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(TRUTH))
-def test_robust_intervals_cover_where_errors_are_correlated(name):
+def test_robust_intervals_have_nominal_coverage_with_correlated_errors(name):
     assert BAND[0] <= all_fitted(CORRELATION, 20)[0][name, True] <= BAND[1]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(TRUTH))
 @pytest.mark.parametrize("robust", [False, True])
-def test_circulant_noise_covers_where_errors_are_correlated(name, robust):
+def test_circulant_noise_has_nominal_coverage_with_correlated_errors(name, robust):
     """Its spectrum is the exponential kernel's but for O(1/20); the length is estimated, and its uncertainty counts."""
     assert BAND[0] <= all_fitted(CORRELATION, 20, noise.Circulant(kernel="exponential"))[0][name, robust] <= BAND[1]
 
@@ -83,11 +83,11 @@ def test_circulant_noise_covers_where_errors_are_correlated(name, robust):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list(TRUTH))
 @pytest.mark.parametrize("robust", [False, True])
-def test_both_intervals_cover_where_errors_are_white(name, robust):
+def test_both_intervals_have_nominal_coverage_with_white_errors(name, robust):
     assert BAND[0] <= all_fitted(0.0, 6)[0][name, robust] <= BAND[1]
 
 
-def test_where_the_prior_says_everything_the_robust_sd_is_the_priors():
+def test_robust_sd_equals_the_prior_sd_if_the_prior_dominates():
     experiment = folded(0.0, 6)[0]
     priors = {"k": bp.Normal(900.0, 1e-3), "coulomb": bp.Normal(25.0, 1e-5)}
     fit = bp.map_estimate(bp.Problem(LINEAR, [experiment], priors=priors, fixed={"c": DAMPING}), progress=False)
@@ -114,7 +114,7 @@ def stationary_on_the_circle(lengthscale: float, seed: int) -> bp.Experiment:
 
 
 @pytest.mark.slow
-def test_residuals_in_units_of_the_right_noise_are_white():
+def test_residuals_whitened_by_the_true_noise_are_white():
     """Uniform p from 500 runs with known noise parameters (KS at 0.1 %); before whitening hardly any passes 1 %."""
     known = {"variance[force]": SD**2, "lengthscale[force]": 0.08}
     runs = [stationary_on_the_circle(0.08, seed) for seed in range(500)]
@@ -146,7 +146,7 @@ def test_measurement_noise_is_that_of_the_mean_of_20_cycles():
 
 
 @pytest.mark.parametrize("amplitude", [0.0, 4.0])
-def test_model_error_is_what_measurement_noise_leaves_open(amplitude):
+def test_model_error_is_the_excess_over_measurement_noise(amplitude):
     """The mean of total² less measured² over 100 recordings is amplitude²/2 within four standard errors.
 
     The wave is in none of the regressors, which have odd harmonics only, so that eq. (7) raises its share by 41/39.

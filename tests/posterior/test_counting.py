@@ -46,16 +46,16 @@ def covered(experiments: list[bp.Experiment]) -> int:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("harmonics", [5, 20, 40])
-def test_the_interval_of_a_friction_like_regressor_covers_its_truth(harmonics):
+def test_interval_of_a_friction_regressor_has_nominal_coverage(harmonics):
     assert BAND[0] <= covered(folded(harmonics)) <= BAND[1]
 
 
 @pytest.mark.slow
-def test_without_projection_the_interval_fails():
+def test_interval_without_projection_misses_nominal_coverage():
     assert not BAND[0] <= covered([replace(e, harmonics={}) for e in folded(5)]) <= BAND[1]
 
 
 @pytest.mark.slow
-def test_counting_every_sample_makes_the_interval_fail():
+def test_counting_every_sample_makes_the_interval_undercover():
     naive = [replace(e, independent={"force": 800}) for e in folded(20)]
     assert covered(naive) < BAND[0]

@@ -104,7 +104,7 @@ def differences(problem: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> np
 
 @pytest.mark.filterwarnings("ignore:A smooth sign")
 @pytest.mark.parametrize("case", CASES)
-def test_gradient_is_that_of_the_density(case):
+def test_gradient_equals_differences_of_the_log_posterior(case):
     problem, theta = CASES[case]()
     theta, noise = np.array(theta), problem.likelihood.guess()
     noise[[name.startswith("variance") for name in problem.noise_names]] = 0.01
@@ -118,7 +118,7 @@ def test_gradient_is_that_of_the_density(case):
 
 @pytest.mark.filterwarnings("ignore:A smooth sign")
 @pytest.mark.parametrize("case", CASES)
-def test_value_and_gradient_away_from_the_anchors(case):
+def test_value_and_gradient_away_from_the_anchors_equal_those_of_an_exact_solve(case):
     """Against a solve to rounding at the same point."""
     problem, theta = CASES[case]()
     theta, noise = np.array(theta), problem.likelihood.guess()
@@ -132,7 +132,7 @@ def test_value_and_gradient_away_from_the_anchors(case):
     assert gradient == pytest.approx(expected, rel=1e-6, abs=1e-8 * np.abs(expected).max())
 
 
-def test_value_and_gradient_outside_the_support():
+def test_value_and_gradient_outside_the_support_are_minus_infinity_and_zero():
     value, gradient = duffing(duffing_run()).value_and_gradient(
         {"c": -1.0, "k": 1.0, "k3": 0.5}, {"displacement": 0.01}
     )
@@ -140,7 +140,7 @@ def test_value_and_gradient_outside_the_support():
     assert gradient.tolist() == [0.0] * 4
 
 
-def test_value_and_gradient_where_the_transposed_solve_is_singular(monkeypatch):
+def test_singular_transposed_solve_gives_minus_infinity_and_zero_gradient(monkeypatch):
     problem = duffing(duffing_run())
     theta, noise = {"c": 0.2, "k": 1.0, "k3": 0.5}, {"displacement": 0.01}
     assert np.isfinite(problem.value_and_gradient(theta, noise)[0])

@@ -87,7 +87,7 @@ def test_circulant_noise_is_a_multivariate_normal_with_circulant_covariance(kern
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("samples", [40, 41])
-def test_within_kept_harmonics_it_is_one_in_their_subspace(kernel, samples):
+def test_circulant_noise_with_kept_harmonics_is_normal_in_their_subspace(kernel, samples):
     """With an orthonormal basis Q of the waves kept the components are √((2H + 1)/n) · Qᵀe, up to a rotation."""
     kept, tau = 6, grid(samples)
     size, harmonic = 2 * kept + 1, np.arange(1, kept + 1)
@@ -107,7 +107,7 @@ def test_within_kept_harmonics_it_is_one_in_their_subspace(kernel, samples):
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("samples", [40, 41])
-def test_at_the_points_of_a_mask_it_is_the_marginal(kernel, samples):
+def test_circulant_noise_at_masked_points_is_the_marginal(kernel, samples):
     mask = np.random.default_rng(2).random(samples) < 0.4
     experiment = run(samples, mask=mask)
     covariance = circulant_covariance(kernel, samples, 7.0)[np.ix_(mask, mask)]
@@ -119,7 +119,7 @@ def test_at_the_points_of_a_mask_it_is_the_marginal(kernel, samples):
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("changes", [{}, {"harmonics": {"force": 6}}, {"mask": np.arange(40) % 3 == 0}])
-def test_without_a_correlation_length_it_is_independent(kernel, changes):
+def test_circulant_noise_without_correlation_is_independent_noise(kernel, changes):
     experiment = run(40, **changes)
     shape = SHAPES[kernel] | {"lengthscale": 1e-9}
     found = log_likelihood(noise.Circulant(kernel=kernel), experiment, variance=7.0, **shape)
@@ -492,7 +492,7 @@ def test_the_model_error_is_found_beside_the_measurement_noise(measured):
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("points", [False, True])
-def test_the_best_spectrum_is_higher_than_any_on_a_grid(kernel, points):
+def test_noise_estimate_maximises_the_density_of_the_spectrum(kernel, points):
     blocks = [block(POINTS)] if points else spectral_residuals()[0]
     generator = np.random.default_rng(9)
     residuals = [np.cumsum(generator.standard_normal(b.size)) for b in blocks]
@@ -512,7 +512,7 @@ def test_the_best_spectrum_is_higher_than_any_on_a_grid(kernel, points):
         )
 
 
-def test_known_noise_parameters_stay():
+def test_fixed_noise_parameters_keep_their_values():
     blocks, residuals, *_ = spectral_residuals()
     found = best_noise(noise.Circulant(), blocks, residuals, fixed={"lengthscale[force]": 0.2, "floor[force]": 0.5})
     assert found[1:].tolist() == [0.2, 0.5]
@@ -531,7 +531,7 @@ def test_known_noise_parameters_stay():
         (lambda: noise.Circulant(kernel="gauss"), "kernel: must be one of 'matern', 'exponential', got 'gauss'"),
     ],
 )
-def test_bad_noise_models_are_refused(build, message):
+def test_error_names_the_bad_noise_argument(build, message):
     with pytest.raises(ValueError, match=message):
         build()
 
@@ -546,7 +546,7 @@ def test_bad_noise_models_are_refused(build, message):
         ({"noise": "circulant", "fixed": {"floor[force]": -0.1}}, r"fixed\['floor\[force\]'\]: must be .*got -0.1"),
     ],
 )
-def test_bad_choices_of_a_problem_are_refused(changes, message):
+def test_error_names_the_bad_noise_of_a_problem(changes, message):
     with pytest.raises(ValueError, match=message):
         bp.Problem(LINEAR, [run(40)], **({"priors": PRIORS} | changes))
 

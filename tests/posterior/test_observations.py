@@ -106,7 +106,7 @@ def test_variances_of_each_run_are_those_of_equation_7():
         assert fit.variances[f"force, {run.name}"] == pytest.approx(expected, rel=1e-9)
 
 
-def test_a_mask_leaves_out_what_was_not_measured():
+def test_mask_excludes_unmeasured_points():
     """Only the points of the mask count, NaN elsewhere does no harm; closed form on those points."""
     run, mask = linear_experiment(TRUTH, 3.0, seed=5), np.arange(40) % 5 == 1
     values = np.where(mask, run.outputs["force"], np.nan)
@@ -153,7 +153,7 @@ def test_section_values_with_their_covariance_are_a_normal_density():
     assert problem.log_likelihood(UNSTABLE, {"scale": 4.0}) == pytest.approx(scaled, abs=1e-6)
 
 
-def test_multipliers_tell_about_the_friction():
+def test_measured_multipliers_add_the_expected_information_on_friction():
     """log|μ| of the period-1 rotations, known to 1 %, sharpens k3; by how much follows from their derivatives."""
     mask, covariance = np.arange(SAMPLES) == 0, np.diag([1e-4, 4e-3])
     known = {"fixed": {n: v for n, v in rotation().parameters.items() if n != "k3"} | {"scale": 1.0}}
@@ -171,7 +171,7 @@ def test_multipliers_tell_about_the_friction():
     assert fits[0].sd["k3"] ** -2 < 0.6 * fits[1].sd["k3"] ** -2
 
 
-def test_a_multiplier_of_the_other_sign_is_another_orbit():
+def test_multiplier_of_the_other_sign_identifies_another_orbit():
     problem = pendulum_problem(
         [section_run(multipliers=[1.7])], noise=bp.noise.Independent(prior=bp.InverseGamma(3, 2))
     )
@@ -209,7 +209,7 @@ def test_a_delay_of_the_outputs_is_found():
     assert known.log_likelihood(theta, [0.01]) == pytest.approx(plain.log_likelihood(theta, [0.01]), rel=of_nyquist)
 
 
-def test_the_delay_of_a_rotating_angle_leaves_no_jump():
+def test_delay_of_a_rotating_angle_leaves_no_jump():
     """A rotation seen 0.05 s late: the same density as that of the punctual one, the trend of the angle included."""
     truth, delay = rotation(), 0.05
     fraction = delay * truth.frequency
@@ -225,7 +225,7 @@ def test_the_delay_of_a_rotating_angle_leaves_no_jump():
     assert value == pytest.approx(0.0, abs=1e-9)
 
 
-def test_an_autonomous_cycle_is_identified_whatever_its_phase():
+def test_autonomous_cycle_is_identified_for_any_phase():
     """The shape tells mu, the measured frequency, known to 0.1 %, omega; within 4 sds (false-alarm rate 0.01 %)."""
     fits = []
     for turned in (0.2, 0.55):
@@ -295,12 +295,12 @@ def test_the_phase_of_a_cycle_is_the_likeliest_one_of_all_channels():
         ({"fixed": {"lengthscale[force]": 1.0}}, r"fixed: must be .*got 'lengthscale\[force\]'"),
     ],
 )
-def test_what_does_not_fit_is_refused_by_name(changes, message):
+def test_error_names_the_argument_that_does_not_fit(changes, message):
     with pytest.raises(ValueError, match=message):
         bp.Problem(LINEAR, linear_runs(10.0, 25.0), **({"priors": PRIORS} | changes))
 
 
-def test_grids_that_one_correlation_cannot_span_are_refused():
+def test_circulant_noise_shared_by_different_grids_is_rejected():
     runs = [linear_experiment(TRUTH, 3.0, seed=1), linear_experiment(TRUTH, 3.0, seed=2, samples=60, name="fine")]
     with pytest.raises(ValueError, match="noise: 'circulant' is not allowed; experiments have 40 and 60 points"):
         bp.Problem(LINEAR, runs, priors=PRIORS, noise="circulant")
@@ -308,7 +308,7 @@ def test_grids_that_one_correlation_cannot_span_are_refused():
     bp.Problem(LINEAR, runs, priors=PRIORS)
 
 
-def test_data_that_cannot_tell_are_refused():
+def test_data_without_information_are_rejected():
     run = linear_experiment(TRUTH, 3.0, seed=5)
     with pytest.raises(ValueError, match=r"outputs of experiment 'run': 'force' is constant \(1\)"):
         bp.Problem(LINEAR, [replace(run, outputs={"force": np.ones(40)})], priors=PRIORS)
@@ -339,12 +339,12 @@ def test_data_that_cannot_tell_are_refused():
         ({"multipliers": None, "covariance": np.eye(2), "multiplier_sd": [1.0]}, "multiplier_sd: it is not allowed"),
     ],
 )
-def test_bad_section_data_are_refused(changes, message):
+def test_error_names_the_bad_section_data(changes, message):
     with pytest.raises(ValueError, match=message):
         section_run(**changes)
 
 
-def test_a_delay_is_no_delay_of_the_model():
+def test_residual_of_exact_data_vanishes_only_without_delay():
     """With the true parameters and no noise the residual vanishes at shift = 0 alone."""
     assert DUFFING["m"] == 1.0
     run = duffing_run()

@@ -55,7 +55,7 @@ def test_densities_integrate_to_one(prior, reference):
 
 
 @cases()
-def test_supports_are_scipys(prior, reference):
+def test_supports_equal_those_of_scipy(prior, reference):
     assert prior.support == reference.support()
     assert all(type(end) is float for end in prior.support)
 
@@ -91,7 +91,7 @@ def test_samples_follow_the_distribution(prior, reference):
 
 
 @pytest.mark.parametrize("name", ["Normal", "LogNormal", "TruncatedNormal", "HalfNormal", "Uniform", "InverseGamma"])
-def test_mean_of_samples_is_the_distributions(name):
+def test_mean_of_samples_equals_the_mean_of_the_distribution(name):
     """Within 4 standard errors, false-alarm rate 0.006 % each."""
     prior, reference = CASES[name]
     draws = prior.sample(40_000, np.random.default_rng(8))
@@ -99,7 +99,7 @@ def test_mean_of_samples_is_the_distributions(name):
 
 
 @cases()
-def test_any_shape_goes_in_and_comes_out(prior, reference):
+def test_arrays_of_any_shape_keep_their_shape(prior, reference):
     x = prior.quantile(np.linspace(0.1, 0.9, 6)).reshape(2, 3)
     for function in (prior.log_prob, prior.gradient, prior.curvature):
         assert function(x).shape == (2, 3)
@@ -110,7 +110,7 @@ def test_any_shape_goes_in_and_comes_out(prior, reference):
 
 
 @cases()
-def test_outside_the_support_the_density_is_zero_and_has_no_slope(prior, reference):
+def test_density_outside_the_support_is_zero_and_its_gradient_nan(prior, reference):
     low, high = prior.support
     outside = np.array([x for x in (low, low - 1.0, high, high + 1.0, np.nan)])
     assert np.all(prior.log_prob(outside) == -np.inf)
@@ -172,7 +172,7 @@ def test_numerical_derivatives_of_scipys_densities_are_as_accurate_as_documented
     assert np.all(np.abs(wrapped.curvature(x) - curvature) < 1e-9 * (np.abs(curvature) + 1 / width**2))
 
 
-def test_numerical_derivatives_keep_inside_the_support():
+def test_numerical_derivatives_stay_inside_the_support():
     """At a distance d from the end of the support the curvature may lose 1e-13/d²."""
     exact, wrapped = bp.LogUniform(1.0, 1e5), FromScipy(stats.loguniform(1.0, 1e5))
     distance = np.array([1e-5, 1e-3, 1e-1])
@@ -180,7 +180,7 @@ def test_numerical_derivatives_keep_inside_the_support():
     assert np.all(error < 1e-13 / distance**2 + 1e-9)
 
 
-def test_scipys_distribution_prints_as_it_was_written_and_equal_ones_are_equal():
+def test_scipy_priors_have_a_constructor_repr_and_compare_by_value():
     assert repr(FromScipy(stats.gamma(2.0, scale=3.0))) == "scipy.stats.gamma(2.0, scale=3.0)"
     assert FromScipy(stats.gamma(2.0, scale=3.0)) == FromScipy(stats.gamma(2.0, scale=3.0))
     assert FromScipy(stats.gamma(2.0)) != FromScipy(stats.gamma(2.0 + 1e-15))
@@ -190,7 +190,7 @@ def test_scipys_distribution_prints_as_it_was_written_and_equal_ones_are_equal()
     assert " at 0x" not in texts[0]
 
 
-def test_equal_priors_print_alike_whatever_numbers_they_were_given():
+def test_equal_priors_have_the_same_repr():
     assert repr(bp.Normal(np.float64(800), 60)) == repr(bp.Normal(800.0, 60.0)) == "Normal(mean=800.0, sd=60.0)"
     assert bp.TruncatedNormal(1, 2, 0, np.inf) == bp.TruncatedNormal(1.0, 2.0, 0.0, INFINITY)
 
@@ -244,7 +244,7 @@ def test_multivariate_normal_samples_have_its_moments():
     assert abs(np.corrcoef(draws.T)[0, 1] - correlation[0, 1]) < 4 * sampling_sd
 
 
-def test_multivariate_normal_keeps_all_its_numbers_in_its_text():
+def test_multivariate_normal_repr_holds_all_its_numbers():
     size = 60
     covariance = np.eye(size) + 1e-3
     prior, other = bp.MultivariateNormal(np.zeros(size), covariance), covariance.copy()
@@ -255,7 +255,7 @@ def test_multivariate_normal_keeps_all_its_numbers_in_its_text():
     assert hash(prior) == hash(bp.MultivariateNormal(np.zeros(size), covariance))
 
 
-def test_multivariate_normal_does_not_change_with_the_array_it_was_given():
+def test_multivariate_normal_copies_its_covariance():
     covariance = np.eye(2)
     prior = bp.MultivariateNormal([0.0, 0.0], covariance)
     covariance[0, 0] = 9.0
@@ -270,7 +270,7 @@ def joint():
     return JointPrior.of({("d", "a"): block, "b": bp.LogNormal(3.0, 0.5)}, ["a", "b", "c", "d"])
 
 
-def test_blocks_are_put_at_the_places_of_their_names(joint):
+def test_blocks_of_a_joint_prior_follow_the_order_of_the_names(joint):
     assert joint.names == ("a", "b", "d")
     assert list(joint.blocks) == [("d", "a"), "b"]
     block, single = joint.blocks.values()
@@ -296,7 +296,7 @@ def test_blocks_are_put_at_the_places_of_their_names(joint):
     assert joint.marginals["a"] == bp.Normal(2.0, 3.0)
 
 
-def test_joint_samples_are_correlated_where_the_block_is(joint):
+def test_joint_samples_are_correlated_within_a_block_only(joint):
     """Correlation 1/6 within 4 sd (false-alarm rate 0.006 %), independence of the other block likewise."""
     draws = joint.sample(20_000, np.random.default_rng(9))
     correlation = np.corrcoef(draws.T)
@@ -310,7 +310,7 @@ def test_excluding_names_the_parameters_of_the_block(joint):
     assert joint.excluding(np.array([1.0, 1.0, np.nan])) == ("d", "a")
 
 
-def test_a_prior_of_ones_own_needs_the_functions_only():
+def test_any_object_with_the_prior_functions_is_a_prior():
     normal = bp.Normal(0.0, 1.0)
     functions = ("support", "log_prob", "gradient", "curvature", "quantile", "sample")
     own = SimpleNamespace(**{name: getattr(normal, name) for name in functions})
@@ -348,7 +348,7 @@ def test_a_prior_of_ones_own_needs_the_functions_only():
         (lambda: bp.MultivariateNormal([0, 0], np.eye(2)).log_prob(np.zeros(3)), "x: shape .* must have 2 values"),
     ],
 )
-def test_bad_arguments_are_named(make, message):
+def test_error_names_the_bad_argument(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
@@ -366,6 +366,6 @@ def test_bad_arguments_are_named(make, message):
         (bp.MultivariateNormal([0.0], [[1.0]]), r"MultivariateNormal\(.*\) is not allowed; .* needs a tuple of names"),
     ],
 )
-def test_what_is_no_prior_is_refused(value, message):
+def test_error_names_what_is_no_prior(value, message):
     with pytest.raises(ValueError, match=message):
         as_prior("priors['k']", value)

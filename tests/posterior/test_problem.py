@@ -41,18 +41,18 @@ def test_many_points_at_once_equal_one_by_one(problem):
     assert together == pytest.approx([float(problem.log_posterior(t, np.array([8.0]))) for t in theta], rel=1e-12)
 
 
-def test_outside_the_prior_nothing_is_solved(problem):
+def test_log_posterior_outside_the_prior_is_minus_infinity(problem):
     assert problem.log_posterior(np.array([870.0, 37.0, 60.0]), np.array([8.0])) == -np.inf
 
 
-def test_value_does_not_depend_on_what_was_evaluated_before(problem):
+def test_log_posterior_does_not_depend_on_earlier_evaluations(problem):
     point, elsewhere = np.array([870.0, 37.0, 22.0]), np.array([300.0, 90.0, 45.0])
     before = problem.log_posterior(point, np.array([8.0]))
     problem.log_posterior(elsewhere, np.array([8.0]))
     assert problem.log_posterior(point, np.array([8.0])) == before
 
 
-def test_projection_removes_what_the_fold_did_not_keep():
+def test_residual_ignores_harmonics_that_the_fold_removed():
     tau = grid(200)
     clean = linear_regressors(0.05, 2.0, tau) @ TRUTH
     spectrum = np.fft.rfft(clean)
@@ -120,7 +120,7 @@ def test_prior_samples_have_the_names(problem):
         ({"priors": PRIORS | {"variance[force]": PRIORS["k"]}}, r"priors: 'variance.force.' .* belongs to the noise"),
     ],
 )
-def test_bad_problems_are_refused_by_name(experiment, changes, message):
+def test_error_names_the_bad_part_of_a_problem(experiment, changes, message):
     with pytest.raises(ValueError, match=message):
         bp.Problem(LINEAR, **({"experiments": [experiment], "priors": PRIORS} | changes))
 
@@ -137,7 +137,7 @@ def test_experiments_must_fit_the_model(experiment):
         bp.Problem(LINEAR, [replace(experiment, guess={"y": np.zeros(experiment.samples)})], priors=PRIORS)
 
 
-def test_a_recording_is_to_be_folded():
+def test_error_for_a_recording_asks_to_fold_it():
     recording = bp.Recording.from_arrays(np.arange(9.0), {"force": np.sin(np.arange(9.0))})
     with pytest.raises(ValueError, match=r"experiments: the recording 'recording' .*; give its mean period, see fold"):
         bp.Problem(LINEAR, [recording], priors=PRIORS)
@@ -197,7 +197,7 @@ def test_a_frozen_scipy_distribution_is_a_prior(experiment):
     assert repr(given.priors["k"]) == "scipy.stats.norm(800.0, 60.0)"
 
 
-def test_fingerprint_tells_priors_apart_and_nothing_else(experiment):
+def test_fingerprint_distinguishes_priors_but_not_their_order(experiment):
     def mark(**changes):
         priors = {("c", "k"): JOINT, "coulomb": stats.gamma(3.0, scale=10.0)} | changes.pop("priors", {})
         return fingerprint(bp.Problem(LINEAR, [experiment], priors=priors, **changes))
@@ -227,7 +227,7 @@ def test_fingerprint_tells_priors_apart_and_nothing_else(experiment):
         ({"k": stats.poisson(3), "c": PRIORS["c"]}, {}, r"priors\['k'\]: scipy.stats.poisson\(3\) .* it is discrete"),
     ],
 )
-def test_priors_that_do_not_fit_are_refused(experiment, priors, fixed, message):
+def test_error_names_the_prior_that_does_not_fit(experiment, priors, fixed, message):
     with pytest.raises(ValueError, match=message):
         bp.Problem(LINEAR, [experiment], priors={"coulomb": PRIORS["coulomb"]} | priors, fixed=fixed)
 
@@ -301,7 +301,7 @@ def test_every_prior_leads_to_the_mode_of_the_density(experiment, prior):
 
 
 @pytest.mark.parametrize("start", [1500.0, 850.0, 300.0])
-def test_a_convex_log_prior_does_not_stop_the_estimate(start):
+def test_estimate_converges_where_the_log_prior_is_convex(start):
     """Far from its centre a t prior curves more against the data than they curve; the way up is found all the same."""
     weak = linear_experiment(TRUTH, 100.0, seed=1)
     priors = {"k": bp.StudentT(500.0, 10.0, 3.0)}
@@ -314,7 +314,7 @@ def test_a_convex_log_prior_does_not_stop_the_estimate(start):
     assert fit.theta["k"] == pytest.approx(float(best[0]), abs=0.5)
 
 
-def test_start_outside_a_joint_block_is_named(experiment):
+def test_error_names_the_parameter_whose_start_is_outside_the_support(experiment):
     problem = bp.Problem(LINEAR, [experiment], priors={("c", "k"): JOINT, "coulomb": TRUNCATED})
     with pytest.raises(ValueError, match=r"start: coulomb = -1 is not allowed; .* support is \(0, inf\)"):
         bp.map_estimate(problem, start={"k": 800.0, "c": 30.0, "coulomb": -1.0})

@@ -133,7 +133,7 @@ def test_ridge_of_a_product():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The data do not change under")
-def test_ridge_with_a_far_second_branch_is_not_called_converged_without_it():
+def test_ridge_with_a_second_branch_is_converged_only_if_both_are_sampled():
     """Uncut priors leave 1.2 % of the mass with both signs negative: found, or not converged."""
     problem, fit = ridge({"a": bp.Normal(1.0, 1.0), "b": bp.Normal(1.0, 1.0)})
     posterior = bp.sample(problem, fit, max_steps=3000, **PAIR)

@@ -62,7 +62,7 @@ def test_log_posterior_has_no_steps(stated):
     assert np.abs(left).max() < share * np.ptp(density)
 
 
-def test_gradient_is_the_slope_of_the_log_posterior(stated):
+def test_gradient_equals_central_differences_of_the_log_posterior(stated):
     """Central differences over 1 % of theta16, at least 1e-3, from solves that start at the anchor at 2."""
     at, _, share = stated
     values = both_sides(12)

@@ -14,7 +14,7 @@ def problem(tied, priors=PRIORS, fixed=VARIANCE) -> bp.Problem:
     )
 
 
-def test_a_tied_parameter_follows_the_free_ones():
+def test_tied_parameter_gives_the_closed_form_posterior():
     """C = k/20 + coulomb turns the linear model into one with two regressors, whose posterior is closed."""
     fit = bp.map_estimate(problem({"c": "k/20 + coulomb"}), progress=False)
     x = linear_regressors(0.05, 2.0, grid(40))
@@ -30,7 +30,7 @@ def test_a_tied_parameter_follows_the_free_ones():
     assert derived["sd"].to_numpy() == pytest.approx(exact, rel=1e-8)
 
 
-def test_density_and_prediction_use_the_tie():
+def test_log_likelihood_uses_the_tied_value():
     tied, free = problem({"c": "0.05*k"}), problem({}, priors=PRIORS | {"c": bp.Normal(45.0, 1e3)})
     theta = {"k": np.array([850.0, 910.0]), "coulomb": np.array([20.0, 31.0])}
     expected = free.log_likelihood(theta | {"c": 0.05 * theta["k"]}, {})
@@ -66,6 +66,6 @@ def test_ties_are_part_of_the_fingerprint():
         ({}, {}, "'c' has neither a prior nor a value"),
     ],
 )
-def test_bad_ties_are_named(tied, fixed, message):
+def test_error_names_the_bad_tie(tied, fixed, message):
     with pytest.raises(ValueError, match=message):
         problem(tied, fixed=VARIANCE | fixed)

@@ -57,7 +57,7 @@ def open_page(browser, path):
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_it_opens_offline_without_a_message_and_shows_all_its_pictures(open_page, size):
+def test_report_opens_offline_without_messages_and_shows_all_pictures(open_page, size):
     page = open_page(size)
     pictures = page.locator("img").evaluate_all("all => all.map(i => [i.complete, i.naturalWidth, i.width])")
     assert len(pictures) >= 5 and all(
@@ -68,7 +68,7 @@ def test_it_opens_offline_without_a_message_and_shows_all_its_pictures(open_page
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_nothing_is_wider_than_the_screen(open_page, size):
+def test_report_fits_the_width_of_the_screen(open_page, size):
     page = open_page(size)
     width = SIZES[size][0]
     assert page.evaluate("document.documentElement.scrollWidth") <= width
@@ -89,14 +89,14 @@ def test_equations_are_typeset_by_the_browser(open_page):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", SIZES)
-def test_it_passes_the_accessibility_check(open_page, size, scheme):
+def test_report_passes_the_accessibility_check(open_page, size, scheme):
     """All rules of axe-core, contrast among them."""
     page = open_page(size, scheme)
     found = axe.Axe().run(page)
     assert found.violations_count == 0, found.generate_report()
 
 
-def test_dark_is_dark_and_the_keyboard_gets_everywhere(open_page):
+def test_dark_mode_is_dark_and_the_keyboard_reaches_everything(open_page):
     page = open_page(scheme="dark")
     assert page.locator("body").evaluate("b => getComputedStyle(b).backgroundColor") == "rgb(18, 22, 26)"
     page.keyboard.press("Tab")

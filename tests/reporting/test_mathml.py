@@ -51,7 +51,7 @@ def test_derivatives_are_dots_over_the_letter_alone():
     )
 
 
-def test_what_no_state_enters_stands_on_the_right():
+def test_terms_without_states_are_on_the_right_hand_side():
     assert shown(inputs.equations(bp.models.silverbox)[0]).endswith("=gdrive+u0")
     assert shown(inputs.equations(bp.models.van_der_pol)[0]) == "x¨−μωx˙(1−x2)+ω2x=0"
     assert shown(inputs.equations(bp.models.landing_gear())[0]).endswith("=force−θ11")

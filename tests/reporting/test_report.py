@@ -29,7 +29,7 @@ def test_estimates_are_those_of_fit_and_posterior(solved, page):
     assert [value(mean), value(spread)] == pytest.approx(list(summary.loc["variance[force]"][["mean", "sd"]]), rel=0.01)
 
 
-def test_data_residual_and_draws_are_told_in_numbers(solved, page):
+def test_numbers_of_data_residual_and_draws_are_shown(solved, page):
     problem, fit, posterior = solved
     (run,) = problem.experiments
     assert page.rows("table-experiments") == {"run": ["measured", "2", "–", "1", "1", "40", "1"]}
@@ -45,7 +45,7 @@ def test_data_residual_and_draws_are_told_in_numbers(solved, page):
         assert [float(tau), float(rhat)] == pytest.approx([posterior.tau[name], posterior.rhat[name]], rel=0.005)
 
 
-def test_verdicts_are_told_in_words(solved, scored, page):
+def test_verdicts_are_shown_in_words(solved, scored, page):
     problem, fit, posterior = solved
     found = bp.identifiability(problem, fit, posterior, profile=False)
     for name, cells in page.rows("table-identifiability").items():
@@ -66,7 +66,7 @@ def test_settings_seed_and_versions_are_kept(solved, page):
     assert versions["numpy"] == [np.__version__]
 
 
-def test_verdicts_that_are_given_are_not_computed_again(solved, scored, tmp_path, monkeypatch):
+def test_given_verdicts_are_not_recomputed(solved, scored, tmp_path, monkeypatch):
     problem, fit, posterior = solved
     found, predicted = bp.identifiability(problem, fit, profile=False), bp.predict(problem, posterior, draws=20)
     for name in ("compare", "identifiability", "predict"):
@@ -76,7 +76,7 @@ def test_verdicts_that_are_given_are_not_computed_again(solved, scored, tmp_path
     assert "Laplace against MCMC in sampling coordinates" in written.text
 
 
-def test_a_fit_alone_has_no_draws_and_says_so(solved, tmp_path):
+def test_report_of_a_fit_alone_states_that_there_are_no_draws(solved, tmp_path):
     problem, fit, _ = solved
     written = Page(bp.report(problem, fit, None, tmp_path / "r.html").read_text(encoding="utf-8"))
     assert len(written.rows("table-estimates")["k"]) == 5
@@ -84,7 +84,7 @@ def test_a_fit_alone_has_no_draws_and_says_so(solved, tmp_path):
     assert {e.attributes["id"] for e in written.all("figure")} == {"figure-fit-1", "figure-loops"}
 
 
-def test_a_prediction_that_fails_is_told(solved, scored, tmp_path, monkeypatch):
+def test_failed_prediction_is_reported(solved, scored, tmp_path, monkeypatch):
     def fail(*_):
         raise RuntimeError("posterior: none of its draws has a periodic solution.")
 
@@ -93,7 +93,7 @@ def test_a_prediction_that_fails_is_told(solved, scored, tmp_path, monkeypatch):
     assert written.text.count("none of its draws has a periodic solution") == 2
 
 
-def test_a_fit_that_cannot_be_trusted_is_said_to_be_so(solved, tmp_path):
+def test_fit_with_warnings_is_marked(solved, tmp_path):
     """Synthetic data, a search that stalled, an estimate at its end, a residual that is not white."""
     problem, fit, _ = solved
     problem = problem.with_experiments([replace(problem.experiments[0], synthetic=True)])
@@ -106,7 +106,7 @@ def test_a_fit_that_cannot_be_trusted_is_said_to_be_so(solved, tmp_path):
     assert "Robust 90 % interval" in text
 
 
-def test_single_points_are_told_as_such(solved, tmp_path):
+def test_single_points_are_labelled(solved, tmp_path):
     problem, _, _ = solved
     run = problem.experiments[0]
     masked = replace(run, mask=np.arange(40) % 4 == 1, independent={})
@@ -115,7 +115,7 @@ def test_single_points_are_told_as_such(solved, tmp_path):
     assert Page(written.read_text(encoding="utf-8")).rows("table-channels")["force"][1] == "output, at 10 points"
 
 
-def test_no_text_becomes_markup(hostile):
+def test_text_is_escaped(hostile):
     source = hostile.read_text(encoding="utf-8")
     page = Page(source)
     assert not page.all("script", "b", "iframe", "object", "link", "base")
@@ -128,7 +128,7 @@ def test_no_text_becomes_markup(hostile):
     assert "NOT CONVERGED" in page.text
 
 
-def test_nothing_is_fetched(written, hostile):
+def test_report_loads_no_external_resources(written, hostile):
     for path in (written, hostile):
         source = path.read_text(encoding="utf-8")
         page = Page(source)
@@ -146,7 +146,7 @@ def test_equations_are_typeset_and_symbols_match(page):
     assert page.rows("table-parameters")["coulomb"][:3] == ["coulomb", "N", "free"]
 
 
-def test_headings_are_in_order_and_links_lead_somewhere(page):
+def test_headings_are_in_order_and_links_have_targets(page):
     levels = [int(e.tag[1]) for e in page.all("h1", "h2", "h3", "h4")]
     assert levels[0] == 1 and levels.count(1) == 1
     assert all(after - before <= 1 for before, after in zip(levels, levels[1:], strict=False))
@@ -157,7 +157,7 @@ def test_headings_are_in_order_and_links_lead_somewhere(page):
     assert set(targets) <= set(ids)
 
 
-def test_who_cannot_see_is_told_what_there_is(solved, page):
+def test_every_picture_has_a_text_alternative(solved, page):
     (html,) = page.all("html")
     assert html.attributes["lang"] == "en"
     assert {e.tag for e in page.elements} >= {"title", "header", "nav", "main", "footer"}
@@ -169,7 +169,7 @@ def test_who_cannot_see_is_told_what_there_is(solved, page):
     assert all(len({cell.tag for cell in row[1:]} - {"th", "td"}) == 0 for rows in page.tables.values() for row in rows)
 
 
-def test_a_write_that_fails_leaves_the_old_page(solved, tmp_path, monkeypatch):
+def test_failed_write_keeps_the_old_page(solved, tmp_path, monkeypatch):
     problem, fit, _ = solved
     target = tmp_path / "report.html"
     target.write_text("old")
@@ -183,7 +183,7 @@ def test_a_write_that_fails_leaves_the_old_page(solved, tmp_path, monkeypatch):
     assert target.read_text() == "old" and os.listdir(tmp_path) == ["report.html"]
 
 
-def test_what_belongs_to_another_problem_is_refused(solved, tmp_path):
+def test_results_of_another_problem_are_rejected(solved, tmp_path):
     problem, fit, posterior = solved
     other = problem.with_experiments([linear_experiment(np.array([900.0, 40.0, 25.0]), 3.0, seed=2)])
     path = tmp_path / "report.html"

@@ -97,7 +97,7 @@ def die_at(monkeypatch: pytest.MonkeyPatch, write: int) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
-def test_killed_between_any_two_writes_of_a_save(problem, uninterrupted, tmp_path, monkeypatch):
+def test_run_killed_between_any_two_writes_of_a_save_resumes_identically(problem, uninterrupted, tmp_path, monkeypatch):
     """The second save is interrupted at each of its writes, until one save needs no more of them."""
     monkeypatch.setattr(checkpoint, "PATIENCE", 0.0)
     with monkeypatch.context() as patch:
@@ -133,7 +133,7 @@ def test_killed_between_any_two_writes_of_a_save(problem, uninterrupted, tmp_pat
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
-def test_killed_at_twenty_random_moments(problem, uninterrupted, tmp_path, monkeypatch):
+def test_run_killed_at_random_moments_resumes_identically(problem, uninterrupted, tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "PATIENCE", 0.0)
     started = time.monotonic()
     bp.sample(*problem, checkpoint=tmp_path / "timed.h5", **RUN)
@@ -150,7 +150,7 @@ def test_killed_at_twenty_random_moments(problem, uninterrupted, tmp_path, monke
         assert resumed.log_posterior_calls == uninterrupted[0].log_posterior_calls
 
 
-def test_interrupted_runs_give_what_they_have_and_can_go_on(problem, uninterrupted, tmp_path, monkeypatch):
+def test_interrupted_run_returns_its_draws_and_can_be_resumed(problem, uninterrupted, tmp_path, monkeypatch):
     """Ctrl-C in the third block: a partial result that says so, and the same chain in the end."""
     path, calls = tmp_path / "run.h5", 0
     original = bp.Problem.misfits
@@ -171,7 +171,7 @@ def test_interrupted_runs_give_what_they_have_and_can_go_on(problem, uninterrupt
     assert same(content(path), uninterrupted[1])
 
 
-def test_a_chain_may_be_continued_further(problem, uninterrupted, tmp_path):
+def test_chain_can_be_extended(problem, uninterrupted, tmp_path):
     path = tmp_path / "run.h5"
     bp.sample(*problem, checkpoint=path, **(RUN | {"max_steps": 100}))
     further = bp.sample(*problem, checkpoint=path, **RUN)
@@ -180,7 +180,7 @@ def test_a_chain_may_be_continued_further(problem, uninterrupted, tmp_path):
     assert again.reason == further.reason == uninterrupted[0].reason
 
 
-def test_a_file_that_is_damaged_locked_or_of_another_run_is_refused(problem, tmp_path):
+def test_checkpoint_that_is_damaged_locked_or_of_another_run_is_rejected(problem, tmp_path):
     path = tmp_path / "run.h5"
     bp.sample(*problem, checkpoint=path, **(RUN | {"max_steps": 50}))
     with pytest.raises(
@@ -195,6 +195,6 @@ def test_a_file_that_is_damaged_locked_or_of_another_run_is_refused(problem, tmp
         bp.sample(*problem, checkpoint=path, **RUN)
 
 
-def test_nothing_is_left_beside_the_file(problem, tmp_path):
+def test_no_temporary_files_remain_beside_the_checkpoint(problem, tmp_path):
     bp.sample(*problem, checkpoint=tmp_path / "run.h5", **(RUN | {"max_steps": 50}))
     assert [path.name for path in tmp_path.iterdir()] == ["run.h5"]

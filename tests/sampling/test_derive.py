@@ -60,7 +60,7 @@ def test_an_infinite_covariance_gives_no_finite_sd(fixed_c):
     assert table["sd"].tolist() == [np.inf, 0.0]
 
 
-def test_refused_for_the_estimate(fixed_c):
+def test_error_names_the_bad_expression_for_an_estimate(fixed_c):
     with pytest.raises(ValueError, match=r"expressions\['a'\]: names in 'kk/c': must be .*got 'kk'.*Did you mean 'k'"):
         fixed_c.derive({"a": "kk/c"})
     for name in ("k", "c"):
@@ -74,11 +74,11 @@ def test_refused_for_the_estimate(fixed_c):
         fixed_c.derive("k")
 
 
-def test_nothing_asked_nothing_given(solved):
+def test_no_expressions_give_an_empty_table(solved):
     assert solved[1].derive({}).empty and solved[2].derive({}).empty
 
 
-def test_posterior_gives_numpys_answer_on_the_draws(solved):
+def test_derived_posterior_statistics_equal_those_of_numpy(solved):
     posterior = solved[2]
     k, c, coulomb = (posterior.draws(name) for name in ("k", "c", "coulomb"))
     table = posterior.derive({"ratio": "c/(2*sqrt(k*1.5))", "product": "c*coulomb", "half": "1/2"})
@@ -115,7 +115,7 @@ def test_posterior_and_estimate_agree_where_both_are_normal(solved):
     assert drawn.loc["sum", "sd"] == pytest.approx(linear.loc["sum", "sd"], rel=0.1)
 
 
-def test_refused_for_the_posterior(solved):
+def test_error_names_the_bad_expression_for_a_posterior(solved):
     posterior = solved[2]
     with pytest.raises(ValueError, match="must be one of 'k', 'c', 'coulomb', 'pi', got 'm'.*Only sampled parameters"):
         posterior.derive({"a": "k/m"})
@@ -129,7 +129,7 @@ def test_refused_for_the_posterior(solved):
         posterior.derive({"a": f"log(k - {median})"})
 
 
-def test_results_read_back_derive_the_same(solved, tmp_path):
+def test_results_read_from_a_file_derive_the_same_table(solved, tmp_path):
     _, fit, posterior = solved
     for result in (fit, posterior):
         before = result.derive({"ratio": "c/k"})

@@ -70,13 +70,13 @@ def alike(one: bp.Posterior, other: bp.Posterior) -> bool:
 
 
 @pytest.mark.parametrize("cores", [1, 2, 4])
-def test_same_bits_with_any_number_of_threads(posed, serial, cores, monkeypatch):
+def test_chains_are_identical_for_any_number_of_threads(posed, serial, cores, monkeypatch):
     monkeypatch.setattr(sample, "available_cores", lambda: cores)
     monkeypatch.setattr(problem_module, "SMALLEST_SHARED", 1)
     assert alike(sampled(posed), serial[0])
 
 
-def test_pieces_leave_no_trace(posed, serial, monkeypatch):
+def test_chains_do_not_depend_on_the_block_length(posed, serial, monkeypatch):
     """In pieces of another length the same chain, and accepted proposals are those that moved a walker."""
     monkeypatch.setattr(ensemble, "PIECE", 7)
     assert alike(sampled(posed), serial[0])
@@ -87,7 +87,7 @@ def test_pieces_leave_no_trace(posed, serial, monkeypatch):
 
 
 @pytest.mark.parametrize("which", ["processes", "dask", "threads"])
-def test_same_bits_with_any_executor(posed, serial, which, request, tmp_path):
+def test_chains_are_identical_for_any_executor(posed, serial, which, request, tmp_path):
     """Chains, log-densities, accepted counts and random states, in the result and in the checkpoint."""
     path = tmp_path / "run.h5"
     with ThreadPoolExecutor(3) as threads:
@@ -96,15 +96,15 @@ def test_same_bits_with_any_executor(posed, serial, which, request, tmp_path):
     assert same(content(path), content(serial[1]))
 
 
-def test_same_bits_with_a_number_of_processes(posed, serial):
+def test_chains_are_identical_for_any_number_of_processes(posed, serial):
     assert alike(sampled(posed, executor=2), serial[0])
 
 
-def test_same_bits_with_variances_integrated_out(posed, processes):
+def test_chains_with_integrated_variances_are_identical_for_any_executor(posed, processes):
     assert alike(*(sampled(posed, executor=e, variances="collapsed", max_steps=50) for e in (None, processes)))
 
 
-def test_same_bits_from_the_prior_with_failing_solves(processes):
+def test_chains_from_the_prior_with_failing_solves_are_identical(processes):
     """A softening spring, which has no periodic solution for many draws of its prior."""
     priors = {"k": bp.Normal(1.0, 0.5), "k3": bp.Normal(0.0, 1.0)}
     problem = bp.Problem(bp.models.duffing, [duffing_run()], priors=priors, fixed={"m": 1.0, "c": DUFFING["c"]})
@@ -113,7 +113,7 @@ def test_same_bits_from_the_prior_with_failing_solves(processes):
     assert alike(one, other) and one.failures
 
 
-def test_a_run_goes_on_with_another_executor(posed, serial, processes, dask, tmp_path):
+def test_run_can_be_resumed_with_another_executor(posed, serial, processes, dask, tmp_path):
     path = tmp_path / "run.h5"
     for steps, executor in ((50, processes), (100, None), (150, dask)):
         last = sampled(posed, executor=executor, checkpoint=path, max_steps=steps)
@@ -139,7 +139,7 @@ def killed(pool: ProcessPoolExecutor) -> None:
         process.join()
 
 
-def test_dead_workers_leave_what_was_walked(posed, serial, tmp_path, monkeypatch):
+def test_draws_before_the_death_of_a_worker_are_kept(posed, serial, tmp_path, monkeypatch):
     """First so early that there is no result, then late enough for one, then to the end without workers."""
     path = tmp_path / "run.h5"
     for workers, steps in ((1, 0), (2, 75)):
@@ -158,7 +158,7 @@ def test_dead_workers_leave_what_was_walked(posed, serial, tmp_path, monkeypatch
     assert alike(sampled(posed, checkpoint=path), serial[0]) and same(content(path), content(serial[1]))
 
 
-def test_ctrl_c_leaves_what_was_walked(posed, serial, processes, tmp_path, monkeypatch):
+def test_draws_before_an_interrupt_are_kept(posed, serial, processes, tmp_path, monkeypatch):
     path = tmp_path / "run.h5"
     with monkeypatch.context() as patch:
         hooked(patch, 75, lambda: signal.raise_signal(signal.SIGINT))
@@ -167,7 +167,7 @@ def test_ctrl_c_leaves_what_was_walked(posed, serial, processes, tmp_path, monke
     assert alike(sampled(posed, executor=processes, checkpoint=path), serial[0])
 
 
-def test_dask_does_the_tasks_of_a_dead_worker_again(posed, serial, dask, monkeypatch):
+def test_dask_repeats_the_tasks_of_a_dead_worker(posed, serial, dask, monkeypatch):
     """Both workers die, one with the only copy of the problem; new ones take their place."""
 
     def kill() -> None:
@@ -188,7 +188,7 @@ def test_profiles_do_not_depend_on_the_executor(posed, which, request):
         assert np.array_equal(here.paths[name], there.paths[name])
 
 
-def test_bad_executors_are_refused(posed):
+def test_error_names_the_bad_executor(posed):
     for call in (bp.sample, bp.profile):
         arguments = {"seed": 1} if call is bp.sample else {}
         with pytest.raises(ValueError, match="executor: must be None, a number of processes .*got 0"):
@@ -298,7 +298,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(find_spec("mpi4py") is None or shutil.which("mpiexec") is None, reason="needs mpi4py and mpiexec")
-def test_same_bits_with_mpi(tmp_path):
+def test_chains_are_identical_with_mpi(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or str(Path.cwd()) for path in sys.path)}

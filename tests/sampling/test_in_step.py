@@ -25,7 +25,7 @@ def three_calls(evaluate, turns):
         return list(threads.map(ask, range(3)))
 
 
-def test_every_caller_gets_its_own_points_and_one_call_is_made_for_all():
+def test_concurrent_callers_share_one_density_call_and_get_their_own_values():
     sizes = []
 
     def counted(points):
@@ -43,7 +43,7 @@ def walk(ground, steps):
     return [float(ground.evaluate(np.full((1, 1), float(k)))[0][0, 0]) for k in range(steps)]
 
 
-def test_nobody_waits_for_an_ensemble_that_is_done():
+def test_finished_ensembles_do_not_block_the_others():
     pieces = {0: [5, 2], 1: [3], 2: [4, 4, 1]}
     left = {number: list(own) for number, own in pieces.items()}
 
@@ -57,7 +57,7 @@ def test_nobody_waits_for_an_ensemble_that_is_done():
     assert all(walked == [float(k) ** 2 for k in range(len(walked))] for _, walked in found)
 
 
-def test_an_error_of_the_density_comes_out_and_leaves_nobody_waiting():
+def test_exception_of_the_density_is_raised_and_releases_all_ensembles():
     def broken(points):
         raise ArithmeticError("no density here")
 
@@ -65,7 +65,7 @@ def test_an_error_of_the_density_comes_out_and_leaves_nobody_waiting():
         list(InStep(Ground(broken, None)).run(walk, [3, 3, 3], lambda *_: None))
 
 
-def test_an_error_of_one_walk_comes_out_and_leaves_nobody_waiting():
+def test_exception_of_one_ensemble_is_raised_and_releases_the_others():
     def stumbling(ground, steps):
         if steps == 2:
             raise ArithmeticError("stumbled")

@@ -27,7 +27,7 @@ def test_the_product_of_two_signed_numbers_has_a_mirrored_mode():
     assert np.sum(np.all(points < 0.0, axis=1) & (product > 0.0)) >= 2
 
 
-def test_modes_that_are_not_apart_or_not_credible_are_none():
+def test_modes_that_are_close_or_improbable_are_not_reported():
     """A number measured near zero has one mode on both sides of it; one that is 1 ± 0.1 has no mode at -1."""
     for value in (0.05, 1.0):
         problem = bp.Problem(
@@ -38,7 +38,7 @@ def test_modes_that_are_not_apart_or_not_credible_are_none():
         assert mirrored_modes(density, *density.laplace(bp.map_estimate(problem, **QUIET))) == []
 
 
-def test_positive_parameters_have_no_signs_to_turn():
+def test_positive_parameters_have_no_mirrored_modes():
     cut = bp.TruncatedNormal(1.0, 1.0, 0.0, np.inf)
     problem = bp.Problem(
         model("number", ["a"], lambda p: {"force": p.a}), [run(force=1.0)], priors={"a": cut}, fixed=known(force=0.1)
@@ -47,7 +47,7 @@ def test_positive_parameters_have_no_signs_to_turn():
     assert mirrored_modes(density, *density.laplace(bp.map_estimate(problem, **QUIET))) == []
 
 
-def test_one_walker_that_stays_apart_is_no_convergence():
+def test_one_separate_walker_prevents_convergence():
     """One of 128 independent walkers that is an sd off is hardly seen in any quantile, but stays apart."""
     kept = np.random.default_rng(1).standard_normal((4, 2000, 32, 2))
     tau = np.ones(2)
@@ -56,7 +56,7 @@ def test_one_walker_that_stays_apart_is_no_convergence():
     assert [text[:22] for text in shortfall(kept, tau, tau, ("a", "b"))] == ["walkers that stay apar"]
 
 
-def test_a_coordinate_that_does_not_move_is_named():
+def test_error_names_the_coordinate_that_does_not_move():
     kept = np.zeros((4, 2000, 32, 2))
     still = shortfall(kept, np.array([1.0, np.inf]), np.ones(2), ("a", "b"))
     assert still == ["'b' not moving, as every proposal is refused"]

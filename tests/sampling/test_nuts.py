@@ -69,7 +69,7 @@ def sd_and_error(values: np.ndarray) -> tuple[float, float]:
 @pytest.mark.filterwarnings("ignore:A smooth sign")
 @pytest.mark.parametrize("coordinates", ["ridge", "natural"])
 @pytest.mark.parametrize("case", CASES)
-def test_gradient_is_that_of_the_sampling_density(case, coordinates):
+def test_gradient_equals_differences_of_the_sampling_density(case, coordinates):
     problem, theta = CASES[case]()
     noise = problem.likelihood.guess()
     noise[[name.startswith("variance") for name in problem.noise_names]] = 0.01
@@ -87,7 +87,7 @@ def test_gradient_is_that_of_the_sampling_density(case, coordinates):
     assert (gradient - numerical) / scale == pytest.approx(np.zeros_like(gradient), abs=1e-7)
 
 
-def test_where_nothing_is_finite_value_and_gradient_say_so(edge):
+def test_value_and_gradient_outside_the_support_are_minus_infinity_and_zero(edge):
     problem, fit = edge
     density = SamplingDensity(problem.anchored(problem.vector(fit.theta)))
     assert density.value_and_gradient(np.log([1.5]))[0] == -np.inf
@@ -142,7 +142,7 @@ def test_nuts_and_emcee_agree_on_the_damper():
 
 
 @needs_nutpie
-def test_same_seed_same_draws_and_another_seed_other_draws(linear, briefly):
+def test_same_seed_gives_identical_draws_and_another_seed_others(linear, briefly):
     first, again, other = (bp.sample(*linear, seed=s, **briefly) for s in (5, 5, 6))
     for name in first.names:
         assert np.array_equal(first.draws(name), again.draws(name))
@@ -152,7 +152,7 @@ def test_same_seed_same_draws_and_another_seed_other_draws(linear, briefly):
 
 
 @needs_nutpie
-def test_too_few_draws_are_not_converged_and_what_nuts_knows_is_kept(linear, briefly, tmp_path):
+def test_too_few_draws_are_not_converged_and_nuts_statistics_are_kept(linear, briefly, tmp_path):
     problem, fit = linear
     posterior = bp.sample(problem, fit, seed=1, start="overdispersed", **briefly)
     assert not posterior.converged
@@ -174,7 +174,7 @@ def test_too_few_draws_are_not_converged_and_what_nuts_knows_is_kept(linear, bri
     assert float(group["lp"][-1, -1]) == pytest.approx(log_density, abs=1e-8)
 
 
-def test_walker_alone_must_be_as_long_as_its_ensemble_of_independent_ones():
+def test_single_nuts_chain_needs_as_many_draws_as_an_ensemble():
     draws = np.random.default_rng(3).standard_normal((4, 400, 8, 1))
     nearly = convergence.shortfall(draws[:, :, :1], np.ones(1), np.ones(1), ("k",))
     assert nearly[0] == "length only 400 tau"
@@ -195,7 +195,7 @@ def test_failed_solves_and_trajectories_that_end_in_them_are_counted(edge, brief
 
 
 @needs_nutpie
-def test_interrupted_run_gives_what_is_there(linear, briefly, monkeypatch):
+def test_interrupted_run_returns_its_draws(linear, briefly, monkeypatch):
     monkeypatch.setattr(nuts, "shortfall", interrupting_at(250))
     posterior = bp.sample(*linear, seed=1, **(briefly | {"max_steps": 5000}))
     assert not posterior.converged
@@ -213,7 +213,7 @@ def interrupting_at(draws: int) -> Callable[..., list[str]]:
 
 
 @needs_nutpie
-def test_error_in_the_density_ends_all_chains(linear, monkeypatch):
+def test_exception_in_the_density_stops_all_chains(linear, monkeypatch):
     def broken(self: SamplingDensity, point: np.ndarray) -> tuple[float, np.ndarray]:
         raise ZeroDivisionError("in a thread")
 
@@ -234,12 +234,12 @@ def test_error_in_the_density_ends_all_chains(linear, monkeypatch):
         ({"max_steps": 10}, "max_steps: must be .*got 10"),
     ],
 )
-def test_what_nuts_does_not_take_is_named(linear, arguments, message):
+def test_error_names_the_option_that_nuts_does_not_support(linear, arguments, message):
     with pytest.raises(ValueError, match=message):
         bp.sample(*linear, **({"seed": 1} | NUTS | arguments))
 
 
-def test_without_nutpie_the_extra_is_named(linear, monkeypatch):
+def test_error_without_nutpie_names_the_extra_to_install(linear, monkeypatch):
     monkeypatch.setitem(sys.modules, "nutpie", None)
     with pytest.raises(ImportError, match=r'sampler: \'nuts\' needs .* pip install "bayesperiodic\[nuts\]"'):
         bp.sample(*linear, seed=1, **NUTS)

@@ -285,7 +285,7 @@ def test_a_channel_may_be_called_time():
     assert data["observed_data"]["a time"].dims == ("a time [s]",)
 
 
-def test_draws_of_several_experiments_survive_the_file_and_pass_into_arviz(tmp_path):
+def test_draws_of_several_experiments_are_read_back_and_accepted_by_arviz(tmp_path):
     posterior, _ = drawn(two_channels(bp.noise.Circulant(per="experiment"), {"c": {SECOND: 2.5}}), steps=50)
     posterior.save(tmp_path / "posterior.nc")
     read = bp.load(tmp_path / "posterior.nc")
@@ -300,7 +300,7 @@ def test_draws_of_several_experiments_survive_the_file_and_pass_into_arviz(tmp_p
     assert {*posterior.names, f"c[{SECOND}]"} <= {*table.index}
 
 
-def test_expressions_mean_the_local_parameters_of_one_experiment(local):
+def test_expressions_use_the_local_parameters_of_one_experiment(local):
     problem, fit, posterior = local
     for name in (FIRST, SECOND):
         table = posterior.derive({"ratio": "coulomb/c", "k_again": "k"}, experiment=name)
@@ -364,7 +364,7 @@ def test_a_posterior_becomes_the_prior_of_the_next_experiment(local):
     )
 
 
-def test_what_cannot_be_a_prior_is_told(solved, local):
+def test_error_names_what_cannot_become_a_prior(solved, local):
     _, fit, posterior = solved
     for result in (fit, posterior):
         for names in ("k", ["k", "c"], ()):
@@ -393,7 +393,7 @@ def test_local_parameters_are_compared_one_by_one(local):
     assert set(table["verdict"]) == {"fine"}
 
 
-def test_failed_solves_are_told_by_cause():
+def test_failed_solves_are_counted_by_cause():
     """A prior beyond whose bound no orbit exists: proposals there fail, and the account says so."""
     run = bp.Experiment(
         "run", 1.0, {"x": 0.3 + 0.2 * np.random.default_rng(1).standard_normal(12)}, {"u": np.zeros(12)}, samples=12

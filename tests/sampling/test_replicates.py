@@ -16,7 +16,7 @@ PRIORS = {"k": bp.Normal(900.0, 60.0), "c": bp.Normal(40.0, 20.0), "coulomb": bp
 
 
 @pytest.mark.parametrize("case", [name for name in CASES if name != "autonomous"])
-def test_residual_of_a_replicate_is_the_noise_that_was_put_in(case):
+def test_residual_of_a_replicate_equals_its_simulated_noise(case):
     """Measured again with that noise, an experiment has its components as residuals, within the harmonics kept."""
     problem, theta = CASES[case]()
     values = problem.likelihood.complete(np.full((1, len(problem.free_noise)), 1e-4))
@@ -67,7 +67,7 @@ def test_replicates_scatter_about_the_draws_own_curves_by_their_own_variances():
     assert np.all(posterior.data["sample_stats"]["status"] == 0)
 
 
-def test_multipliers_are_reported_and_reject_nothing():
+def test_predictive_multipliers_are_reported_without_rejecting_draws():
     """The pendulum's rotation is unstable at every draw, and its multiplier is the solver's."""
     problem = pendulum_problem([pendulum_run()])
     posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=250, progress=False)

@@ -104,7 +104,7 @@ def posterior_point(posterior: bp.Posterior, problem: bp.Problem, index: int) ->
 
 
 @pytest.mark.parametrize("start", ["prior", "overdispersed"])
-def test_other_starts_lead_to_the_same_posterior(known_variance, posterior, start):
+def test_posterior_does_not_depend_on_the_start(known_variance, posterior, start):
     """Means within 4 Monte Carlo errors of both runs."""
     other = bp.sample(*known_variance, seed=3, start=start, **PAIR)
     assert other.converged
@@ -125,13 +125,13 @@ def test_positive_parameter_sampled_in_its_logarithm_keeps_its_natural_density()
     assert logarithm.std() == pytest.approx(1.0, abs=error)
 
 
-def test_same_seed_same_bits_and_another_seed_other_draws(known_variance):
+def test_same_seed_gives_identical_draws_and_another_seed_others(known_variance):
     first, again, other = (bp.sample(*known_variance, seed=s, max_steps=250, **PAIR) for s in (5, 5, 6))
     assert np.array_equal(first.draws("k"), again.draws("k"))
     assert not np.array_equal(first.draws("k"), other.draws("k"))
 
 
-def test_bits_do_not_depend_on_the_number_of_cores(known_variance, monkeypatch):
+def test_draws_do_not_depend_on_the_number_of_cores(known_variance, monkeypatch):
     two = bp.sample(*known_variance, seed=5, max_steps=250, **PAIR)
     monkeypatch.setattr(sample, "available_cores", lambda: 1)
     assert np.array_equal(two.draws("k"), bp.sample(*known_variance, seed=5, max_steps=250, **PAIR).draws("k"))
@@ -179,7 +179,7 @@ def test_draws_pass_into_arviz_and_carry_units(posterior):
     assert float(convergence.arviz().ess(group[["k"]])["k"]) > 500
 
 
-def test_rhat_sees_ensembles_that_disagree():
+def test_rhat_exceeds_one_if_ensembles_disagree():
     generator = np.random.default_rng(4)
     agreeing = generator.standard_normal((4, 100, 8, 1))
     assert convergence.rhat(agreeing)[0] < 1.01
@@ -208,12 +208,12 @@ def test_summary_names_its_interval(posterior):
         ({"variances": "collapsed"}, "variances: 'collapsed' is not allowed; there is no unknown variance"),
     ],
 )
-def test_bad_arguments_are_named(known_variance, arguments, message):
+def test_error_names_the_bad_argument(known_variance, arguments, message):
     with pytest.raises(ValueError, match=message):
         bp.sample(*known_variance, **({"seed": 1, "progress": False} | arguments))
 
 
-def test_start_where_nothing_is_finite_fails_loudly(known_variance):
+def test_start_without_finite_log_posterior_raises(known_variance):
     problem, fit = known_variance
     other = bp.Problem(
         LINEAR, problem.experiments, priors=PRIORS | {"k": bp.Uniform(0.0, 1.0)}, fixed={"variance[force]": 9.0}
@@ -222,7 +222,7 @@ def test_start_where_nothing_is_finite_fails_loudly(known_variance):
         bp.sample(other, fit, seed=1, **PAIR)
 
 
-def test_an_estimate_of_another_problem_is_refused(known_variance):
+def test_estimate_of_another_problem_is_rejected(known_variance):
     problem, fit = known_variance
     others = [replace(e, name="other") for e in problem.experiments]
     other = bp.Problem(LINEAR, others, priors=PRIORS, fixed={"variance[force]": 9.0})
@@ -232,7 +232,7 @@ def test_an_estimate_of_another_problem_is_refused(known_variance):
         bp.sample(problem, replace(fit, theta={n: v for n, v in fit.theta.items() if n != "k"}), seed=1, **PAIR)
 
 
-def test_without_a_laplace_approximation_the_next_step_is_told(known_variance):
+def test_error_without_a_laplace_approximation_names_the_alternative(known_variance):
     problem, fit = known_variance
     for known, step in (
         ({"undetermined": ("k → k·t, c → c·t",)}, r"fix what the data do not determine \(k → k·t, c → c·t\)"),

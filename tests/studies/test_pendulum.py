@@ -89,7 +89,7 @@ def test_a_measured_recording_is_read_and_not_called_synthetic(tmp_path):
     assert not pendulum_recording.section_of(read).synthetic
 
 
-def test_bad_arguments_are_named(tmp_path, capsys):
+def test_error_names_the_bad_argument(tmp_path, capsys):
     assert main(["pendulum", "--noise", "2", "--out", str(tmp_path)]) == 1
     assert "--noise 2.0 is not allowed" in capsys.readouterr().err
     assert main(["pendulum", "--data", str(tmp_path / "none.csv"), "--out", str(tmp_path)]) == 1

@@ -128,7 +128,7 @@ def test_every_transformation_leaves_the_symbolic_equations_and_outputs_unchange
 
 
 @pytest.mark.parametrize("name", LIBRARY)
-def test_the_rank_leaves_no_room_for_further_symmetries(name, found):
+def test_rank_and_number_of_symmetries_add_up_to_the_number_of_parameters(name, found):
     _, _, structure = found(name)
     _, _, appearing, symmetries = LIBRARY[name]
     assert (structure.table.verdict != "does not appear").sum() == appearing
@@ -170,7 +170,7 @@ def test_sensitivities_of_periodic_solutions_have_the_same_rank(name, found):
     assert np.count_nonzero(size > 1e-9 * size[0]) == structure.rank
 
 
-def test_of_the_pendulum_only_three_ratios_are_determined_and_the_arm_by_the_drive():
+def test_pendulum_determines_three_friction_ratios_and_the_arm_length_through_the_drive():
     structure = bp.structure(bp.models.pendulum, fixed=["a", "g", "v0"])
     assert structure.combinations == ("k1/(m*l**2)", "k2/(m*l**2)", "k3/(m*l**2)")
     assert dict(structure.table.verdict) == {"l": "determined"} | dict.fromkeys(
@@ -184,7 +184,7 @@ def test_of_the_pendulum_only_three_ratios_are_determined_and_the_arm_by_the_dri
     assert "Fix one of m, k1, k2, k3; fixing l does not help" in said
 
 
-def test_with_nothing_known_about_the_pendulum_lengths_are_only_relative(found):
+def test_pendulum_without_fixed_parameters_determines_only_length_ratios(found):
     _, _, structure = found("pendulum")
     assert set(structure.combinations) == {"k1/(m*l**2)", "k2/(m*l**2)", "k3/(m*l**2)", "a/l", "g/l"}
     assert structure.table.partners["l"] == "a, g"
@@ -198,7 +198,7 @@ def test_fixing_one_of_the_scaled_parameters_determines_all_others(known):
     assert structure.rank == 4
 
 
-def test_fixing_the_arm_leaves_the_scaling():
+def test_fixing_the_arm_length_does_not_remove_the_scaling_symmetry():
     assert len(bp.structure(bp.models.pendulum, fixed=["a", "g", "v0", "l"]).symmetries) == 1
 
 
@@ -237,12 +237,12 @@ def test_the_shift_is_exact_only_with_the_conduction(found):
         ),
     ],
 )
-def test_with_one_channel_of_the_landing_gear_more_is_lost(name, groups, found):
+def test_landing_gear_with_one_output_has_a_third_symmetry(name, groups, found):
     _, _, structure = found(name)
     assert [set(symmetry.parameters) for symmetry in structure.symmetries] == groups
 
 
-def test_what_is_not_measured_does_not_appear(found):
+def test_parameters_of_unmeasured_outputs_do_not_appear(found):
     _, _, by_force = found("force, pressure")
     _, _, by_displacement = found("displacement, pressure")
     assert list(by_force.table.index[by_force.table.verdict == "does not appear"]) == ["theta12"]
@@ -263,7 +263,7 @@ def test_transformed_parameters_give_the_same_periodic_outputs(which, amount, fo
         np.testing.assert_allclose(after.outputs[name], before.outputs[name], rtol=1e-8)
 
 
-def test_an_offset_of_the_silverbox_is_a_change_of_its_stiffness_and_the_other_offset(found):
+def test_output_offset_of_the_silverbox_is_equivalent_to_changed_stiffness_and_input_offset(found):
     _, _, structure = found("offset_silverbox")
     scaling, shift = structure.symmetries
     assert set(scaling.parameters) == {"w0", "c", "k1", "k2", "k3", "g", "u0"}
@@ -278,7 +278,7 @@ def test_an_offset_of_the_silverbox_is_a_change_of_its_stiffness_and_the_other_o
 
 
 @pytest.mark.parametrize("name", [name for name, (*_, symmetries) in LIBRARY.items() if symmetries])
-def test_combinations_are_as_many_as_needed_independent_and_unmoved(name, found):
+def test_combinations_are_complete_independent_and_invariant(name, found):
     _, _, structure = found(name)
     moved = [n for n in structure.table.index if structure.table.fix[n]]
     assert len(structure.combinations) == len(moved) - len(structure.symmetries)
@@ -356,7 +356,7 @@ def test_without_its_mass_an_oscillator_is_of_first_order():
     assert structure.complete
 
 
-def test_without_heat_capacity_the_temperature_follows_at_once():
+def test_without_heat_capacity_the_scaling_and_the_shift_remain():
     """What then ties theta15 to the other parameters is gone; the scaling of T and the shift stay."""
     structure = bp.structure(bp.models.landing_gear("displacement"), fixed={"theta15": 0.0})
     assert structure.complete
@@ -378,7 +378,7 @@ def test_the_feedthrough_of_an_input_moves_into_the_state():
     assert unchanged(model, ["y"], structure.symmetries[0])
 
 
-def test_corners_hide_nothing():
+def test_symmetries_of_equations_with_corners_are_found():
     """The place of a gap and an output offset are only in combination; the offset alone would move the corner."""
     model = small(
         ["x"],
@@ -392,7 +392,7 @@ def test_corners_hide_nothing():
     assert set(bp.structure(model, fixed=["y0"]).table.verdict) == {"determined"}
 
 
-def test_the_place_of_a_jump_is_not_called_undetermined():
+def test_position_of_a_jump_is_not_reported_as_undetermined():
     """Derivatives do not see it, so that the rank is withheld."""
     step = lambda s, p: sp.Piecewise((1, s.x > p.place), (0, True))  # noqa: E731
     model = small(
@@ -418,7 +418,7 @@ def test_a_parameter_that_a_hidden_state_absorbs_is_not_determined():
     assert dict(bp.structure(model).table.verdict) == {"a": "determined", "b": "not determined"}
 
 
-def test_what_the_symmetries_miss_the_rank_finds():
+def test_rank_detects_what_the_symmetries_miss():
     """Y = z/(1 + b z) has y' = a u for every b; the change of z that absorbs b is a Möbius map, not an affine one."""
     model = small(
         ["z"],
@@ -432,7 +432,7 @@ def test_what_the_symmetries_miss_the_rank_finds():
     assert not structure.complete
 
 
-def test_absent_parameters_and_states_that_no_output_depends_on_are_told():
+def test_absent_parameters_and_unobserved_states_are_reported():
     model = small(
         ["x", "z"],
         ["a", "b", "k"],
@@ -451,7 +451,7 @@ def test_outputs_of_inputs_alone_need_no_state():
     assert structure.table.verdict["k"] == "does not appear"
 
 
-def test_a_symmetry_may_not_use_names_that_the_model_has():
+def test_amount_of_a_symmetry_avoids_the_names_of_the_model():
     model = small(["x"], ["t", "scale"], lambda s, p, u: [s.dx + p.t * p.scale * s.x - u.u], lambda s, p, u: {"y": s.x})
     (symmetry,) = bp.structure(model).symmetries
     assert symmetry.amount == "scale_factor"
@@ -467,7 +467,7 @@ def test_a_symmetry_may_not_use_names_that_the_model_has():
         ({"c": "c + delta"}, False),
     ],
 )
-def test_a_transformation_that_changes_an_equation_or_an_output_is_refused(images, confirmed):
+def test_transformation_that_changes_an_equation_or_an_output_is_rejected(images, confirmed):
     model = small(
         ["x"], ["a", "b", "c"], lambda s, p, u: [s.dx + (p.a + p.b) * s.x - u.u], lambda s, p, u: {"y": s.x + p.c}
     )
@@ -493,7 +493,7 @@ def test_a_structure_saves_and_loads(tmp_path, found):
     assert loaded.symmetries == structure.symmetries
 
 
-def test_bad_arguments_are_named():
+def test_error_names_the_bad_argument():
     with pytest.raises(ValueError, match="outputs: must be .*got 'angel'.*'angle'"):
         bp.structure(bp.models.pendulum, outputs=["angel"])
     with pytest.raises(ValueError, match="outputs: \\(\\) is not allowed"):

@@ -34,7 +34,7 @@ def test_identities_are_recognised(zero):
 
 
 @pytest.mark.parametrize("other", [sp.tanh(x) - sp.tanh(2 * x), sp.sqrt(x) - sp.sqrt(a), sp.sign(x) - 1])
-def test_what_is_not_zero_is_not_called_so(other):
+def test_nonzero_expressions_are_not_identified_as_zero(other):
     assert not Algebra([other], [x, y]).is_zero(other)
 
 
@@ -62,7 +62,7 @@ def test_power_series_are_taylor_series(expression):
     np.testing.assert_allclose(series(expression, coefficients)[:, 0].real, wanted, rtol=1e-12, atol=1e-13)
 
 
-def test_power_series_carry_complex_steps():
+def test_power_series_propagate_complex_steps():
     values = {x: np.array([[0.4 + 1e-30j], [1.0]]), y: np.array([[2.0 + 0j], [0.0]])}
     found = series(sp.sin(x * y), values)[:, 0].imag / 1e-30
     np.testing.assert_allclose(found, [2 * np.cos(0.8), -4 * np.sin(0.8)], rtol=1e-14)
@@ -113,7 +113,7 @@ def test_circuits_of_a_plane_are_the_vectors_with_a_zero():
         (a * (b - 1) * (x - 1), "a*(1 - x)*(1 - b)"),
     ],
 )
-def test_text_is_in_the_order_of_the_names_and_read_back_as_the_same(expression, text):
+def test_expression_text_follows_the_order_of_the_names_and_parses_to_the_same_value(expression, text):
     names = {x: "x", y: "y", a: "a", b: "b"}
     assert written(expression, names) == text
     values = {"x": 0.3, "y": 0.8, "a": 1.7, "b": 0.4}
