@@ -1,7 +1,7 @@
 import numpy as np
+import pytest
 
-from bayesperiodic.orbits.cycles import eigenvalues, has_shorter_period, newton_step, shift_between
-from bayesperiodic.orbits.return_map import ReturnMap
+from bayesperiodic.orbits.return_map import Atlas, ReturnMap
 
 OPEN = np.array([np.inf, np.inf])
 
@@ -33,8 +33,8 @@ def test_a_quadratic_map_is_recovered_exactly():
 
 
 def test_noise_in_the_arguments_does_not_attenuate_slopes():
-    # Points in a strip, like the leaves of an attractor; the strip's sd is 2.5 of the noise's, which takes 14 % from
-    # ordinary slopes across it. False alarms: below 1e-3 for the four slopes (four standard errors).
+    # Points in a strip of 2.5 times the sd of the noise, like the leaves of an attractor: ordinary slopes across it are
+    # 14 % too small. False-alarm rate below 1e-3 for the four slopes (four standard errors).
     centre, errors, plain = np.array([[0.0, 0.2]]), [], []
     for seed in range(150):
         noisy = maps(2000, 0.02, seed, width=0.05)
@@ -45,7 +45,7 @@ def test_noise_in_the_arguments_does_not_attenuate_slopes():
     assert np.mean(plain, axis=0)[0, 0] < -0.1
 
 
-def test_influences_give_the_standard_deviation():
+def test_influences_give_the_variance_of_replicates():
     # The mean stated variance is that of 300 replicates within 25 %, three standard errors of a variance.
     centre = np.array([[0.1, 0.2]])
     fits = [maps(1500, 0.02, seed).fit(centre, 150, 2) for seed in range(300)]
@@ -54,7 +54,7 @@ def test_influences_give_the_standard_deviation():
     np.testing.assert_allclose(stated, actual, rtol=0.25)
 
 
-def test_angles_wrap():
+def test_increments_modulo_a_turn_give_the_same_map():
     generator = np.random.default_rng(3)
     angle = generator.uniform(0.0, 1.0, 800)
     other = generator.uniform(-1.0, 1.0, 800)
@@ -72,23 +72,24 @@ def test_angles_wrap():
     np.testing.assert_allclose((alone.value - known.value) % 1.0 % 1.0, [[0.0, 0.0]], atol=1e-12)
 
 
-def test_newton_closes_a_linear_chain_in_one_step():
-    generator = np.random.default_rng(0)
-    jacobian = generator.standard_normal((1, 3, 2, 2))
-    points = generator.standard_normal((3, 2))
-    offsets = np.roll(points, -1, axis=0) - np.einsum("pij,pj->pi", jacobian[0], points)
-    guess = points + 0.3
-    defect = np.einsum("pij,pj->pi", jacobian[0], guess) + offsets - np.roll(guess, -1, axis=0)
-    np.testing.assert_allclose(guess + newton_step(defect[None], jacobian)[0], points, atol=1e-12)
+@pytest.fixture(scope="module")
+def atlas():
+    return Atlas(maps(4000, 0.0, 1), 72)
 
 
-def test_small_eigenvalues_keep_their_digits():
-    chain = np.array([[[3e4, 1.0], [0.0, 1e-7]], [[2.0, 0.5], [0.0, 3e-5]]])
-    np.testing.assert_allclose(eigenvalues(chain), [6e4, 3e-12], rtol=1e-12)
+def test_an_atlas_reproduces_a_quadratic_map_between_the_centres(atlas):
+    points = np.random.default_rng(2).uniform(-0.8, 0.8, (200, 2))
+    found, jacobian, bandwidth = atlas.at(points)
+    assert found == pytest.approx(quadratic(points), abs=1e-9)
+    assert jacobian == pytest.approx(np.array([slopes(x, y) for x, y in points]), abs=1e-7)
+    assert np.isfinite(bandwidth).all()
 
 
-def test_shifts_and_divisors_of_a_cycle():
-    cycle = np.array([[0.0, 1.0], [0.3, -1.0], [0.7, 0.2]])
-    assert shift_between(np.roll(cycle, -2, axis=0), cycle, lambda d: d) == (0.0, 2)
-    assert has_shorter_period(np.tile(cycle, (2, 1)), lambda d: d, 1e-9)
-    assert not has_shorter_period(cycle, lambda d: d, 1e-9)
+def test_fits_about_the_points_agree_with_the_atlas(atlas):
+    points = np.random.default_rng(3).uniform(-0.8, 0.8, (50, 2))
+    for one, other in zip(atlas.at(points)[:2], atlas.exactly(points)[:2], strict=True):
+        assert one == pytest.approx(other, abs=1e-7)
+
+
+def test_an_atlas_is_undefined_far_from_the_data(atlas):
+    assert np.isinf(atlas.at(np.array([[3.0, 3.0]]))[2]).all()
