@@ -5,7 +5,7 @@ each of the 14 experiments with its own matrix, restored between passes and not 
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -24,6 +24,7 @@ COPIED = 64 * 2**20
 EMCEE_STEPS = 200
 SWEEP, FACTOR, SOLVE = "sweep", "dgbtrf", "dgbtrs"
 ALL_FREE = "gradient, 15 parameters"
+FOLDED_ROWS = ("near", "call", "batched", "gradient")
 STAGES = ("priors", "periodic solves, sums of squares", "likelihood", "the rest of the call")
 
 
@@ -82,28 +83,51 @@ def measure(setting: Setting, repeats: int) -> dict[str, Any]:
     return {"schemes": found, "bandwidth_gb_per_s": bandwidth(repeats), "emcee_us": emcee_overhead(setting, repeats)}
 
 
-def _of_scheme(setting: Setting, scheme: str, repeats: int) -> dict[str, Any]:
-    warm, noise, theta = setting.schemed(scheme), setting.noise, setting.theta
-    floor, half = Floor(warm, setting.estimate), len(theta) // 2
-    all_free, at = with_all_free(setting, scheme)
-    many = np.resize(theta[:half], (WALKERS, theta.shape[1]))
-    stages = _stages(setting, warm, theta[:half])
-    actions = {
-        SWEEP: Action(floor.sweep), FACTOR: Action(floor.factor), SOLVE: Action(floor.solve),
-        "near": Action(partial(_walk, warm, theta[:half], noise), half),
-        "far": Action(partial(_walk, warm, theta[half:], noise), len(theta) - half),
-        "call": Action(partial(_calls, warm, theta[:half], noise), half),
+def measure_folded(setting: Setting, repeats: int) -> dict[str, Any]:
+    """Return floor and ratios with folded recordings, by scheme."""
+    return {"schemes": {scheme: _of_folded(setting, scheme, repeats) for scheme in SCHEMES}}
+
+
+def _of_folded(setting: Setting, scheme: str, repeats: int) -> dict[str, Any]:
+    warm, noise, theta = setting.schemed(scheme), setting.noise, setting.theta[: len(setting.theta) // 2]
+    times = interleaved(_floor_actions(Floor(warm, setting.estimate)) | _call_actions(warm, theta, noise), repeats)
+    return _ratios(times, FOLDED_ROWS)
+
+
+def _floor_actions(floor: Floor) -> dict[str, Action]:
+    return {SWEEP: Action(floor.sweep), FACTOR: Action(floor.factor), SOLVE: Action(floor.solve)}
+
+
+def _call_actions(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> dict[str, Action]:
+    many = np.resize(theta, (WALKERS, theta.shape[1]))
+    return {
+        "near": Action(partial(_walk, warm, theta, noise), len(theta)),
+        "call": Action(partial(_calls, warm, theta, noise), len(theta)),
         "batched": Action(partial(warm.log_posterior, many, noise), WALKERS),
         "gradient": Action(partial(_gradient, warm, theta[0], noise)),
-        ALL_FREE: Action(partial(_gradient, all_free, at, noise)),
-    } | {f"stage {name}": Action(run, half) for name, run in stages.items()}  # fmt: skip
-    times = interleaved(actions, repeats)
+    }
+
+
+def _ratios(times: Mapping[str, np.ndarray], names: Sequence[str]) -> dict[str, Any]:
     under = times[SWEEP] + times[FACTOR] + times[SOLVE]
-    names = ("near", "far", "call", "batched", "gradient", ALL_FREE)
     return {
         "floor_us": {name: spread(1e6 * times[name]) for name in (SWEEP, FACTOR, SOLVE)} | {"sum": spread(1e6 * under)},
         "us": {name: spread(1e6 * times[name]) for name in names},
         "ratio": {name: ratio(times[name], under) for name in names},
+    }
+
+
+def _of_scheme(setting: Setting, scheme: str, repeats: int) -> dict[str, Any]:
+    warm, noise, theta = setting.schemed(scheme), setting.noise, setting.theta
+    floor, half = Floor(warm, setting.estimate), len(theta) // 2
+    all_free, at = with_all_free(setting, scheme)
+    stages = _stages(setting, warm, theta[:half])
+    actions = _floor_actions(floor) | _call_actions(warm, theta[:half], noise)
+    actions["far"] = Action(partial(_walk, warm, theta[half:], noise), len(theta) - half)
+    actions[ALL_FREE] = Action(partial(_gradient, all_free, at, noise))
+    actions |= {f"stage {name}": Action(run, half) for name, run in stages.items()}
+    times = interleaved(actions, repeats)
+    return _ratios(times, ("near", "far", "call", "batched", "gradient", ALL_FREE)) | {
         "stages_us": _differences({name: float(np.nanmedian(times[f"stage {name}"])) * 1e6 for name in stages}),
         "bytes": floor.bytes,
         "same_grid_error": same_grid_error(setting, warm),

@@ -16,7 +16,7 @@ import bayesperiodic as bp
 from studies.benchmark.equations import table
 from studies.benchmark.kernels import Integrators, integrators, misfit
 from studies.damper import run as damper
-from studies.gear import FINE, GEAR, gear_at_rest, gear_problem, measured
+from studies.gear import FINE, GEAR, SAMPLES, folded, gear_at_rest, gear_problem, measured
 from studies.silverbox import data as silverbox_data
 
 FORCE, DISPLACEMENT, DUFFING, DAMPER, SILVERBOX = (
@@ -28,7 +28,9 @@ WIDE = 3.0
 DUFFING_TRUTH = {"m": 1.0, "c": 0.01, "k": 1.0, "k3": 0.5}
 # [Hz] and [N]: below the resonance, where only one motion is stable.
 DUFFING_RUNS = ((0.075, 0.2), (0.1, 0.15), (0.125, 0.1))
-DUFFING_SAMPLES = 160
+DUFFING_SAMPLES, DUFFING_HARMONICS = 160, 12
+# Appended to the names of problems with folded recordings whose harmonics are cut.
+FOLDED = ", folded"
 SILVERBOX_SAMPLES = 20_480
 # At 800 points, and at 8192 of the Silverbox, the scheme is too coarse for the accuracy asked for.
 DAMPER_SAMPLES = 1600
@@ -218,17 +220,28 @@ def gear(drive: str, count: int, seed: int, **other: Any) -> Setting:
     """Return the landing gear with one direction given."""
     problem = gear_problem(drive, seed, **other)
     start = {name: GEAR[name] for name in problem.names}
-    return _setting(FORCE if drive == "force" else DISPLACEMENT, problem, count, seed, gear_at_rest, start)
+    name = FORCE if drive == "force" else DISPLACEMENT
+    name += FOLDED if other.get("cut") else ""
+    return _setting(name, problem, count, seed, gear_at_rest, start)
 
 
-def duffing(count: int, seed: int) -> Setting:
-    """Return the Duffing oscillator whose motion takes hundreds of cycles to become steady."""
-    wave = np.cos(2 * np.pi * np.arange(DUFFING_SAMPLES) / DUFFING_SAMPLES)
+def duffing(count: int, seed: int, *, cut: bool = False) -> Setting:
+    """Return the Duffing oscillator whose motion takes hundreds of cycles to become steady.
+
+    With `cut` the experiments are folded recordings with `DUFFING_HARMONICS` harmonics on 800 points.
+    """
+    samples = SAMPLES if cut else DUFFING_SAMPLES
+    wave, model = np.cos(2 * np.pi * np.arange(samples) / samples), bp.models.duffing
     runs = [(frequency, {"force": amplitude * wave}) for frequency, amplitude in DUFFING_RUNS]
-    experiments = measured(bp.models.duffing, DUFFING_TRUTH, runs, DUFFING_SAMPLES, seed)
+    if cut:
+        harmonics = dict.fromkeys(("force", "displacement"), DUFFING_HARMONICS)
+        experiments = folded(model, DUFFING_TRUTH, runs, harmonics, samples, seed)
+    else:
+        experiments = measured(model, DUFFING_TRUTH, runs, samples, seed)
     priors = {name: bp.LogNormal(DUFFING_TRUTH[name], 0.5) for name in ("c", "k", "k3")}
-    problem = bp.Problem(bp.models.duffing, experiments, priors=priors, fixed={"m": 1.0}, scheme=FINE)
-    return _setting(DUFFING, problem, count, seed, lambda *_: np.zeros(2), {n: DUFFING_TRUTH[n] for n in priors})
+    problem = bp.Problem(model, experiments, priors=priors, fixed={"m": 1.0}, scheme=FINE)
+    name = DUFFING + (FOLDED if cut else "")
+    return _setting(name, problem, count, seed, lambda *_: np.zeros(2), {n: DUFFING_TRUTH[n] for n in priors})
 
 
 def damped(data: Path | None, count: int, seed: int) -> Setting:

@@ -23,15 +23,152 @@ from threadpoolctl import threadpool_limits
 
 import bayesperiodic as bp
 from studies import common
+from studies.benchmark import contenders, figures, peers, posteriors, scaling, targets
+from studies.benchmark import floor as floors
+from studies.benchmark import problems as made
 from studies.benchmark.equations import NUMPY, FirstOrder
+from studies.benchmark.integration import PREDICTED, SHOOTING, refer
+from studies.common import table_of_rows
 from studies.pendulum.orbits import shoot
 from studies.pendulum.recording import FREQUENCY, OMEGA, QUICK_PERIODS, TRUTH, section_of, simulate
 from studies.shooting import TURN
 
+# What the guard compares with.
+KEPT = Path("figures/benchmark/results.json")
+# What each problem led to is kept here until the study ends.
+PARTS = "parts"
 PERIOD, SAMPLES = 3, 800
 ORBITS, TOLERANCE = 12, 1e-12
 # Of the distance at which the orbit is called left: rad, with rates in units of 5 rad/s a rad.
 LEFT = 0.1
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def run(options: argparse.Namespace) -> None:
+    """Run the study."""
+    before = read_kept(KEPT) if options.guard else None
+    if options.guard:
+        options.quick, options.out = True, KEPT.parent.parent / "quick" / "benchmark"
+
+    watch, kept = common.Stopwatch(), options.out / PARTS
+    found: dict[str, Any] = {"seed": options.seed, "quick": options.quick, "cores": os.cpu_count()}
+    found["load_average"] = [*os.getloadavg()] if hasattr(os, "getloadavg") else None
+    found |= {"problems": {}, "floor": {}}
+    for name, make in folded(options).items():
+        with watch.part(name, f"{name}: log-posterior, gradient and batch over the floor"):
+            found["floor"][name] = floors.measure_folded(make(), 5 if options.quick else 31)
+        print(targets.floor(name, found["floor"][name]), flush=True)
+    for number, (name, make) in enumerate(problems(options).items()):
+        with watch.part(name, f"{name}: every contender"):
+            work = partial(_of_problem, name, make, options)
+            one = common.remembered(kept / f"{number}.pkl", _source(options, name), work)
+        found["problems"][name] = one["contest"]
+        print(targets.problem(name, one["contest"]), flush=True)
+        if "posterior" in one:
+            found["posterior"] = one["posterior"]
+            print(targets.posterior(one["posterior"]), flush=True)
+        if "floor" in one:
+            found["floor"][name] = one["floor"]
+            print(targets.floor(name, one["floor"]), flush=True)
+    if not options.quick:
+        _rest(found, options, watch)
+    found["checks"] = targets.rows(found)
+    print("\nWhat must show\n" + table_of_rows(found["checks"]) + "\n")
+    with watch.part("figure", "drawing"):
+        paths = common.save_figures(options.out, {"benchmark": figures.draw(found)})
+    path = common.write_results(options.out, found | {"seconds": watch.total(), "versions": common.versions()})
+    print(f"figures: {', '.join(map(str, paths))}\nresults: {path}")
+    shutil.rmtree(kept, ignore_errors=True)
+    if before is not None:
+        guard(found, before)
+
+
+def _of_problem(name: str, make: Callable[[], Any], options: argparse.Namespace) -> dict[str, Any]:
+    """Return the contest of one problem, and what is measured on this one alone."""
+    setting = make()
+    result: dict[str, Any] = {}
+    if name.startswith("landing gear"):
+        result["floor"] = floors.measure(
+            setting, 5 if options.quick else 31
+        )  # before other packages start their threads
+    result["contest"], methods = contest(setting, options.quick)
+    if name == made.DUFFING and not options.quick:
+        result["posterior"] = posteriors.measure(setting, result["contest"], methods, options.seed)
+    return result
+
+
+def _source(options: argparse.Namespace, name: str) -> str:
+    """Return what tells kept parts of another version, or with other settings, apart."""
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    own = [common.sha256(path) for path in files]
+    settings = map(str, (options.seed, options.quick, options.guard))
+    return " ".join([common.versions()["bayesperiodic"], name, *settings, *own])
+
+
+def _rest(found: dict[str, Any], options: argparse.Namespace, watch: common.Stopwatch) -> None:
+    """Measure the pendulum's unstable orbit and how time and memory grow."""
+    with watch.part("pendulum", "an unstable orbit of the pendulum, by time integration"):
+        found["pendulum"] = measure(options.seed)
+    print(account(found["pendulum"]), flush=True)
+    with watch.part("scaling", "growth of time and memory"):
+        found["scaling"] = scaling.measure(options.seed)
+    print(scaling.account(found["scaling"]), flush=True)
+
+
+def read_kept(path: Path) -> dict[str, Any]:
+    """Return the results that the guard compares with."""
+    if not path.is_file():
+        raise FileNotFoundError(f"--guard: {path} is not there; run the whole study first.")
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def guard(found: dict[str, Any], before: dict[str, Any]) -> None:
+    """Compare ratios, never seconds, with those kept; raise a RuntimeError if any is worse."""
+    lines = targets.worse(found, before)
+    print(f"guard: {targets.compared(found, before)} ratios compared, tolerance {targets.TOLERANCE:g}")
+    if lines:
+        raise RuntimeError("ratios are worse than those kept:\n" + "\n".join(lines))
+
+
+def problems(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
+    """Return what makes the problems, by name; a quick run takes the first three.
+
+    The guard needs the draws of the whole run: what a contender takes depends on them, from the predicted orbit most.
+    """
+    count, seed = (2, options.seed) if options.quick and not options.guard else (5, options.seed)
+    every: dict[str, Callable[[], Any]] = {
+        made.FORCE: lambda: made.gear("force", count, seed),
+        made.DISPLACEMENT: lambda: made.gear("displacement", count, seed),
+        made.DUFFING: lambda: made.duffing(count, seed),
+    }
+    if options.quick:
+        return every
+    return every | {
+        made.DAMPER: lambda: made.damped(options.data, count, seed),
+        made.SILVERBOX: lambda: made.silverbox(None, count, seed),
+    }
+
+
+def folded(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
+    """Return what makes the problems with folded recordings and cut harmonics, by name."""
+    return {
+        made.FORCE + made.FOLDED: lambda: made.gear("force", 5, options.seed, cut=True),
+        made.DUFFING + made.FOLDED: lambda: made.duffing(5, options.seed, cut=True),
+    }
+
+
+def contest(setting: Any, quick: bool) -> tuple[dict[str, Any], Any]:
+    """Return what all contenders take of one problem, and the methods of shooting from the predicted orbit.
+
+    A quick run leaves out other packages and those of SciPy's methods that integrate.
+    """
+    contest = contenders.Contest(refer(setting))
+    scheme = contenders.add_own(contest)
+    compiled = contenders.add_compiled(contest)
+    contenders.add_scipy(contest, compiled, quick=quick)
+    if not quick:
+        peers.add_peers(contest, compiled)
+    return contenders.measured(contest, scheme, 3 if quick else 15), compiled.get((SHOOTING, PREDICTED), [])
 
 
 def measure(seed: int) -> dict[str, Any]:
@@ -83,145 +220,3 @@ def account(found: dict[str, Any]) -> str:
         f"begun on the orbit, is off by {steps} rad after each of its periods; it has left it after "
         f"{found['left_after_periods']}"
     )
-
-
-# What the guard compares with.
-KEPT = Path("figures/benchmark/results.json")
-# What each problem led to is kept here until the study ends.
-PARTS = "parts"
-
-
-@threadpool_limits.wrap(limits=1, user_api="blas")
-def run(options: argparse.Namespace) -> None:
-    """Run the study."""
-    from studies.benchmark import figures, targets
-    from studies.common import table_of_rows
-
-    before = read_kept(KEPT) if options.guard else None
-    if options.guard:
-        options.quick, options.out = True, KEPT.parent.parent / "quick" / "benchmark"
-
-    watch, kept = common.Stopwatch(), options.out / PARTS
-    found: dict[str, Any] = {"seed": options.seed, "quick": options.quick, "cores": os.cpu_count()}
-    found["load_average"] = [*os.getloadavg()] if hasattr(os, "getloadavg") else None
-    found |= {"problems": {}, "floor": {}}
-    for number, (name, make) in enumerate(problems(options).items()):
-        with watch.part(name, f"{name}: every contender"):
-            work = partial(_of_problem, name, make, options)
-            one = common.remembered(kept / f"{number}.pkl", _source(options, name), work)
-        found["problems"][name] = one["contest"]
-        print(targets.problem(name, one["contest"]), flush=True)
-        if "posterior" in one:
-            found["posterior"] = one["posterior"]
-            print(targets.posterior(one["posterior"]), flush=True)
-        if "floor" in one:
-            found["floor"][name] = one["floor"]
-            print(targets.floor(name, one["floor"]), flush=True)
-    if not options.quick:
-        _rest(found, options, watch)
-    found["checks"] = targets.rows(found)
-    print("\nWhat must show\n" + table_of_rows(found["checks"]) + "\n")
-    with watch.part("figure", "drawing"):
-        paths = common.save_figures(options.out, {"benchmark": figures.draw(found)})
-    path = common.write_results(options.out, found | {"seconds": watch.total(), "versions": common.versions()})
-    print(f"figures: {', '.join(map(str, paths))}\nresults: {path}")
-    shutil.rmtree(kept, ignore_errors=True)
-    if before is not None:
-        guard(found, before)
-
-
-def _of_problem(name: str, make: Callable[[], Any], options: argparse.Namespace) -> dict[str, Any]:
-    """Return the contest of one problem, and what is measured on this one alone."""
-    from studies.benchmark import posteriors
-    from studies.benchmark.problems import DUFFING
-
-    setting = make()
-    result: dict[str, Any] = {}
-    if name.startswith("landing gear"):
-        result["floor"] = floor(setting, options.quick)  # before other packages start their threads
-    result["contest"], methods = contest(setting, options.quick)
-    if name == DUFFING and not options.quick:
-        result["posterior"] = posteriors.measure(setting, result["contest"], methods, options.seed)
-    return result
-
-
-def _source(options: argparse.Namespace, name: str) -> str:
-    """Return what tells kept parts of another version, or with other settings, apart."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
-    own = [common.sha256(path) for path in files]
-    settings = map(str, (options.seed, options.quick, options.guard))
-    return " ".join([common.versions()["bayesperiodic"], name, *settings, *own])
-
-
-def _rest(found: dict[str, Any], options: argparse.Namespace, watch: common.Stopwatch) -> None:
-    """Measure the pendulum's unstable orbit and how time and memory grow."""
-    from studies.benchmark import scaling
-
-    with watch.part("pendulum", "an unstable orbit of the pendulum, by time integration"):
-        found["pendulum"] = measure(options.seed)
-    print(account(found["pendulum"]), flush=True)
-    with watch.part("scaling", "growth of time and memory"):
-        found["scaling"] = scaling.measure(options.seed)
-    print(scaling.account(found["scaling"]), flush=True)
-
-
-def read_kept(path: Path) -> dict[str, Any]:
-    """Return the results that the guard compares with."""
-    if not path.is_file():
-        raise FileNotFoundError(f"--guard: {path} is not there; run the whole study first.")
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def guard(found: dict[str, Any], before: dict[str, Any]) -> None:
-    """Compare ratios, never seconds, with those kept; raise a RuntimeError if any is worse."""
-    from studies.benchmark import targets
-
-    lines = targets.worse(found, before)
-    print(f"guard: {targets.compared(found, before)} ratios compared, tolerance {targets.TOLERANCE:g}")
-    if lines:
-        raise RuntimeError("ratios are worse than those kept:\n" + "\n".join(lines))
-
-
-def problems(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
-    """Return what makes the problems, by name; a quick run takes the first three.
-
-    The guard needs the draws of the whole run: what a contender takes depends on them, from the predicted orbit most.
-    """
-    from studies.benchmark import problems as made
-
-    count, seed = (2, options.seed) if options.quick and not options.guard else (5, options.seed)
-    every: dict[str, Callable[[], Any]] = {
-        made.FORCE: lambda: made.gear("force", count, seed),
-        made.DISPLACEMENT: lambda: made.gear("displacement", count, seed),
-        made.DUFFING: lambda: made.duffing(count, seed),
-    }
-    if options.quick:
-        return every
-    return every | {
-        made.DAMPER: lambda: made.damped(options.data, count, seed),
-        made.SILVERBOX: lambda: made.silverbox(None, count, seed),
-    }
-
-
-def contest(setting: Any, quick: bool) -> tuple[dict[str, Any], Any]:
-    """Return what all contenders take of one problem, and the methods of shooting from the predicted orbit.
-
-    A quick run leaves out other packages and those of SciPy's methods that integrate.
-    """
-    from studies.benchmark import contenders, peers
-    from studies.benchmark.integration import PREDICTED, SHOOTING, refer
-
-    contest = contenders.Contest(refer(setting))
-    scheme = contenders.add_own(contest)
-    compiled = contenders.add_compiled(contest)
-    contenders.add_scipy(contest, compiled, quick=quick)
-    if not quick:
-        peers.add_peers(contest, compiled)
-    return contenders.measured(contest, scheme, 3 if quick else 15), compiled.get((SHOOTING, PREDICTED), [])
-
-
-def floor(setting: Any, quick: bool) -> dict[str, Any]:
-    """Return the floor of the landing gear and the stages above it."""
-    from studies.benchmark import floor as benchmark_floor
-
-    return benchmark_floor.measure(setting, 5 if quick else 31)

@@ -37,7 +37,7 @@ def test_results_and_figures_are_written(found):
         assert all(sum(counts) == 2 for by_name in case["histograms"].values() for counts in by_name.values())
         assert len((folder / name / "replicates.jsonl").read_text().splitlines()) == 2
     assert {path.name for path in folder.glob("*.png")} == {"duffing.png", "miscounted.png"}
-    assert "SYNTHETIC" in printed and "independent draws a rank" in printed
+    assert "SYNTHETIC" in printed and "draws per rank" in printed
 
 
 def test_a_second_run_does_nothing_again(found, monkeypatch):
