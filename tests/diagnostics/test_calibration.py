@@ -19,7 +19,7 @@ from bayesperiodic.diagnostics import campaigns
 from bayesperiodic.diagnostics.calibration import FILE, summary
 from bayesperiodic.diagnostics.campaigns import Campaign, check_supported, position, replicate
 from tests.known import LINEAR, RUNAWAY, grid, linear_regressors
-from tests.posterior.observed import cycle_run
+from tests.problems import cycle_run
 
 KNOWN_VARIANCE = 9.0
 PRIORS = {"k": bp.Normal(900.0, 60.0), "c": bp.Normal(40.0, 200.0), "coulomb": bp.Normal(25.0, 100.0)}

@@ -14,7 +14,7 @@ from bayesperiodic.diagnostics.verdicts import Sample, joint_verdict, marginal_v
 from bayesperiodic.sampling.coordinates import SamplingDensity
 from bayesperiodic.sampling.posterior import gather, tree
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
-from tests.posterior.test_targets import known, model, run
+from tests.sampling.test_targets import known, model, run
 
 SHAPE = (4, 80, 20)
 SEEDS = range(20)

@@ -7,8 +7,8 @@ from bayesperiodic.diagnostics.design import Candidate, Information, rank_candid
 from bayesperiodic.diagnostics.identifiability import cumulative_jensen_shannon, structure_of
 from tests.known import GEAR, LINEAR, grid, linear_experiment, linear_regressors
 from tests.pendulum import PENDULUM
-from tests.posterior.observed import pendulum_run
-from tests.posterior.test_targets import known, model, run
+from tests.problems import pendulum_run
+from tests.sampling.test_targets import known, model, run
 
 QUIET = {"progress": False}
 SHORT = QUIET | {"seed": 1, "ensembles": 2, "max_steps": 500}

@@ -8,8 +8,7 @@ import bayesperiodic as bp
 from bayesperiodic.diagnostics.adequacy import TESTS
 from bayesperiodic.sampling.posterior import tree
 from tests.known import LINEAR, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors
-from tests.posterior.observed import DUFFING, DUFFING_PRIORS, SAMPLES
-from tests.posterior.test_gradient import CASES
+from tests.problems import CASES, DUFFING, DUFFING_PRIORS, SAMPLES
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 FLAT = {"k": bp.Normal(900.0, 1e5), "c": bp.Normal(40.0, 1e4), "coulomb": bp.Normal(25.0, 1e4)}

@@ -4,7 +4,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic.periodic import family
 from tests.known import CYCLE, SADDLE_NODE, grid
-from tests.posterior.observed import DUFFING, DUFFING_PRIORS, duffing_run
+from tests.problems import DUFFING, DUFFING_PRIORS, duffing_run
 
 DRAWS = 400
 

@@ -10,7 +10,7 @@ import bayesperiodic as bp
 from bayesperiodic.estimation.initial import all_at_once
 from tests.known import LINEAR, linear_experiment
 from tests.pendulum import FREQUENCY, GENTLE, PENDULUM, measured, section_problem
-from tests.posterior.observed import cycle_run
+from tests.problems import cycle_run
 
 PHI = {"phi": "angle"}
 PAPER = {"m": 1.51 * PENDULUM["m"], "l": 1.189 * PENDULUM["l"], "k3": 2 * PENDULUM["k3"]}

@@ -6,77 +6,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic.periodic.batch import Batch
 from tests.known import EIGHTH_ORDER
-from tests.posterior.observed import (
-    DUFFING_PRIORS,
-    PENDULUM_PRIORS,
-    SAMPLES,
-    cycle_run,
-    duffing_run,
-    pendulum_problem,
-    pendulum_run,
-    section_run,
-)
-
-DELAY = {"shift": bp.Normal(0.0, 0.1)}
-POINTS = np.arange(SAMPLES) % 20 == 3
-
-
-def duffing(*experiments: bp.Experiment, **changes) -> bp.Problem:
-    arguments = {"priors": DUFFING_PRIORS, "fixed": {"m": 1.0}}
-    return bp.Problem(bp.models.duffing, experiments, **(arguments | changes))
-
-
-CASES = {
-    "every sample": lambda: (duffing(duffing_run()), [0.21, 1.02, 0.48]),
-    "harmonics kept, tied": lambda: (
-        duffing(
-            duffing_run(harmonics={"displacement": 7}),
-            priors={"c": bp.LogNormal(0.2, 0.3), "k": bp.Normal(1.0, 0.3)},
-            tied={"k3": "0.5*k**2"},
-        ),
-        [0.21, 1.02],
-    ),
-    "circulant": lambda: (
-        duffing(duffing_run(harmonics={"displacement": 9}), noise="circulant"),
-        [0.21, 1.02, 0.48],
-    ),
-    "measured": lambda: (
-        duffing(duffing_run(scatter={"displacement": 0.2}, cycles=9), noise="measured"),
-        [0.21, 1.02, 0.48],
-    ),
-    "local and delayed": lambda: (
-        duffing(
-            duffing_run(),
-            duffing_run("run 2", 0.13, seed=2),
-            priors=DUFFING_PRIORS | DELAY,
-            local=["c"],
-            noise=bp.noise.Independent(per="experiment"),
-        ),
-        [0.21, 0.19, 1.02, 0.48, 0.05, -0.03],
-    ),
-    "angle of a rotation": lambda: (pendulum_problem([pendulum_run()]), [0.301, 4.6e-4]),
-    "delayed angle": lambda: (
-        pendulum_problem([pendulum_run()], priors=PENDULUM_PRIORS | DELAY),
-        [0.301, 4.6e-4, 0.02],
-    ),
-    "section and multiplier": lambda: (
-        pendulum_problem([section_run()], noise=bp.noise.Independent(prior=bp.InverseGamma(3.0, 2.0))),
-        [0.301, 4.6e-4],
-    ),
-    "masked, correlated": lambda: (
-        pendulum_problem([pendulum_run(mask=POINTS, multipliers=[-1.75], multiplier_sd=[0.1])], noise="circulant"),
-        [0.301, 4.6e-4],
-    ),
-    "autonomous": lambda: (
-        bp.Problem(
-            bp.models.van_der_pol,
-            [cycle_run()],
-            priors={"mu": bp.LogNormal(1.5, 0.3), "omega": bp.Normal(1.0, 0.2)},
-            scheme="central4",
-        ),
-        [1.52, 1.003, 0.05],
-    ),
-}
+from tests.problems import CASES, duffing, duffing_run
 
 
 def differences(problem: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:

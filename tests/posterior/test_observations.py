@@ -8,7 +8,7 @@ from scipy import stats
 
 import bayesperiodic as bp
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors, normal_posterior
-from tests.posterior.observed import (
+from tests.problems import (
     DUFFING,
     DUFFING_PRIORS,
     PENDULUM_PRIORS,

@@ -21,7 +21,7 @@ from bayesperiodic.posterior import problem as problem_module
 from bayesperiodic.posterior.likelihood import Squares
 from bayesperiodic.sampling import ensemble, sample
 from bayesperiodic.sampling.coordinates import SamplingDensity
-from tests.posterior.observed import (
+from tests.problems import (
     DUFFING,
     DUFFING_PRIORS,
     SAMPLES,

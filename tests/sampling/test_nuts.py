@@ -13,7 +13,7 @@ from bayesperiodic.sampling import convergence, nuts
 from bayesperiodic.sampling.coordinates import SamplingDensity
 from studies.damper import run as damper
 from tests.known import EIGHTH_ORDER, LINEAR, RUNAWAY, grid, linear_experiment, linear_regressors
-from tests.posterior.test_gradient import CASES
+from tests.problems import CASES
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}

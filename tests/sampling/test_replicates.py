@@ -8,8 +8,7 @@ import pytest
 import bayesperiodic as bp
 from bayesperiodic.posterior.observation import Response
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
-from tests.posterior.observed import pendulum_problem, pendulum_run, rotation
-from tests.posterior.test_gradient import CASES
+from tests.problems import CASES, pendulum_problem, pendulum_run, rotation
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(900.0, 60.0), "c": bp.Normal(40.0, 20.0), "coulomb": bp.Normal(25.0, 10.0)}

@@ -9,7 +9,7 @@ import bayesperiodic as bp
 from bayesperiodic.estimation.laplace import undetermined
 from bayesperiodic.sampling.coordinates import SamplingDensity
 from tests.known import LINEAR, formula_model, grid, linear_experiment, linear_regressors
-from tests.posterior.observed import DUFFING, DUFFING_PRIORS, duffing_run
+from tests.problems import DUFFING, DUFFING_PRIORS, duffing_run
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}

@@ -1,4 +1,4 @@
-"""Problems with every kind of observation, shared by the tests of the density and of its gradient."""
+"""Problems with every kind of observation, shared by the tests of densities, gradients, samplers and predictions."""
 
 from dataclasses import replace
 from functools import cache
@@ -14,6 +14,8 @@ SAMPLES = 200
 DUFFING = {"m": 1.0, "c": 0.2, "k": 1.0, "k3": 0.5}
 DUFFING_PRIORS = {"c": bp.LogNormal(0.2, 0.3), "k": bp.Normal(1.0, 0.3), "k3": bp.LogNormal(0.5, 0.5)}
 PENDULUM_PRIORS = {"l": bp.LogNormal(0.3, 0.05), "k3": bp.LogNormal(4.5e-4, 0.3)}
+DELAY = {"shift": bp.Normal(0.0, 0.1)}
+POINTS = np.arange(SAMPLES) % 20 == 3
 ROTATION = next(k for k in shooting.UNSTABLE if len(k.section) == 1 and abs(k.multipliers[0]) < 2)
 
 
@@ -84,3 +86,62 @@ def cycle_run(mu: float = 1.5, name: str = "cycle", turned: float = 0.2, seed: i
 def named(experiment: bp.Experiment, name: str) -> bp.Experiment:
     """Return the experiment under another name."""
     return replace(experiment, name=name)
+
+
+def duffing(*experiments: bp.Experiment, **changes) -> bp.Problem:
+    arguments = {"priors": DUFFING_PRIORS, "fixed": {"m": 1.0}}
+    return bp.Problem(bp.models.duffing, experiments, **(arguments | changes))
+
+
+# Name -> problem and a point θ.
+CASES = {
+    "every sample": lambda: (duffing(duffing_run()), [0.21, 1.02, 0.48]),
+    "harmonics kept, tied": lambda: (
+        duffing(
+            duffing_run(harmonics={"displacement": 7}),
+            priors={"c": bp.LogNormal(0.2, 0.3), "k": bp.Normal(1.0, 0.3)},
+            tied={"k3": "0.5*k**2"},
+        ),
+        [0.21, 1.02],
+    ),
+    "circulant": lambda: (
+        duffing(duffing_run(harmonics={"displacement": 9}), noise="circulant"),
+        [0.21, 1.02, 0.48],
+    ),
+    "measured": lambda: (
+        duffing(duffing_run(scatter={"displacement": 0.2}, cycles=9), noise="measured"),
+        [0.21, 1.02, 0.48],
+    ),
+    "local and delayed": lambda: (
+        duffing(
+            duffing_run(),
+            duffing_run("run 2", 0.13, seed=2),
+            priors=DUFFING_PRIORS | DELAY,
+            local=["c"],
+            noise=bp.noise.Independent(per="experiment"),
+        ),
+        [0.21, 0.19, 1.02, 0.48, 0.05, -0.03],
+    ),
+    "angle of a rotation": lambda: (pendulum_problem([pendulum_run()]), [0.301, 4.6e-4]),
+    "delayed angle": lambda: (
+        pendulum_problem([pendulum_run()], priors=PENDULUM_PRIORS | DELAY),
+        [0.301, 4.6e-4, 0.02],
+    ),
+    "section and multiplier": lambda: (
+        pendulum_problem([section_run()], noise=bp.noise.Independent(prior=bp.InverseGamma(3.0, 2.0))),
+        [0.301, 4.6e-4],
+    ),
+    "masked, correlated": lambda: (
+        pendulum_problem([pendulum_run(mask=POINTS, multipliers=[-1.75], multiplier_sd=[0.1])], noise="circulant"),
+        [0.301, 4.6e-4],
+    ),
+    "autonomous": lambda: (
+        bp.Problem(
+            bp.models.van_der_pol,
+            [cycle_run()],
+            priors={"mu": bp.LogNormal(1.5, 0.3), "omega": bp.Normal(1.0, 0.2)},
+            scheme="central4",
+        ),
+        [1.52, 1.003, 0.05],
+    ),
+}

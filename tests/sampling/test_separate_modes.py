@@ -7,7 +7,7 @@ import bayesperiodic as bp
 from bayesperiodic.sampling.convergence import shortfall
 from bayesperiodic.sampling.coordinates import SamplingDensity
 from bayesperiodic.sampling.starts import mirrored_modes, start_points
-from tests.posterior.test_targets import known, model, ridge, run
+from tests.sampling.test_targets import known, model, ridge, run
 
 QUIET = {"progress": False}
 UNCUT = bp.Normal(1.0, 1.0)
