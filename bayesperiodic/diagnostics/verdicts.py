@@ -134,7 +134,7 @@ def has_other_mode(sample: Sample, point: float) -> bool:
     density = gaussian_filter1d(mass, bandwidth / width, mode="constant")
     slope = np.diff(density.mean(axis=0))
     valleys = np.flatnonzero((slope[:-1] < 0.0) & (slope[1:] >= 0.0)) + 1
-    return any(_separates(density, mass, at, point > edges[at] + 0.5 * width) for at in valleys)
+    return any(_separates(density, mass, int(at), point > edges[at] + 0.5 * width) for at in valleys)
 
 
 def _separates(density: np.ndarray, mass: np.ndarray, valley: int, point_above: bool) -> bool:

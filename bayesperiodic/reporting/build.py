@@ -98,7 +98,7 @@ def _parameters(given: ReportInputs) -> html.Table:
     for name, value in fit.theta.items():
         rounding = html.Rounding.of(value, fit.sd[name])
         drawn = mcmc_cells(given, name, rounding)
-        row = {
+        row: dict[str, str | html.Badge] = {
             "Parameter": html.code(name),
             "Unit": given.unit(name),
             "MAP": rounding.text(value),

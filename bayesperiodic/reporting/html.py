@@ -50,6 +50,9 @@ class Number(str):
     """A formatted number; columns that hold one are aligned to the right."""
 
 
+Row = Mapping[str, str | Markup | Badge]
+
+
 @dataclass(frozen=True)
 class Table:
     """A table: rows as mappings from column titles to cells, where the first cell heads the row.
@@ -59,7 +62,7 @@ class Table:
 
     id: str
     caption: str
-    rows: Sequence[Mapping[str, str | Markup | Badge]]
+    rows: Sequence[Row]
 
     @property
     def columns(self) -> list[tuple[str, bool]]:

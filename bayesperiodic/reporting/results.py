@@ -110,11 +110,11 @@ def mcmc_cells(given: ReportInputs, name: str, rounding: html.Rounding) -> dict[
     """Return mean, standard deviation and 90 % interval of the draws; no columns without draws."""
     if given.posterior is None:
         return {}
-    cells = dict.fromkeys(("MCMC: mean", "MCMC: sd", "MCMC: 90 % interval"), html.Number(html.NOTHING))
+    titles = ("MCMC: mean", "MCMC: sd", "MCMC: 90 % interval")
     if name not in given.summary.index:
-        return cells
-    mean, sd, low, high = given.summary.loc[name, ["mean", "sd", "q05", "q95"]]
-    return dict(zip(cells, (rounding.text(mean), rounding.sd(sd), rounding.interval(low, high)), strict=True))
+        return dict.fromkeys(titles, html.Number(html.NOTHING))
+    mean, sd, low, high = given.summary.loc[name, ["mean", "sd", "q05", "q95"]].astype(float)
+    return dict(zip(titles, (rounding.text(mean), rounding.sd(sd), rounding.interval(low, high)), strict=True))
 
 
 def _corner(given: ReportInputs, posterior: Posterior) -> html.Figure:
@@ -305,7 +305,7 @@ def _adequacy(found: Prediction) -> list[html.Block]:
     ]
     caption = (
         "Tests of the model. Verdicts use p-values adjusted for all tests of the table (Holm), with a false alarm rate "
-        f"of {LEVEL:.0%}; the last column is the fraction of the residual variance beyond the measured noise."
+        f"of {html.percent(LEVEL)}; the last column is the fraction of the residual variance beyond the measured noise."
     )
     blocks: list[html.Block] = [html.Table("table-adequacy", caption, rows)]
     blocks += [html.Paragraph(f"{label}: {words}.") for label, words in found.findings.items()]
