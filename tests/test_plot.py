@@ -122,7 +122,7 @@ def test_corner_draws_the_names_asked_for_and_no_ellipse_where_there_is_no_appro
     axes = np.array(bp.plot.corner(posterior, laplace=without).axes).reshape(4, 4)
     assert len(axes[1, 0].lines) == 2 and not axes[3, 0].lines
     assert not bp.plot.corner(posterior, names=["k"]).axes[0].lines
-    with pytest.raises(ValueError, match="names: must be one of 'k', 'c', got 'kk'"):
+    with pytest.raises(ValueError, match="names: must be one of 'k', 'c', .*got 'kk'"):
         bp.plot.corner(posterior, names=["kk"])
     for names in ("k", [], ["k", "k"]):
         with pytest.raises(ValueError, match="names: must be .*, got"):

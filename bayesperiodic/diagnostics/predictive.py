@@ -26,19 +26,7 @@ NOISE_LEVELS = 21
 
 @dataclass(frozen=True)
 class Bands(Result):
-    """Predictive bands of the mean period of each experiment.
-
-    Attributes
-    ----------
-    median, low, high : dict of str to dict of str to array (points,)
-        By experiment and channel: median and central 90 % band of the mean period within the kept harmonics, including
-        the residual variance, assumed normal at each point. Section values with a covariance of their own have the band
-        of the model alone.
-    probability : float
-        Of the band.
-    draws, failed : int
-        Number of draws, and of those without a periodic solution.
-    """
+    """Predictive bands of the mean period by experiment and channel, see `Prediction`."""
 
     median: dict[str, dict[str, np.ndarray]]
     low: dict[str, dict[str, np.ndarray]]

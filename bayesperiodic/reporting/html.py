@@ -1,11 +1,12 @@
-"""Elements of the page (paragraphs, tables, figures, equations) and the formatting of numbers and units."""
+"""Tables, figures and badges of the page, the formatting of numbers and units, and the template engine."""
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from itertools import groupby
 from math import floor, isfinite, isinf, isnan, log10
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -13,29 +14,6 @@ from markupsafe import Markup
 GOOD, CAUTION, BAD, NEUTRAL = "good", "caution", "bad", "neutral"
 # A badge shows its tone by a sign as well as by a colour.
 SIGNS = {GOOD: "✓", CAUTION: "!", BAD: "✕", NEUTRAL: "•"}
-
-
-@dataclass(frozen=True)
-class Paragraph:
-    """A few sentences."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Note:
-    """A highlighted warning."""
-
-    tone: str
-    text: str
-
-
-@dataclass(frozen=True)
-class Heading:
-    """A heading within a section."""
-
-    id: str
-    text: str
 
 
 @dataclass(frozen=True)
@@ -88,44 +66,6 @@ class Figure:
     wide: bool = False
 
 
-@dataclass(frozen=True)
-class Equations:
-    """Equations as MathML, and optionally as LaTeX source."""
-
-    id: str
-    label: str
-    rows: tuple[Markup, ...]
-    latex: str = ""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A question about the identification and its result."""
-
-    question: str
-    badge: Badge
-    text: str
-
-
-@dataclass(frozen=True)
-class Findings:
-    """Results in a row of boxes."""
-
-    items: tuple[Finding, ...]
-
-
-Block = Paragraph | Note | Heading | Table | Figure | Equations | Findings
-
-
-@dataclass(frozen=True)
-class Section:
-    """A section of the page."""
-
-    id: str
-    title: str
-    blocks: list[Block] = field(default_factory=list)
-
-
 def code(name: str) -> Markup:
     """Return a name in the type of source code."""
     return Markup("<code>{}</code>").format(name)
@@ -167,7 +107,7 @@ def p_value(p: float) -> Number:
     return Number("< 10⁻³⁰⁰") if p < 1e-300 else number(p, 2)
 
 
-def counted(what: str, count: int) -> str:
+def counted(count: int, what: str) -> str:
     """Format a count with its noun."""
     return f"{count} {what}{'s' if count != 1 else ''}"
 
@@ -242,23 +182,11 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     made.tests["badge"] = lambda value: isinstance(value, Badge)
-    made.filters["kind"] = lambda block: type(block).__name__.lower()
+    made.globals |= {"signs": SIGNS, "Badge": Badge}
+    made.filters |= {"number": number, "percent": percent, "counted": counted}
     return made
 
 
-def page(title: str, subtitle: str, badges: Sequence[Badge], sections: Sequence[Section], written: str) -> str:
-    """Render the page; all text is escaped.
-
-    Parameters
-    ----------
-    title, subtitle : str
-    badges : sequence of Badge
-        Shown below the title.
-    sections : sequence of Section
-    written : str
-        Date and time.
-    """
-    template = _environment().get_template("page.html")
-    return template.render(
-        title=title, subtitle=subtitle, badges=badges, sections=sections, written=written, signs=SIGNS
-    )
+def page(**content: Any) -> str:
+    """Render the page; all text is escaped."""
+    return _environment().get_template("page.html").render(content)

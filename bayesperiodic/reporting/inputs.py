@@ -1,7 +1,6 @@
-"""Inputs of the report, and the sections on the data and the model."""
+"""Inputs of the report, and the typesetting of equations and symbols."""
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,10 +13,10 @@ from sympy.printing.mathml import MathMLPresentationPrinter
 from sympy.printing.pretty.pretty_symbology import greek_unicode
 
 from bayesperiodic import _checks
-from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.diagnostics.comparison import Comparison, compare
 from bayesperiodic.diagnostics.identifiability import Identifiability, identifiability
 from bayesperiodic.diagnostics.predictive import Prediction, predict
+from bayesperiodic.estimation.map_estimate import remarks
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
 from bayesperiodic.posterior import labels
@@ -83,23 +82,46 @@ class ReportInputs:
         """Whether any of the data were simulated."""
         return any(e.synthetic for e in self.problem.experiments)
 
+    @property
+    def clocks(self) -> set[str]:
+        """The time symbols, of "tau" and "frequency", that the model contains."""
+        model = self.problem.model
+        used = set().union(*(e.free_symbols for e in (*model.equations, *model.output_expressions)))
+        return {name for name in ("tau", "frequency") if model.time_symbols[name] in used}
+
     @cached_property
     def summary(self) -> pd.DataFrame:
         """Mean, sd, interval and diagnostics of the draws by name; empty without draws."""
         return pd.DataFrame() if self.posterior is None else self.posterior.summary()
 
-    @cached_property
+    @property
     def robust_ratios(self) -> dict[str, float]:
         """Robust over Laplace standard deviation where it exceeds 1.5 although some residual is not white."""
-        if not self.coloured:
-            return {}
         ratios = {name: self.fit.robust_sd[name] / sd for name, sd in self.fit.sd.items() if sd > 0.0}
-        return {name: ratio for name, ratio in ratios.items() if np.isfinite(ratio) and ratio > LARGE_RATIO}
+        large = {name: ratio for name, ratio in ratios.items() if np.isfinite(ratio) and ratio > LARGE_RATIO}
+        return large if self.coloured else {}
 
     @property
     def coloured(self) -> list[str]:
         """The channels whose residual is not white."""
         return [channel for channel, white in self.fit.whiteness.items() if white.p < NOT_WHITE]
+
+    @property
+    def underestimated_sds(self) -> list[str]:
+        """A warning if standard deviations are too small because a residual is not white."""
+        if not (ratios := self.robust_ratios):
+            return []
+        worst = max(ratios, key=lambda name: ratios[name])
+        return [
+            f"The residual of {', '.join(self.coloured)} is not white, so the standard deviations and intervals of "
+            f"{', '.join(ratios)} are too small; the robust ones are up to {html.number(ratios[worst], 2)} times as "
+            f"large ({worst})."
+        ]
+
+    @property
+    def warnings(self) -> list[str]:
+        """All warnings on the estimate."""
+        return [*remarks(self.problem, self.fit), *self.underestimated_sds]
 
     def unit(self, name: str) -> str:
         """Return the formatted unit of a parameter, a channel or a noise parameter, by its full name."""
@@ -125,58 +147,6 @@ def _check_data(posterior: Posterior, problem: Problem) -> None:
             "posterior: must be of the parameters and data of `problem`, got draws of other parameters or data. Give "
             "sample(problem, fit)."
         )
-
-
-def data_section(given: ReportInputs) -> html.Section:
-    """Return the section on the data, by experiment and by channel."""
-    experiments = [
-        {
-            "Experiment": e.name,
-            "Data": "synthetic" if e.synthetic else "measured",
-            "Frequency [Hz]": html.number(e.frequency, 7),
-            "Standard error [Hz]": html.number(e.frequency_se, 2) if e.frequency_se else html.NOTHING,
-            "Cycles": html.Number(e.cycles),
-            "Forcing periods per response": html.Number(e.periods),
-            "Points per period": html.Number(e.samples),
-            "Periodicity": html.number(e.periodicity, 5),
-        }
-        for e in given.problem.experiments
-    ]
-    channels = [
-        _channel(given, e, channel, kind)
-        for e in given.problem.experiments
-        for kind, channels in (("input", e.inputs), ("output", e.outputs))
-        for channel in channels
-    ]
-    blocks: list[html.Block] = [
-        html.Table(
-            "table-experiments",
-            "Experiments. The periodicity is the fraction of the variance that the mean period explains.",
-            experiments,
-        ),
-        html.Table("table-channels", "Channels: prescribed (inputs) and compared with the model (outputs).", channels),
-    ]
-    if given.synthetic:
-        blocks.insert(
-            0, html.Note(html.CAUTION, "Some or all of these data are synthetic: they were simulated, not measured.")
-        )
-    return html.Section("data", "Data", blocks)
-
-
-def _channel(given: ReportInputs, e: Experiment, channel: str, kind: str) -> dict[str, str]:
-    values = (e.inputs if kind == "input" else e.outputs)[channel]
-    measured = values if e.mask is None or kind == "input" else values[e.mask]
-    return {
-        "Channel": html.code(channel),
-        "Experiment": e.name,
-        "Kind": kind if e.mask is None or kind == "input" else f"{kind}, at {measured.size} points",
-        "Unit": given.unit(channel),
-        "Minimum": html.number(float(measured.min()), 4),
-        "Maximum": html.number(float(measured.max()), 4),
-        "Harmonics kept": html.Number(e.harmonics.get(channel, "all")),
-        "Independent values": html.Number(e.independent.get(channel, html.NOTHING)),
-        "Standard deviation of one cycle": html.number(e.scatter.get(channel, np.nan)),
-    }
 
 
 DOTS = ("", "˙", "¨")
@@ -302,61 +272,3 @@ def _block(printer: _Printer, *sides: sp.Expr) -> Markup:
     """Return a displayed equation."""
     printed = "<mo>=</mo>".join(printer.text_of(printer._print(side)) for side in sides)
     return Markup(f'<math display="block">{printed}</math>')
-
-
-LONGEST = 120
-NOISE_MODELS = {
-    "independent": "independent errors, with an unknown variance for each {}.",
-    "measured": "the scatter of the measured cycles, and an independent model error with a variance for each {}.",
-    "circulant": "errors correlated along the period and stationary on the circle, with a variance for each {}.",
-}
-
-
-def model_section(given: ReportInputs) -> html.Section:
-    """Return the section on the equations, the parameters and the noise model."""
-    problem, model, noise = given.problem, given.problem.model, given.problem.noise
-    states = ", ".join(f"{name} [{given.unit(name)}]" for name in model.states)
-    used = set().union(*(e.free_symbols for e in (*model.equations, *model.output_expressions)))
-    symbols = {"tau": "; τ is the time in forcing periods", "frequency": "; f is the frequency in Hz"}
-    clocks = "".join(words for name, words in symbols.items() if model.time_symbols[name] in used)
-    own = "channel" if noise.per == "channel" else "channel of each experiment"
-    noise_model = NOISE_MODELS.get(noise.name, f"user-defined, with parameters for each {noise.per}.").format(own)
-    parameters = [
-        {
-            "Parameter": html.code(name),
-            "Symbol": symbol(name.partition("[")[0]),
-            "Unit": given.unit(name),
-            "Role": role,
-            "Prior, value or expression": known,
-        }
-        for plain in (*model.parameters, SHIFT)
-        for name, role, known in _roles(problem, plain)
-    ]
-    blocks: list[html.Block] = [
-        html.Paragraph(
-            f"The model {model.name} has the state{'s' if len(model.states) > 1 else ''} {states}. A dot is a "
-            f"derivative with respect to time, per second{clocks}."
-        ),
-        html.Equations("equations", "Equations of motion", equations(model), model.latex()),
-        html.Equations("outputs", "Output equations", outputs(model)),
-        html.Table("table-parameters", "Parameters with their priors, fixed values or expressions.", parameters),
-        html.Paragraph(f"Noise model “{noise.name}”: {noise_model} Prior of the variances: {noise.prior_text}."),
-    ]
-    return html.Section("model", "Model", blocks)
-
-
-def _roles(problem: Problem, plain: str) -> Iterator[tuple[str, str, str]]:
-    """Yield the full names of a parameter with its role and its prior, value or expression."""
-    partners = {name: key for key in problem.priors if isinstance(key, tuple) for name in key}
-    for name in (n for n in problem.names if n.partition("[")[0] == plain):
-        prior = repr(problem.joint_prior.marginals[name])
-        prior = prior if len(prior) <= LONGEST else f"{prior[:LONGEST]}…"
-        others = ", ".join(other for other in partners.get(name, ()) if other != name)
-        yield name, "free", prior + (f", jointly with {others}" if others else "")
-    if plain in problem.tied:
-        yield plain, "tied", problem.tied[plain]
-    by_run = problem.fixed.get(plain, {})
-    if len(by_run) == len(problem.experiments) and len(set(by_run.values())) == 1:
-        by_run = {"": next(iter(by_run.values()))}
-    for run, value in by_run.items():
-        yield (f"{plain}[{run}]" if run else plain), "fixed", str(html.number(value, 6))
