@@ -1,8 +1,7 @@
-"""Periodic signals as arrays and as Fourier coefficients.
+"""Fourier amplitudes of periodic signals.
 
-A real signal over one response period is held on an equidistant grid without its end point. Its complex
-coefficients c[h] satisfy y(t) = Re Σ_h c[h] exp(2πi h t / period), so that |c[h]| is the amplitude of harmonic h
-and c[0] the mean.
+A real signal is sampled over one response period on an equidistant grid without the end point. Its complex amplitudes
+c[h] satisfy y(t) = Re Σ_h c[h] exp(2πi h t / period), so that |c[h]| is the amplitude of harmonic h and c[0] the mean.
 """
 
 import numpy as np
@@ -16,7 +15,7 @@ def coefficients(values: np.ndarray, harmonics: int | None = None) -> np.ndarray
     values : array (…, points)
         One response period, end point excluded.
     harmonics : int, optional
-        The highest harmonic wanted; by default all below the grid's Nyquist harmonic.
+        The highest harmonic; by default the highest one below the Nyquist harmonic of the grid.
 
     Returns
     -------
@@ -40,7 +39,7 @@ def on_grid(amplitudes: np.ndarray, points: int) -> np.ndarray:
 
 
 def at_times(amplitudes: np.ndarray, phase: np.ndarray) -> np.ndarray:
-    """Return one signal at any phases (fractions of the period), by Horner's rule in exp(2πi phase)."""
+    """Return one signal at arbitrary phases (fractions of the period), by Horner's rule in exp(2πi phase)."""
     turn = np.exp(2j * np.pi * np.asarray(phase))
     total = np.zeros_like(turn)
     for amplitude in amplitudes[::-1]:
@@ -49,16 +48,16 @@ def at_times(amplitudes: np.ndarray, phase: np.ndarray) -> np.ndarray:
 
 
 def derivative(amplitudes: np.ndarray, frequency: float, order: int = 1) -> np.ndarray:
-    """Return the complex amplitudes of a time derivative; `frequency` [Hz] is that of harmonic 1."""
+    """Return the complex amplitudes of a time derivative; `frequency` [Hz] belongs to harmonic 1."""
     harmonic = np.arange(amplitudes.shape[-1])
     return amplitudes * (2j * np.pi * frequency * harmonic) ** order
 
 
 def project(values: np.ndarray, harmonics: int) -> np.ndarray:
-    """Return signals (…, points) with everything above the given harmonic removed."""
+    """Return signals (…, points) without the harmonics above the given one."""
     return on_grid(coefficients(values, harmonics), values.shape[-1])
 
 
 def highest_harmonic(points: int) -> int:
-    """Return the highest harmonic that a grid of that many points represents without ambiguity."""
+    """Return the highest harmonic below the Nyquist harmonic of a grid."""
     return (points - 1) // 2

@@ -1,4 +1,4 @@
-"""Results as files: HDF5, written whole or not at all, read back without the model and without evaluating anything."""
+"""Storage of results in HDF5 files, which are written atomically and read without executing stored code."""
 
 import json
 import os
@@ -17,24 +17,24 @@ ARRAYS = "arrays"
 
 
 class Result:
-    """A frozen dataclass of plain data that saves itself; `load` reads it back."""
+    """Base of frozen dataclasses of plain data with a `save` method; `load` reads them."""
 
     def save(self, path: str | Path) -> None:
-        """Write the result to an HDF5 file, replacing an older one only when the new one is complete.
+        """Write the result to an HDF5 file; an existing file is replaced when the new one is complete.
 
-        A result that holds draws is a netCDF file whose groups xarray and ArviZ open directly.
+        The file of a result with draws is a netCDF file whose groups xarray and ArviZ can open.
 
         Parameters
         ----------
         path : path
-            In a folder that exists.
+            The folder must exist.
 
         Raises
         ------
         OSError
             If the file cannot be written there.
         TypeError
-            If the result holds what is no plain data, such as a function.
+            If the result contains something other than plain data, such as a function.
         """
         import h5py
 
@@ -51,16 +51,16 @@ class Result:
 
 
 def in_folder(path: str | Path) -> Path:
-    """Return the path; raise a FileNotFoundError if the folder for it is not there."""
+    """Return the path; raise a FileNotFoundError if its folder does not exist."""
     target = Path(path)
     if not target.parent.is_dir():
-        raise FileNotFoundError(f"path: {str(path)!r} is not allowed; there is no folder {str(target.parent)!r}.")
+        raise FileNotFoundError(f"path: must be in an existing folder, got {str(path)!r}.")
     return target
 
 
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[Path]:
-    """Give a path to write to, whose file takes the place of `path` only when the block ends without an error."""
+    """Provide a temporary path whose file replaces `path` when the block ends without an error."""
     target = in_folder(path)
     with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
         draft = Path(folder) / target.name
@@ -69,7 +69,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
 
 
 def load(path: str | Path) -> Any:
-    """Return a saved result, without the model and without evaluating anything in the file.
+    """Load a saved result; the model is not needed and no stored code is executed.
 
     Parameters
     ----------
@@ -78,14 +78,14 @@ def load(path: str | Path) -> Any:
     Returns
     -------
     Result
-        Of the class that was saved: an `Experiment`, a `PeriodicSolution`, a `MapEstimate`, a `Posterior`, …
+        An object of the class that was saved, such as `Experiment`, `MapEstimate` or `Posterior`.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file is not one that a result was saved to, or a version of this package did that has other fields.
+        If the file contains no saved result, or one of a version of this package with other fields.
 
     Examples
     --------
@@ -98,7 +98,7 @@ def load(path: str | Path) -> Any:
     import h5py
 
     if not Path(path).is_file():
-        raise FileNotFoundError(f"path: {str(path)!r} is not allowed; there is no such file.")
+        raise FileNotFoundError(f"path: must be an existing file, got {str(path)!r}.")
     try:
         with h5py.File(path, "r") as file:
             header = json.loads(file.attrs[HEADER])
@@ -106,7 +106,7 @@ def load(path: str | Path) -> Any:
             arrays = {key: stored[key][()] for key in stored}
     except (OSError, KeyError, ValueError) as error:
         raise ValueError(
-            f"path: {str(path)!r} is not a saved result ({error}). It must come from save(); a checkpoint is read by "
+            f"path: must be a file written by save(), got {str(path)!r} ({error}); a checkpoint is read by "
             "sample(…, checkpoint=path)."
         ) from None
     return _decode(header, arrays, path)
@@ -135,7 +135,7 @@ def _encode(value: Any, arrays: dict[str, Any], trees: list[Any]) -> Any:
     if type(value).__name__ == "DataTree":
         trees.append(value)
         return {"tree": True}
-    raise TypeError(f"A {type(value).__name__} cannot be saved; numbers, texts, arrays, tables and draws can.")
+    raise TypeError(f"result: must consist of numbers, texts, arrays, tables and draws, got {type(value).__name__}.")
 
 
 def _decode(value: Any, arrays: dict[str, Any], path: str | Path) -> Any:
@@ -158,8 +158,8 @@ def _decode(value: Any, arrays: dict[str, Any], path: str | Path) -> Any:
     needed = {f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING}
     if not needed <= content.keys() <= {f.name for f in fields(kind)}:
         raise ValueError(
-            f"path: {str(path)!r} is not allowed; its {kind.__name__} was saved by another version of this package. "
-            "Load it with that one, or make it again."
+            f"path: must contain a result of this version of bayesperiodic, got {str(path)!r}, whose {kind.__name__} "
+            "has other fields; load it with the version that saved it, or compute it again."
         )
     return kind(**content)
 
@@ -179,5 +179,5 @@ def _result_class(name: str) -> Any:
     module, _, qualname = name.partition(":")
     found = getattr(import_module(module), qualname, None) if module.startswith("bayesperiodic.") else None
     if not is_dataclass(found):
-        raise ValueError(f"path: a saved {name!r} is not known to this version; read it with the one that wrote it.")
+        raise ValueError(f"path: must contain a result of bayesperiodic, got {name!r}; load it with its own version.")
     return found

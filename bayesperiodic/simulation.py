@@ -1,4 +1,4 @@
-"""Time integration: simulated recordings, transients included. Independent of the periodic solver."""
+"""Simulated recordings by time integration, independent of the periodic solver."""
 
 from collections.abc import Callable, Mapping
 
@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.recording import Recording
+from bayesperiodic.models.code_generation import as_columns
 from bayesperiodic.models.integrate import integrate_accurately
 from bayesperiodic.models.model import Model
 
@@ -19,7 +20,7 @@ DIFFERENCE_STEP = 2e-3
 # In forcing periods.
 LONGEST_STEP, TRIAL = 0.05, 3.0
 
-REMEDY = "Check the parameters' signs and units, and the start: the motion may grow without bounds."
+REMEDY = "The motion may be unbounded; check the signs and units of the parameters, and the start."
 
 Signal = np.ndarray | Callable[[np.ndarray], np.ndarray]
 
@@ -36,7 +37,7 @@ def simulate(
     noise: Mapping[str, float] | None = None,
     seed: int | None = None,
 ) -> Recording:
-    """Integrate a model in time and return what an instrument would record; the recording is marked synthetic.
+    """Simulate a recording by time integration of a model; the recording is marked as synthetic.
 
     Parameters
     ----------
@@ -44,21 +45,21 @@ def simulate(
     parameters : mapping of str to float
         A value for every parameter.
     inputs : mapping of str to array (samples,) or callable
-        One forcing period on an equidistant grid (end point excluded, repeated and differentiated spectrally), or a
-        function of time [s] that takes arrays; its derivatives are taken by sixth-order differences at 0.2 % of the
-        forcing period, so it must be smooth.
+        One forcing period on an equidistant grid, end point excluded, which is repeated and differentiated spectrally;
+        or a smooth function of arrays of time [s], which is differentiated by differences of sixth order with a step of
+        0.2 % of the forcing period.
     frequency : float
         Forcing frequency [Hz].
     duration : float
-        [s].
+        Duration [s].
     sampling_rate : float
-        [Hz].
+        Sampling rate [Hz].
     start : mapping of str to float, optional
-        States at time 0, and first derivatives of second-order states as ``dx``; those not named are zero.
+        States at time 0, and first derivatives of second-order states, such as ``dx``; the others are zero.
     noise : mapping of str to float, optional
         Standard deviation of independent normal noise on outputs and inputs.
     seed : int, optional
-        For the noise.
+        Seed of the noise.
 
     Returns
     -------
@@ -68,9 +69,9 @@ def simulate(
     Raises
     ------
     ValueError
-        For unknown or missing names, values that are not finite or not positive where they must be.
+        For unknown or missing names, and values that are not finite or not positive.
     RuntimeError
-        If the integrator fails, which it says why.
+        If the integration fails.
 
     Examples
     --------
@@ -100,7 +101,7 @@ def simulate(
 
 
 class FirstOrder:
-    """The model as ẏ = f(t, y), y = the states and the first derivatives of the second-order ones."""
+    """A model as ẏ = f(t, y), where y contains the states and the first derivatives of the second-order states."""
 
     def __init__(self, model: Model, theta: np.ndarray, frequency: float, signals: list[Callable]):
         self.model, self.theta, self.frequency, self.signals = model, theta, frequency, signals
@@ -112,7 +113,7 @@ class FirstOrder:
     def of(
         cls, model: Model, parameters: Mapping[str, float], inputs: Mapping[str, Signal], frequency: float
     ) -> "FirstOrder":
-        """Return the system at checked values of all parameters and under all inputs."""
+        """Return the system for validated parameters and inputs."""
         _checks.same_names("parameters", parameters, model.parameters)
         theta = np.array([_checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
         _checks.same_names("inputs", inputs, model.inputs)
@@ -120,14 +121,14 @@ class FirstOrder:
         return cls(model, theta, frequency, signals)
 
     def start(self, given: Mapping[str, float]) -> np.ndarray:
-        """Return y from the states and rates that are given, the others zero."""
+        """Return y from the given states and rates; the others are zero."""
         names = [*self.model.states, *("d" + self.model.states[i] for i in self.second)]
         for name in given:
             _checks.one_of("start", name, names)
         return np.array([_checks.finite_number(f"start[{n!r}]", given.get(n, 0.0)) for n in names])
 
     def amplitudes(self) -> np.ndarray:
-        """Return (harmonics, 3·inputs): those of u, u̇, ü, without the harmonics that no periodic input has."""
+        """Return the complex amplitudes of u, u̇, ü, (harmonics, 3·inputs), up to the last harmonic of any input."""
         columns = [s.amplitudes[order] for order in range(3) for s in self.signals if isinstance(s, _Periodic)]
         table = np.zeros((max((c.size for c in columns), default=1), len(columns)), dtype=complex)
         for j, column in enumerate(columns):
@@ -137,13 +138,12 @@ class FirstOrder:
         return table[: 1 + np.flatnonzero(present).max(initial=0)]
 
     def inputs(self, time: np.ndarray) -> np.ndarray:
-        """Return (points, 3·inputs): u, u̇, ü."""
+        """Return u, u̇, ü, (points, 3·inputs)."""
         derivatives = [signal(time) for signal in self.signals]
-        columns = [d[order] for order in range(3) for d in derivatives]
-        return np.ascontiguousarray(np.stack(columns, axis=-1)) if columns else np.empty((time.size, 0))
+        return as_columns((d[order] for order in range(3) for d in derivatives), time.size)
 
     def states(self, time: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return (points, 3·states) with the highest derivatives solved from the equations, linear in them."""
+        """Return q, q̇, q̈, (points, 3·states), with the highest derivatives solved from the equations."""
         states = np.zeros((time.size, 3 * self.count))
         states[:, : self.count] = y[:, : self.count]
         for column, i in enumerate(self.second):
@@ -186,7 +186,7 @@ def _integrate(system: FirstOrder, start: np.ndarray, time: np.ndarray) -> np.nd
 
 
 def integrate_periodic(system: FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Return what `_integrate` does, for inputs that are Fourier series; many periods take seconds."""
+    """Return the same as `_integrate` for inputs that are Fourier series, by compiled code."""
 
     def path(tau: np.ndarray, absolute: np.ndarray, relative: np.ndarray) -> np.ndarray:
         return integrate_accurately(
@@ -203,14 +203,14 @@ def integrate_periodic(system: FirstOrder, start: np.ndarray, time: np.ndarray) 
     amplitudes, tau, ones = system.amplitudes(), time * system.frequency, np.ones(start.size)
     trial = path(np.linspace(0.0, min(tau[-1], TRIAL), 61), 1e-12 * ones, 1e-3 * ones)
     size, relative = np.abs(trial).max(axis=0) + np.finfo(float).tiny, RELATIVE_TOLERANCE * ones
-    # The error of an angle counts by the turn, however far it has gone.
-    turning = [i for i, state in enumerate(system.model.states) if state in system.model.angles]
-    size[turning], relative[turning] = np.maximum(size[turning], np.pi), 0.0
+    # The error of an angle is relative to one turn, not to its value.
+    angles = [i for i, state in enumerate(system.model.states) if state in system.model.angles]
+    size[angles], relative[angles] = np.maximum(size[angles], np.pi), 0.0
     found = path(tau, RELATIVE_TOLERANCE * size, relative)
     if len(found) < time.size or not np.isfinite(found).all():
         raise RuntimeError(
-            f"The time integration of {system.model.name!r} failed after {time[len(found) - 1]:.6g} s: the step became "
-            f"too small. {REMEDY}"
+            f"The time integration of {system.model.name!r} failed at {time[len(found) - 1]:.6g} s, because the step "
+            f"became too small. {REMEDY}"
         )
     return found
 
@@ -246,11 +246,11 @@ def _with_derivatives(name: str, signal: Signal, frequency: float) -> Callable[[
 
 
 TRANSIENT, ROUNDS, NEWTON = 5, 12, 12
-SETTLED, STEP = 1e-9, 1e-5
+TOLERANCE, STEP = 1e-9, 1e-5
 
 
 class NotSettled(RuntimeError):
-    """The motion has no stable steady cycle near where it was started, or did not come to it."""
+    """The simulated motion did not converge to a stable steady cycle."""
 
 
 def steady_cycle(
@@ -262,11 +262,11 @@ def steady_cycle(
     samples: int,
     start: Mapping[str, float] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Return one cycle of every output after the transient has died out, without noise.
+    """Return one steady cycle of every output, without noise.
 
-    Five cycles are integrated from the start; then Newton's method looks for the state that a cycle leads back to,
-    which takes slow transients such as those of heat to their end at once. What it finds counts only if it is stable,
-    because a recording shows nothing else; otherwise ten times five more cycles are integrated before it is given up.
+    Five cycles are integrated from the start. Then Newton's method solves for the state that is repeated after one
+    cycle, which avoids long integrations of slow transients, such as thermal ones. Only a stable cycle is accepted;
+    otherwise five more cycles are integrated and the solution is repeated, at most twelve times in total.
 
     Parameters
     ----------
@@ -278,7 +278,7 @@ def steady_cycle(
     frequency : float
         Forcing frequency [Hz].
     samples : int
-        Of the cycle, end point excluded.
+        Samples of the cycle, end point excluded.
     start : mapping of str to float, optional
         As for `simulate`.
 
@@ -295,33 +295,33 @@ def steady_cycle(
     try:
         y = system.start(start or {})
         for _ in range(ROUNDS):
-            y = _after(system, y, TRANSIENT)
-            found = _returning(system, y)
+            y = _advanced(system, y, TRANSIENT)
+            found = _fixed_point(system, y)
             if found is not None:
                 time = np.arange(samples) / (samples * frequency)
                 values = system.outputs(time, integrate_periodic(system, found, time))
                 return {name: values[:, i] for i, name in enumerate(model.outputs)}
     except (RuntimeError, np.linalg.LinAlgError) as error:
         raise NotSettled(f"{model.name!r}: {error}") from error
-    raise NotSettled(f"{model.name!r} does not settle on a cycle in {ROUNDS * TRANSIENT} periods.")
+    raise NotSettled(f"{model.name!r} does not converge to a stable cycle in {ROUNDS * TRANSIENT} periods.")
 
 
-def _after(system: FirstOrder, y: np.ndarray, periods: int) -> np.ndarray:
+def _advanced(system: FirstOrder, y: np.ndarray, periods: int) -> np.ndarray:
     return integrate_periodic(system, y, np.array([0.0, periods / system.frequency]))[-1]
 
 
-def _returning(system: FirstOrder, y: np.ndarray) -> np.ndarray | None:
-    """Return the state near y that a cycle leads back to; None if there is none, or it is not stable."""
+def _fixed_point(system: FirstOrder, y: np.ndarray) -> np.ndarray | None:
+    """Return the state near y that is repeated after one cycle; None if there is none or it is unstable."""
     identity = np.eye(y.size)
     for _ in range(NEWTON):
         scale = np.maximum(np.abs(y), np.abs(y).max() * STEP) + np.finfo(float).tiny
-        end = _after(system, y, 1)
-        moved = [_after(system, y + STEP * scale[i] * identity[i], 1) for i in range(y.size)]
+        end = _advanced(system, y, 1)
+        moved = [_advanced(system, y + STEP * scale[i] * identity[i], 1) for i in range(y.size)]
         monodromy = np.stack([(m - end) / (STEP * s) for m, s in zip(moved, scale, strict=True)], axis=1)
         step = np.linalg.solve(identity - monodromy, end - y)
         if not np.isfinite(step).all():
             return None
         y = y + step
-        if np.all(np.abs(step) <= SETTLED * scale):
+        if np.all(np.abs(step) <= TOLERANCE * scale):
             return y if np.abs(np.linalg.eigvals(monodromy)).max() < 1.0 else None
     return None

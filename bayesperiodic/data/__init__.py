@@ -1,1 +1,1 @@
-"""What was measured."""
+"""Recordings and experiments."""

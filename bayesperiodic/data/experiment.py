@@ -1,4 +1,4 @@
-"""Experiment: one measured period on the grid, with what stands behind it."""
+"""Experiments: one measured period on an equidistant grid, with its uncertainty."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ MEANING = "samples·periods"
 
 @dataclass(frozen=True)
 class Experiment(Result):
-    """One response period of measured outputs, and of the inputs that caused them.
+    """One response period of measured outputs and inputs.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ class Experiment(Result):
     frequency : float
         Forcing frequency [Hz].
     outputs, inputs : mapping of str to array (samples·periods,)
-        End point excluded.
+        Values on the grid, end point excluded.
     samples : int
         Grid points per forcing period.
     periods : int
@@ -34,49 +34,49 @@ class Experiment(Result):
     scatter : mapping of str to float, optional
         Standard deviation of **one** cycle about the mean, within the kept harmonics, by channel.
     cycles : int
-        Cycles behind the mean.
+        Number of averaged cycles.
     independent : mapping of str to int, optional
-        Number of independent values behind the samples, by output; by default every measured sample is one, but no
-        more than 2·harmonics + 1 are.
+        Effective number of independent values, by output; by default the number of measured samples, at most
+        2·harmonics + 1.
     harmonics : mapping of str to int, optional
         Highest harmonic of the response period that each channel keeps; the model's outputs are projected onto the
-        same harmonics before they are compared. By default nothing was removed.
+        same harmonics before the comparison. By default all harmonics are kept.
     amplitude_variance : mapping of str to array (harmonics + 1,), optional
         Variance of the mean's complex Fourier amplitudes.
     frequency_se : float
-        Standard error of the frequency [Hz]; zero where it is known.
+        Standard error of the frequency [Hz]; zero if it is known.
     periodicity : float
-        Fraction of the variance that the mean period explains, of the channel where it is least.
+        Fraction of the variance that the mean period explains, of the channel with the smallest one.
     drift : mapping of str to float
-        By what fraction the fundamental of each channel grew over the recording.
+        Relative growth of the fundamental of each channel over the recording.
     origin : float
         Time [s] of the recording at which τ = 0.
     synthetic : bool
         True if the data were simulated.
     mask : bool array (samples·periods,), optional
-        True at the points where the outputs were measured, such as the points of a Poincaré section; what stands
-        elsewhere is not looked at.
+        True at the points where the outputs were measured, such as the points of a Poincaré section; other entries
+        are ignored.
     covariance : array (values, values) or (values + multipliers, values + multipliers), optional
-        Covariance of the outputs at the points of the mask, point by point, within a point in the order of `outputs`,
-        up to one unknown factor ("scale"); then that of the logarithms of ``multipliers``, if it has rows for them.
+        Covariance of the outputs at the points of the mask, point by point and in the order of `outputs` within a
+        point, up to one unknown factor ("scale"). It may have further rows for the logarithms of ``multipliers``.
     multipliers : array (multipliers,), optional
         Measured Floquet multipliers, real and signed, largest modulus first; they are compared as log|μ|.
     multiplier_sd : array (multipliers,), optional
-        Standard deviations of log|μ|, where ``covariance`` has no rows for them.
+        Standard deviations of log|μ|, if ``covariance`` has no rows for them.
     guess : mapping of str to array (samples·periods,), optional
-        States of the model, turns of angles included, from which the first periodic solve starts; without it that is
-        the equilibrium. An unstable orbit needs one.
+        States of the model, including turns of angles, from which the first periodic solve starts; by default the
+        equilibrium. An unstable orbit needs a guess.
 
     Raises
     ------
     ValueError
-        For arrays of a wrong length, NaN where something was measured, a frequency ≤ 0, an unknown channel, a name with
-        ``/``, ``[`` or ``]``, a mask without points, a covariance that is not symmetric and positive definite,
-        multipliers that are zero or without an error.
+        For arrays of a wrong length, NaN in measured samples, a frequency ≤ 0, an unknown channel, a name with ``/``,
+        ``[`` or ``]``, a mask without points, a covariance that is not symmetric and positive definite, multipliers
+        that are zero or have no standard deviation.
 
     Examples
     --------
-    A force measured over 20 cycles, of which the fold kept five harmonics:
+    A force measured over 20 cycles, with five harmonics kept:
 
     >>> import numpy as np, bayesperiodic as bp
     >>> tau = np.arange(64) / 64
@@ -112,7 +112,7 @@ class Experiment(Result):
 
     def __post_init__(self) -> None:
         if not self.name or any(c in self.name for c in "/[]"):
-            raise ValueError(f"name: {self.name!r} is not allowed; any other text without '/', '[' and ']' is.")
+            raise ValueError(f"name: must be a text without '/', '[' and ']', got {self.name!r}.")
         object.__setattr__(self, "frequency", _checks.positive("frequency", self.frequency))
         points = _checks.integer("samples", self.samples, 4) * _checks.integer("periods", self.periods, 1)
         if self.mask is not None:
@@ -143,7 +143,7 @@ class Experiment(Result):
         self._check_covariance(measured * len(self.outputs))
 
     def _measured(self, kind: str, values: ArrayLike) -> ArrayLike:
-        """Return the values of a channel with zeros where an output was not measured."""
+        """Return the values of a channel, with zeros at points of an output that the mask excludes."""
         array = np.asarray(values)
         if self.mask is None or kind == "inputs" or array.shape != self.mask.shape or array.dtype.kind not in "fiu":
             return values
@@ -152,47 +152,46 @@ class Experiment(Result):
     def _check_multipliers(self) -> None:
         if self.multipliers is None:
             if self.multiplier_sd is not None:
-                raise ValueError("multiplier_sd: it is not allowed without `multipliers`.")
+                raise ValueError("multiplier_sd: requires `multipliers`.")
             return
         values = _checks.finite_vector("multipliers", self.multipliers)
         if not values.size or np.any(values == 0.0) or np.any(np.diff(np.abs(values)) > 0.0):
             raise ValueError(
-                f"multipliers: {values.tolist()} is not allowed; they must be real, not zero, and ordered by modulus, "
-                "largest first."
+                f"multipliers: must be real, not zero, and ordered by descending modulus, got {values.tolist()}."
             )
         object.__setattr__(self, "multipliers", values)
         if self.multiplier_sd is not None:
             sd = _checks.finite_vector("multiplier_sd", self.multiplier_sd, values.size)
             if np.any(sd <= 0.0):
-                raise ValueError(f"multiplier_sd: {sd.tolist()} is not allowed; they must be > 0.")
+                raise ValueError(f"multiplier_sd: must be > 0, got {sd.tolist()}.")
             object.__setattr__(self, "multiplier_sd", sd)
 
     def _check_covariance(self, values: int) -> None:
         logarithms = 0 if self.multipliers is None else self.multipliers.size
         if self.covariance is None:
             if logarithms and self.multiplier_sd is None:
-                raise ValueError("multipliers: without an error they are not allowed; give multiplier_sd.")
+                raise ValueError("multipliers: must have standard deviations; give multiplier_sd.")
             return
         matrix = np.asarray(self.covariance, dtype=float)
         size = values if self.multiplier_sd is not None else values + logarithms
         if matrix.shape != (size, size):
             raise ValueError(
-                f"covariance: shape {matrix.shape} is not allowed; it must be {(size, size)}, for {values} "
-                f"measured values{f' and {logarithms} multipliers' if size > values else ''}."
+                f"covariance: must have shape {(size, size)}, for {values} measured values"
+                f"{f' and {logarithms} multipliers' if size > values else ''}, got {matrix.shape}."
             )
         if bad := np.count_nonzero(~np.isfinite(matrix)):
-            raise ValueError(f"covariance: it must be finite and symmetric; {bad} of its entries are not finite.")
+            raise ValueError(f"covariance: must be finite and symmetric, got {bad} entries that are not finite.")
         if not np.allclose(matrix, matrix.T, rtol=1e-8):
             i, j = np.unravel_index(np.argmax(np.abs(matrix - matrix.T)), matrix.shape)
             raise ValueError(
-                f"covariance: it must be finite and symmetric; entry [{i}, {j}] is {matrix[i, j]:g}, entry [{j}, {i}] "
-                f"is {matrix[j, i]:g}."
+                f"covariance: must be finite and symmetric, got {matrix[i, j]:g} in entry [{i}, {j}] and "
+                f"{matrix[j, i]:g} in entry [{j}, {i}]."
             )
         try:
             covariance_cholesky(matrix)
         except np.linalg.LinAlgError:
             raise ValueError(
-                "covariance: it must be positive definite; every combination of the values needs an error of its own."
+                "covariance: must be positive definite, so that every combination of the values has a variance > 0."
             ) from None
         object.__setattr__(self, "covariance", matrix)
 
@@ -206,29 +205,29 @@ class Experiment(Result):
         *,
         samples: int = 800,
     ) -> "Experiment":
-        """Return the experiment that was measured as harmonic amplitudes instead of time histories.
+        """Make an experiment from harmonic amplitudes instead of time histories.
 
         Parameters
         ----------
         name : str
         frequency : float
-            Of harmonic 1, the forcing frequency [Hz].
+            Frequency of harmonic 1, the forcing frequency [Hz].
         outputs, inputs : mapping of str to complex array (harmonics + 1,)
             Amplitudes c of harmonics 0, 1, 2, …: the signal is Re Σ c[h] exp(2πi h τ), so that c[0] is the mean (real),
-            ``|c[h]|`` the amplitude and a cosine has a real, positive one.
+            ``|c[h]|`` the amplitude, and c[h] of a cosine real and positive.
         samples : int
-            Grid points per period; more than twice the highest harmonic.
+            Grid points per period, more than twice the highest harmonic.
 
         Returns
         -------
         Experiment
-            The outputs are compared in these harmonics only; each channel has 2·harmonics + 1 independent values.
+            Only these harmonics of the outputs are compared; each channel has 2·harmonics + 1 independent values.
 
         Raises
         ------
         ValueError
-            For amplitudes that are not finite or no vector, a mean that is not real, too few samples for the highest
-            harmonic, and as `Experiment` does.
+            For amplitudes that are not a finite vector, a mean that is not real, too few samples for the highest
+            harmonic, and as for `Experiment`.
 
         Examples
         --------
@@ -266,7 +265,7 @@ class Experiment(Result):
         return self.tau / self.frequency
 
     def project(self, channel: str, values: np.ndarray) -> np.ndarray:
-        """Return signals with the harmonics removed that the measured channel did not keep.
+        """Project signals onto the harmonics that the measured channel keeps.
 
         Parameters
         ----------
@@ -285,7 +284,7 @@ class Experiment(Result):
     def __repr__(self) -> str:
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
         return (
-            f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples a "
+            f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples per "
             f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''})"
         )
 
@@ -294,28 +293,26 @@ def _checked_mask(given: ArrayLike, points: int) -> np.ndarray:
     mask = np.asarray(given)
     if mask.dtype != bool or mask.shape != (points,) or not mask.any():
         raise ValueError(
-            f"mask: {mask.dtype} of shape {mask.shape} with {np.count_nonzero(mask)} points is not allowed; it must be "
-            f"a bool array of shape {(points,)}, True at one point at least."
+            f"mask: must be a bool array of shape {(points,)}, True at one point or more, got {mask.dtype} of shape "
+            f"{mask.shape} with {np.count_nonzero(mask)} points."
         )
     return mask
 
 
 def _amplitudes(argument: str, values: ArrayLike, samples: int) -> np.ndarray:
-    """Return checked complex amplitudes of harmonics from 0 on."""
     try:
         amplitudes = np.array(values, dtype=complex)
     except (TypeError, ValueError):
-        raise ValueError(f"{argument}: {values!r} is not allowed; it must be an array of complex numbers.") from None
+        raise ValueError(f"{argument}: must be an array of complex numbers, got {values!r}.") from None
     if amplitudes.ndim != 1 or not amplitudes.size or not np.isfinite(amplitudes).all():
         raise ValueError(
-            f"{argument}: {amplitudes.tolist()} is not allowed; it must be a vector of finite amplitudes of harmonics "
-            "0, 1, 2, …"
+            f"{argument}: must be a vector of finite amplitudes of harmonics 0, 1, 2, …, got {amplitudes.tolist()}."
         )
     if amplitudes[0].imag != 0.0:
-        raise ValueError(f"{argument}: {amplitudes[0]} is not allowed as harmonic 0; the mean must be real.")
+        raise ValueError(f"{argument}: must have a real mean (harmonic 0), got {amplitudes[0]}.")
     if amplitudes.size - 1 > _fourier.highest_harmonic(samples):
         raise ValueError(
-            f"samples: {samples} is not allowed; harmonic {amplitudes.size - 1} of {argument} needs at least "
-            f"{2 * amplitudes.size - 1}."
+            f"samples: must be at least {2 * amplitudes.size - 1} for harmonic {amplitudes.size - 1} of {argument}, "
+            f"got {samples}."
         )
     return amplitudes

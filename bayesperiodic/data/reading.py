@@ -1,4 +1,4 @@
-"""Columns of measured numbers from CSV, NPZ and MAT files."""
+"""Columns of CSV, NPZ and MAT files, and conversion of units."""
 
 import zipfile
 from collections.abc import Iterable, Sequence
@@ -17,13 +17,13 @@ def read_csv(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
     try:
         table = pd.read_csv(existing(path), skipinitialspace=True, low_memory=False)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise ValueError(f"path: {str(path)!r} cannot be read as CSV ({error}); it needs a header line.") from None
+        raise ValueError(f"path: must be a CSV file with a header line, got {str(path)!r} ({error}).") from None
     table.columns = [str(name).strip() for name in table.columns]
     columns, names = [*columns], [*table.columns]
     if not {*columns} <= {*names} and _is_no_header(names):
         raise ValueError(
-            f"path: {str(path)!r} is not allowed; its first line is read as {names}. It must name the columns, "
-            "separated by commas, and numbers must have a decimal point."
+            f"path: must be a CSV file whose first line names the columns, separated by commas, got {str(path)!r}, "
+            f"whose first line is read as {names}. Numbers must have a decimal point."
         )
     result = {}
     for column in columns:
@@ -31,27 +31,27 @@ def read_csv(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
         if not pd.api.types.is_numeric_dtype(values):
             row = int(np.flatnonzero(pd.to_numeric(values, errors="coerce").isna() & values.notna())[0])
             raise ValueError(
-                f"column {column!r} of {Path(path).name}: {values.iloc[row]!r} in data row {row + 1} is not allowed; "
-                "every cell must be a number, with a decimal point."
+                f"column {column!r} of {Path(path).name}: must contain numbers, with a decimal point, got "
+                f"{values.iloc[row]!r} in data row {row + 1}."
             )
         result[column] = _numbers(path, column, values.to_numpy())
     return result
 
 
 def read_npz(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return named arrays of an NPZ file; pickled objects are never loaded."""
+    """Return named arrays of an NPZ file, without loading pickled objects."""
     try:
         with np.load(existing(path), allow_pickle=False) as archive:
             return {c: _numbers(path, c, _pick(path, archive, c)) for c in columns}
     except (zipfile.BadZipFile, EOFError, AttributeError, TypeError) as error:
         raise ValueError(
-            f"path: {str(path)!r} cannot be read as NPZ ({error}). Save named arrays by numpy.savez."
+            f"path: must be an NPZ file of named arrays (numpy.savez), got {str(path)!r} ({error})."
         ) from None
     except ValueError as error:
         if "allow_pickle" in str(error):
             raise ValueError(
-                f"path: {str(path)!r} is no NPZ file, or holds pickled objects. Save plain arrays by numpy.savez, or "
-                "read a CSV or MAT file by from_csv or from_mat."
+                f"path: must be an NPZ file without pickled objects, got {str(path)!r}. Save numeric arrays by "
+                "numpy.savez, or read a CSV or MAT file by from_csv or from_mat."
             ) from None
         raise
 
@@ -68,20 +68,20 @@ def read_mat(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
     try:
         variables = {name: value for name, value in loadmat(file).items() if not name.startswith("__")}
     except (ValueError, TypeError, NotImplementedError, EOFError) as error:
-        raise ValueError(f"path: {str(path)!r} cannot be read as MAT ({error}).") from None
+        raise ValueError(f"path: must be a MAT file, got {str(path)!r} ({error}).") from None
     return {c: _numbers(path, c, _pick(path, variables, c)) for c in columns}
 
 
 def existing(path: str | Path) -> Path:
-    """Return the path; raise a FileNotFoundError if no file is there."""
+    """Return the path; raise a FileNotFoundError if there is no such file."""
     file = Path(path)
     if not file.is_file():
-        raise FileNotFoundError(f"path: {str(path)!r} is not allowed; there is no such file.")
+        raise FileNotFoundError(f"path: must be an existing file, got {str(path)!r}.")
     return file
 
 
 def _is_no_header(names: list[str]) -> bool:
-    """Return whether a first line holds numbers, or is not split at its separators."""
+    """Return whether a first line contains numbers, or separators other than commas."""
     if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
         return True
     try:
@@ -100,8 +100,7 @@ def _numbers(path: str | Path, column: str, values: Any) -> np.ndarray:
     array = np.squeeze(np.asarray(values))
     if array.ndim != 1 or array.dtype.kind not in "fiub":
         raise ValueError(
-            f"{argument}: an array of shape {np.shape(values)} and type {array.dtype} is not allowed; it must be one "
-            "column of real numbers."
+            f"{argument}: must be one column of real numbers, got shape {np.shape(values)} and type {array.dtype}."
         )
     return array.astype(float)
 
@@ -112,27 +111,29 @@ def convert(name: str, values: np.ndarray, unit: float | Sequence[str]) -> np.nd
     Parameters
     ----------
     name : str
-        The channel, for messages.
+        Channel, for messages.
     values : array
     unit : float or (from, to)
-        A factor, or two unit names such as ("mm", "m").
+        Factor, or two unit names such as ("mm", "m").
 
     Raises
     ------
     ValueError
-        For a factor that is zero or not finite, an unknown unit, or two units of different dimension.
+        For a factor that is zero or not finite, an unknown unit, or units of different dimensions.
     """
     argument = f"units[{name!r}]"
     if isinstance(unit, int | float):
         factor = _checks.finite_number(argument, unit)
         if factor == 0.0:
-            raise ValueError(f"{argument}: 0 is not allowed; a factor must differ from zero.")
+            raise ValueError(f"{argument}: must not be zero, got {unit!r}.")
         return values * factor
     if isinstance(unit, str) or len(unit) != 2 or not all(isinstance(u, str) for u in unit):
-        raise ValueError(f"{argument}: {unit!r} is not allowed; give a factor or a pair such as ('mm', 'm').")
+        raise ValueError(f"{argument}: must be a factor or a pair such as ('mm', 'm'), got {unit!r}.")
     import pint
 
     try:
         return np.asarray(pint.UnitRegistry().Quantity(values, unit[0]).to(unit[1]).magnitude, dtype=float)
     except (pint.errors.PintError, AssertionError, TypeError, ValueError) as error:
-        raise ValueError(f"{argument}: {tuple(unit)!r} is not allowed; {error}.") from None
+        raise ValueError(
+            f"{argument}: must be two units of the same dimension, got {tuple(unit)!r} ({error})."
+        ) from None

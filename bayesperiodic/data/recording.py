@@ -18,12 +18,12 @@ Units = Mapping[str, float | Sequence[str]]
 
 @dataclass(frozen=True)
 class Recording(Result):
-    """Signals measured together over time.
+    """Signals measured at the same times.
 
     Attributes
     ----------
     time : array (samples,)
-        Strictly increasing [s]; the steps need not be equal.
+        Strictly increasing times [s]; the steps need not be equal.
     outputs, inputs : dict of str to array (samples,)
     name : str
     synthetic : bool
@@ -32,8 +32,8 @@ class Recording(Result):
     Raises
     ------
     ValueError
-        For fewer than two samples, samples that are NaN or infinite, lengths that differ, a time that does not
-        increase, no output, names that are no identifiers or come twice.
+        For fewer than two samples, samples that are NaN or infinite, different lengths, a time that does not increase,
+        no output, names that are not identifiers or are repeated.
 
     Examples
     --------
@@ -56,20 +56,20 @@ class Recording(Result):
     def __post_init__(self) -> None:
         _checks.finite_vector("time", self.time)
         if self.time.size < 2:
-            raise ValueError(f"time: {self.time.size} samples are not allowed; a recording needs at least 2.")
+            raise ValueError(f"time: must have at least 2 samples, got {self.time.size}.")
         step = np.diff(self.time)
         if np.any(step <= 0):
             index = int(np.flatnonzero(step <= 0)[0])
             raise ValueError(
-                f"time: {self.time[index + 1]:g} s after {self.time[index]:g} s at index {index + 1} is not allowed; "
-                "time must increase."
+                f"time: must increase, got {self.time[index + 1]:g} s after {self.time[index]:g} s at index "
+                f"{index + 1}."
             )
         if not self.outputs:
-            raise ValueError("outputs: {} is not allowed; a recording needs at least one measured output.")
+            raise ValueError("outputs: must have at least one channel, got none.")
         _checks.identifiers("outputs and inputs", (*self.outputs, *self.inputs))
         for kind, channels in (("outputs", self.outputs), ("inputs", self.inputs)):
             for name, values in channels.items():
-                _checks.finite_vector(f"{kind}[{name!r}]", values, self.time.size, "one a time")
+                _checks.finite_vector(f"{kind}[{name!r}]", values, self.time.size, "one per time")
 
     @property
     def sampling_rate(self) -> float:
@@ -80,14 +80,14 @@ class Recording(Result):
     def from_arrays(
         cls, time: Any, outputs: Mapping[str, Any], inputs: Mapping[str, Any] | None = None, *, name: str | None = None
     ) -> "Recording":
-        """Make a recording of arrays, pandas Series or xarray DataArrays.
+        """Make a recording from arrays, pandas Series or xarray DataArrays.
 
         Parameters
         ----------
         time : array (samples,)
-            Strictly increasing [s].
+            Strictly increasing times [s].
         outputs, inputs : mapping of str to array (samples,)
-            In the units of the model's channels.
+            Values in the units of the model's channels.
         name : str, optional
             By default "recording".
 
@@ -98,7 +98,7 @@ class Recording(Result):
         Raises
         ------
         ValueError
-            For samples that are NaN or infinite, lengths that differ, or a time that does not increase.
+            For samples that are NaN or infinite, different lengths, or a time that does not increase.
 
         Examples
         --------
@@ -140,11 +140,11 @@ class Recording(Result):
         time : str, optional
             Column of times [s].
         sampling_rate : float, optional
-            [Hz], where the file has no column of times.
+            Sampling rate [Hz], if the file has no column of times.
         units : mapping of str to float or (from, to), optional
             Conversion of a channel (or of "time") by a factor or a pair of units such as ``("mm", "m")``.
         name : str, optional
-            By default the file's name without its ending.
+            By default the file name without its extension.
 
         Returns
         -------
@@ -155,7 +155,7 @@ class Recording(Result):
         FileNotFoundError
             If there is no such file.
         ValueError
-            For a missing column, a cell that is no number, NaN or infinite samples, a time that does not increase,
+            For a missing column, a cell that is not a number, NaN or infinite samples, a time that does not increase,
             both or neither of ``time`` and ``sampling_rate``, an unknown unit.
 
         Examples
@@ -192,10 +192,10 @@ class Recording(Result):
         time : str, optional
             Array of times [s].
         sampling_rate : float, optional
-            [Hz], where the file has no times.
+            Sampling rate [Hz], if the file has no times.
         units : mapping of str to float or (from, to), optional
         name : str, optional
-            By default the file's name without its ending.
+            By default the file name without its extension.
 
         Returns
         -------
@@ -206,7 +206,7 @@ class Recording(Result):
         FileNotFoundError
             If there is no such file.
         ValueError
-            As `from_csv` does, and for an array of objects, which would have to be unpickled.
+            As `from_csv`, and for an array of objects, which would have to be unpickled.
         """
         return cls._from_file(reading.read_npz, path, outputs, inputs, time, sampling_rate, units, name)
 
@@ -232,10 +232,10 @@ class Recording(Result):
         time : str, optional
             Variable of times [s].
         sampling_rate : float, optional
-            [Hz], where the file has no times.
+            Sampling rate [Hz], if the file has no times.
         units : mapping of str to float or (from, to), optional
         name : str, optional
-            By default the file's name without its ending.
+            By default the file name without its extension.
 
         Returns
         -------
@@ -246,7 +246,7 @@ class Recording(Result):
         FileNotFoundError
             If there is no such file.
         ValueError
-            As `from_csv` does, and for a variable that is no vector of real numbers.
+            As `from_csv`, and for a variable that is not a vector of real numbers.
         """
         return cls._from_file(reading.read_mat, path, outputs, inputs, time, sampling_rate, units, name)
 
@@ -266,7 +266,7 @@ class Recording(Result):
         for argument, given in (("outputs", outputs), ("inputs", inputs)):
             _checks.mapping(argument, given, "{'force': 'the column of the force'}")
         if (time is None) == (sampling_rate is None):
-            raise ValueError(f"time: {time!r} with sampling_rate {sampling_rate!r} is not allowed; give exactly one.")
+            raise ValueError(f"time: must be given or sampling_rate, and not both, got {time!r} and {sampling_rate!r}.")
         for key in units:
             _checks.one_of("units", key, ("time", *outputs, *inputs))
         wanted = dict.fromkeys([*([time] if time else []), *outputs.values(), *inputs.values()])
@@ -295,7 +295,7 @@ class Recording(Result):
         Parameters
         ----------
         start, stop : float
-            [s].
+            Times [s].
 
         Returns
         -------
@@ -304,13 +304,13 @@ class Recording(Result):
         Raises
         ------
         ValueError
-            If fewer than two samples are left.
+            If fewer than two samples remain.
         """
         keep = (self.time >= start) & (self.time <= stop)
         if keep.sum() < 2:
             raise ValueError(
-                f"start, stop: {start!r}, {stop!r} is not allowed; the recording runs from {self.time[0]:g} to "
-                f"{self.time[-1]:g} s and two samples at least must remain."
+                f"start, stop: must select at least two samples between {self.time[0]:g} and {self.time[-1]:g} s, got "
+                f"{start!r}, {stop!r}."
             )
         return replace(
             self,
@@ -332,47 +332,46 @@ class Recording(Result):
     ) -> Experiment:
         """Fold the steady part of the recording into its mean period on an equidistant grid.
 
-        The fundamental frequency is found by least squares over the whole steady part, the mean period is a
-        least-squares Fourier series (the sampling rate need not divide the period), and only whole cycles after the
-        transient are used.
+        The fundamental frequency is estimated by least squares over the whole steady part. The mean period is a
+        least-squares Fourier series, so that the sampling rate may be arbitrary. Only whole cycles after the transient
+        are used.
 
         Parameters
         ----------
         samples : int
             Grid points per forcing period.
         frequency : float, optional
-            Forcing frequency [Hz], taken as exact; by default it is estimated, with a standard error.
+            Exact forcing frequency [Hz]; by default it is estimated, with a standard error.
         periods : int
             Forcing periods per response period.
         harmonics : int or mapping of str to int, optional
             Harmonics of the response period to keep, for all channels or by channel. By default each channel keeps all
-            up to the last one that stands out of the cycle-to-cycle scatter: an F-test on its squared amplitude with a
-            false-alarm rate of 1 % over all harmonics tested.
+            harmonics up to the last one that is significant relative to the cycle-to-cycle scatter: an F-test on the
+            squared amplitude, with a false-alarm rate of 1 % over all harmonics tested.
         origin : float or "crossing"
-            Time [s] at which τ = 0; or, for a free-running system whose phase means nothing, where the fundamental of
-            the first output crosses its mean upwards, for the first time after time 0.
+            Time [s] at which τ = 0. "crossing", for autonomous systems, whose phase is arbitrary: the first time >= 0
+            at which the fundamental of the first output crosses zero upwards.
         largest_drift : float, optional
-            How far the fundamental of a channel may grow or shrink over the whole recording, as a fraction of its mean
-            (a straight line through the amplitudes of the cycles). A free-running system that is held on a cycle, or
-            settles on one, has none.
+            Limit of the relative change of a channel's fundamental over the recording, by linear regression on the
+            amplitudes of the cycles. By default there is no limit.
         name : str, optional
             By default the recording's name.
 
         Returns
         -------
         Experiment
-            With `.frequency_se`, `.cycles` (how many were used), `.scatter`, `.independent` (2·harmonics + 1, at most
-            the number of samples), `.harmonics`, `.periodicity` and `.drift`.
+            With `.frequency_se`, `.cycles` (the number used), `.scatter`, `.independent` (2·harmonics + 1, at most the
+            number of samples), `.harmonics`, `.periodicity` and `.drift`.
 
         Raises
         ------
         ValueError
-            For fewer than three cycles, a constant channel, a signal that is not periodic (its periodicity is told),
-            more harmonics than the samples resolve, an unknown channel in `harmonics`, a drift beyond the largest.
+            For fewer than three cycles, a constant channel, a signal that is not periodic, more harmonics than the
+            samples resolve, an unknown channel in `harmonics`, a drift beyond the limit.
 
         Examples
         --------
-        Noise of 0.1 mm on the recorded displacement of an oscillator, drive and sampling rate incommensurate:
+        The displacement of an oscillator with noise of 0.1 mm; forcing and sampling rate are incommensurate:
 
         >>> import numpy as np, bayesperiodic as bp
         >>> force = {"force": np.cos(2 * np.pi * np.arange(64) / 64)}

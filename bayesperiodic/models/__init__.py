@@ -1,4 +1,4 @@
-"""What we believe: symbolic models, compiled to kernels; the ready-made ones are attributes here."""
+"""Models: equations, compiled functions, and a library of models (the attributes of this package)."""
 
 from bayesperiodic.models.library import chain, dahl, duffing, flutter, landing_gear, pendulum, silverbox, van_der_pol
 

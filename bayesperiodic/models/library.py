@@ -1,4 +1,4 @@
-"""Ready-made models. ``help(bayesperiodic.models.pendulum)`` tells where one comes from and what it is for."""
+"""Library of models; ``help(bayesperiodic.models.pendulum)`` shows the equations and the source of one."""
 
 from functools import cache
 from typing import Any
@@ -7,8 +7,6 @@ import sympy as sp
 
 from bayesperiodic import _checks
 from bayesperiodic.models.model import Model, smooth_sign
-
-__all__ = ["chain", "dahl", "duffing", "landing_gear", "pendulum", "silverbox", "van_der_pol"]
 
 duffing = Model(
     "duffing",
@@ -20,9 +18,9 @@ duffing = Model(
     outputs=lambda s, p, u: {"displacement": s.x},
     description="""A mass on a damper and a hardening or softening spring: m ẍ + c ẋ + k x + k3 x³ = force.
 
-    The cubic is the first term of any smooth symmetric restoring force after the linear one (G. Duffing, Erzwungene
-    Schwingungen bei veränderlicher Eigenfrequenz, Vieweg, 1918). For a first try, and for structures near a resonance,
-    whose bent peak has up to three periodic solutions at one frequency.
+    The cubic term is the first nonlinear term of any smooth symmetric restoring force (G. Duffing, Erzwungene
+    Schwingungen bei veränderlicher Eigenfrequenz, Vieweg, 1918). For first experiments, and for structures near a
+    resonance, which have up to three periodic solutions at one frequency.
 
     Examples
     --------
@@ -42,15 +40,15 @@ dahl = Model(
     outputs=lambda s, p, u: {"force": p.Kx * u.ddisplacement + p.K * u.displacement + p.F0 + p.Kw * s.w},
     description="""A damper with Dahl friction: force = Kx v + K x + F0 + Kw w, ẇ = rho (v − ``|v|`` w), x given, v = ẋ.
 
-    Before it slides, friction is a spring: dw/dx = rho (1 − w sgn v) takes the friction force Kw w from one sliding
-    value to the other, −Kw and Kw, within a few 1/rho of travel, at any speed (P. R. Dahl, Solid friction damping of
+    Dahl friction is elastic before it slides: by dw/dx = rho (1 − w sgn v), the friction force Kw w changes between its
+    sliding values −Kw and Kw within a travel of a few 1/rho, at any speed (P. R. Dahl, Solid friction damping of
     mechanical vibrations, AIAA Journal 14, 1976, 1675-1682; exponent 1). Viscous damping Kx, a stiffness K and an
-    offset F0 act beside it. For dampers and joints whose displacement is imposed.
+    offset F0 act in parallel. For dampers and joints whose displacement is prescribed.
 
     Examples
     --------
-    With an amplitude of 10 mm, 50 times 1/rho, friction slides most of the time, and takes nearly the 4·Kw·10 mm = 2 J
-    a period of ideal Coulomb friction:
+    With an amplitude of 10 mm, 50 times 1/rho, friction slides most of the time and dissipates almost the
+    4·Kw·10 mm = 2 J per period of ideal Coulomb friction:
 
     >>> import numpy as np, bayesperiodic as bp
     >>> x = 0.01 * np.cos(2 * np.pi * np.arange(800) / 800)
@@ -89,15 +87,16 @@ pendulum = Model(
     outputs=lambda s, p, u: {"angle": s.phi, "rate": s.dphi},
     description="""The parametrically driven pendulum of de Kraker, Verbeek & van de Wouw (1997), equation 10.
 
-    A point mass m on an arm l, at the angle φ (state phi) from hanging down, whose pivot is at the height −a cos ωt,
-    ω = 2π·frequency. Seen from the pivot, gravity is g + a ω² cos ωt, and the torques divided by the inertia m l² are::
+    A point mass m on an arm l, at the angle φ (state phi) from the downward position. The height of the pivot is
+    −a cos ωt, ω = 2π·frequency, so that gravity relative to the pivot is g + a ω² cos ωt. The moments about the pivot,
+    divided by the inertia m l², are::
 
         φ̈ + [k1 tanh(φ̇/v0) + k2 φ̇ + k3 φ̇|φ̇|]/(m l²) + (g + a ω² cos ωt)/l · sin φ = 0
 
-    with Coulomb friction of the bearing (the paper's sgn φ̇, smoothed below the speed v0), viscous damping and air
-    resistance. Of m, only k1/m, k2/m and k3/m can be told. For stable and unstable periodic orbits, of rotating and
-    chaotic motion too: φ may wind. A set that behaves as the paper tells, locked at ω = 13 rad/s, chaotic at 9.09, is
-    in the example.
+    with Coulomb friction in the bearing (the paper's sgn φ̇, smoothed below the speed v0), viscous damping and air
+    resistance. Only the ratios k1/m, k2/m and k3/m are identifiable, not m. For stable and unstable periodic orbits,
+    including those of rotating and chaotic motion: φ may wind. With the values in the example the motion is, as in the
+    paper, periodic at ω = 13 rad/s and chaotic at 9.09 rad/s.
 
     Examples
     --------
@@ -119,11 +118,11 @@ silverbox = Model(
     outputs=lambda s, p, u: {"response": s.y},
     description="""An electronic Duffing oscillator: ÿ/w0² + c ẏ/w0 + k1 y + k2 y² + k3 y³ = g drive + u0, all in volts.
 
-    The usual model of the Silverbox, a circuit that imitates a mass on a hardening spring (T. Wigren, J. Schoukens,
-    Three free data sets for development and benchmarking in nonlinear system identification, European Control
-    Conference, 2013). For measured signals with offsets, whence k2 and u0. w0 only sets the scale of time: doubled,
-    with c halved and the others quartered, it gives the same response; so fix it. An offset of the response is left
-    out, because other k1, k2 and u0 do the same.
+    The usual model of the Silverbox, an electronic circuit that is equivalent to a mass on a hardening spring
+    (T. Wigren, J. Schoukens, Three free data sets for development and benchmarking in nonlinear system identification,
+    European Control Conference, 2013). k2 and u0 represent offsets of the measured signals. w0 is a time scale and not
+    identifiable: twice w0 with c/2 and a quarter of the other parameters gives the same response; fix it. The response
+    has no offset parameter, because other values of k1, k2 and u0 have the same effect.
 
     Examples
     --------
@@ -144,9 +143,9 @@ van_der_pol = Model(
     description="""A self-excited oscillator without any input: ẍ − mu omega (1 − x²) ẋ + omega² x = 0.
 
     Van der Pol's equation (Philosophical Magazine 2, 1926, 978-992) with time scaled by omega. The damping is negative
-    for ``|x|`` < 1 and positive beyond, so that every motion but rest ends on one cycle, of amplitude about 2 and, for
-    small mu, of period (2π/omega)(1 + mu²/16 + …). The displacement is relative to the one where the damping vanishes.
-    For autonomous systems, where the frequency is part of the answer and the phase is free.
+    for ``|x|`` < 1 and positive for ``|x|`` > 1, so that every motion except rest converges to one limit cycle, with
+    amplitude about 2 and, for small mu, period (2π/omega)(1 + mu²/16 + …). The displacement is relative to the one at
+    which the damping vanishes. For autonomous systems, whose frequency is unknown and whose phase is arbitrary.
 
     Examples
     --------
@@ -177,12 +176,12 @@ _GEAR_CHANNELS = {"displacement": "m", "force": "N", "pressure": "Pa", "q": "m",
 
 
 def landing_gear(drive: str = "force") -> Model:
-    r"""Return the nose landing gear damper of the paper, driven by a force or by a displacement.
+    r"""Return the model of a nose landing gear damper, driven by a force or by a displacement.
 
-    These are eq. (9) of [1]_. q is the compression and T the absolute temperature of the gas. The force on the axle
-    balances inertia, oil damping with the velocity squared, the gas on the area theta4, Coulomb friction (partly
-    growing with the pressure) smoothed by an arctan, and a constant, which with theta11 = −theta4 · ambient pressure is
-    the air outside:
+    The equations are eq. (9) of [1]_. q is the compression and T the absolute temperature of the gas. The force on the
+    axle balances inertia, quadratic oil damping, the gas pressure on the area theta4, Coulomb friction (with a part
+    proportional to the pressure) smoothed by an arctan, and a constant, which is the ambient pressure on the same area
+    if theta11 = −theta4 · ambient pressure:
 
     .. math::
 
@@ -191,21 +190,21 @@ def landing_gear(drive: str = "force") -> Model:
         \theta_{15} \dot T + \theta_{16} (1 + \theta_6 q)(T + \theta_{17}) - (\theta_4 p + \theta_{11}) \dot q &= 0 \\
         p = \frac{\theta_5 T}{1 + \theta_6 q + \theta_7 T}, \qquad \mathrm{displacement} &= q + \theta_{12}
 
-    The second row is the energy of the gas: its heat capacity theta15, conduction theta16 through the wall to the
-    surroundings at −theta17, and the work of compression. p is the absolute pressure of an ideal gas, whose volume
-    relative to that at q = 0 is 1 + theta6 q (theta6 < 0), corrected by theta7 T. There is no theta13 or theta14.
+    The second row is the energy balance of the gas: heat capacity theta15, heat conduction theta16 through the wall to
+    the surroundings at temperature −theta17, and the work of compression. p is the absolute pressure of an ideal gas
+    with relative volume 1 + theta6 q (theta6 < 0), corrected by theta7 T. There is no theta13 or theta14.
 
     Parameters
     ----------
     drive : {"force", "displacement"}
-        "force": states q and T, input force, outputs displacement and pressure; for a gear under load, a drop or a
-        design. "displacement": state T, input displacement (q and its derivatives follow from it), outputs force and
-        pressure; for a test rig that imposes the motion, as the paper's does, and faster to solve.
+        "force": states q and T, input force, outputs displacement and pressure; for a gear under a prescribed load.
+        "displacement": state T, input displacement, which determines q and its derivatives, outputs force and pressure;
+        for a test rig with prescribed motion, such as the paper's, and faster to solve.
 
     Returns
     -------
     Model
-        The same object for the same drive. Where theta4 is free and theta11 stands for the ambient pressure, tie them.
+        The same object for the same drive. If theta4 is free and theta11 represents the ambient pressure, tie them.
 
     Raises
     ------
@@ -266,29 +265,29 @@ def _landing_gear(drive: str) -> Model:
         outputs=outputs,
         description=f"""A landing gear damper with a gas spring and oil damping, its {drive} prescribed.
 
-        De Kraker, Verbeek & van de Wouw (1997), eq. (9): a balance of forces and one of the energy of the gas; derived
-        in the docstring of `bayesperiodic.models.landing_gear`.
+        De Kraker, Verbeek & van de Wouw (1997), eq. (9): balances of forces and of the energy of the gas; see the
+        docstring of `bayesperiodic.models.landing_gear`.
         """,
     )
 
 
 def chain(masses: int) -> Model:
-    r"""Return a row of equal masses on nonlinear springs, the first one tied to the ground, a force on the last one.
+    r"""Return a chain of equal masses on nonlinear springs, with the first one grounded and a force on the last mass.
 
-    Newton's law for mass i between its springs, with the elongations e_i = x_i − x_(i−1) and x_0 = 0,
+    Newton's law for mass i, with the elongations e_i = x_i − x_(i−1) and x_0 = 0, is
 
     .. math::
 
         m \ddot x_i + R(e_i, \dot e_i) - R(e_{i+1}, \dot e_{i+1}) = 0,
         \qquad R(e, \dot e) = c \dot e + k e + k_3 e^3,
 
-    and the force in the place of R beyond the last mass. One mass is the Duffing oscillator. For several modes with
-    few parameters: internal resonances, what one measured channel can tell, how the effort grows with the states.
+    with the force in place of −R after the last mass. One mass is the Duffing oscillator. For several modes with few
+    parameters: internal resonances, identifiability from one channel, cost as a function of the number of states.
 
     Parameters
     ----------
     masses : int
-        At least 1.
+        Number of masses, >= 1.
 
     Returns
     -------
@@ -299,7 +298,7 @@ def chain(masses: int) -> Model:
     Raises
     ------
     ValueError
-        For a number of masses that is not whole or below 1.
+        If the number of masses is not an integer >= 1.
 
     Examples
     --------
@@ -332,28 +331,28 @@ def _chain(masses: int) -> Model:
         units={**dict.fromkeys(states, "m"), "force": "N", "displacement": "m"},
         equations=equations,
         outputs=lambda s, p, u: {"displacement": getattr(s, states[-1])},
-        description=f"""Equal masses ({masses}) in a row on dampers and cubic springs, the last one forced.
+        description=f"""A chain of {masses} equal masses on dampers and cubic springs, with a force on the last one.
 
-        Newton's law for each mass; derived in the docstring of `bayesperiodic.models.chain`.
+        Newton's law for each mass; see the docstring of `bayesperiodic.models.chain`.
         """,
     )
 
 
-# Jones's approximation of Wagner's function: 1 − c1 exp(−c2 s) − c3 exp(−c4 s) after s half chords.
+# Jones's approximation of Wagner's function: 1 − c1 exp(−c2 s) − c3 exp(−c4 s) after a travel of s half chords.
 C1, C2, C3, C4 = (sp.Rational(n, 10_000) for n in (1650, 455, 3350, 3000))
-AT_ONCE = 1 - C1 - C3
+INITIAL_LIFT = 1 - C1 - C3
 
 
-def _equations(s: Any, p: Any, u: Any) -> list[sp.Expr]:
+def _flutter(s: Any, p: Any, u: Any) -> list[sp.Expr]:
     air, arm = sp.pi * p.rho * p.b**2 * p.span, p.a + sp.Rational(1, 2)
     coupling = p.b * p.m * p.x_alpha - p.a * p.b * air
-    lift = 2 * air / p.b * AT_ONCE * (p.U * s.dh + p.U**2 * s.alpha)
+    lift = 2 * air / p.b * INITIAL_LIFT * (p.U * s.dh + p.U**2 * s.alpha)
     lag = 2 * air / p.b * p.U**2 * ((C1 * C2 + C3 * C4) * s.dw + C2 * C4 * (C1 + C3) * p.U / p.b * s.w)
     heave = (
         (p.m_T + air) * s.ddh
         + coupling * s.ddalpha
         + p.c_h * s.dh
-        + (1 + AT_ONCE * (1 - 2 * p.a)) * air * p.U * s.dalpha
+        + (1 + INITIAL_LIFT * (1 - 2 * p.a)) * air * p.U * s.dalpha
         + p.k_h * s.h
         + lift
         + lag
@@ -361,7 +360,7 @@ def _equations(s: Any, p: Any, u: Any) -> list[sp.Expr]:
     pitch = (
         coupling * s.ddh
         + (p.I_alpha + (sp.Rational(1, 8) + p.a**2) * p.b**2 * air) * s.ddalpha
-        + (p.c_alpha + (1 - arm) * (1 - 2 * AT_ONCE * arm) * air * p.b * p.U) * s.dalpha
+        + (p.c_alpha + (1 - arm) * (1 - 2 * INITIAL_LIFT * arm) * air * p.b * p.U) * s.dalpha
         + p.k_alpha * s.alpha
         + p.k_alpha2 * s.alpha**2
         + p.k_alpha3 * s.alpha**3
@@ -403,24 +402,25 @@ flutter = Model(
         "offset_pitch": "1",
     },
     units={"h": "m", "alpha": "rad", "w": "s", "heave": "1", "pitch": "1"},
-    equations=_equations,
+    equations=_flutter,
     outputs=lambda s, p, u: {
         "heave": p.offset_heave + p.gain_heave * s.h,
         "pitch": p.offset_pitch + p.gain_pitch * s.alpha,
     },
-    description="""An aerofoil on springs that may heave and pitch in a wind, and flutters from a certain wind speed on.
+    description="""An aerofoil on springs with heave and pitch, which flutters above a critical wind speed.
 
     Heave h and pitch α (state alpha) of a section of half chord b, with unsteady aerodynamics of one lag state w, as
     published with measured stable and unstable limit cycles by K. H. Lee, D. A. W. Barton and L. Renson (Modelling of
     physical systems with a Hopf bifurcation using mechanistic models and machine learning, Mechanical Systems and
     Signal Processing 191, 2023, 110173). With q = (h, α, w), M q̈ + D(U) q̇ + K(U) q + (0, k_alpha2 α² + k_alpha3 α³,
-    0) = 0: the air (density rho, wing of length span) adds mass, damping and stiffness, lift grows with the wind speed
-    U, and the wake, Wagner's function in Jones's approximation, remembers past motion. The spring in pitch hardens, so
-    that cycles exist below the speed at which the equilibrium loses its stability: an unstable one inside a stable one.
-    The wing, of mass m, pitches about an axis that lies a·b behind the middle of the chord and x_alpha·b ahead of its
-    centre of mass, with the inertia I_alpha; all that heaves weighs m_T. Its springs and dampers are k_h, c_h in
-    heave and k_alpha, k_alpha2, k_alpha3, c_alpha in pitch. The sensors' readings are linear: heave = offset_heave +
-    gain_heave h, pitch = offset_pitch + gain_pitch α. For self-excited systems whose unstable cycles are measured too.
+    0) = 0. The air (density rho, wing of length span) adds mass, damping and stiffness; the lift increases with the
+    wind speed U and depends on past motion through the wake, by Jones's approximation of Wagner's function. The spring
+    in pitch hardens, so that limit cycles exist below the speed at which the equilibrium loses its stability: an
+    unstable one inside a stable one.
+    The wing has mass m and inertia I_alpha about its pitch axis, which is a·b behind the middle of the chord and
+    x_alpha·b ahead of the centre of mass; the total heaving mass is m_T. The springs and dampers are k_h, c_h in heave
+    and k_alpha, k_alpha2, k_alpha3, c_alpha in pitch. The sensors are linear: heave = offset_heave + gain_heave h,
+    pitch = offset_pitch + gain_pitch α. For self-excited systems whose unstable cycles are also measured.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Model: differential and output equations written once, symbolically."""
+"""Models: differential and output equations in symbolic form."""
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
@@ -13,26 +13,26 @@ RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble"
 
 
 class Names:
-    """Symbols by attribute: ``s.dx``, ``p.k3``; an unknown name is answered with the nearest known one."""
+    """Symbols as attributes, such as ``s.dx`` and ``p.k3``."""
 
-    def __init__(self, what: str, symbols: Mapping[str, sp.Symbol]):
-        self._what = what
+    def __init__(self, kind: str, symbols: Mapping[str, sp.Symbol]):
+        self._kind = kind
         self._symbols = dict(symbols)
 
     def __getattr__(self, name: str) -> sp.Symbol:
         if name.startswith("_"):
             raise AttributeError(name)
         try:
-            _checks.one_of(self._what, name, self._symbols)
+            _checks.one_of(self._kind, name, self._symbols)
         except ValueError as error:
             raise AttributeError(str(error)) from None
         return self._symbols[name]
 
 
 class Model:
-    """A nonlinear model, g(q, q̇, q̈, u, τ, θ) = 0 with outputs ŷ = f(q, q̇, q̈, u, τ, θ).
+    """Nonlinear model g(q, q̇, q̈, u, τ, θ) = 0 with outputs ŷ = f(q, q̇, q̈, u, τ, θ), eq. (1) of [1]_.
 
-    It is eq. (1) of [1]_, written once; residuals, all derivatives and compiled code follow from it.
+    Residuals, all derivatives and compiled functions are derived from the symbolic equations.
 
     Parameters
     ----------
@@ -42,9 +42,9 @@ class Model:
         Degrees of freedom q. A state is of second order if its second derivative appears in an equation,
         of first order if only its first does.
     parameters : mapping of str to str, or sequence of str
-        Names of θ, with their units.
+        Names of θ, optionally with their units.
     equations : callable (s, p, u) -> sequence of expressions
-        The residuals g, one a state, in SymPy expressions of ``s.x, s.dx, s.ddx`` (state and its time derivatives,
+        The residuals g, one per state, as SymPy expressions of ``s.x, s.dx, s.ddx`` (state and its time derivatives,
         per second), ``s.tau`` (time in forcing periods), ``s.frequency`` [Hz], parameters ``p.c`` and inputs
         ``u.force, u.dforce, u.ddforce``.
     outputs : callable (s, p, u) -> mapping of str to expression
@@ -52,17 +52,17 @@ class Model:
     inputs : sequence of str, optional
         Prescribed periodic signals.
     angles : sequence of str, optional
-        States that may wind (advance by a multiple of 2π a period) and outputs compared modulo 2π.
+        States that may wind (advance by a multiple of 2π per period) and outputs compared modulo 2π.
     units : mapping of str to str, optional
         Units of states, inputs and outputs, for tables and axes.
     description : str, optional
-        What the model is and where it comes from; becomes the instance's docstring.
+        Docstring of the instance.
 
     Raises
     ------
     ValueError
-        For names that are reserved, repeated or no identifiers, a number of equations other than that of the states,
-        an expression with a symbol or a function that the model does not know, a state without a derivative.
+        For names that are reserved, repeated or not identifiers, a number of equations different from that of the
+        states, an expression with an unknown symbol or function, and a state without a derivative.
 
     References
     ----------
@@ -100,10 +100,10 @@ class Model:
         self.inputs = _checks.identifiers("inputs", inputs, (*RESERVED, *self.states))
         self.parameters = _checks.identifiers("parameters", parameters, RESERVED)
         for argument, names in (("states", self.states), ("inputs", self.inputs)):
-            _refuse_derivatives(argument, names)
+            _check_derivative_names(argument, names)
             _checks.identifiers(argument, [d + n for d in ("", "d", "dd") for n in names], RESERVED)
         if not self.states:
-            raise ValueError("states: () is not allowed; a model needs at least one state.")
+            raise ValueError("states: must have at least one name, got none.")
 
         self.state_symbols = _with_derivatives("s", self.states)
         self.input_symbols = _with_derivatives("u", self.inputs)
@@ -116,19 +116,18 @@ class Model:
         )
         written = equations(*spaces)
         if isinstance(written, sp.Basic):
-            raise ValueError(f"equations: {written} alone is not allowed; return a list, of one for each state.")
+            raise ValueError(f"equations: must return a list, one expression per state, got {written} alone.")
         self.equations = tuple(self._expression("equations", e) for e in written)
         if len(self.equations) != len(self.states):
             raise ValueError(
-                f"equations: {len(self.equations)} are not allowed; there must be {len(self.states)}, one for each of "
-                f"the states {list(self.states)}. An equation may hold s.dd{self.states[0]}: of second order, it needs "
-                "no state for the rate."
+                f"equations: must be {len(self.states)}, one for each of the states {list(self.states)}, got "
+                f"{len(self.equations)}. An equation may contain s.dd{self.states[0]}, so that rates need no states."
             )
         given = dict(_checks.mapping("outputs", outputs(*spaces), "{'displacement': s.x}"))
         self.outputs = _checks.identifiers("outputs", given, (*RESERVED, *self.inputs))
         self.output_expressions = tuple(self._expression("outputs", given[n]) for n in self.outputs)
         if not self.outputs:
-            raise ValueError("outputs: {} is not allowed; a model needs at least one output.")
+            raise ValueError("outputs: must have at least one output, got none.")
 
         self.angles = tuple(angles)
         for angle in self.angles:
@@ -144,13 +143,13 @@ class Model:
             given = sp.Float(given)
         if not isinstance(given, sp.Expr):
             raise ValueError(
-                f"{argument}: {given!r} is not allowed; write SymPy expressions of s, p and u, and an equation "
-                "left = right as left - right."
+                f"{argument}: must be SymPy expressions of s, p and u, got {given!r}; write an equation left = right "
+                "as left - right."
             )
         known = {*self.state_symbols.values(), *self.input_symbols.values()}
         known |= {*self.parameter_symbols.values(), *self.time_symbols.values()}
-        if strangers := sorted(map(str, given.free_symbols - known)):
-            raise ValueError(f"{argument}: unknown symbols {', '.join(strangers)}; use only what s, p and u carry.")
+        if unknown := sorted(map(str, given.free_symbols - known)):
+            raise ValueError(f"{argument}: must contain only symbols of s, p and u, got {', '.join(unknown)}.")
         return given
 
     def _order(self, state: str) -> int:
@@ -158,23 +157,26 @@ class Model:
         for order, prefix in ((2, "dd"), (1, "d")):
             if self.state_symbols[prefix + state] in appearing:
                 return order
-        raise ValueError(f"states: {state!r} has no derivative in any equation; eliminate it or add its equation.")
+        raise ValueError(
+            f"states: must have a derivative in an equation, got {state!r} without one; eliminate it, or add its "
+            "equation."
+        )
 
     @cached_property
     def autonomous(self) -> bool:
-        """True if neither inputs nor the time appear in the equations, so that the period is part of the solution."""
+        """True if the equations contain neither inputs nor τ, so that the period is unknown."""
         forcing = {*self.input_symbols.values(), self.time_symbols["tau"]}
         return not any(e.free_symbols & forcing for e in self.equations)
 
     @cached_property
     def smooth_signs(self) -> tuple[sp.Expr, ...]:
-        """The tanh and arctan in the equations whose arguments vary along an orbit."""
+        """The tanh and arctan terms in the equations whose arguments vary along an orbit."""
         moving = {*self.state_symbols.values(), *self.input_symbols.values(), self.time_symbols["tau"]}
         found = set().union(*(e.atoms(sp.tanh, sp.atan) for e in self.equations))
         return tuple(sorted((sign for sign in found if sign.free_symbols & moving), key=sp.default_sort_key))
 
     def softened(self) -> "Model":
-        """Return the model with a last parameter more, which multiplies the arguments of all smooth signs."""
+        """Return the model with an additional last parameter that multiplies the arguments of all smooth signs."""
         sharpness = sp.Symbol("p_sharpness_of_signs", real=True)
         softer = {sign: sign.func(sharpness * sign.args[0]) for sign in self.smooth_signs}
         other = object.__new__(Model)
@@ -229,7 +231,7 @@ class Model:
         return {}
 
     def input_derivatives(self) -> dict[str, int]:
-        """Return for every input the highest time derivative of it that the model uses."""
+        """Return the order of the highest time derivative of every input that the model uses."""
         used = set().union(*(e.free_symbols for e in (*self.equations, *self.output_expressions)))
         return {
             name: max(
@@ -267,14 +269,14 @@ class Model:
         )
 
 
-def _refuse_derivatives(argument: str, names: tuple[str, ...]) -> None:
+def _check_derivative_names(argument: str, names: tuple[str, ...]) -> None:
     space = "s" if argument == "states" else "u"
     for name in names:
         for derivative in (f"d{name}", f"dd{name}"):
             if derivative in names:
                 raise ValueError(
-                    f"{argument}: {derivative!r} is not allowed beside {name!r}, whose derivative it is, and which "
-                    f"needs no name. Leave it out and write {space}.{derivative}."
+                    f"{argument}: must not contain derivatives, got {derivative!r} and {name!r}; leave {derivative!r} "
+                    f"out and write {space}.{derivative}."
                 )
 
 
@@ -289,13 +291,13 @@ def smooth_sign(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
     ----------
     x : sympy expression
     width : number > 0 or sympy expression, in the units of `x`
-        At ``|x|`` = width the value is 0.76, at 3 width 0.995. A transition crossed in only a few grid steps is
-        not resolved by any difference scheme.
+        The value is 0.76 at ``|x|`` = width and 0.995 at 3 width. Difference schemes do not resolve a transition within
+        a few grid steps.
 
     Returns
     -------
     sympy expression
-        Without a unit.
+        Dimensionless.
 
     Raises
     ------
@@ -304,7 +306,7 @@ def smooth_sign(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
 
     Examples
     --------
-    Coulomb friction of 20 N whose sign changes over within about ±1 mm/s:
+    Coulomb friction of 20 N with a transition within about ±1 mm/s:
 
     >>> import sympy as sp, bayesperiodic as bp
     >>> v = sp.Symbol("v")
@@ -322,7 +324,7 @@ def smooth_abs(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
     ----------
     x : sympy expression
     width : number > 0 or sympy expression, in the units of `x`
-        Far from zero the value is ``|x|`` − width; the curvature at zero is 1 / width.
+        The value tends to ``|x|`` − width for large ``|x|``; the curvature at zero is 1 / width.
 
     Returns
     -------

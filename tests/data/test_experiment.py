@@ -38,12 +38,12 @@ def test_estimate_compares_only_the_given_harmonics():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"outputs": {"x": [1j, 1.0]}}, r"outputs\['x'\]: 1j is not allowed as harmonic 0; the mean must be real"),
-        ({"outputs": {"x": [1.0, np.nan]}}, r"outputs\['x'\]: .* is not allowed; it must be a vector of finite"),
-        ({"outputs": {"x": []}}, r"outputs\['x'\]: \[\] is not allowed"),
-        ({"outputs": {"x": "abc"}}, r"outputs\['x'\]: 'abc' is not allowed; it must be an array of complex"),
-        ({"inputs": {"u": [[1.0]]}}, r"inputs\['u'\]: .* is not allowed"),
-        ({"samples": 6}, r"samples: 6 is not allowed; harmonic 3 of outputs\['x'\] needs at least 7"),
+        ({"outputs": {"x": [1j, 1.0]}}, r"outputs\['x'\]: must have a real mean .harmonic 0., got 1j"),
+        ({"outputs": {"x": [1.0, np.nan]}}, r"outputs\['x'\]: must be a vector of finite amplitudes .*got"),
+        ({"outputs": {"x": []}}, r"outputs\['x'\]: must be a vector .*got \[\]"),
+        ({"outputs": {"x": "abc"}}, r"outputs\['x'\]: must be an array of complex numbers, got 'abc'"),
+        ({"inputs": {"u": [[1.0]]}}, r"inputs\['u'\]: must be a vector .*got \[\[.1"),
+        ({"samples": 6}, r"samples: must be at least 7 for harmonic 3 of outputs\['x'\], got 6"),
         ({"samples": 2}, "samples: must be .*got 2"),
         ({"frequency": -1.0}, "frequency: must be .*got -1.0"),
     ],

@@ -323,20 +323,23 @@ def test_data_without_information_are_rejected():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"mask": np.zeros(SAMPLES, dtype=bool)}, "mask: bool of shape .* with 0 points is not allowed"),
-        ({"mask": np.ones(3, dtype=bool)}, "mask: bool of shape .3,. with 3 points is not allowed"),
-        ({"covariance": np.eye(2)}, r"covariance: shape \(2, 2\) is not allowed; it must be \(3, 3\), for 2 measured"),
-        ({"covariance": -np.eye(3)}, "covariance: it must be positive definite"),
+        ({"mask": np.zeros(SAMPLES, dtype=bool)}, "mask: must be a bool array .* got bool of shape .* with 0 points"),
+        ({"mask": np.ones(3, dtype=bool)}, "mask: must be a bool array .* got bool of shape .3,. with 3 points"),
+        ({"covariance": np.eye(2)}, r"covariance: must have shape \(3, 3\), for 2 measured .*got \(2, 2\)"),
+        ({"covariance": -np.eye(3)}, "covariance: must be positive definite"),
         (
             {"covariance": np.triu(np.ones((3, 3)))},
-            r"covariance: it must be finite and symmetric; entry \[0, 1\] is 1, entry \[1, 0\] is 0",
+            r"covariance: must be finite and symmetric, got 1 in entry \[0, 1\] and 0 in entry \[1, 0\]",
         ),
-        ({"covariance": np.full((3, 3), np.nan)}, "covariance: .* 9 of its entries are not finite"),
-        ({"multipliers": [0.0]}, r"multipliers: \[0.0\] is not allowed"),
-        ({"multipliers": [1.0, -2.0]}, r"multipliers: \[1.0, -2.0\] .* ordered by modulus"),
-        ({"multiplier_sd": [0.0], "covariance": np.eye(2)}, r"multiplier_sd: \[0.0\] is not allowed"),
-        ({"covariance": None}, "multipliers: without an error they are not allowed; give multiplier_sd"),
-        ({"multipliers": None, "covariance": np.eye(2), "multiplier_sd": [1.0]}, "multiplier_sd: it is not allowed"),
+        ({"covariance": np.full((3, 3), np.nan)}, "covariance: must be finite and symmetric, got 9 entries"),
+        ({"multipliers": [0.0]}, r"multipliers: must be real, not zero, .*got \[0.0\]"),
+        ({"multipliers": [1.0, -2.0]}, r"multipliers: must be .* ordered by descending modulus, got \[1.0, -2.0\]"),
+        ({"multiplier_sd": [0.0], "covariance": np.eye(2)}, r"multiplier_sd: must be > 0, got \[0.0\]"),
+        ({"covariance": None}, "multipliers: must have standard deviations; give multiplier_sd"),
+        (
+            {"multipliers": None, "covariance": np.eye(2), "multiplier_sd": [1.0]},
+            "multiplier_sd: requires `multipliers`",
+        ),
     ],
 )
 def test_error_names_the_bad_section_data(changes, message):
