@@ -13,13 +13,13 @@ matplotlib.use("Agg")
 
 @pytest.fixture(scope="session", autouse=True)
 def interrupts():
-    """Let Ctrl-C interrupt: a shell that runs the tests in the background has them ignore it."""
+    """Enable SIGINT, which a shell disables for tests that it runs in the background."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
 def solved():
-    """Return a problem, its MAP estimate and a short posterior, all plain and well determined."""
+    """Return a well-determined problem, its MAP estimate and a short posterior."""
     priors = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}
     problem = bp.Problem(LINEAR, [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)], priors=priors)
     fit = bp.map_estimate(problem)

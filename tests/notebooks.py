@@ -7,7 +7,7 @@ from pathlib import Path
 FOLDER = Path(__file__).parents[1] / "studies" / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 SECONDS_A_CELL = 600
-# What the kernel puts before a warning: the path of a file that was never there, and the line that warned.
+# Prefix of a warning of the kernel: a temporary path and a line number.
 WHERE = re.compile(r"^\S*ipykernel_\S+\.py:\d+: (\w+: .*)\n(?:  .*\n)?", re.MULTILINE)
 
 
@@ -28,7 +28,7 @@ def execute(path, folder):
 
 
 def store(path, folder):
-    """Execute a notebook and write it back, whole or not at all."""
+    """Execute a notebook and replace its file atomically."""
     import nbformat
 
     draft = path.with_suffix(".part")

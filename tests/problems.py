@@ -49,7 +49,7 @@ def pendulum_run(seed: int = 1, sd: float = 0.01, **changes) -> bp.Experiment:
 
 
 def section_run(**changes) -> bp.Experiment:
-    """Return the rotation's section point alone, with covariance and, unless unwanted, its unstable multiplier."""
+    """Return the rotation's section point with covariance and, by default, its unstable multiplier."""
     mask = np.arange(SAMPLES) % SAMPLES == 0
     covariance = np.array([[1e-4, 3e-4, 2e-4], [3e-4, 4e-3, -1e-4], [2e-4, -1e-4, 1e-2]])
     given = {"mask": mask, "covariance": covariance, "multipliers": [ROTATION.multipliers[0].real * 1.05]}

@@ -88,7 +88,7 @@ def pendulum_attractor(omega: float, start: np.ndarray, periods: int, skip: int)
 
 
 def known(winding: int, omega: float, orbit: Orbit) -> Known:
-    """Return an orbit of the pendulum as it stands in the tables."""
+    """Return an orbit in the form of the tables."""
     period = 2.0 * np.pi / omega if orbit.states.shape[1] == 2 else 1.0
     tau = orbit.times[:-1] / period
     section = tuple((float(q), float(v)) for q, v in orbit.states[np.abs(tau - np.round(tau)) < 1e-9, :2])

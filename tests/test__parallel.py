@@ -60,7 +60,7 @@ class Recording(ProcessPoolExecutor):
 
 
 class Forgetful:
-    """An executor of the plainest kind, whose only process forgets everything every third task."""
+    """An executor with one process that is replaced after every third task."""
 
     def __init__(self):
         self.carried: list[bool] = []
@@ -153,7 +153,7 @@ def test_dead_workers_raise_one_error():
 
 
 def test_a_task_that_kills_dask_workers_ends_the_run(dask, monkeypatch):
-    """Dask gives a task up when too many workers have died of it; here, the first."""
+    """Dask abandons a task after the first worker that it kills."""
     monkeypatch.setattr(dask.cluster.scheduler, "allowed_failures", 0)
     with (
         pytest.raises(WorkersLost, match=r"executor: its workers were lost \(KilledWorker: "),

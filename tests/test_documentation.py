@@ -65,13 +65,13 @@ PROPERTIES = {n: f for n, (_, _, f) in MEMBERS.items() if isinstance(f, property
 
 
 def sections(text: str | None) -> dict[str, str]:
-    """Return the text of a numpydoc docstring by heading, what stands above the first one by ""."""
+    """Return the text of a numpydoc docstring by heading, with "" for the part above the first heading."""
     parts = re.split(r"^(\w[\w ]*)\n-{3,}\n", inspect.cleandoc(text or "") + "\n", flags=re.MULTILINE)
     return {"": parts[0]} | dict(zip(parts[1::2], parts[2::2], strict=True))
 
 
 def entries(section: str) -> dict[str, str]:
-    """Return what stands behind the colon for every name of a section."""
+    """Return the type of every name of a section."""
     found = {}
     for line in section.splitlines():
         if line and not line.startswith(" "):
@@ -163,7 +163,7 @@ def test_classes(name):
 
 
 def _has_source(function: Any) -> bool:
-    """Return whether somebody wrote it: the __init__ of a dataclass is generated."""
+    """Return whether a function is hand-written: the __init__ of a dataclass is generated."""
     return function.__code__.co_filename == inspect.getsourcefile(inspect.getmodule(function))
 
 

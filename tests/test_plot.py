@@ -67,7 +67,7 @@ def test_corner_laplace_ellipses_cover_the_draws(solved):
 
 @pytest.mark.parametrize(("middle", "spread"), [(-2.5, 1e-4), (4e7, 3e4)])
 def test_corner_has_whole_values_at_its_ticks(solved, middle, spread):
-    """Also where they differ in the last digits alone or are large, which matplotlib would shorten."""
+    """Also for values that differ in their last digits only or are large, for which matplotlib prints offsets."""
     _, _, posterior = solved
     data = posterior.data.copy()
     data["posterior"] = data["posterior"].to_dataset().map(lambda values: middle + spread * values / values.std())

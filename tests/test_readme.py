@@ -50,7 +50,7 @@ def pendulum():
 
 
 def gear():
-    """Two experiments of the landing gear, and what is known of it."""
+    """Two experiments of the landing gear and its known parameters."""
     from studies.landing_gear.rig import GEAR
 
     model, wave = bp.models.landing_gear("displacement"), np.cos(2 * np.pi * np.arange(200) / 200)
@@ -75,7 +75,7 @@ def linear_draws():
     return names | {"posterior": bp.sample(names["problem"], names["fit"], seed=1, progress=False)}
 
 
-# What the reader has before the first block of a heading, by heading; and what would take too long as printed.
+# Variables defined before the first block of each heading, and shortened versions of slow blocks.
 BEFORE = {
     "Fifteen lines": dict,
     "Your recording, your model": damper_file,

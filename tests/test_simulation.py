@@ -118,7 +118,7 @@ def test_arrays_and_functions_of_time_give_the_same_run(drive):
 
 
 def test_a_stiff_run_under_periodic_inputs_takes_no_interpreted_step(monkeypatch):
-    """A lag of 0.1 ms through 5 s, as stiff as a trial in SciPy's steps would be slow; the answer in closed form."""
+    """A lag of 0.1 ms over 5 s, stiff, with the solution in closed form."""
     monkeypatch.setattr("bayesperiodic.simulation.solve_ivp", lambda *_, **__: pytest.fail("interpreted steps"))
     model = bp.Model(
         "lag",

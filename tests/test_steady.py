@@ -11,7 +11,7 @@ WAVE = np.cos(2 * np.pi * grid(16))
 
 
 def test_a_linear_oscillator_has_its_closed_form_response():
-    """Damped by 1 % a radian: the transient dies out over some hundred periods, which are not integrated."""
+    """A transient of some hundred periods is not integrated in full."""
     values = {"m": 1.0, "c": 0.02, "k": 1.0, "k3": 0.0}
     found = steady_cycle(bp.models.duffing, values, {"force": WAVE}, frequency=0.1, samples=40)
     rate = 2 * np.pi * 0.1

@@ -46,7 +46,7 @@ def test_mean_period_is_exact_on_a_grid_incommensurate_with_the_sampling():
 
 
 def test_noise_free_input_ends_the_frequency_refinement(monkeypatch):
-    """Its frequency is known to rounding, long before a step is small against its standard error."""
+    """Its frequency is exact before a step is small compared with its standard error."""
     calls, original = [], folding._linearised
     monkeypatch.setattr(folding, "_linearised", lambda *given: calls.append(given) or original(*given))
     time = np.arange(716) / (119.37 * 2.0)
@@ -173,7 +173,7 @@ def test_error_for_a_signal_that_is_not_periodic_states_the_periodicity():
 
 @pytest.mark.parametrize("seed", [0, 1, 7])
 def test_random_walks_are_refused(seed):
-    """Of some the autocorrelation has no positive peak."""
+    """The autocorrelation of some of them has no positive peak."""
     walk = np.cumsum(np.random.default_rng(seed).standard_normal(2000))
     with pytest.raises(ValueError, match=r"must (be periodic|be steady|have at least 3 cycles), got .*'recording'"):
         bp.Recording.from_arrays(np.arange(2000) / 500, {"y": walk, "z": np.roll(walk, 9)}).fold()

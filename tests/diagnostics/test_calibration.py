@@ -46,7 +46,7 @@ def linear(overcount: float = 1.0, *, known: bool = True, **changes) -> bp.Probl
 
 @pytest.fixture
 def without_draws(monkeypatch):
-    """Let every sampler fail, which takes most of the time."""
+    """Skip the samplers, which take most of the time."""
 
     def fails(*_, **__):
         raise RuntimeError("no draws")
@@ -56,7 +56,7 @@ def without_draws(monkeypatch):
 
 @pytest.mark.slow
 def test_ranks_of_exact_posteriors_are_uniform_and_a_wrong_likelihood_is_detected(without_draws):
-    """120 linear problems with known variance: Laplace is exact. Counted twice, every θ is called too narrow.
+    """120 linear problems with known variance: Laplace is exact; with doubled counts it is too narrow.
 
     Dispersion is then 2 on average with a standard error of 0.26; the three tests have a false-alarm rate of 1 % each.
     """
@@ -189,7 +189,7 @@ def serial():
 
 @pytest.mark.slow
 def test_a_dask_worker_killed_in_the_middle_changes_nothing(serial, dask, tmp_path, monkeypatch):
-    """SIGKILL after the second replicate: its tasks are done again, none is lost or counted twice."""
+    """SIGKILL after the second replicate: its tasks are repeated, none is lost or counted twice."""
 
     class Bar(tqdm):
         def update(self, n=1):

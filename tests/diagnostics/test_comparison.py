@@ -138,7 +138,7 @@ CASES = {
 
 @cache
 def case(name):
-    """Return problem, estimate, posterior of exact draws, and what draws again."""
+    """Return problem, estimate, posterior of exact draws, and a function that draws again."""
     draw, parameters, output, prior, sd = CASES[name]
     problem = bp.Problem(
         model(name, parameters, output),
@@ -207,7 +207,7 @@ def linear_points(fit, generator):
 
 
 def test_laplace_is_the_posterior_of_a_linear_problem_with_known_variance():
-    """Ellipsoids hold what they should within 4 errors, and all importance weights are equal."""
+    """Ellipsoids have their nominal probability within 4 errors, and all importance weights are equal."""
     problem, fit = linear_case(**{"variance[force]": 9.0})
     posterior = posterior_of(problem, linear_points(fit, np.random.default_rng(9)))
     for coordinates in ("natural", "sampling"):
@@ -281,7 +281,7 @@ def test_a_heavy_tailed_posterior_has_a_large_pareto_k():
 
 
 def test_the_tail_of_even_importance_weights_does_not_count():
-    """Hardly measured, but for an unknown variance normal: weights differ by a factor of three, and k̂ is above 0.7."""
+    """A weakly determined parameter with unknown variance: weights differ by a factor of three, and k̂ is above 0.7."""
     data = linear_experiment([900.0, 40.0, 25.0], 30.0, seed=8)
     priors = {"k": bp.Normal(900.0, 5000.0), "c": bp.Normal(40.0, 4.0)}
     problem = bp.Problem(LINEAR, [data], priors=priors, fixed={"coulomb": 25.0})

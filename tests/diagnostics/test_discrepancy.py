@@ -55,7 +55,7 @@ def test_power_against_model_error_in_low_harmonics():
 def test_explained_sums_are_those_of_a_regression_with_free_amplitudes():
     generator = np.random.default_rng(3)
     changes = np.zeros((3, HARMONIC.size))
-    # Two parameters that only move harmonic 1 and a third that moves all: 3 and higher are left what one parameter is.
+    # Two parameters move harmonic 1 only and a third moves all: harmonics 3 and higher lose one degree of freedom.
     changes[:2, [1, 21]] = np.eye(2)
     changes[2] = generator.standard_normal(HARMONIC.size)
     components = generator.standard_normal(HARMONIC.size)
@@ -119,7 +119,7 @@ def test_common_parameters_are_accepted_and_different_ones_found():
 
 
 def test_a_known_variance_counts_against_common_parameters():
-    """A measured frequency, alone in its group, is explained by a parameter of its own and not by the common one."""
+    """A measured frequency, alone in its group, is fitted by its own parameter and not by the common one."""
     generator = np.random.default_rng(7)
     changes = np.ones((1, HARMONIC.size))
     data = (generator.standard_normal(HARMONIC.size), changes, "a")

@@ -57,7 +57,7 @@ def test_information_is_that_of_the_regression(linear):
 
 @pytest.mark.parametrize(("moved", "left"), [(1e-5, 0.01), (0.1, np.inf)])
 def test_undetermined_direction_counts_for_the_parameters_it_moves(moved, left):
-    """Nothing is known along (moved, 1, 1); k is known to 0.01 prior sds but for that."""
+    """The direction (moved, 1, 1) is undetermined; k is otherwise known to 0.01 prior sds."""
     nothing = np.array([moved, 1.0, 1.0])
     directions = np.linalg.qr(np.column_stack([nothing, [1.0, 0.0, 0.0], [0.0, 1.0, -1.0]]))[0]
     matrix = directions @ np.diag([0.0, 1e4, 4.0]) @ directions.T
@@ -139,7 +139,7 @@ def test_parameter_without_effect_is_not_determined():
 
 
 def test_candidate_experiment_adds_the_information_of_a_real_one(linear):
-    """Doing a run again doubles the information; with twice the amplitude each linear regressor counts four times."""
+    """A repeated run doubles the information; with twice the amplitude each linear regressor counts four times."""
     problem, fit = linear
     information = Information.of(problem, fit)
     found = rank_candidates(problem, fit, information, [Candidate("run", 2.0, 1.0), Candidate("run", 2.0, 2.0)])
@@ -191,7 +191,7 @@ def test_distance_of_weighted_draws_is_that_of_their_distributions():
 
 
 def test_power_scaling_distinguishes_prior_from_likelihood(linear):
-    """A posterior that is the prior's reacts to it alone, one that is the data's to them."""
+    """A posterior dominated by the prior depends on the power of the prior only, and likewise for the data."""
     problem, fit = one(lambda p: p.a, 1.0, 5.0, a=bp.LogNormal(1.0, 0.1))
     table = bp.identifiability(problem, fit, bp.sample(problem, fit, **SHORT), profile=False).table
     assert table.loc["a", "prior_sensitivity"] > 0.05 > table.loc["a", "likelihood_sensitivity"]

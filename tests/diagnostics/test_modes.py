@@ -1,4 +1,4 @@
-"""What counts as another mode."""
+"""Detection of further modes."""
 
 import numpy as np
 import pytest

@@ -13,7 +13,7 @@ from tests.problems import CASES, DUFFING, DUFFING_PRIORS, SAMPLES
 TRUTH = np.array([900.0, 40.0, 25.0])
 FLAT = {"k": bp.Normal(900.0, 1e5), "c": bp.Normal(40.0, 1e4), "coulomb": bp.Normal(25.0, 1e4)}
 
-# What a Duffing model without the quadratic stiffness k2 cannot do: the even harmonics.
+# A Duffing model without the quadratic stiffness k2 cannot produce the even harmonics.
 ASYMMETRIC = bp.Model(
     "asymmetric_duffing",
     states=["x"],
@@ -126,7 +126,7 @@ def test_well_determined_linear_problems_are_adequate():
 
 
 def test_an_experiment_under_other_parameters_is_no_single_fault_but_one_of_the_whole():
-    """Each run is explained by parameters of its own, 900 and 1100 N/m, and not by common ones."""
+    """The runs have the stiffnesses 900 and 1100 N/m, so that common parameters fit neither."""
     runs = [linear_experiment([k, 40.0, 25.0], 3.0, seed=i, name=f"run {i}") for i, k in enumerate((900.0, 1100.0))]
     problem = bp.Problem(LINEAR, runs, priors=FLAT)
     prediction = bp.predict(problem, linear_draws(problem, 1), draws=40)
@@ -154,7 +154,7 @@ def duffing_posterior(k2: float, seed: int = 1, sd: float = 0.02, noise: str = "
 
 
 def test_plenty_of_data_and_a_missing_stiffness_is_misspecified():
-    """The stiffness is known within 20 %, and a mean and a second harmonic are left that the model cannot have."""
+    """The stiffness is known within 20 %; a mean and a second harmonic remain that the model cannot produce."""
     problem, posterior = duffing_posterior(0.1)
     assert max(posterior.draws(n).std() / abs(posterior.draws(n).mean()) for n in ("k", "k3")) < 0.2
     prediction = bp.predict(problem, posterior, draws=40)
@@ -236,7 +236,7 @@ def test_undetermined_and_misspecified_is_misspecified():
 
 
 def test_a_parameter_fixed_at_a_wrong_value_is_misspecified_and_a_strong_prior_is_not():
-    """With c = 10 instead of 40 N s/m the force lacks 19 N of damping; a prior that insists on it is a prior."""
+    """With c fixed at 10 instead of 40 N s/m the force lacks 19 N of damping; a narrow prior is not a fixed value."""
     run = linear_experiment([900.0, 40.0, 0.0], 3.0, seed=3)
     tight = {"k": bp.Normal(900.0, 1e5), "c": bp.Normal(10.0, 0.1)}
     for changes, verdict in (
@@ -324,7 +324,7 @@ def recording(p: dict[str, float], samples: int = 50) -> bp.Recording:
 
 
 def test_transient_bands_are_the_quantiles_of_the_signal(solved):
-    """The force on a ramp is linear in θ, so the 90 % band is ±1.645 sds of what the draws' covariance says."""
+    """The force on a ramp is linear in θ, so the 90 % band is ±1.645 sds from the covariance of the draws."""
     problem, _, posterior = solved
     prediction = bp.predict(problem, posterior, draws=1000, run=recording)
     bands = prediction.transient

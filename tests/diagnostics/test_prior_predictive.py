@@ -50,7 +50,7 @@ def test_measured_values_outside_the_prior_are_seen():
 
 
 def test_fraction_of_prior_draws_without_a_cycle_is_reported():
-    """The cycle of radius √mu exists for mu > 0 alone."""
+    """The cycle of radius √mu exists for mu > 0 only."""
     tau = grid(100)
     states = {"x": np.cos(2 * np.pi * tau), "y": np.sin(2 * np.pi * tau)}
     noisy = states["x"] + 0.01 * np.random.default_rng(1).standard_normal(100)

@@ -1,4 +1,4 @@
-"""The tests of uniformity: their false alarms, and what each of them sees."""
+"""Tests of uniformity: false-alarm rates and power."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What an estimate tells of itself: joint Laplace, discretisation, undetermined directions, starts, orbit identity."""
+"""Diagnostics of an estimate: joint Laplace, discretisation, undetermined directions, starts, orbit identity."""
 
 from dataclasses import replace
 
@@ -111,7 +111,7 @@ def test_grid_too_coarse_for_the_posterior_gives_a_warning():
 
 
 def test_directions_without_information_are_named():
-    """Products keep a·b², sums keep a + 2b, and one parameter is nowhere; the prior says what is left."""
+    """Only a·b² and shift_a + 2·shift_b are identifiable, and one parameter has no effect; the rest is the prior's."""
     run = sine_run(lambda x, rate: 12.0 * x + 0.5 * rate)
     priors = {
         "a": bp.LogNormal(3.0, 0.3),
@@ -161,7 +161,7 @@ def test_residuals_contain_only_kept_harmonics():
 
 
 def test_determined_parameter_keeps_its_sd_beside_undetermined_ones():
-    """With uniform priors only a·b² is known, and the sum beside it as if it were alone."""
+    """With uniform priors only a·b² is identifiable; shift_a has the sd that it would have alone."""
     run = sine_run(lambda x, rate: 12.0 * x + 0.5 * rate)
     priors = {"a": bp.Uniform(0.0, 50.0), "b": bp.Uniform(0.0, 50.0), "shift_a": bp.Uniform(-5.0, 5.0)}
     fixed = {"shift_b": 0.0, "idle": 0.0, "variance[force]": 0.25}
@@ -173,7 +173,7 @@ def test_determined_parameter_keeps_its_sd_beside_undetermined_ones():
 
 
 def test_estimate_at_a_bound_is_the_bounded_least_squares_solution():
-    """Bounded least squares in closed form: the parameter pressed against the end is fixed there."""
+    """Bounded least squares in closed form, with the active bound as a fixed value."""
     run = linear_experiment(TRUTH, 3.0, seed=1)
     wide = {"k": bp.Normal(800.0, 1e6), "c": bp.Normal(30.0, 1e6), "coulomb": bp.Uniform(0.0, 20.0)}
     with pytest.warns(UserWarning, match=r"'coulomb', 20, lies at the end of its prior's support \(0, 20\)"):
@@ -190,7 +190,7 @@ def test_estimate_at_a_bound_is_the_bounded_least_squares_solution():
 
 
 def test_directions_without_information_do_not_stop_the_iteration():
-    """Three collinear columns: from far away the sum is found all the same, to 1e-6 of its standard deviation."""
+    """Collinear columns: from a distant start the sum is found to 1e-5 of its standard deviation."""
     run = sine_run(lambda x, rate: 12.0 * x + 0.5 * rate)
     priors = {"shift_a": bp.Normal(400.0, 1e9), "shift_b": bp.Normal(900.0, 1e9)}
     fixed = {"a": 12.0, "b": 1.0, "idle": 0.0, "variance[force]": 0.25}
@@ -231,7 +231,7 @@ def test_further_starts_find_the_better_mode():
 
 
 def test_no_step_slips_to_another_periodic_solution():
-    """Near Duffing's fold a full step has no upper branch; the estimate stays on the measured one and is right."""
+    """Near Duffing's fold a full step would lose the upper branch; the estimate stays on it."""
     tau, theta = grid(200), {"m": 1.0, "c": 0.1, "k": 1.0, "k3": 0.5}
     force = {"force": 0.4 * np.cos(2 * np.pi * tau)}
     settings = {"frequency": 0.22, "samples": 200, "scheme": "central4"}
@@ -256,7 +256,7 @@ def test_no_step_slips_to_another_periodic_solution():
 
 
 def test_noise_is_split_into_measurement_noise_and_model_error():
-    """Scatter of 6 N in 4 cycles is 3 N of the mean; with a residual of 5 N (eq. 7) 4 N are left to the model."""
+    """A scatter of 6 N in 4 cycles gives 3 N in the mean; with a residual of 5 N (eq. 7) the model error is 4 N."""
     run = linear_experiment(TRUTH, 5.0, seed=4)
     fit = bp.map_estimate(bp.Problem(LINEAR, [replace(run, scatter={"force": 6.0}, cycles=4)], priors=PRIORS))
     residual = run.outputs["force"] - linear_regressors(0.05, 2.0, grid(40)) @ list(fit.theta.values())

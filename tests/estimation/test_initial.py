@@ -1,4 +1,4 @@
-"""Orbits and parameters found together, from starts at which the orbits are others or do not exist."""
+"""Simultaneous fit of orbits and parameters, from starts at which the orbits differ or do not exist."""
 
 from dataclasses import replace
 from functools import cache
@@ -93,7 +93,7 @@ def test_all_orbits_but_one_survive_a_continuation_to_the_papers_start_and_back(
 
 
 def test_only_combinations_of_the_five_pendulum_parameters_are_well_determined():
-    """The combinations that the equations know, k/(m l²), are determined far better than the parameters themselves."""
+    """The combinations in the equations, k/(m l²), are determined far better than the parameters themselves."""
     names = ("m", "l", "k1", "k2", "k3")
     problem = bp.Problem(
         bp.models.pendulum,
@@ -119,7 +119,7 @@ def test_log_likelihood_at_the_truth_is_chi_squared_distributed():
 
 
 def test_error_names_the_experiment_that_is_no_orbit():
-    """A candidate whose points and cycle no pendulum of this kind could show, among four that are real."""
+    """One candidate that is no orbit of the pendulum, among four that are."""
     tau = np.arange(300) / 100
     angle = 2.0 * np.sin(2 * np.pi * tau / 3) + np.sin(14 * np.pi * tau)
     like = measured(next(k for k in GENTLE if len(k.section) == 3))

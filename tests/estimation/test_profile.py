@@ -70,7 +70,7 @@ def test_unknown_variance_gives_the_logarithm_of_the_misfit():
 
 
 def test_profile_of_a_factor_of_a_determined_product_is_flat():
-    """Of a·b alone, a is as good anywhere in its support, b where a's support lets it be; c does not mind."""
+    """Only a·b is identifiable: the profiles of a and b are flat where their supports allow it."""
     model = formula_model("product", ["a", "b", "c"], lambda p, u, s: {"y": p.a * p.b * u.x + p.c * u.dx})
     priors = {"a": bp.LogUniform(0.1, 10.0), "b": bp.LogUniform(1e-4, 1e4), "c": bp.Normal(0.0, 10.0)}
     problem = posed(model, 2 * WAVE + 0.7 * RATE, 0.01, priors)
@@ -90,7 +90,7 @@ def test_profile_of_a_factor_of_a_determined_product_is_flat():
 
 
 def test_a_saturating_parameter_is_bounded_on_one_side():
-    """Y = a/(1 + a)·x measured as 0.98 ± 0.02: a ≥ 17.9, and nothing above."""
+    """Y = a/(1 + a)·x measured as 0.98 ± 0.02: a ≥ 17.9 without an upper bound."""
     sd = 0.02
     model = formula_model("saturating", ["a"], lambda p, u, s: {"y": p.a / (1 + p.a) * u.x})
     problem = posed(model, 0.98 * WAVE, sd**2 * WAVE @ WAVE, {"a": bp.Uniform(0.0, 1e6)})
@@ -122,7 +122,7 @@ def test_skewed_profile_agrees_with_brute_force_maximisation():
             found = problem.log_posterior({name: profile.values[name][:, None], other: tried}, {})
             best, width = np.take_along_axis(tried, found.argmax(axis=1)[:, None], axis=1)[:, 0], 0.02 * width
         expected = found.max(axis=1) - float(problem.log_posterior(fit.theta, {}))
-        # On the straight way from the prior's medians to the outermost k3 the branch of orbits turns back.
+        # Between the prior medians and the outermost k3 the branch of orbits has a fold.
         reached = slice(1 if name == "k3" else 0, None)
         assert profile.log_density[name][reached] == pytest.approx(expected[reached], abs=1e-6)
         assert np.all(profile.log_density[name] > expected - 1e-6)
@@ -154,7 +154,7 @@ def test_return_sweep_finds_the_branch_that_the_first_sweep_misses(monkeypatch):
 
 
 def test_profile_is_extended_where_another_branch_raises_its_end():
-    """Outwards a stays in a narrow well of b; the jump at its upper end leads into a wide one, back past the peak."""
+    """The first sweep stays in a narrow well of b; at its end it jumps into a wide one that passes the peak."""
     model = formula_model(
         "unlike_wells",
         ["a", "b"],
@@ -192,7 +192,7 @@ def test_point_better_than_the_estimate_is_reported_and_can_be_the_start():
 @pytest.mark.filterwarnings("ignore:The log-density is higher")
 @pytest.mark.parametrize("support", [(1.99, 2.01), (2.01, 2.05), (1.8, 1.99)])
 def test_profile_with_a_parameter_at_its_bound_equals_bounded_least_squares(support):
-    """Against bounded least squares: b presses against the ends of its support as a moves, and c makes up for it."""
+    """Against bounded least squares: b reaches the bounds of its support as a varies."""
     model = formula_model(
         "bounded", ["a", "b", "c"], lambda p, u, s: {"y": p.a * u.x + p.b * (u.x + u.dx + u.x**2) + p.c * u.dx}
     )
@@ -211,7 +211,7 @@ def test_profile_with_a_parameter_at_its_bound_equals_bounded_least_squares(supp
 
 
 def test_interval_end_is_nan_where_solves_fail():
-    """A state at rest at √a exists for a > 0 alone, and data this weak do not keep a from zero."""
+    """An equilibrium √a exists for a > 0 only, and the weak data allow a close to zero."""
     model = bp.Model(
         "saddle_node",
         states=["w"],
@@ -234,7 +234,7 @@ def test_interval_end_is_nan_where_solves_fail():
 
 
 def test_the_profile_stays_on_the_branch_of_the_estimate():
-    """Below its jump a hardening oscillator responds large or small; the estimate's own solution decides."""
+    """Below its jump a hardening oscillator has two responses; the profile follows that of the estimate."""
     force, parameters = 0.6 * np.cos(2 * np.pi * grid(50)), {"m": 1.0, "c": 0.1, "k": 1.0, "k3": 0.5}
     start = bp.solve_periodic(bp.models.duffing, parameters, {"force": force}, frequency=0.1, samples=50)
     branch = bp.continue_periodic(bp.models.duffing, start, "frequency", until=0.3, step=0.01, progress=False)

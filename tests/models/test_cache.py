@@ -19,7 +19,7 @@ print(sum(sum(f.stats.cache_hits.values()) for f in functions.values()))
 """
 
 
-# What takes little to compile.
+# Functions that compile quickly.
 SMALL, NAMES = (
     """
 from numba import njit

@@ -129,7 +129,7 @@ BY_HAND = {
 
 
 def random_points(name):
-    """Return a model, q, q̇, q̈ and u, u̇, ü of the sizes that it is made for, its parameters and τ."""
+    """Return a model, q, q̇, q̈ and u, u̇, ü of typical size, its parameters and τ."""
     model, (parameters, sizes) = LIBRARY[name](), TYPICAL[name]
     generator = np.random.default_rng(5)
 
@@ -247,7 +247,7 @@ def test_pendulum_swings_at_the_root_of_g_over_l():
     ("phi", "rate", "multiplier"), [(-0.5676231, 13.8571218, -1.71), (-2.9184347, 5.8256325, 11.12)]
 )
 def test_unstable_rotations_of_the_pendulum_repeat_after_one_period(phi, rate, multiplier):
-    """Found by Newton's method on a Runge-Kutta map at 9.09 rad/s, given with seven decimals."""
+    """Section points at 9.09 rad/s from Newton's method on a Runge-Kutta map, with seven decimals."""
     f = 9.09 / (2 * np.pi)
     run = bp.simulate(
         bp.models.pendulum,

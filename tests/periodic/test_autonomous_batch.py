@@ -12,7 +12,7 @@ from bayesperiodic.periodic.solve import collapsed, has_shorter_period
 from tests.known import grid
 from tests.periodic.test_factors import SCHEMES, dense
 
-# Van der Pol's oscillator, whose spring knows the frequency: every term of ∂g/∂f is there.
+# Van der Pol's oscillator with a frequency-dependent spring, so that ∂g/∂f has every term.
 ODD = bp.Model(
     "odd_oscillator",
     states=["x"],

@@ -1,4 +1,4 @@
-"""Compiled functions that call those of another text are never older than these."""
+"""Compiled functions are rebuilt when a source that they call changes."""
 
 from functools import cache
 

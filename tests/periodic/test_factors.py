@@ -8,7 +8,7 @@ from bayesperiodic.periodic.schemes import CyclicGrid, find_scheme
 from tests.known import grid
 
 SCHEMES = ["backward2", "central2", "central4", "fourier"]
-# Offsets with gaps, and none before the point: what loops over a known number of offsets must not take for granted.
+# Schemes with gaps between the offsets and without offsets before the point.
 GAPS = bp.Scheme("gaps", 2, first={-3: -1 / 6, 3: 1 / 6}, second={-3: 1 / 9, 0: -2 / 9, 3: 1 / 9})
 FORWARD = bp.Scheme("forward", 1, first={0: -1.0, 1: 1.0}, second={0: 1.0, 1: -2.0, 2: 1.0})
 

@@ -1,4 +1,4 @@
-"""Hopf points, cycles that start there, and what is on a branch at one value."""
+"""Hopf points, the cycles that emerge there, and the solutions of a branch at one value."""
 
 from dataclasses import replace
 

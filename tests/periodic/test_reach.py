@@ -26,7 +26,7 @@ def test_a_saddle_node_ends_the_branch(a, end):
 
 @pytest.mark.parametrize(("mu", "end"), [(2.0, "arrived"), (0.05, "arrived"), (-0.05, "equilibrium")])
 def test_a_hopf_point_ends_the_branch(mu, end):
-    """The cycle of radius √mu exists for mu > 0 alone."""
+    """The cycle of radius √mu exists for mu > 0 only."""
     tau, theta = grid(100), np.array([1.0, 3.0])
     guess = {"x": np.cos(TURN * tau), "y": np.sin(TURN * tau)}
     equations, solved, _ = solve_free(built(CYCLE, {}, 3.0 / TURN, scheme="central4"), theta, guess)

@@ -1,4 +1,4 @@
-"""Stable and unstable cycles of the flutter rig at one wind speed: what is measured of one never meets the other."""
+"""Stable and unstable cycles of the flutter rig at one wind speed are never confused."""
 
 from functools import cache
 
@@ -40,7 +40,7 @@ def problem():
 
 
 def test_stable_and_unstable_cycles_are_never_confused():
-    """Draws of 12 %: half have their fold above 15 m/s, some no unstable cycle; by continuation, and by multipliers."""
+    """Draws with an sd of 12 %, half with the fold above 15 m/s; checked by continuation and by multipliers."""
     stated, generator = problem(), np.random.default_rng(1)
     theta = np.array([RIG[name] for name in stated.names]) * np.exp(0.12 * generator.standard_normal((600, len(FREE))))
     solved = stated.responses.solve(theta)
@@ -59,7 +59,7 @@ def test_stable_and_unstable_cycles_are_never_confused():
 
 
 def test_determinant_changes_sign_between_cycles_on_both_sides_of_a_fold():
-    """The unstable cycle has one real multiplier above 1 more, so that the determinant has the other sign."""
+    """The unstable cycle has one more real multiplier above 1, so that the determinant has the other sign."""
     stated = problem()
     parameters = np.array([(RIG | SENSORS | {"U": SPEED})[n] for n in bp.models.flutter.parameters])
     found = []

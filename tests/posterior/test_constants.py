@@ -25,7 +25,7 @@ def problem(coulomb, **changes) -> bp.Problem:
 
 
 def test_each_experiment_has_its_own_constant():
-    """The closed posterior of k and c, each run's own friction taken off its force."""
+    """The closed-form posterior of k and c after subtracting each run's own friction."""
     fit = bp.map_estimate(problem(COULOMB), progress=False)
     x = linear_regressors(0.05, 2.0, grid(40))
     values = np.concatenate([e.outputs["force"] - COULOMB[e.name] * x[:, 2] for e in experiments()])
@@ -49,7 +49,7 @@ def test_density_agrees_with_one_problem_an_experiment():
 
 
 def test_tie_may_use_a_constant_that_differs_between_experiments():
-    """Damping = coulomb · k/900, k the only free parameter: closed, and no common slope to derive anything from c."""
+    """Damping = coulomb · k/900 with k as the only free parameter; the slope differs between experiments."""
     tied = problem(COULOMB, tied={"c": "coulomb*k/900"}, priors={"k": PRIORS["k"]})
     assert tied.parameters(np.array([[450.0]]), "heavy")[0] == pytest.approx([450.0, 20.0, 40.0])
     fit = bp.map_estimate(tied, progress=False)
@@ -83,7 +83,7 @@ def test_error_names_the_bad_constant(coulomb, message):
 
 
 def test_problem_restricted_to_some_experiments_is_the_same_problem():
-    """What was said of the others goes with them; constants without a name hold for new data too."""
+    """Settings of removed experiments are dropped; constants for all experiments hold for new data too."""
     runs = [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=i, name=f"run {i}") for i in (1, 2)]
     k, c, other = bp.Normal(800.0, 60.0), bp.LogNormal(30.0, 0.5), bp.LogNormal(50.0, 0.5)
     whole = bp.Problem(

@@ -76,7 +76,7 @@ def test_robust_intervals_have_nominal_coverage_with_correlated_errors(name):
 @pytest.mark.parametrize("name", list(TRUTH))
 @pytest.mark.parametrize("robust", [False, True])
 def test_circulant_noise_has_nominal_coverage_with_correlated_errors(name, robust):
-    """Its spectrum is the exponential kernel's but for O(1/20); the length is estimated, and its uncertainty counts."""
+    """The true spectrum is that of the exponential kernel up to O(1/20); the length is estimated."""
     assert BAND[0] <= all_fitted(CORRELATION, 20, noise.Circulant(kernel="exponential"))[0][name, robust] <= BAND[1]
 
 
@@ -132,7 +132,7 @@ def test_residuals_of_white_noise_are_white():
 
 @cache
 def splits(amplitude: float) -> list[NoiseSplit]:
-    """Return how 100 recordings of white noise are taken apart, harmonic 8 having this amplitude beside the model."""
+    """Return the noise splits of 100 recordings of white noise with an unmodelled harmonic 8 of this amplitude."""
     wave = amplitude * np.cos(2 * np.pi * 8 * grid(800) + 0.3)
     runs = [replace(e, outputs={"force": e.outputs["force"] + wave}) for e in folded(0.0, 20, 100)]
     return [fitted(run).noise_split["force"] for run in runs]

@@ -224,7 +224,7 @@ def test_jeffreys_prior_of_a_model_error_is_that_of_the_whole_variance():
 
 @pytest.mark.parametrize("model", [noise.Independent, noise.Circulant])
 def test_jeffreys_prior_is_constant_in_the_logarithm_and_the_flat_one_is_not(model):
-    """1/v dv = d ln v, dv = v d ln v; whatever else the noise has, its prior is there as well."""
+    """1/v dv = d ln v, dv = v d ln v; priors of other noise parameters do not change the difference."""
     values = np.ones((3, len(model().shape_priors) + 1))
     values[:, 0] = 0.01, 1.0, 50.0
     jeffreys, flat = (Likelihood(model(prior=p), [block()], {}).log_prior(values) for p in ("jeffreys", "flat"))

@@ -1,4 +1,4 @@
-"""What is compared with the data: masks, angles, delays, multipliers, frequencies, and parameters of single runs."""
+"""Comparison with the data: masks, angles, delays, multipliers, frequencies, and local parameters."""
 
 from dataclasses import replace
 
@@ -107,7 +107,7 @@ def test_variances_of_each_run_are_those_of_equation_7():
 
 
 def test_mask_excludes_unmeasured_points():
-    """Only the points of the mask count, NaN elsewhere does no harm; closed form on those points."""
+    """The estimate is the closed form on the points of the mask; values elsewhere may be NaN."""
     run, mask = linear_experiment(TRUTH, 3.0, seed=5), np.arange(40) % 5 == 1
     values = np.where(mask, run.outputs["force"], np.nan)
     masked = replace(run, outputs={"force": values}, mask=mask, independent={})
@@ -154,7 +154,7 @@ def test_section_values_with_their_covariance_are_a_normal_density():
 
 
 def test_measured_multipliers_add_the_expected_information_on_friction():
-    """log|μ| of the period-1 rotations, known to 1 %, sharpens k3; by how much follows from their derivatives."""
+    """The information of log|μ|, known to 1 %, on k3 is that of its derivative."""
     mask, covariance = np.arange(SAMPLES) == 0, np.diag([1e-4, 4e-3])
     known = {"fixed": {n: v for n, v in rotation().parameters.items() if n != "k3"} | {"scale": 1.0}}
     prior = {"priors": {"k3": PENDULUM_PRIORS["k3"]}}
@@ -210,7 +210,7 @@ def test_a_delay_of_the_outputs_is_found():
 
 
 def test_delay_of_a_rotating_angle_leaves_no_jump():
-    """A rotation seen 0.05 s late: the same density as that of the punctual one, the trend of the angle included."""
+    """A rotation delayed by 0.05 s has the same density as without delay, the trend of the angle included."""
     truth, delay = rotation(), 0.05
     fraction = delay * truth.frequency
     late = {}
@@ -226,7 +226,7 @@ def test_delay_of_a_rotating_angle_leaves_no_jump():
 
 
 def test_autonomous_cycle_is_identified_for_any_phase():
-    """The shape tells mu, the measured frequency, known to 0.1 %, omega; within 4 sds (false-alarm rate 0.01 %)."""
+    """The shape determines mu, the frequency omega; within 4 sds (false-alarm rate 0.01 %)."""
     fits = []
     for turned in (0.2, 0.55):
         problem = bp.Problem(
@@ -247,7 +247,7 @@ def test_autonomous_cycle_is_identified_for_any_phase():
 
 
 def test_the_phase_of_a_cycle_is_the_likeliest_one_of_all_channels():
-    """Within a standard deviation, for the fundamentals tell it; the phase of the noisy channel is ten off."""
+    """The phase is within one sd of the maximum; that of the noisy channel alone is ten sds off."""
     model = bp.Model(
         "two_sensors",
         states=["x"],

@@ -74,7 +74,7 @@ def test_residual_ignores_harmonics_that_the_fold_removed():
 
 @pytest.mark.parametrize("kept", [{40: [None, None]}, {40: [3, None, 19]}, {41: [5, 20]}, {40: [None, 4], 63: [8]}])
 def test_each_experiment_counts_with_the_harmonics_that_it_keeps(kept):
-    """The squares behind eq. (6), against projections onto cosines and sines by least squares."""
+    """The squares of eq. (6), against least-squares projections onto cosines and sines."""
     generator, experiments, expected = np.random.default_rng(4), [], 0.0
     theta, v = np.array([870.0, 37.0, 22.0]), 7.0
     for samples, highest in kept.items():
@@ -157,7 +157,7 @@ TRUNCATED = bp.TruncatedNormal(20.0, 10.0, 0.0, np.inf)
 
 
 def test_a_joint_prior_goes_by_the_names_of_its_key(experiment):
-    """The key's order is the covariance's, the problem's order the model's."""
+    """The covariance follows the order of the key, the problem that of the model."""
     problem = bp.Problem(LINEAR, [experiment], priors={"coulomb": TRUNCATED, ("c", "k"): JOINT})
     assert problem.names == ("k", "c", "coulomb")
     assert problem.priors == {("c", "k"): JOINT, "coulomb": TRUNCATED}
@@ -188,7 +188,7 @@ def test_only_parameters_on_the_positive_half_line_are_sampled_in_their_logarith
 
 
 def test_a_frozen_scipy_distribution_is_a_prior(experiment):
-    """Beside the package's own normal the same numbers come out."""
+    """The values equal those of the package's own normal distribution."""
     given = bp.Problem(LINEAR, [experiment], priors=PRIORS | {"k": stats.norm(800.0, 60.0)})
     own = bp.Problem(LINEAR, [experiment], priors=PRIORS)
     theta = np.array([870.0, 37.0, 22.0])
@@ -261,7 +261,7 @@ def test_a_correlated_prior_gives_the_closed_form(experiment):
 
 
 def test_one_posterior_is_the_next_prior():
-    """Two experiments one after the other, in another order of the names, give what they give together."""
+    """Two experiments in sequence, with another order of the names, give the same posterior as both together."""
     experiments = [replace(linear_experiment(TRUTH, 3.0, seed=s), name=f"run {s}") for s in (11, 12)]
     settings = {"fixed": {"variance[force]": 9.0}}
     prior = {NAMES: bp.MultivariateNormal(MEAN, COVARIANCE)}
@@ -302,7 +302,7 @@ def test_every_prior_leads_to_the_mode_of_the_density(experiment, prior):
 
 @pytest.mark.parametrize("start", [1500.0, 850.0, 300.0])
 def test_estimate_converges_where_the_log_prior_is_convex(start):
-    """Far from its centre a t prior curves more against the data than they curve; the way up is found all the same."""
+    """Far from its centre a Student's t prior is log-convex, more than the likelihood is concave."""
     weak = linear_experiment(TRUTH, 100.0, seed=1)
     priors = {"k": bp.StudentT(500.0, 10.0, 3.0)}
     problem = bp.Problem(LINEAR, [weak], priors=priors, fixed={"c": 40.0, "coulomb": 25.0, "variance[force]": 1e4})
@@ -329,7 +329,7 @@ def test_an_experiment_that_is_not_in_a_list_is_refused():
 
 
 def test_a_problem_of_a_saved_experiment_is_the_same(tmp_path):
-    """So that a checkpoint goes on with an experiment that was loaded."""
+    """A checkpoint can therefore be resumed with an experiment that was loaded."""
     time = np.arange(400) / 40
     run = bp.Recording.from_arrays(time, {"displacement": np.sin(6 * time)}, {"force": np.cos(6 * time)}).fold(32)
     run.save(tmp_path / "run.h5")

@@ -37,7 +37,7 @@ def problem(drive: str) -> bp.Problem:
 
 @pytest.fixture(scope="module", params=["displacement", "force"])
 def stated(request):
-    """Return the problem and the share of the density's, and of the slope's, range that may be left unexplained."""
+    """Return the problem and the tolerances of the density and its slope, relative to their ranges."""
     # Under a given force the discretised work of a cycle is not quite zero, and its error in the mean temperature is
     # divided by theta16: 2e-7 W even with this scheme, 5e-6 W with central2.
     return problem(request.param), *{"displacement": (5e-8, 1e-6), "force": (4e-6, 1e-3)}[request.param]

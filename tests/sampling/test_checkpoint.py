@@ -1,4 +1,4 @@
-"""A run that is killed, at any moment, goes on as if nothing had happened."""
+"""A run that is killed at any moment resumes to the same chain."""
 
 import os
 import signal
@@ -98,7 +98,7 @@ def die_at(monkeypatch: pytest.MonkeyPatch, write: int) -> None:
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_run_killed_between_any_two_writes_of_a_save_resumes_identically(problem, uninterrupted, tmp_path, monkeypatch):
-    """The second save is interrupted at each of its writes, until one save needs no more of them."""
+    """The second save is interrupted at each of its writes."""
     monkeypatch.setattr(checkpoint, "PATIENCE", 0.0)
     with monkeypatch.context() as patch:
         total = 0
@@ -151,7 +151,7 @@ def test_run_killed_at_random_moments_resumes_identically(problem, uninterrupted
 
 
 def test_interrupted_run_returns_its_draws_and_can_be_resumed(problem, uninterrupted, tmp_path, monkeypatch):
-    """Ctrl-C in the third block: a partial result that says so, and the same chain in the end."""
+    """Ctrl-C in the third block gives a result marked as interrupted; the resumed chain is the same."""
     path, calls = tmp_path / "run.h5", 0
     original = bp.Problem.misfits
 

@@ -93,7 +93,7 @@ def test_derived_posterior_statistics_equal_those_of_numpy(solved):
 
 
 def test_ess_is_that_of_the_quantity(solved):
-    """A parameter sampled as it is has the ESS of the summary; so has one sampled in its logarithm, in log."""
+    """The ESS equals that of the summary in the coordinate in which the parameter is sampled."""
     posterior = solved[2]
     table = posterior.derive({"k_scaled": "3 - 2*k", "log_c": "log(c)"})
     assert table.loc["k_scaled", "ess"] == pytest.approx(posterior.ess["k"], rel=1e-9)

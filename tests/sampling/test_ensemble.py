@@ -1,4 +1,4 @@
-"""What several ensembles propose is evaluated in one call, and none of them can tell."""
+"""Concurrent ensembles share one call of the density; results and exceptions reach the right caller."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +14,7 @@ def squares(points):
 
 
 def three_calls(evaluate, turns):
-    """Return what three threads are told that ask in turns, each with as many points as its number says."""
+    """Return the values that three threads get; thread n evaluates n + 1 points per turn."""
     start = threading.Barrier(3)
 
     def ask(number):
@@ -39,7 +39,7 @@ def test_concurrent_callers_share_one_density_call_and_get_their_own_values():
 
 
 def walk(ground, steps):
-    """Ask for so many points one by one."""
+    """Evaluate one point per step."""
     return [float(ground.evaluate(np.full((1, 1), float(k)))[0][0, 0]) for k in range(steps)]
 
 

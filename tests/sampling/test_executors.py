@@ -1,4 +1,4 @@
-"""Whoever walks, the chain is the same; whoever dies, nothing that was walked is lost."""
+"""Chains do not depend on the executor, and draws survive the death of workers."""
 
 import os
 import pickle
@@ -77,7 +77,7 @@ def test_chains_are_identical_for_any_number_of_threads(posed, serial, cores, mo
 
 
 def test_chains_do_not_depend_on_the_block_length(posed, serial, monkeypatch):
-    """In pieces of another length the same chain, and accepted proposals are those that moved a walker."""
+    """Other block lengths give the same chain; accepted proposals are those that moved a walker."""
     monkeypatch.setattr(ensemble, "PIECE", 7)
     assert alike(sampled(posed), serial[0])
     kept = content(serial[1])
@@ -121,7 +121,7 @@ def test_run_can_be_resumed_with_another_executor(posed, serial, processes, dask
 
 
 def hooked(monkeypatch: pytest.MonkeyPatch, steps: int, act) -> None:
-    """Let something happen once all ensembles have walked so many steps, between two pieces."""
+    """Call a function between two blocks, once all ensembles have made so many steps."""
 
     class Bar(tqdm):
         def update(self, n=1):
@@ -140,7 +140,7 @@ def killed(pool: ProcessPoolExecutor) -> None:
 
 
 def test_draws_before_the_death_of_a_worker_are_kept(posed, serial, tmp_path, monkeypatch):
-    """First so early that there is no result, then late enough for one, then to the end without workers."""
+    """Interrupted before the first result, then after it, then completed without workers."""
     path = tmp_path / "run.h5"
     for workers, steps in ((1, 0), (2, 75)):
         with ProcessPoolExecutor(workers, get_context("spawn")) as pool, monkeypatch.context() as patch:

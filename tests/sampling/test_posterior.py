@@ -50,7 +50,7 @@ def runs(coulombs=(25.0, 35.0), sd=3.0):
 
 
 def drawn(problem, steps=12):
-    """Return a posterior of chains that were made up, without any sampling."""
+    """Return a posterior of synthetic chains, without sampling."""
     density = SamplingDensity(problem)
     kept = 0.1 * np.random.default_rng(1).standard_normal((2, steps, 4, density.dimension))
     return gather(density, kept, kept.sum(axis=-1), converged=True, reason="made up", acceptance=0.5, seed=0), kept
@@ -58,7 +58,7 @@ def drawn(problem, steps=12):
 
 @pytest.fixture(scope="module")
 def local():
-    """Return a problem with a parameter of each experiment's own and known variances, its estimate and posterior."""
+    """Return a problem with a local parameter and known variances, its estimate and posterior."""
     problem = bp.Problem(LINEAR, runs(), priors=PRIORS, local=["coulomb"], fixed={"variance[force]": 9.0})
     fit = bp.map_estimate(problem, **QUIET)
     return problem, fit, bp.sample(problem, fit, seed=1, **PAIR)
@@ -91,7 +91,7 @@ def test_local_parameters_have_their_closed_form_within_monte_carlo_error(local)
 
 @pytest.mark.parametrize(("prior", "spent"), [("jeffreys", 1), ("flat", 3)])
 def test_variances_of_each_experiment_follow_their_closed_form(prior, spent):
-    """With a parameter of its own and a flat prior M/v is χ² in every experiment, by itself."""
+    """With a local parameter and a flat prior M/v is χ² in every experiment independently."""
     problem = bp.Problem(
         LINEAR,
         runs(),
@@ -257,7 +257,7 @@ def test_known_values_are_kept_beside_the_sampled_ones():
 
 
 def test_the_scale_of_a_covariance_has_no_channel():
-    """Beside an experiment with variances of its own; the variance of a channel that is in no such one is NaN."""
+    """Next to an experiment with its own variances; the variance of an absent channel is NaN."""
     covariance = np.eye(80) + 0.1
     for per, name, dims in (("channel", "scale", ()), ("experiment", f"scale[{SECOND}]", ("experiment",))):
         problem = two_channels(bp.noise.Independent(per=per), second=("force", "rate"), covariance=covariance)
@@ -321,7 +321,7 @@ def test_expressions_use_the_local_parameters_of_one_experiment(local):
 
 
 def test_constants_and_ties_of_one_experiment_enter_an_estimate():
-    """A local parameter is never taken for a constant, though a single experiment has only one value of it."""
+    """A local parameter is not treated as a constant, although each experiment has one value of it."""
     problem = bp.Problem(
         LINEAR,
         runs(),
@@ -341,7 +341,7 @@ def test_constants_and_ties_of_one_experiment_enter_an_estimate():
 
 
 def test_a_posterior_becomes_the_prior_of_the_next_experiment(local):
-    """An estimate's carries everything over in a linear model with normal priors."""
+    """In a linear model with normal priors the prior made from an estimate is exact."""
     problem, fit, posterior = local
     key = (f"coulomb[{SECOND}]", "k")
     prior = posterior.as_prior(key)
@@ -394,7 +394,7 @@ def test_local_parameters_are_compared_one_by_one(local):
 
 
 def test_failed_solves_are_counted_by_cause():
-    """A prior beyond whose bound no orbit exists: proposals there fail, and the account says so."""
+    """Proposals in the part of the prior without an orbit fail and are counted."""
     run = bp.Experiment(
         "run", 1.0, {"x": 0.3 + 0.2 * np.random.default_rng(1).standard_normal(12)}, {"u": np.zeros(12)}, samples=12
     )

@@ -1,4 +1,4 @@
-"""What a posterior expects to be measured: replicates of the data, and the multipliers of its orbits."""
+"""Predictive replicates of the data, and the multipliers of the orbits."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ PRIORS = {"k": bp.Normal(900.0, 60.0), "c": bp.Normal(40.0, 20.0), "coulomb": bp
 
 @pytest.mark.parametrize("case", [name for name in CASES if name != "autonomous"])
 def test_residual_of_a_replicate_equals_its_simulated_noise(case):
-    """Measured again with that noise, an experiment has its components as residuals, within the harmonics kept."""
+    """The residual components of a simulated experiment equal those of its noise, within the kept harmonics."""
     problem, theta = CASES[case]()
     values = problem.likelihood.complete(np.full((1, len(problem.free_noise)), 1e-4))
     components = problem.likelihood.simulate(values, np.random.default_rng(3))
@@ -82,7 +82,7 @@ def test_predictive_multipliers_are_reported_without_rejecting_draws():
 
 
 def test_orbits_are_kept_with_the_draws_so_that_predictions_start_from_them():
-    """A second guess leads elsewhere: the prediction stays on the rotation that was sampled."""
+    """With another guess in the problem the prediction stays on the rotation that was sampled."""
     problem = pendulum_problem([pendulum_run()])
     posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=250, progress=False)
     states = posterior.guesses(["rotation"], ["phi"])["rotation"]

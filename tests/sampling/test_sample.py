@@ -114,7 +114,7 @@ def test_posterior_does_not_depend_on_the_start(known_variance, posterior, start
 
 
 def test_positive_parameter_sampled_in_its_logarithm_keeps_its_natural_density():
-    """No data to speak of: the draws are the prior's."""
+    """With almost no data the draws follow the prior."""
     priors = PRIORS | {"c": bp.LogNormal(30.0, 0.5)}
     experiment = linear_experiment(TRUTH, 3.0, seed=3)
     problem = bp.Problem(LINEAR, [experiment], priors=priors, fixed={"variance[force]": 1e12})

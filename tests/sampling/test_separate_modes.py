@@ -1,4 +1,4 @@
-"""Modes that walkers do not pass between: where they start, and what the stop rule says of them."""
+"""Modes that walkers do not cross between: starting points and the convergence criterion."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ UNCUT = bp.Normal(1.0, 1.0)
 
 @pytest.mark.filterwarnings("ignore:The data do not change under")
 def test_the_product_of_two_signed_numbers_has_a_mirrored_mode():
-    """Both negative: the likelihood is the same and N(1, 1) of both is lower by e^-4, up to where the mode is."""
+    """With both signs negative the likelihood is the same and the prior density lower by e^-4 at the mode."""
     problem, fit = ridge({"a": UNCUT, "b": UNCUT})
     density = SamplingDensity(problem)
     mean, covariance = density.laplace(fit)
@@ -28,7 +28,7 @@ def test_the_product_of_two_signed_numbers_has_a_mirrored_mode():
 
 
 def test_modes_that_are_close_or_improbable_are_not_reported():
-    """A number measured near zero has one mode on both sides of it; one that is 1 ± 0.1 has no mode at -1."""
+    """A parameter measured near zero has one mode that covers both signs; one at 1 ± 0.1 has no mode at -1."""
     for value in (0.05, 1.0):
         problem = bp.Problem(
             model("number", ["a"], lambda p: {"force": p.a}), [run(force=value)], priors={"a": bp.Normal(0.0, 2.0)},
@@ -48,7 +48,7 @@ def test_positive_parameters_have_no_mirrored_modes():
 
 
 def test_one_separate_walker_prevents_convergence():
-    """One of 128 independent walkers that is an sd off is hardly seen in any quantile, but stays apart."""
+    """One of 128 independent walkers that is off by one sd hardly changes any quantile."""
     kept = np.random.default_rng(1).standard_normal((4, 2000, 32, 2))
     tau = np.ones(2)
     assert shortfall(kept, tau, tau, ("a", "b")) == []

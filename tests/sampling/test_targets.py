@@ -1,4 +1,4 @@
-"""Sampling of posteriors that are known: means, spreads, distances of distributions, and independence of the walkers.
+"""Sampling of known posteriors: means, spreads, distances of distributions, and independence of the walkers.
 
 Every figure is compared within five of its own Monte Carlo errors: false-alarm rate below 1e-4 a test.
 """
@@ -86,7 +86,7 @@ def test_banana():
 
 
 def test_two_modes_of_opposite_sign():
-    """Only a² is measured: half the draws on each side, or "not converged" said."""
+    """Only a² is measured: half the draws have each sign, or the result is "not converged"."""
     signed = model("square", ["a"], lambda p: {"force": p.a**2})
     problem = bp.Problem(signed, [run(force=1.0)], priors={"a": bp.Normal(0.0, 2.0)}, fixed=known(force=0.1))
     fit = bp.map_estimate(problem, start={"a": 0.8}, **QUIET)
@@ -97,7 +97,7 @@ def test_two_modes_of_opposite_sign():
 
 @pytest.mark.filterwarnings("ignore:The estimate of 'a', 0.9.*, lies at the end")
 def test_edge_of_a_uniform_prior():
-    """The data pull beyond the prior's end: a normal cut off one standard deviation below its mean."""
+    """The likelihood peaks beyond the bound of the prior: a normal truncated one sd below its mean."""
     edged = model("edged", ["a"], lambda p: {"force": p.a})
     problem = bp.Problem(edged, [run(force=1.0)], priors={"a": bp.Uniform(0.0, 0.9)}, fixed=known(force=0.1))
     posterior = bp.sample(problem, bp.map_estimate(problem, **QUIET), **PAIR)
@@ -115,7 +115,7 @@ def ridge(priors: dict) -> tuple[bp.Problem, bp.MapEstimate]:
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The data do not change under")
 def test_ridge_of_a_product():
-    """Priors N(1, 1) cut at zero: sd(a) = 0.595 by quadrature; the stop rule sees through a short natural chain."""
+    """Priors N(1, 1) cut at zero: sd(a) = 0.595 by quadrature; a short natural chain is not converged."""
     cut = bp.TruncatedNormal(1.0, 1.0, 0.0, np.inf)
     problem, fit = ridge({"a": cut, "b": cut})
     a = np.geomspace(1e-3, 20.0, 200_001)
@@ -134,7 +134,7 @@ def test_ridge_of_a_product():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The data do not change under")
 def test_ridge_with_a_second_branch_is_converged_only_if_both_are_sampled():
-    """Uncut priors leave 1.2 % of the mass with both signs negative: found, or not converged."""
+    """Without truncation 1.2 % of the mass has both signs negative: it is sampled, or the result is not converged."""
     problem, fit = ridge({"a": bp.Normal(1.0, 1.0), "b": bp.Normal(1.0, 1.0)})
     posterior = bp.sample(problem, fit, max_steps=3000, **PAIR)
     negative = float(np.mean(posterior.draws("a") < 0.0))

@@ -1,4 +1,4 @@
-"""Facts about structural identifiability, confirmed by substitution done here and by periodic solutions."""
+"""Structural identifiability, confirmed by independent substitution and by periodic solutions."""
 
 from types import SimpleNamespace
 
@@ -137,7 +137,7 @@ def test_rank_and_number_of_symmetries_add_up_to_the_number_of_parameters(name, 
 
 
 def sensitivities(name, model, outputs):
-    """Return those of periodic outputs to the logarithms of the parameters, each column of length 1."""
+    """Return sensitivities of periodic outputs to the logarithms of the parameters, each column of length 1."""
     tau = np.arange(128) / 128
     wave = np.cos(2 * np.pi * tau) + 0.6 * np.cos(4 * np.pi * tau + 1.0) + 0.3 * np.sin(6 * np.pi * tau)
     runs = [(0.05, 0.3, 0.3), (0.1, 0.4, 0.1), (0.2, 0.5, -0.2), (0.4, 0.8, 0.1)]
@@ -357,7 +357,7 @@ def test_without_its_mass_an_oscillator_is_of_first_order():
 
 
 def test_without_heat_capacity_the_scaling_and_the_shift_remain():
-    """What then ties theta15 to the other parameters is gone; the scaling of T and the shift stay."""
+    """The scaling of T and the shift remain."""
     structure = bp.structure(bp.models.landing_gear("displacement"), fixed={"theta15": 0.0})
     assert structure.complete
     assert structure.rank == 12
@@ -379,7 +379,7 @@ def test_the_feedthrough_of_an_input_moves_into_the_state():
 
 
 def test_symmetries_of_equations_with_corners_are_found():
-    """The place of a gap and an output offset are only in combination; the offset alone would move the corner."""
+    """Only gap + offset is identifiable; the offset alone would move the corner."""
     model = small(
         ["x"],
         ["k", "gap", "y0"],
@@ -393,7 +393,7 @@ def test_symmetries_of_equations_with_corners_are_found():
 
 
 def test_position_of_a_jump_is_not_reported_as_undetermined():
-    """Derivatives do not see it, so that the rank is withheld."""
+    """Derivatives do not detect it, so that no rank is given."""
     step = lambda s, p: sp.Piecewise((1, s.x > p.place), (0, True))  # noqa: E731
     model = small(
         ["x"],
