@@ -102,7 +102,7 @@ def raised(function: Any, cls: type | None = None, seen: set[Any] | None = None)
         if isinstance(call, ast.Name) and call.id.startswith("_"):
             helper = function.__globals__.get(call.id)
         elif isinstance(call, ast.Attribute) and isinstance(call.value, ast.Name):
-            found |= {"ValueError"} if call.value.id == "checks" else set()
+            found |= {"ValueError"} if call.value.id == "_checks" else set()
             found |= {"warns"} if (call.value.id, call.attr) == ("warnings", "warn") else set()
             if call.value.id in ("self", "cls") and call.attr.startswith("_") and cls is not None:
                 helper = plain(inspect.getattr_static(cls, call.attr, None))
