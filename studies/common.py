@@ -1,8 +1,6 @@
-"""What every study needs: where the data are, steps that say what they do, results and figures written whole.
+"""Helpers of the studies: data files, timed steps, results and figures, tables of targets, checkpointed tasks.
 
-Tasks for all cores, and long runs that go on where they were ended, by tasks (a line each in a file) or by parts.
-
-Rows of the sampling study: what must show, the value found, the limits allowed, and whether they are met.
+Results and figures are written completely or not at all.
 """
 
 import hashlib
@@ -34,19 +32,19 @@ Row = dict[str, Any]
 
 
 def row(what: str, value: float | None, low: float, high: float | None, note: str = "") -> Row:
-    """Return a row of results.json, `high` None if nothing is too high; without a value there is no verdict."""
+    """Return a row of results.json; `high` None means no upper limit, and a missing value gives no verdict."""
     value = None if value is None or math.isnan(value) else float(value)
     met = None if value is None else value >= low and (high is None or value <= high)
     return {"what": what, "value": value, "low": low, "high": high, "met": met, "note": note}
 
 
 def unjudged(entry: Row, why: str) -> Row:
-    """Return a row that keeps its value and has no verdict."""
+    """Return a row without its verdict."""
     return entry | {"met": None, "note": why}
 
 
 def table_of_rows(rows: list[Row]) -> str:
-    """Return rows as text, notes below."""
+    """Return rows as text, with notes below."""
     verdicts, lines = {True: "yes", False: "NO", None: "-"}, []
     notes = list(dict.fromkeys(entry["note"] for entry in rows if entry["note"]))
     for entry in rows:
@@ -73,10 +71,10 @@ Value = TypeVar("Value")
 def resumed(
     path: Path, tasks: Sequence[Task], work: Callable[[Task], Line], task_of: Callable[[Line], Task], source: str
 ) -> list[Line]:
-    """Do the tasks that a file lacks, all cores at it, and return the lines of all in their order.
+    """Compute the tasks missing from a file on all cores, and return the lines of all tasks in order.
 
-    `path`: A JSON line a task; those of another source stay in it and do not count. `work`: Returns a task's line, with
-    "source" in it. `task_of`: Returns the task that a line is of. `source`: Tells results of another version apart.
+    The file has one JSON line per task; lines of another source are ignored. `work` returns a task's line, with
+    "source" in it; `task_of` returns the task of a line; `source` identifies the version.
     """
     with workers() as pool:
         return _parallel.checkpointed_tasks(path, tasks, _do_task, task_of, source, shared=work, executor=pool)
@@ -87,10 +85,7 @@ def _do_task(work: Callable[[Task], Line], task: Task) -> Line:
 
 
 def remembered(path: Path, source: str, make: Callable[[], Part]) -> Part:
-    """Return a part of a study from the file of an earlier run, or make it and keep it there.
-
-    `source`: Tells parts of another version, or with other settings, apart.
-    """
+    """Return a part of a study from the file of an earlier run with the same `source`, or compute and store it."""
     if path.is_file():
         saved, part = pickle.loads(path.read_bytes())
         if saved == source:
@@ -104,10 +99,7 @@ def remembered(path: Path, source: str, make: Callable[[], Part]) -> Part:
 
 
 def each(work: Callable[..., Value], tasks: Sequence[Task], *, here: bool = False) -> Iterator[Value]:
-    """Yield work(*task) of every task, in their order.
-
-    `work`: Of a module. `here`: One after the other in this process; else in processes, each task on one core.
-    """
+    """Yield work(*task) of every task in order, computed in this process (`here`) or in one process per core."""
     if here:
         yield from (work(*task) for task in tasks)
         return
@@ -126,7 +118,7 @@ def _run_task(work: Callable[..., Value], task: Task) -> bytes:
 
 
 def workers() -> ProcessPoolExecutor:
-    """Return a pool of as many fresh processes as there are cores."""
+    """Return a pool with one new process per core."""
     return ProcessPoolExecutor(available_cores(), mp_context=multiprocessing.get_context("spawn"))
 
 
@@ -137,13 +129,13 @@ WITHOUT_TIME = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 
 def find_data(given: Path | None, relative: str) -> tuple[Path, str] | None:
-    """Return a measured file and the name to report for it, None where it is not to be had.
+    """Return a measured file and the name to report for it, None if it is missing.
 
     Searched: the path given, then the folder named by BAYESPERIODIC_DATA, then ``data/``.
     """
     if given is not None:
         if not given.is_file():
-            raise FileNotFoundError(f"--data: {str(given)!r} is not allowed; there is no such file.")
+            raise FileNotFoundError(f"--data: must be an existing file, got {str(given)!r}.")
         return given, str(given)
     for folder in (os.environ.get("BAYESPERIODIC_DATA"), "data"):
         if folder and (Path(folder) / relative).is_file():
@@ -181,12 +173,12 @@ class Stopwatch:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that matter."""
+    """Return the versions of Python and of the main packages."""
     return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
 def write_results(folder: Path, results: dict[str, Any]) -> Path:
-    """Write results.json, whole or not at all."""
+    """Write results.json atomically."""
     folder.mkdir(parents=True, exist_ok=True)
     target, draft = folder / "results.json", folder / ".results.json.part"
     draft.write_text(json.dumps(results, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -195,9 +187,9 @@ def write_results(folder: Path, results: dict[str, Any]) -> Path:
 
 
 def save_figures(folder: Path, figures: dict[str, Figure]) -> list[Path]:
-    """Save figures as small PNG files, and as what matplotlib's "savefig.format" says; return the paths.
+    """Save figures as small PNG files and in matplotlib's "savefig.format", without time stamps; return the paths.
 
-    Without time stamps, each whole or not at all.
+    Each file is written atomically.
     """
     folder.mkdir(parents=True, exist_ok=True)
     wanted = matplotlib.rcParams["savefig.format"]

@@ -1,6 +1,6 @@
-"""Times measured side by side: every action in turn within every repeat, medians, and ratios repeat by repeat.
+"""Interleaved timing, gains of several cores, and the error of a gradient.
 
-How right a gradient of the log-posterior is.
+Every action runs once in each repeat; ratios are taken by repeat, and medians and ranges are reported.
 """
 
 import time
@@ -18,9 +18,9 @@ LOOP = 5_000_000
 
 
 def gradient_error(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> float:
-    """Return the error of the gradient by θ against five-point differences of log-posteriors, of its largest component.
+    """Return the error of the gradient relative to its largest component, against five-point differences.
 
-    Components count, and steps are taken, in standard deviations of one parameter with the others known.
+    Components and steps are in standard deviations of one parameter given the others.
 
     `warm`: The one that the gradient is of; the differences are of the problem anchored at θ. `theta` (names,). `noise`
     (noise_names,).
@@ -40,17 +40,17 @@ def _conditional_sd(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> n
 
 
 class Action(NamedTuple):
-    """Something timed."""
+    """A timed action."""
 
-    run: Callable[[], Any]  # Returns its own seconds, or anything else where the clock shall be read here
-    of: int = 1  # Of how many log-posteriors it takes the time
-    most: int = 10_000  # Repeats at most; of a slow action fewer are worth their time
+    run: Callable[[], Any]  # Returns its own seconds as a float, or anything else to be timed from outside
+    of: int = 1  # Number of log-posteriors per run
+    most: int = 10_000  # Largest number of repeats
 
 
 def interleaved(actions: Mapping[str, Action], repeats: int) -> dict[str, np.ndarray]:
-    """Return seconds (repeats,) a log-posterior of each action, NaN in repeats that leave it out.
+    """Return seconds (repeats,) per log-posterior of each action, NaN in omitted repeats.
 
-    A first round, which fills caches, does not count for the actions that are repeated more than once.
+    A first round, which fills caches, is not counted for actions that are repeated more than once.
     """
     found = {name: np.full(repeats, np.nan) for name in actions}
     for repeat in range(-1, repeats):
@@ -66,7 +66,7 @@ def interleaved(actions: Mapping[str, Action], repeats: int) -> dict[str, np.nda
 
 
 def spread(values: np.ndarray) -> dict[str, float]:
-    """Return median, least and largest of the values that are there."""
+    """Return median, least and largest of the finite values."""
     there = values[np.isfinite(values)]
     return {"median": float(np.median(there)), "least": float(there.min()), "largest": float(there.max())}
 
@@ -82,9 +82,9 @@ def slope(sizes: Any, values: Any) -> float:
 
 
 def gain_of_cores(call: Callable[[int], Any], cores: int, repeats: int) -> dict[str, Any]:
-    """Compare what all cores gain on a call, given its number of threads, with what they gain on a plain loop.
+    """Compare the gain of all cores on a call, which takes the number of threads, with that on a plain loop.
 
-    The plain loop is compiled, needs no memory, and runs once a core. All four are timed in turn within every repeat.
+    The plain loop is compiled, needs no memory, and runs once per core. All four are timed in turn within every repeat.
     """
     with ThreadPoolExecutor(cores) as pool:
         list(pool.map(plain_loop, [10] * cores))
@@ -106,7 +106,7 @@ def gain_of_cores(call: Callable[[int], Any], cores: int, repeats: int) -> dict[
 
 @numba.njit(nogil=True)
 def plain_loop(count: int) -> float:
-    """Return the result of so many dependent divisions."""
+    """Return the result of `count` dependent divisions."""
     total = 0.0
     for k in range(count):
         total += 1.0 / (1.0 + k * total)

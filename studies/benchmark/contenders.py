@@ -1,4 +1,4 @@
-"""One log-posterior, and its gradient, by every contender on one problem: how right it is and what it takes."""
+"""Accuracy and time of one log-posterior and its gradient, by method, on one problem."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -37,18 +37,18 @@ Compiled = dict[tuple[str, str], list[Method]]
 
 @dataclass(frozen=True)
 class Row:
-    """One contender."""
+    """One method."""
 
     name: str
     error: float  # The largest |Δ log-posterior| at the draws
-    action: Action | None  # None where it is not installed or never right enough
-    note: str = ""  # How it was set, or why there is no time
+    action: Action | None  # None if it is not installed or never accurate enough
+    note: str = ""  # Settings, or why there is no time
     gradient_error: float | None = None  # The largest of any component, relative to the largest component
 
 
 @dataclass
 class Contest:
-    """All contenders of one problem."""
+    """All methods on one problem."""
 
     reference: Reference
     rows: list[Row] = field(default_factory=list)
@@ -59,15 +59,15 @@ class Contest:
         return self.reference.setting
 
     def add(self, name: str, error: float, action: Action, note: str = "", gradient_error: float | None = None) -> None:
-        """Enter a contender; it is not timed where it is less accurate than allowed."""
+        """Add a method; it is not timed if it is less accurate than allowed."""
         right = error <= ALLOWED
-        note = note if right else f"{note + '; ' if note else ''}not right enough"
+        note = note if right else f"{note + '; ' if note else ''}not accurate enough"
         self.rows.append(Row(name, error, action if right else None, note, gradient_error))
 
     def gradient_error(self, gradient: np.ndarray) -> float:
-        """Return how far a gradient by θ at the first draw is from this package's, of the largest component.
+        """Return the error of a gradient at the first draw against this package's, relative to the largest component.
 
-        Components count in the posterior's standard deviations.
+        Components are scaled by the posterior's standard deviations.
         """
         problem, theta = self.setting.problem, self.setting.theta[0]
         exact = problem.gradient(theta, self.setting.noise, method="forward")[: gradient.size]
@@ -75,12 +75,12 @@ class Contest:
         return float(np.abs((gradient - exact) * sd).max() / np.abs(exact * sd).max())
 
     def refuse(self, name: str, why: str) -> None:
-        """Enter a contender that there is nothing to time of."""
+        """Add a method that cannot be timed."""
         self.rows.append(Row(name, np.inf, None, why))
 
 
 def add_own(contest: Contest) -> str | None:
-    """Enter this package with every scheme; return the cheapest scheme that is right enough, None for none."""
+    """Add this package with every scheme; return the cheapest sufficiently accurate scheme, or None."""
     setting, best = contest.setting, None
     for scheme in SCHEMES:
         warm = setting.schemed(scheme)
@@ -129,14 +129,14 @@ def _cold(setting: Setting, scheme: str) -> None:
 
 
 def add_compiled(contest: Contest) -> Compiled:
-    """Enter the compiled Runge-Kutta method until steady and shooting on it, each from every start."""
+    """Add the compiled Runge-Kutta method until steady and shooting on it, each from every start."""
     reference, every, found = contest.reference, contest.reference.discretised(), {}
     for kind in (STEADY, SHOOTING):
         for start in STARTS:
             name = f"{kind} {start}"
             tuned = reference.tuned(lambda k, *rest: tune(every[k], kind, start, *rest))  # noqa: B023
             if tuned is None:
-                contest.refuse(name, "not steady within 5000 cycles, or not right enough at any tolerance")
+                contest.refuse(name, "not steady within 5000 cycles, or not accurate enough at any tolerance")
                 continue
             methods, error = tuned
             slow = kind == STEADY and start != PREDICTED
@@ -156,7 +156,7 @@ def _steps(methods: Sequence[Method]) -> str:
 
 
 def integrate(contest: Contest, methods: Sequence[Callable[[np.ndarray], float]], count: int) -> None:
-    """Compute the log-posteriors of the first so many draws."""
+    """Compute the log-posteriors of the first `count` draws."""
     setting, reference = contest.setting, contest.reference
     for k in range(count):
         setting.log_prior(setting.theta[k])
@@ -165,7 +165,7 @@ def integrate(contest: Contest, methods: Sequence[Callable[[np.ndarray], float]]
 
 
 def _add_gradient(contest: Contest, methods: Sequence[Method]) -> None:
-    """Enter shooting with the variational equations."""
+    """Add shooting with the variational equations."""
     setting, reference = contest.setting, contest.reference
 
     def both(k: int) -> tuple[float, np.ndarray]:
@@ -183,7 +183,7 @@ def _add_gradient(contest: Contest, methods: Sequence[Method]) -> None:
 
 
 def add_scipy(contest: Contest, compiled: Compiled, *, quick: bool = False) -> None:
-    """Enter solve_ivp (but for a quick run), its cycles counted by the compiled method, and solve_bvp."""
+    """Add solve_ivp (but for a quick run), its cycles counted by the compiled method, and solve_bvp."""
     reference = contest.reference
     every = [m.discretised for m in next(iter(compiled.values()))]
     for method in () if quick else INITIAL:
@@ -191,7 +191,7 @@ def add_scipy(contest: Contest, compiled: Compiled, *, quick: bool = False) -> N
         for start in (EQUILIBRIUM, ESTIMATE):
             name = f"{method} {start}"
             if tuned is None or (STEADY, start) not in compiled:
-                contest.refuse(name, "not right enough at any tolerance, or not steady within 5000 cycles")
+                contest.refuse(name, "not accurate enough at any tolerance, or not steady within 5000 cycles")
                 continue
             ready, error = tuned
             tolerances = [one.relative for one in ready]
@@ -201,7 +201,7 @@ def add_scipy(contest: Contest, compiled: Compiled, *, quick: bool = False) -> N
     for start in (ESTIMATE,) if quick else (EQUILIBRIUM, ESTIMATE):
         found = reference.tuned(lambda k, *rest: tune_boundary(every[k], start, *rest), SLOW_DRAWS)  # noqa: B023
         if found is None:
-            contest.refuse(f"{BVP} {start}", "not right enough at any tolerance, or not converged")
+            contest.refuse(f"{BVP} {start}", "not accurate enough at any tolerance, or not converged")
             continue
         solved, error = found
         tolerances = [one.boundary.tolerance for one in solved]
@@ -216,7 +216,7 @@ def _seconds(contest: Contest, ready: Sequence[Initial], start: str, cycles: Seq
 
 
 def measured(contest: Contest, scheme: str | None, repeats: int) -> dict[str, Any]:
-    """Return times of all contenders, and by how much each is dearer than one warm log-posterior of this package."""
+    """Return times of all methods, and their ratios to one warm log-posterior of this package."""
     actions = {row.name: row.action for row in contest.rows if row.action is not None}
     times = interleaved(actions, repeats)
     under = times.get(f"{OWN_WARM}, {scheme}")

@@ -1,7 +1,7 @@
-"""A model as a system of first order, y' = f(y, u, p), with derivatives, for the integrators of others.
+"""A model as a system of first order, y' = f(y, u, p), with derivatives, for time integrators.
 
-Generated from the model's own expressions, so that every contender solves the same equations: as text that Numba
-compiles into straight-line code, that NumPy runs on whole arrays, or that JAX traces.
+Generated from the model's expressions, so that every method solves the same equations: as text that Numba compiles,
+that NumPy evaluates on whole arrays, or that JAX traces.
 
 y holds the states, each of second order followed by its rate; u the inputs and their first two derivatives, then τ; p
 the model's parameters, then the frequency.

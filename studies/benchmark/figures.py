@@ -1,4 +1,4 @@
-"""The benchmark in one figure."""
+"""Figure of the benchmark."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,7 +17,7 @@ COLOURS = [colormaps["tab20"](k) for k in range(20)]
 
 
 def draw(found: Mapping[str, Any]) -> Figure:
-    """Return the figure: contenders over one warm log-posterior, and the stages of one beside the floor."""
+    """Return the figure: methods relative to one warm log-posterior, and its stages relative to the floor."""
     figure = Figure(SIZE, layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.15, 1.0])[0]
     if found["problems"]:
@@ -49,7 +49,7 @@ def _contenders(ax: Axes, problems: Mapping[str, Any]) -> None:
     ax.invert_yaxis()
     ax.grid(axis="x", alpha=0.3)
     ax.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=2)
-    ax.set_title("One log-posterior, equally right: median and range over the repeats")
+    ax.set_title("One log-posterior at equal accuracy: median and range over the repeats")
 
 
 def _floor(ax: Axes, found: Mapping[str, Any]) -> None:
@@ -78,4 +78,4 @@ def _posterior(ax: Axes, found: Mapping[str, Any]) -> None:
     names = sorted(values, key=lambda name: values[name])
     ax.barh(range(len(names)), [values[name] for name in names])
     ax.set_yticks(range(len(names)), names, fontsize=6)
-    ax.set(xscale="log", xlabel="effective samples a second [1/s]", title="Duffing (synthetic): posterior")
+    ax.set(xscale="log", xlabel="effective samples per second [1/s]", title="Duffing (synthetic): posterior")

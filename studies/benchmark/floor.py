@@ -1,7 +1,7 @@
-"""The floor of a log-posterior of the landing gear, and how far each of its stages is from it.
+"""Time of a log-posterior and its stages, relative to a lower bound (the floor).
 
-The floor is one compiled sweep for residual and Jacobian, and LAPACK's factorisation and solve of the same band, for
-each of the 14 experiments with its own matrix, restored between passes and not while the clock runs.
+The floor is one compiled evaluation of residual and Jacobian, and LAPACK's factorisation and solve of the same band
+matrix, for each experiment with its own matrix. Restoring the matrices between passes is not timed.
 """
 
 import time
@@ -52,7 +52,7 @@ class Floor:
 
     @property
     def bytes(self) -> int:
-        """What a factorisation reads and writes, and a solve reads, all matrices together."""
+        """Bytes that a factorisation reads and writes, and a solve reads, over all matrices."""
         return 3 * sum(band.nbytes for band in self._bands)
 
     def sweep(self) -> None:
@@ -69,7 +69,7 @@ class Floor:
         return time.perf_counter() - before
 
     def solve(self) -> float:
-        """Return the seconds of the solves with what was factored last."""
+        """Return the seconds of the solves with the last factors."""
         rights = [np.array(right) for right in self._right]
         before = time.perf_counter()
         for work, pivots, right in zip(self._work, self._pivots, rights, strict=True):
@@ -162,7 +162,7 @@ def _gradient(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
 
 
 def _stages(setting: Setting, warm: bp.Problem, theta: np.ndarray) -> dict[str, Callable[[], Any]]:
-    """Return the call's parts, each with all that comes before it but for the priors."""
+    """Return the cumulative stages of a call."""
     noise, points = setting.noise, [one[None] for one in theta]
     residuals = [warm.misfits(one, 1)[0] for one in points]
     return {
@@ -186,7 +186,7 @@ def same_grid_error(setting: Setting, warm: bp.Problem) -> float:
 
 
 def bandwidth(repeats: int) -> dict[str, float]:
-    """Return how fast one core reads and writes memory in a copy [GB/s]."""
+    """Return the memory bandwidth of one core in a copy [GB/s]."""
     source = np.ones(COPIED // 8)
     target = np.empty_like(source)
     times = interleaved({"copy": Action(lambda: np.copyto(target, source))}, repeats)["copy"]
@@ -194,7 +194,7 @@ def bandwidth(repeats: int) -> dict[str, float]:
 
 
 def emcee_overhead(setting: Setting, repeats: int) -> dict[str, float]:
-    """Return what emcee itself takes of a log-posterior [µs], with one that costs nothing."""
+    """Return emcee's own time per log-posterior [µs], measured with a trivial density."""
     size = len(setting.problem.names)
     start = np.random.default_rng(1).standard_normal((WALKERS, size))
 

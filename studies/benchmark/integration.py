@@ -1,6 +1,6 @@
-"""Time integration and shooting of one experiment, each with the cheapest settings that are right enough.
+"""Time integration and shooting of one experiment, with the cheapest settings of sufficient accuracy.
 
-The common reference of a problem: log-posteriors at the draws by fully converged, fine shooting.
+The reference of a problem is its log-posterior at the draws by fully converged shooting with small steps.
 """
 
 from collections.abc import Callable
@@ -28,7 +28,7 @@ TIGHT, LOOSE = 1e-11, 1e-9
 
 @dataclass(frozen=True)
 class Discretised:
-    """An experiment with so many Runge-Kutta steps a period, and its orbit at the estimate."""
+    """An experiment with a number of Runge-Kutta steps per period, and its orbit at the estimate."""
 
     case: Case
     steps: int
@@ -144,7 +144,7 @@ class Discretised:
 
 @dataclass(frozen=True)
 class Method:
-    """One way to the log-likelihood of one experiment."""
+    """A method for the log-likelihood of one experiment."""
 
     discretised: Discretised
     kind: str  # `STEADY` or `SHOOTING`
@@ -176,7 +176,7 @@ class Method:
 
 
 def exact(case: Case, parameters: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the log-likelihood at draws by fine shooting, and by how much twice as long steps change it."""
+    """Return the log-likelihood at draws by shooting with small steps, and its change when the steps are doubled."""
     coarse = np.full(len(parameters), np.nan)
     for steps in (REFERENCE_STEPS[0] // 2, *REFERENCE_STEPS):
         one = Discretised(case, steps)
@@ -189,7 +189,7 @@ def exact(case: Case, parameters: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def discretise(case: Case, parameters: np.ndarray, exact: np.ndarray, allowed: float) -> Discretised:
-    """Return the experiment with the fewest steps whose orbits are no further off than allowed at any draw."""
+    """Return the experiment with the fewest steps that keep the error at all draws within the limit."""
     for steps in STEPS:
         one = Discretised(case, steps)
         if one.anchor is not None and _off(one, parameters, exact) <= allowed:
@@ -208,7 +208,7 @@ def _off(one: Discretised, parameters: np.ndarray, exact: np.ndarray) -> float:
 def tune(
     one: Discretised, kind: str, start: str, parameters: np.ndarray, exact: np.ndarray, allowed: float
 ) -> Method | None:
-    """Return the method with the loosest tolerance that is right enough at every draw; None if there is none."""
+    """Return the method with the loosest tolerance that is accurate enough at every draw; None if there is none."""
     for tolerance in TOLERANCES:
         found = Method(one, kind, start, tolerance).judged(parameters, exact)
         if found.error <= allowed:
@@ -219,15 +219,15 @@ def tune(
 Way = TypeVar("Way", bound=Callable[[np.ndarray], float])
 
 ALLOWED = 1e-2
-# What experiments may be off, of what it were if their errors had either sign.
+# Fractions of the allowed error per experiment that are tried, because errors may add up.
 TRIES = (1.0, 0.5, 0.25, 0.1)
-# Steps take a part of what an experiment may be off, the way to the steady state the rest.
+# Fraction of the allowed error that the step size may use; the approach to the steady state may use the rest.
 SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What every contender is held against."""
+    """Reference of all methods."""
 
     setting: Setting
     parameters: list[np.ndarray]  # (draws, parameters + 1): One an experiment
@@ -236,7 +236,7 @@ class Reference:
 
     @property
     def each(self) -> float:
-        """What an experiment may be off, so that errors of either sign add up to what is allowed."""
+        """Allowed error per experiment, so that errors of either sign add up to the total allowed."""
         return ALLOWED / np.sqrt(len(self.exact))
 
     @property
@@ -250,7 +250,7 @@ class Reference:
         return np.array([self.setting.log_prior(theta) for theta in self.setting.theta])
 
     def discretised(self) -> list[Discretised]:
-        """Return every experiment with the fewest steps that are right enough."""
+        """Return every experiment with the fewest steps that are accurate enough."""
         return [
             discretise(case, p, e, SHARE * self.each)
             for case, p, e in zip(self.setting.cases, self.parameters, self.exact, strict=True)
@@ -259,11 +259,11 @@ class Reference:
     def tuned(
         self, choose: Callable[[int, np.ndarray, np.ndarray, float], Way | None], draws: int | None = None
     ) -> tuple[list[Way], float] | None:
-        """Return the cheapest way to every experiment's log-likelihood that together are right, and their error.
+        """Return the cheapest methods for all experiments' log-likelihoods that are accurate together, and their error.
 
-        `choose`: From the experiment's number, parameters and log-likelihoods at the draws and what it may be off, to
-        the cheapest way, None if there is none. `draws`: The first so many alone, for what takes long. None where an
-        experiment has none.
+        `choose` maps the experiment's number, parameters and log-likelihoods at the draws and the allowed error to the
+        cheapest method or None. `draws` limits the draws for slow methods. The result is None if an experiment has no
+        method.
         """
         at = slice(draws)
         for share in TRIES:
@@ -280,7 +280,7 @@ class Reference:
         return found, error
 
     def error(self, log_posteriors: np.ndarray) -> float:
-        """Return the largest error of log-posteriors at the first so many draws, infinite where one is not finite."""
+        """Return the largest error of log-posteriors at the first draws, infinite if one is not finite."""
         off = np.abs(log_posteriors - self.log_posteriors[: len(log_posteriors)])
         return float(off.max()) if np.isfinite(off).all() else np.inf
 

@@ -1,7 +1,7 @@
-"""Compiled integration of one model over its period: the classical Runge-Kutta method until steady, and shooting on it.
+"""Compiled integration of one model over its period: classical Runge-Kutta until steady, and shooting based on it.
 
-What the strongest competitor would write for a given model: the right-hand side and its derivatives are inlined
-straight-line code, sizes are constants, nothing is allocated within a cycle, and no call holds the interpreter's lock.
+Right-hand side and derivatives are straight-line code, sizes are constants, a cycle allocates nothing, and calls
+release the interpreter's lock.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ import numpy as np
 from studies.benchmark.equations import NUMBA, FirstOrder
 
 MAX_CYCLES = 5000
-# A state this many times its size has been lost.
+# A state larger than this multiple of its scale has diverged.
 LOST = 1e6
 
 compiled = numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
@@ -305,7 +305,7 @@ def _pulled(c: Any, d: Any, size: int, channels: int, count: int) -> Any:
 
 
 def _in_time(f: Any, a: Any, size: int) -> tuple[Any, Any]:
-    """Return rates and their derivatives by y at a time, as SciPy asks for them."""
+    """Return rates and their derivatives by y at a time, as SciPy requires them."""
 
     @compiled
     def rates_in_time(t, y, p, u, period):

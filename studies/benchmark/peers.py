@@ -1,10 +1,8 @@
-"""The contenders from other packages, each a row that says so where it is not installed.
+"""Methods of other packages: diffrax on JAX, and harmonic balance by `harmonicbalance`.
 
-diffrax on JAX for one experiment: compiled, in double precision, with gradients by its own adjoint.
-
-A harmonic-balance package from PyPI, `harmonicbalance`, on the Duffing oscillator.
-
-Its series are of one unknown, so that of the benchmark's problems it is written for this one.
+diffrax runs compiled, in double precision, with gradients by its own adjoint. The Fourier series of `harmonicbalance`
+have one unknown, so it is applied to the Duffing oscillator only. A package that is not installed gives a row without
+times.
 """
 
 import contextlib
@@ -28,7 +26,7 @@ HARMONICS = (1, 3, 5, 7, 9, 11, 15, 21, 31)
 
 
 def balance_missing() -> str:
-    """Return what to say where it is not installed, nothing where it is."""
+    """Return a note if the package is not installed, else an empty string."""
     lacking = importlib.util.find_spec("harmonicbalance") is None
     return 'harmonicbalance is not installed (pip install "bayesperiodic[benchmark]")' if lacking else ""
 
@@ -52,7 +50,7 @@ class Balanced:
     def _start(self) -> Any:
         samples = self._case.experiment.samples
         if not self.discretised.shoot(self._case.estimate, PREDICTED, LOOSE):
-            raise RuntimeError("The orbit at the estimate is not to be had.")
+            raise RuntimeError("The orbit at the estimate was not found.")
         return self._series(self.discretised.states(np.arange(samples) * self._case.period / samples)[0])
 
     def _series(self, values: np.ndarray) -> Any:
@@ -94,7 +92,7 @@ def _sign_of_derivatives() -> float:
 
 
 def tune_balanced(one: Discretised, parameters: np.ndarray, exact: np.ndarray, allowed: float) -> Balanced | None:
-    """Return the fewest harmonics that are right enough at the draws; None if there are none."""
+    """Return the fewest harmonics that are accurate enough at the draws; None if there are none."""
     for harmonics in HARMONICS:
         found = Balanced(one, harmonics)
         if np.max([abs(found(p) - e) for p, e in zip(parameters, exact, strict=True)]) <= allowed:
@@ -113,14 +111,14 @@ CHORDS = 1
 
 
 def diffrax_missing() -> str:
-    """Return what to say where it is not installed, nothing where it is."""
+    """Return a note if the package is not installed, else an empty string."""
     lacking = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     return f'{lacking[0]} is not installed (pip install "bayesperiodic[benchmark]")' if lacking else ""
 
 
 @dataclass(frozen=True)
 class Traced:
-    """One model's integration as JAX sees it."""
+    """One model's integration for JAX."""
 
     model: Any
 
@@ -199,7 +197,7 @@ class Integrated:
 
     @cached_property
     def parts(self) -> tuple[Any, ...]:
-        """What the log-likelihood by shooting takes besides p."""
+        """Arguments of the log-likelihood by shooting besides p."""
         anchor, case = self.discretised.anchor, self._case
         assert anchor is not None
         data = np.stack([case.experiment.outputs[channel] for channel in case.model.outputs], axis=-1)
@@ -272,7 +270,7 @@ def _both(model: Any) -> Callable[..., Any]:
 
 
 def tune_diffrax(one: Discretised, parameters: np.ndarray, exact: np.ndarray, allowed: float) -> Integrated | None:
-    """Return diffrax with the loosest tolerance that is right enough at the draws; None if there is none."""
+    """Return diffrax with the loosest tolerance that is accurate enough at the draws; None if there is none."""
     for relative in RELATIVE:
         found = Integrated(one, relative)
         if np.max([abs(found(p) - e) for p, e in zip(parameters, exact, strict=True)]) <= allowed:
@@ -289,7 +287,7 @@ BALANCE = "harmonic balance from the estimate's orbit"
 
 
 def add_peers(contest: Contest, compiled: Compiled) -> None:
-    """Enter diffrax, and a package for harmonic balance on the one problem that it can state."""
+    """Add diffrax, and harmonic balance on the problem that its package can state."""
     if diffrax_missing():
         for name in DIFFRAX_ROWS:
             contest.refuse(name, diffrax_missing())
@@ -308,7 +306,7 @@ def _add_diffrax(contest: Contest, compiled: Compiled) -> None:
     tuned = reference.tuned(lambda k, *rest: tune_diffrax(every[k], *rest), 1)
     if tuned is None:
         for name in DIFFRAX_ROWS:
-            contest.refuse(name, "not right enough at any tolerance")
+            contest.refuse(name, "not accurate enough at any tolerance")
         return
     ready, error = tuned
     tolerances = [one.relative for one in ready]
@@ -344,7 +342,7 @@ def _add_balance(contest: Contest, compiled: Compiled) -> None:
     every = _discretised(compiled)
     tuned = contest.reference.tuned(lambda k, *rest: tune_balanced(every[k], *rest))
     if tuned is None:
-        contest.refuse(BALANCE, "not right enough with any number of harmonics, or not converged")
+        contest.refuse(BALANCE, "not accurate enough with any number of harmonics, or not converged")
         return
     ready, error = tuned
     note = f"harmonicbalance, {min(o.harmonics for o in ready)} … {max(o.harmonics for o in ready)} harmonics"

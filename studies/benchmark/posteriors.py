@@ -1,8 +1,8 @@
-"""Effective samples a second from the posterior of the Duffing oscillator: this package, and what a user would write.
+"""Effective samples per second from the posterior of the Duffing oscillator, by this package and by other samplers.
 
-The unknown variance is integrated out (Jeffreys' prior), or sampled with the rest; the posterior of the parameters is
-the same. emcee in natural coordinates walks around the fastest contender once. Around the others it would make the same
-chain, because their densities agree, so that its effective samples a log-posterior are divided by the time of theirs.
+The unknown variance is integrated out (Jeffreys' prior) or sampled; the posterior of the parameters is the same. emcee
+in natural coordinates runs once, with the fastest log-posterior. With the others its chain would be the same, because
+the densities agree, so that its effective samples per log-posterior are divided by their time.
 """
 
 import importlib.util
@@ -41,10 +41,10 @@ Density = Callable[[np.ndarray], float]
 
 
 def measure(setting: Setting, contest: Mapping[str, Any], methods: Sequence[Method], seed: int) -> dict[str, Any]:
-    """Return samplers, and emcee around every contender that was timed.
+    """Return the samplers, and emcee with every timed method.
 
     `setting`: With one channel, all harmonics, and positive parameters that are the model's own. `contest`: What
-    `benchmark_contenders.measured` returned. `methods`: The fastest contender's, one an experiment.
+    `contenders.measured` returned. `methods`: The fastest contender's, one an experiment.
     """
     walked = _emcee(setting, methods, seed)
     found = {name: _own(setting, seed, options) for name, options in OWN.items()}
@@ -62,7 +62,7 @@ def measure(setting: Setting, contest: Mapping[str, Any], methods: Sequence[Meth
 
 
 def _split(found: Mapping[str, Any], walked: Mapping[str, Any], around: Mapping[str, Any]) -> dict[str, Any]:
-    """Return by how much the best of this package's samplers is ahead of emcee around each contender, and why."""
+    """Return the ratio of this package's best sampler to emcee with each method, split into sampler and solver."""
     best = max(
         (name for name in OWN if "ess_per_second" in found.get(name, {})), key=lambda n: found[n]["ess_per_second"]
     )
@@ -110,8 +110,8 @@ def collapsed(setting: Setting, ways: Sequence[Density]) -> Density:
 
 
 def _emcee(setting: Setting, methods: Sequence[Method], seed: int) -> dict[str, float]:
-    """Walk in natural coordinates, as the manual of emcee begins; a quarter of the steps is burn-in."""
-    exact = [replace(method, tolerance=LOOSE) for method in methods]  # Walkers stray further than the draws.
+    """Run emcee in natural coordinates as in its tutorial; a quarter of the steps is burn-in."""
+    exact = [replace(method, tolerance=LOOSE) for method in methods]  # Walkers move further out than the draws.
     density, generator = collapsed(setting, exact), np.random.default_rng(seed)
     sd = np.array(list(setting.fit.sd.values()))
     start = setting.estimate + 0.1 * sd * generator.standard_normal((WALKERS, sd.size))
@@ -198,7 +198,7 @@ def _axes(setting: Setting) -> np.ndarray:
 def _potential(
     setting: Setting, tuned: Sequence[peers.Integrated], middle: np.ndarray, factor: np.ndarray
 ) -> Callable[[Any], Any]:
-    """Return minus the log-density over z, as JAX traces it, ln θ = middle + factor · z; priors are log-normal."""
+    """Return minus the log-density over z, traced by JAX, ln θ = middle + factor · z; priors are log-normal."""
     import jax.numpy as jnp
 
     priors = [setting.problem.priors[name] for name in setting.problem.names]

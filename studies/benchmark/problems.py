@@ -1,7 +1,7 @@
-"""The problems of the benchmark: posterior densities, and the draws at which every contender has to be right.
+"""Posterior densities of the benchmark, and the draws at which every method must be accurate.
 
 The draws are those of the Laplace approximation at the MAP estimate, and as many at three times its standard
-deviations. Variances stay at their estimates, so that log-posteriors differ by the periodic states alone.
+deviations. Variances are fixed at their estimates, so that log-posteriors differ by the periodic states alone.
 """
 
 from collections.abc import Callable, Mapping
@@ -38,7 +38,7 @@ DAMPER_SAMPLES = 1600
 
 @dataclass(frozen=True)
 class Case:
-    """One experiment of a problem as an integrator sees it."""
+    """One experiment of a problem in the form of the integrators."""
 
     experiment: bp.Experiment
     model: Any
@@ -132,7 +132,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Setting:
-    """A posterior density and the points at which contenders have to be right.
+    """A posterior density and the points at which methods must be accurate.
 
     `theta` (draws, names): The first half at the posterior's standard deviations, the second at three times these.
     `start`: Static equilibrium of an experiment: from it and its parameters to y.

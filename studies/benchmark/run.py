@@ -1,11 +1,9 @@
-"""What a log-posterior and a posterior cost, against what a user would pick instead, and against the arithmetic.
+"""Time of a log-posterior and of a posterior, compared with time integration, other packages and linear algebra.
 
-Every contender has to be right before its time counts: |Δ log-posterior| ≤ 0.01 at draws of the posterior and at three
-times their spread, against fully converged, fine shooting; each at its own cheapest step count or tolerance. Ratios
-are of times taken side by side in one run, with linear algebra in one thread. Peers that are not installed are rows
-that say so.
-
-An unstable period-3 orbit of the pendulum: time integration, begun on it to ten digits, leaves it.
+A method is timed only if it is accurate: |Δ log-posterior| ≤ 0.01 at draws of the posterior and at three times their
+spread, against fully converged shooting with small steps; each with its cheapest step count or tolerance. Ratios are
+of interleaved times in one run, with linear algebra in one thread. Folded recordings with cut harmonics, the usual
+case, have rows of their own. An unstable period-3 orbit of the pendulum shows that time integration leaves it.
 """
 
 import argparse
@@ -33,13 +31,13 @@ from studies.pendulum.orbits import shoot
 from studies.pendulum.recording import FREQUENCY, OMEGA, QUICK_PERIODS, TRUTH, section_of, simulate
 from studies.shooting import TURN
 
-# What the guard compares with.
+# Results that the guard compares with.
 KEPT = Path("figures/benchmark/results.json")
-# What each problem led to is kept here until the study ends.
+# Folder for the results of each problem until the study ends.
 PARTS = "parts"
 PERIOD, SAMPLES = 3, 800
 ORBITS, TOLERANCE = 12, 1e-12
-# Of the distance at which the orbit is called left: rad, with rates in units of 5 rad/s a rad.
+# Distance at which the orbit counts as left [rad], with 5 rad/s counted as 1 rad.
 LEFT = 0.1
 
 
@@ -73,7 +71,7 @@ def run(options: argparse.Namespace) -> None:
     if not options.quick:
         _rest(found, options, watch)
     found["checks"] = targets.rows(found)
-    print("\nWhat must show\n" + table_of_rows(found["checks"]) + "\n")
+    print("\nTargets\n" + table_of_rows(found["checks"]) + "\n")
     with watch.part("figure", "drawing"):
         paths = common.save_figures(options.out, {"benchmark": figures.draw(found)})
     path = common.write_results(options.out, found | {"seconds": watch.total(), "versions": common.versions()})
@@ -84,7 +82,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _of_problem(name: str, make: Callable[[], Any], options: argparse.Namespace) -> dict[str, Any]:
-    """Return the contest of one problem, and what is measured on this one alone."""
+    """Return the results of one problem, and the measurements made on this problem only."""
     setting = make()
     result: dict[str, Any] = {}
     if name.startswith("landing gear"):
@@ -98,7 +96,7 @@ def _of_problem(name: str, make: Callable[[], Any], options: argparse.Namespace)
 
 
 def _source(options: argparse.Namespace, name: str) -> str:
-    """Return what tells kept parts of another version, or with other settings, apart."""
+    """Return a key that identifies version and settings of kept parts."""
     files = sorted(Path(__file__).parent.glob("*.py"))
     own = [common.sha256(path) for path in files]
     settings = map(str, (options.seed, options.quick, options.guard))
@@ -116,9 +114,9 @@ def _rest(found: dict[str, Any], options: argparse.Namespace, watch: common.Stop
 
 
 def read_kept(path: Path) -> dict[str, Any]:
-    """Return the results that the guard compares with."""
+    """Return the kept results for the guard."""
     if not path.is_file():
-        raise FileNotFoundError(f"--guard: {path} is not there; run the whole study first.")
+        raise FileNotFoundError(f"--guard: {path} does not exist; run the whole study first.")
     return json.loads(path.read_text(encoding="utf-8"))
 
 
@@ -127,13 +125,13 @@ def guard(found: dict[str, Any], before: dict[str, Any]) -> None:
     lines = targets.worse(found, before)
     print(f"guard: {targets.compared(found, before)} ratios compared, tolerance {targets.TOLERANCE:g}")
     if lines:
-        raise RuntimeError("ratios are worse than those kept:\n" + "\n".join(lines))
+        raise RuntimeError("ratios are worse than the kept ones:\n" + "\n".join(lines))
 
 
 def problems(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
-    """Return what makes the problems, by name; a quick run takes the first three.
+    """Return the functions that make the problems, by name; a quick run takes the first three.
 
-    The guard needs the draws of the whole run: what a contender takes depends on them, from the predicted orbit most.
+    The guard uses the draws of the full run, because the time of a method depends on them.
     """
     count, seed = (2, options.seed) if options.quick and not options.guard else (5, options.seed)
     every: dict[str, Callable[[], Any]] = {
@@ -150,7 +148,7 @@ def problems(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
 
 
 def folded(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
-    """Return what makes the problems with folded recordings and cut harmonics, by name."""
+    """Return the functions that make the problems with folded recordings and cut harmonics, by name."""
     return {
         made.FORCE + made.FOLDED: lambda: made.gear("force", 5, options.seed, cut=True),
         made.DUFFING + made.FOLDED: lambda: made.duffing(5, options.seed, cut=True),
@@ -158,9 +156,9 @@ def folded(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
 
 
 def contest(setting: Any, quick: bool) -> tuple[dict[str, Any], Any]:
-    """Return what all contenders take of one problem, and the methods of shooting from the predicted orbit.
+    """Return the times of all methods on one problem, and the methods of shooting from the predicted orbit.
 
-    A quick run leaves out other packages and those of SciPy's methods that integrate.
+    A quick run omits other packages and SciPy's integrators.
     """
     contest = contenders.Contest(refer(setting))
     scheme = contenders.add_own(contest)
@@ -172,7 +170,7 @@ def contest(setting: Any, quick: bool) -> tuple[dict[str, Any], Any]:
 
 
 def measure(seed: int) -> dict[str, Any]:
-    """Return the orbit's multiplier and how far the integration is from it after each of its periods (SYNTHETIC)."""
+    """Return the orbit's multiplier and the distance of the integration from it after each period (SYNTHETIC)."""
     found = bp.find_orbits(section_of(simulate(QUICK_PERIODS, seed)), periods=[PERIOD])
     polished = bp.polish_orbits(bp.models.pendulum, found, TRUTH, samples=SAMPLES)
     orbit = next(one for one in polished if one.period == PERIOD and not one.equilibrium)
@@ -192,7 +190,7 @@ def measure(seed: int) -> dict[str, Any]:
 
 
 def distances(start: np.ndarray) -> list[float]:
-    """Return how far the integration is from its start after each of the orbit's periods, angles modulo a turn."""
+    """Return the distance of the integration from its start after each of the orbit's periods, angles modulo a turn."""
     model = bp.models.pendulum
     rates, p = FirstOrder(model, ()), np.array([*(TRUTH[name] for name in model.parameters), FREQUENCY])
     function = rates.function(NUMPY, rates.rates)
@@ -212,11 +210,11 @@ def distances(start: np.ndarray) -> list[float]:
 
 
 def account(found: dict[str, Any]) -> str:
-    """Return what is printed."""
+    """Return the text to print."""
     steps = ", ".join(f"{d:.0e}" for d in found["distances"])
     largest = max(map(abs, found["multipliers"]))
     return (
         f"  period-3 orbit (SYNTHETIC), multiplier {largest:.4g}: this package {found['status']}; DOP853 at 1e-12, "
-        f"begun on the orbit, is off by {steps} rad after each of its periods; it has left it after "
-        f"{found['left_after_periods']}"
+        f"started on the orbit, deviates by {steps} rad after each period; it leaves the orbit after "
+        f"{found['left_after_periods']} periods"
     )

@@ -1,4 +1,4 @@
-"""How time and memory grow with samples, experiments, walkers and parameters; what starting takes."""
+"""Growth of time and memory with samples, experiments, walkers and parameters; time of the first calls."""
 
 import os
 import subprocess
@@ -101,10 +101,10 @@ def _gradient(free: int, seed: int) -> Callable[[], Any]:
 
 
 def start() -> dict[str, float]:
-    """Return what starting takes [s], and the peak of a process [MB].
+    """Return start-up times [s] and the peak memory of a process [MB].
 
-    A first solve with nothing in the cache, one of a new model when the package's own kernels are there, and the same
-    from the cache.
+    First solve with an empty cache, first solve of a new model with the generic kernels cached, and the same solve from
+    the cache.
     """
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"BAYESPERIODIC_CACHE": cache}
@@ -117,7 +117,7 @@ def start() -> dict[str, float]:
 
 
 def peak() -> float:
-    """Return the most memory that this process has had [MB], NaN where the system does not tell.
+    """Return the peak memory of this process [MB], NaN if the system does not report it.
 
     A process started from a large one inherits its ``ru_maxrss``.
     """
@@ -133,7 +133,7 @@ def _run(text: str, environment: dict[str, str]) -> float:
 
 
 def account(found: dict[str, Any]) -> str:
-    """Return what is printed."""
+    """Return the text to print."""
     lines = [
         f"  {axis}: time ∝ {axis}^{one['time_exponent']:.2f}, memory ∝ {axis}^{one['memory_exponent']:.2f}"
         for axis, one in found["growth"].items()

@@ -1,4 +1,4 @@
-"""SciPy's methods on one experiment: solve_ivp on compiled right-hand sides, solve_bvp on those of NumPy."""
+"""SciPy on one experiment: solve_ivp with compiled right-hand sides, solve_bvp with those of NumPy."""
 
 import time
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class Initial:
         return self._case.table(TABLE)
 
     def cycles(self, p: np.ndarray, start: np.ndarray, count: int) -> np.ndarray:
-        """Return the states (samples, size) of the last of so many cycles; NaN where SciPy gives up."""
+        """Return the states (samples, size) of the last of so many cycles; NaN if SciPy fails."""
         case, samples = self._case, self._case.experiment.samples
         options = {"jac": case.compiled.jacobian_in_time} if self.method == RADAU else {}
         solved = solve_ivp(  # type: ignore[call-overload]
@@ -77,7 +77,7 @@ def _log_likelihood(case: Case, p: np.ndarray, states: np.ndarray) -> float:
 def tune_initial(
     one: Discretised, method: str, parameters: np.ndarray, exact: np.ndarray, allowed: float
 ) -> Initial | None:
-    """Return solve_ivp with the loosest tolerance that is right enough at the draws; None if there is none."""
+    """Return solve_ivp with the loosest tolerance that is accurate enough at the draws; None if there is none."""
     for relative in RELATIVE:
         found = Initial(one, method, relative)
         if np.max([abs(found(p) - e) for p, e in zip(parameters, exact, strict=True)]) <= allowed:
@@ -147,7 +147,7 @@ class Solved:
 def tune_boundary(
     one: Discretised, start: str, parameters: np.ndarray, exact: np.ndarray, allowed: float
 ) -> Solved | None:
-    """Return solve_bvp with the loosest tolerance that is right enough at the draws; None if there is none."""
+    """Return solve_bvp with the loosest tolerance that is accurate enough at the draws; None if there is none."""
     for relative in RELATIVE:
         boundary = Boundary(one.case, relative)
         mesh = boundary.constant()

@@ -1,8 +1,6 @@
-"""What the benchmark should show, each beside what was measured.
+"""Targets of the benchmark, its results as text, and the regression guard.
 
-Regression guard: the ratios of a quick run against those kept. Seconds are never compared.
-
-The benchmark's results as text.
+The guard compares the ratios of a quick run with those kept, never absolute times.
 """
 
 from collections.abc import Mapping
@@ -19,13 +17,13 @@ from studies.common import Row, row
 
 
 def problem(name: str, found: Mapping[str, Any]) -> str:
-    """Return the contenders of one problem."""
+    """Return the methods of one problem."""
     kind = "SYNTHETIC data" if found["synthetic"] else "measured data"
     experiments = "1 experiment" if found["experiments"] == 1 else f"{found['experiments']} experiments"
     lines = [
         f"{name} ({kind}, {experiments}, {found['samples']} samples; |Δ log-posterior| ≤ {found['allowed']:g} at "
         f"{found['draws']} draws, reference uncertain by {found['reference_uncertainty']:.0e})",
-        f"  {'contender':52s}{'ms':>10s}{'/ warm (least … largest)':>34s}{'error':>9s}  settings",
+        f"  {'method':52s}{'ms':>10s}{'/ warm (least … largest)':>34s}{'error':>9s}  settings",
     ]
     return "\n".join([*lines, *(_row(entry) for entry in found["rows"])])
 
@@ -42,12 +40,12 @@ def between(values: Mapping[str, float] | None) -> str:
 
 
 def posterior(found: Mapping[str, Any]) -> str:
-    """Return samplers, and emcee around the contenders."""
-    lines = ["Effective samples a second, Duffing (SYNTHETIC data), the smallest of any parameter"]
+    """Return the samplers, and emcee with the methods."""
+    lines = ["Effective samples per second, Duffing (SYNTHETIC data), the smallest of any parameter"]
     for name, entry in found["samplers"].items():
         value = f"{entry['ess_per_second']:.3g}" if "ess_per_second" in entry else "-"
         lines.append(f"  {name:60s}{value:>10s}  {entry.get('note', '')}")
-    lines.append(f"  {found['split']['best']} over emcee around:  ratio = sampler × solver")
+    lines.append(f"  {found['split']['best']} over emcee with:  ratio = sampler × solver")
     for name, entry in found["split"]["against"].items():
         lines.append(f"    {name:58s}{entry['ratio']:>10.3g} = {entry['sampler']:.3g} × {entry['solver']:.3g}")
     return "\n".join(lines)
@@ -55,7 +53,7 @@ def posterior(found: Mapping[str, Any]) -> str:
 
 def floor(name: str, found: Mapping[str, Any]) -> str:
     """Return floor and stages of one problem."""
-    lines = [f"{name}: the floor, and what a warm log-posterior takes on one core [µs]"]
+    lines = [f"{name}: floor and time of a warm log-posterior on one core [µs]"]
     for scheme, entry in found["schemes"].items():
         parts = ", ".join(f"{part} {value['median']:.0f}" for part, value in entry["floor_us"].items() if part != "sum")
         lines.append(f"  {scheme}: floor {entry['floor_us']['sum']['median']:.0f} ({parts})")
@@ -70,17 +68,17 @@ def floor(name: str, found: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-# By which factor a median may be worse; on a shared machine those of a quick run stray by a third, some by more, and
-# then the ranges over the repeats overlap.
+# Allowed factor between medians. On a shared machine medians of a quick run vary by a third; if some vary more, the
+# ranges over the repeats overlap.
 TOLERANCE = 1.6
 OWN = "this package"
 
 
 def worse(now: Mapping[str, Any], kept: Mapping[str, Any], tolerance: float = TOLERANCE) -> list[str]:
-    """Return a line for every ratio whose median is worse now by more than the tolerance, and its best than any kept.
+    """Return a line for every ratio whose median is worse by more than the tolerance and whose range does not overlap.
 
-    Contenders are compared by their time over this package's, which must not fall, and this package by its time over
-    the floor, which must not rise.
+    Methods are compared by their time relative to this package, which must not decrease, and this package by its time
+    relative to the floor, which must not increase.
     """
     lines = []
     for name, (new, old) in _pairs(now, kept).items():
@@ -125,7 +123,7 @@ LEAST = (
     (BALANCE, 10.0, None),
 )
 GRADIENT_LEAST, GRADIENT_ERROR = 2.0, 1e-6
-# Largest shares of the floor.
+# Largest ratios to the floor.
 NEAR, WITH_GRADIENT = 0.35, 1.0
 FOLDED_LIMITS = {
     FORCE + FOLDED: {"near": 0.35, "call": 0.35, "batched": 0.18, "gradient": 1.0},
@@ -212,12 +210,12 @@ def _of_posterior(found: Mapping[str, Any]) -> list[Row]:
     for what, ratios, least in (("the fastest", others, FASTEST), ("SciPy's integrators", scipy, AROUND_SCIPY)):
         if ratios:
             name = min(ratios, key=lambda n: ratios[n])
-            text = f"effective samples a second: {best} / emcee around {what} ({name})"
+            text = f"effective samples per second: {best} / emcee around {what} ({name})"
             result.append(row(text, ratios[name], least, None))
     numpyro, own = found["samplers"][NUMPYRO], found["samplers"][best]
     there = "ess_per_second" in numpyro
     value = own["ess_per_second"] / numpyro["ess_per_second"] if there else None
-    text = f"effective samples a second: {best} / {NUMPYRO}"
+    text = f"effective samples per second: {best} / {NUMPYRO}"
     return [*result, row(text, value, FASTEST, None, numpyro.get("note", ""))]
 
 

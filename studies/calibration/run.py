@@ -1,24 +1,19 @@
-"""Is a 90 % interval a 90 % interval: simulated campaigns of three problems, and of one whose likelihood is wrong.
+"""Coverage of intervals: simulated campaigns of three problems, and of one with a wrong likelihood.
 
-All data are synthetic. Every replicate draws its truth from the priors, records it by time integration, and goes
-through fold, MAP point, Laplace approximation and emcee (`bp.calibrate`). The likelihood of the second case is
-deliberately wrong: it counts a quarter more independent values than there are, as if every variance were a fifth
-smaller. Replicates are saved as they end, results after each case, and the same command does what is missing.
-``--processes N`` has the replicates done by N processes, ``--dask ADDRESS`` by a Dask cluster, ``--mpi`` by the
-processes of ``mpiexec -n 3 python -m mpi4py.futures -m studies calibration --mpi``. ``--scaling`` measures what a
-second worker gains, and nothing else.
+All data are synthetic. Every replicate draws its truth from the priors, records it by time integration, and runs fold,
+MAP estimate, Laplace approximation and emcee (`bp.calibrate`). The likelihood of the second case is deliberately wrong:
+it counts a quarter more independent values than there are, as if every variance were a fifth smaller. The problems
+have the scale of the measured magneto-rheological damper, of a hardening Duffing oscillator below its resonance, and of
+eq. (9) of the landing gear with the displacement given; the noise is white, and the prior of its variance is drawn from
+too.
 
-The problems whose intervals the calibration study counts; of their recordings only the settings are used.
+Replicates are saved as they end, results after each case; the same command computes missing replicates. Replicates run
+in N processes with ``--processes N``, on a Dask cluster with ``--dask ADDRESS``, or in the processes of
+``mpiexec -n 3 python -m mpi4py.futures -m studies calibration --mpi``.
 
-Every truth is drawn from the priors, so these are problems and not results: parameters of the size of the measured
-magneto-rheological damper, a hardening Duffing oscillator below its resonance, and eq. (9) of the landing gear with the
-displacement given. Noise is white, with the variance of the folded mean drawn from its prior too.
-
-What a second worker gains, what a task costs, and what that means for a thousand workers.
-
-Campaigns of the Duffing oscillator are farmed out to Dask clusters of one and of two processes on this machine. Between
-them the same number of plain loops, that share nothing, run in processes of their own: what two of these gain is what
-the machine has to give at that moment, and the farm is measured against it.
+``--scaling`` only measures the gain of a second worker and the cost of a task. Campaigns of the Duffing oscillator run
+on Dask clusters of one and of two processes; between them, independent plain loops in two processes measure what the
+machine can gain at that moment.
 """
 
 import argparse
@@ -131,7 +126,7 @@ BINS = 20
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
     if options.replicates < 0:
-        raise ValueError(f"--replicates: {options.replicates} is not allowed; it must be at least 0.")
+        raise ValueError(f"--replicates: must be at least 0, got {options.replicates}.")
     if options.scaling:
         print(f"scaling: {common.write_results(options.out / 'scaling', scaling(options.seed))}")
         return
@@ -157,7 +152,7 @@ def run(options: argparse.Namespace) -> None:
 
 @contextmanager
 def executor_of(options: argparse.Namespace) -> Iterator[Any]:
-    """Provide who does the replicates."""
+    """Provide the executor of the replicates."""
     if options.dask:
         from distributed import Client
 
@@ -195,7 +190,7 @@ SCALING_STEPS = 250
 
 
 def scaling(seed: int) -> dict[str, Any]:
-    """Return the gains of two workers, seconds a replicate, the cost of a task, and sizes of what travels."""
+    """Return the gain of two workers, seconds per replicate, the cost of a task, and message sizes."""
     from distributed import Client, LocalCluster
 
     problem = duffing()
@@ -237,7 +232,7 @@ def plain_loop(count: int) -> int:
 
 
 def _overhead(client: Any) -> float:
-    """Return seconds a task that does nothing, of many at once on two workers."""
+    """Return the seconds of an empty task, among many on two workers."""
 
     def empty() -> None:
         with TaskPool(client, None) as pool:

@@ -27,7 +27,7 @@ PRIORS: dict[str, Any] = {
     "rho": bp.LogNormal(2e4, 1.5),
 }
 RULE = (
-    "the displacement keeps all harmonics up to the last one that stands out of the cycle-to-cycle scatter "
+    "the displacement keeps all harmonics up to the last one that exceeds the cycle-to-cycle scatter "
     "(F-test, false-alarm rate 1 % over all harmonics)"
 )
 SYNTHETIC_SHAPE = {1: 12.6e-3, 2: 0.05e-3, 3: 0.4e-3j, 9: 0.012e-3}
@@ -83,7 +83,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def read_recording(given: Path | None, seed: int) -> tuple[bp.Recording, dict[str, Any]]:
-    """Return the measured recording, or a generated one of the same kind, and what to report about it."""
+    """Return the measured recording, or a generated one of the same kind, and its description."""
     found = common.find_data(given, FILE)
     if found is None:
         return generate(seed), {"path": "generated", "sha256": None, "synthetic": True}
@@ -193,7 +193,7 @@ def tables(
     comparison: bp.Comparison,
     choices: list[dict[str, Any]],
 ) -> str:
-    """Return the tables that the study prints, with what must be said about them."""
+    """Return the tables to print, with their interpretation."""
     kind = "SYNTHETIC data" if data["synthetic"] else "measured data"
     table = comparison.table
     rows = pd.DataFrame(
@@ -223,10 +223,9 @@ def tables(
     if white.p < 0.01:
         lines.append(
             f"The residual is not white (p = {white.p:.1g}, autocorrelation {white.lag1:.2f} from one independent "
-            "value to the next):\nit is model error, not noise, and neighbouring values repeat it. All standard "
-            "deviations above are therefore too small, but for the\nrobust ones, which take the residual's spectrum as "
-            f"it is. Of {split.total:.2f} N, {split.measurement:.2f} N are measurement noise and {split.model:.2f} N "
-            "model error."
+            "value to the next):\nit is dominated by model error. The Laplace standard deviations above are therefore "
+            "too small; the robust ones use the\nspectrum of the residual. Of its "
+            f"{split.total:.2f} N, {split.measurement:.2f} N are measurement noise and {split.model:.2f} N model error."
         )
     lines += ["", f"The same with other numbers of displacement harmonics; the rule: {RULE}."]
     lines.append(
@@ -246,7 +245,7 @@ def tables(
     widest = max(c["laplace_sd"]["rho"] for c in choices)
     lines.append(
         f"rho runs from {min(rho):.3g} to {max(rho):.3g} 1/m over these choices, {np.ptp(rho) / widest:.1f} of its "
-        "largest standard deviation: it depends on\nhow sharply the measured motion reverses, and no posterior width "
-        "shows that."
+        "largest standard deviation: it depends on\nhow sharply the measured motion reverses, which the posterior does "
+        "not include."
     )
     return "\n".join(lines)

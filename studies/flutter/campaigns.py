@@ -1,8 +1,9 @@
-"""Synthetic flutter rigs again and again: do the intervals of the nonlinear stiffnesses cover, are branches kept apart.
+"""Synthetic campaigns of the flutter rig: coverage of the nonlinear stiffnesses' intervals, separation of the branches.
 
-Each campaign has the eight kinds of cycles of the true model, with noise of its own as large as that of the measured
-records, folded and fitted as these are, but for the noise: with a true model the scatter of the cycles tells how much
-there is in each record (`bp.noise.Measured`). The sensors' scales are known, since they and the stiffnesses are one.
+Each campaign has the eight kinds of cycles of the true model, with its own noise of the measured records' size, folded
+and fitted in the same way except for the noise: with a true model the scatter of the cycles estimates the noise of each
+record (`bp.noise.Measured`). The sensors' scales are fixed, since they and the stiffnesses are not separately
+identifiable.
 """
 
 import argparse
@@ -30,7 +31,7 @@ Task = tuple[int]
 
 
 def run(options: argparse.Namespace) -> None:
-    """Do the campaigns that the file in the folder lacks, and report on all of them."""
+    """Compute the campaigns missing from the file in the folder, and report on all of them."""
     watch = common.Stopwatch()
     print("All data are SYNTHETIC: cycles of a stated truth, with noise.")
     folder = options.out / "campaigns"
@@ -45,14 +46,14 @@ def run(options: argparse.Namespace) -> None:
 
 
 def source() -> str:
-    """Return what tells campaigns of another version apart."""
+    """Return a key that identifies the version of the campaigns."""
     files = [Path(__file__), Path(str(rig.__file__))]
     text = common.versions()["bayesperiodic"] + "".join(common.sha256(path) for path in files)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def campaign(task: Task) -> dict[str, Any]:
-    """Return what one campaign says."""
+    """Return the results of one campaign."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         records = rig.generate(task[0])
@@ -94,7 +95,7 @@ def account(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def table(found: Mapping[str, Any]) -> str:
-    """Return the counts to print."""
+    """Return the counts as text."""
     covered = ", ".join(f"{name} {found['covered'].get(name)}" for name in STIFFNESSES)
     return (
         f"  {found['campaigns']} campaigns, {len(found['failures'])} failures; {found['level']:.0%} intervals cover "

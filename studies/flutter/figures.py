@@ -149,7 +149,7 @@ def contractions(fits: Mapping[str, Fitted], synthetic: bool) -> Figure:
     axes.invert_yaxis()
     axes.set_xlabel("Laplace sd over the prior's sd [1]")
     figure.legend(frameon=False, ncols=4, loc="outside lower center")
-    figure.suptitle(f"Flutter rig{', synthetic data' if synthetic else ''}: what the cycles tell of each parameter")
+    figure.suptitle(f"Flutter rig{', synthetic data' if synthetic else ''}: information on each parameter")
     return figure
 
 

@@ -1,4 +1,4 @@
-"""What the flutter study asks of the fits: what unstable cycles add, what is predicted, how large the misfit is."""
+"""Analysis of the flutter fits: gain from unstable cycles, predicted cycles, size of the misfit."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -39,7 +39,7 @@ def sizes(outputs: Mapping[str, np.ndarray]) -> dict[str, float]:
 
 
 def errors(fitted: Fitted, experiments: Mapping[str, bp.Experiment]) -> dict[str, Any]:
-    """Return by how much the fitted cycles miss the measured ones, and whether they are of the right stability."""
+    """Return the errors of the fitted cycles, and whether their stability is correct."""
     found = {}
     for name, e in experiments.items():
         orbit, measured = fitted.fit.solutions[name], sizes(e.outputs)
@@ -53,7 +53,7 @@ def errors(fitted: Fitted, experiments: Mapping[str, bp.Experiment]) -> dict[str
 
 
 def authors_errors(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float]) -> dict[str, Any]:
-    """Return the same for the authors' values and sensor units; None and why where they have no cycle."""
+    """Return the same for the authors' values and sensor units; None and the reason if there is no cycle."""
     along = cycles(RIG | AUTHORS | SENSORS)
     found: dict[str, Any] = {}
     for name, e in experiments.items():
@@ -77,7 +77,7 @@ def mean_size(found: Mapping[str, Any]) -> float | None:
 
 
 def kind_of(name: str) -> str:
-    """Return "stable" or "unstable", what a record's name tells of its cycle."""
+    """Return "stable" or "unstable", from a record's name."""
     return "unstable" if name.startswith("unstable") else "stable"
 
 
@@ -104,7 +104,7 @@ def contraction(fits: Mapping[str, Fitted]) -> dict[str, dict[str, dict[str, flo
 
 
 def springs(fit: bp.MapEstimate) -> dict[str, tuple[float, float]]:
-    """Return the nonlinear stiffnesses in units of the pitch sensor, which no scale can touch, with their sds."""
+    """Return the nonlinear stiffnesses in units of the pitch sensor, independent of the scales, with their sds."""
     gain = fit.theta["gain_pitch"]
     found = {}
     for power, (name, spring) in enumerate(zip(SPRINGS, ("k_alpha2", "k_alpha3"), strict=True), 1):
@@ -133,7 +133,7 @@ def leave_out(
     left: list[str],
     draws: int,
 ) -> tuple[Fitted, dict[str, Any]]:
-    """Return the fit without some cycles, whose way starts at the estimate θ from all, and how it predicts them."""
+    """Return the fit without some cycles, started at the estimate θ from all, and its predictions of them."""
     kept = {name: e for name, e in experiments.items() if name not in left}
     fitted = estimate(kept, speeds, start=START | theta)
     return fitted, predictions(fitted, experiments, speeds, left, draws)

@@ -1,4 +1,4 @@
-"""The flutter rig by other means: matrices in numbers, eigenvalues, time integration; nothing of the package."""
+"""Flutter rig by numerical matrices, eigenvalues and time integration, independent of the package."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -51,7 +51,7 @@ def flutter_matrices(p: Mapping[str, float]) -> tuple[np.ndarray, ...]:
 
 
 def first_order(speed: float, rig: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return A of ẏ = A y for small motion, y = (q, q̇), and what the spring's moment does to ẏ."""
+    """Return A of ẏ = A y for small motion, y = (q, q̇), and the contribution of the spring's moment to ẏ."""
     mass, damping, stiffness = flutter_matrices({**rig, "U": speed})
     inverse = np.linalg.inv(mass)
     below = np.hstack([-inverse @ stiffness, -inverse @ damping])

@@ -1,6 +1,6 @@
-"""What is known of the flutter rig, its cycles by continuation from the Hopf point, and the problem that is solved.
+"""Flutter rig: records or synthetic ones, known parameters, cycles by continuation from the Hopf point, problem.
 
-The records of the flutter rig, or a rig generated in their image; folded without an input.
+Records are folded without an input.
 """
 
 import math
@@ -59,9 +59,9 @@ class Cycles(NamedTuple):
     branches: tuple[bp.Branch, ...]
 
     def at(self, name: str, speed: float) -> bp.PeriodicSolution:
-        """Return the cycle at a speed [m/s] of the kind that a record's name tells: the unstable or the stable one.
+        """Return the cycle at a speed [m/s] of the kind in a record's name, unstable or stable.
 
-        Raises ValueError: Where there is none; the nearest fold or end of the branch, and the Hopf point, are told.
+        Raises ValueError: If there is none; the message names the nearest fold or endpoint, and the Hopf point.
         """
         orbits: list[bp.PeriodicSolution] = []
         missing = ""
@@ -75,7 +75,7 @@ class Cycles(NamedTuple):
         if not fitting:
             missing = missing or f"no orbit there is {'stable' if kind else 'unstable'}."
             raise ValueError(
-                f"speed: {speed:g} m/s is not allowed for {name!r}; {missing} The Hopf point is at "
+                f"speed: must have a cycle for {name!r}, got {speed:g} m/s; {missing} The Hopf point is at "
                 f"{self.hopf.value:.6g} m/s."
             )
         return fitting[-1] if kind else fitting[0]
@@ -88,11 +88,13 @@ def cycles(values: Mapping[str, float], samples: int = SAMPLES) -> Cycles:
     """
     points = bp.hopf_points(MODEL, values, "U", between=SEARCHED)
     if not points:
-        raise ValueError(f"values: {dict(values)} are not allowed; no Hopf point is between {SEARCHED} m/s.")
+        raise ValueError(f"values: must have a Hopf point within {SEARCHED} m/s, got {dict(values)}.")
     point = points[0]
     first = bp.emerging_cycle(MODEL, point, amplitude={"alpha": FIRST_AMPLITUDE}, samples=samples, scheme=SCHEME)
     if not first.converged:
-        raise ValueError(f"values: {dict(values)} are not allowed; the first cycle is {first.status}.")
+        raise ValueError(
+            f"values: must have a cycle near the Hopf point, got {dict(values)}; the first cycle is {first.status}."
+        )
     if first.parameters["U"] > point.value:
         return Cycles(point, (_along(first, HIGHEST_SPEED),))
     down = _along(first, LOWEST_SPEED)
@@ -133,8 +135,8 @@ def estimate(
 ) -> Fitted:
     """Return the MAP point; the frequency's error is what the last fit but one left, root mean square.
 
-    A model that misses the frequencies by more than their standard errors must not be held to these. The way starts at
-    the medians of the priors, on orbits of the right branch, and is followed to `start`.
+    A model whose frequency errors exceed the standard errors must not be weighted by these. Continuation starts at the
+    medians of the priors, on orbits of the correct branch, and ends at `start`.
     """
     known = dict(known or {})
     along = cycles(RIG | START | known)
@@ -177,7 +179,7 @@ KINDS = {
 
 
 class Record(NamedTuple):
-    """One record: what was recorded, at which wind speed [m/s], and how its cycle was held."""
+    """One record: recording, wind speed [m/s] and control of the cycle."""
 
     recording: bp.Recording
     speed: float
@@ -185,12 +187,12 @@ class Record(NamedTuple):
 
     @property
     def stable(self) -> bool:
-        """Whether the cycle is one that the rig stays on by itself, as the record's name tells."""
+        """Whether the cycle is stable without control, from the record's name."""
         return not self.recording.name.startswith("unstable")
 
 
 def read_records(given: Path | None, seed: int) -> tuple[list[Record], dict[str, Any]]:
-    """Return the measured records, or generated ones of the same kind, and what to report about them."""
+    """Return the measured records, or generated ones of the same kind, and their description."""
     found = common.find_data(given, FILE)
     if found is None:
         return generate(seed), {"path": "generated", "sha256": None, "synthetic": True}

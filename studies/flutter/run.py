@@ -1,13 +1,10 @@
 """A flutter rig identified from its measured limit cycles, stable and unstable.
 
-An aerofoil on springs in a wind, whose stable limit cycles and unstable ones (held by control-based continuation) were
-measured at wind speeds from 14.9 to 17.3 m/s (K. H. Lee, D. A. W. Barton, L. Renson, Mechanical Systems and Signal
-Processing 191, 2023, 110173). Asked: what the unstable cycles add, whether the model predicts cycles that it was not
-fitted to, and what cannot be known as long as the sensors' scales are free.
-
-The authors' values by continuation, against eigenvalues and a long time integration that know nothing of it.
-
-What the flutter study writes and prints.
+An aerofoil on springs in a wind, whose stable limit cycles and unstable ones (stabilised by control-based continuation)
+were measured at wind speeds from 14.9 to 17.3 m/s (K. H. Lee, D. A. W. Barton, L. Renson, Mechanical Systems and Signal
+Processing 191, 2023, 110173). The study examines what the unstable cycles add, whether the model predicts cycles that
+were not fitted, and which parameters are not identifiable while the sensors' scales are free. The cycles at the
+authors' values, by continuation, are compared with eigenvalues and with a long time integration.
 """
 
 import argparse
@@ -46,7 +43,7 @@ from studies.flutter.rig import (
 def introduction(
     data: dict[str, Any], records: list[Record], experiments: dict[str, bp.Experiment], refused: dict[str, str]
 ) -> str:
-    """Return what is said about the records before anything is fitted."""
+    """Return the description of the records to print."""
     lines = [f"  {'SYNTHETIC records' if data['synthetic'] else 'measured records'} {data['path']}; {RULE}"]
     for record in records:
         name = record.recording.name
@@ -63,7 +60,7 @@ def introduction(
 
 
 def of_records(records: list[Record], experiments: dict[str, bp.Experiment], refused: dict[str, str]) -> dict[str, Any]:
-    """Return what each record is, used or not, and why."""
+    """Return the description of each record, and why it is used or not."""
     found: dict[str, Any] = {}
     for record in records:
         name = record.recording.name
@@ -85,7 +82,7 @@ def of_records(records: list[Record], experiments: dict[str, bp.Experiment], ref
 
 
 def of_fits(fits: dict[str, Fitted], experiments: dict[str, bp.Experiment], authors: dict[str, Any]) -> dict[str, Any]:
-    """Return what comes from the fits."""
+    """Return the results of the fits."""
     both = fits["both"]
     fit, found = both.fit, questions.errors(both, experiments)
     return {
@@ -121,7 +118,7 @@ def of_posterior(
     verdict: bp.Identifiability | None,
     compared: bp.Comparison | None,
 ) -> dict[str, Any]:
-    """Return what the equations leave open, and what the draws say."""
+    """Return the structural identifiability, and the results of the draws."""
     return {
         "structure": {"text": str(structure), "free_scales": questions.FREE_SCALES},
         "verdicts": verdict and verdict.table["verdict"].to_dict(),
@@ -130,7 +127,7 @@ def of_posterior(
 
 
 def draws_of(posterior: bp.Posterior, fit: bp.MapEstimate, compared: bp.Comparison) -> dict[str, Any]:
-    """Return what the draws say, beside Laplace."""
+    """Return the results of the draws and of the Laplace approximation."""
     names = list(fit.theta)
     return {
         "converged": posterior.converged,
@@ -150,7 +147,7 @@ def _correlation(posterior: bp.Posterior, one: str, other: str) -> float:
 
 
 def tables(results: dict[str, Any]) -> str:
-    """Return the tables, with what must be said about them."""
+    """Return the tables to print, with their interpretation."""
     kind = "SYNTHETIC data" if results["data"]["synthetic"] else "measured data"
     lines = [f"Flutter rig, {kind}: errors of amplitudes (heave, pitch) and of the frequency", ""]
     for name, one in results["errors"].items():
@@ -175,8 +172,8 @@ def tables(results: dict[str, Any]) -> str:
     lines += ["", "cycles that were not fitted: error, in posterior sds, in sds with the model's error"]
     for case, found in results["predictions"].items():
         for name, one in found.items():
-            said = [_missed(c, one[c]) for c in ("heave", "pitch") if c in one]
-            lines.append(f"  {case:22s} {name:17s} " + (", ".join(said) or "no cycle"))
+            errors = [_missed(c, one[c]) for c in ("heave", "pitch") if c in one]
+            lines.append(f"  {case:22s} {name:17s} " + (", ".join(errors) or "no cycle"))
     return "\n".join(lines)
 
 
@@ -226,17 +223,17 @@ def half_range(values: np.ndarray) -> float:
 
 
 def line(found: Mapping[str, Any]) -> str:
-    """Return what is printed."""
+    """Return the text to print."""
     speed, frequency = found["hopf_speed"], found["hopf_frequency"]
     off = {
         points: max(abs(one[name]) for one in by_speed.values() for name in STATES)
         for points, by_speed in found["stable_cycles"].items()
     }
-    told = ", ".join(f"{most:.1e} with {points}" for points, most in off.items())
+    differences = ", ".join(f"{most:.1e} with {points}" for points, most in off.items())
     return (
         f"  the authors' values: Hopf point {speed['continuation']:.4f} m/s, {frequency['continuation']:.5f} Hz "
         f"(eigenvalues {speed['eigenvalues']:.4f}, {frequency['eigenvalues']:.5f}); amplitudes of stable cycles off a "
-        f"time integration's by at most {told}"
+        f"time integration's by at most {differences}"
     )
 
 
@@ -251,7 +248,7 @@ KINDS = ("stable", "unstable")
 
 
 class Answers(NamedTuple):
-    """What was asked of the cycles, and what came out."""
+    """Results of the fits to the cycles."""
 
     checks: dict[str, Any]
     authors: dict[str, Any]
@@ -303,7 +300,7 @@ def run(options: argparse.Namespace) -> None:
 def answers(
     watch: common.Stopwatch, experiments: dict[str, bp.Experiment], speeds: dict[str, float], quick: bool
 ) -> Answers:
-    """Return what the fits say: of the authors' values, to all cycles, to some of them, and of those left out."""
+    """Return the results of the fits: authors' values, all cycles, subsets, and predictions of the cycles left out."""
     with watch.part("authors", "following the cycles of the authors' values from the Hopf point"):
         checks = account()
         print(line(checks), flush=True)

@@ -1,7 +1,7 @@
-"""Whole campaigns of the landing gear again and again: do intervals of truth A cover, and is it ever called wrong.
+"""Repeated campaigns of the landing gear: coverage of intervals under truth A, and rate of false misfit verdicts.
 
-Every campaign has its own noise. Each of its experiments is sampled briefly (two ensembles of eight walkers, at most
-600 steps), which is enough for intervals and signs; the Laplace approximation is counted beside it.
+Every campaign has its own noise. Each experiment is sampled briefly (two ensembles of eight walkers, at most 600
+steps), which is enough for intervals and signs; intervals of the Laplace approximation are counted too.
 """
 
 import hashlib
@@ -31,13 +31,13 @@ Task = tuple[str, int]
 
 
 def campaigns(folder: Path, count: int, seed: int, truth: str = "A") -> list[dict[str, Any]]:
-    """Do the campaigns that the file in the folder lacks, and return all of them."""
+    """Compute the campaigns missing from the file in the folder, and return all of them."""
     tasks: list[Task] = [(truth, FIRST_SEED * seed + number) for number in range(count)]
     return resumed(folder / FILE, tasks, campaign, lambda line: (line["truth"], line["seed"]), source())
 
 
 def source() -> str:
-    """Return what tells campaigns of another version apart."""
+    """Return a key that identifies the version of the campaigns."""
     modules = (identification, rig, verdicts)
     files = [Path(__file__), *(Path(str(module.__file__)) for module in modules)]
     text = common.versions()["bayesperiodic"] + "".join(common.sha256(path) for path in files)
@@ -45,7 +45,7 @@ def source() -> str:
 
 
 def campaign(task: Task) -> dict[str, Any]:
-    """Return what one campaign says, by experiment."""
+    """Return the results of one campaign, by experiment."""
     truth, seed = task
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -108,7 +108,7 @@ def account(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def table(found: Mapping[str, Any]) -> str:
-    """Return the counts to print."""
+    """Return the counts as text."""
     low, high = found["band"]
     lines = [f"  {found['campaigns']} campaigns, {found['experiments']} posteriors; 90 % intervals that cover:"]
     for kind, counts in found["covered"].items():

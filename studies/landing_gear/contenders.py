@@ -1,8 +1,8 @@
-"""Time integration of one experiment of the landing gear until steady, no less accurate than it has to be.
+"""Time integration of one experiment of the landing gear until steady, at a given accuracy.
 
 The compiled methods of `studies.landing_gear.integrators`, and SciPy's LSODA and Radau on the same compiled right-hand
-side. Each gets, experiment by experiment, the largest steps and the loosest tolerances with which no output of any draw
-is further off than allowed, of its range, from the integration at its finest.
+side. For each experiment the largest steps and loosest tolerances are chosen with which the outputs of all draws agree
+with the finest integration to the allowed fraction of their range.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ Integrate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]
 
 @dataclass(frozen=True)
 class Gear:
-    """One experiment as the integrators see it."""
+    """One experiment in the form of the integrators."""
 
     drive: str
     experiment: bp.Experiment

@@ -1,8 +1,9 @@
-"""What a log-posterior of the landing gear costs: the periodic solver against time integration until steady.
+"""Time of a log-posterior of the landing gear: the periodic solver against time integration until steady.
 
-All fourteen experiments at draws of their joint posterior, side by side in one run. Timed are whole log-posteriors of
-the periodic solver, of the others the integration alone, each as accurate as the periodic solver or more. What that
-asks of them depends on its scheme, so that each direction has the study's own, and the smoother one the finer one too.
+All fourteen experiments at draws of their joint posterior, interleaved in one run. The periodic solver is timed with
+the whole log-posterior, the others with the integration alone, at the accuracy of the periodic solver or better. This
+accuracy depends on the scheme: each direction is measured with the study's scheme, the smoother one also with the
+finer scheme.
 """
 
 import os
@@ -59,7 +60,7 @@ def measure(drive: str, identified: Identified, seed: int, *, quick: bool) -> di
 def _by_scheme(
     drive: str, scheme: str, identified: Identified, theta: np.ndarray, gears: Sequence[Gear], quick: bool
 ) -> dict[str, Any]:
-    """Return what the others take to be as accurate as one scheme of the periodic solver."""
+    """Return the times of the other methods at the accuracy of one scheme of the periodic solver."""
     stated, fit = identified.problem, identified.fit
     if scheme != stated.scheme:
         stated = problem(stated.experiments, drive, scheme=scheme)
@@ -91,7 +92,7 @@ def draws(
     """Return draws (count, names) from which time integration becomes steady, and how many were left out.
 
     At theta16 ≤ 0 the gas has no steady state that an integration could reach. Of those with every theta16 positive
-    some need more cycles than anybody would wait for.
+    some need more cycles than `MAX_CYCLES`.
 
     `steady`: Of a draw (1, names).
     """
@@ -216,7 +217,7 @@ def _interleaved(actions: Mapping[str, tuple[Callable[[], Any], int]], repeats: 
 
 
 def _ratios(times: Mapping[str, np.ndarray], scipy: Mapping[str, float | None]) -> dict[str, Any]:
-    """Return by how much time integration is dearer; the compiled ones by the quicker of the two in each repeat."""
+    """Return the time ratios of integration to the periodic solver, by the faster compiled method in each repeat."""
     quickest = {start: np.min([times[f"{kind} {start}"] for kind in COMPILED], axis=0) for start in (STATIC, ESTIMATE)}
     found = {f"compiled {start} / {WARM}": values / times[WARM] for start, values in quickest.items()}
     found |= {f"compiled {STATIC} / {BATCHED}": quickest[STATIC] / times[BATCHED]}
@@ -230,20 +231,20 @@ def _spread(values: np.ndarray) -> dict[str, float]:
 
 
 def table(drive: str, found: Mapping[str, Any]) -> str:
-    """Return what is printed."""
+    """Return the text to print."""
     left_out = found["left_out"]
     lines = [
-        f"  {drive} given: {left_out['not_positive']} of {left_out['draws']} draws left out, having no steady state, "
+        f"  {drive} given: {left_out['not_positive']} of {left_out['draws']} draws excluded without a steady state, "
         f"{left_out['too_slow']} of {left_out['tried']} others, not steady after {MAX_CYCLES} cycles"
     ]
     for scheme, one in found["schemes"].items():
         worst = max(entry["error"] for entry in one["experiments"].values())
         lines.append(
-            f"    {scheme}, right to {worst:.0e} of the range: {one['milliseconds'][WARM]['median']:.2f} ms a "
+            f"    {scheme}, error at most {worst:.0e} of the range: {one['milliseconds'][WARM]['median']:.2f} ms a "
             "log-posterior of all experiments"
         )
         for name, ratio in one["ratios"].items():
             lines.append(f"      {name}: {ratio['median']:.1f} ({ratio['least']:.1f} … {ratio['largest']:.1f})")
         for method, milliseconds in one["scipy_milliseconds"].items():
-            lines += [] if milliseconds else [f"      {method}: not that accurate at any tolerance"]
+            lines += [] if milliseconds else [f"      {method}: not as accurate at any tolerance"]
     return "\n".join(lines)

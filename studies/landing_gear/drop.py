@@ -1,10 +1,10 @@
-"""The drop test of the landing gear study: a transient predicted by what periodic motions told.
+"""Drop test of the landing gear study: a transient predicted from the posterior of periodic motions.
 
 The rig of figure 2 of de Kraker, Verbeek & van de Wouw (1997), SYNTHETIC: a frame of 2.02 m pivots at one end and
-carries a mass at the other, where the gear stands between it and the floor, 1.16 m high and 0.58 m wide between its
-joints. The mass is suddenly freed. The paper gives these three lengths; mass, inertia and the compression at which the
-gear is held are chosen so that pressures and strokes are those of the shaker's experiments. Rod and line of truth B act
-on what the instruments show; the frame is too heavy to mind half a millimetre.
+carries a mass at the other, supported by the gear, 1.16 m high and 0.58 m wide between its joints. The mass is suddenly
+released. The paper gives these three lengths; mass, inertia and initial compression are chosen so that pressures and
+strokes are those of the shaker experiments. Rod and line of truth B act on the measured signals only; their effect on
+the heavy frame, half a millimetre, is neglected.
 """
 
 from collections.abc import Iterable, Mapping
@@ -32,8 +32,8 @@ class Dropped:
     """One truth's drop test."""
 
     identified: Identified  # All shaker experiments with theta4, theta6 and theta16 in common
-    true: bp.Recording  # What happens, without noise
-    band: Any  # What the posterior expects
+    true: bp.Recording  # Without noise
+    band: Any  # Posterior prediction
 
 
 @cache
@@ -108,13 +108,13 @@ def drop(values: Mapping[str, float], effects: Iterable[str] = (), duration: flo
 
 
 def identify(recordings: Iterable[bp.Recording], seed: int, *, quick: bool) -> Identified:
-    """Return what all shaker experiments say of the one gear that is dropped."""
+    """Return the joint fit of all shaker experiments to the gear that is dropped."""
     experiments = [fold(recording, DISPLACEMENT) for recording in recordings]
     return draw(estimate(experiments, DISPLACEMENT, one_conduction=True), seed, quick=quick, executor=ENSEMBLES)
 
 
 def predict(identified: Identified, effects: Iterable[str], draws: int) -> Dropped:
-    """Return the drop as it happens under the effects of a truth, and as the posterior expects it."""
+    """Return the true drop under the effects of a truth, and its posterior prediction."""
     assert identified.posterior is not None
     name = identified.problem.experiments[0].name
     found = bp.predict(identified.problem, identified.posterior, draws=draws, run=drop, experiment=name)
@@ -122,7 +122,7 @@ def predict(identified: Identified, effects: Iterable[str], draws: int) -> Dropp
 
 
 def account(dropped: Dropped) -> dict[str, Any]:
-    """Return what results.json holds: shares of time within the 90 % band, and the settling."""
+    """Return the entries of results.json: shares of time within the 90 % band, and the settling."""
     time, band = dropped.true.time, dropped.band
     spans = {"0 to 2.5 s": time <= SHORT, "2.5 to 30 s": time > SHORT}
     found: dict[str, Any] = {"draws": band.draws, "failed": band.failed, "probability": band.probability}

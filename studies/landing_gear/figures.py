@@ -1,7 +1,4 @@
-"""Figures of the landing gear study.
-
-Force against displacement over a cycle, and what the fit leaves of it.
-"""
+"""Figures of the landing gear study."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -31,7 +28,7 @@ TRUTH_NAMES = {"A": "truth A: eq. (9) holds", "B": "truth B: lost motion, line l
 
 
 def histories(recordings: Mapping[str, bp.Recording], identified: Mapping[str, Identified]) -> Figure:
-    """Draw recorded displacement, force and pressure of one experiment and what the fit says, a column a truth."""
+    """Draw recorded and fitted displacement, force and pressure of one experiment, one column per truth."""
     from matplotlib import pyplot as plt
 
     figure = plt.figure(figsize=(5.0 * len(recordings) + 1.0, 8.5), layout="constrained")
@@ -234,7 +231,7 @@ def repaired(found: Mapping[str, Any]) -> Figure:
     bottom.set_ylabel("rms error of the force [N]\nin experiments held out")
     bottom.set_xticks(place, [name.replace(" Hz ", " Hz\n±") for name in order], fontsize=8)
     bottom.legend(frameon=False, ncols=2)
-    figure.suptitle("Better models of the gear of truth B, SYNTHETIC data")
+    figure.suptitle("Extended models of truth B, SYNTHETIC data")
     return figure
 
 

@@ -1,15 +1,14 @@
-"""The landing gear with the force given, as in eq. (9): the noise of the measured force is carried along.
+"""The landing gear with the force given, as in eq. (9), with the noise of the measured force propagated.
 
 With the force as input its noise moves displacement and pressure together, by more than their own noise, and in a way
-that a heat conduction can imitate: a fit that takes the force for exact is sure of wrong signs. Here displacement and
-pressure have the covariance B S Bᵀ + J F Jᵀ, with S and F the variances of the amplitudes of outputs and force that the
-scatter of the cycles shows, B the harmonics kept, and J the derivatives of the steady motion by the force's amplitudes,
-at an estimate that is made twice; up to one common factor, which is 1 where the model holds. (Errors in variables, to
+that resembles heat conduction: a fit that treats the force as exact is confident of wrong signs. Here displacement and
+pressure have the covariance B S Bᵀ + J F Jᵀ, with S and F the variances of the amplitudes of outputs and force from the
+scatter of the cycles, B the harmonics kept, and J the derivatives of the steady motion by the force's amplitudes, at an
+estimate that is computed twice; up to one common factor, which is 1 if the model is adequate. (Errors in variables, to
 first order: W. A. Fuller, Measurement Error Models, Wiley, 1987.)
 
-All experiments of the landing gear at once: theta4 and theta6 in common, theta16 each experiment's own.
-
-How steep the friction of the landing gear may be: theta10 from 30 to 3000 s/m, solved from static equilibrium.
+Joint fits share theta4 and theta6; theta16 is local to each experiment. The steepness of the friction, theta10, is
+varied from 30 to 3000 s/m, solved from static equilibrium.
 """
 
 import warnings
@@ -57,12 +56,12 @@ def solve(run: Run, slope: float, drive: str) -> tuple[bp.PeriodicSolution, bool
 
 
 def _solve(run: Run, gear: Mapping[str, float], drive: str, signal: np.ndarray) -> tuple[bp.PeriodicSolution, bool]:
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         found = bp.solve_periodic(
             bp.models.landing_gear(drive), gear, {drive: signal}, frequency=run.frequency, samples=SAMPLES
         )
-    return found, any("steps of the grid" in str(warning.message) for warning in told)
+    return found, any("steps of the grid" in str(warning.message) for warning in caught)
 
 
 def slope_account(runs: Sequence[Run]) -> dict[str, Any]:
@@ -78,7 +77,7 @@ def slope_account(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def slope_line(found: Mapping[str, Any]) -> str:
-    """Return what is printed."""
+    """Return the text to print."""
     every = [one for by_slope in found.values() for one in by_slope.values()]
     total = sum(sum(one["status"].values()) for one in every)
     converged = sum(one["status"].get("converged", 0) for one in every)
@@ -94,13 +93,13 @@ def slope_line(found: Mapping[str, Any]) -> str:
 POINTS = 80
 # Of the force's amplitudes, in their standard deviations, for derivatives by differences.
 STEP = 3.0
-# The covariance is taken at a fit that takes the force for exact, then once more at the fit that it leads to.
+# The covariance is computed at a fit that treats the force as exact, then again at the resulting fit.
 ROUNDS = 2
 SCHEME = "central4"
 
 
 def judge(recording: bp.Recording, seed: int, quick: bool) -> tuple[Identified, Verdict]:
-    """Return what a fit says that takes the force for exact, and the verdict with its noise carried along."""
+    """Return the fit that treats the force as exact, and the verdict with the noise of the force propagated."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The noise of the measured inputs")
         exact = found = estimate([fold(recording, FORCE)], FORCE)
@@ -108,9 +107,9 @@ def judge(recording: bp.Recording, seed: int, quick: bool) -> tuple[Identified, 
             found = _fitted(with_noise_of_the_input(exact.problem.experiments[0], found.fit.theta))
     identified = draw(found, seed, quick=quick)
     stated, fit = identified.problem, identified.fit
-    said = bp.identifiability(stated, fit, identified.posterior, profile=False, candidates=[])
+    identifiability = bp.identifiability(stated, fit, identified.posterior, profile=False, candidates=[])
     p = misfit(stated, fit)
-    return exact, Verdict(identified, said, p < FALSE_ALARM, p)
+    return exact, Verdict(identified, identifiability, p < FALSE_ALARM, p)
 
 
 def _fitted(experiment: bp.Experiment) -> Identified:
@@ -145,7 +144,7 @@ def with_noise_of_the_input(experiment: bp.Experiment, theta: Mapping[str, float
 
     columns = []
     with warnings.catch_warnings():
-        # Of a grid that is coarse for the friction: the fit says so once.
+        # The warning on a grid too coarse for the friction is shown once, by the fit.
         warnings.filterwarnings("ignore", "A smooth sign of")
         centre = moved(experiment.inputs[FORCE], "static")
         for wave in amplitudes(experiment, FORCE).T:
@@ -183,7 +182,7 @@ def given_displacement(recordings: Iterable[bp.Recording], seed: int, *, quick: 
 
 
 def given_force(forced: Mapping[str, Verdict], seed: int, *, quick: bool) -> Identified | None:
-    """Return estimate and draws with the force given, its noise carried along as by the single fits.
+    """Return estimate and draws with the force given, its noise propagated as in the single fits.
 
     None for one experiment.
     """
@@ -204,7 +203,7 @@ def given_force(forced: Mapping[str, Verdict], seed: int, *, quick: bool) -> Ide
 
 
 def account(identified: Identified) -> dict[str, Any]:
-    """Return what results.json holds."""
+    """Return the entries of results.json."""
     posterior = identified.posterior
     assert posterior is not None
     table = posterior.summary()
@@ -227,7 +226,7 @@ def account(identified: Identified) -> dict[str, Any]:
 
 
 def line(drive: str, found: Mapping[str, Any]) -> str:
-    """Return what is printed."""
+    """Return the text to print."""
     sds = found["posterior"]
     common = ", ".join(f"{name} {sds[name]['mean']:.6g} ± {sds[name]['sd']:.1g}" for name in ("theta4", "theta6"))
     drawn = found["reason"]

@@ -1,7 +1,7 @@
-"""Identification of theta4, theta6 and theta16 of the landing gear, as the paper does, and of all experiments at once.
+"""Identification of theta4, theta6 and theta16 of the landing gear, per experiment as in the paper, and jointly.
 
-The other parameters are at their true values, theta11 follows theta4 (it stands for the ambient pressure). The
-harmonics kept are chosen beforehand, so that the number of independent values does not depend on the noise.
+The other parameters are fixed at their true values, and theta11 is tied to theta4 (it represents the ambient pressure).
+The harmonics kept are fixed, so that the number of independent values does not depend on the noise.
 """
 
 import time
@@ -18,8 +18,8 @@ KEPT = {
     DISPLACEMENT: {"displacement": 3, "force": 60, "pressure": 20},
     FORCE: {"displacement": 40, "force": 60, "pressure": 40},
 }
-# What drawings and a data sheet tell of area and volume; of the conduction its order of magnitude and not its sign. Its
-# median is off zero, where the mean temperature is undetermined and solves are at their worst.
+# Area and volume as known from drawings and a data sheet; of the conduction only the order of magnitude.
+# Its median is off zero, where the mean temperature is undetermined and solves are at their worst.
 PRIORS = {"theta4": bp.LogNormal(5.2e-3, 0.1), "theta6": bp.Normal(-2.3, 0.3), "theta16": bp.Normal(3.0, 20.0)}
 FIXED = {name: value for name, value in GEAR.items() if name not in (*PRIORS, "theta11")}
 TIED = {"theta11": "-1e5*theta4"}
@@ -30,12 +30,12 @@ MAX_STEPS, QUICK_STEPS = 20_000, 250
 
 @dataclass(frozen=True)
 class Identified:
-    """What one problem led to."""
+    """Estimate and draws of one problem."""
 
     problem: bp.Problem
     fit: bp.MapEstimate
-    posterior: bp.Posterior | None  # None where no draws were asked for
-    seconds: float  # That the draws took
+    posterior: bp.Posterior | None  # None without draws
+    seconds: float  # Time of sampling
 
 
 def fold(recording: bp.Recording, drive: str) -> bp.Experiment:

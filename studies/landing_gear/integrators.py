@@ -1,12 +1,12 @@
-"""The landing gear of eq. (9) integrated in time until it is steady, by compiled code written by hand for it alone.
+"""Compiled time integration of the landing gear of eq. (9) until steady.
 
-What a user without a periodic solver would write: two methods for each direction, the classical Runge-Kutta method with
-fixed steps, and the pair of orders 5 and 4 of Dormand and Prince with error control (Hairer, Nørsett & Wanner, Solving
-Ordinary Differential Equations I, 1993, table 5.2). They stop as soon as the gas is within `tolerance` of its steady
-temperature, which two successive changes over a cycle foretell: they fall by the same factor in every cycle.
+Two methods for each direction: the classical Runge-Kutta method with fixed steps, and the pair of orders 5 and 4 of
+Dormand and Prince with error control (Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, 1993, table
+5.2). Integration stops when the gas is within `tolerance` of its steady temperature, estimated from two successive
+changes over a cycle, which decrease geometrically.
 
-States are the gas temperature T [K], and with the force given also compression q [m] and velocity [m/s] before it.
-Parameters come as an array in the order of `NAMES`.
+States are the gas temperature T [K], preceded by compression q [m] and velocity [m/s] if the force is given. Parameters
+are in the order of `NAMES`.
 """
 
 import math
@@ -220,7 +220,7 @@ def _controlled_steps(rates, size):
 
 @compiled
 def displacement_rates_in_time(t, y, g, inputs, frequency):
-    """Return the rates at a time [s], as SciPy asks for them."""
+    """Return the rates at a time [s], as SciPy requires them."""
     u, rate = np.empty(3), np.empty(1)
     signals(inputs, t * frequency, u)
     displacement_rates(g, u, y, rate)
@@ -229,7 +229,7 @@ def displacement_rates_in_time(t, y, g, inputs, frequency):
 
 @compiled
 def force_rates_in_time(t, y, g, inputs, frequency):
-    """Return the rates at a time [s], as SciPy asks for them."""
+    """Return the rates at a time [s], as SciPy requires them."""
     u, rate = np.empty(3), np.empty(3)
     signals(inputs, t * frequency, u)
     force_rates(g, u, y, rate)

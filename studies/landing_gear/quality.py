@@ -1,10 +1,10 @@
-"""Quality control, as the paper proposes it: whether a new gear is the same as the reference, and if not, in what.
+"""Quality control as the paper proposes it: whether a new gear equals the reference, and which parameter differs.
 
-SYNTHETIC units under three experiments each. Good ones have the reference's parameters, faulty ones too little gas,
-worn friction, or less oil, whose place the gas takes. A parameter of a unit is called "different" where it is off the
-reference's by more than both their standard deviations allow, at a false-alarm rate of 1 % a unit over all parameters.
-The reference is measured several times, so that its own error does not decide over all units. The area theta4 is
-machined and known; the gas's heat capacity theta15 follows its amount, theta5/theta6.
+SYNTHETIC units under three experiments each. Good ones have the reference's parameters; faulty ones have too little
+gas, worn friction, or less oil, so that the gas fills a larger volume. A parameter is called "different" if it deviates
+from the reference by more than their combined standard deviations allow, at a false-alarm rate of 1 % per unit over all
+parameters. The reference is measured several times to reduce its own error. The area theta4 is machined and known; the
+gas's heat capacity theta15 is proportional to its amount, theta5/theta6.
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,7 +59,7 @@ REFERENCE_SEED, FIRST_UNIT = 5000, 10_000
 
 @dataclass(frozen=True)
 class Unit:
-    """What is found of one gear."""
+    """Estimate of one gear."""
 
     kind: str
     theta: dict[str, float]
@@ -95,19 +95,19 @@ def examine_all(references: int, each: int, seed: int) -> tuple[Unit, list[Unit]
 
 
 def _together(units: Sequence[Unit]) -> Unit:
-    """Return the mean of units that are one gear, measured again and again."""
+    """Return the mean of repeated measurements of one gear."""
     theta = {name: float(np.mean([unit.theta[name] for unit in units])) for name in PRIORS}
     sd = {name: float(np.sqrt(np.mean([unit.sd[name] ** 2 for unit in units]) / len(units))) for name in PRIORS}
     return Unit(GOOD, theta, sd, all(unit.converged for unit in units))
 
 
 def deviations(reference: Unit, unit: Unit) -> dict[str, float]:
-    """Return by how many of their common standard deviations a unit is off the reference, by parameter."""
+    """Return the deviation of a unit from the reference in combined standard deviations, by parameter."""
     return {n: (unit.theta[n] - reference.theta[n]) / float(np.hypot(unit.sd[n], reference.sd[n])) for n in PRIORS}
 
 
 def account(reference: Unit, units: Sequence[Unit]) -> dict[str, Any]:
-    """Return what results.json holds: how often each parameter is called different, by kind of unit."""
+    """Return the entries of results.json: how often each parameter is called different, by kind of unit."""
     typical = {name: np.sqrt(np.mean([unit.sd[name] ** 2 for unit in units])) for name in PRIORS}
     found: dict[str, Any] = {
         "experiments": list(CAMPAIGN),
@@ -147,7 +147,7 @@ def _rate(wrong: int, count: int) -> dict[str, Any]:
 
 def table(found: Mapping[str, Any]) -> str:
     """Return the counts as lines to print."""
-    lines = [f"  quality control: units called different by more than {found['limit']:.2f} standard deviations, in"]
+    lines = [f"  quality control: units that differ by more than {found['limit']:.2f} standard deviations, in"]
     names = "".join(f"{MEANINGS[name]:>17s}" for name in PRIORS)
     lines.append(f"  {'kind of unit':16s}{'units':>6s}{'any':>5s}{names}")
     for kind, one in found["kinds"].items():

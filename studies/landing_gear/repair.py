@@ -1,10 +1,10 @@
-"""Better models for truth B of the landing gear study, compared by what they predict of experiments held out.
+"""Better models for truth B of the landing gear study, compared by their predictions of held-out experiments.
 
-Each model is fitted to three quarters of the experiments, with theta4, theta6 and theta16 in common, and predicts the
-others. The score of an experiment is the logarithm of the density of its data at the estimate, its variances integrated
-out, −½ Σ n ln(M/n) up to a constant that no model has a part in: n counts the independent values of a channel, M is
-their sum of squared errors. Errors are correlated along a period, so a score is compared between models experiment by
-experiment, and the scatter over experiments gives the standard error of the mean difference.
+Each model is fitted to three quarters of the experiments, with common theta4, theta6 and theta16, and predicts the
+others. The score of an experiment is the log-density of its data at the estimate, its variances integrated out,
+−½ Σ n ln(M/n) up to a constant common to all models: n counts the independent values of a channel, M is its sum of
+squared errors. Errors are correlated along a period, so scores are compared between models by experiment, and the
+scatter over experiments gives the standard error of the mean difference.
 """
 
 from collections.abc import Mapping, Sequence
@@ -56,14 +56,14 @@ class Task:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a fit gives."""
+    """Results of a fit."""
 
     task: Task
     status: str
     theta: dict[str, float]
     sd: dict[str, float]
     scores: dict[str, float]  # Of the experiments held out
-    errors: dict[str, dict[str, float]]  # Root mean square of what is predicted wrongly, by experiment and channel
+    errors: dict[str, dict[str, float]]  # Root mean square prediction error, by experiment and channel
 
 
 def repair(names: Sequence[str], truth: str, seed: int, *, quick: bool) -> list[Fitted]:
@@ -123,7 +123,7 @@ def score(one: bp.Problem, theta: Mapping[str, float]) -> tuple[float, dict[str,
 
 
 def account(fits: Sequence[Fitted]) -> dict[str, Any]:
-    """Return what results.json holds: scores by model, differences from eq. (9), and theta16 with all experiments."""
+    """Return the entries of results.json: scores by model, differences from eq. (9), theta16 with all experiments."""
     kept = {channel: 2 * KEPT[DISPLACEMENT][channel] + 1 for channel in ("force", "pressure")}
     noise = {channel: NOISE[channel] * float(np.sqrt(count / RECORDED)) for channel, count in kept.items()}
     found: dict[str, Any] = {"noise_of_the_mean": noise, "models": {}, "theta16": {}}
@@ -175,6 +175,6 @@ def table(found: Mapping[str, Any]) -> str:
     for model, one in found["theta16"].items():
         negative = sum(p > 0.99 for p in one["p_negative_laplace"].values())
         lines.append(
-            f"  {model}: theta16 surely negative in {negative} of {len(one['p_negative_laplace'])} experiments"
+            f"  {model}: theta16 negative with P > 99 % in {negative} of {len(one['p_negative_laplace'])} experiments"
         )
     return "\n".join(lines)

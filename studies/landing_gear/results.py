@@ -1,4 +1,4 @@
-"""What the landing gear study reports: the content of results.json, and what is printed."""
+"""Results of the landing gear study: content of results.json, and printed tables."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,19 +18,19 @@ LARGE_STROKE, TOLERANCE = 0.06, 0.25
 
 @dataclass(frozen=True)
 class OfTruth:
-    """Everything that one truth led to."""
+    """Results of one truth."""
 
     recordings: dict[str, bp.Recording]  # By experiment
     verdicts: dict[str, Verdict]  # The displacement given
     joint: dict[str, Identified]  # All experiments, theta4 and theta6 in common, by what is given
     sensitivity: dict[str, dict[str, Any]]  # The other parameters under priors, by experiment
-    exact: dict[str, Identified]  # The force given and taken for exact
-    forced: dict[str, Verdict]  # The force given, its noise carried along
+    exact: dict[str, Identified]  # The force given and treated as exact
+    forced: dict[str, Verdict]  # The force given, with its noise propagated
     dropped: Dropped
 
 
 def rig() -> dict[str, Any]:
-    """Return the rig and the truths as results.json holds them."""
+    """Return the entries of results.json on rig and truths."""
     return {
         "experiments": {r.name: {"frequency": r.frequency, "half_stroke": r.stroke, "speed": r.speed} for r in RUNS},
         "speed_limit": SPEED_LIMIT,
@@ -91,7 +91,7 @@ def opposite_pairs(runs: Sequence[Run], verdicts: Mapping[str, Verdict]) -> list
 
 
 def account(truth: str, results: Mapping[str, Any]) -> str:
-    """Return what is printed of a truth."""
+    """Return the text to print on a truth."""
     forced = results["force_given"]
     signs, forced_signs = (
         "; ".join(f"{sign}: {', '.join(names) or 'none'}" for sign, names in found["signs"].items())

@@ -189,7 +189,7 @@ def integrate_steady(run: Run, effects: frozenset[str], samples: int, changed: C
     """Return one steady cycle without noise, end point excluded, by `bp.simulate`.
 
     The gas takes minutes to reach its mean temperature, to which its distance falls by the same factor in every cycle.
-    So the integration starts again from the limit that three stretches foretell (Aitken), until it stays there.
+    So the integration starts again from the limit that three segments predict (Aitken), until it remains there.
     """
     values = parameters(effects) | dict(changed)
     start = {"T": -values["theta17"]}

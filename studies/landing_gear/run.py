@@ -1,8 +1,8 @@
 """A landing gear on a shaker: fourteen synthetic experiments and a heat conduction that changes its sign.
 
 Section 4 of de Kraker, Verbeek & van de Wouw (1997), whose measurements are not public, on a simulated rig: theta4,
-theta6 and theta16 of eq. (9), experiment by experiment, for a gear that obeys eq. (9) (truth A) and for one with
-effects that it lacks (truth B). Is a negative theta16 what the data cannot tell, or what the model gets wrong?
+theta6 and theta16 of eq. (9), by experiment, for a gear that obeys eq. (9) (truth A) and for one with effects that
+eq. (9) lacks (truth B). The study examines whether a negative theta16 is due to lack of information or to model error.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from studies.landing_gear.results import OfTruth
 from studies.landing_gear.rig import RUNS, TRUTHS, Run, measure
 from studies.landing_gear.verdicts import Verdict, judge
 
-# What each truth led to is kept here until the study ends.
+# Folder for the results of each truth until the study ends.
 PARTS = "parts"
 LARGE, SMALL, FIGURE_1 = "0.2 Hz 80 mm", "3 Hz 4 mm", "1 Hz 18 mm"
 QUICK = tuple(run for run in RUNS if run.name in (FIGURE_1, SMALL))
@@ -35,7 +35,7 @@ UNITS, QUICK_UNITS = (10, 60), (1, 1)
 def run(options: argparse.Namespace) -> None:
     """Run the study, or with ``--replicates`` campaigns of truth A alone."""
     if options.replicates < 0:
-        raise ValueError(f"--replicates: {options.replicates} is not allowed; it must be at least 0.")
+        raise ValueError(f"--replicates: must be at least 0, got {options.replicates}.")
     if options.replicates:
         _campaigns(options)
         return
@@ -64,14 +64,14 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _source(options: argparse.Namespace, truth: str) -> str:
-    """Return what tells kept posteriors of another version, or with other settings, apart."""
+    """Return a key that identifies version and settings of kept posteriors."""
     modules = drop, force, identification, landing_gear_results, rig, landing_gear_verdicts
     files = [common.sha256(Path(str(module.__file__))) for module in modules]
     return " ".join([common.versions()["bayesperiodic"], truth, str(options.seed), str(options.quick), *files])
 
 
 def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace) -> tuple[OfTruth, dict[str, float]]:
-    """Return everything that one truth leads to, and the seconds of its parts."""
+    """Return the results of one truth, and the seconds of its parts."""
     seed, quick, watch = options.seed, options.quick, common.Stopwatch()
     with watch.part(f"rig {truth}", f"truth {truth}: simulating and recording {len(runs)} experiments"):
         recordings = {r.name: measure(r, TRUTHS[truth], seed) for r in runs}
@@ -108,7 +108,7 @@ def _of_all(
     watch: common.Stopwatch,
     results: dict[str, Any],
 ) -> dict[str, Any]:
-    """Do what is not about one truth's posteriors, fill in the results, and return the figures by name."""
+    """Run the parts common to all truths, add their results, and return the figures by name."""
     drawn: dict[str, Any] = {}
     if "B" in truths:
         with watch.part("repair", "truth B: better models, compared by what they predict of experiments held out"):

@@ -1,10 +1,8 @@
-"""What the landing gear study concludes from one experiment: the sign of theta16, and whether the model holds.
+"""Conclusions from one experiment of the landing gear: the sign of theta16, and whether the model is adequate.
 
-How much the sign of theta16 leans on the parameters that are held at their values: all of them under priors.
-
-Experiment by experiment, the displacement given. Mass, damping and friction are as uncertain as after a test of the
-gear without gas, its amount and heat capacity as after filling it by a manometer. theta2, theta7 and theta12, zero in
-this gear, stay fixed.
+The sensitivity of the sign to the fixed parameters is examined with the displacement given, by experiment, with all of
+them under priors: mass, damping and friction are as uncertain as after a test of the gear without gas, the amount of
+gas and its heat capacity as after filling by a manometer. theta2, theta7 and theta12, zero in this gear, stay fixed.
 """
 
 import warnings
@@ -28,12 +26,12 @@ FALSE_ALARM = 0.01
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is said of one experiment."""
+    """Verdicts on one experiment."""
 
     identified: Identified
     identifiability: bp.Identifiability
-    misspecified: bool  # Whether the model is called that, at a false-alarm rate of 1 % an experiment
-    p: float  # Behind it
+    misspecified: bool  # At a false-alarm rate of 1 % per experiment
+    p: float  # p-value of the misfit
 
     @property
     def p_negative(self) -> tuple[float, float]:
@@ -54,13 +52,13 @@ def judge(identified: Identified) -> Verdict:
     """Return the verdict on an experiment whose posterior was sampled."""
     assert identified.posterior is not None
     stated, fit, posterior = identified.problem, identified.fit, identified.posterior
-    said = bp.identifiability(stated, fit, posterior, profile=False, candidates=[])
+    found = bp.identifiability(stated, fit, posterior, profile=False, candidates=[])
     table = bp.predict(stated, posterior).table
-    return Verdict(identified, said, str(table["verdict"]["all"]) == "misspecified", float(table["p"]["all"]))
+    return Verdict(identified, found, str(table["verdict"]["all"]) == "misspecified", float(table["p"]["all"]))
 
 
 def account(verdict: Verdict) -> dict[str, Any]:
-    """Return what results.json holds of an experiment."""
+    """Return the entries of results.json on an experiment."""
     identified = verdict.identified
     posterior = identified.posterior
     assert posterior is not None
@@ -85,7 +83,7 @@ def account(verdict: Verdict) -> dict[str, Any]:
 
 
 def laplace(identified: Identified) -> dict[str, Any]:
-    """Return what results.json holds of a MAP estimate."""
+    """Return the entries of results.json on a MAP estimate."""
     fit = identified.fit
     return {
         "status": fit.status,
@@ -106,9 +104,9 @@ def laplace(identified: Identified) -> dict[str, Any]:
 
 
 def line(name: str, verdict: Verdict) -> str:
-    """Return what is printed of an experiment."""
+    """Return the text to print on an experiment."""
     fit, (negative, error) = verdict.identified.fit, verdict.p_negative
-    told = "misspecified" if verdict.misspecified else "adequate"
+    adequacy = "misspecified" if verdict.misspecified else "adequate"
     if "scale" in fit.noise:
         size = f"scale of the errors {fit.noise['scale']:.2f}"
     else:
@@ -117,7 +115,7 @@ def line(name: str, verdict: Verdict) -> str:
     return (
         f"{name:>14s}: theta16 {fit.theta[CONDUCTION]:8.3f} ± {fit.sd[CONDUCTION]:.3f} W/K, "
         f"P(< 0) = {negative:.4f} ± {error:.4f} (Laplace {ndtr(-fit.theta[CONDUCTION] / fit.sd[CONDUCTION]):.4f}), "
-        f"{verdict.sign}, {told}; {size}"
+        f"{verdict.sign}, {adequacy}; {size}"
     )
 
 
@@ -131,12 +129,12 @@ SPREADS = {
 WALL = bp.Normal(GEAR["theta17"], 5.0)
 OTHERS = {name: bp.LogNormal(GEAR[name], spread) for name, spread in SPREADS.items()} | {"theta17": WALL}
 SAMPLING: dict[str, Any] = {"ensembles": 2, "walkers": 24, "variances": "collapsed", "progress": False}
-# Fewer draws than the stop rule asks for; what they are worth is reported.
+# Fewer draws than the stop rule requires; their effective number is reported.
 STEPS, QUICK_STEPS = 2000, 250
 
 
 def examine_all(runs: Sequence[Run], truth: str, seed: int, *, quick: bool) -> dict[str, dict[str, Any]]:
-    """Return what every experiment says with the other parameters under priors."""
+    """Return the results of every experiment with the other parameters under priors."""
     tasks = [(run, truth, seed, quick) for run in runs]
     return dict(zip([run.name for run in runs], each(examine, tasks, here=quick), strict=True))
 
@@ -145,7 +143,7 @@ def examine(run: Run, truth: str, seed: int, quick: bool) -> dict[str, Any]:
     """Return theta16 and its sign, by draws and by the Laplace approximation."""
     stated = problem(fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT))
     with warnings.catch_warnings():
-        # Of the wall's temperature, which the priors hold.
+        # The warning on the wall's temperature, which the priors determine.
         warnings.filterwarnings("ignore", "The data do not change under")
         fit = bp.map_estimate(stated, progress=False)
     posterior = bp.sample(stated, fit, seed=seed, max_steps=QUICK_STEPS if quick else STEPS, **SAMPLING)
@@ -178,7 +176,7 @@ def problem(experiment: bp.Experiment) -> bp.Problem:
 
 
 def table(found: Mapping[str, Mapping[str, Any]], fixed: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return what is printed, beside the posteriors with the others fixed."""
+    """Return the text to print, with the posteriors at fixed other parameters."""
     lines = ["  the other parameters under priors: theta16 [W/K] and P(< 0), beside those with the others fixed"]
     for name, one in found.items():
         other = fixed[name]

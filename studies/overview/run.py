@@ -1,7 +1,7 @@
-"""One picture of what the package does: follow unstable motions, find them in chaos, and judge what data can tell.
+"""Overview in one picture: following unstable motions, finding them in chaos, and identifiability of parameters.
 
 The frequency response of a hardening spring is computed; the pendulum's section and the posterior of its mass and air
-resistance come from synthetic recordings. With all its parameters free only ratios of the mass to the frictions show.
+resistance come from synthetic recordings. With all parameters free only ratios of mass and friction are identifiable.
 """
 
 import argparse
@@ -48,7 +48,7 @@ def follow(ax: Axes) -> list[float]:
     start = bp.solve_periodic(bp.models.duffing, values, force, frequency=0.08, samples=SAMPLES, scheme="central4")
     branch = bp.continue_periodic(bp.models.duffing, start, "frequency", until=0.4, progress=False)
     bp.plot.branch(branch, ax=ax)
-    ax.set_title("follow periodic motions, stable or not")
+    ax.set_title("periodic motions, stable and unstable")
     return [round(fold.frequency, 4) for fold in branch.folds]
 
 
@@ -62,12 +62,12 @@ def find(ax: Axes, periods: int, seed: int) -> dict[str, int]:
     assert legend is not None
     ax.set_ylim(top=ROOM)
     ax.legend(handles=legend.legend_handles, loc="upper right", fontsize=7.5, ncols=2, columnspacing=1.0)
-    ax.set_title("find unstable orbits in chaos, without a model")
+    ax.set_title("unstable orbits found in chaos without a model")
     return {str(p): sum(o.period == p for o in orbits) for p in range(1, LONGEST + 1)}
 
 
 def judge(ax: Axes, seed: int, steps: int) -> dict[str, str | bool]:
-    """Draw draws of two parameters with the Laplace ellipses, and return what is said of each."""
+    """Draw posterior draws of two parameters with the Laplace ellipses, and return the verdicts on both."""
     case = scaling_symmetry()
     problem = case.problem(seed)
     fit = bp.map_estimate(problem, progress=False)
@@ -77,14 +77,14 @@ def judge(ax: Axes, seed: int, steps: int) -> dict[str, str | bool]:
     ax.plot(mass[thin], air[thin], ".", ms=2.5, color=bp.plot.COLOURS["mcmc"], rasterized=True)
     ax.plot(*ellipses(fit), color=bp.plot.COLOURS["laplace"], ls="--")
     ax.plot(case.truth[MASS], case.truth[AIR], "x", ms=9, mew=2.5, color="black")
-    ax.set(xlabel="mass m [kg]", ylabel="air resistance k3 [N m s²]", title="judge what data can tell: only the ratio")
+    ax.set(xlabel="mass m [kg]", ylabel="air resistance k3 [N m s²]", title="identifiability: only the ratio")
     ax.legend(handles=_handles(), loc="lower right", fontsize=8, framealpha=0.95)
-    said = bp.identifiability(problem, fit, posterior, profile=False).verdicts
-    return {MASS: said[MASS], AIR: said[AIR], "converged": posterior.converged}
+    verdicts = bp.identifiability(problem, fit, posterior, profile=False).verdicts
+    return {MASS: verdicts[MASS], AIR: verdicts[AIR], "converged": posterior.converged}
 
 
 def ellipses(fit: bp.MapEstimate) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ellipses of the Laplace approximation that hold `PROBABILITIES`, one after the other."""
+    """Return the ellipses of the Laplace approximation with the probabilities `PROBABILITIES`."""
     names = [MASS, AIR]
     factor = np.linalg.cholesky(fit.covariance.loc[names, names].to_numpy(float))
     turn = np.linspace(0.0, 2 * np.pi, 200)

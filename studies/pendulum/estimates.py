@@ -1,6 +1,6 @@
-"""The pendulum identified from its unstable orbits: m and l, k3, all five; from the paper's errors of the start.
+"""The pendulum identified from its unstable orbits: m and l, k3, and all five parameters, from the paper's start.
 
-All five parameters of the pendulum free: the ridge, by structure, Laplace and MCMC.
+With all five parameters free, the ridge is described by structure, Laplace approximation and MCMC.
 """
 
 import re
@@ -21,8 +21,8 @@ START = {name: TRUTH[name] * (1.0 + error) for name, error in START_ERRORS.items
 LARGEST = 50.0
 SAMPLES = 100
 SCHEME = "central4"
-# With longer orbits standard deviations fall by another 40 %, and l came out 2.3, 1.8 and 1.0 of them high in three
-# recordings: what bias the local fits have, at places that orbits have in common, does not average out.
+# Longer orbits reduce the standard deviations by another 40 %, but l was 2.3, 1.8 and 1.0 of them too large in three
+# recordings: the bias of the local fits at points shared by orbits does not average out.
 LONGEST_USED = 3
 ALL = "all five"
 FREE = {"m and l": ("m", "l"), "k3": ("k3",), ALL: ("m", "l", "k1", "k2", "k3")}
@@ -39,7 +39,7 @@ MOST_DROPPED = 4
 
 @dataclass(frozen=True)
 class Identified:
-    """What the orbits of one recording say.
+    """Estimates from the orbits of one recording.
 
     `problems, fits`: By what is free.
     """
@@ -48,7 +48,7 @@ class Identified:
     selected: bp.Orbits
     problems: dict[str, bp.Problem]
     fits: dict[str, bp.MapEstimate]
-    lost: tuple[tuple[str, str], ...]  # Orbits that the first estimate went without, and why
+    lost: tuple[tuple[str, str], ...]  # Orbits excluded from the first estimate, and why
 
 
 def identify(orbits: bp.Orbits, *, which: Sequence[str] = tuple(FREE)) -> Identified:
@@ -103,7 +103,7 @@ def _moderate(orbit: bp.Orbit) -> bool:
 
 
 def _first_estimate(orbits: Sequence[bp.Orbit]) -> tuple[bp.MapEstimate, list[tuple[str, str]]]:
-    """Return m and l from measured cycles, without the orbits that cannot be solved on the way."""
+    """Return m and l from measured cycles, without orbits whose solves fail."""
     used = list(orbits)
     lost: list[tuple[str, str]] = []
     while True:
@@ -124,11 +124,11 @@ def errors(fit: bp.MapEstimate) -> dict[str, float]:
 
 
 def covers(fit: bp.MapEstimate, probability: float = 0.9) -> dict[str, bool]:
-    """Return whether the intervals of an estimate hold the truth."""
+    """Return whether the intervals of an estimate contain the truth."""
     return {name: bool(low <= TRUTH[name] <= high) for name, (low, high) in fit.interval(probability).items()}
 
 
-def told(fit: bp.MapEstimate, *, synthetic: bool) -> dict[str, Mapping[str, float]]:
+def estimate_table(fit: bp.MapEstimate, *, synthetic: bool) -> dict[str, Mapping[str, float]]:
     """Return estimate and standard deviation of each parameter, and its relative error where the truth is known."""
     found = {name: {"value": value, "sd": fit.sd[name]} for name, value in fit.theta.items()}
     return {n: row | ({"relative_error": errors(fit)[n]} if synthetic else {}) for n, row in found.items()}
@@ -143,16 +143,16 @@ QUICK_STEPS = 250
 
 @dataclass(frozen=True)
 class Ridge:
-    """Draws of all five parameters, and what is said of them.
+    """Draws of all five parameters and their verdicts.
 
     `natural, sampling`: Of Laplace with the draws, in natural values and in logarithms. `combinations`: Mean and sd of
-    what the data determine, by Laplace (columns value, laplace_sd) and MCMC (mean, sd).
+    the identifiable combinations, by Laplace (columns value, laplace_sd) and MCMC (mean, sd).
     """
 
     problem: bp.Problem
     fit: bp.MapEstimate
     posterior: bp.Posterior
-    structure: bp.Structure  # What the equations leave open, before any data
+    structure: bp.Structure  # Structural identifiability, without data
     identifiability: bp.Identifiability
     natural: bp.Comparison
     sampling: bp.Comparison
@@ -160,7 +160,7 @@ class Ridge:
 
 
 def sample(identified: Identified, seed: int, quick: bool) -> Ridge:
-    """Sample the posterior of all five, and let the package say what it says of it."""
+    """Sample the posterior of all five parameters, and diagnose it."""
     problem, fit = identified.problems[ALL], identified.fits[ALL]
     settings: dict[str, Any] = {"max_steps": QUICK_STEPS} if quick else {}
     posterior = bp.sample(problem, fit, seed=seed, ensembles=2, variances="collapsed", progress=False, **settings)
@@ -181,19 +181,19 @@ def sample(identified: Identified, seed: int, quick: bool) -> Ridge:
 
 
 def combination_draws(posterior: bp.Posterior) -> dict[str, np.ndarray]:
-    """Return the draws of what the data determine."""
+    """Return the draws of the identifiable combinations."""
     mass, length, *torques = (posterior.draws(name) for name in NATURAL)
     return {"l": length} | {f"c{i}": torque / (mass * length**2) for i, torque in enumerate(torques, 1)}
 
 
 def truths() -> dict[str, float]:
-    """Return the true values of what the data determine."""
+    """Return the true values of the identifiable combinations."""
     inertia = TRUTH["m"] * TRUTH["l"] ** 2
     return {"l": TRUTH["l"]} | {f"c{i}": TRUTH[f"k{i}"] / inertia for i in (1, 2, 3)}
 
 
 def collect(ridge: Ridge) -> dict[str, Any]:
-    """Return what results.json tells of the ridge."""
+    """Return the entries of results.json on the ridge."""
     posterior, fit = ridge.posterior, ridge.fit
     table = ridge.identifiability.table
     return {

@@ -65,8 +65,8 @@ def marginals(ridge: Ridge, *, truth: bool) -> Figure:
     grid[1, 4].legend(handles, labels, loc="center", frameon=False)
     for row, text in zip(grid, ("parameters", "what the data determine"), strict=True):
         row[0].set_ylabel(f"{text}:\ndensity")
-    said = ["synthetic data"] * truth + ["NOT CONVERGED"] * (not ridge.posterior.converged)
-    figure.suptitle(", ".join(["All five free, from unstable orbits alone", *said]))
+    notes = ["synthetic data"] * truth + ["NOT CONVERGED"] * (not ridge.posterior.converged)
+    figure.suptitle(", ".join(["All five free, from unstable orbits alone", *notes]))
     return figure
 
 
@@ -93,9 +93,9 @@ def eigenvalues(table: Mapping[str, Any]) -> Figure:
     for top, bottom, (noise, methods) in zip(above, below, table.items(), strict=True):
         for shift, (method, (colour, marker, style)) in zip((-0.2, 0.2), METHODS.items(), strict=True):
             rows = [row for row in methods[method] if row["candidates"] or row["orbits"]]
-            told = [row for row in rows if row["median_relative_error"] is not None]
-            errors = [100 * row["median_relative_error"] for row in told]
-            top.semilogy([row["period"] for row in told], errors, style, marker=marker, color=colour, label=method)
+            matched = [row for row in rows if row["median_relative_error"] is not None]
+            errors = [100 * row["median_relative_error"] for row in matched]
+            top.semilogy([row["period"] for row in matched], errors, style, marker=marker, color=colour, label=method)
             periods = np.array([row["period"] for row in rows]) + shift
             bottom.bar(periods, [r["candidates"] for r in rows], 0.36, color="white", edgecolor=colour, hatch="///")
             bottom.bar(periods, [r["orbits"] for r in rows], 0.36, color=colour)

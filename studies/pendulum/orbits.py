@@ -1,6 +1,6 @@
-"""The pendulum's periodic orbits: found, polished, held against shooting, eigenvalues by two methods.
+"""Periodic orbits of the pendulum: found, polished, compared with shooting, multipliers by two methods.
 
-The driven pendulum by SciPy's integrator and shooting, as a reference that shares nothing with the package.
+The shooting reference of `studies.shooting` is independent of the package.
 """
 
 from collections.abc import Mapping, Sequence
@@ -89,7 +89,7 @@ class Reference:
 
 
 def references(polished: bp.Orbits) -> tuple[list[Reference], list[str]]:
-    """Return what shooting from polished orbits converges to, and the names of those that it does not confirm.
+    """Return the orbits that shooting from polished orbits converges to, and the names of unconfirmed ones.
 
     Of a pair of symmetric partners one is integrated and the other mirrored.
     """
@@ -138,7 +138,7 @@ def classes(orbits: bp.Orbits) -> dict[int, int]:
 
 
 def matched(orbit: bp.Orbit, truths: Sequence[Reference]) -> Reference | None:
-    """Return the true orbit that a candidate stands for, begun where the candidate begins; None where it is none."""
+    """Return the true orbit of a candidate, with the same first point; None if there is none."""
     best, nearest = None, MATCHED
     for truth in truths:
         if truth.period != orbit.period or (orbit.winding is not None and truth.winding != orbit.winding):
@@ -198,5 +198,5 @@ def covered(pulls: Sequence[float]) -> dict[str, float]:
 
 
 def points_only(section: bp.PoincareSection) -> bp.PoincareSection:
-    """Return the same section as a laboratory that samples once a drive period has it."""
+    """Return the same section sampled once per drive period."""
     return bp.PoincareSection.from_points(section.points, COORDINATES, frequency=FREQUENCY, angles=ANGLES)

@@ -1,4 +1,4 @@
-"""The chaotic pendulum's recording: simulated with noise, or read from a file."""
+"""Recording of the chaotic pendulum: simulated with noise, or read from a file."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ TRUTH = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11
 KNOWN = {"a": 0.11, "g": 9.81, "v0": 0.05}
 COORDINATES, ANGLES = ("angle", "rate"), ("angle",)
 UNITS = {"angle": "rad", "rate": "rad/s"}
-# What the attractor covers: a turn, and the range of the rate.
+# Size of the attractor: a turn, and the range of the rate.
 SIZE = {"angle": 6.28, "rate": 32.6}
 PERIODS, QUICK_PERIODS, SETTLING = 42_754, 6_000, 50
 SAMPLES = 40
@@ -47,17 +47,17 @@ def with_noise(recording: bp.Recording, fraction: float, seed: int) -> bp.Record
 
 
 def get(data: Path | None, quick: bool, seed: int) -> tuple[bp.Recording, dict[str, Any]]:
-    """Return the recording without added noise, simulated unless a file is given, and what to report of it.
+    """Return the recording without added noise, simulated unless a file is given, and its description.
 
     A file has the columns time [s], angle [rad] and rate [rad/s], of a pendulum driven at ω = 9.09 rad/s, whose pivot
-    moves by a = 0.11 m; where k1, k2 and k3 are held fixed they have the values of `TRUTH`.
+    moves by a = 0.11 m; k1, k2 and k3 have the values of `TRUTH` where they are fixed.
     """
     about: dict[str, Any] = {"path": "generated", "sha256": None, "synthetic": True}
     if data is None:
         recording = simulate(QUICK_PERIODS if quick else PERIODS, seed)
     else:
         if not data.is_file():
-            raise FileNotFoundError(f"--data: {str(data)!r} is not allowed; there is no such file.")
+            raise FileNotFoundError(f"--data: must be an existing file, got {str(data)!r}.")
         recording = bp.Recording.from_csv(data, time="time", outputs={name: name for name in COORDINATES})
         about = {"path": str(data), "sha256": common.sha256(data), "synthetic": False}
     size = {"values": sum(v.size for v in recording.outputs.values())}

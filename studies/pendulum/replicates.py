@@ -1,4 +1,4 @@
-"""Table 1 of the paper over many recordings: errors, coverage, failures; and whether eigenvalues as data do harm."""
+"""Table 1 of the paper over many recordings: errors, coverage, failures, and multipliers as data."""
 
 import argparse
 import multiprocessing
@@ -23,7 +23,7 @@ NOISE_LEVELS = (0.001, 0.01)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Do the replicates, and write their table."""
+    """Compute the replicates, and write their table."""
     watch = common.Stopwatch()
     print("All data are SYNTHETIC: simulated from the stated truth, with noise.")
     with watch.part("truths", "the true orbits, by shooting"):
@@ -57,7 +57,7 @@ def true_orbits(seed: int) -> list[Reference]:
 
 
 def replicate(seed: int, truths: Sequence[Reference]) -> list[dict[str, Any]]:
-    """Return what one recording gives at every noise level: its start on the attractor and its noise are the seed's."""
+    """Return the results of one recording, whose start and noise the seed determines, at every noise level."""
     recording, lines = simulate(PERIODS, seed), []
     for noise in NOISE_LEVELS:
         line: dict[str, Any] = {"seed": seed, "noise": noise, "errors": {}}
@@ -144,7 +144,7 @@ def account(table: dict[str, Any]) -> str:
             )
         bars = found["eigenvalue_bars"]
         lines.append(
-            f"         failures {len(found['failures'])}, orbits lost {found['lost_orbits']}, selected that are none "
+            f"         failures {len(found['failures'])}, orbits lost {found['lost_orbits']}, selected but not true "
             f"{found['selected_that_are_no_orbits']}; eigenvalue error bars {bars['cover']} of {bars['bars']} "
             f"(band {bars['band_low']:.0f} … {bars['band_high']:.0f}); {found['seconds_each']:.1f} s each"
         )

@@ -1,10 +1,9 @@
 """A chaotic pendulum, identified from the unstable periodic orbits in its recording (section 5 of the paper).
 
-φ'' + c1 tanh(φ'/v0) + c2 φ' + c3 φ'|φ'| + (g + a ω² cos ωt)/l · sin φ = 0 with c_i = k_i/(m l²), at ω = 9.09 rad/s:
-from 42,754 drive periods to orbits with error bars, to m and l, to k3, and to what all five parameters cannot be told.
-With --replicates N: the counterpart of the paper's table 1, over N recordings.
-
-Finding orbits at several noise levels, each on a core.
+φ'' + c1 tanh(φ'/v0) + c2 φ' + c3 φ'|φ'| + (g + a ω² cos ωt)/l · sin φ = 0 with c_i = k_i/(m l²), at ω = 9.09 rad/s.
+Orbits with error bars are found in 42,754 drive periods; m and l, then k3, then all five parameters are estimated, of
+which only combinations are identifiable. With --replicates N: the counterpart of the paper's table 1, over N
+recordings.
 """
 
 import argparse
@@ -27,7 +26,7 @@ from studies.pendulum.recording import section_of, with_noise
 
 @dataclass(frozen=True)
 class Found:
-    """What was found in one section.
+    """Orbits found in one section.
 
     `chained, boxes`: By the default method and by the paper's recipe.
     """
@@ -38,7 +37,7 @@ class Found:
 
 
 def search(recording: bp.Recording, noises: Sequence[float], seed: int, periods: Sequence[int]) -> dict[float, Found]:
-    """Return what is found with each noise added to the recording, as a fraction of the attractor's size."""
+    """Return the orbits found with each noise level added to the recording, as a fraction of the attractor's size."""
     tasks = [(recording, noise, seed, tuple(periods)) for noise in dict.fromkeys(noises)]
     if len(tasks) == 1:
         return {noises[0]: _found(tasks[0])}
@@ -64,8 +63,8 @@ def run(options: argparse.Namespace) -> None:
     """Run the study."""
     if options.replicates < 0 or not 0.0 <= options.noise < 1.0:
         raise ValueError(
-            f"--replicates {options.replicates} --noise {options.noise} is not allowed; replicates must be at least 0, "
-            "and the noise a fraction of the attractor's size from 0 to 1."
+            f"--replicates, --noise: must be at least 0 and a fraction from 0 to 1, got {options.replicates} and "
+            f"{options.noise}."
         )
     if options.replicates:
         replicates.run(options)
@@ -106,7 +105,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
-    """Return what was found without noise, held against shooting, and the eigenvalues at every noise and method."""
+    """Return the orbits found without noise, compared with shooting, and the multipliers by noise level and method."""
     clean = found[0.0].chained
     polished = bp.polish_orbits(bp.models.pendulum, clean, pendulum_recording.TRUTH, samples=orbits.SAMPLES)
     truths, refuted = orbits.references(polished)
@@ -142,13 +141,13 @@ def against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
 def estimates(
     about: Mapping[str, Any], found: Found, identified: Identified, with_eigenvalues: Mapping[str, bp.MapEstimate]
 ) -> dict[str, Any]:
-    """Return the estimates, the orbits behind them and those left out."""
+    """Return the estimates, the orbits used and those excluded."""
     used = sum(orbit.points.size for orbit in identified.selected)
     table = {}
     for which, fit in identified.fits.items():
         table[which] = {
             "status": fit.status,
-            "parameters": pendulum_estimates.told(fit, synthetic=about["synthetic"]),
+            "parameters": pendulum_estimates.estimate_table(fit, synthetic=about["synthetic"]),
             "scale": fit.noise["scale"],
             "sd_with_eigenvalues_over_without": {n: with_eigenvalues[which].sd[n] / fit.sd[n] for n in fit.theta},
         }
@@ -166,7 +165,7 @@ def estimates(
 
 
 def orbit_account(results: Mapping[str, Any]) -> str:
-    """Return what was found against what is there, to print."""
+    """Return the comparison of found and true orbits as text."""
     clean = results["found_without_noise"]
     lines = [
         f"  without noise {clean['polished']} orbits of {clean['candidates']} candidates; classes by period "
@@ -194,8 +193,8 @@ def estimate_account(results: Mapping[str, Any]) -> str:
         f"{reduction['numbers_in_the_recording']} numbers in the recording {reduction['numbers_used']} are used"
     ]
     for which, row in results["estimates"].items():
-        for name, told in row["parameters"].items():
-            error = f", error {told['relative_error']:+.3%}" if "relative_error" in told else ""
+        for name, one in row["parameters"].items():
+            error = f", error {one['relative_error']:+.3%}" if "relative_error" in one else ""
             paper = f" (paper {PAPER_ERRORS[name]:.1%})" if which != "all five" and name in PAPER_ERRORS else ""
-            lines.append(f"    {which:9s} {name:2s} = {told['value']:.6g} ± {told['sd']:.2g}{error}{paper}")
+            lines.append(f"    {which:9s} {name:2s} = {one['value']:.6g} ± {one['sd']:.2g}{error}{paper}")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""What sampling costs beside its log-posteriors: in a pool of workers, and in one vectorised call on several cores."""
+"""Overhead of sampling: in a pool of workers, and in one vectorised call on several cores."""
 
 import importlib.util
 import logging
@@ -33,7 +33,7 @@ ONLY_LINUX = "not measurable here: only Linux holds a process on one core"
 
 
 def run_cost(quick: bool) -> dict[str, Any]:
-    """Measure what sampling costs on this machine; a quick run leaves the pools out."""
+    """Measure the cost of sampling on this machine; a quick run omits the pools."""
     load = [*os.getloadavg()] if hasattr(os, "getloadavg") else None
     found: dict[str, Any] = {"load_average": load, "cores": available_cores()}
     found["vectorised"] = vectorised_gain(3 if quick else 15)
@@ -44,7 +44,7 @@ def run_cost(quick: bool) -> dict[str, Any]:
 
 
 def rows(cost: dict[str, Any]) -> list[Row]:
-    """Return what must show of the costs; where this machine cannot tell, there is no verdict."""
+    """Return the targets of the costs, without a verdict if this machine cannot measure them."""
     result, pools, vectorised = [], cost["pools"], cost["vectorised"]
     for name in POOLS:
         what = f"wall time of a pool of one {name} worker over that of one thread"
@@ -68,7 +68,7 @@ def _quartiles(pair: list[float]) -> str:
 
 
 def loaded(cost: dict[str, Any]) -> str:
-    """Return a note if others were using the machine when the measurements began, nothing otherwise."""
+    """Return a note if the machine was busy when the measurements began, else an empty string."""
     load = cost["load_average"]
     if load is None or load[0] <= QUIET * cost["cores"]:
         return ""
@@ -91,7 +91,7 @@ def pool_overhead(repeats: int = 3, pools: tuple[str, ...] = POOLS, seconds: flo
     """Compare a sampling run on one thread with the same run handed to one worker, log-posteriors taking 5 ms.
 
     Both compute on the same core, the worker while this process waits on another one: then neither the cores' speeds
-    nor what else runs on them tells the two apart. Runs alternate, thread, processes, thread, Dask, thread, and so on,
+    nor other load on them affects the comparison. Runs alternate, thread, processes, thread, Dask, thread, and so on,
     and each is compared with the mean of its two neighbours. The workers have done a short run before, as starting
     processes takes seconds whatever the length of a run. A piece, which is what a message carries, is 4 walkers × 25
     steps, an eighth of what the default walkers make it, so that the overhead of a default run is smaller.
@@ -165,7 +165,7 @@ def _dask_pool(core: int) -> Iterator[Pool]:
     from distributed import Client, LocalCluster
 
     with (
-        # A worker that is told to end while it sends a heartbeat says so at length.
+        # A worker that is stopped while it sends a heartbeat logs long messages.
         LocalCluster(
             n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
         ) as cluster,
@@ -197,7 +197,7 @@ def _only_on(cores: set[int]) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class SlowPrior:
-    """A normal prior, N(1, 1), that takes a plain loop of so many turns for every value: what a hard model would take.
+    """A normal prior, N(1, 1), that takes a plain loop of so many turns for every value: as slow as a large model.
 
     With a model that is quick to solve, nothing else takes time in a run, before the walk or after it.
     """
@@ -248,7 +248,7 @@ def slow_problem(seconds: float) -> tuple[bp.Problem, bp.MapEstimate]:
 
 
 def vectorised_gain(repeats: int = 15) -> dict[str, Any]:
-    """Compare what all cores gain on one call of 64 walkers × 14 experiments with what they gain on a plain loop.
+    """Compare the gain of all cores on one call of 64 walkers × 14 experiments with that on a plain loop.
 
     The call is `Problem.log_likelihood`, on one thread and on as many as there are cores.
 

@@ -1,4 +1,4 @@
-"""Three ways to sample the damper's posterior: emcee, emcee with the variance integrated out, and NUTS by gradients."""
+"""The damper's posterior by three samplers: emcee, emcee with the variance integrated out, and NUTS."""
 
 import argparse
 import importlib.util
@@ -86,7 +86,7 @@ def compare_all(posteriors: dict[str, bp.Posterior]) -> list[dict[str, Any]]:
 
 
 def limit(count: int, ensembles: int) -> float:
-    """Return what the largest of so many differences exceeds with a probability of at most 1 % (Bonferroni).
+    """Return the limit that the largest of `count` differences exceeds with a probability of at most 1 % (Bonferroni).
 
     Each is Student's t; its degrees of freedom are at least those of one sampler's error, one less than it has batches.
     """
@@ -94,7 +94,7 @@ def limit(count: int, ensembles: int) -> float:
 
 
 def collect(sampled: Sampled) -> dict[str, Any]:
-    """Return what results.json tells about the damper."""
+    """Return the entries of results.json on the damper."""
     differences = compare_all(sampled.posteriors)
     ensembles = [np.unique(p.data["posterior"]["ensemble"]).size for p in sampled.posteriors.values()]
     return {
@@ -123,7 +123,7 @@ def _account(posterior: bp.Posterior, seconds: float) -> dict[str, Any]:
 
 
 def rows(found: dict[str, Any], quick: bool) -> list[Row]:
-    """Return what must show on the damper: agreement of the samplers in pairs, and convergence unless `quick`."""
+    """Return the targets of the damper: pairwise agreement of the samplers, and convergence unless `quick`."""
     kind = "damper, synthetic" if found["data"]["synthetic"] else "damper"
     result = []
     for name in SAMPLERS:

@@ -40,7 +40,7 @@ def draw_ridge(ridge: sampling_ridge.Ridge) -> Figure:
         curve = np.linspace(1.0 / FARTHEST, FARTHEST, 400)
         top.plot(curve, 1.0 / curve, color="0.6", lw=6.0, alpha=0.5, label="a·b = 1", zorder=1)
         top.plot(draws["a"][some], draws["b"][some], ".", color=DRAWS, ms=2.5, label=f"{SHOWN} of the draws")
-        verdict = "converged" if posterior.converged else "NOT converged, as the stop rule says"
+        verdict = "converged" if posterior.converged else "NOT converged by the stop rule"
         top.set_title(f"{name}:\n{verdict}", fontsize=11)
         bins = np.linspace(0.0, FARTHEST, 81)
         bottom.hist(draws["a"], bins, density=True, color=HISTOGRAM, alpha=0.7, label="draws")
@@ -85,7 +85,7 @@ def draw_samplers(sampled: Sampled, found: dict[str, Any]) -> Figure:
 
 
 def draw_costs(cost: dict[str, Any], busy: str) -> Figure:
-    """Draw what pools cost and what cores gain, with the limits; grey where it decides nothing."""
+    """Draw the overhead of pools and the gain of cores, with the limits; grey without a verdict."""
     from matplotlib import pyplot as plt
 
     figure = plt.figure(figsize=(10.0, 4.8), layout="constrained")
@@ -115,7 +115,7 @@ def draw_costs(cost: dict[str, Any], busy: str) -> Figure:
     right.set_title(
         f"{gains['cores']} cores on a call of {gains['walkers']} walkers × {gains['experiments']} experiments"
     )
-    figure.suptitle("What sampling costs" + (f": {busy}" if busy else ""), fontsize=11)
+    figure.suptitle("Cost of sampling" + (f": {busy}" if busy else ""), fontsize=11)
     return figure
 
 

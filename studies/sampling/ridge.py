@@ -1,9 +1,8 @@
-"""The ridge a·b = 1 ± 2 %, known by quadrature, on which samplers fool themselves.
+"""The ridge a·b = 1 ± 2 %, known by quadrature, where convergence diagnostics can pass although chains have not mixed.
 
-With b integrated out in closed form the density of a is known but for its scale. Two priors: N(1, 1) for a and b, cut
-at zero, and uncut, which leaves 1.2 % of the mass on a second branch where both are negative.
-
-Monte Carlo errors from the means of batches of draws.
+With b integrated out in closed form the density of a is known up to its scale. Two priors: N(1, 1) for a and b, cut at
+zero, and uncut, which leaves 1.2 % of the mass on a second branch where both are negative. Monte Carlo errors come from
+the means of batches of draws.
 """
 
 import time
@@ -21,10 +20,10 @@ BATCHES = 5
 
 
 def standard_error(posterior: bp.Posterior, values: np.ndarray) -> float:
-    """Return the Monte Carlo error of the mean of what was computed from the draws, (draws,) as `Posterior.draws`.
+    """Return the Monte Carlo error of the mean of values computed from the draws, (draws,) as `Posterior.draws`.
 
-    Each ensemble, or chain of NUTS, is cut into consecutive batches. Their means know of the dependence in time, of
-    walkers on each other, and of ensembles that disagree.
+    Each ensemble, or chain of NUTS, is cut into consecutive batches. Their means reflect the dependence in time,
+    between walkers, and the differences between ensembles.
     """
     group = posterior.data["posterior"]
     by_chain = values.reshape(group.sizes["chain"], group.sizes["draw"])
@@ -49,7 +48,7 @@ ERRORS = 4.0
 
 @dataclass(frozen=True)
 class Ridge:
-    """What was sampled on the ridge, and the truth.
+    """Posteriors of the ridge.
 
     `default, natural`: Priors cut at zero: the default settings, and a short chain in natural coordinates. `uncut,
     uncut_prior`: Priors over both signs: the default settings but for fewer steps at most, and as many from draws of
@@ -96,7 +95,7 @@ def _problem(prior: Any) -> bp.Problem:
     )
     tau = np.arange(POINTS) / POINTS
     x = np.sqrt(2.0) * np.sin(2 * np.pi * tau)
-    # A second harmonic, which the model has not got, makes the residual finite.
+    # A second harmonic, which the model lacks, makes the residual finite.
     outputs = {"product": x + 1e-3 * np.sin(4 * np.pi * tau)}
     run = bp.Experiment("run", 1.0, outputs, {"x": x}, samples=POINTS, synthetic=True)
     known = {"variance[product]": POINTS * WIDTH**2}
@@ -135,7 +134,7 @@ def negative_mass() -> float:
 
 
 def collect(ridge: Ridge) -> dict[str, Any]:
-    """Return what results.json tells about the ridge."""
+    """Return the entries of results.json on the ridge."""
     table: dict[str, Any] = {"width": WIDTH, "sd_by_quadrature": {"cut": spread(cut=True), "uncut": spread(cut=False)}}
     for name in ("default", "natural", *UNCUT):
         posterior: bp.Posterior = getattr(ridge, name)
@@ -167,7 +166,7 @@ def _negative_share(posterior: bp.Posterior) -> dict[str, float]:
 
 
 def rows(found: dict[str, Any]) -> list[Row]:
-    """Return what must show on the ridge."""
+    """Return the targets of the ridge."""
     default, natural = found["default"], found["natural"]
     ratio = default["sd"] / found["sd_by_quadrature"]["cut"]
     return [

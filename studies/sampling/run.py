@@ -1,6 +1,6 @@
-"""Whether sampling can be trusted, and what it costs: a ridge known by quadrature, three samplers, pools and cores.
+"""Accuracy and cost of sampling: a ridge known by quadrature, three samplers, pools of workers and cores.
 
-The ridge is computed, the damper measured (or generated, and then called synthetic), see studies/damper/run.py.
+The ridge is computed; the damper is measured or synthetic, see studies/damper/run.py.
 """
 
 import argparse
@@ -17,12 +17,12 @@ def run(options: argparse.Namespace) -> None:
     from studies.sampling import cost as sampling_cost  # compiles
 
     watch = common.Stopwatch()
-    with watch.part("cost", "what sampling costs in a pool of workers, and what it gains on several cores"):
+    with watch.part("cost", "overhead of a pool of workers, and gain of several cores"):
         cost = sampling_cost.run_cost(options.quick)
     busy = sampling_cost.loaded(cost)
     if busy:
         print(f"  note: {busy}")
-    with watch.part("ridge", "the ridge a·b = 1, whose spread is known"):
+    with watch.part("ridge", "the ridge a·b = 1, with known spread"):
         ridge = sampling_ridge.sample_ridge(options.seed, options.quick)
     with watch.part("damper", "the damper by three samplers"):
         sampled = damper.sample_damper(options)
@@ -51,7 +51,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def tables(found: dict[str, Any]) -> str:
-    """Return the account that the study prints."""
+    """Return the text to print."""
     kind = "SYNTHETIC data" if found["damper"]["data"]["synthetic"] else "measured data"
     lines = [f"The damper by three samplers, {kind}", damper.table(found["damper"]), ""]
     pools = found["cost"]["pools"]
@@ -66,5 +66,5 @@ def tables(found: dict[str, Any]) -> str:
             ),
             "",
         ]
-    lines += ["What must show", common.table_of_rows(found["checks"])]
+    lines += ["Targets", common.table_of_rows(found["checks"])]
     return "\n".join([*lines, *([f"Note: {found['cost']['note']}."] if found["cost"]["note"] else [])])

@@ -1,4 +1,4 @@
-"""What the Silverbox study's estimates rest on: the grid, the starts, and what of the residual comes again."""
+"""Checks of the Silverbox estimates: grid, starts, and repeatability of the residual."""
 
 import time
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ OTHER_START = {"c": 0.3, "k1": 1.6, "k2": 1.0, "k3": 20.0, "g": 2.0, "u0": 0.02}
 
 
 class Discretisation(NamedTuple):
-    """The error of the response on the grid, against one with twice the points."""
+    """Error of the response on the grid, against one with twice the points."""
 
     difference: np.ndarray  # (points,)
     fraction: float  # Its root mean square over the measured standard deviation
@@ -33,9 +33,9 @@ def discretisation(recording: bp.Recording, experiment: bp.Experiment, theta: Ma
 
 
 def starts_from_rest(experiment: bp.Experiment, theta: Mapping[str, float]) -> tuple[list[dict[str, Any]], list[float]]:
-    """Return how the response is found from rest at full amplitude, and the seconds it took.
+    """Return how the solver finds the response from rest at full amplitude, and the seconds.
 
-    With a fifth of the damping Newton's method stalls there, and the drive has to be raised step by step.
+    With a fifth of the damping Newton's method stalls, and the drive is increased in steps.
     """
     points = {
         "prior medians": medians(),
@@ -52,15 +52,15 @@ def starts_from_rest(experiment: bp.Experiment, theta: Mapping[str, float]) -> t
 
 
 def other_start(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, Any]:
-    """Return how far the estimate from another start is from the first one, in standard deviations."""
+    """Return the difference of the estimate from another start, in standard deviations."""
     other = bp.map_estimate(problem(experiment), start=OTHER_START)
     return {"start": OTHER_START, "status": other.status, "shift": _shift(fit, other)}
 
 
 def repetition(experiment: bp.Experiment, fit: bp.MapEstimate, recording: bp.Recording) -> dict[str, Any]:
-    """Return which part of the residual a second recording of the same phase leaves again, and the estimates' shift.
+    """Return the part of the residual that a second recording reproduces, and the shift of the estimates.
 
-    What comes again is model error; what does not is the noise of the mean period, whatever its spectrum.
+    The reproducible part is model error; the rest is the noise of the mean period, whatever its spectrum.
     """
     again = fold(recording, experiment.samples, experiment.harmonics["response"])
     other = bp.map_estimate(problem(again))
@@ -74,7 +74,7 @@ def repetition(experiment: bp.Experiment, fit: bp.MapEstimate, recording: bp.Rec
 
 
 def beyond_drive(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, float]:
-    """Return what the harmonics above the drive's last line bring to the residual, and data against model there."""
+    """Return the share of the residual in harmonics above the drive's last line, and data against model there."""
     residual = np.fft.rfft(fit.residuals[experiment.name]["response"])
     measured = np.fft.rfft(experiment.outputs["response"])
     power = np.abs(residual[1:]) ** 2

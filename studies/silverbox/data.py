@@ -1,7 +1,4 @@
-"""The steady parts of the Silverbox's multisine record, or two generated in their image.
-
-What the Silverbox study fits: mean period, model, priors and grid.
-"""
+"""Silverbox multisine: steady parts of the record or synthetic ones, mean period, model, priors and grid."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,7 +24,7 @@ SYNTHETIC_NOISE = {"drive": 3e-5, "response": 3e-4}
 
 
 def read_steady_parts(given: Path | None, seed: int) -> tuple[tuple[bp.Recording, bp.Recording], dict[str, Any]]:
-    """Return both measured steady parts, or generated ones of the same kind, and what to report about them."""
+    """Return both measured steady parts, or generated ones of the same kind, and their description."""
     found = common.find_data(given, FILE)
     if found is None:
         data = {"path": "generated", "sha256": None, "synthetic": True}

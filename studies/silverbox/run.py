@@ -2,9 +2,7 @@
 
 The recording is the Schroeder-phased multisine of the Silverbox benchmark (T. Wigren, J. Schoukens, 2013;
 nonlinearbenchmark.org): odd lines up to 200 Hz, nine steady periods of 1024 samples. Model, in volts and with w0 fixed:
-ÿ/w0² + c ẏ/w0 + k1 y + k2 y² + k3 y³ = g u + u0. An offset of the output is left out: other k1, k2 and u0 do the same.
-
-What the Silverbox study prints.
+ÿ/w0² + c ẏ/w0 + k1 y + k2 y² + k3 y³ = g u + u0. An offset of the output is omitted, because k1, k2 and u0 absorb it.
 """
 
 import argparse
@@ -39,7 +37,7 @@ HUM, OVERSTATED = 50.0, 0.7
 
 
 def introduction(data: dict[str, Any], experiment: bp.Experiment) -> str:
-    """Return what is said about the data before anything is fitted."""
+    """Return the description of the data to print."""
     what = "SYNTHETIC recording" if data["synthetic"] else "measured recording"
     lines = [
         f"  {what} {data['path']}: {experiment.cycles} steady cycles at {experiment.frequency:.6f} Hz, "
@@ -53,7 +51,7 @@ def introduction(data: dict[str, Any], experiment: bp.Experiment) -> str:
 
 
 def tables(every: dict[str, bp.MapEstimate], within: dict[str, bp.MapEstimate], results: dict[str, Any]) -> str:
-    """Return the tables, with what must be said about them."""
+    """Return the tables to print, with their interpretation."""
     kind = "SYNTHETIC data" if results["data"]["synthetic"] else "measured data"
     first, second = results["response_harmonics"]["choices"]
     return "\n".join(
@@ -158,7 +156,7 @@ def _start_lines(results: dict[str, Any]) -> list[str]:
 NOISES = ("independent", "measured", "circulant")
 SAMPLES, QUICK_SAMPLES = 8192, 4096
 RULE = (
-    "the response keeps all harmonics up to the last one that stands out of the cycle-to-cycle scatter (F-test, "
+    "the response keeps all harmonics up to the last one that exceeds the cycle-to-cycle scatter (F-test, "
     "false-alarm rate 1 % over all harmonics); the drive keeps its lines, up to 200 Hz"
 )
 
@@ -231,7 +229,7 @@ def collect(
 
 
 def by_noise(experiment: bp.Experiment, fits: dict[str, bp.MapEstimate]) -> dict[str, Any]:
-    """Return what the noise models lead to, side by side."""
+    """Return the results of the noise models."""
     return {
         "harmonics": experiment.harmonics["response"],
         "status": {noise: f.status for noise, f in fits.items()},

@@ -1,6 +1,6 @@
-"""What a solve costs: against LAPACK on the same matrices, after a small change, with size, and on several cores.
+"""Time of a periodic solve: relative to LAPACK on the same matrices, after a small change, with size, on several cores.
 
-This is the one module of the studies that looks inside the package: it times single Newton iterations.
+This is the one study module that imports the solver's internals, because it times single Newton iterations.
 """
 
 import time
@@ -41,7 +41,7 @@ def run_cost(quick: bool = False) -> dict[str, Any]:
 
 
 def checks(cost: dict[str, Any]) -> list[tuple[str, float, float, float]]:
-    """Return what the measurements should show: what, the value found, and the limits allowed."""
+    """Return the targets: name, value found and limits."""
     rows = []
     for entry in cost["newton_iteration"]:
         what = f"Newton iteration / (sweep + gbtrf + gbtrs), {entry['drive']}, {entry['scheme']}"
@@ -76,8 +76,8 @@ def gear_equations(drive: str, scheme: str) -> list[PeriodicEquations]:
 def newton_iteration(drive: str, scheme: str, repeats: int) -> dict[str, Any]:
     """Compare one Newton iteration with one sweep plus LAPACK's gbtrf and gbtrs on the same folded band.
 
-    The iteration is the time of a solve from a guess 0.1 % off over its iterations, so it carries its share of what a
-    solve does once. The copy that gbtrf needs, because it overwrites the band, is timed alone and taken off.
+    The iteration is the time of a solve from a guess 0.1 % off over its iterations, so it includes its share of the
+    set-up of a solve. The copy that gbtrf needs, because it overwrites the band, is timed alone and subtracted.
     """
     theta = np.array(list(GEAR.values()))
     measured = []
@@ -130,7 +130,7 @@ def newton_iteration(drive: str, scheme: str, repeats: int) -> dict[str, Any]:
 
 
 def _prepared(equations: PeriodicEquations, theta: np.ndarray, guess: np.ndarray) -> tuple[Callable[[], Any], int]:
-    """Return a solve from a guess with its work arrays at hand, and how many Newton iterations it takes."""
+    """Return a solve from a guess with preallocated work arrays, and its number of Newton iterations."""
     z, grid = guess.copy(), equations.grid
     states, columns = equations.states(z), equations.residual_jacobian(z, theta)
     history, factors = np.empty((equations.kernels.MAX_ITERATIONS, 3)), empty_factors(grid, equations.count)
@@ -219,7 +219,7 @@ def with_samples(sizes: tuple[int, ...], repeats: int) -> dict[str, Any]:
 
 
 def with_systems(repeats: int, systems: int = 512) -> dict[str, Any]:
-    """Compare what both cores gain on a batch of solves with what they gain on a plain compute loop in the same run."""
+    """Compare the gain of both cores on a batch of solves with that on a plain loop in the same run."""
     theta = np.array(list(GEAR.values()))
     (equations,) = gear_equations("force", "backward2")[8:9]
     z = equations.solve(theta, equations.static_guess(theta)).z

@@ -1,7 +1,7 @@
 """The periodic solver against independent references: orders, unstable and rotating orbits, branches with their folds.
 
-Nothing is measured here; all is computed from the models' equations. The references come from multiple shooting and
-Taylor series that share no code with the package; studies/shooting.py states their accuracy.
+All data are computed from the models' equations. The references come from multiple shooting and Taylor series that
+share no code with the package; studies/shooting.py states their accuracy.
 """
 
 import argparse
@@ -263,7 +263,7 @@ def follow_pendulum(quick: bool) -> tuple[dict[int, bp.Branch], dict[str, Any]]:
 def first(points: tuple[bp.PeriodicSolution, ...], where: str) -> bp.PeriodicSolution:
     """Return the first of the special points of a branch."""
     if not points:
-        raise RuntimeError(f"pendulum, {where}: the fold or period doubling that must be there was not found.")
+        raise RuntimeError(f"pendulum, {where}: the fold or period doubling was not found.")
     return points[0]
 
 
@@ -442,7 +442,7 @@ def draw_orders(forced: dict[str, Any], periods: dict[str, Any]) -> Figure:
 
 
 def checks(results: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return what must show: the value found and the limits allowed."""
+    """Return the targets: value found and limits."""
     orders, pendulum, periods = results["orders"], results["pendulum"], results["van_der_pol"]
     rows: list[tuple[str, float, float, float]] = []
     for kind in ("forced", "manufactured"):
@@ -471,7 +471,7 @@ def checks(results: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def verdict(what: str, found: float, low: float, high: float) -> dict[str, Any]:
-    """Return a check as results.json holds it."""
+    """Return a check as an entry of results.json."""
     return {"what": what, "found": found, "low": low, "high": high, "met": bool(low <= found <= high)}
 
 
@@ -481,7 +481,7 @@ def at(entry: dict[str, Any], samples: int, what: str = "errors") -> float:
 
 
 def tables(results: dict[str, Any]) -> str:
-    """Return the account that the study prints."""
+    """Return the text to print."""
     pendulum, lines = results["pendulum"], []
     doublings = {
         f"from period {p} to {2 * int(p)}": {
@@ -526,7 +526,7 @@ def tables(results: dict[str, Any]) -> str:
     for e in results["duffing"]:
         folds = " and ".join(f"{f:.6f} Hz" for f in sorted(e["folds"])) or "none"
         lines.append(f"  force {e['force']:g} N: {folds}")
-    for title, rows in (("What must show", results["checks"]), ("What it costs", results["cost"]["checks"])):
+    for title, rows in (("Targets", results["checks"]), ("Cost", results["cost"]["checks"])):
         verdicts = [
             {
                 "": "yes" if c["met"] else "NO",

@@ -1,9 +1,9 @@
-"""The gallery: small models with stated truths, synthetic data, and what has to be said of every parameter.
+"""Gallery of small models with known truths, synthetic data, and the expected verdicts on every parameter.
 
-Where only the noise of one run stands between a parameter and its sign, one data set in twenty shows the sign by luck.
-So the case with an open sign has an unknown delay of the recording, which acts as a damping, and the one with a
-truncated posterior a prior whose end lies about two standard errors short of the truth: there the answer is known
-for every data set.
+If only the noise of one run obscured the sign of a parameter, one data set in twenty would show the sign by chance.
+The case with an undetermined sign therefore has an unknown delay of the recording, which acts as damping, and the one
+with a truncated posterior has a prior that ends about two standard errors below the truth: the correct verdict is then
+known for every data set.
 """
 
 import zlib
@@ -29,12 +29,12 @@ Expected = Mapping[str, Mapping[str, tuple[str, ...]]]
 
 @dataclass(frozen=True)
 class Case:
-    """A case whose answer is known.
+    """A case with known verdicts.
 
-    `fault`: By tool, the parameters whose verdicts name the fault; empty where nothing is wrong.
+    `fault`: By tool, the parameters whose verdicts name the fault; empty if there is no fault.
     """
 
-    title: str  # What is wrong, in words
+    title: str  # The fault, in words
     truth: Mapping[str, float]  # Of every parameter, also of those that the fitted model lacks
     problem: Callable[[int], bp.Problem]  # Makes the problem of a data seed
     shown: str  # The parameter of the figure

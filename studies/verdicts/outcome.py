@@ -1,4 +1,4 @@
-"""What the diagnoses say of one data set of a case, and whether they are right."""
+"""Verdicts of the diagnostics on one data set of a case, and whether they are correct."""
 
 import time
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ GOOD = {IDENTIFIABILITY: DETERMINED, COMPARE: FINE, JOINT: FINE, PREDICT: ADEQUA
 
 @dataclass(frozen=True)
 class Drawn:
-    """Draws, and what is said from them."""
+    """Draws and the verdicts based on them."""
 
     posterior: bp.Posterior
     comparison: bp.Comparison
@@ -33,7 +33,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Estimate, draws, and what every tool says of them."""
+    """Estimate, draws and the verdicts of every tool."""
 
     case: Case
     problem: bp.Problem
@@ -44,9 +44,9 @@ class Outcome:
 
     @property
     def drawn(self) -> Drawn:
-        """Draws and what is said from them, where there are any."""
+        """Draws and the verdicts based on them, if any."""
         if self.sampled is None:
-            raise ValueError("drawless: there are no draws here.")
+            raise ValueError("drawless: requires draws, which this case does not have.")
         return self.sampled
 
     @property
@@ -61,42 +61,42 @@ class Outcome:
 
     @property
     def wrong(self) -> dict[str, str]:
-        """What is not as expected, by tool and parameter."""
-        said = self.verdicts
+        """Unexpected verdicts, by tool and parameter."""
+        verdicts = self.verdicts
         return {
-            f"{tool} {name}": said[tool][name]
+            f"{tool} {name}": verdicts[tool][name]
             for tool, rows in self.case.expected.items()
-            if tool in said
+            if tool in verdicts
             for name, allowed in rows.items()
-            if said[tool][name] not in allowed
+            if verdicts[tool][name] not in allowed
         }
 
     @property
     def named(self) -> bool:
-        """Whether the fault is named by the tools that must; True where there is none."""
+        """Whether the expected tools name the fault; True if there is no fault."""
         faulty = {f"{tool} {name}" for tool, names in self.case.fault.items() for name in names}
         return not faulty & set(self.wrong)
 
     @property
     def warned(self) -> bool:
-        """Whether any tool says anything but that all is well."""
+        """Whether any tool reports a problem."""
         return any(verdict != GOOD[tool] for tool, rows in self.verdicts.items() for verdict in rows.values())
 
     @property
     def converged(self) -> bool:
-        """Of the estimate, and of the draws where there are any."""
+        """Convergence of the estimate, and of the draws if any."""
         return self.fit.converged and (self.sampled is None or self.sampled.posterior.converged)
 
     @property
     def p_values(self) -> dict[str, dict[str, float]]:
-        """Of the discrepancy tests, by row of the prediction; those that are not possible left out."""
+        """p-values of the possible discrepancy tests, by row of the prediction."""
         table = self.drawn.prediction.table.select_dtypes("number")
         return {
             str(row): {str(c): float(v) for c, v in values.items() if pd.notna(v)} for row, values in table.iterrows()
         }
 
     def line(self) -> dict[str, Any]:
-        """Return what is kept of a replicate."""
+        """Return the stored results of a replicate."""
         return {
             "right": not self.wrong,
             "named": self.named,
@@ -110,7 +110,7 @@ class Outcome:
 
 
 def examine(name: str, data_seed: int, sampler_seed: int, *, drawless: bool = False) -> Outcome:
-    """Return what is said of the data of one seed, sampled with another; drawless as far as the case allows it."""
+    """Return the verdicts on the data of one seed, sampled with another seed, without draws if the case allows it."""
     start, case = time.perf_counter(), CASES[name]()
     problem = case.problem(data_seed)
     fit = bp.map_estimate(problem, progress=False)
@@ -124,7 +124,7 @@ def examine(name: str, data_seed: int, sampler_seed: int, *, drawless: bool = Fa
 
 
 def numbers(outcome: Outcome) -> dict[str, Any]:
-    """Return the figures behind the verdicts, Monte Carlo errors as pairs (value, error)."""
+    """Return the numbers behind the verdicts; those with a Monte Carlo error as pairs (value, error)."""
     table = outcome.identifiability.table
     found: dict[str, Any] = {
         str(name): {"contraction": _pair(row, "contraction")} | _signed(row) for name, row in table.iterrows()
@@ -144,6 +144,6 @@ def _signed(row: pd.Series) -> dict[str, list[float | None]]:
 
 
 def _pair(row: Any, column: str) -> list[float | None]:
-    """Return a figure and its Monte Carlo error, to five digits; None for what is not finite."""
+    """Return a number and its Monte Carlo error to five digits, None if not finite."""
     pair = float(row[column]), float(row[f"{column}_mcse"])
     return [float(f"{value:.5g}") if abs(value) < float("inf") else None for value in pair]

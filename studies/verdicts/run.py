@@ -1,11 +1,7 @@
-"""A gallery of cases with known answers, and what the diagnoses say of each: identifiability, compare, predict.
+"""Gallery of cases with known answers, and the verdicts of identifiability, compare and predict on each.
 
 All data are synthetic, with noise. ``--replicates N`` repeats every case on N data sets and samples the first data set
-with up to 20 seeds. Each replicate is saved in replicates.jsonl as it ends, and the same command does the missing ones.
-
-Figures of the gallery of verdicts.
-
-The gallery again and again: other data, other sampler seeds; resumed where it was interrupted.
+with up to 20 seeds. Each replicate is saved in replicates.jsonl as it ends, and the same command computes missing ones.
 """
 
 import argparse
@@ -63,7 +59,7 @@ def replicate(task: Task) -> dict[str, Any]:
 
 
 def _before_sampling(name: str, data_seed: int) -> Outcome:
-    """Return what is said of the data of one seed from the estimate alone."""
+    """Return the verdicts on the data of one seed from the estimate alone."""
     start, case = time.perf_counter(), CASES[name]()
     problem = case.problem(data_seed)
     fit = bp.map_estimate(problem, progress=False)
@@ -71,14 +67,14 @@ def _before_sampling(name: str, data_seed: int) -> Outcome:
 
 
 def source() -> str:
-    """Return what tells replicates of other cases, or of another version, apart."""
+    """Return a key that identifies version and cases of the replicates."""
     files = [Path(str(module.__file__)) for module in (cases, verdicts_outcome)]
     text = common.versions()["bayesperiodic"] + "".join(common.sha256(path) for path in files)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def replicates(folder: Path, names: Sequence[str], count: int, seed: int) -> list[dict[str, Any]]:
-    """Do the replicates that the file in the folder lacks, and return all of them."""
+    """Compute the replicates missing from the file in the folder, and return all of them."""
     tasks: list[Task] = []
     for number in range(count):
         tasks += [(name, DATA, number, seed) for name in names]
@@ -119,13 +115,13 @@ def _counts(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _flips(lines: Sequence[Mapping[str, Any]], outcome: Outcome) -> dict[str, list[str]]:
-    """Return the verdicts, of those that are expected, that are not the same for every sampler seed."""
-    said: dict[str, set[str]] = {}
+    """Return the expected verdicts that differ between sampler seeds."""
+    by_name: dict[str, set[str]] = {}
     for line in lines:
         for tool, rows in outcome.case.expected.items():
             for name in rows if tool in line.get("verdicts", {}) else ():
-                said.setdefault(f"{tool} {name}", set()).add(line["verdicts"][tool][name])
-    return {what: sorted(verdicts) for what, verdicts in said.items() if len(verdicts) > 1}
+                by_name.setdefault(f"{tool} {name}", set()).add(line["verdicts"][tool][name])
+    return {what: sorted(verdicts) for what, verdicts in by_name.items() if len(verdicts) > 1}
 
 
 def account_of_replicates(found: Mapping[str, Any]) -> str:
@@ -160,7 +156,7 @@ def figures(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
 
 
 def gallery(outcomes: Mapping[str, Outcome]) -> Figure:
-    """Draw, for every case, the marginal of one parameter and what was said of it."""
+    """Draw for every case the marginal of one parameter and its verdicts."""
     from matplotlib import pyplot as plt
 
     figure = plt.figure(figsize=(11.0, 1.55 * len(outcomes) + 0.7), layout="constrained")
@@ -197,14 +193,14 @@ def _marginal(axes: Axes, outcome: Outcome) -> None:
 
 
 def _words(axes: Axes, outcome: Outcome) -> None:
-    """Write what is wrong and what was said, the verdict that names the fault in bold."""
-    case, said = outcome.case, outcome.verdicts
+    """Write the fault and the verdicts, with the verdict that names the fault in bold."""
+    case, verdicts = outcome.case, outcome.verdicts
     axes.set_axis_off()
     axes.text(0.0, 1.0, textwrap.fill(f"wrong: {case.title}", WIDTH), va="top", fontsize=11, weight="bold")
     rows = {
-        IDENTIFIABILITY: _grouped(said[IDENTIFIABILITY]),
-        COMPARE: _grouped(said[COMPARE]),
-        PREDICT: said[PREDICT]["all"],
+        IDENTIFIABILITY: _grouped(verdicts[IDENTIFIABILITY]),
+        COMPARE: _grouped(verdicts[COMPARE]),
+        PREDICT: verdicts[PREDICT]["all"],
     }
     for place, (tool, text) in zip((0.66, 0.40, 0.14), rows.items(), strict=True):
         bold = tool in case.fault
@@ -216,7 +212,7 @@ def _words(axes: Axes, outcome: Outcome) -> None:
 
 
 def _grouped(verdicts: Mapping[str, str]) -> str:
-    """Return verdicts in words, parameters with the same one together."""
+    """Return verdicts as text, grouped by verdict."""
     members: dict[str, list[str]] = {}
     for name, verdict in verdicts.items():
         members.setdefault(verdict, []).append(name)
@@ -229,7 +225,7 @@ QUICK = ("product_ridge", "linear", "prior_dominated", "misspecified")
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
     if options.replicates < 0:
-        raise ValueError(f"--replicates: {options.replicates} is not allowed; it must be at least 0.")
+        raise ValueError(f"--replicates: must be at least 0, got {options.replicates}.")
     watch = common.Stopwatch()
     print("All data are SYNTHETIC: simulated from the stated truths, with noise.")
     outcomes: dict[str, Outcome] = {}
@@ -276,8 +272,8 @@ def collect(outcome: Outcome) -> dict[str, Any]:
 
 
 def account(outcome: Outcome) -> str:
-    """Return what is printed of a case."""
-    said = [f"{tool}: {', '.join(f'{n} {v}' for n, v in rows.items())}" for tool, rows in outcome.verdicts.items()]
+    """Return the text to print on a case."""
+    verdicts = [f"{tool}: {', '.join(f'{n} {v}' for n, v in rows.items())}" for tool, rows in outcome.verdicts.items()]
     verdict = f"WRONG ({outcome.wrong})" if outcome.wrong else "right"
-    lines = [f"  fault: {outcome.case.title}; every verdict {verdict}; {outcome.drawn.posterior.reason}", *said]
+    lines = [f"  fault: {outcome.case.title}; every verdict {verdict}; {outcome.drawn.posterior.reason}", *verdicts]
     return "\n    ".join(lines)

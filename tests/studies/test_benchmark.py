@@ -201,7 +201,7 @@ def test_a_quick_run_writes_table_and_figure(tmp_path, capsys, setting, monkeypa
     assert main(["benchmark", "--quick", "--out", str(tmp_path)]) == 0
     results = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     printed = capsys.readouterr().out
-    assert "SYNTHETIC" in printed and "dgbtrf" in printed and "What must show" in printed
+    assert "SYNTHETIC" in printed and "dgbtrf" in printed and "Targets" in printed
     assert (tmp_path / "benchmark.png").stat().st_size > 1000
     floor = results["floor"][problems.FORCE]["schemes"]["central4"]
     assert floor["same_grid_error"] < 1e-4 and floor["floor_us"]["sum"]["median"] > 0.0

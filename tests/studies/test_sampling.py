@@ -37,7 +37,7 @@ def test_ridge_shows_all_that_it_must_even_in_a_quick_run(done):
     assert len(cut) >= 6 and all(check["met"] for check in cut)
     assert results["ridge"]["natural"]["converged"] is False
     assert "max_steps = 500 reached with" in results["ridge"]["natural"]["reason"]
-    assert "What must show" in printed and "quadrature" in printed
+    assert "Targets" in printed and "quadrature" in printed
 
 
 @pytest.mark.slow
