@@ -21,7 +21,7 @@ from bayesperiodic.posterior.labels import local_names
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.coordinates import SamplingDensity
 from bayesperiodic.sampling.posterior import Posterior
-from bayesperiodic.symmetry.structure import Structure, analysed
+from bayesperiodic.symmetry.structure import Structure, analyse_structure
 from bayesperiodic.symmetry.system import system_of
 
 
@@ -55,7 +55,7 @@ def _structure(
     for _ in ties:
         ties = {symbol: expression.subs(ties | values) for symbol, expression in ties.items()}
     system = system_of(model, outputs)
-    return analysed(model.name, system.given(known, values | ties), known)
+    return analyse_structure(model.name, system.given(known, values | ties), known)
 
 
 POWER = 1.25

@@ -1,1 +1,1 @@
-"""Structural identifiability: symmetries of a model."""
+"""Structural identifiability by symmetries of the equations."""

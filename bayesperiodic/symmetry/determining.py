@@ -1,4 +1,4 @@
-"""Linear algebra modulo a prime: exact ranks of matrices of polynomials, at random values of their symbols."""
+"""Determining equations of Lie symmetries, solved by exact linear algebra modulo a prime and over the rationals."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -59,14 +59,14 @@ def independent_rows(matrix: np.ndarray) -> list[int]:
 def circuits(vectors: np.ndarray, weights: np.ndarray, tries: int = 200) -> list[tuple[int, ...]]:
     """Return supports of combinations of the vectors that contain no smaller support, the lightest first.
 
-    Every reduced echelon form consists of such combinations; forms for `tries` random orders of the columns are taken,
-    from a fixed seed.
+    Every reduced echelon form consists of such combinations; forms for `tries` random orders of the columns, from a
+    fixed seed, are used.
     """
     random = np.random.default_rng(0)
     found: set[tuple[int, ...]] = set()
     columns = vectors.shape[1]
     for trial in range(tries if len(vectors) > 1 else 1):
-        # Heavy columns come first as pivots, so that each appears in one row only.
+        # Heavy columns are the first pivots, so that each appears in one row only.
         order = np.lexsort((random.permutation(columns), -weights)) if trial % 2 else random.permutation(columns)
         for row in reduced(vectors[:, order])[0]:
             found.add(tuple(sorted(int(c) for c in order[np.flatnonzero(row)])))
@@ -81,8 +81,8 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return total
 
 
-def whole_circuits(vectors: np.ndarray, weights: np.ndarray) -> list[np.ndarray]:
-    """Return the combinations of whole-number vectors of `circuits`, in the smallest whole numbers."""
+def integer_circuits(vectors: np.ndarray, weights: np.ndarray) -> list[np.ndarray]:
+    """Return the combinations of integer vectors of `circuits`, in the smallest integers."""
     found = []
     for support in circuits(vectors, weights) if len(vectors) else []:
         rest = [c for c in range(vectors.shape[1]) if c not in support]
@@ -95,7 +95,7 @@ def whole_circuits(vectors: np.ndarray, weights: np.ndarray) -> list[np.ndarray]
 
 
 def integer_rows(matrix: DomainMatrix) -> np.ndarray:
-    """Return the rows of a rational matrix, each times the smallest number that makes it whole."""
+    """Return the rows of a rational matrix, scaled to integers without common factor."""
     rows = matrix.to_Matrix()
     result = np.zeros(rows.shape, dtype=np.int64)
     for i in range(rows.shape[0]):
@@ -107,17 +107,17 @@ def integer_rows(matrix: DomainMatrix) -> np.ndarray:
 
 
 class Algebra:
-    """The field of rational functions in which given expressions live.
+    """Field of rational functions that contains given expressions.
 
-    Transcendental functions and roots are variables of their own, so that two expressions are equal if their elements
-    are; only sin² + cos² = 1, cosh² − sinh² = 1, sign² = 1 and the powers of roots are known relations. The converse
-    holds unless the expressions contain other relations, such as tan = sin/cos. Denominators under roots are positive.
+    Transcendental functions and roots are represented by variables. Two expressions are equal if their elements are.
+    The converse holds for the relations sin² + cos² = 1, cosh² − sinh² = 1, sign² = 1 and powers of roots, not for
+    others such as tan = sin/cos. Denominators under roots are assumed to be positive.
 
     Parameters
     ----------
     expressions : iterable of expressions
     moving : iterable of symbols
-        What varies along a motion. The coefficients of its powers are polynomials of the other symbols.
+        Symbols that vary along a motion. Coefficients of their powers are polynomials of the other symbols.
     """
 
     def __init__(self, expressions: Iterable[sp.Expr], moving: Iterable[sp.Symbol]):
@@ -129,18 +129,18 @@ class Algebra:
         used = set().union(*(e.free_symbols for e in (*replaced, *self._relations)))
         plain = sorted(used - set(self._symbols.values()), key=str)
         generators = [*reversed(self._symbols.values()), *plain]
-        # Those that vary come first; functions before what they contain, so that relations can be eliminated.
+        # Varying symbols come first, and functions before their arguments, so that relations can be eliminated.
         self.generators = sorted(generators, key=lambda s: s not in self._moving)
         self.size = sum(s in self._moving for s in self.generators)
         self.field = field(self.generators or [sp.Dummy("one")], sp.QQ, "lex")[0]
         self._divisors = [self.field.from_expr(r).numer for r in self._relations]
 
     def element(self, expression: sp.Expr) -> Any:
-        """Return the element of the field; it must not contain functions that the given expressions did not."""
+        """Return the field element of an expression whose functions occur in the given expressions."""
         return self.field.from_expr(self._replaced(expression))
 
     def numerators(self, expressions: Sequence[sp.Expr]) -> list[Any]:
-        """Return polynomials in the ratios of the expressions, their relations eliminated."""
+        """Return polynomials proportional to the expressions, reduced by the relations."""
         elements = [self.element(e) for e in expressions]
         common = reduce(lambda a, b: a.lcm(b), (e.denom for e in elements))
         found = [e.numer * common.exquo(e.denom) for e in elements]
@@ -151,14 +151,14 @@ class Algebra:
         return not self.numerators([expression])[0]
 
     def split(self, polynomial: Any) -> dict[tuple[int, ...], dict[tuple[int, ...], Any]]:
-        """Return {powers of what varies: {powers of the other generators: coefficient}}."""
+        """Return {powers of the varying symbols: {powers of the other generators: coefficient}}."""
         parts: dict[tuple[int, ...], dict[tuple[int, ...], Any]] = {}
         for powers, coefficient in polynomial.terms():
             parts.setdefault(powers[: self.size], {})[powers[self.size :]] = coefficient
         return parts
 
     def original(self, expression: sp.Expr) -> sp.Expr:
-        """Return an expression of the generators with the functions in the place of their variables."""
+        """Return an expression with the variables replaced by the functions that they represent."""
         back = {symbol: function for function, symbol in self._symbols.items()}
         while expression.free_symbols & set(back):
             expression = expression.xreplace(back)
@@ -221,16 +221,16 @@ Polynomial = dict[tuple[int, ...], Any]
 
 @dataclass(frozen=True)
 class Term:
-    """A direction in which a parameter or a state may move.
+    """Basis element of the infinitesimal transformations of one parameter or state.
 
     Attributes
     ----------
     name : str
-        Of the parameter or state.
+        Name of the parameter or state.
     moves : expression
-        1 for a parameter; for a state what multiplies the unknown coefficient: 1, a state, or an input.
+        Factor of the unknown coefficient: 1 for a parameter; 1, a state, or an input for a state.
     field : dict
-        The move of every symbol, derivatives of the state included.
+        Symbol -> change, including the derivatives of the state.
     is_parameter : bool
     """
 
@@ -240,17 +240,18 @@ class Term:
     is_parameter: bool
 
     def applied(self, expression: sp.Expr) -> sp.Expr:
-        """Return the change of an expression."""
-        return sp.Add(*(move * derivative(expression, symbol) for symbol, move in self.field.items()))
+        """Return the Lie derivative of an expression."""
+        return lie_derivative(self.field, expression)
 
 
-def derivative(expression: sp.Expr, symbol: sp.Symbol) -> sp.Expr:
-    """Return the derivative away from corners, where signs do not change."""
-    return sp.diff(expression, symbol).replace(sp.DiracDelta, lambda *_: sp.S.Zero)
+def lie_derivative(field: Mapping[sp.Symbol, sp.Expr], expression: sp.Expr) -> sp.Expr:
+    """Return the derivative of an expression along a vector field, away from kinks."""
+    slopes = {s: sp.diff(expression, s).replace(sp.DiracDelta, lambda *_: sp.S.Zero) for s in field}
+    return sp.Add(*(move * slopes[symbol] for symbol, move in field.items()))
 
 
 def terms_of(system: System) -> list[Term]:
-    """Return all directions: every parameter, and every state by terms affine in the states and inputs."""
+    """Return the basis: every parameter, and every state with terms affine in the states and inputs."""
     found = [Term(n, sp.S.One, {s: sp.S.One}, True) for n, s in system.parameters.items()]
     signals = [(n, order) for n, order in system.orders.items()] + [(n, 2) for n in system.inputs]
     for state, order in system.orders.items():
@@ -265,10 +266,10 @@ def terms_of(system: System) -> list[Term]:
 
 @dataclass(frozen=True)
 class Determining:
-    """Σ_k z_k (X_k g) − Λ g = 0 and Σ_k z_k (X_k y) = 0 for all motions: linear in z and Λ, at every θ.
+    """Determining equations Σ_k z_k (X_k g) − Λ g = 0 and Σ_k z_k (X_k y) = 0, linear in z and Λ at every θ.
 
-    The arguments of signs must keep their sign, which gives rows like those of g. Coefficients of different powers of
-    what varies must vanish one by one.
+    The arguments of signs must keep their signs, which gives further rows like those of g. The coefficients of all
+    powers of the varying symbols must vanish separately.
 
     Attributes
     ----------
@@ -278,7 +279,7 @@ class Determining:
     rows : tuple of dict
         Column -> {powers of the parameters: coefficient}.
     multipliers : tuple of bool
-        The other columns: whether a multiplier is on the diagonal of Λ.
+        The other columns: whether the element of Λ is on its diagonal.
     """
 
     terms: tuple[Term, ...]
@@ -306,9 +307,9 @@ class Determining:
         return matrix
 
     def solution(self, support: Iterable[int]) -> dict[int, sp.Expr]:
-        """Return the z that vanishes outside the support, multipliers left out, in polynomials without common factor.
+        """Return the z that vanishes outside the support, as polynomials without common factor.
 
-        The support must be one for which z is unique up to a factor.
+        The support must determine z up to a factor.
         """
         own = sorted(support)
         columns = [*own, *range(len(self.terms), self.matrix.shape[1])]
@@ -343,7 +344,7 @@ def determining_equations(system: System) -> Determining:
 
 
 def _coefficients(row: dict[int, sp.Expr], algebra: Algebra) -> list[dict[int, Polynomial]]:
-    """Return what multiplies each power of what varies in a row."""
+    """Return the coefficients of each power of the varying symbols in a row."""
     parts: dict[tuple[int, ...], dict[int, Polynomial]] = {}
     for column, polynomial in zip(row, algebra.numerators(list(row.values())), strict=True):
         for powers, coefficients in algebra.split(polynomial).items():
@@ -362,7 +363,7 @@ def _modulo(polynomial: Polynomial, point: list[int]) -> int:
 
 
 def _primitive(vector: list[sp.Expr]) -> list[sp.Expr]:
-    """Return a multiple of a vector of rational functions: polynomials without a common factor."""
+    """Return the multiple of a vector of rational functions that consists of polynomials without common factor."""
     common = sp.lcm_list([sp.fraction(sp.together(e))[1] for e in vector])
     whole = [sp.cancel(e * common) for e in vector]
     shared = sp.gcd_list([e for e in whole if e != 0])
@@ -379,11 +380,11 @@ class Generator:
     Attributes
     ----------
     parameters, states : dict
-        Name -> move, of those that move.
+        Name -> change, of those that change.
     field : dict
-        Symbol -> move, derivatives of the states included.
+        Symbol -> change, including derivatives of the states.
     weights : dict or None
-        Name -> whole number, if every move is that multiple of the parameter or state itself.
+        For scalings, name -> integer ratio of the change to the parameter or state.
     """
 
     parameters: dict[str, sp.Expr]
@@ -392,11 +393,11 @@ class Generator:
     weights: dict[str, int] | None = None
 
     def applied(self, expression: sp.Expr) -> sp.Expr:
-        """Return the change of an expression."""
-        return sp.Add(*(move * derivative(expression, symbol) for symbol, move in self.field.items()))
+        """Return the Lie derivative of an expression."""
+        return lie_derivative(self.field, expression)
 
     def times(self, factor: sp.Expr) -> "Generator":
-        """Return the generator with all its moves multiplied by a function of the parameters."""
+        """Return the generator multiplied by a function of the parameters."""
         parts = [{k: sp.factor(v * factor) for k, v in part.items()} for part in _parts(self)]
         return Generator(*parts)
 
@@ -410,7 +411,7 @@ class Generator:
 
 
 def generators_of(equations: Determining) -> list[Generator]:
-    """Return symmetries that move parameters, as many as are independent of each other at generic values."""
+    """Return a maximal set of symmetries of the parameters that are independent at generic values."""
     scalings = _scalings(equations)
     moves = _moves_of_parameters(equations, scalings)
     count = len(equations.terms)
@@ -432,7 +433,7 @@ def generators_of(equations: Determining) -> list[Generator]:
 
 
 def _scalings(equations: Determining) -> list[dict[int, int]]:
-    """Return {term: weight} of independent symmetries that multiply parameters and states by powers of one number."""
+    """Return {term: weight} of independent scalings of parameters and states."""
     terms, rows = equations.terms, equations.rows
     columns = [k for k, t in enumerate(terms) if t.is_parameter or t.moves == _own(equations, k)]
     diagonal = [len(terms) + j for j, on in enumerate(equations.multipliers) if on]
@@ -452,7 +453,7 @@ def _scalings(equations: Determining) -> list[dict[int, int]]:
     parameters = [place for place, k in enumerate(columns) if terms[k].is_parameter]
     found: list[dict[int, int]] = []
     taken = np.empty((0, len(parameters)), dtype=np.int64)
-    for vector in whole_circuits(whole, heavy):
+    for vector in integer_circuits(whole, heavy):
         if rank(np.concatenate([taken, vector[None, parameters]])) > len(taken):
             taken = np.concatenate([taken, vector[None, parameters]])
             found.append({k: int(w) for k, w in zip(columns, vector, strict=False) if w})
@@ -460,7 +461,7 @@ def _scalings(equations: Determining) -> list[dict[int, int]]:
 
 
 def _moves_of_parameters(equations: Determining, scalings: list[dict[int, int]]) -> np.ndarray:
-    """Return how the scalings move the parameters, modulo the prime at the point of the matrix."""
+    """Return the changes of the parameters by the scalings, modulo the prime at the point of the matrix."""
     values = dict(zip(equations.unknowns, equations.point, strict=True))
     parameters = [k for k, term in enumerate(equations.terms) if term.is_parameter]
     rows = [[s.get(k, 0) * values[_own(equations, k)] % PRIME for k in parameters] for s in scalings]
@@ -468,7 +469,7 @@ def _moves_of_parameters(equations: Determining, scalings: list[dict[int, int]])
 
 
 def _own(equations: Determining, term: int) -> sp.Symbol:
-    """Return the symbol of the parameter or state that a term moves."""
+    """Return the symbol of the parameter or state of a term."""
     return next(iter(equations.terms[term].field))
 
 

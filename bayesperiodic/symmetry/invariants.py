@@ -1,4 +1,4 @@
-"""The directions of the parameters to which no output reacts, at one general value: what is determined, what not."""
+"""Unidentifiable directions of the parameters, finite symmetry transformations, and identifiable combinations."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -10,25 +10,25 @@ from sympy.polys.matrices import DomainMatrix
 
 from bayesperiodic.symmetry import determining
 from bayesperiodic.symmetry.determining import Algebra, Generator
-from bayesperiodic.symmetry.system import System, silent_directions
+from bayesperiodic.symmetry.system import System, null_directions
 
 SMALL = 1e-7
 
 
 @dataclass(frozen=True)
 class Directions:
-    """Directions to which no output reacts.
+    """Parameter directions without effect on the outputs.
 
     Attributes
     ----------
     rows : array (directions, parameters)
-        Orthonormal, relative to the values of the parameters.
+        Orthonormal in the logarithms of the parameters.
     names : tuple of str
         The parameters.
     values : dict
-        Symbol -> value, of known parameters too.
+        Symbol -> value, including known parameters.
     points : int
-        Number of values at which sensitivities were computed; 0 if the rows are those of the symmetries.
+        Number of parameter values with sensitivities; 0 if the rows are those of the symmetries.
     unexplained : tuple of str
         Parameters in directions that no symmetry explains.
     """
@@ -45,17 +45,17 @@ class Directions:
         return [n for n, column in zip(self.names, self.rows.T, strict=True) if np.any(np.abs(column) > SMALL)]
 
     def alone(self, name: str) -> bool:
-        """Return whether a parameter moves by itself."""
+        """Return whether a parameter can change without any other."""
         column = self.names.index(name)
         return _rank(np.delete(self.rows, column, axis=1)) < len(self.rows)
 
     def partners(self, name: str) -> list[str]:
-        """Return the other parameters that stand still whenever one does."""
+        """Return the other parameters that are fixed if this one is."""
         columns = dict(zip(self.names, self.rows.T, strict=True))
         return [n for n in self.moved if n != name and _rank(np.array([columns[name], columns[n]])) == 1]
 
     def smallest_set(self) -> tuple[str, ...]:
-        """Return the first parameters that, once known, leave no direction."""
+        """Return the first parameters that, if fixed, leave no direction."""
         chosen: list[int] = []
         for column in range(len(self.names)):
             if _rank(self.rows[:, [*chosen, column]]) > len(chosen):
@@ -63,21 +63,21 @@ class Directions:
         return tuple(self.names[column] for column in chosen)
 
     def slope(self, expression: sp.Expr, symbols: Sequence[sp.Symbol]) -> np.ndarray:
-        """Return the derivatives of an expression by the logarithms of parameters, its largest one ±1."""
+        """Return the derivatives of an expression with respect to log-parameters, the largest one scaled to ±1."""
         slope = np.array([float((s * sp.diff(expression, s)).subs(self.values)) for s in symbols])
         return slope / max(np.abs(slope).max(initial=0.0), np.finfo(float).tiny)
 
-    def leave(self, expression: sp.Expr, symbols: Sequence[sp.Symbol]) -> bool:
-        """Return whether an expression of the parameters does not change along any direction."""
+    def preserve(self, expression: sp.Expr, symbols: Sequence[sp.Symbol]) -> bool:
+        """Return whether an expression is constant along all directions."""
         return bool(np.all(np.abs(self.rows @ self.slope(expression, symbols)) < SMALL))
 
 
 def directions_of(system: System, generators: Sequence[Generator]) -> Directions:
-    """Return the directions of the fewest sensitivities, or those of the symmetries where there are none."""
+    """Return the smallest set of directions by sensitivities, or those of the symmetries if there are none."""
     symbols = (*system.parameters.values(), *system.known.values())
     general = {s: 0.5 + (0.618 * k) % 1 for k, s in enumerate(symbols, 1)}
     names = tuple(system.parameters)
-    found = silent_directions(system) if names else []
+    found = null_directions(system) if names else []
     if not found:
         return Directions(_explained(system, generators, general), names, general)
     values, rows = min(found, key=lambda pair: len(pair[1]))
@@ -96,7 +96,7 @@ def _explained(system: System, generators: Sequence[Generator], values: dict[sp.
 
 
 def _has_moving_switches(system: System) -> bool:
-    """Return whether a jump may depend on a parameter in a way that derivatives do not see."""
+    """Return whether the location of a discontinuity may depend on a parameter."""
     switches = set().union(*(e.atoms(sp.sign) for e in (*system.equations, *system.outputs.values())))
     return any(switch.free_symbols & set(system.parameters.values()) for switch in switches)
 
@@ -116,13 +116,13 @@ class Flow:
     Attributes
     ----------
     generator : Generator
-        In the normalisation that the transformation belongs to.
+        Generator in the normalisation of the transformation.
     amount : symbol
-        A factor > 0 for scalings, else a number, any of either sign near zero.
+        Group parameter: a factor > 0 for scalings, otherwise a real number, 0 for the identity.
     images : dict
-        Symbol -> its image, for parameters, states and the states' derivatives that move.
+        Symbol -> image, for parameters, states and derivatives of states that change.
     factor : Matrix or None
-        What the equations are multiplied by; None until the flow is verified.
+        Factor of the transformed equations; None until the flow is verified.
     """
 
     generator: Generator
@@ -136,10 +136,10 @@ class Flow:
 
 
 def flow_of(generator: Generator) -> Flow | None:
-    """Return the finite form of a symmetry, if one of several normalisations has a closed one.
+    """Return the finite transformation of a symmetry, if one of several normalisations has a closed form.
 
-    Scalings are written down; otherwise the Lie series exp(δ X) of every symbol, its reciprocal or its square must
-    end or become an exponential series.
+    The form of scalings is known. For others, the Lie series exp(δ X) of every symbol, its reciprocal or its square
+    must terminate or be an exponential series.
     """
     if generator.weights is not None:
         factor = sp.Symbol("t", positive=True)
@@ -162,7 +162,7 @@ def flow_of(generator: Generator) -> Flow | None:
 
 
 def _with_factor(flow: Flow) -> Flow:
-    """Return the flow in terms of t = exp(δ), where δ appears only so."""
+    """Return the flow in terms of t = exp(δ), if δ appears only in this form."""
     factor = sp.Symbol("t", positive=True)
     images = {s: e.subs(flow.amount, sp.log(factor)) for s, e in flow.images.items()}
     images = {s: _shortest(sp.powsimp(sp.expand_log(e))) for s, e in images.items()}
@@ -212,7 +212,7 @@ def _shortest(expression: sp.Expr) -> sp.Expr:
 
 
 def _series(generator: Generator, start: sp.Expr, amount: sp.Symbol) -> sp.Expr | None:
-    """Return exp(δ X) f if X^(n+1) f is X^n f times a constant of X, perhaps 0, for a small n."""
+    """Return exp(δ X) f if X^(n+1) f = c X^n f for a small n and an invariant c of X, which may be 0."""
     total, term = sp.S.Zero, start
     for order in range(LONGEST):
         following = sp.cancel(generator.applied(term))
@@ -231,9 +231,9 @@ AWKWARD = 5
 
 
 def coefficients_of(system: System) -> dict[sp.Expr, bool]:
-    """Return the coefficients of the equations and outputs, and whether one belongs to a term of the drive.
+    """Return the coefficients of the equations and outputs, and whether each belongs to a forcing term.
 
-    An equation is first divided by the coefficient of its highest derivative. Arguments of functions count as well.
+    An equation is first divided by the coefficient of its highest derivative. Arguments of functions are included.
     """
     highest = [system.symbols["d" * n + s] for s, n in system.orders.items()]
     parameters = (*system.parameters.values(), *system.known.values())
@@ -267,10 +267,10 @@ def combinations_of(
     directions: Directions,
     coefficients: Iterable[sp.Expr],
 ) -> list[sp.Expr]:
-    """Return independent combinations of the parameters that move, which all symmetries leave alone.
+    """Return independent combinations of the undetermined parameters that are invariant under all symmetries.
 
-    Coefficients of the equations come first, then the simplest others. There are as many as parameters that move less
-    the directions in which they do, unless a symmetry has no closed form.
+    Coefficients of the equations come first, then the simplest others. Their number is that of the undetermined
+    parameters minus that of the directions, unless a symmetry has no closed form.
     """
     symbols = tuple(system.parameters.values())
     moving = [system.parameters[n] for n in directions.moved]
@@ -284,7 +284,7 @@ def combinations_of(
     for candidate in dict.fromkeys([*plain, *others]):
         if len(chosen) == wanted:
             break
-        if not directions.leave(candidate, symbols) or any(_normal(g.applied(candidate)) != 0 for g in generators):
+        if not directions.preserve(candidate, symbols) or any(_normal(g.applied(candidate)) != 0 for g in generators):
             continue
         extended = np.vstack([slopes, directions.slope(candidate, moving)])
         if np.linalg.matrix_rank(extended, tol=1e-9) == len(extended):
@@ -296,7 +296,7 @@ def combinations_of(
 def _others(
     system: System, moving: Sequence[sp.Symbol], generators: Sequence[Generator], flows: Sequence[Flow]
 ) -> list[sp.Expr]:
-    """Return monomials that the scalings leave alone, of the parameters after the other symmetries made some zero."""
+    """Return scaling-invariant monomials of the parameters, after the other symmetries set some to zero."""
     rates = {g: _weights_of_parameters(system, g) for g in generators}
     curved = [f.generator for f in flows if len(rates[f.generator]) < len(f.generator.parameters)]
     moved, zero = _with_zeros(system, curved)
@@ -311,13 +311,13 @@ def _others(
     symbols = [system.parameters[n] for n in left]
     products = [
         sp.Mul(*(moved.get(s, s) ** int(power) for s, power in zip(symbols, vector, strict=True)))
-        for vector in determining.whole_circuits(vectors, np.ones(len(left), dtype=np.int64))
+        for vector in determining.integer_circuits(vectors, np.ones(len(left), dtype=np.int64))
     ]
     return [sp.factor(sp.cancel(p)) for p in products]
 
 
 def _weights_of_parameters(system: System, generator: Generator) -> dict[str, int]:
-    """Return whole numbers for the parameters that move as under a scaling, whatever the others and the states do."""
+    """Return integer weights of the parameters that a symmetry scales, regardless of the others and the states."""
     rates = {n: sp.cancel(move / system.parameters[n]) for n, move in generator.parameters.items()}
     best: dict[str, sp.Expr] = {}
     for unit in rates.values():
@@ -331,7 +331,7 @@ def _weights_of_parameters(system: System, generator: Generator) -> dict[str, in
 def _with_zeros(
     system: System, generators: Sequence[Generator]
 ) -> tuple[dict[sp.Symbol, sp.Expr], dict[sp.Symbol, Generator]]:
-    """Return the parameters after one each was made zero along the symmetries, and which by which symmetry."""
+    """Return the parameters after each symmetry set one to zero, and which symmetry set which parameter."""
     moved = {s: s for s in system.parameters.values()}
     zero: dict[sp.Symbol, Generator] = {}
     straight: dict[sp.Symbol, Generator] = {}

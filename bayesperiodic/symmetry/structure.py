@@ -1,4 +1,4 @@
-"""Structural identifiability: which parameters the equations and the measured channels can determine at all."""
+"""Structural identifiability: parameters and combinations that the equations and measured channels can determine."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,25 +24,25 @@ from bayesperiodic.symmetry.system import System, system_of
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A change of parameters, and of states that are not measured, that leaves all measured outputs as they are.
+    """Transformation of parameters, and of states that are not measured, that leaves all measured outputs unchanged.
 
     Attributes
     ----------
     kind : {"scaling", "shift", "other"}
-        "shift" adds a constant to a parameter or a state, and may transform others along with it.
+        "shift" adds a constant to a parameter or a state, and may also transform others.
     parameters : tuple of str
-        Those that change: knowing any one of them removes the symmetry.
+        The parameters that change. Fixing any one of them removes the symmetry.
     generator : dict of str to str
         Parameter or state -> its infinitesimal change.
     transformation : dict of str to str
-        Parameter or state -> its image under the finite transformation, whose amount is `amount`; confirmed by exact
-        substitution in the equations. Empty if no closed form was found.
+        Parameter or state -> its image under the finite transformation with the group parameter `amount`, confirmed by
+        exact substitution in the equations. Empty if no closed form was found.
     amount : str
-        Name of the amount: a factor > 0 of scalings, otherwise a number that is 0 where nothing changes.
+        Name of the group parameter: a factor > 0 for scalings, otherwise a number that is 0 for the identity.
     factor : tuple of tuple of str
-        The matrix that the transformation multiplies the equations by.
+        The matrix by which the transformation multiplies the equations.
     no_help : tuple of str
-        Determined or other parameters that enter the same combinations, but do not remove the symmetry if known.
+        Parameters that enter the same combinations, but do not remove the symmetry if they are fixed.
     """
 
     kind: str
@@ -62,35 +62,35 @@ class Symmetry:
 
 @dataclass(frozen=True)
 class Structure(Result):
-    """Which parameters, and which combinations of them, equations and measured outputs determine at all.
+    """Structural identifiability of a model: the parameters and combinations that the outputs can determine.
 
     Attributes
     ----------
     model : str
-        Its name.
+        Name of the model.
     outputs : tuple of str
-        What is measured.
+        The measured outputs.
     known : tuple of str
-        Parameters taken as known.
+        Parameters assumed to be known.
     table : DataFrame
-        A row a parameter that is not known. verdict: "determined", "only in combination", "not determined" (no
-        combination with it either) or "does not appear"; enters: the combinations (of a determined parameter: the
-        coefficients without undetermined ones) by which it enters; fix: the numbers, from 1, of the symmetries that
-        knowing it removes; partners: others that determine it once one of them is known.
+        One row per unknown parameter. verdict: "determined", "only in combination", "not determined" (in no combination
+        either) or "does not appear"; enters: the combinations that contain it (for a determined parameter, the
+        coefficients without undetermined ones); fix: numbers, from 1, of the symmetries that fixing it removes;
+        partners: other parameters, of which any one determines it if known.
     combinations : tuple of str
-        Independent combinations that are determined, of the parameters that are not; texts that `derive` takes. With
-        directions that are `unexplained`, confirmed along these at random values only.
+        Independent identifiable combinations of the parameters that are not determined; expressions for `derive`. With
+        `unexplained` directions they are confirmed at random values only.
     symmetries : tuple of Symmetry
-        Independent of each other.
+        Independent symmetries.
     to_fix : tuple of str
-        The first parameters, in the model's order, that leave no symmetry once they are known.
+        The first parameters, in the model's order, that remove all symmetries if they are fixed.
     rank : int or None
-        Number of directions of the parameters (without those that do not appear) that the outputs react to, the rank
-        of exact sensitivities at random values of the parameters; None where it could not be computed.
+        Rank of exact sensitivities of the outputs to the parameters that appear, at random parameter values; None if it
+        could not be computed.
     points : int
-        Number of these random values.
+        Number of random parameter values.
     unexplained : tuple of str
-        Parameters in directions that no output reacted to and that no symmetry found explains.
+        Parameters in directions without sensitivity that no symmetry found explains.
 
     Examples
     --------
@@ -141,7 +141,7 @@ class Structure(Result):
         return lines
 
     def _through(self, name: str) -> str:
-        """Return a determined parameter, with what determines it if it enters a combination with others too."""
+        """Return a determined parameter, with the coefficients that determine it if combinations contain it too."""
         terms = str(self.table.at[name, "enters"])
         shared = any(name in symmetry.no_help for symmetry in self.symmetries)
         return f"{name} through {_listed(terms.split('; '), 'and')}" if shared and terms else name
@@ -187,7 +187,7 @@ def written(expression: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
     ----------
     expression : expression
     names : dict
-        Symbol -> name, in the order in which factors and terms are written.
+        Symbol -> name, in the order of factors and terms.
     """
     order = {symbol: place for place, symbol in enumerate(names)}
     number, rest = sp.factor_terms(expression).as_coeff_Mul()
@@ -241,25 +241,26 @@ def _base(base: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
 def structure(
     model: Model, *, outputs: Iterable[str] | None = None, fixed: Mapping[str, float] | Iterable[str] = ()
 ) -> Structure:
-    """Find which parameters, and which combinations of them, can be determined from the measured outputs at all.
+    """Analyse structural identifiability: find the parameters and combinations that the outputs can determine.
 
-    Everything is taken at its best: no noise, no end of data, any inputs, frequencies and motions, and parameters in
-    general position. What is found undetermined here no experiment can determine; the converse needs the data.
+    The analysis assumes unlimited data without noise, arbitrary inputs, frequencies and motions, and generic parameter
+    values. A parameter that is not determined here cannot be determined by any experiment; the converse depends on the
+    data.
 
-    Two searches meet. One is for transformations of the parameters and the states that map solutions to solutions and
-    leave outputs, inputs and time alone (Lie symmetries, as in [1]_ [2]_; those of the states affine in states and
-    inputs). They obey linear equations, solved exactly over the rational functions of the parameters; a finite
-    transformation is accepted only if substitution in the symbolic equations confirms it. The other is the rank of
-    exact sensitivities of the outputs' Taylor coefficients at random values, beyond which no symmetry of any kind can
-    exist [3]_. Where the two add up to the number of parameters, nothing is left open.
+    Two methods are combined. The first finds transformations of parameters and states that map solutions to solutions
+    and leave outputs, inputs and time unchanged: Lie symmetries [1]_ [2]_, affine in states and inputs. They satisfy
+    linear equations, which are solved exactly over the rational functions of the parameters; a finite transformation
+    is accepted only if substitution in the symbolic equations confirms it. The second computes the rank of exact
+    sensitivities of the outputs' Taylor coefficients at random values, which bounds the number of symmetries of any
+    kind [3]_. If the rank and the number of symmetries add up to the number of parameters, the result is complete.
 
     Parameters
     ----------
     model : Model
     outputs : iterable of str, optional
-        The measured ones; by default all.
+        The measured outputs; by default all.
     fixed : iterable of str, or mapping of str to number, optional
-        Parameters that are known. A value of zero removes their terms, any other is taken as general.
+        Known parameters. A value of zero removes their terms; any other value is treated as generic.
 
     Returns
     -------
@@ -272,9 +273,9 @@ def structure(
 
     Notes
     -----
-    "Determined" means up to isolated alternatives: discrete ambiguities, such as the common sign of two factors, are
-    not looked for. A jump (not a corner) whose place depends on a parameter is seen by the symmetries but not by the
-    sensitivities, so that no rank is given then.
+    "Determined" means locally: discrete ambiguities, such as the common sign of two factors, are not searched for.
+    Sensitivities do not detect the dependence of a discontinuity on a parameter (unlike that of a kink), and no rank is
+    returned in this case.
 
     References
     ----------
@@ -298,7 +299,7 @@ def structure(
     for name in measured:
         _checks.one_of("outputs", name, model.outputs)
     if not measured:
-        raise ValueError("outputs: () is not allowed; at least one must be measured.")
+        raise ValueError("outputs: must have at least one name, got none.")
     known = tuple(fixed)
     for name in known:
         _checks.one_of("fixed", name, model.parameters)
@@ -308,12 +309,12 @@ def structure(
     system = whole.given(known, {whole.parameters[name]: sp.S.Zero for name in zeros})
     for name in zeros:
         if any(e.has(sp.zoo, sp.nan, sp.oo) for e in (*system.equations, *system.outputs.values())):
-            raise ValueError(f"fixed: {name} = 0 is not allowed; the equations divide by it.")
-    return analysed(model.name, system, known)
+            raise ValueError(f"fixed: must not be zero if the equations divide by it, got {name} = 0.")
+    return analyse_structure(model.name, system, known)
 
 
-def analysed(name: str, whole: System, known: tuple[str, ...]) -> Structure:
-    """Return the structure of a symbolic system, in which parameters may have been replaced by expressions."""
+def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Structure:
+    """Return the structure of a symbolic system, whose parameters may have been replaced by expressions."""
     system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if n in whole.appearing})
     names = {s: n for n, s in (whole.parameters | whole.known).items()}
     kinds, generators, flows = _symmetries(system)
@@ -339,7 +340,7 @@ def analysed(name: str, whole: System, known: tuple[str, ...]) -> Structure:
 
 
 def _symmetries(system: System) -> tuple[list[str], list[Generator], list[Flow | None]]:
-    """Return the kinds of the symmetries, their generators and, where there is a closed one, their finite forms."""
+    """Return the kinds of the symmetries, their generators and, if there are closed forms, their flows."""
     found = generators_of(determining_equations(system)) if system.parameters else []
     flows = [verified(system, flow) if (flow := flow_of(g)) else None for g in found]
     return (

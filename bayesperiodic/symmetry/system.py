@@ -1,4 +1,4 @@
-"""A model as plain symbolic equations: what is measured, what is unknown, corners written with signs."""
+"""Symbolic equations of a model, their power series, and the directions without sensitivity."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -20,14 +20,14 @@ class System:
     Attributes
     ----------
     orders : dict
-        State -> 1 or 2, of those that the measured outputs depend on; 0 where known parameters removed derivatives.
+        State -> 1 or 2, of those that the measured outputs depend on; 0 if known parameters removed the derivatives.
     inputs : tuple of str
     symbols : dict
         Name -> symbol of states ("x", "dx", "ddx"), inputs (likewise), "tau" and "frequency".
     parameters : dict
-        Name -> symbol, of the unknown ones.
+        Name -> symbol of the unknown parameters.
     known : dict
-        Name -> symbol, of the parameters that are taken as known.
+        Name -> symbol of the known parameters.
     equations : tuple of expression
     outputs : dict
         Name -> expression.
@@ -49,11 +49,11 @@ class System:
 
     @property
     def jets(self) -> tuple[sp.Symbol, ...]:
-        """States, inputs, their derivatives, tau and frequency: all that varies along a motion or between them."""
+        """Jet variables: states, inputs, their derivatives, tau and frequency."""
         return tuple(self.symbols.values())
 
     def given(self, known: Iterable[str], values: Mapping[sp.Symbol, sp.Expr]) -> "System":
-        """Return the system with parameters taken as known and expressions put in the place of parameters."""
+        """Return the system with known parameters, and with parameters replaced by expressions."""
         taken = {self.parameters[name] for name in known} | set(values)
         return _observed(
             replace(
@@ -83,10 +83,7 @@ def system_of(model: Model, outputs: Iterable[str]) -> System:
 
 
 def _observed(system: System) -> System:
-    """Return the system without the states and equations that no measured output depends on.
-
-    The orders are those that are left where a highest derivative lost its factor.
-    """
+    """Return the system without the states and equations that no measured output depends on; update the orders."""
     used = set().union(*(e.free_symbols for e in (*system.equations, *system.outputs.values())))
     left = {s: max((k for k in range(3) if system.symbols["d" * k + s] in used), default=0) for s in system.orders}
     system = replace(system, orders=left)
@@ -110,7 +107,7 @@ def _observed(system: System) -> System:
 
 
 def _with_signs(expression: sp.Expr) -> sp.Expr:
-    """Return the expression with exact numbers, and its corners and branches as sums of signs."""
+    """Return the expression with exact numbers, and with kinks and branches written as sums of signs."""
     exact = sp.nsimplify(expression, rational=True)
     exact = exact.replace(sp.Piecewise, _pieces).replace(sp.Heaviside, lambda x, *_: (1 + sp.sign(x)) / 2)
     exact = exact.replace(lambda e: isinstance(e, sp.Max | sp.Min), lambda e: e.rewrite(sp.Abs))
@@ -126,7 +123,7 @@ def _pieces(*pieces: Any) -> sp.Expr:
 
 
 def _weight(condition: Any) -> sp.Expr:
-    """Return 1 where the condition holds and 0 where it does not."""
+    """Return the indicator function of a condition."""
     if condition in (sp.true, sp.false):
         return sp.Integer(1 if condition else 0)
     if isinstance(condition, sp.And):
@@ -143,7 +140,7 @@ def _weight(condition: Any) -> sp.Expr:
 def series(expression: sp.Expr, values: Mapping[sp.Symbol, np.ndarray]) -> np.ndarray:
     """Return the power series of an expression of power series, complex arrays (order + 1, …).
 
-    Signs are those of the leading coefficients' real parts.
+    The sign of a series is that of the real part of its leading coefficient.
 
     Raises
     ------
@@ -181,7 +178,7 @@ def series(expression: sp.Expr, values: Mapping[sp.Symbol, np.ndarray]) -> np.nd
             leading = np.sign(value(e.args[0])[0].real)
             return constant(1.0) * leading
         if len(e.args) != 1:
-            raise TypeError(f"{e.func} is not known here.")
+            raise TypeError(f"expression: must consist of functions of one argument, got {e.func}.")
         return composed(_derivatives(e.func, e.func, len(template)), value(e.args[0]))
 
     return value(expression)
@@ -193,7 +190,7 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def composed(derivatives: list[Callable[[np.ndarray], np.ndarray]], inner: np.ndarray) -> np.ndarray:
-    """Return a function of a power series, from its derivatives of all orders, by Horner's rule."""
+    """Return a function of a power series, given its derivatives of all orders, by Horner's rule."""
     start = inner[0]
     rest = inner.copy()
     rest[0] = 0.0
@@ -205,7 +202,7 @@ def composed(derivatives: list[Callable[[np.ndarray], np.ndarray]], inner: np.nd
 
 
 def differentiated(a: np.ndarray) -> np.ndarray:
-    """Return the derivative by time; the last coefficient is lost and set to zero."""
+    """Return the time derivative; its last coefficient is unknown and set to zero."""
     result = np.zeros_like(a)
     for k in range(1, len(a)):
         result[k - 1] = k * a[k]
@@ -228,19 +225,19 @@ NEWTON_STEPS = 30
 ZERO = 1e-9
 
 
-def silent_directions(system: System) -> list[tuple[dict[sp.Symbol, float], np.ndarray]]:
-    """Return, at several random values of the parameters, the directions to which no output reacts.
+def null_directions(system: System) -> list[tuple[dict[sp.Symbol, float], np.ndarray]]:
+    """Return the parameter directions without effect on the outputs, at several random parameter values.
 
-    The outputs' first derivatives by time, as many as there are initial values, are taken at many unrelated instants
-    (states, inputs, their derivatives, time and frequency random), with their exact sensitivities to the parameters
-    and to the states at that instant. What the states at the instants can undo is projected out. These derivatives
-    carry all that the input-output equations contain [1]_.
+    The first time derivatives of the outputs, as many as there are initial values, are computed at many unrelated
+    instants (with random states, inputs, their derivatives, time and frequency), with their exact sensitivities to the
+    parameters and to the states at that instant. Effects that the states can compensate are projected out. These
+    derivatives contain the information of the input-output equations [1]_.
 
     Returns
     -------
     list of (values, array (directions, parameters))
-        The values of all parameters, and orthonormal rows in the logarithms of the unknown ones. Empty if the equations
-        cannot be solved for the highest derivatives or contain functions that NumPy does not have.
+        Values of all parameters, and orthonormal rows in the logarithms of the unknown ones. Empty if the equations
+        cannot be solved for the highest derivatives or contain functions that NumPy lacks.
 
     References
     ----------
@@ -253,19 +250,19 @@ def silent_directions(system: System) -> list[tuple[dict[sp.Symbol, float], np.n
         theta = random.uniform(0.5, 1.5, len(system.parameters))
         known = random.uniform(0.5, 1.5, len(system.known))
         try:
-            reactions = _reactions(system, theta, known, random)
+            sensitivities = _sensitivities(system, theta, known, random)
         except (TypeError, NameError, np.linalg.LinAlgError):
             return []
-        if len(reactions) < len(theta):
+        if len(sensitivities) < len(theta):
             return []
-        _, size, directions = np.linalg.svd(reactions)
+        _, size, directions = np.linalg.svd(sensitivities)
         values = dict(zip((*system.parameters.values(), *system.known.values()), [*theta, *known], strict=True))
         found.append((values, directions[np.count_nonzero(size > ZERO * size[0]) :]))
     return found
 
 
-def _reactions(system: System, theta: np.ndarray, known: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Return the rows of sensitivities to the logarithms of the parameters that no change of the states can undo."""
+def _sensitivities(system: System, theta: np.ndarray, known: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Return sensitivities to the logarithms of the parameters that changes of the states cannot compensate."""
     order, points = sum(system.orders.values()) + 1, 20 + 3 * len(theta)
     taylor = _motions(system, theta, known, order, points, random)
     rows = []
@@ -285,7 +282,7 @@ def _reactions(system: System, theta: np.ndarray, known: np.ndarray, random: np.
 def _motions(
     system: System, theta: np.ndarray, known: np.ndarray, order: int, points: int, random: np.random.Generator
 ) -> np.ndarray:
-    """Return the outputs' Taylor coefficients (order + 1, points, directions, outputs); a direction a complex step."""
+    """Return Taylor coefficients of the outputs (order + 1, points, directions, outputs), with complex steps."""
     starts = [system.symbols["d" * k + s] for s, highest in system.orders.items() for k in range(highest)]
     directions = len(theta) + len(starts)
     shape = (order + 3, points, directions)
@@ -318,7 +315,7 @@ def _motions(
 
 
 def _follow(system: System, values: dict[sp.Symbol, np.ndarray], order: int) -> None:
-    """Fill in the Taylor coefficients of the states, one order of the equations after the other."""
+    """Compute the Taylor coefficients of the states, order by order."""
     highest = [system.symbols["d" * n + s] for s, n in system.orders.items()]
     if not highest:
         return

@@ -10,7 +10,7 @@ import bayesperiodic as bp
 from bayesperiodic._expressions import parse
 from bayesperiodic.symmetry.determining import Generator
 from bayesperiodic.symmetry.invariants import Flow, verified
-from bayesperiodic.symmetry.structure import analysed
+from bayesperiodic.symmetry.structure import analyse_structure
 from bayesperiodic.symmetry.system import system_of
 
 GEAR = {
@@ -481,8 +481,8 @@ def test_tied_parameters_enter_as_expressions():
     model = small(["x"], ["a", "b"], lambda s, p, u: [s.dx + p.a * p.b * s.x - u.u], lambda s, p, u: {"y": s.x})
     a, b = model.parameter_symbols.values()
     whole = system_of(model, model.outputs)
-    assert analysed("tied", whole.given((), {b: 2 * a}), ()).table.verdict["a"] == "determined"
-    assert analysed("tied", whole.given((), {b: 2 / a}), ()).table.verdict["a"] == "does not appear"
+    assert analyse_structure("tied", whole.given((), {b: 2 * a}), ()).table.verdict["a"] == "determined"
+    assert analyse_structure("tied", whole.given((), {b: 2 / a}), ()).table.verdict["a"] == "does not appear"
 
 
 def test_a_structure_saves_and_loads(tmp_path, found):
@@ -496,9 +496,9 @@ def test_a_structure_saves_and_loads(tmp_path, found):
 def test_error_names_the_bad_argument():
     with pytest.raises(ValueError, match="outputs: must be .*got 'angel'.*'angle'"):
         bp.structure(bp.models.pendulum, outputs=["angel"])
-    with pytest.raises(ValueError, match="outputs: \\(\\) is not allowed"):
+    with pytest.raises(ValueError, match="outputs: must have at least one name"):
         bp.structure(bp.models.pendulum, outputs=[])
     with pytest.raises(ValueError, match="fixed: must be .*got 'mass'"):
         bp.structure(bp.models.pendulum, fixed=["mass"])
-    with pytest.raises(ValueError, match="fixed: m = 0 is not allowed; the equations divide by it"):
+    with pytest.raises(ValueError, match="fixed: must not be zero if the equations divide by it, got m = 0"):
         bp.structure(bp.models.pendulum, fixed={"m": 0.0})

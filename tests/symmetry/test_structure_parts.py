@@ -92,7 +92,7 @@ def test_null_spaces_modulo_the_prime_are_exact():
 def test_circuits_of_a_plane_are_the_vectors_with_a_zero():
     """Each combination of the two rows that has a zero entry has no smaller support."""
     rows = np.array([[1, 0, 1, 1], [0, 1, 1, 2]])
-    found = determining.whole_circuits(rows, np.ones(4, dtype=int))
+    found = determining.integer_circuits(rows, np.ones(4, dtype=int))
     assert {tuple(v) for v in found} == {(1, 0, 1, 1), (0, 1, 1, 2), (-1, 1, 0, 1), (2, -1, 1, 0)}
 
 
