@@ -8,6 +8,7 @@ import pytest
 
 import bayesperiodic as bp
 from studies.flutter.reference import RIG, flutter_matrices
+from tests.pendulum import PENDULUM
 
 LIBRARY = {
     "duffing": lambda: bp.models.duffing,
@@ -20,7 +21,6 @@ LIBRARY = {
     "chain_3": lambda: bp.models.chain(3),
     "flutter": lambda: bp.models.flutter,
 }
-PENDULUM = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
 GEAR = {
     "theta1": 80.0, "theta2": 9.81, "theta3": 8e3, "theta4": 5e-3, "theta5": 1e6 / 293, "theta6": -2.5,
     "theta7": 2e-4, "theta8": 150.0, "theta9": 1e-4, "theta10": 300.0, "theta11": -500.0, "theta12": 0.03,

@@ -1,4 +1,4 @@
-"""The chaotic pendulum at 9.09 rad/s, recorded; its Runge-Kutta method shares nothing with the package."""
+"""Recordings of the chaotic pendulum at 9.09 rad/s by a Runge-Kutta method independent of the package."""
 
 from functools import cache
 
@@ -15,7 +15,7 @@ TRANSIENT = 200
 
 
 @njit
-def _march(angle, rate, drive, periods, steps, kept, step, c1, c2, c3, width, length):
+def _runge_kutta(angle, rate, drive, periods, steps, kept, step, c1, c2, c3, width, length):
     path = np.empty((periods * kept + 1, 2))
     every = steps // kept
     for k in range(periods * steps + 1):
@@ -23,10 +23,10 @@ def _march(angle, rate, drive, periods, steps, kept, step, c1, c2, c3, width, le
             path[k // every, 0], path[k // every, 1] = angle, rate
         q, v, dq, dv, sum_q, sum_v = angle, rate, 0.0, 0.0, 0.0, 0.0
         for stage in range(4):
-            share = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
-            q, v = angle + share * step * dq, rate + share * step * dv
-            pull = drive[(2 * (k % steps) + (stage + 1) // 2) % (2 * steps)]
-            dq, dv = v, -c1 * np.tanh(v / width) - (c2 + c3 * abs(v)) * v - pull / length * np.sin(q)
+            fraction = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
+            q, v = angle + fraction * step * dq, rate + fraction * step * dv
+            gravity = drive[(2 * (k % steps) + (stage + 1) // 2) % (2 * steps)]
+            dq, dv = v, -c1 * np.tanh(v / width) - (c2 + c3 * abs(v)) * v - gravity / length * np.sin(q)
             weight = 1.0 if stage in (0, 3) else 2.0
             sum_q, sum_v = sum_q + weight * dq, sum_v + weight * dv
         angle, rate = angle + step / 6.0 * sum_q, rate + step / 6.0 * sum_v
@@ -42,9 +42,9 @@ def path(periods: int, samples: int, start: int = 0, steps: int = 400) -> np.nda
     drive = PENDULUM["g"] + PENDULUM["lift"] * OMEGA**2 * np.cos(np.pi * np.arange(2 * steps) / steps)
     constants = [PENDULUM[name] for name in ("c1", "c2", "c3", "width", "length")]
     step = 1.0 / (FREQUENCY * steps)
-    settled = _march(angle, rate, drive, TRANSIENT, steps, 1, step, *constants)[-1]
+    settled = _runge_kutta(angle, rate, drive, TRANSIENT, steps, 1, step, *constants)[-1]
     angle = (settled[0] + np.pi) % (2.0 * np.pi) - np.pi
-    result = _march(angle, settled[1], drive, periods, steps, samples, step, *constants)
+    result = _runge_kutta(angle, settled[1], drive, periods, steps, samples, step, *constants)
     result.flags.writeable = False
     return result
 
