@@ -177,7 +177,10 @@ def _read_tree(path: str | Path) -> Any:
 
 def _result_class(name: str) -> Any:
     module, _, qualname = name.partition(":")
-    found = getattr(import_module(module), qualname, None) if module.startswith("bayesperiodic.") else None
+    try:
+        found = getattr(import_module(module), qualname, None) if module.startswith("bayesperiodic.") else None
+    except ModuleNotFoundError:
+        found = None
     if not is_dataclass(found):
         raise ValueError(f"path: must contain a result of bayesperiodic, got {name!r}; load it with its own version.")
     return found

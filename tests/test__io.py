@@ -110,9 +110,10 @@ def test_error_names_the_missing_folder(tmp_path):
         experiment.save(tmp_path / "nowhere" / "run.h5")
 
 
-def test_file_cannot_load_classes_of_other_packages(solved, tmp_path):
+@pytest.mark.parametrize("kind", ["subprocess:Popen", "bayesperiodic.of_old:MapEstimate"])
+def test_file_cannot_load_classes_of_other_packages_or_versions(solved, tmp_path, kind):
     solved[1].save(tmp_path / "fit.h5")
     with h5py.File(tmp_path / "fit.h5", "a") as file:
-        file.attrs["bayesperiodic_result"] = '{"result": "subprocess:Popen", "fields": {"args": "true"}}'
-    with pytest.raises(ValueError, match="path: must contain a result of bayesperiodic, got 'subprocess:Popen'"):
+        file.attrs["bayesperiodic_result"] = f'{{"result": "{kind}", "fields": {{"args": "true"}}}}'
+    with pytest.raises(ValueError, match=f"path: must contain a result of bayesperiodic, got '{kind}'"):
         bp.load(tmp_path / "fit.h5")
