@@ -20,11 +20,11 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic._parallel import checkpointed_tasks
 from bayesperiodic.diagnostics.adequacy import holm
 from bayesperiodic.diagnostics.campaigns import (
-    APART,
     DONE,
     LAPLACE,
     MCMC,
     METHODS,
+    SPACING,
     Campaign,
     check_supported,
     replicate,
@@ -69,8 +69,7 @@ def bin_count(size: int) -> int:
 def ecdf_test(values: np.ndarray) -> float:
     """Return p of the empirical distribution function's smallest pointwise binomial tail ([1]_, section 3).
 
-    The null distribution is simulated once for every number of values, with a fixed seed. ArviZ 0.23
-    has no public function for it.
+    The null distribution is simulated once for every number of values, with a fixed seed.
 
     References
     ----------
@@ -260,7 +259,9 @@ def calibrate(
     _checks.integer("replicates", replicates, 1)
     _checks.integer("seed", seed, 0)
     check_supported(problem)
-    settings = f"{fingerprint(problem)}, seed {seed}, {ensembles} x {walkers} walkers, {max_steps} steps, {APART} apart"
+    settings = (
+        f"{fingerprint(problem)}, seed {seed}, {ensembles} x {walkers} walkers, {max_steps} steps, {SPACING} apart"
+    )
     source = hashlib.sha256(f"{importlib.metadata.version('bayesperiodic')}, {settings}".encode()).hexdigest()[:16]
     campaign = Campaign(problem, seed, source, ensembles, walkers, max_steps)
     lines = checkpointed_tasks(

@@ -25,7 +25,7 @@ DONE, NO_STEADY_STATE = "done", "no steady state"
 FEWEST_CYCLES = 3
 # Steps between draws taken as independent, in autocorrelation times (which short chains underestimate), the least
 # number of these draws, and the largest R-hat.
-APART, FEWEST_DRAWS, LARGEST_RHAT = 5.0, 20, 1.1
+SPACING, FEWEST_DRAWS, LARGEST_RHAT = 5.0, 20, 1.1
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ def independent_draws(posterior: Posterior) -> dict[str, np.ndarray] | None:
     if not np.isfinite(tau):
         return None
     chains, steps = group.sizes["chain"], group.sizes["draw"]
-    kept = np.arange(steps - 1, -1, -int(np.ceil(APART * tau)))
+    kept = np.arange(steps - 1, -1, -int(np.ceil(SPACING * tau)))
     if chains * kept.size < FEWEST_DRAWS:
         return None
     return {name: posterior.draws(name).reshape(chains, steps)[:, kept].ravel() for name in posterior.names}

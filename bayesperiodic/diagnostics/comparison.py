@@ -71,15 +71,15 @@ class Comparison(Result):
     coordinates : str
         "natural" or "sampling".
     probabilities : array (probabilities,)
-        Of the quantiles and of the ellipsoids.
+        Probabilities of the quantiles and of the ellipsoids.
     quantiles : dict of str to array (probabilities,)
-        Of the draws.
+        Quantiles of the draws.
     edges, densities : dict of str to array (bins + 1,) and (bins,)
         Histograms of the central 99.9 % of the draws.
     shares, shares_mcse : array (probabilities,)
         Fractions of draws inside the Laplace ellipsoids of these probabilities.
     units : dict of str to str
-        Of the natural values.
+        Units of the natural values.
     synthetic, converged : bool
         Whether the data are synthetic, and whether the draws have converged.
 

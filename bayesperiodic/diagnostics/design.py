@@ -19,7 +19,7 @@ from bayesperiodic.periodic.solve import solve_periodic
 from bayesperiodic.posterior.problem import Problem
 
 ONE_SD = float(ndtr(1.0))
-SMALLEST, HARDLY = 1e-12, 1e-3
+SMALLEST, NEGLIGIBLE = 1e-12, 1e-3
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Information:
         values, vectors = self._relative
         informed = values > SMALLEST * max(values[-1], np.finfo(float).tiny)
         variance = np.sum(vectors[:, informed] ** 2 / values[informed], axis=1)
-        unseen = np.any(np.abs(vectors[:, ~informed]) > HARDLY, axis=1)
+        unseen = np.any(np.abs(vectors[:, ~informed]) > NEGLIGIBLE, axis=1)
         return np.where(unseen, np.inf, np.sqrt(variance))
 
     @property

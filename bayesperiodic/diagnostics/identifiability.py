@@ -135,11 +135,11 @@ DETERMINED, PRIOR_ONLY = "determined", "only with the prior"
 COMBINATION, SIGN, NOTHING = "only in combination", "sign undetermined", "not determined"
 # Standard deviations left by the data alone, in prior sds: the largest one of determined parameters (a contraction of
 # 0.9), and the smallest one of undetermined parameters (1 % of the information of the prior).
-ENOUGH, SILENT = 1.0 / 3.0, 10.0
+DETERMINED_SD, UNINFORMED_SD = 1.0 / 3.0, 10.0
 COLLINEAR = 5.0
-ONE_SIGN = 0.975
+SIGN_PROBABILITY = 0.975
 MONTE_CARLO_ERRORS = 3.0
-NULL = 1e-13
+UNINFORMED_GAIN = 1e-13
 PRIOR_DRAWS = 20_000
 BOTH_SIGNS = "both signs fit the data: use a prior of one sign, or measure an output that is odd in it"
 
@@ -365,15 +365,15 @@ def _size_known(problem: Problem, fit: MapEstimate, posterior: Posterior | None,
 
 def _verdict(row: dict, size_known: bool) -> str:
     margin = MONTE_CARLO_ERRORS * row["p_negative_mcse"]
-    if size_known and max(row["p_negative"], 1.0 - row["p_negative"]) < ONE_SIGN - margin:
+    if size_known and max(row["p_negative"], 1.0 - row["p_negative"]) < SIGN_PROBABILITY - margin:
         return SIGN
     if row["profile"] == ONE_SIDED and row["collinearity"] < COLLINEAR:
         return PRIOR_ONLY
-    if row["alone"] > SILENT:
+    if row["alone"] > UNINFORMED_SD:
         return NOTHING
     if row["structural"]:
         return COMBINATION
-    if row["together"] <= ENOUGH:
+    if row["together"] <= DETERMINED_SD:
         return DETERMINED
     return COMBINATION if row["collinearity"] >= COLLINEAR and row["alone"] < 1.0 else PRIOR_ONLY
 
@@ -386,7 +386,7 @@ def _evidence(row: dict) -> str:
         text += f", the other parameters widen it {factor}"
     if row["structural"]:
         text += ", by a structural symmetry"
-    if row["alone"] > ENOUGH and row["profile"] != ONE_SIDED:
+    if row["alone"] > DETERMINED_SD and row["profile"] != ONE_SIDED:
         text += f", the data alone would leave {row['alone']:.3g} prior sds with all other parameters known"
     if row["profile"] and row["profile"] != "closed":
         text += f", profile {row['profile']}"
@@ -407,7 +407,7 @@ def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.Data
         )
     if row["verdict"] == COMBINATION:
         own = directions[directions["parameters"].str.split(", ").apply(lambda members: name in members)]
-        own = own[own["gain"] < 1.0 / ENOUGH**2]
+        own = own[own["gain"] < 1.0 / DETERMINED_SD**2]
         if len(own):
             best = own.iloc[0]
             combos = f", or report {best['combinations']}" if best["combinations"] else ""
@@ -429,7 +429,7 @@ def _directions(information: Information) -> pd.DataFrame:
     Directions without information are reduced to as few parameters as possible.
     """
     gains, vectors = information.gains, information.directions.T
-    uninformed = gains < NULL * gains.max()
+    uninformed = gains < UNINFORMED_GAIN * gains.max()
     shown = vectors.copy()
     if uninformed.sum() > 1:
         shown[uninformed] = reduced(vectors[uninformed])
@@ -444,7 +444,7 @@ def _directions(information: Information) -> pd.DataFrame:
                 "direction": in_words(vector, information.names, information.logarithmic),
                 "parameters": ", ".join(members),
                 "combinations": ", ".join(combinations(vector, information.names, information.logarithmic))
-                if gain < 1.0 / ENOUGH**2
+                if gain < 1.0 / DETERMINED_SD**2
                 else "",
             }
         )

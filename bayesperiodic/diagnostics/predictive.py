@@ -74,7 +74,7 @@ class Transient(Result):
         By output: pointwise median and central 90 % band of the signals, for the uncertainty of the parameters alone,
         without measurement noise unless `run` adds it.
     probability : float
-        Of the band.
+        Probability of the band.
     draws : int
         Number of runs, one per draw.
     failures : dict of str to int
@@ -180,7 +180,7 @@ class Prediction(Bands):
         the kept harmonics, including the residual variance, assumed normal at each point. Section values with a
         covariance of their own have the band of the model alone.
     probability : float
-        Of the band.
+        Probability of the band.
     draws, failed : int
         Number of draws, and of those without a periodic solution.
     table : DataFrame

@@ -43,7 +43,7 @@ def branch(
     output : str, optional
         By default the first one.
     unit : str, optional
-        Of the ordinate; by default that of the output, or s for the period.
+        Unit of the ordinate; by default that of the output, or s for the period.
     labels : sequence of str, optional
         One per branch, for the legend.
     angular : bool
@@ -182,7 +182,7 @@ def section(
         At most 20,000 points are drawn.
     orbits : Orbits or sequence of Orbit
     units : mapping of str to str, optional
-        Of the coordinates; angles are in rad.
+        Units of the coordinates; angles are in rad.
     figure : Figure, optional
         An empty figure to draw into.
     ax : Axes, optional
@@ -233,7 +233,7 @@ def orbits(
     orbits : Orbits or sequence of Orbit
         At least one.
     units : mapping of str to str, optional
-        Of the coordinates; angles are in rad.
+        Units of the coordinates; angles are in rad.
     figure : Figure, optional
         An empty figure to draw into.
 

@@ -21,7 +21,7 @@ from bayesperiodic.diagnostics.campaigns import METHODS
 from bayesperiodic.diagnostics.comparison import Comparison
 from bayesperiodic.diagnostics.verdicts import END_SHIFT, ERRORS, FINE, LEVELS
 from bayesperiodic.estimation.profile import CLOSED, Profile
-from bayesperiodic.plot.posterior import chosen, draw_marginal, panel_grid
+from bayesperiodic.plot.posterior import chosen, draw_marginal, panel_grid, panels
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, caveats, wrapped_label
 
 LEVEL = 0.99
@@ -61,9 +61,9 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
     """
     names = calibration.names
     figure = figure or plt.figure(figsize=(10.5, 2.1 * len(names) + 1.0), layout="constrained")
-    panels = figure.subplots(len(names), 3, squeeze=False)
+    grid = figure.subplots(len(names), 3, squeeze=False)
     verdicts = calibration.table.set_index(["method", "quantity"])["verdict"]
-    for row, name in zip(panels, names, strict=True):
+    for row, name in zip(grid, names, strict=True):
         for method in METHODS:
             values = calibration.positions[method][name]
             values = np.sort(values[np.isfinite(values)])
@@ -76,7 +76,7 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
         row[0].set_ylim(0.0, HEADROOM * row[0].get_ylim()[1])
         row[0].set_ylabel(wrapped_label(name, ""))
         row[0].legend(frameon=False, fontsize="small", loc="upper center")
-    for top, bottom, (title, label) in zip(panels[0], panels[-1], COLUMNS.items(), strict=True):
+    for top, bottom, (title, label) in zip(grid[0], grid[-1], COLUMNS.items(), strict=True):
         top.set_title(title, fontsize="medium")
         bottom.set_xlabel(label)
     figure.suptitle(f"{calibration.replicates} synthetic campaigns; bands of 99 %", fontsize="medium")
@@ -143,15 +143,13 @@ def comparison(comparison: Comparison, *, names: Sequence[str] | None = None, fi
     size = max(2.4 * columns, 8.4), 2.5 * rows + 4.6
     figure = figure or plt.figure(figsize=size, layout="constrained")
     top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[2.5 * rows + 0.4, 4.2])[:, 0]
-    panels = top.subplots(rows, columns, squeeze=False).ravel()
-    for axes, name in zip(panels, names, strict=False):
+    marginals = panels(top, len(names))
+    for axes, name in zip(marginals, names, strict=True):
         about = comparison.table.loc[name].to_dict()
         draw_marginal(axes, comparison.edges[name], comparison.densities[name], about["map"], about["laplace_sd"])
         axes.set_title(about["verdict"], fontsize="medium")
         axes.set_xlabel(_coordinate_label(comparison, name))
-    for axes in panels[len(names) :]:
-        axes.remove()
-    top.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
+    top.legend(*marginals[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
     if text := caveats(comparison.synthetic, comparison.converged):
         top.suptitle(text, x=0.99, ha="right", fontsize="medium")
     left, right = below.subplots(1, 2)
@@ -250,13 +248,10 @@ def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Fig
     shown = chosen(names, profile.names)
     columns, rows = panel_grid(len(shown), PROFILES_ACROSS)
     figure = figure or plt.figure(figsize=(3.0 * columns + 0.8, 2.7 * rows + 0.6), layout="constrained")
-    panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
-    for axes, name in zip(panels, shown, strict=False):
-        _profile_panel(axes, profile, name)
-    for axes in panels[len(shown) :]:
-        axes.remove()
-    for axes in panels[: len(shown) : columns]:
-        axes.set_ylabel("relative log-density")
+    for number, axes in enumerate(panels(figure, len(shown), PROFILES_ACROSS, sharey=True)):
+        _profile_panel(axes, profile, shown[number])
+        if number % columns == 0:
+            axes.set_ylabel("relative log-density")
     drawn = {label: line for axes in figure.axes for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     legend = {label: drawn[label] for label in PROFILE_LEGEND if label in drawn}
     figure.legend(legend.values(), legend.keys(), loc="outside upper center", ncols=len(legend), frameon=False)

@@ -6,7 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.ticker import ScalarFormatter
 from scipy.stats import norm
 
@@ -104,13 +104,17 @@ def _bins(draws: np.ndarray) -> int:
 
 
 def _write_out_ticks(figure: Figure) -> None:
-    """Remove offsets and common factors of ticks, which would appear on another panel."""
-    for axes in figure.axes:
-        for axis in (axes.xaxis, axes.yaxis):
-            formatter = axis.get_major_formatter()
-            if isinstance(formatter, ScalarFormatter):
-                formatter.set_useOffset(False)
-                formatter.set_powerlimits(WHOLE)
+    """Remove offsets of ticks, and move their common factors into the labels, because they would overlap panels."""
+    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+        formatter = axis.get_major_formatter()
+        if isinstance(formatter, ScalarFormatter):
+            formatter.set_useOffset(False)
+            formatter.set_powerlimits(WHOLE)
+            formatter.set_locs(axis.get_majorticklocs().tolist())
+            if (factor := formatter.get_offset()) and (label := axis.get_label_text()):
+                name, _, unit = label.partition("\n[")
+                axis.set_label_text(f"{name}\n[{' '.join(filter(None, [factor, unit or ']']))}")
+            axis.get_offset_text().set_visible(False)
 
 
 def _corner_legend(figure: Figure, posterior: Posterior, laplace: bool, fontsize: int) -> None:
@@ -226,15 +230,13 @@ def marginals(
         sd = np.sqrt(np.diag(covariance))
     columns, rows = panel_grid(len(names))
     figure = figure or plt.figure(figsize=(2.4 * columns + 0.4, 2.3 * rows + 0.6), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for i, (axes, name) in enumerate(zip(panels, names, strict=False)):
+    shown = panels(figure, len(names))
+    for i, (axes, name) in enumerate(zip(shown, names, strict=True)):
         draws = posterior.draws(name)
         density, edges = np.histogram(draws, BINS, tuple(np.quantile(draws, SHOWN)), density=True)
         draw_marginal(axes, edges, density, float(mean[i]), float(sd[i]))
         axes.set_xlabel(wrapped_label(name, unit_of(posterior, name)))
-    for axes in panels[len(names) :]:
-        axes.remove()
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
+    figure.legend(*shown[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
     if text := caveats_of(posterior):
         figure.suptitle(text, x=0.99, ha="right", fontsize="medium")
     return figure
@@ -244,6 +246,15 @@ def panel_grid(count: int, across: int = ACROSS) -> tuple[int, int]:
     """Return the numbers of columns and rows of so many panels."""
     columns = min(count, across)
     return columns, -(-count // columns)
+
+
+def panels(figure: FigureBase, count: int, across: int = ACROSS, sharey: bool = False) -> list[Axes]:
+    """Create so many panels in a grid."""
+    columns, rows = panel_grid(count, across)
+    grid = figure.subplots(rows, columns, sharey=sharey, squeeze=False).ravel()
+    for axes in grid[count:]:
+        axes.remove()
+    return list(grid[:count])
 
 
 def draw_marginal(axes: Axes, edges: np.ndarray, density: np.ndarray, mean: float, sd: float) -> None:

@@ -42,7 +42,7 @@ def report(
     posterior : Posterior or None
         Without draws the report has no MCMC results, no comparison and no test of the model.
     path : path
-        Of the file, such as "report.html".
+        Path of the file, such as "report.html".
     title : str, optional
         By default the model's name.
     comparison : Comparison, optional
@@ -54,7 +54,7 @@ def report(
     Returns
     -------
     Path
-        Of the file.
+        Path of the file.
 
     Raises
     ------
