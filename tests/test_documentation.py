@@ -131,7 +131,7 @@ def test_all_kinds_of_public_names_are_looked_at():
 
 
 @pytest.mark.parametrize("name", ["models", "noise", "plot"])
-def test_modules_say_what_they_hold(name):
+def test_module_docstrings_are_present(name):
     assert sections(getattr(bp, name).__doc__)[""].strip()
 
 

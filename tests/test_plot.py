@@ -66,7 +66,7 @@ def test_corner_laplace_ellipses_cover_the_draws(solved):
 
 
 @pytest.mark.parametrize(("middle", "spread"), [(-2.5, 1e-4), (4e7, 3e4)])
-def test_corner_has_whole_values_at_its_ticks(solved, middle, spread):
+def test_corner_ticks_show_complete_values(solved, middle, spread):
     """Also for values that differ in their last digits only or are large, for which matplotlib prints offsets."""
     _, _, posterior = solved
     data = posterior.data.copy()
@@ -114,7 +114,7 @@ def test_corner_takes_the_noise_from_the_joint_laplace_approximation(solved):
     assert np.ptp(values[:, 1]) == pytest.approx(2 * fit.sd["k"] * np.sqrt(-2.0 * np.log(0.1)), rel=1e-3)
 
 
-def test_corner_draws_the_names_asked_for_and_no_ellipse_where_there_is_no_approximation(solved):
+def test_corner_draws_given_names_and_no_ellipse_without_an_approximation(solved):
     _, fit, posterior = solved
     figure = bp.plot.corner(posterior, laplace=fit, names=("coulomb", "k"))
     assert labels(figure) == {"k\n[N/m]", "coulomb\n[N]"}
@@ -155,7 +155,7 @@ def lines(axes, style):
     return [line for line in axes.lines if line.get_linestyle() == style]
 
 
-def test_branch_is_solid_where_stable_dashed_between_its_folds_and_says_so(response):
+def test_branch_is_solid_where_stable_and_dashed_between_its_folds(response):
     figure = bp.plot.branch(response)
     (axes,) = figure.axes
     assert labels(figure) == {"frequency [Hz]", "amplitude of displacement [m]"}

@@ -92,7 +92,7 @@ BEFORE = {
 SHORTER = {"replicates=1000": "replicates=2", "range(1, 6)": "range(1, 3)"}
 
 
-def test_every_heading_with_code_is_known():
+def test_every_heading_with_code_has_its_setup():
     assert set(BLOCKS) == set(BEFORE)
 
 

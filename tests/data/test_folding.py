@@ -55,7 +55,7 @@ def test_noise_free_input_ends_the_frequency_refinement(monkeypatch):
     assert len(calls) < 20
 
 
-def test_harmonics_kept_are_those_that_stand_out():
+def test_significant_harmonics_are_kept():
     e = recording().fold(800)
     assert e.harmonics == {"x": 3, "y": 5}
     assert e.independent == {"y": 11}

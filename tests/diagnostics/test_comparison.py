@@ -221,7 +221,7 @@ def test_laplace_is_the_posterior_of_a_linear_problem_with_known_variance():
         assert found.shares == pytest.approx(found.probabilities, abs=0.03)
 
 
-def test_an_unknown_variance_leaves_laplace_a_good_proposal():
+def test_laplace_with_unknown_variance_is_a_good_proposal():
     """Student's t with 37 degrees of freedom in three dimensions."""
     problem, fit = linear_case()
     generator = np.random.default_rng(10)
@@ -263,7 +263,7 @@ def test_joint_departures_from_normality_are_named(change, verdict):
         (1.0, 0.0, 0.75, "fine"),
     ],
 )
-def test_the_joint_verdict_tells_a_shift_from_a_scale_and_counts_pareto_k(scale, shift, k, verdict):
+def test_joint_verdict_distinguishes_shift_and_scale_and_uses_pareto_k(scale, shift, k, verdict):
     points = shift + scale * np.random.default_rng(14).standard_normal((6400, 3))
     sampled = partial(Sample.of, ensemble=np.repeat(np.arange(4), SHAPE[2]), size=6400.0)
     assert joint_verdict(points, np.zeros(3), np.eye(3), sampled, (k, 0.1), True) == verdict

@@ -15,7 +15,7 @@ def sensitivities(generator: np.random.Generator, parameters: int = 3) -> np.nda
     return generator.standard_normal((parameters, HARMONIC.size)) * np.exp(-HARMONIC / 2.0)
 
 
-def test_p_values_of_white_noise_are_uniform_or_conservative_whatever_was_fitted():
+def test_p_values_of_white_noise_are_uniform_or_conservative_after_any_fit():
     """1000 trials with 41 components, 3 parameters: KS of the whiteness p at 0.1 %, and binomial limits at 0.1 %."""
     generator = np.random.default_rng(1)
     whiteness, harmonics = np.empty(TRIALS), np.empty(TRIALS)

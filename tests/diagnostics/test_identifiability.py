@@ -38,7 +38,7 @@ def verdicts(problem: bp.Problem, fit: bp.MapEstimate, **changes) -> dict[str, s
     return bp.identifiability(problem, fit, posterior).verdicts
 
 
-def test_information_is_that_of_the_regression(linear):
+def test_information_equals_that_of_the_regression(linear):
     """In ln k, c and coulomb: sds with all others known and unknown, in prior sds, from XᵀX/9."""
     problem, fit = linear
     found = Information.of(problem, fit)
@@ -66,7 +66,7 @@ def test_undetermined_direction_counts_for_the_parameters_it_moves(moved, left):
     assert np.isinf(found.together[1:]).all()
 
 
-def test_contraction_is_that_of_the_normal_posterior(linear):
+def test_contraction_equals_that_of_the_normal_posterior(linear):
     """With draws and without; the draws' within four of the Monte Carlo errors that are stated with it."""
     problem, fit = linear
     table = bp.identifiability(problem, fit, profile=False).table

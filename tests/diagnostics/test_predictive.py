@@ -125,7 +125,7 @@ def test_well_determined_linear_problems_are_adequate():
     assert alarms <= 2
 
 
-def test_an_experiment_under_other_parameters_is_no_single_fault_but_one_of_the_whole():
+def test_experiment_under_other_parameters_fails_the_common_test_only():
     """The runs have the stiffnesses 900 and 1100 N/m, so that common parameters fit neither."""
     runs = [linear_experiment([k, 40.0, 25.0], 3.0, seed=i, name=f"run {i}") for i, k in enumerate((900.0, 1100.0))]
     problem = bp.Problem(LINEAR, runs, priors=FLAT)

@@ -18,7 +18,7 @@ def saddle_node(prior) -> bp.Problem:
     return bp.Problem(SADDLE_NODE, runs, priors={"a": prior})
 
 
-def test_the_share_without_an_orbit_is_that_of_the_prior_beyond_the_fold():
+def test_fraction_without_an_orbit_equals_the_prior_mass_beyond_the_fold():
     """Φ(−1) = 15.9 % of Normal(1, 1) is negative, where ẋ = a − x² has no equilibrium; draw by draw.
 
     Within 1/256 of the way from the fold the solver may fail, which is told apart.
@@ -35,7 +35,7 @@ def test_the_share_without_an_orbit_is_that_of_the_prior_beyond_the_fold():
     assert all(cause.endswith("ends in a fold") for cause in ends)
 
 
-def test_the_outputs_are_those_of_the_prior():
+def test_outputs_have_the_quantiles_of_the_prior():
     """The output √a with a ~ LogNormal(1, 0.5) has the quantiles e^(∓0.411); 4 errors of quantiles of 400 draws."""
     found = bp.prior_predictive(saddle_node(bp.LogNormal(1.0, 0.5)), draws=DRAWS, seed=1, progress=False)
     assert found.table.loc["all", "converged"] == 1.0

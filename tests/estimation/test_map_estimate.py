@@ -40,7 +40,7 @@ def test_independent_values_set_the_weight_of_the_samples():
     assert fit.covariance.to_numpy() == pytest.approx(covariance, rel=1e-10)
 
 
-def test_unknown_variance_is_that_of_equation_7():
+def test_unknown_variance_follows_equation_7():
     """V = s Σe² / (nNs − l) with s = 1 channel, N = 2 experiments, n = 40 samples, l = 3 parameters."""
     experiments = [replace(linear_experiment(TRUTH, 3.0, seed=s), name=f"run {s}") for s in (3, 4)]
     fit = bp.map_estimate(bp.Problem(LINEAR, experiments, priors=PRIORS))

@@ -52,7 +52,7 @@ def batch(scheme="central4", *mus):
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_bordered_solve_and_orientation_are_those_of_dense_algebra(scheme):
+def test_bordered_solve_and_orientation_agree_with_dense_algebra(scheme):
     """At an orbit, where ∂g/∂z is nearly singular, and away from it; ∂g/∂f by central differences."""
     solution, generator, signs = solved(0.8, samples=21, scheme=scheme), np.random.default_rng(1), set()
     for spread in (0.0, *[1.0] * 12):
@@ -92,7 +92,7 @@ def test_steps_near_an_anchor_converge_with_its_factors_alone():
 
 
 @pytest.mark.parametrize("scheme", ["central4", "fourier"])
-def test_orbits_followed_near_and_far_are_those_solved_one_by_one(scheme):
+def test_orbits_followed_near_and_far_agree_with_single_solves(scheme):
     mus = np.array([0.2, 0.7, 0.99, 1.0, 1.02, 1.5, 2.0])
     theta = np.stack([mus, np.full(mus.size, 0.1)], axis=-1)
     found = batch(scheme, 1.0, 0.6).solve(theta, keep=True)

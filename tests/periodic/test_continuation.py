@@ -65,7 +65,7 @@ def doubled(rotation):
     return bp.continue_periodic(bp.models.pendulum, first, "frequency", until=9.09 / TURN, progress=False)
 
 
-def test_folds_of_a_frequency_response_are_those_of_poincares_map(resonance):
+def test_folds_of_a_frequency_response_agree_with_the_poincare_map(resonance):
     upper, lower = duffing_fold((-0.2, 4.5, 0.3)), duffing_fold((-1.05, 0.62, 0.24))
     assert len(resonance.folds) == 2
     for fold, exact in zip(resonance.folds, (upper, lower), strict=True):
@@ -115,7 +115,7 @@ def test_branch_can_be_followed_back_over_its_folds(resonance):
     assert branch[-1].states["x"] == pytest.approx(resonance[0].states["x"], abs=1e-8)
 
 
-def test_first_period_doubling_of_the_pendulum_is_that_of_shooting(rotation):
+def test_first_period_doubling_of_the_pendulum_agrees_with_shooting(rotation):
     known = shooting.DOUBLINGS[0]
     assert len(rotation.period_doublings) == 1 and not rotation.folds and rotation.complete
     found = rotation.period_doublings[0]
@@ -310,7 +310,7 @@ def test_branch_as_a_dataset(doubled):
         assert bool(at["stable"]) == doubled[point].stable
 
 
-def test_saved_branch_is_read_back_whole(resonance, tmp_path):
+def test_saved_branch_is_read_back_completely(resonance, tmp_path):
     resonance.save(tmp_path / "branch.h5")
     again = bp.load(tmp_path / "branch.h5")
     assert isinstance(again, bp.Branch) and len(again) == len(resonance)

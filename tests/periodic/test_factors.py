@@ -208,7 +208,7 @@ def test_bordered_solves_do_not_change_plain_solves():
     assert np.array_equal(factors.solve(right), before)
 
 
-def test_status_codes_of_the_compiled_code_are_those_of_the_package():
+def test_status_codes_of_the_compiled_code_match_those_of_the_package():
     names = ("CONVERGED", "STALLED", "SINGULAR", "NOT_FINITE", "OTHER_ORBIT", "MAX_SEGMENTS")
     kernels = compiled.kernels(1, (2, 3, 2))
     assert [getattr(kernels, name) for name in names] == [getattr(compiled, name) for name in names]

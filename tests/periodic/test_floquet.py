@@ -84,7 +84,7 @@ def test_multipliers_of_equal_modulus_and_opposite_sign(points):
 
 
 @pytest.mark.parametrize("points", [400, 401])
-def test_eigenfunctions_are_those_of_the_manufactured_system(points):
+def test_eigenfunctions_agree_with_the_manufactured_system(points):
     """They are v = P(t) c and w = P(t)⁻ᵀ d with B c = λ c, Bᵀ d = λ d, each up to a factor."""
     b, exact = wide_range()
     p, matrix = manufactured(points, b)
@@ -200,7 +200,7 @@ def test_exponent_of_a_stiff_equation_is_its_rate(points, rate, tolerance):
 
 
 def test_multipliers_of_overly_stiff_equations_are_stable_and_positive():
-    """Beyond what the integration resolves; a false −1 would pass for a period doubling."""
+    """Beyond the resolution of the integration; a false −1 would indicate a period doubling."""
     for points in (200, 201):
         multiplier = np.exp(floquet(np.full((points, 1, 1), -1e8), 1.0).exponents[0])
         assert 0.0 <= multiplier.real < 1.0 and multiplier.imag == 0.0

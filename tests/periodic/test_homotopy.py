@@ -179,7 +179,7 @@ def test_time_integration_fallback_leaves_an_unstable_equilibrium():
 
 
 def switch(steps: float, samples: int) -> bp.PeriodicSolution:
-    """Return a solution in which the argument of the sign crosses from −1 to 1 in so many of 100 steps."""
+    """Return a solution in which the argument of the sign crosses from −1 to 1 within the given number of 100 steps."""
     width = steps * (2 * np.pi) ** 2 / 100 / 2
     return bp.solve_periodic(
         SWITCH, {"width": width}, {"x": np.sin(2 * np.pi * grid(samples))}, frequency=1.0, samples=samples

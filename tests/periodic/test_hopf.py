@@ -20,7 +20,7 @@ def branch():
     return bp.continue_periodic(bp.models.flutter, first, "U", until=14.0, step=1.0, progress=False)
 
 
-def test_hopf_point_is_where_the_eigenvalues_of_the_written_out_matrices_cross():
+def test_hopf_point_agrees_with_the_eigenvalues_of_the_published_matrices():
     (point,) = bp.hopf_points(bp.models.flutter, VALUES, "U", between=(5.0, 25.0))
     speed, frequency = hopf()
     assert point.value == pytest.approx(speed, rel=1e-9)
@@ -55,7 +55,7 @@ def test_flutter_is_subcritical_with_the_published_fold(branch):
 
 
 @pytest.mark.parametrize("speed", [15.6, 16.5, 17.3])
-def test_stable_cycles_are_those_of_a_time_integration(branch, speed):
+def test_stable_cycles_agree_with_time_integration(branch, speed):
     (orbit,) = (s for s in bp.solutions_at(bp.models.flutter, branch, speed) if s.stable)
     frequency, states = settled(speed)
     assert orbit.frequency == pytest.approx(frequency, rel=1e-7)

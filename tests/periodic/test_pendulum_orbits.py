@@ -112,7 +112,7 @@ def test_period_two_guess_that_ends_on_the_period_one_orbit_has_status_other_orb
     assert ended.states["phi"] == pytest.approx(tiled, abs=1e-8)
     assert ended.status == "other orbit"
     assert not ended.converged and ended.multipliers.size == 0 and ended.sensitivities == {}
-    # The same orbit from a guess that is itself of period 1 is what was asked for, with squared multipliers.
+    # From a guess of period 1 the same orbit converges, with squared multipliers.
     asked = bp.solve_periodic(bp.models.pendulum, PENDULUM, **twice, guess={"phi": tiled})
     assert asked.converged
     assert np.sort_complex(asked.multipliers) == pytest.approx(np.sort_complex(once.multipliers**2), rel=1e-6)
@@ -144,7 +144,7 @@ def test_period_two_orbit_is_not_mistaken_for_a_repetition():
     assert np.abs(half).max() > 0.1
 
 
-def test_saved_orbit_is_read_back_whole(tmp_path):
+def test_saved_orbit_is_read_back_completely(tmp_path):
     solution = pendulum_solution(ROTATIONS[1], 200, "central4")
     solution.save(tmp_path / "orbit.h5")
     again = bp.load(tmp_path / "orbit.h5")

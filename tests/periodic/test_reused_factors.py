@@ -39,7 +39,7 @@ def rig(drive: str, scheme: str) -> list[PeriodicEquations]:
 )
 @pytest.mark.parametrize("scheme", ["backward2", "central2"])
 @pytest.mark.parametrize("drive", ["force", "displacement"])
-def test_every_solve_converges_to_what_a_solve_from_scratch_finds(drive, scheme, spread):
+def test_solves_with_reused_factors_equal_solves_from_scratch(drive, scheme, spread):
     """Spreads are standard deviations relative to theta4, theta6 and theta16; many theta16 are negative.
 
     At theta16 = -0.006 the smallest singular value is 1/350 of the anchor's, and 350 times as much is left after a step

@@ -211,7 +211,7 @@ def test_measured_noise_adds_the_scatter_of_the_mean():
         assert log_likelihood("measured", experiment, variance=5.0) == pytest.approx(expected, rel=1e-10)
 
 
-def test_jeffreys_prior_of_a_model_error_is_that_of_the_whole_variance():
+def test_jeffreys_prior_of_a_model_error_is_flat_in_the_log_total_variance():
     """∝ 1/(4 + v): the mass from zero to 4 is ln 2, and that from 4 to 4R is ln((1 + R)/2)."""
     problem = bp.Problem(LINEAR, [run(40, scatter={"force": 6.0}, cycles=9)], priors=PRIORS, noise="measured")
 
@@ -319,7 +319,7 @@ def situation(model) -> tuple[Likelihood, list[np.ndarray], np.ndarray]:
 
 @pytest.mark.parametrize("share", [1.0, 0.8])
 @pytest.mark.parametrize("model", MODELS, ids=repr)
-def test_gradients_are_those_of_high_order_differences(model, share):
+def test_noise_gradients_equal_high_order_differences(model, share):
     likelihood, residuals, values = situation(model)
     by_residual, by_noise = likelihood.gradients(residuals, values, share)
 
@@ -554,7 +554,7 @@ def test_error_names_the_bad_noise_of_a_problem(changes, message):
 @pytest.mark.parametrize(
     ("model", "needed"), [(noise.Independent(), 3), (noise.Independent(prior="flat"), 5), (noise.Circulant(), 3)]
 )
-def test_an_improper_prior_is_refused_where_the_data_can_be_fitted_exactly(model, needed):
+def test_improper_prior_is_rejected_if_the_data_can_be_fitted_exactly(model, needed):
     """Three free parameters fit three values; the flat prior diverges with two values more."""
     with pytest.raises(ValueError, match=rf"only {needed} independent values, where more than {needed} are needed"):
         bp.Problem(LINEAR, [run(40, independent={"force": needed})], priors=PRIORS, noise=model)

@@ -94,7 +94,7 @@ def test_a_tie_to_a_local_parameter_is_local():
     assert problem.parameters(theta, "run 2")[0] == pytest.approx([900.0, 50.0, 25.0])
 
 
-def test_variances_of_each_run_are_those_of_equation_7():
+def test_variances_of_each_run_follow_equation_7():
     """V = M/[n (1 − l/Σn)] with n = 40, l = 3, Σn = 80, in each run."""
     runs = [linear_experiment(TRUTH, sd, seed=seed, name=f"run {seed}") for seed, sd in ((1, 1.0), (2, 9.0))]
     fit = bp.map_estimate(

@@ -53,7 +53,7 @@ def both_sides(count: int) -> np.ndarray:
     return np.concatenate([-one[::-1], one])
 
 
-def test_log_posterior_has_no_steps(stated):
+def test_log_posterior_is_smooth_through_the_singular_value(stated):
     """On 600 points a polynomial of degree 12 through zero leaves a few millionths of the density's range."""
     at, share, _ = stated
     values = both_sides(300)

@@ -23,7 +23,7 @@ def contrast(one: str, other: str) -> float:
     return (high + 0.05) / (low + 0.05)
 
 
-def test_the_formula_gives_known_ratios():
+def test_contrast_formula_gives_published_ratios():
     """Black on white is 21:1, and #767676 the lightest grey that passes on white (WebAIM: 4.54:1)."""
     assert contrast("#000000", "#ffffff") == pytest.approx(21.0)
     assert contrast("#767676", "#ffffff") == pytest.approx(4.54, abs=0.005)

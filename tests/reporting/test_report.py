@@ -58,7 +58,7 @@ def test_verdicts_are_shown_in_words(solved, scored, page):
         assert words in answers
 
 
-def test_settings_seed_and_versions_are_kept(solved, page):
+def test_settings_seed_and_versions_are_shown(solved, page):
     settings, versions = page.rows("table-settings"), page.rows("table-versions")
     assert settings["Seed"] == [str(solved[2].seed)]
     assert settings["Difference scheme"] == ["central2"]

@@ -92,7 +92,7 @@ def test_derived_posterior_statistics_equal_those_of_numpy(solved):
     assert set(table.columns) < set(posterior.summary().columns)
 
 
-def test_ess_is_that_of_the_quantity(solved):
+def test_ess_of_a_derived_quantity_is_its_own(solved):
     """The ESS equals that of the summary in the coordinate in which the parameter is sampled."""
     posterior = solved[2]
     table = posterior.derive({"k_scaled": "3 - 2*k", "log_c": "log(c)"})

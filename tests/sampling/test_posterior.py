@@ -277,7 +277,7 @@ def test_units_and_the_noise_model_are_attributes():
     assert group["floor"].attrs == group["lengthscale"].attrs == {"noise": "circulant"}
 
 
-def test_a_channel_may_be_called_time():
+def test_channel_may_be_named_time():
     tau = grid(40)
     experiment = bp.Experiment("a", 2.0, {"time": np.sin(2 * np.pi * tau)}, {"x": np.cos(2 * np.pi * tau)}, samples=40)
     priors = {"k": bp.Normal(1.0, 1.0), "c": bp.Normal(1.0, 1.0)}

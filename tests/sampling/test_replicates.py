@@ -81,7 +81,7 @@ def test_predictive_multipliers_are_reported_without_rejecting_draws():
     assert np.all(np.abs(group["rotation angle"] - data) <= np.pi)
 
 
-def test_orbits_are_kept_with_the_draws_so_that_predictions_start_from_them():
+def test_predictions_start_from_the_orbits_of_the_draws():
     """With another guess in the problem the prediction stays on the rotation that was sampled."""
     problem = pendulum_problem([pendulum_run()])
     posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=250, progress=False)

@@ -66,7 +66,7 @@ def _orders():
     return enumerate(("", "d", "dd"))
 
 
-def test_inputs_are_those_of_the_samples_between_them_too():
+def test_inputs_are_interpolated_trigonometrically():
     samples, time = 32, np.arange(512) / 512
     experiment = bp.Experiment(
         "run", 0.5, {"displacement": np.arange(32.0)}, {"force": _wave(samples)}, samples=samples
@@ -85,7 +85,7 @@ def _wave(samples):
     return np.cos(angle) + 0.3 * np.sin(2 * angle)
 
 
-def test_elimination_needs_its_pivots():
+def test_elimination_uses_pivoting():
     generator = np.random.default_rng(1)
     matrix, right = generator.standard_normal((3, 3)), generator.standard_normal(3)
     matrix[0, 0] = 0.0
@@ -94,7 +94,7 @@ def test_elimination_needs_its_pivots():
     assert right == pytest.approx(exact, rel=1e-12)
 
 
-def test_integration_and_shooting_end_on_the_same_orbit_which_is_periodic_for_scipy_too(setting):
+def test_integration_shooting_and_scipy_agree_on_the_orbit(setting):
     case = setting.cases[0]
     p, one = case.estimate, Discretised(case, 400)
     ends = []
@@ -125,7 +125,7 @@ def test_the_runge_kutta_method_and_its_dense_output_are_of_fourth_order(setting
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_log_posteriors_are_those_of_the_package_where_only_some_harmonics_are_kept():
+def test_log_posteriors_with_cut_harmonics_equal_those_of_the_package():
     experiment = damper.generate(1).fold(400)
     problem = bp.Problem(bp.models.dahl, [experiment], priors=damper.PRIORS)
     fit = bp.map_estimate(problem, progress=False)
@@ -137,7 +137,7 @@ def test_log_posteriors_are_those_of_the_package_where_only_some_harmonics_are_k
         assert own == pytest.approx(float(problem.log_posterior(theta, made.noise)), abs=1e-8)
 
 
-def test_the_gradient_by_shooting_is_that_of_its_value(setting):
+def test_gradient_by_shooting_equals_differences_of_its_value(setting):
     case, sd = setting.cases[0], np.array(list(setting.fit.sd.values()))
     one, theta = Discretised(case, 200), setting.theta[0]
     _, gradient = one.value_and_gradient(setting.parameters(theta, case)[0], 1e-11)
@@ -148,7 +148,7 @@ def test_the_gradient_by_shooting_is_that_of_its_value(setting):
         assert gradient[k] * sd[k] == pytest.approx((up - down) / 0.02, rel=1e-4, abs=1e-4)
 
 
-def test_every_contender_is_right_before_it_is_timed(setting):
+def test_every_contender_is_accurate_before_it_is_timed(setting):
     reference = refer(setting)
     assert reference.uncertainty < 1e-6
     contest = contenders.Contest(reference)
@@ -169,7 +169,7 @@ def test_every_contender_is_right_before_it_is_timed(setting):
     json.dumps(found)
 
 
-def test_actions_take_turns_and_ratios_are_taken_within_a_repeat():
+def test_timings_are_interleaved_and_ratios_taken_within_a_repeat():
     order = []
     actions = {
         "a": Action(lambda: order.append("a")),
@@ -184,7 +184,7 @@ def test_actions_take_turns_and_ratios_are_taken_within_a_repeat():
     assert slope([1, 2, 4], [3, 12, 48]) == pytest.approx(2.0)
 
 
-def test_targets_are_called_met_and_missed_as_measured():
+def test_targets_are_reported_as_met_or_missed():
     def entry(name, value):
         return {"name": name, "ratio": value and {"median": value}, "note": "never right", "gradient_error": None}
 
@@ -208,7 +208,7 @@ def test_a_quick_run_writes_table_and_figure(tmp_path, capsys, setting, monkeypa
     assert {row["what"].split(":")[0] for row in results["checks"]} >= {problems.FORCE}
 
 
-def test_a_peer_that_is_not_installed_is_a_row_that_says_so(setting, monkeypatch):
+def test_missing_peer_has_a_row_with_the_reason(setting, monkeypatch):
     monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
     contest = contenders.Contest(refer(replace(setting, name=problems.DUFFING)))
     compiled = contenders.add_compiled(contest)
@@ -221,7 +221,7 @@ def test_a_peer_that_is_not_installed_is_a_row_that_says_so(setting, monkeypatch
 
 
 @pytest.mark.parametrize("peer", ["diffrax", "harmonicbalance"])
-def test_peers_are_right(setting, peer):
+def test_peers_give_accurate_results(setting, peer):
     pytest.importorskip(peer)
     case = setting.cases[0]
     one, p = Discretised(case, 800), setting.parameters(setting.theta, case)
@@ -244,7 +244,7 @@ def test_the_density_of_the_peers_is_the_posterior_with_the_variance_integrated_
     assert density(-setting.theta[0]) == -np.inf
 
 
-def test_the_potential_of_jax_is_that_density(setting):
+def test_potential_in_jax_equals_the_density(setting):
     jax = pytest.importorskip("jax")
     pytest.importorskip("diffrax")
     methods = [Method(Discretised(case, 800), SHOOTING, PREDICTED, 1e-9) for case in setting.cases]
@@ -267,7 +267,7 @@ def test_integration_leaves_an_unstable_orbit_at_the_rate_of_its_multiplier():
     assert upright[0] > 1e-8 and max(upright) > benchmark.LEFT
 
 
-def test_the_guard_compares_ratios_only_and_names_those_that_are_worse(tmp_path):
+def test_guard_compares_ratios_and_names_the_worse_ones(tmp_path):
     def spread(median, share):
         return {"median": median, "least": median * (1.0 - share), "largest": median * (1.0 + share)}
 
@@ -289,7 +289,7 @@ def test_the_guard_compares_ratios_only_and_names_those_that_are_worse(tmp_path)
         benchmark.guard(results(1.0, 0.5), benchmark.read_kept(kept))
 
 
-def test_the_guard_times_the_draws_of_the_whole_run():
+def test_guard_times_the_draws_of_the_full_run():
     def drawn(**given):
         options = argparse.Namespace(**{"quick": False, "guard": False, "seed": 3, "data": None} | given)
         return benchmark.problems(options)[problems.DUFFING]().theta
@@ -298,7 +298,7 @@ def test_the_guard_times_the_draws_of_the_whole_run():
     assert len(drawn(quick=True)) < len(drawn())
 
 
-def test_exponents_are_those_of_the_power_laws():
+def test_exponents_of_power_laws_are_recovered():
     def seconds(size):
         return 1e-3 * size**1.5 * float(np.ones(100_000 * size).mean())
 
@@ -315,7 +315,7 @@ def test_memory_of_the_batched_call_grows_no_faster_than_the_walkers():
     assert slope([64, 256], peaks) < 1.2
 
 
-def test_posterior_and_scaling_are_told_and_judged():
+def test_posterior_and_scaling_are_reported_with_verdicts():
     walked = {"ess_per_log_posterior": 0.02}
     own = {"ess_per_second": 100.0, "ess_per_log_posterior": 0.05, "seconds": 10.0, "log_posteriors": 20_000}
     samplers = {"sample, default": own, posteriors.NUMPYRO: {"note": "jax is not installed"}}

@@ -40,7 +40,7 @@ def test_results_and_figures_are_written(found):
     assert "SYNTHETIC" in printed and "draws per rank" in printed
 
 
-def test_a_second_run_does_nothing_again(found, monkeypatch):
+def test_second_run_recomputes_nothing(found, monkeypatch):
     folder, results, _ = found
     monkeypatch.setattr(calibration, "CASES", {"duffing": calibration.CASES["duffing"]})
     before = (folder / "duffing" / "replicates.jsonl").read_bytes()
@@ -59,6 +59,6 @@ def test_every_case_can_be_simulated_and_only_one_miscounts(name):
         assert ratio == pytest.approx(OVERCOUNT if name == "miscounted" else 1.0, abs=0.02)
 
 
-def test_a_bad_number_of_replicates_is_refused(tmp_path, capsys):
+def test_bad_number_of_replicates_is_rejected(tmp_path, capsys):
     assert main(["calibration", "--out", str(tmp_path), "--replicates", "-1"]) == 1
     assert "--replicates: -1 is not allowed" in capsys.readouterr().err

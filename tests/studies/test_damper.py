@@ -51,7 +51,7 @@ def quick(short_recording, tmp_path_factory):
         return folder, run(folder, "--quick"), printed.getvalue()
 
 
-def test_synthetic_data_are_called_synthetic_and_the_truth_is_found(quick):
+def test_synthetic_data_are_labelled_and_the_truth_is_recovered(quick):
     folder, results, printed = quick
     assert "SYNTHETIC" in printed and damper.SHA256 in printed and "github.com/labcontrol-data" in printed
     assert results["data"] == {"path": "generated", "sha256": None, "synthetic": True}
@@ -72,14 +72,14 @@ def test_same_seed_same_results_but_for_seconds_and_versions(quick, synthetic, t
         assert (folder / f"{name}.png").read_bytes() == (tmp_path / f"{name}.png").read_bytes()
 
 
-def test_reaching_the_limit_of_a_quick_run_is_said(quick):
+def test_quick_run_reports_that_it_reached_its_limit(quick):
     results = quick[1]
     assert results["converged"] is False
     assert "max_steps = 500 reached" in results["reason"]
     assert set(results["comparison"].values()) == {"not converged"}
 
 
-def test_what_it_cannot_do_is_one_line_and_a_status(tmp_path, capsys):
+def test_errors_are_one_line_with_an_exit_status(tmp_path, capsys):
     assert main(["damper", "--data", "nowhere.csv", "--out", str(tmp_path)]) == 1
     assert capsys.readouterr().err == "error: --data: 'nowhere.csv' is not allowed; there is no such file.\n"
     assert main(["dampper"]) == 2

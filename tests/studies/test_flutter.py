@@ -32,7 +32,7 @@ def run(folder, *arguments):
     return printed.getvalue()
 
 
-def test_authors_hopf_point_is_that_of_the_eigenvalues_and_a_speed_without_a_cycle_is_told():
+def test_hopf_point_agrees_with_the_eigenvalues_and_a_speed_without_a_cycle_raises():
     along = rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS)
     speed, frequency = hopf()
     assert along.hopf.value == pytest.approx(speed, abs=0.05)
@@ -42,13 +42,13 @@ def test_authors_hopf_point_is_that_of_the_eigenvalues_and_a_speed_without_a_cyc
         along.at("unstable", 14.9)
 
 
-def test_half_a_range_is_that_of_the_signal_and_not_of_its_samples():
+def test_half_range_is_that_of_the_interpolated_signal():
     tau = (np.arange(12) + 0.3) / 12
     assert flutter.half_range(0.2 + np.cos(2 * np.pi * tau)) == pytest.approx(1.0, rel=1e-6)
 
 
 @pytest.mark.slow
-def test_a_quick_run_tells_what_was_asked_and_says_synthetic(tmp_path):
+def test_quick_run_writes_all_results_and_labels_synthetic_data(tmp_path):
     printed = run(tmp_path, "--quick")
     assert "SYNTHETIC records" in printed
     results = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
@@ -59,7 +59,7 @@ def test_a_quick_run_tells_what_was_asked_and_says_synthetic(tmp_path):
     assert {path.stem for path in tmp_path.glob("*.png")} == {"bifurcation", "portraits", "contraction"}
 
 
-def test_synthetic_records_are_called_synthetic_and_have_the_cycles_of_the_truth():
+def test_synthetic_records_are_labelled_and_have_the_true_cycles():
     along = rig.cycles(rig.RIG | rig.TRUE)
     records = rig.generate(1)
     admitted, refused = rig.usable(records)
@@ -71,7 +71,7 @@ def test_synthetic_records_are_called_synthetic_and_have_the_cycles_of_the_truth
         assert questions.sizes(e.outputs) == pytest.approx(questions.sizes(orbit.outputs), rel=0.05)
 
 
-def test_campaigns_are_resumed(tmp_path, monkeypatch):
+def test_campaigns_are_resumable(tmp_path, monkeypatch):
     """The second time there is none to do."""
     printed = run(tmp_path, "--replicates", "1")
     assert "0 failures" in printed and "kept apart in 1" in printed
@@ -81,7 +81,7 @@ def test_campaigns_are_resumed(tmp_path, monkeypatch):
     assert max(abs(line["pulls"][name]) for name in campaigns.STIFFNESSES) < 5.0
 
 
-def test_records_that_drift_or_are_too_short_are_left_out_with_the_reason():
+def test_records_that_drift_or_are_too_short_are_excluded_with_a_reason():
     time = rig.STEP * np.arange(2000)
     still = np.cos(2 * np.pi * 2.45 * time)
     given = {"steady": still, "growing": still * (1 + 0.04 * time), "short": still[:400]}
@@ -94,7 +94,7 @@ def test_records_that_drift_or_are_too_short_are_left_out_with_the_reason():
     assert "is not steady" in refused["growing"] and "at least 3 cycles are needed" in refused["short"]
 
 
-def test_amplitudes_of_draws_are_those_of_the_branch_continued_at_their_values():
+def test_amplitudes_of_draws_agree_with_branches_continued_at_their_values():
     along = rig.cycles(rig.RIG | rig.TRUE)
     changed = rig.TRUE | {"k_alpha2": 650.0, "c_h": 7.5, "gain_pitch": 0.8}
     other = rig.cycles(rig.RIG | changed)
@@ -109,7 +109,7 @@ def test_amplitudes_of_draws_are_those_of_the_branch_continued_at_their_values()
             assert np.isnan(size[2])
 
 
-def test_draws_of_laplace_are_normal_in_the_logarithms_of_what_is_positive():
+def test_laplace_draws_are_normal_in_the_logarithms_of_positive_parameters():
     """Sample moments of 20 000 draws, within five standard errors: false alarm below 1e-5."""
     names = ["k_alpha2", "gain_pitch", "offset_pitch"]
     spread = np.array([[0.04, 0.06, 0.0], [0.06, 0.1, 0.0], [0.0, 0.0, 0.25]])
@@ -123,13 +123,13 @@ def test_draws_of_laplace_are_normal_in_the_logarithms_of_what_is_positive():
     assert np.all(np.abs(np.cov(rows) - spread) < 5 * np.outer(sds, sds) * np.sqrt(2 / 20_000))
 
 
-def test_speeds_within_a_quarter_are_left_out_together():
+def test_speeds_within_a_quarter_metre_per_second_form_one_group():
     speeds = {"a": 14.9, "b": 16.4, "c": 16.5, "d": 17.2, "e": 17.3}
     assert questions.groups(speeds) == [["a"], ["b", "c"], ["d", "e"]]
 
 
 @real_data
-def test_of_the_measured_records_the_one_that_drifts_is_left_out():
+def test_measured_record_that_drifts_is_excluded():
     records, data = rig.read_records(None, 1)
     admitted, refused = rig.usable(records)
     assert data["sha256"] == rig.SHA256

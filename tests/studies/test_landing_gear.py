@@ -42,7 +42,7 @@ def test_the_rig_keeps_its_power_limit_and_varies_the_amplitude_at_equal_frequen
     assert RUNS[0].stroke == max(run.stroke for run in RUNS) and RUNS[0].frequency == min(frequencies)
 
 
-def test_truth_a_is_eq_9():
+def test_truth_a_satisfies_equation_9():
     """The rig's time integration against the periodic solver on the ready-made model, at its order of accuracy."""
     cycle = integrate_steady(SMALL, TRUTHS["A"], 1600)
     solved = bp.solve_periodic(
@@ -82,7 +82,7 @@ def lever(psi: float) -> float:
     return abs(axis[0] * 1.16 + axis[1] * 2.6) / np.hypot(*axis)
 
 
-def test_the_drop_is_that_of_equations_written_by_hand():
+def test_drop_agrees_with_equations_written_by_hand():
     """Moments about the pivot and eq. (9), integrated by SciPy's Radau."""
     g = GEAR
 
@@ -115,7 +115,7 @@ def test_the_dropped_gear_comes_to_the_balance_of_moments():
 
 
 @pytest.mark.parametrize("slope", force.SLOPES)
-def test_steep_friction_is_solved_and_a_coarse_grid_is_told(slope):
+def test_steep_friction_is_solved_and_a_coarse_grid_gives_a_warning(slope):
     """The arctan changes over within 2/slope of velocity: 3 steps and more of the grid at 300 s/m, not at 1000."""
     for run in (SMALL, Run(1.0, 18e-3)):
         found, warned = force.solve(run, slope, "force")
@@ -170,7 +170,7 @@ def quick(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_quick_run_tells_right_model_from_wrong_one(quick):
+def test_quick_run_distinguishes_the_right_model_from_the_wrong_one(quick):
     _, results, printed = quick
     assert "SYNTHETIC" in printed and results["study"]["synthetic"] and results["study"]["quick"]
     assert results["A"]["misspecified"] == [] and results["A"]["signs"]["negative"] == []
@@ -227,7 +227,7 @@ def test_errors_with_the_force_given_have_the_covariance_of_all_noise():
 
 
 @pytest.mark.slow
-def test_quality_control_names_what_is_faulty(quick):
+def test_quality_control_names_the_fault(quick):
     """One unit of each kind; a false alarm comes in 1 % of units, the faults are 70 standard deviations and more."""
     _, results, printed = quick
     kinds = results["quality"]["kinds"]
@@ -241,7 +241,7 @@ def test_quality_control_names_what_is_faulty(quick):
 
 
 @pytest.mark.slow
-def test_a_model_with_the_lost_motion_predicts_better_what_it_was_not_fitted_to(quick):
+def test_model_with_lost_motion_has_lower_held_out_error(quick):
     """Each of the two experiments from the other; the score's gain is the fall of ln(rms) times independent values."""
     _, results, printed = quick
     models = results["repair"]["models"]
@@ -269,7 +269,7 @@ def test_a_faulty_gear_has_the_gas_law_of_its_fault():
 
 
 @pytest.mark.slow
-def test_every_figure_is_drawn_and_says_synthetic(quick):
+def test_every_figure_is_drawn_and_labelled_synthetic(quick):
     drawn, _, _ = quick
     corners = {f"corner_{stroke}_{truth}" for stroke in ("large", "small") for truth in "AB"}
     assert set(drawn) == {"histories", "theta16", "theta16_force", "drop", "loops", "quality", "repair"} | corners

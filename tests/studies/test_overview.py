@@ -15,7 +15,7 @@ def fit():
     return bp.map_estimate(scaling_symmetry().problem(1), progress=False)
 
 
-def test_ellipses_are_where_a_normal_distribution_has_its_probabilities(fit):
+def test_ellipses_have_the_probabilities_of_a_normal_distribution(fit):
     names = [overview.MASS, overview.AIR]
     covariance = fit.covariance.loc[names, names].to_numpy(float)
     away = np.stack(overview.ellipses(fit)) - np.array([[fit.theta[name]] for name in names])

@@ -22,7 +22,7 @@ def quick(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_what_is_found_without_noise_is_confirmed_by_shooting(quick):
+def test_orbits_found_without_noise_are_confirmed_by_shooting(quick):
     results, _, _ = quick
     found = results["found_without_noise"]
     assert found["polished"] >= 12 and found["not_confirmed_by_shooting"] == []
@@ -39,7 +39,7 @@ def test_chained_fits_find_more_orbits_than_boxes(quick):
 
 
 @pytest.mark.slow
-def test_estimates_are_better_than_the_paper_s_by_far(quick):
+def test_estimates_have_smaller_errors_than_in_the_paper(quick):
     """The paper's errors are 9.6, 0.3 and 11.6 %, on its own experiment; targets at 0.1 % noise 1, 0.25 and 1 %."""
     results, printed, _ = quick
     estimates = results["estimates"]
@@ -52,13 +52,13 @@ def test_estimates_are_better_than_the_paper_s_by_far(quick):
 
 
 @pytest.mark.slow
-def test_all_five_get_the_verdict_of_the_structural_analysis(quick):
+def test_verdicts_of_all_five_parameters_agree_with_the_structural_analysis(quick):
     results, _, _ = quick
     verdicts = results["all_five"]["verdicts"]
     assert verdicts.pop("l") == "determined"
     assert verdicts == dict.fromkeys(("m", "k1", "k2", "k3"), "only in combination")
     assert "k1/(m*l**2)" in results["all_five"]["structure"]
-    # Too short a chain, and said so.
+    # The chain is too short and is reported as not converged.
     assert not results["all_five"]["converged"]
 
 
@@ -77,7 +77,7 @@ def test_shooting_from_disturbed_points_returns_to_the_tabulated_orbits():
         assert shot.multipliers == pytest.approx(np.array(known.multipliers), rel=1e-5)
 
 
-def test_a_measured_recording_is_read_and_not_called_synthetic(tmp_path):
+def test_measured_recording_is_not_labelled_synthetic(tmp_path):
     recording = pendulum_recording.with_noise(pendulum_recording.simulate(300, 3), 1e-3, 3)
     table = np.column_stack([recording.time, *recording.outputs.values()])
     path = tmp_path / "run.csv"

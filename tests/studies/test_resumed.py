@@ -1,7 +1,7 @@
 from studies.common import remembered
 
 
-def test_a_part_is_made_once_and_again_for_another_source(tmp_path):
+def test_cached_part_is_recomputed_for_another_source(tmp_path):
     made = []
 
     def make():

@@ -31,7 +31,7 @@ def found(results: dict, what: str) -> list[dict]:
 
 
 @pytest.mark.slow
-def test_ridge_shows_all_that_it_must_even_in_a_quick_run(done):
+def test_quick_run_meets_all_checks_of_the_ridge(done):
     _, results, printed = done
     cut = found(results, "ridge, default") + found(results, "ridge, natural") + found(results, "by quadrature")
     assert len(cut) >= 6 and all(check["met"] for check in cut)
@@ -41,7 +41,7 @@ def test_ridge_shows_all_that_it_must_even_in_a_quick_run(done):
 
 
 @pytest.mark.slow
-def test_every_row_has_a_value_or_says_why_not(done):
+def test_every_row_has_a_value_or_a_reason(done):
     _, results, _ = done
     for check in results["checks"]:
         assert set(check) == {"what", "value", "low", "high", "met", "note"}
@@ -64,7 +64,7 @@ def test_samplers_are_compared_in_every_mean_and_sd(done):
         assert entry["moments"]["Kx"]["mean"] > 0.0 and entry["moments"]["rho"]["sd_error"] > 0.0
 
 
-def test_density_on_the_ridge_is_that_of_a_double_integral():
+def test_density_on_the_ridge_equals_a_double_integral():
     """By SciPy's adaptive quadrature over b, for the cut priors and the uncut ones."""
     for cut in (True, False):
         a, density = sampling_ridge.marginal(cut=cut)
@@ -97,7 +97,7 @@ def chain(generator: np.random.Generator, correlation: float, mean: float = 0.0)
     return SimpleNamespace(data={"posterior": group}, names=("x",), draws=lambda name: values.ravel())
 
 
-def test_monte_carlo_errors_are_those_of_an_autoregressive_chain():
+def test_monte_carlo_errors_of_an_autoregressive_chain_agree_with_the_closed_form():
     """Known: tau = (1 + r)/(1 − r), for squares with r². Twenty batches know it to 16 %; allowed is four times that."""
     generator = np.random.default_rng(1)
     moments = sampling_damper.moments(chain(generator, 0.8))["x"]
@@ -106,7 +106,7 @@ def test_monte_carlo_errors_are_those_of_an_autoregressive_chain():
     assert moments["sd_error"] == pytest.approx(np.sqrt(0.5 * 1.64 / 0.36 / draws), rel=0.65)
 
 
-def test_a_sampler_that_is_off_by_a_tenth_of_an_sd_is_found_out():
+def test_sampler_with_a_bias_of_a_tenth_sd_is_detected():
     """The false-alarm rate of the limit is 1 %; the difference is six Monte Carlo errors of both together or more."""
     generator = np.random.default_rng(2)
     right, same, off = (chain(generator, 0.8, mean) for mean in (0.0, 0.0, 0.1))
@@ -115,7 +115,7 @@ def test_a_sampler_that_is_off_by_a_tenth_of_an_sd_is_found_out():
     assert max(d["errors"] for d in sampling_damper.compare_all({"one": right, "other": off})) > limit
 
 
-def test_a_second_branch_that_was_missed_is_met_only_by_not_claiming_convergence():
+def test_missed_second_branch_passes_only_without_claimed_convergence():
     mass = {"found": 0.0, "by_quadrature": 0.0122, "monte_carlo_error": 0.001}
     run = {"sd": 0.6, "converged": True, "tau": {"a": 8.0}, "reason": "stop rule passed", "negative_mass": mass}
     ridge = {name: run for name in ("default", "natural", "uncut")}
@@ -125,13 +125,13 @@ def test_a_second_branch_that_was_missed_is_met_only_by_not_claiming_convergence
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="only Linux holds a process on one core")
-def test_a_worker_walks_the_chain_of_the_thread_and_is_timed():
+def test_overhead_of_a_worker_is_measured():
     found = sampling_cost.pool_overhead(1, ("process",), 1e-5)
     assert found["ratios"]["process"]["median"] > 0.0 and found["ratios"]["process"]["processor_time"] > 0.0
     assert found["log_posteriors"]["piece"] == 100 and found["log_posteriors"]["run"] >= 2000
 
 
-def test_gain_has_no_verdict_where_a_plain_loop_gains_nothing():
+def test_gain_has_no_verdict_if_a_plain_loop_gains_nothing():
     drive = {"gain": 1.2, "plain": 1.3, "ratio": 0.95, "ratio_quartiles": [0.9, 1.0]}
     cost = {
         "pools": None,
@@ -146,7 +146,7 @@ def test_gain_has_no_verdict_where_a_plain_loop_gains_nothing():
     assert "busy" in sampling_cost.loaded({"load_average": [3.0, 0, 0], "cores": 2})
 
 
-def test_rows_keep_their_limits():
+def test_rows_compare_values_with_their_limits():
     assert [row("x", value, 0.9, 1.1)["met"] for value in (0.8, 1.0, 1.2, None)] == [False, True, False, None]
     assert row("x", 5.0, 0.9, None)["met"] is True
     text = table_of_rows([row("x", 5.0, 0.9, None, "why"), row("y", None, 0.0, 1.0, "because")])

@@ -50,7 +50,7 @@ def has_the_promised_keys(results):
     return True
 
 
-def test_synthetic_data_are_called_synthetic_and_the_truth_is_found(quick):
+def test_synthetic_data_are_labelled_and_the_truth_is_recovered(quick):
     folder, results, printed = quick
     assert "SYNTHETIC" in printed and data.SHA256 in printed and "nonlinearbenchmark.org" in printed
     assert results["data"] == {"path": "generated", "sha256": None, "synthetic": True}

@@ -21,7 +21,7 @@ def done(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_all_that_must_show_does(done):
+def test_all_checks_of_the_study_are_met(done):
     _, results, printed = done
     assert len(results["checks"]) >= 20
     assert [check["what"] for check in results["checks"] if not check["met"]] == []
@@ -33,7 +33,7 @@ def test_all_that_must_show_does(done):
 
 
 @pytest.mark.slow
-def test_orders_are_those_of_the_schemes(done):
+def test_measured_orders_equal_those_of_the_schemes(done):
     forced = done[1]["orders"]["forced"]
     assert forced["backward2"]["order"] == pytest.approx(2.0, abs=0.05)
     assert forced["central2"]["order"] == pytest.approx(2.0, abs=0.05)
@@ -42,7 +42,7 @@ def test_orders_are_those_of_the_schemes(done):
     assert done[1]["orders"]["reference_error"] < 1e-12
 
 
-def test_the_pendulum_of_the_study_is_that_of_the_shooting_tables():
+def test_pendulum_of_the_study_has_the_parameters_of_the_shooting_tables():
     c = {name: solver.PENDULUM[f"k{i}"] / (0.1 * 0.3**2) for i, name in enumerate(("c1", "c2", "c3"), start=1)}
     assert {name: shooting.PENDULUM[name] for name in c} == pytest.approx(c)
     assert sorted({len(known.section) for known in solver.ORBITS}) == [3, 5]
@@ -62,7 +62,7 @@ def test_the_pendulum_follows_its_cascade_and_comes_back_as_the_other_rotation(d
 
 
 @pytest.mark.slow
-def test_duffing_folds_lie_where_one_harmonic_puts_them(done):
+def test_duffing_folds_agree_with_one_term_harmonic_balance(done):
     """(k − mω² + ¾k3A²)²A² + (cωA)² = F² has vertical tangents there, but for the third harmonic."""
     m, c, k, k3 = (solver.DUFFING[name] for name in ("m", "c", "k", "k3"))
     for entry in done[1]["duffing"]:

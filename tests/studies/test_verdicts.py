@@ -26,7 +26,7 @@ def quick(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_every_verdict_of_the_quick_gallery_is_right(quick):
+def test_every_verdict_of_the_quick_gallery_is_correct(quick):
     _, results, printed = quick
     assert set(results) == {*verdicts.QUICK, "study"}
     for name in verdicts.QUICK:
@@ -39,7 +39,7 @@ def test_every_verdict_of_the_quick_gallery_is_right(quick):
 
 
 @pytest.mark.slow
-def test_a_prior_that_dominates_contracts_as_it_must(quick):
+def test_contraction_of_a_dominating_prior_is_the_expected_one(quick):
     """Data ± 7.1 and prior ± 3 N s/m: contraction 1/(1 + 7.1²/3²) = 0.15, the variance estimated (± 40 %)."""
     _, results, _ = quick
     value, error = results["prior_dominated"]["numbers"]["c"]["contraction"]
@@ -80,7 +80,7 @@ def test_replicates_are_saved_one_by_one_and_resumed(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The data do not change under")
-def test_counts_tell_what_is_wrong_and_what_flips(quick):
+def test_counts_report_wrong_and_changed_verdicts(quick):
     folder, results, _ = quick
     outcome = examine("scaling_symmetry", 0, 0, drawless=True)
     assert outcome.sampled is None and not outcome.wrong and outcome.named
@@ -99,7 +99,7 @@ def test_counts_tell_what_is_wrong_and_what_flips(quick):
     assert "1 times identifiability m" in verdicts.account_of_replicates({"scaling_symmetry": found})
 
 
-def test_a_replicate_that_fails_is_counted_and_told(monkeypatch):
+def test_failed_replicate_is_counted_and_reported(monkeypatch):
     def fails(*_, **__):
         raise RuntimeError("no orbit")
 
@@ -110,7 +110,7 @@ def test_a_replicate_that_fails_is_counted_and_told(monkeypatch):
     assert counts["right"] == 0 and counts["errors"] == ["RuntimeError: no orbit"] and counts["seconds_each"] is None
 
 
-def test_every_case_states_what_its_tools_must_say():
+def test_every_case_states_its_expected_verdicts():
     for name, make in CASES.items():
         case = make()
         assert set(case.fault) <= set(case.expected), name

@@ -68,7 +68,7 @@ def test_power_series_propagate_complex_steps():
     np.testing.assert_allclose(found, [2 * np.cos(0.8), -4 * np.sin(0.8)], rtol=1e-14)
 
 
-def test_unknown_functions_of_two_arguments_are_refused():
+def test_unknown_functions_of_two_arguments_raise():
     with pytest.raises(TypeError):
         series(sp.Function("f")(x, y), {x: np.ones((2, 1), complex), y: np.ones((2, 1), complex)})
 
