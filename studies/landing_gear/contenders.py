@@ -11,11 +11,12 @@ from functools import cached_property
 
 import numpy as np
 from scipy.integrate import solve_ivp
-from scipy.optimize import brentq
 
 import bayesperiodic as bp
+from studies.benchmark.equations import table
+from studies.gear import gear_at_rest
 from studies.landing_gear.identification import DISPLACEMENT, SAMPLES
-from studies.landing_gear.integrators import CONTROLLED_STEPS, FIXED_STEPS, OUTPUTS, SCIPY_RATES
+from studies.landing_gear.integrators import NAMES, Methods, methods
 
 FIXED, CONTROLLED, LSODA, RADAU = "Runge-Kutta", "Dormand-Prince", "LSODA", "Radau"
 COMPILED, SCIPY = (FIXED, CONTROLLED), (LSODA, RADAU)
@@ -38,26 +39,24 @@ class Gear:
 
     drive: str
     experiment: bp.Experiment
-    parameters: np.ndarray  # (draws, parameters): In the order of `landing_gear_integrators.NAMES`
+    parameters: np.ndarray  # (draws, parameters): In the order of `integrators.NAMES`
     estimate: np.ndarray  # (parameters,): The MAP estimate
 
     def still(self, parameters: np.ndarray) -> np.ndarray:
         """Return static equilibrium under the mean input, the gas as warm as the wall."""
-        mean, wall = float(self.experiment.inputs[self.drive].mean()), -parameters[14]
-        if self.drive == DISPLACEMENT:
-            return np.array([wall])
-
-        def balance(q: float) -> float:
-            pressure = parameters[4] * wall / (1.0 + parameters[5] * q + parameters[6] * wall)
-            return float(parameters[3] * pressure + parameters[10] - mean)
-
-        return np.array([brentq(balance, -0.1, -0.99 / parameters[5]), 0.0, wall])
+        return gear_at_rest(self.experiment, dict(zip(NAMES, parameters, strict=True)))
 
     def outputs(self, parameters: np.ndarray, path: np.ndarray) -> np.ndarray:
         """Return the outputs (SAMPLES, 2) that belong to states (points, size) over a cycle."""
         if len(path) != SAMPLES:
             path = np.fft.irfft(np.fft.rfft(path, axis=0) * (SAMPLES / len(path)), SAMPLES, axis=0)
-        return OUTPUTS[self.drive](parameters, self._inputs, np.ascontiguousarray(path))
+        out = np.empty((SAMPLES, 2))
+        self._methods.outputs(parameters, self._inputs, np.ascontiguousarray(path), out)
+        return out
+
+    @property
+    def _methods(self) -> Methods:
+        return methods(self.drive)
 
     def integrator(self, kind: str, fineness: float, tolerance: float) -> Integrate:
         """Return a compiled method with so many steps a cycle, or with this relative error of a step."""
@@ -66,11 +65,11 @@ class Gear:
 
         def fixed(parameters: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, int]:
             path = np.empty((min(steps, SAMPLES), start.size))
-            return path, FIXED_STEPS[self.drive](parameters, inputs, frequency, start.copy(), tolerance, path)
+            return path, self._methods.fixed(parameters, inputs, frequency, start.copy(), tolerance, path)
 
         def controlled(parameters: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, int]:
             path, scale = np.empty((SAMPLES, start.size)), self._scale(parameters)
-            count = CONTROLLED_STEPS[self.drive](
+            count = self._methods.controlled(
                 parameters, inputs, frequency, start.copy(), scale, fineness, tolerance, path
             )
             return path, count
@@ -84,14 +83,14 @@ class Gear:
 
         def integrate(parameters: np.ndarray, start: np.ndarray) -> np.ndarray:
             solved = solve_ivp(  # type: ignore[call-overload]
-                SCIPY_RATES[self.drive],
+                self._methods.rates_in_time,
                 (0.0, cycles / frequency),
                 start,
                 method,
                 times,
                 rtol=relative,
                 atol=relative * self._scale(parameters),
-                args=(parameters, inputs, frequency),
+                args=(parameters, inputs, 1.0 / frequency),
             )
             return solved.y.T if solved.success else np.full((SAMPLES, start.size), np.nan)
 
@@ -119,12 +118,7 @@ class Gear:
         return self._table(SAMPLES)
 
     def _table(self, points: int) -> np.ndarray:
-        """Return the input and its first two derivatives (points, 3) over a cycle."""
-        amplitudes = np.fft.rfft(self.experiment.inputs[self.drive]) / SAMPLES
-        turning = 2j * np.pi * self.experiment.frequency * np.arange(amplitudes.size)
-        kept = min(amplitudes.size, points // 2 + 1)
-        columns = [np.fft.irfft((amplitudes * turning**order)[:kept] * points, points) for order in range(3)]
-        return np.ascontiguousarray(np.stack(columns, axis=-1))
+        return table(self.experiment, [self.drive], points)
 
     def _scale(self, parameters: np.ndarray) -> np.ndarray:
         return np.array([-parameters[14]] if self.drive == DISPLACEMENT else [*SCALE, -parameters[14]])

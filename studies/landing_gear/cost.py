@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 import bayesperiodic as bp
+from studies.benchmark.kernels import MAX_CYCLES
 from studies.landing_gear.contenders import (
     COMPILED,
     SCIPY,
@@ -25,8 +26,9 @@ from studies.landing_gear.contenders import (
     error,
 )
 from studies.landing_gear.identification import DISPLACEMENT, FORCE, SAMPLES, Identified, problem
-from studies.landing_gear.integrators import MAX_CYCLES, NAMES
+from studies.landing_gear.integrators import NAMES
 from studies.landing_gear.verdicts import CONDUCTION
+from studies.timing import Action, interleaved, spread
 
 DRAWS, QUICK_DRAWS = 10, 2
 REPEATS, QUICK_REPEATS = 9, 1
@@ -68,10 +70,10 @@ def _by_scheme(
     own = _own_errors(warm, theta, gears)
     chosen = [{k: choose(gear, k, allowed) for k in COMPILED} for gear, allowed in zip(gears, own, strict=True)]
     noise = np.array(list(fit.noise.values()))
-    times = _interleaved(_actions(warm, scheme, noise, theta, gears, chosen), QUICK_REPEATS if quick else REPEATS)
+    times = interleaved(_actions(warm, scheme, noise, theta, gears, chosen), QUICK_REPEATS if quick else REPEATS)
     scipy = {method: _scipy(gears, own, chosen, method) for method in SCIPY}
     return {
-        "milliseconds": {name: _spread(1e3 * values) for name, values in times.items()},
+        "milliseconds": {name: spread(1e3 * values) for name, values in times.items()},
         "scipy_milliseconds": {method: seconds and 1e3 * seconds for method, seconds in scipy.items()},
         "ratios": _ratios(times, scipy),
         "experiments": {
@@ -139,19 +141,19 @@ def _actions(
     theta: np.ndarray,
     gears: Sequence[Gear],
     chosen: Sequence[Mapping[str, Contender]],
-) -> dict[str, tuple[Callable[[], Any], int]]:
+) -> dict[str, Action]:
     """Return what is timed, and of how many log-posteriors each call takes the time."""
     many = np.resize(theta, (WALKERS, theta.shape[1]))
-    actions: dict[str, tuple[Callable[[], Any], int]] = {
-        WARM: (lambda: [warm.log_posterior(one, noise) for one in theta], len(theta)),
-        BATCHED: (lambda: warm.log_posterior(many, noise), WALKERS),
-        COLD: (lambda: [_cold(gear, scheme) for gear in gears], 1),
+    actions: dict[str, Action] = {
+        WARM: Action(lambda: [warm.log_posterior(one, noise) for one in theta], len(theta)),
+        BATCHED: Action(lambda: warm.log_posterior(many, noise), WALKERS),
+        COLD: Action(lambda: [_cold(gear, scheme) for gear in gears]),
     }
     for kind in COMPILED:
         contenders = [by_kind[kind] for by_kind in chosen]
         known = [_steady(*one) for one in zip(gears, contenders, strict=True)]
-        actions[f"{kind} {STATIC}"] = partial(_integrate, gears, contenders, None), len(theta)
-        actions[f"{kind} {ESTIMATE}"] = partial(_integrate, gears, contenders, known), len(theta)
+        actions[f"{kind} {STATIC}"] = Action(partial(_integrate, gears, contenders, None), len(theta))
+        actions[f"{kind} {ESTIMATE}"] = Action(partial(_integrate, gears, contenders, known), len(theta))
     return actions
 
 
@@ -204,18 +206,6 @@ def _few_cycles(gear: Gear, method: str, relative: float) -> float:
     return min(times)
 
 
-def _interleaved(actions: Mapping[str, tuple[Callable[[], Any], int]], repeats: int) -> dict[str, np.ndarray]:
-    """Return seconds (repeats,) a log-posterior of every action, all of them in turn within every repeat."""
-    found: dict[str, list[float]] = {name: [] for name in actions}
-    for repeat in range(repeats + 1):
-        for name, (action, count) in actions.items():
-            before = time.perf_counter()
-            action()
-            if repeat:
-                found[name].append((time.perf_counter() - before) / count)
-    return {name: np.array(values) for name, values in found.items()}
-
-
 def _ratios(times: Mapping[str, np.ndarray], scipy: Mapping[str, float | None]) -> dict[str, Any]:
     """Return the time ratios of integration to the periodic solver, by the faster compiled method in each repeat."""
     quickest = {start: np.min([times[f"{kind} {start}"] for kind in COMPILED], axis=0) for start in (STATIC, ESTIMATE)}
@@ -223,11 +213,7 @@ def _ratios(times: Mapping[str, np.ndarray], scipy: Mapping[str, float | None]) 
     found |= {f"compiled {STATIC} / {BATCHED}": quickest[STATIC] / times[BATCHED]}
     found |= {f"compiled {STATIC} / {COLD}": quickest[STATIC] / times[COLD]}
     found |= {f"{method} {STATIC} / {WARM}": seconds / times[WARM] for method, seconds in scipy.items() if seconds}
-    return {name: _spread(values) for name, values in found.items()}
-
-
-def _spread(values: np.ndarray) -> dict[str, float]:
-    return {"median": float(np.median(values)), "least": float(values.min()), "largest": float(values.max())}
+    return {name: spread(values) for name, values in found.items()}
 
 
 def table(drive: str, found: Mapping[str, Any]) -> str:
