@@ -1,9 +1,9 @@
-"""The disk cache of compiled kernels: one folder a generated source, private to its user.
+"""Disk cache of compiled kernels: one folder per source text and constants, private to its user.
 
-An entry is built in a folder of its own and renamed into place, so that any number of processes may fill the cache
+An entry is built in a temporary folder and renamed into place, so that any number of processes may fill the cache
 at once. Before anything of an entry is executed, the folder must belong to the user and be closed to others, the
-source must equal the one just generated, and every compiled file must have the digest recorded when it was written.
-Anything else is compiled in memory, with a warning.
+source must equal the expected one, and every compiled file must have the digest recorded when it was written.
+Otherwise the kernels are compiled in memory, with a warning.
 """
 
 import hashlib
@@ -16,7 +16,7 @@ import sys
 import tempfile
 import types
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +37,24 @@ def cache_folder() -> Path:
     return Path(os.environ.get("BAYESPERIODIC_CACHE") or platformdirs.user_cache_dir("bayesperiodic")) / "kernels"
 
 
-def load(body: str, names: Sequence[str]) -> dict[str, Any]:
-    """Return named functions of a source text, from the cache or freshly compiled (and then cached).
+def load(
+    body: str, constants: Mapping[str, Any] | None = None, shared: types.ModuleType | None = None
+) -> types.ModuleType:
+    """Return a source text as a module of compiled functions, from the cache or freshly compiled (and then cached).
 
-    The text's functions are compiled with the signatures that it states and the Numba option ``cache=CACHE``.
+    Parameters
+    ----------
+    body : str
+        Its functions are compiled with the signatures that it states and the Numba option ``cache=CACHE``.
+    constants : mapping of str to object, optional
+        Values with a unique `repr`, defined in the module before its text is executed.
+    shared : module, optional
+        A module returned by this function, whose names are defined in the module too. An entry is compiled again when
+        the text or the constants of the shared module change.
     """
-    source = _header() + body
+    constants = dict(constants or {})
+    source = f"{_header()}# {constants!r}, {shared.__name__ if shared else None}\n{body}"
+    names = {**(vars(shared) if shared else {}), **constants}
     try:
         entry = _private_folder() / hashlib.sha256(source.encode()).hexdigest()[:32]
         if not entry.is_dir():
@@ -51,11 +63,11 @@ def load(body: str, names: Sequence[str]) -> dict[str, Any]:
         return _execute(source, names, entry / SOURCE, cache=True)
     except (CacheProblem, OSError) as problem:
         reason = str(problem)
-    except Exception as problem:  # whatever a damaged compiled file provokes in the loader
+    except Exception as problem:  # any error that a damaged compiled file causes in the loader
         reason = f"{type(problem).__name__}: {problem}"
     warnings.warn(
-        f"The kernel cache in {cache_folder()} cannot be used ({reason}); compiling in memory, which every start "
-        "will repeat. Delete the folder or set BAYESPERIODIC_CACHE to one that you own.",
+        f"The kernel cache in {cache_folder()} cannot be used ({reason}); compiling in memory, at every start. Delete "
+        "the folder or set BAYESPERIODIC_CACHE to one that you own.",
         RuntimeWarning,
         stacklevel=2,
     )
@@ -63,7 +75,7 @@ def load(body: str, names: Sequence[str]) -> dict[str, Any]:
 
 
 def _header() -> str:
-    """Return the line that tells what, besides the text, decides on the machine code."""
+    """Return the versions and the processor, on which the machine code depends besides the text."""
     python = ".".join(map(str, sys.version_info[:3]))
     machine = f"{platform.machine()} {' '.join(map(str, cpu_target.target_context.codegen().magic_tuple()))}"
     versions = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, python {python}, {machine}"
@@ -80,18 +92,18 @@ def _private_folder() -> Path:
     return folder
 
 
-def _build(source: str, names: Sequence[str], entry: Path) -> dict[str, Any]:
+def _build(source: str, names: Mapping[str, Any], entry: Path) -> types.ModuleType:
     workshop = Path(tempfile.mkdtemp(prefix="building-", dir=entry.parent))
     try:
         (workshop / SOURCE).write_text(source, encoding="utf-8")
-        functions = _execute(source, names, workshop / SOURCE, cache=True)
+        module = _execute(source, names, workshop / SOURCE, cache=True)
         (workshop / MANIFEST).write_text(json.dumps(_digests(workshop)), encoding="utf-8")
         try:
             workshop.rename(entry)
         except OSError:
             if not entry.is_dir():
                 raise
-        return functions
+        return module
     finally:
         shutil.rmtree(workshop, ignore_errors=True)
 
@@ -111,9 +123,10 @@ def _digests(entry: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def _execute(source: str, names: Sequence[str], path: Path, cache: bool) -> dict[str, Any]:
+def _execute(source: str, names: Mapping[str, Any], path: Path, cache: bool) -> types.ModuleType:
     module = types.ModuleType(f"bayesperiodic_kernels_{hashlib.sha256(source.encode()).hexdigest()[:32]}")
-    module.__dict__.update(__file__=str(path), CACHE=cache)
+    own = {name: value for name, value in names.items() if not name.startswith("__")}
+    module.__dict__.update(own, __file__=str(path), CACHE=cache)
     sys.modules[module.__name__] = module
     settings: Any = numba.config
     elsewhere, settings.CACHE_DIR = settings.CACHE_DIR, ""  # beside the source, where its digests are kept
@@ -121,4 +134,4 @@ def _execute(source: str, names: Sequence[str], path: Path, cache: bool) -> dict
         exec(compile(source, str(path), "exec"), module.__dict__)
     finally:
         settings.CACHE_DIR = elsewhere
-    return {name: getattr(module, name) for name in names}
+    return module

@@ -117,17 +117,20 @@ class Kernels:
         tau: np.ndarray,
         frequency: float,
     ) -> np.ndarray:
-        """Return one of the functions on a grid, (points, size)."""
-        size = {
+        """Return one of the functions on a grid, (points, columns)."""
+        out = np.empty((tau.size, self.columns(name)))
+        getattr(self, name)(states, inputs, parameters, tau, frequency, out)
+        return out
+
+    def columns(self, name: str) -> int:
+        """Return the number of columns of one of the functions."""
+        return {
             "residual": self.states,
             "residual_jacobian": self.states * (1 + 3 * self.states),
             "outputs": self.channels,
             "transitions": self.smooth_signs,
             "derivatives": sum(rows * columns for rows, columns in self._derivative_shapes()),
         }[name]
-        out = np.empty((tau.size, size))
-        getattr(self, name)(states, inputs, parameters, tau, frequency, out)
-        return out
 
     def split_derivatives(self, columns: np.ndarray) -> list[np.ndarray]:
         """Return g_θ, g_u, g_ν, f_q, f_θ, f_u, f_ν as arrays (points, rows, columns), ν being the frequency."""
@@ -276,7 +279,8 @@ class SymbolicModel:
 
 
 def _grid_functions(source: str, names: Sequence[str]) -> dict[str, GridFunction]:
-    return {name: GridFunction(compiled) for name, compiled in load(source, names).items()}
+    module = load(source)
+    return {name: GridFunction(getattr(module, name)) for name in names}
 
 
 def _vjp(weights: Sequence[sp.Symbol], rows: Sequence[sp.Expr], columns: Sequence[sp.Symbol]) -> list[sp.Expr]:

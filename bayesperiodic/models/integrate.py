@@ -1,8 +1,8 @@
-"""Compiled time integration: quick transients on the grid of a periodic problem, and accurate ones at any times."""
+"""Compiled time integration: fast transients on the grid of a periodic problem, and accurate ones at any times."""
 
 from functools import cache
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 
@@ -13,15 +13,15 @@ TRIALS = 100_000
 
 
 @cache
-def _kernels() -> dict[str, Any]:
+def _kernels() -> ModuleType:
     source = Path(__file__).with_name("_kernels").joinpath("integrate.py").read_text(encoding="utf-8")
-    return load(source, ("runge_kutta", "dormand_prince"))
+    return load(source)
 
 
 @cache
 def _tableau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return stages, nodes and error weights of the method of order 8, with the step's end as the last stage."""
-    from scipy.integrate import DOP853  # takes half a second, which no periodic solve should wait for
+    from scipy.integrate import DOP853  # an import of half a second
 
     a = np.vstack([DOP853.A, DOP853.B])
     return a, np.append(DOP853.C, 1.0), np.stack([DOP853.E5, DOP853.E3])
@@ -58,12 +58,12 @@ def integrate_accurately(
     Returns
     -------
     array (times, size)
-        Fewer rows where the integration could not go on.
+        Fewer rows if the integration fails.
     """
     path = np.empty((time.size, start.size))
     path[0] = start
     orders = np.array([model.orders[state] for state in model.states])
-    known = _kernels()["dormand_prince"](
+    known = _kernels().dormand_prince(
         model.kernels.residual_jacobian,
         np.ascontiguousarray(amplitudes, dtype=complex),
         parameters,
@@ -90,7 +90,7 @@ def integrate(
     steps: int,
     kept: int,
 ) -> np.ndarray | None:
-    """Integrate by the classical fourth-order Runge-Kutta method; None if the states grow beyond all bounds.
+    """Integrate by the classical fourth-order Runge-Kutta method; None if the states overflow.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def integrate(
     """
     orders = np.array([model.orders[state] for state in model.states])
     path = np.empty((kept, orders.sum()))
-    finished = _kernels()["runge_kutta"](
+    finished = _kernels().runge_kutta(
         model.kernels.residual_jacobian,
         np.array(start, dtype=float),
         np.ascontiguousarray(inputs),

@@ -1,44 +1,35 @@
 """Many parameter vectors times many input sets of a forced model, shared among the cores."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from types import SimpleNamespace
-from typing import NamedTuple
+from types import ModuleType
 
 import numpy as np
 
 from bayesperiodic._parallel import available_cores, in_threads
-from bayesperiodic.periodic.compiled import adjoint_kernels, autonomous_kernels, batch_kernels
-from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
-from bayesperiodic.periodic.sensitivity import Sensitivities, parameter_sensitivities, softening, softest_direction
+from bayesperiodic.periodic.compiled import (
+    NO_FACTORS,
+    Anchors,
+    BatchSolution,
+    Border,
+    Factors,
+    Functions,
+    Orbits,
+    Sets,
+    kernels,
+)
+from bayesperiodic.periodic.equations import BorderedFactors, PeriodicEquations, empty_factors, workspace
+from bayesperiodic.periodic.sensitivity import (
+    Sensitivities,
+    frequency_derivatives,
+    parameter_sensitivities,
+    smallest_singular_vectors,
+    stiffness_gradient,
+)
 
 SMALLEST_PART, PARTS_EACH = 4, 4
-NO_FACTORS = -1
-
-
-class BatchSolution(NamedTuple):
-    """What a batch of solves ended with.
-
-    Attributes
-    ----------
-    z : array (sets, solves, points, states)
-        The periodic parts; without entries unless they were asked for.
-    outputs : array (sets, solves, points, channels)
-    frequency : array (sets, solves)
-        [Hz].
-    status : int array (sets, solves)
-        Index into `compiled.STATUSES`.
-    iterations : int array (sets, solves)
-        Chord steps and Newton iterations.
-    """
-
-    z: np.ndarray
-    outputs: np.ndarray
-    frequency: np.ndarray
-    status: np.ndarray
-    iterations: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -86,14 +77,14 @@ class Anchor:
 
 
 class Batch:
-    """Input sets with their anchors, ready to be solved for many parameter vectors.
+    """Driven input sets with their anchors, solved for many parameter vectors.
 
     Parameters
     ----------
     sets : sequence of PeriodicEquations
-        Of one forced model on one grid; inputs, frequencies and winding numbers may differ.
+        Of one driven model on one grid; inputs, frequencies and winding numbers may differ.
     anchors : sequence of Anchor
-        One a set.
+        One per set.
     """
 
     def __init__(self, sets: Sequence[PeriodicEquations], anchors: Sequence[Anchor]):
@@ -102,48 +93,46 @@ class Batch:
         if any(e.model is not first.model or (e.grid.scheme, e.grid.samples, e.grid.periods) != layout for e in sets):
             raise ValueError("sets: all must have the same model, scheme, samples and periods.")
         self._first, self._size = first, len(sets)
-        self._factors = empty_factors(first.grid, first.count, (len(sets),))
+        self._sets = Sets(
+            np.stack([e.inputs for e in sets]), np.array([e.frequency for e in sets]), np.stack([e.drift for e in sets])
+        )
+        factors = empty_factors(first.grid, first.count, (len(sets),))
+        factors.ends[:, 0] = NO_FACTORS
         sensitivities = np.zeros((len(sets), len(first.model.parameters), first.grid.points, first.count))
-        left = np.zeros((len(sets), first.grid.points, first.count))
-        right = np.zeros((len(sets), first.grid.points, 3 * first.count))
-        slopes, amplitude = np.zeros(sensitivities.shape[:2]), np.stack([np.abs(a.z).max(axis=0) for a in anchors])
+        left, right = np.zeros((2, len(sets), first.grid.points, first.count))
+        gradient, amplitude = np.zeros(sensitivities.shape[:2]), np.stack([np.abs(a.z).max(axis=0) for a in anchors])
         for e, (equations, anchor) in enumerate(zip(sets, anchors, strict=True)):
-            own = tuple(part[e] for part in self._factors)
-            own[5][0] = NO_FACTORS
-            if anchor.sensitivities is not None:
-                sensitivities[e] = anchor.sensitivities
-                columns = equations.residual_jacobian(anchor.z, anchor.parameters)
-                if not equations.factorise(columns, anchor.z, own):
-                    own[5][0] = NO_FACTORS
-                left[e], right[e] = softest_direction(equations, anchor.z, columns)
-                slopes[e] = softening(equations, anchor.z, anchor.parameters, sensitivities[e], left[e], right[e])
+            if anchor.sensitivities is None:
+                continue
+            own = Factors(*(part[e] for part in factors))
+            sensitivities[e] = anchor.sensitivities
+            columns = equations.residual_jacobian(anchor.z, anchor.parameters)
+            if not equations.factorise(columns, anchor.z, own):
+                own.ends[0] = NO_FACTORS
+            left[e], change = smallest_singular_vectors(equations, anchor.z, columns)
+            gradient[e] = stiffness_gradient(equations, anchor.z, anchor.parameters, sensitivities[e], left[e], change)
+            right[e] = change[:, : first.count]
         ranges = np.stack([np.ptp(a.z, axis=0) for a in anchors])
         ratios = np.divide(ranges, amplitude, out=np.full(ranges.shape, np.inf), where=amplitude > 0.0)
-        near = first.kernels.FAR * ratios.min(axis=1)
-        self._shared = (
-            first.grid.tau,
-            np.array([e.frequency for e in sets]),
-            np.stack([e.drift for e in sets]),
+        self._anchors = Anchors(
             np.stack([a.parameters for a in anchors]),
             np.stack([a.z for a in anchors]),
             sensitivities,
             amplitude,
-            slopes,
-            near,
-            self._factors,
+            gradient,
+            first.kernels.FAR * ratios.min(axis=1),
+            factors,
             left,
-            np.ascontiguousarray(right[..., : first.count]),
+            right,
         )
-        self._inputs = np.stack([e.inputs for e in sets])
 
     @cached_property
-    def _kernels(self) -> SimpleNamespace:
-        return batch_kernels(self._first.count, self._first.grid.stencil)
+    def _functions(self) -> Functions:
+        return self._first.functions
 
     @cached_property
-    def _functions(self) -> np.ndarray:
-        kernels = self._first.model.kernels
-        return np.array([kernels.residual.address, kernels.residual_jacobian.address, kernels.outputs.address])
+    def _kernels(self) -> ModuleType:
+        return kernels("batch", self._first.count, self._first.grid.stencil)
 
     def solve(self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False) -> BatchSolution:
         """Solve every input set for every parameter vector; the result does not depend on the number of threads.
@@ -152,18 +141,16 @@ class Batch:
         ----------
         parameters : array (sets, solves, parameters), or (solves, parameters) if they are those of every set
         threads : int, optional
-            By default as many as there are cores.
+            By default the number of cores.
         keep : bool
-            Return z too, after further chord steps, so that what is derived from it is as exact as it can be.
+            Return z too, after further chord steps down to rounding, for derivatives.
         """
         model, grid = self._first.model, self._first.grid
         solves = parameters.shape[-2]
         z = np.empty((self._size, solves, grid.points if keep else 0, self._first.count))
         y = np.empty((self._size, solves, grid.points, model.kernels.channels))
         nothing = np.empty((self._size, grid.points, 0)), np.empty(0, dtype=np.int64)
-        _, status, iterations = self._solve(parameters, *nothing, z, y, threads, keep)
-        frequency = np.repeat(self._shared[1][:, None], solves, axis=1)
-        return BatchSolution(z, y, frequency, status, iterations)
+        return self._solve(parameters, *nothing, z, y, threads, keep)[0]
 
     def squares(
         self, parameters: np.ndarray, data: np.ndarray, measured: np.ndarray, threads: int | None = None
@@ -185,7 +172,8 @@ class Batch:
         """
         solves, channels = parameters.shape[-2], self._first.model.kernels.channels
         z, y = np.empty((self._size, solves, 0, self._first.count)), np.empty((self._size, solves, 0, channels))
-        return self._solve(parameters, data, measured, z, y, threads)[:2]
+        solution, squares = self._solve(parameters, data, measured, z, y, threads)
+        return squares, solution.status
 
     def orbits(
         self, parameters: np.ndarray, data: np.ndarray, measured: np.ndarray, threads: int | None = None
@@ -203,8 +191,7 @@ class Batch:
         model, points = self._first.model, self._first.grid.points
         z = np.empty((self._size, 1, points, self._first.count))
         y = np.empty((self._size, 1, points, model.kernels.channels))
-        squares, status, iterations = self._solve(parameters, data, measured, z, y, threads)
-        return BatchSolution(z, y, self._shared[1][:, None], status, iterations), squares
+        return self._solve(parameters, data, measured, z, y, threads)
 
     def _solve(
         self,
@@ -215,42 +202,21 @@ class Batch:
         y: np.ndarray,
         threads: int | None,
         polish: bool = False,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Fill z and y where they have entries; return sums of squares, status and iterations."""
-        grid, rates, solves = self._first.grid, self._first.model.kernels.output_rates, z.shape[1]
+    ) -> tuple[BatchSolution, np.ndarray]:
+        """Fill z and y where they have entries; return them with sums of squares."""
+        grid, solves = self._first.grid, z.shape[1]
         every = np.empty((self._size, solves, parameters.shape[-1]))
         every[:] = parameters
-        squares = np.empty((self._size, solves, measured.size))
-        status, iterations = np.empty((2, self._size, solves), dtype=np.int64)
+        squares, status = np.empty((self._size, solves, measured.size)), np.empty((2, self._size, solves), dtype=int)
+        frequency = np.repeat(self._sets.frequency[:, None], solves, axis=1)
+        solution = BatchSolution(z, y, frequency, *status)
+        before = self._functions, grid.packed, grid.periods, self._sets, self._anchors, every, data, measured
+        after = polish, self._first.model.kernels.output_rates, solution, squares
         solve_many = self._kernels.solve_many
+        _in_blocks(lambda block: solve_many(*before, *block, *after), self._size * solves, SMALLEST_PART, threads)
+        return solution, squares
 
-        def part(block: tuple[int, int]) -> None:
-            solve_many(
-                self._functions,
-                grid.packed,
-                grid.periods,
-                self._inputs,
-                every,
-                *self._shared,
-                data,
-                measured,
-                *block,
-                polish,
-                rates,
-                z,
-                y,
-                squares,
-                status,
-                iterations,
-            )
-
-        total = self._size * solves
-        workers = max(1, min(threads or available_cores(), total // SMALLEST_PART))
-        parts = 1 if workers == 1 else workers * min(PARTS_EACH, max(1, total // (workers * SMALLEST_PART)))
-        in_threads(part, list(pairwise([total * k // parts for k in range(parts + 1)])), workers)
-        return squares, status, iterations
-
-    def pull(
+    def vjp(
         self,
         parameters: np.ndarray,
         z: np.ndarray,
@@ -266,68 +232,70 @@ class Batch:
         z : array (sets, points, states)
         weights : array (sets, points, channels)
         moving : tuple of int
-            The parameters by which.
+            Indices of the parameters θ.
         threads : int, optional
         """
         model, grid = self._first.model, self._first.grid
-        vjp, (frequency, drift) = model.vjp_kernels(moving), self._shared[1:3]
-        jacobian, outputs, equations = model.kernels.residual_jacobian, vjp.outputs_vjp, vjp.equations_vjp
-        functions = np.array([jacobian.address, outputs.address, equations.address])
-        gradients = np.empty((self._size, len(moving)))
-        compiled = adjoint_kernels(self._first.count, grid.stencil)
+        products = model.vjp_kernels(moving)
+        functions = model.kernels.residual_jacobian, products.outputs_vjp, products.equations_vjp
+        addresses, gradients = np.array([f.address for f in functions]), np.empty((self._size, len(moving)))
+        points = [np.ascontiguousarray(part) for part in (parameters, z, weights)]
 
         def part(block: tuple[int, int]) -> None:
-            compiled.pull_many(
-                functions,
-                grid.packed,
-                self._inputs,
-                np.ascontiguousarray(parameters),
-                grid.tau,
-                frequency,
-                drift,
-                np.ascontiguousarray(z),
-                np.ascontiguousarray(weights),
-                empty_factors(grid, self._first.count),
-                *block,
-                gradients,
-            )
+            factors = empty_factors(grid, self._first.count)
+            self._kernels.vjp_many(addresses, grid.packed, self._sets, *points, factors, *block, gradients)
 
-        workers = max(1, min(threads or available_cores(), self._size // SMALLEST_PART))
-        in_threads(part, list(pairwise([self._size * k // workers for k in range(workers + 1)])), workers)
+        _in_blocks(part, self._size, SMALLEST_PART, threads, each=1)
         return gradients
 
 
+def _in_blocks(
+    part: Callable[[tuple[int, int]], None], total: int, smallest: int, threads: int | None, each: int = PARTS_EACH
+) -> None:
+    """Call a function for blocks (start, stop) of a range, up to `each` per thread, none below the smallest size."""
+    workers = max(1, min(threads or available_cores(), total // smallest))
+    parts = 1 if workers == 1 else workers * min(each, max(1, total // (workers * smallest)))
+    in_threads(part, list(pairwise([total * k // parts for k in range(parts + 1)])), workers)
+
+
 class AutonomousBatch:
-    """Orbits with their anchors, ready to be followed to many parameter vectors.
+    """Autonomous orbits with their anchors, followed to many parameter vectors.
 
     Parameters
     ----------
     sets : sequence of PeriodicEquations
         Of one autonomous model on one grid.
     anchors : sequence of Anchor
-        One an orbit.
+        One per orbit.
     """
 
     def __init__(self, sets: Sequence[PeriodicEquations], anchors: Sequence[Anchor]):
-        first, points, states = sets[0], sets[0].grid.points, sets[0].count
-        self._first = first
-        self._inputs = np.stack([e.at_frequency(a.frequency).inputs for e, a in zip(sets, anchors, strict=True)])
-        self._drift = np.stack([e.drift for e in sets])
-        parameters = anchors[0].parameters.size
-        nothing = np.zeros((parameters, points, states)), np.zeros(parameters)
-        self._anchors = (
-            np.stack([a.parameters for a in anchors]),
-            np.stack([a.z for a in anchors]),
-            np.array([a.frequency for a in anchors]),
-            np.stack([nothing[0] if a.sensitivities is None else a.sensitivities for a in anchors]),
-            np.stack([nothing[1] if a.frequency_sensitivities is None else a.frequency_sensitivities for a in anchors]),
-        )
-        factored = [Bordered(e, a.parameters, a.z, a.frequency) for e, a in zip(sets, anchors, strict=True)]
-        self._chords = tuple(np.stack(parts) for parts in zip(*(f.parts for f in factored), strict=True))
-        self._targets = np.array([float(f.row @ a.z.ravel()) for f, a in zip(factored, anchors, strict=True)])
+        self._first = sets[0]
+        here = [e.at_frequency(a.frequency) for e, a in zip(sets, anchors, strict=True)]
+        frequency = np.array([a.frequency for a in anchors])
+        self._sets = Sets(np.stack([e.inputs for e in here]), frequency, np.stack([e.drift for e in here]))
+        factors = [phase_bordered(e, a.parameters, a.z) for e, a in zip(here, anchors, strict=True)]
+        rows = [
+            f.border.rows[0].reshape(a.z.shape)[e.grid.place] for e, f, a in zip(here, factors, anchors, strict=True)
+        ]
+        z, parameters = np.stack([a.z for a in anchors]), np.stack([a.parameters for a in anchors])
         known = [a.sensitivities is not None for a in anchors]
-        self._orientations = np.where(known, [f.orientation for f in factored], 0.0)
-        self._width, self._explicit = factored[0].width, factored[0].explicit
+        sensitivities, slopes = np.zeros((*parameters.shape, *z.shape[1:])), np.zeros(parameters.shape)
+        for e, anchor in enumerate(anchors):
+            if anchor.sensitivities is not None and anchor.frequency_sensitivities is not None:
+                sensitivities[e], slopes[e] = anchor.sensitivities, anchor.frequency_sensitivities
+        self._orbits = Orbits(
+            parameters,
+            z,
+            frequency,
+            sensitivities,
+            slopes,
+            np.stack([f.band for f in factors]),
+            np.stack([f.pivots for f in factors]),
+            Border(*(np.stack(parts) for parts in zip(*(f.border for f in factors), strict=True))),
+            np.array([float(np.sum(row * a.z)) for row, a in zip(rows, anchors, strict=True)]),
+            np.where(known, [f.orientation for f in factors], 0.0),
+        )
 
     def solve(
         self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False, whole: bool = False
@@ -339,95 +307,32 @@ class AutonomousBatch:
         parameters, threads, keep
             See `batch.Batch.solve`.
         whole : bool
-            The orbits of a parameter vector count only together. Where one is lost, others that would take more effort
+            A parameter vector needs all of its orbits. Where one is lost, others that would take more effort
             are not followed, and get its status.
         """
-        model, grid, (sets, points, states) = self._first.model, self._first.grid, self._anchors[1].shape
+        first, (sets, points, states) = self._first, self._orbits.z.shape
         solves = parameters.shape[-2]
         every = np.empty((sets, solves, parameters.shape[-1]))
         every[:] = parameters
-        z = np.empty((sets, solves, points if keep else 0, states))
-        y, frequency = np.empty((sets, solves, points, model.kernels.channels)), np.empty((sets, solves))
-        status, iterations = np.empty((2, sets, solves), dtype=np.int64)
-
-        def part(block: tuple[int, int]) -> None:
-            autonomous_kernels().follow_many(
-                model.kernels.residual_jacobian,
-                model.kernels.derivatives,
-                model.kernels.outputs,
-                self._explicit,
-                self._width,
-                grid.packed,
-                self._inputs,
-                every,
-                grid.tau,
-                self._drift,
-                self._anchors,
-                self._chords,
-                self._targets,
-                self._orientations,
-                *block,
-                whole,
-                z,
-                y,
-                frequency,
-                status,
-                iterations,
-            )
-
-        workers = max(1, min(threads or available_cores(), solves))
-        parts = 1 if workers == 1 else min(workers * PARTS_EACH, solves)
-        in_threads(part, list(pairwise([solves * k // parts for k in range(parts + 1)])), workers)
-        return BatchSolution(z, y, frequency, status, iterations)
-
-
-class Bordered:
-    """The factors of [∂g/∂z, ∂g/∂frequency; phase row, 0] at an orbit.
-
-    Attributes
-    ----------
-    parts : tuple of array
-        The band, its pivots, the row in the order of `place`, and what else the compiled functions need.
-    work : tuple
-        Room for the compiled functions, which ends in the parts.
-    row : array (points·states,)
-        The phase condition's, in natural order.
-    orientation : float
-        The sign of the determinant, which changes along a branch at folds alone; 0 where it is singular.
-    explicit, width : int
-        Where the explicit derivatives by the frequency start among the model's `derivatives`, and how many these are.
-    """
-
-    def __init__(self, equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, frequency: float):
-        grid, model = equations.grid, equations.model
-        size, lower = z.size, grid.half_width * equations.count + equations.count - 1
-        self.width = equations.evaluate("derivatives", z, parameters).shape[1]
-        self.explicit = equations.count * (len(model.parameters) + 3 * len(model.inputs))
-        self.parts = (
-            np.empty((size, 3 * lower + 1)),
-            np.empty(size, dtype=np.int64),
-            np.empty(size),
-            np.empty((2, size)),
-            np.empty(4),
+        solution = BatchSolution(
+            np.empty((sets, solves, points if keep else 0, states)),
+            np.empty((sets, solves, points, first.model.kernels.channels)),
+            np.empty((sets, solves)),
+            *np.empty((2, sets, solves), dtype=int),
         )
-        self.work = (
-            np.empty((grid.points, 3 * equations.count)),
-            np.empty((grid.points, equations.count * (1 + 3 * equations.count))),
-            np.empty((grid.points, self.width)),
-            np.empty((1, size)),
-            self.parts,
+        follow_many = kernels("autonomous", states, first.grid.stencil).follow_many
+        before = first.functions, first.grid.packed, self._sets, self._orbits, every
+        _in_blocks(
+            lambda block: follow_many(*before, *block, whole, workspace(first, bordered=True), solution),
+            solves,
+            1,
+            threads,
         )
-        self.orientation = autonomous_kernels().orient(
-            model.kernels.residual_jacobian,
-            model.kernels.derivatives,
-            self.explicit,
-            grid.packed,
-            equations.at_frequency(frequency).inputs,
-            parameters,
-            grid.tau,
-            frequency,
-            equations.drift,
-            np.ascontiguousarray(z),
-            self.work,
-        )
-        self.row = self.parts[2].reshape(grid.points, -1)[grid.place].ravel()
+        return solution
+
+
+def phase_bordered(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> BorderedFactors:
+    """Return the factors of [∂g/∂z, ∂g/∂frequency; phase row, 0] at an autonomous orbit."""
+    columns, derivatives = equations.residual_jacobian(z, parameters), equations.derivatives(z, parameters)
+    slope = frequency_derivatives(equations, z, columns, derivatives)[0]
+    return equations.bordered(columns, slope[None], equations.phase_row(z)[None])

@@ -1,75 +1,297 @@
-"""What `kernels` defines, compiled or loaded from the kernel cache, its loops unrolled for small models."""
+"""Compiled functions of the periodic solver: their arguments, status codes and loading.
 
+The functions are in the sources in `_kernels`, which import the definitions below. Loops over states and over the
+offsets of the scheme are unrolled for small models: the sizes are constants of the module that is compiled.
+"""
+
+import hashlib
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
 
 from bayesperiodic.models.cache import load
-
-NAMES = (
-    "CONVERGED", "STALLED", "SINGULAR", "NOT_FINITE", "OTHER_ORBIT", "MAX_ITERATIONS", "MAX_SEGMENTS", "MAX_HALVINGS",
-    "STEP_TOLERANCE", "CHORD_RATE", "FAR", "factor", "solve", "solve_transposed", "differentiate", "assemble",
-    "factorise", "back_substitute", "scales", "norm", "scaled_step", "newton", "repetitions",
-)  # fmt: skip
-BATCH_NAMES = ("solve_many",)
-FREE_NAMES = ("orient", "bordered_solve", "secant", "has_shrunk", "has_shorter_period", "follow_many")
-ADJOINT_NAMES = ("back_substitute_transposed", "pull_many")
-GENERIC = "STATES, REACH, WIDTH, HALF = 0, 0, 0, 0"
-SHARED = "from bayesperiodic.periodic._kernels.newton import"
-UNROLLED_STATES = 3
-ANY = 0, 0, 0, 0
 
 STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit")
 CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT = range(len(STATUSES))
 MAX_SEGMENTS = 12
+NO_FACTORS = -1
+MAX_ITERATIONS = 50
+MAX_HALVINGS = 20
+STEP_TOLERANCE = 1e-9
+UNROLLED_STATES = 3
+SAME = 1e-6  # largest difference of repetitions, in units of the range
+SHRUNK = 1e-6  # largest range of an equilibrium, in units of the guess's
+ABSENT = 1e-6  # largest relative amplitude of an absent harmonic
+
+FLAG, COUNT, NUMBER, COMPLEX = types.boolean, types.int64, types.float64, types.complex128
+VECTOR, MATRIX, CUBE, GAINS = (types.Array(NUMBER, dimensions, "C") for dimensions in (1, 2, 3, 4))
+PLACES, INDICES = (types.Array(COUNT, dimensions, "C") for dimensions in (1, 2))
 
 
-def kernels(states: int, stencil: tuple[int, int, int]) -> SimpleNamespace:
-    """Return the compiled functions for a number of states and the stencil of a grid, see `schemes.CyclicGrid`."""
-    return _kernels(_unrolled(states, stencil))
+class Functions(NamedTuple):
+    """Addresses of a model's grid functions; `grid_function_at` makes functions of them in compiled code."""
+
+    residual: int
+    residual_jacobian: int
+    outputs: int
+    derivatives: int
+
+    @classmethod
+    def of(cls, kernels: Any) -> "Functions":
+        """Return the addresses of `Model.kernels`."""
+        return cls(*(getattr(kernels, name).address for name in cls._fields))
 
 
-def batch_kernels(states: int, stencil: tuple[int, int, int]) -> SimpleNamespace:
-    """Return the compiled functions of `batch_kernels`, specialised likewise."""
-    return _with_shared("batch.py", BATCH_NAMES, _unrolled(states, stencil))
+class Grid(NamedTuple):
+    """A `schemes.CyclicGrid`, whose attributes these are."""
+
+    first: np.ndarray
+    second: np.ndarray
+    neighbours: np.ndarray
+    shift: np.ndarray
+    place: np.ndarray
+    tau: np.ndarray
+    half_width: int
+    lead: int
 
 
-def adjoint_kernels(states: int, stencil: tuple[int, int, int]) -> SimpleNamespace:
-    """Return the compiled functions of `adjoint_kernels`, specialised likewise."""
-    return _with_shared("adjoint.py", ADJOINT_NAMES, _unrolled(states, stencil))
+class Setting(NamedTuple):
+    """Arguments of the equations besides the states.
 
-
-def autonomous_kernels() -> SimpleNamespace:
-    """Return the compiled functions of `autonomous_kernels`."""
-    return _with_shared("autonomous.py", FREE_NAMES, ANY)
-
-
-def _unrolled(states: int, stencil: tuple[int, int, int]) -> tuple[int, ...]:
-    """Return the sizes for which loops are unrolled, zeros where they are not."""
-    return (states, *stencil) if states <= UNROLLED_STATES and any(stencil) else ANY
-
-
-@cache
-def _kernels(sizes: tuple[int, ...]) -> SimpleNamespace:
-    source = _text("newton.py")
-    if GENERIC not in source:
-        raise RuntimeError(f"newton.py does not contain {GENERIC!r}.")
-    sized = f"STATES, REACH, WIDTH, HALF = {', '.join(map(str, sizes))}"
-    return SimpleNamespace(**load(source.replace(GENERIC, sized), NAMES))
-
-
-@cache
-def _with_shared(name: str, wanted: tuple[str, ...], sizes: tuple[int, ...]) -> SimpleNamespace:
-    """Return the compiled functions of a file whose text imports others from `kernels`, taken as they are compiled.
-
-    The module that these are in is named by its own text, so that the text that imports them changes with theirs: code
-    compiled from one text goes stale when a function of another that it calls has changed.
+    inputs (points, 3·inputs), parameters (parameters,), frequency [Hz], drift (states,): the mean rate of each state
+    per forcing period, not zero for a winding angle.
     """
-    source, shared = _text(name), _kernels(sizes).newton.__module__
-    if SHARED not in source:
-        raise RuntimeError(f"{name} does not contain {SHARED!r}.")
-    return SimpleNamespace(**load(source.replace(SHARED, f"from {shared} import"), wanted))
+
+    inputs: np.ndarray
+    parameters: np.ndarray
+    frequency: float
+    drift: np.ndarray
 
 
-def _text(name: str) -> str:
-    return Path(__file__).with_name("_kernels").joinpath(name).read_text(encoding="utf-8")
+class Factors(NamedTuple):
+    """Factors of ∂g/∂z: of the folded band, or of its segments with their interface, see `_kernels/linear.py`."""
+
+    band: np.ndarray
+    pivots: np.ndarray
+    inverses: np.ndarray
+    gains: np.ndarray
+    transfer: np.ndarray
+    ends: np.ndarray
+    interface: np.ndarray
+    interface_pivots: np.ndarray
+
+
+class Border(NamedTuple):
+    """The border of [∂g/∂z, B; C, D] and its factors.
+
+    Attributes
+    ----------
+    columns : array (borders + 1, size)
+        B, overwritten by the factors; the last row is for the deflation of ∂g/∂z.
+    rows : array (borders, size)
+        C.
+    corner : array (borders, borders)
+        D.
+    small : array (borders + 1, 3·borders + 1)
+    pivots : int array (borders + 1,)
+    """
+
+    columns: np.ndarray
+    rows: np.ndarray
+    corner: np.ndarray
+    small: np.ndarray
+    pivots: np.ndarray
+
+    @classmethod
+    def empty(cls, borders: int, size: int) -> "Border":
+        """Return a border of zeros."""
+        return cls(
+            np.zeros((borders + 1, size)),
+            np.zeros((borders, size)),
+            np.zeros((borders, borders)),
+            np.empty((borders + 1, 3 * borders + 1)),
+            np.empty(borders + 1, dtype=np.int64),
+        )
+
+
+class Unknowns(NamedTuple):
+    """Further scalar unknowns of the equations, and the conditions C·z + D·values = targets that fix them.
+
+    Attributes
+    ----------
+    values, targets : array (unknowns,)
+    scales : array (unknowns,)
+        Steps of the values are measured in these, or in the value if that is larger.
+    parameters : array (unknowns, parameters)
+        Change of the parameters per unit of each.
+    inputs : array (unknowns, points, 3·inputs)
+        Change of the inputs per unit of each.
+    frequency : int
+        Index of the unknown that is the frequency, or −1.
+    """
+
+    values: np.ndarray
+    targets: np.ndarray
+    scales: np.ndarray
+    parameters: np.ndarray
+    inputs: np.ndarray
+    frequency: int
+
+
+NO_UNKNOWNS = Unknowns(np.empty(0), np.empty(0), np.empty(0), np.empty((0, 0)), np.empty((0, 0, 0)), -1)
+NO_BORDER = Border.empty(0, 0)
+
+
+class Workspace(NamedTuple):
+    """Arrays that the Newton iteration overwrites: states, columns of `residual_jacobian` and `derivatives`, factors."""
+
+    states: np.ndarray
+    columns: np.ndarray
+    derivatives: np.ndarray
+    factors: Factors
+
+
+class Sets(NamedTuple):
+    """Input sets of a batch: inputs (sets, points, 3·inputs), frequency (sets,) [Hz], drift (sets, states)."""
+
+    inputs: np.ndarray
+    frequency: np.ndarray
+    drift: np.ndarray
+
+
+class Anchors(NamedTuple):
+    """Anchors of the input sets of a driven batch, arrays (sets, …).
+
+    Attributes
+    ----------
+    parameters, z, sensitivities
+        See `batch.Anchor`.
+    amplitude : array (sets, states)
+        The largest absolute value of each state.
+    stiffness_gradient : array (sets, parameters)
+        See `sensitivity.stiffness_gradient`.
+    near : array (sets,)
+        Length of the path of chord steps, in units of the amplitude, below which an orbit cannot be far.
+    factors : Factors
+        Of ∂g/∂z; the first of `ends` is −1 where there are none.
+    left, right : array (sets, points, states)
+        See `sensitivity.smallest_singular_vectors`.
+    """
+
+    parameters: np.ndarray
+    z: np.ndarray
+    sensitivities: np.ndarray
+    amplitude: np.ndarray
+    stiffness_gradient: np.ndarray
+    near: np.ndarray
+    factors: Factors
+    left: np.ndarray
+    right: np.ndarray
+
+
+class Orbits(NamedTuple):
+    """Anchors of an autonomous batch, arrays (sets, …).
+
+    Attributes
+    ----------
+    parameters, z, frequency, sensitivities, frequency_sensitivities
+        See `batch.Anchor`.
+    band, pivots, border
+        Factors of the equations bordered by the phase condition.
+    target, orientation : array (sets,)
+        Value of the phase condition; orientation of the factors, 0 for a guess without factors.
+    """
+
+    parameters: np.ndarray
+    z: np.ndarray
+    frequency: np.ndarray
+    sensitivities: np.ndarray
+    frequency_sensitivities: np.ndarray
+    band: np.ndarray
+    pivots: np.ndarray
+    border: Border
+    target: np.ndarray
+    orientation: np.ndarray
+
+
+class BatchSolution(NamedTuple):
+    """Solutions of a batch.
+
+    Attributes
+    ----------
+    z : array (sets, solves, points, states)
+        The periodic parts; without entries unless requested.
+    outputs : array (sets, solves, points, channels)
+    frequency : array (sets, solves)
+        [Hz].
+    status : int array (sets, solves)
+        Index into `STATUSES`.
+    iterations : int array (sets, solves)
+        Steps with the anchor's factors and Newton iterations.
+    """
+
+    z: np.ndarray
+    outputs: np.ndarray
+    frequency: np.ndarray
+    status: np.ndarray
+    iterations: np.ndarray
+
+
+def named(kind: type, *fields: types.Type) -> types.NamedTuple:
+    """Return Numba's type of a named tuple."""
+    return types.NamedTuple(fields, kind)
+
+
+FUNCTIONS = types.NamedUniTuple(COUNT, len(Functions._fields), Functions)
+GRID = named(Grid, VECTOR, VECTOR, INDICES, INDICES, PLACES, VECTOR, COUNT, COUNT)
+SETTING = named(Setting, MATRIX, VECTOR, NUMBER, VECTOR)
+FACTORS = named(Factors, MATRIX, PLACES, CUBE, GAINS, CUBE, PLACES, VECTOR, PLACES)
+BORDER = named(Border, MATRIX, MATRIX, MATRIX, MATRIX, PLACES)
+UNKNOWNS = named(Unknowns, VECTOR, VECTOR, VECTOR, MATRIX, CUBE, COUNT)
+WORKSPACE = named(Workspace, MATRIX, MATRIX, MATRIX, FACTORS)
+SETS = named(Sets, CUBE, VECTOR, MATRIX)
+ALL_FACTORS = named(Factors, CUBE, INDICES, GAINS, types.Array(NUMBER, 5, "C"), GAINS, INDICES, MATRIX, INDICES)
+ANCHORS = named(Anchors, MATRIX, CUBE, GAINS, MATRIX, MATRIX, VECTOR, ALL_FACTORS, CUBE, CUBE)
+ALL_BORDERS = named(Border, CUBE, CUBE, CUBE, CUBE, INDICES)
+ORBITS = named(Orbits, MATRIX, CUBE, VECTOR, GAINS, MATRIX, CUBE, INDICES, ALL_BORDERS, VECTOR, VECTOR)
+SOLUTION = named(BatchSolution, GAINS, GAINS, MATRIX, INDICES, INDICES)
+
+
+def kernels(name: str, states: int, stencil: tuple[int, int, int]) -> ModuleType:
+    """Return the compiled functions of a source for a number of states and the stencil of a `schemes.CyclicGrid`.
+
+    Parameters
+    ----------
+    name : str
+        "linear", "newton", "batch" or "autonomous".
+    states : int
+    stencil : tuple of int
+        `schemes.CyclicGrid.stencil`.
+    """
+    sizes = (states, *stencil) if states <= UNROLLED_STATES and any(stencil) else (0, 0, 0, 0)
+    return _kernels(name, sizes)
+
+
+SHARED = {"newton": "linear", "batch": "newton", "autonomous": "newton"}
+
+
+@cache
+def _kernels(name: str, sizes: tuple[int, ...]) -> ModuleType:
+    constants = {"SIZES": sizes, "DEFINITIONS": _digest()}
+    shared = _kernels(SHARED[name], sizes) if name in SHARED else None
+    return load(source(name), constants, shared)
+
+
+def source(name: str) -> str:
+    """Return the text of a source in `_kernels`."""
+    return Path(__file__).with_name("_kernels").joinpath(f"{name}.py").read_text(encoding="utf-8")
+
+
+@cache
+def _digest() -> str:
+    """Return a digest of the definitions in this file, which the sources import."""
+    return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()

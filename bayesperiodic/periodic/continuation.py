@@ -15,9 +15,9 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.models.model import Model
+from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, Point, Tracer, trace
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR
-from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
-from bayesperiodic.periodic.family import INPUTS, Family, Point, Tracer, trace
+from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved, null_vector
 from bayesperiodic.periodic.solution import PeriodicSolution, describe, equations_of
 from bayesperiodic.periodic.solve import solve_periodic
 
@@ -242,15 +242,15 @@ def iterate_periodic(
             f"solution: status {solution.status!r} is not allowed; it must have converged. Solve again from another "
             "guess."
         )
-    family, values = _family(equations, parameters, vary)
+    parametrised, values = _parametrised(equations, parameters, vary)
     until = _checks.finite_number("until", until)
     if vary == FREQUENCY:
         _checks.positive("until", until)
     if until == values[0]:
         raise ValueError(f"until: {until!r} is not allowed; {vary} has that value at the start, give another.")
     step = abs(until - values[0]) / STEPS if step is None else _checks.positive("step", step)
-    for point in trace(family, z, values, until=until, step=step, refine=_special_points):
-        yield float(point.values[0]), _solution(family, point), point.kind
+    for point in trace(parametrised, z, values, until=until, step=step, refine=_special_points):
+        yield float(point.values[0]), _solution(parametrised, point), point.kind
 
 
 def double_period(model: Model, solution: PeriodicSolution, vary: str) -> PeriodicSolution:
@@ -307,23 +307,25 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
         periods=solution.periods if model.autonomous else 2 * solution.periods,
         winding={name: 2 * turns for name, turns in solution.winding.items()},
     )
-    family, values = _family(twice, parameters, vary)
+    parametrised, values = _parametrised(twice, parameters, vary)
     start = np.tile(z, (2, 1))
     columns = twice.residual_jacobian(start, parameters)
-    across = twice.factors(columns).null_vector()
-    across = 0.5 * (across - np.roll(across, len(z), axis=0))
-    tracer = Tracer(family, np.ptp(start, axis=0), values, 2.0 * values[0] + 1.0)
-    tangent = (across, np.zeros_like(values))
+    doubling = null_vector(twice.grid, columns, twice.count, twice.frequency)
+    doubling = 0.5 * (doubling - np.roll(doubling, len(z), axis=0))
+    tracer = Tracer(parametrised, np.ptp(start, axis=0), values, 2.0 * values[0] + 1.0)
+    tangent = (doubling, np.zeros_like(values))
     length = tracer.length(tangent)
-    point = Point(start, values, (across / length, tangent[1]), 0.0)
+    point = Point(start, values, (doubling / length, tangent[1]), 0.0)
     corrected = tracer.correct(point, DOUBLED)
     if corrected is None:
         return describe(twice, parameters, Solved(start, SINGULAR, np.empty((0, 3))), FOUND_BY)
-    return _solution(family, corrected[0], sensitivities=True)
+    return _solution(parametrised, corrected[0], sensitivities=True)
 
 
-def _family(equations: PeriodicEquations, parameters: np.ndarray, vary: str) -> tuple[Family, np.ndarray]:
-    """Return the family in what is varied (and, for an autonomous model, the frequency) and the present values."""
+def _parametrised(
+    equations: PeriodicEquations, parameters: np.ndarray, vary: str
+) -> tuple[ParametrisedEquations, np.ndarray]:
+    """Return the equations with the varied quantity (and the frequency of an autonomous model) free, and their values."""
     model = equations.model
     allowed = [*model.parameters, *model.inputs, *([] if model.autonomous else [FREQUENCY])]
     _checks.one_of("vary", vary, allowed)
@@ -332,14 +334,14 @@ def _family(equations: PeriodicEquations, parameters: np.ndarray, vary: str) -> 
         column, width = model.inputs.index(vary), len(model.inputs)
         change = np.zeros_like(equations.inputs)
         change[:, column::width] = equations.inputs[:, column::width]
-        family = Family(equations.with_inputs(equations.inputs - change), parameters, (INPUTS, *own), change)
-        return family, np.array([1.0, *own_values])
+        base = equations.with_inputs(equations.inputs - change)
+        return ParametrisedEquations(base, parameters, (INPUTS, *own), change), np.array([1.0, *own_values])
     value = equations.frequency if vary == FREQUENCY else parameters[model.parameters.index(vary)]
-    return Family(equations, parameters, (vary, *own)), np.array([value, *own_values])
+    return ParametrisedEquations(equations, parameters, (vary, *own)), np.array([value, *own_values])
 
 
-def _solution(family: Family, point: Point, sensitivities: bool = False) -> PeriodicSolution:
-    equations, parameters = family.at(point.values)
+def _solution(parametrised: ParametrisedEquations, point: Point, sensitivities: bool = False) -> PeriodicSolution:
+    equations, parameters = parametrised.at(point.values)
     solved = Solved(point.z, CONVERGED, np.empty((0, 3)))
     return describe(equations, parameters, solved, FOUND_BY, sensitivities)
 
@@ -387,7 +389,7 @@ def _fold_test(tracer: Tracer, point: Point) -> float:
 
 def _doubling_test(tracer: Tracer, point: Point) -> float:
     """Return a number that changes sign where a multiplier passes −1."""
-    solution = _solution(tracer.family, point)
+    solution = _solution(tracer.parametrised, point)
     exponents = solution.floquet.exponents if solution.floquet is not None else np.array([np.nan])
     growth = np.abs(exponents.real)
     parts = np.exp(-growth) + np.exp(exponents - growth)

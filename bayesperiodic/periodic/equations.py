@@ -3,21 +3,33 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from types import SimpleNamespace
-from typing import NamedTuple
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.models.code_generation import as_columns
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic import compiled
-from bayesperiodic.periodic.compiled import kernels
+from bayesperiodic.periodic.compiled import (
+    MAX_HALVINGS,
+    MAX_ITERATIONS,
+    MAX_SEGMENTS,
+    NO_BORDER,
+    NO_UNKNOWNS,
+    Border,
+    Factors,
+    Functions,
+    Setting,
+    Unknowns,
+    Workspace,
+    kernels,
+)
 from bayesperiodic.periodic.schemes import CyclicGrid, Scheme, find_scheme
 
 
 class CyclicFactors:
-    """The folded band of ∂g/∂z, factored with pivoting.
+    """Factors of the folded band of ∂g/∂z, with pivoting.
 
     Parameters
     ----------
@@ -31,20 +43,21 @@ class CyclicFactors:
     Attributes
     ----------
     regular : bool
-        False if a pivot is zero or not finite; then only `solve_bordered` may work.
+        False if a pivot is zero or not finite; then only `BorderedFactors` may exist.
     """
 
     def __init__(self, grid: CyclicGrid, columns: np.ndarray, states: int, frequency: float):
         self._grid, self._states = grid, states
-        self._compiled: SimpleNamespace = kernels(states, grid.stencil)
+        self._compiled: Any = kernels("linear", states, grid.stencil)
         self._lower = grid.half_width * states + states - 1
         size = grid.points * states
-        self._band = np.empty((size, 3 * self._lower + 1))
-        self._pivots = np.full(size, -1)
-        self._compiled.assemble(columns, grid.packed, states, frequency, self._band)
-        self.regular = bool(self._compiled.factor(self._band, self._lower, self._lower, self._pivots))
-        self._complete = self.regular or bool(np.all(self._pivots >= 0) and np.isfinite(self._band[-1, self._lower]))
-        self._deflation: tuple[float, int] | None = None
+        self.band = np.empty((size, 3 * self._lower + 1))
+        self.pivots = np.empty(size, dtype=np.int64)
+        self._compiled.assemble(columns, grid.packed, states, frequency, self.band)
+        self.regular = self._factor()
+
+    def _factor(self) -> bool:
+        return bool(self._compiled.factor(self.band, self._lower, self._lower, self.pivots))
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Return x (…, points, states) of ∂g/∂z·x = right."""
@@ -52,22 +65,69 @@ class CyclicFactors:
 
     def solve_transposed(self, right: np.ndarray) -> np.ndarray:
         """Return x (…, points, states) of (∂g/∂z)ᵀ·x = right."""
-        return self._substitute(self._compiled.solve_transposed, right)
+        return self._substitute(kernels("batch", self._states, self._grid.stencil).solve_transposed, right)
 
-    def solve_bordered(
-        self, columns: np.ndarray, rows: np.ndarray, corner: np.ndarray, right: np.ndarray, below: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Solve [∂g/∂z, B; C, D]·(x, y) = (right, below), also where ∂g/∂z alone is singular; None if all is.
+    def _substitute(self, routine: Callable[..., None], right: np.ndarray) -> np.ndarray:
+        folded = self._fold(right)
+        routine(self.band, self._lower, self._lower, self.pivots, folded)
+        return self._unfold(folded).reshape(right.shape)
 
-        The last pivot, where the singularity of a cyclic system gathers, is replaced by one of ordinary size; what this
-        changes is undone as one more bordering unknown.
+    def _fold(self, natural: np.ndarray) -> np.ndarray:
+        """Return arrays (…, points, states) in the folded order, (arrays, size)."""
+        folded = np.empty((natural.size // len(self.band), self._grid.points, self._states))
+        folded[:, self._grid.place] = natural.reshape(folded.shape)
+        return folded.reshape(-1, len(self.band))
+
+    def _unfold(self, folded: np.ndarray) -> np.ndarray:
+        shaped = folded.reshape(-1, self._grid.points, self._states)
+        return np.ascontiguousarray(shaped[:, self._grid.place])
+
+
+class BorderedFactors(CyclicFactors):
+    """Factors of [∂g/∂z, B; C, D], also where ∂g/∂z is singular.
+
+    Parameters
+    ----------
+    grid, columns, states, frequency
+        As `CyclicFactors` takes them.
+    sides, rows : array (borders, points, states)
+        B and C.
+    corner : array (borders, borders)
+        D, by default zero.
+
+    Attributes
+    ----------
+    orientation : float
+        The sign of the determinant, which changes along a branch only at folds; 0 if the matrix is singular.
+    border : Border
+    """
+
+    def __init__(
+        self,
+        grid: CyclicGrid,
+        columns: np.ndarray,
+        states: int,
+        frequency: float,
+        sides: np.ndarray,
+        rows: np.ndarray,
+        corner: np.ndarray | float = 0.0,
+    ):
+        self._sides, self._rows, self._corner = sides, rows, corner
+        super().__init__(grid, columns, states, frequency)
+
+    def _factor(self) -> bool:
+        self.border = Border.empty(len(self._rows), len(self.band))
+        self.border.columns[:-1] = self._fold(self._sides)
+        self.border.rows[:] = self._fold(self._rows)
+        self.border.corner[:] = self._corner
+        self.orientation = self._compiled.factor_bordered(self.band, self.pivots, self.border)
+        return self.orientation != 0.0
+
+    def solve_bordered(self, right: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Solve [∂g/∂z, B; C, D]·(x, y) = (right, below); None if the matrix is singular.
 
         Parameters
         ----------
-        columns, rows : array (borders, points, states)
-            B and C.
-        corner : array (borders, borders)
-            D.
         right : array (sides, points, states)
         below : array (sides, borders)
 
@@ -76,73 +136,31 @@ class CyclicFactors:
         x : array (sides, points, states)
         y : array (sides, borders)
         """
-        if not self._complete:
+        if not self.regular:
             return None
-        size, row = self._deflate()
-        unit = np.zeros((1, self._grid.points, self._states))
-        unit[0, row // self._states, row % self._states] = size
-        borders, sides = len(columns), len(right)
-        x = self._substitute(self._compiled.solve, np.concatenate([right, columns, unit]), deflated=True)
-        plain, bordering, undone = x[:sides], x[sides : sides + borders], x[-1]
-        last = (*np.argwhere(self._grid.place == self._grid.points - 1)[0], self._states - 1)
-        small = np.empty((borders + 1, borders + 1))
-        small[:borders, :borders] = corner - np.einsum("cps,bps->cb", rows, bordering)
-        small[:borders, borders] = np.einsum("cps,ps->c", rows, undone)
-        small[borders, :borders] = -bordering[:, last[0], last[1]]
-        small[borders, borders] = undone[last] - 1.0
-        known = np.empty((sides, borders + 1))
-        known[:, :borders] = below - np.einsum("cps,rps->rc", rows, plain)
-        known[:, borders] = -plain[:, last[0], last[1]]
-        try:
-            y = np.linalg.solve(small, known.T).T
-        except np.linalg.LinAlgError:
-            return None
-        x = plain - np.einsum("rb,bps->rps", y[:, :borders], bordering) + y[:, borders, None, None] * undone
-        return (x, y[:, :borders]) if np.isfinite(x).all() else None
+        folded, y = self._fold(right), np.array(below, dtype=float, order="C")
+        self._compiled.solve_bordered(self.band, self.pivots, self.border, folded, y)
+        return (self._unfold(folded), y) if np.isfinite(folded).all() else None
 
-    def null_vector(self) -> np.ndarray:
-        """Return the vector (points, states) of unit length that ∂g/∂z makes smallest, where it is nearly singular."""
-        size, row = self._deflate()
-        unit = np.zeros((1, self._grid.points, self._states))
-        unit[0, row // self._states, row % self._states] = size
-        vector = self._substitute(self._compiled.solve, unit, deflated=True)[0]
-        return vector / np.linalg.norm(vector)
 
-    def _deflate(self) -> tuple[float, int]:
-        """Give the last pivot an ordinary size; return by how much, and the row (natural order) where this acts."""
-        if self._deflation is None:
-            pivots = self._band[:, self._lower]
-            last = 1.0 / pivots[-1] if self.regular else 0.0
-            size = float(np.median(1.0 / np.abs(pivots[:-1])))
-            self._last_pivots = pivots[-1], 1.0 / size
-            row = len(self._pivots) - 1
-            for j in range(len(self._pivots) - 2, -1, -1):
-                if self._pivots[j] == row:
-                    row = j
-                elif row == j:
-                    row = int(self._pivots[j])
-            point = int(np.flatnonzero(self._grid.place == row // self._states)[0])
-            self._deflation = size - last, point * self._states + row % self._states
-        return self._deflation
-
-    def _substitute(self, routine: Callable[..., None], right: np.ndarray, deflated: bool = False) -> np.ndarray:
-        if self._deflation is not None:
-            self._band[-1, self._lower] = self._last_pivots[deflated]
-        flat = np.empty((right.size // self._band.shape[0], *right.shape[-2:]))
-        flat[:, self._grid.place] = right.reshape(flat.shape)
-        routine(self._band, self._lower, self._lower, self._pivots, flat.reshape(len(flat), len(self._band)))
-        return np.ascontiguousarray(flat[:, self._grid.place]).reshape(right.shape)
+def null_vector(grid: CyclicGrid, columns: np.ndarray, states: int, frequency: float) -> np.ndarray:
+    """Return the unit vector (points, states) that a nearly singular ∂g/∂z makes smallest."""
+    nothing = np.empty((0, grid.points, states))
+    factors = BorderedFactors(grid, columns, states, frequency, nothing, nothing)
+    vector = factors._unfold(factors.border.columns)[0]
+    return vector / np.linalg.norm(vector)
 
 
 FREQUENCY = "frequency"
 
 
 class Solved(NamedTuple):
-    """What Newton's iteration ended with: the periodic part z (points, states), a status code, and its history."""
+    """Result of the Newton iteration: z (points, states), status code, history, values of further unknowns."""
 
     z: np.ndarray
     code: int
     history: np.ndarray
+    values: np.ndarray = np.empty(0)
 
 
 class Derivatives(NamedTuple):
@@ -218,10 +236,19 @@ class PeriodicEquations:
         """Number of states."""
         return len(self.model.states)
 
-    @cached_property
-    def kernels(self) -> SimpleNamespace:
+    @property
+    def kernels(self) -> ModuleType:
         """The compiled functions of the solver."""
-        return compiled.kernels(self.count, self.grid.stencil)
+        return kernels("newton", self.count, self.grid.stencil)
+
+    @property
+    def functions(self) -> Functions:
+        """The model's grid functions as the compiled functions take them."""
+        return Functions.of(self.model.kernels)
+
+    def setting(self, parameters: np.ndarray) -> Setting:
+        """Return what else the equations depend on as the compiled functions take it."""
+        return Setting(self.inputs, parameters, self.frequency, self.drift)
 
     @cached_property
     def winding(self) -> dict[str, int]:
@@ -247,7 +274,7 @@ class PeriodicEquations:
         inputs[0, len(self.model.inputs) :] = 0.0
         states, best = np.zeros((1, 3 * count)), np.inf
         solution = states[0, :count].copy()
-        for _ in range(self.kernels.MAX_ITERATIONS):
+        for _ in range(MAX_ITERATIONS):
             row = kernels.evaluate("residual_jacobian", states, inputs, parameters, tau, self.frequency)[0]
             residual, stiffness = row[:count], row[count:].reshape(count, 3, count)[:, 0]
             size = float(np.linalg.norm(residual))
@@ -258,31 +285,31 @@ class PeriodicEquations:
         return np.tile(solution, (self.grid.points, 1))
 
     def solve(self, parameters: np.ndarray, guess: np.ndarray) -> Solved:
-        """Run Newton's iteration from a guess (points, states) for the periodic part."""
+        """Run the Newton iteration from a guess (points, states) for the periodic part."""
+        return self.solve_with(parameters, guess, NO_UNKNOWNS, NO_BORDER)
+
+    def solve_with(self, parameters: np.ndarray, guess: np.ndarray, unknowns: Unknowns, border: Border) -> Solved:
+        """Run the Newton iteration for z and further unknowns from a guess; see `_kernels/newton.py`."""
         z = np.array(guess, dtype=float, order="C")
-        points, count = z.shape
-        history = np.zeros((self.kernels.MAX_ITERATIONS, 3))
-        code, iterations = self.kernels.newton(
-            self.model.kernels.residual_jacobian,
+        history = np.zeros((MAX_ITERATIONS, 3))
+        code, iterations, _ = self.kernels.newton(
+            self.functions,
             self.grid.packed,
-            self.inputs,
-            parameters,
-            self.grid.tau,
-            self.frequency,
-            self.drift,
+            self.setting(parameters),
+            unknowns,
+            border,
+            MAX_HALVINGS,
             z,
             history,
-            np.empty((points, 3 * count)),
-            np.empty((points, count * (1 + 3 * count))),
-            empty_factors(self.grid, count),
+            workspace(self, bordered=unknowns.values.size > 0),
         )
-        return Solved(z, code, history[:iterations])
+        return Solved(z, code, history[:iterations], unknowns.values)
 
     def states(self, z: np.ndarray, drift: np.ndarray | None = None) -> np.ndarray:
         """Return q, q̇, q̈ side by side, (points, 3·states), from the periodic part."""
         out = np.empty((z.shape[0], 3 * z.shape[1]))
         rate = self.drift if drift is None else drift
-        self.kernels.differentiate(z, rate, self.grid.packed, self.grid.tau, self.frequency, out)
+        self.kernels.differentiate(z, rate, self.grid.packed, self.frequency, out)
         return out
 
     def changes(self, z: np.ndarray) -> np.ndarray:
@@ -305,8 +332,14 @@ class PeriodicEquations:
         """Return the factors of ∂g/∂z for what `residual_jacobian` returned."""
         return CyclicFactors(self.grid, columns, self.count, self.frequency)
 
-    def factorise(self, columns: np.ndarray, z: np.ndarray, factors: tuple[np.ndarray, ...]) -> bool:
-        """Fill the compiled functions' own factors of ∂g/∂z at z; return False if it is singular."""
+    def bordered(
+        self, columns: np.ndarray, sides: np.ndarray, rows: np.ndarray, corner: np.ndarray | float = 0.0
+    ) -> BorderedFactors:
+        """Return the factors of [∂g/∂z, B; C, D]."""
+        return BorderedFactors(self.grid, columns, self.count, self.frequency, sides, rows, corner)
+
+    def factorise(self, columns: np.ndarray, z: np.ndarray, factors: Factors) -> bool:
+        """Fill the factors of ∂g/∂z at z that the compiled iteration uses; return False if it is singular."""
         amplitude = np.abs(z).max(axis=0)
         amplitude[amplitude == 0.0] = 1.0
         return self.kernels.factorise(columns, self.grid.packed, self.frequency, amplitude, factors)
@@ -338,29 +371,43 @@ class PeriodicEquations:
 
     def phase_row(self, z: np.ndarray) -> np.ndarray:
         """Return the row (points, states) of the phase condition against z, states in units of their range."""
-        flow = self.changes(z[None])[0, :, self.count : 2 * self.count]
-        spread = np.ptp(z, axis=0)
-        flow = flow / np.where(spread > 0, spread, 1.0) ** 2
-        length = np.linalg.norm(flow)
-        return flow / length if length > 0 else flow
+        return phase_row(self.grid, z, self.states(z))
 
     def evaluate(self, name: str, z: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return one of the model's grid functions at the periodic part z."""
         return self.model.kernels.evaluate(name, self.states(z), self.inputs, parameters, self.grid.tau, self.frequency)
 
 
-def empty_factors(grid: CyclicGrid, states: int, sets: tuple[int, ...] = ()) -> tuple[np.ndarray, ...]:
-    """Return room for the factors of the compiled functions, one for each of `sets`."""
+def phase_row(grid: CyclicGrid, z: np.ndarray, states: np.ndarray) -> np.ndarray:
+    """Return the row (points, states) of the phase condition against z, given q, q̇, q̈ side by side."""
+    folded = np.empty(z.size)
+    kernels("newton", z.shape[1], grid.stencil).phase_row(np.ascontiguousarray(z), states, grid.packed, folded)
+    return np.ascontiguousarray(folded.reshape(z.shape)[grid.place])
+
+
+def workspace(equations: PeriodicEquations, *, bordered: bool) -> Workspace:
+    """Return the arrays that the Newton iteration overwrites."""
+    points, count = equations.grid.points, equations.count
+    return Workspace(
+        np.empty((points, 3 * count)),
+        np.empty((points, count * (1 + 3 * count))),
+        np.empty((points, equations.model.kernels.columns("derivatives") if bordered else 0)),
+        empty_factors(equations.grid, count),
+    )
+
+
+def empty_factors(grid: CyclicGrid, states: int, sets: tuple[int, ...] = ()) -> Factors:
+    """Return arrays for the factors of the compiled functions, one for each of `sets`."""
     points, reach = grid.points, max(grid.reach, 1)
     lower = grid.half_width * states + states - 1
-    coupled = compiled.MAX_SEGMENTS * reach * states if grid.reach else 1
-    return (
+    coupled = MAX_SEGMENTS * reach * states if grid.reach else 1
+    return Factors(
         np.empty((*sets, points * states, 3 * lower + 1)),
         np.empty((*sets, points * states), dtype=np.int64),
         np.empty((*sets, points, states, states)),
         np.empty((*sets, points, reach, states, states)),
         np.empty((*sets, states, reach * states, points)),
-        np.empty((*sets, 1 + compiled.MAX_SEGMENTS), dtype=np.int64),
+        np.empty((*sets, 1 + MAX_SEGMENTS), dtype=np.int64),
         np.empty((*sets, coupled * (3 * coupled - 2))),
         np.empty((*sets, coupled), dtype=np.int64),
     )

@@ -14,12 +14,12 @@ References
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType
 
 import numpy as np
 
 from bayesperiodic.models.cache import load
+from bayesperiodic.periodic.compiled import source
 
 STENCIL = 8
 GAUSS_NODES = np.array([0.5 - np.sqrt(15) / 10, 0.5, 0.5 + np.sqrt(15) / 10])
@@ -38,9 +38,8 @@ STIFF, MOST_PARTS = 3.0, 32
 
 
 @cache
-def _kernels() -> SimpleNamespace:
-    source = Path(__file__).with_name("_kernels").joinpath("floquet.py").read_text(encoding="utf-8")
-    return SimpleNamespace(**load(source, ("transfer_matrices", "along", "across", "largest")))
+def _kernels() -> ModuleType:
+    return load(source("floquet"))
 
 
 @dataclass(frozen=True)
@@ -71,8 +70,12 @@ class Floquet:
         """Return the eigenfunctions of the first multipliers only, arrays (count, points, size)."""
         result = np.empty((2, count, *self._steps.shape[:2]), dtype=complex)
         for k in range(count):
-            _kernels().along(self._steps, np.ascontiguousarray(self._along[k]), self._every, result[0, k])
-            _kernels().across(self._steps, np.ascontiguousarray(self._across[k]), self._every, result[1, k])
+            _kernels().forward_eigenfunction(
+                self._steps, np.ascontiguousarray(self._along[k]), self._every, result[0, k]
+            )
+            _kernels().adjoint_eigenfunction(
+                self._steps, np.ascontiguousarray(self._across[k]), self._every, result[1, k]
+            )
         return result[0], result[1]
 
 
@@ -169,7 +172,7 @@ def floquet(matrix: np.ndarray, period: float) -> Floquet:
     return Floquet(np.array(exponents)[order], steps, length, np.array(v)[order], np.array(w)[order])
 
 
-def easy_multipliers(matrix: np.ndarray, period: float, count: int) -> np.ndarray | None:
+def leading_multipliers(matrix: np.ndarray, period: float, count: int) -> np.ndarray | None:
     """Return the largest multipliers of ẏ = A(t) y, complex (count,) or fewer; None where that takes `floquet`.
 
     A vector carried round the period turns in a few rounds into the eigenvector of the largest one, if that is real
@@ -186,7 +189,9 @@ def easy_multipliers(matrix: np.ndarray, period: float, count: int) -> np.ndarra
     points, size, _ = matrix.shape
     steps = _transfer_matrices(matrix, period / points)
     if count == 1:
-        found, logarithm, sign = _kernels().largest(steps, np.full(size, 1.0 / np.sqrt(size)), ROUNDS, DECOUPLED)
+        found, logarithm, sign = _kernels().dominant_multiplier(
+            steps, np.full(size, 1.0 / np.sqrt(size)), ROUNDS, DECOUPLED
+        )
         if found:
             with np.errstate(over="ignore"):
                 return np.array([sign * np.exp(logarithm)], dtype=complex)

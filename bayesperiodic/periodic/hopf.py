@@ -12,8 +12,8 @@ from scipy.optimize import brentq
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
-from bayesperiodic.periodic.family import Family, solve_family
+from bayesperiodic.periodic.arclength import ParametrisedEquations
+from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations
 from bayesperiodic.periodic.floquet import first_order_matrix
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import PeriodicSolution, describe
@@ -180,11 +180,11 @@ def emerging_cycle(
     rows = np.zeros((2, *z.shape))
     rows[:, :, model.states.index(state)] = 2.0 / len(z) * np.stack([wave.real, wave.imag])
     values = np.array([point.value, point.frequency])
-    family = Family(equations, theta, (point.vary, FREQUENCY))
+    parametrised = ParametrisedEquations(equations, theta, (point.vary, FREQUENCY))
     scales = np.maximum(np.abs(values), 1.0)
-    found = solve_family(family, z, values, rows, np.zeros((2, 2)), np.array([size, 0.0]), scales)
-    equations, theta = family.at(found.values)
-    return describe(equations, theta, Solved(found.z, found.code, found.history), "Hopf point", sensitivities=False)
+    found = parametrised.solve(z, values, rows, np.zeros((2, 2)), np.array([size, 0.0]), scales)
+    equations, theta = parametrised.at(found.values)
+    return describe(equations, theta, found, "Hopf point", sensitivities=False)
 
 
 def _equations(model: Model, frequency: float, samples: int, scheme: str | Scheme) -> PeriodicEquations:

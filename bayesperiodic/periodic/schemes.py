@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from bayesperiodic import _checks
+from bayesperiodic.periodic.compiled import Grid
 
 UNROLLED_OFFSETS = 5
 
@@ -225,6 +226,6 @@ class CyclicGrid:
         return bool(np.all(np.diff(self.offsets) == 1))
 
     @cached_property
-    def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, int, int]:
+    def packed(self) -> Grid:
         """The grid as the compiled functions take it."""
-        return self.first, self.second, self.neighbours, self.shift, self.place, self.half_width, self.lead
+        return Grid(*(getattr(self, name) for name in Grid._fields))

@@ -77,24 +77,23 @@ def respond(
     equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray, d: Derivatives, g: np.ndarray, f: np.ndarray
 ) -> Sensitivities | None:
     """Return the response to changes of g (directions, points, states) and f (directions, points, channels)."""
-    factors = equations.factors(columns)
     if equations.model.autonomous:
         g_frequency, f_frequency = frequency_derivatives(equations, z, columns, d)
-        nothing = np.zeros((len(g), 1))
-        row = equations.phase_row(z)[None]
-        solved = factors.solve_bordered(g_frequency[None], row, np.zeros((1, 1)), -g, nothing)
+        factors = equations.bordered(columns, g_frequency[None], equations.phase_row(z)[None])
+        solved = factors.solve_bordered(-g, np.zeros((len(g), 1)))
         if solved is None:
             return None
         z_change, frequency = solved[0], solved[1][:, 0]
         f = f + frequency[:, None, None] * f_frequency
-    elif factors.regular:
-        z_change, frequency = factors.solve(-g), np.zeros(len(g))
     else:
-        return None
+        regular = equations.factors(columns)
+        if not regular.regular:
+            return None
+        z_change, frequency = regular.solve(-g), np.zeros(len(g))
     return Sensitivities(z_change, f + np.einsum("ncq,dnq->dnc", d.f_q, equations.changes(z_change)), frequency)
 
 
-def softest_direction(
+def smallest_singular_vectors(
     equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return about the singular vectors of a regular ∂g/∂z with its smallest singular value, by inverse iteration.
@@ -123,7 +122,7 @@ def softest_direction(
     return left / np.einsum("ne,neq,nq->", left, g_q, change), change
 
 
-def softening(
+def stiffness_gradient(
     equations: PeriodicEquations,
     z: np.ndarray,
     parameters: np.ndarray,
@@ -138,7 +137,7 @@ def softening(
     sensitivities : array (parameters, points, states)
         Of the solution z; a parameter without any counts as one that does not matter.
     left, right
-        As `softest_direction` returns them.
+        As `smallest_singular_vectors` returns them.
     """
     amplitude, result = np.abs(z).max(axis=0), np.zeros(parameters.size)
     units = np.where(amplitude > 0.0, amplitude, 1.0)

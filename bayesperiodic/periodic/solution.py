@@ -12,7 +12,14 @@ from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
-from bayesperiodic.periodic.equations import FREQUENCY, CyclicFactors, PeriodicEquations, Solved
+from bayesperiodic.periodic.equations import (
+    FREQUENCY,
+    BorderedFactors,
+    CyclicFactors,
+    PeriodicEquations,
+    Solved,
+    phase_row,
+)
 from bayesperiodic.periodic.floquet import Floquet, first_order_matrix, floquet
 from bayesperiodic.periodic.schemes import CyclicGrid, Scheme
 from bayesperiodic.periodic.sensitivity import parameter_sensitivities
@@ -60,12 +67,11 @@ def _respond(
     """Return how far a defect of the equations moves each state at most, and an autonomous model's frequency."""
     points, count = z.shape
     columns = np.concatenate([np.zeros((points, count)), solution.linearisation.reshape(points, -1)], axis=1)
-    factors = CyclicFactors(grid, np.ascontiguousarray(columns), count, solution.frequency)
+    matrix = grid, np.ascontiguousarray(columns), count, solution.frequency
     if not solution.autonomous:
-        return np.abs(factors.solve(defect)).max(axis=0).tolist()
-    flow = rate / np.maximum(np.ptp(z, axis=0), np.finfo(float).tiny) ** 2
-    flow /= np.linalg.norm(flow)
-    solved = factors.solve_bordered(slope[None], flow[None], np.zeros((1, 1)), defect[None], np.zeros((1, 1)))
+        return np.abs(CyclicFactors(*matrix).solve(defect)).max(axis=0).tolist()
+    row = phase_row(grid, z, np.concatenate([z, rate, rate], axis=1))
+    solved = BorderedFactors(*matrix, slope[None], row[None]).solve_bordered(defect[None], np.zeros((1, 1)))
     if solved is None:
         return [np.nan] * (count + 1)
     return [*np.abs(solved[0][0]).max(axis=0).tolist(), abs(float(solved[1][0, 0]))]

@@ -9,9 +9,9 @@ import numpy as np
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.models.integrate import integrate
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, OTHER_ORBIT
+from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
+from bayesperiodic.periodic.compiled import ABSENT, CONVERGED, NOT_FINITE, OTHER_ORBIT, SHRUNK
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
-from bayesperiodic.periodic.family import INPUTS, Family, solve_autonomous, trace
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, as_guess, describe
 
@@ -27,16 +27,17 @@ def raise_amplitude(equations: PeriodicEquations, parameters: np.ndarray, static
     mean = np.zeros_like(equations.inputs)
     width = len(equations.model.inputs)
     mean[:, :width] = equations.inputs[:, :width].mean(axis=0)
-    family = Family(equations.with_inputs(mean), parameters, (INPUTS,), equations.inputs - mean)
-    beginning = family.equations.solve(parameters, static)
+    start = equations.with_inputs(mean)
+    scaled = ParametrisedEquations(start, parameters, (INPUTS,), equations.inputs - mean)
+    beginning = start.solve(parameters, static)
     if beginning.code != CONVERGED:
         return None
-    columns = family.equations.residual_jacobian(beginning.z, parameters)
-    factors = family.equations.factors(columns)
+    columns = start.residual_jacobian(beginning.z, parameters)
+    factors = start.factors(columns)
     if not factors.regular:
         return None
-    linear = factors.solve(family.slopes(np.zeros(1), beginning.z, columns)[0])
-    points = list(trace(family, beginning.z, np.zeros(1), until=1.0, step=0.1, size=np.ptp(linear, axis=0)))
+    linear = factors.solve(scaled.slopes(np.zeros(1), beginning.z, columns)[0])
+    points = list(trace(scaled, beginning.z, np.zeros(1), until=1.0, step=0.1, size=np.ptp(linear, axis=0)))
     if not points or points[-1].values[0] != 1.0:
         return None
     return equations.solve(parameters, points[-1].z)
@@ -134,8 +135,6 @@ def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tupl
 
 GUESSES = ("static", "integration")
 FEW_STEPS = 4
-EQUILIBRIUM = 1e-6
-ABSENT = 1e-6
 
 
 def solve_periodic(
@@ -321,18 +320,18 @@ def solve_free(
                 "guess that moves fixes the phase."
             )
     equations = replace(equations, frequency=frequency)
-    found = solve_autonomous(Family(equations, theta, ("frequency",)), z, frequency)
+    found = solve_autonomous(equations, theta, z, frequency)
     equations = equations.at_frequency(float(found.values[0]))
     code = found.code
     shorter = code == CONVERGED and has_shorter_period(found.z)
     if shorter or (code != NOT_FINITE and collapsed(found.z, z)):
         code = OTHER_ORBIT
-    return equations, Solved(found.z, code, found.history), found_by
+    return equations, found._replace(code=code), found_by
 
 
 def collapsed(z: np.ndarray, guess: np.ndarray) -> bool:
     """Return whether an orbit has shrunk to an equilibrium."""
-    return bool(np.all(np.ptp(z, axis=0) <= EQUILIBRIUM * np.ptp(guess, axis=0)))
+    return bool(np.all(np.ptp(z, axis=0) <= SHRUNK * np.ptp(guess, axis=0)))
 
 
 def has_shorter_period(z: np.ndarray) -> bool:

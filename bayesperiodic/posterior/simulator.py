@@ -13,7 +13,7 @@ from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch, BatchSo
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.family import LOST, reach
-from bayesperiodic.periodic.floquet import easy_multipliers, first_order_matrix
+from bayesperiodic.periodic.floquet import leading_multipliers, first_order_matrix
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, describe
@@ -523,7 +523,7 @@ def leading_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z:
 def _easy_multipliers(
     equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int
 ) -> np.ndarray | None:
-    """Return the largest multipliers of a forced model where `floquet.easy_multipliers` finds them."""
+    """Return the largest multipliers of a forced model where `floquet.leading_multipliers` finds them."""
     orders = tuple(equations.model.orders.values())
     columns = equations.residual_jacobian(z, parameters)[:, equations.count :]
     try:
@@ -534,7 +534,7 @@ def _easy_multipliers(
     spread = np.ptp(z, axis=0)
     sizes = np.where(spread > 0.0, spread, 1.0)
     sizes = np.concatenate([sizes, 2 * np.pi / period * sizes[[order == 2 for order in orders]]])
-    return easy_multipliers(matrix * (sizes / sizes[:, None]), period, count)
+    return leading_multipliers(matrix * (sizes / sizes[:, None]), period, count)
 
 
 def _described(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> PeriodicSolution:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.periodic.floquet import easy_multipliers, first_order_matrix, floquet
+from bayesperiodic.periodic.floquet import leading_multipliers, first_order_matrix, floquet
 from tests.known import grid
 
 PERIOD = 1.7
@@ -212,19 +212,19 @@ def test_leading_multipliers_are_exact_or_not_returned():
     real = np.array([[1.0, 3.0], [0.5, -2.0]])
     largest = np.exp(3.0 * np.linalg.eigvals(real).max())
     for matrix in (real, 10.0 * real):
-        found = easy_multipliers(np.tile(matrix, (100, 1, 1)), 3.0 / matrix[0, 0], 1)
+        found = leading_multipliers(np.tile(matrix, (100, 1, 1)), 3.0 / matrix[0, 0], 1)
         assert found == pytest.approx([largest], rel=1e-9)
     # Seen from axes that turn by half a turn in the period the multipliers change their signs.
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     axes = [np.cos(np.pi * t) * np.eye(2) + np.sin(np.pi * t) * turn for t in tau]
     seen = np.array([a @ real @ a.T + np.pi / 3.0 * turn for a in axes])
-    assert easy_multipliers(seen, 3.0, 1) == pytest.approx([-largest], rel=1e-6)
-    pair = easy_multipliers(np.tile(turn, (100, 1, 1)), 1.0, 2)
+    assert leading_multipliers(seen, 3.0, 1) == pytest.approx([-largest], rel=1e-6)
+    pair = leading_multipliers(np.tile(turn, (100, 1, 1)), 1.0, 2)
     assert sorted(pair, key=np.imag) == pytest.approx([np.exp(-1j), np.exp(1j)], rel=1e-9)
     near = np.tile(np.diag([-0.2, 0.1, 0.099]), (100, 1, 1))
     for count in (1, 2):
-        assert easy_multipliers(near, 1.0, count) == pytest.approx(np.exp([0.1, 0.099])[:count], rel=1e-9)
+        assert leading_multipliers(near, 1.0, count) == pytest.approx(np.exp([0.1, 0.099])[:count], rel=1e-9)
     far = np.zeros((3, 3))
     far[:2, :2], far[2, 2] = 5.0 * turn, -40.0
     for count in (1, 3):
-        assert easy_multipliers(np.tile(far, (100, 1, 1)), 1.0, count) is None
+        assert leading_multipliers(np.tile(far, (100, 1, 1)), 1.0, count) is None

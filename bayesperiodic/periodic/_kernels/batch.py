@@ -1,52 +1,80 @@
-"""The compiled code of batches: forced orbits at many parameter vectors, each predicted from the anchor of its inputs.
+"""Compiled batches of driven orbits: solves predicted from anchors, and vector-Jacobian products at the solutions.
 
-Loaded through the kernel cache, with the functions of `kernels` that it imports as they are there (see `compiled`).
+The adjoint state λ of weights w on the outputs solves (∂g/∂z)ᵀ·λ = (∂ŷ/∂z)ᵀ·w; then Σ w·dŷ/dθ = Σ w·∂ŷ/∂θ − Σ λ·∂g/∂θ,
+by the implicit function theorem (de Kraker et al. 1997, eq. 4).
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from numba import njit
+from numba import njit, types
 
 from bayesperiodic.models.code_generation import grid_function_at
-from bayesperiodic.periodic._kernels.newton import (
-    CHORD_RATE,
+from bayesperiodic.periodic.compiled import (
+    ANCHORS,
     CONVERGED,
+    COUNT,
     CUBE,
     FACTORS,
-    FAR,
-    FUNCTION,
-    GAINS,
+    FLAG,
+    FUNCTIONS,
     GRID,
-    INDICES,
-    LARGEST_PART,
     MATRIX,
+    MAX_HALVINGS,
     MAX_ITERATIONS,
-    OPTIONS,
+    NO_FACTORS,
+    NUMBER,
     OTHER_ORBIT,
     PLACES,
-    SMALLEST_PART,
-    STATES,
+    SETS,
+    SETTING,
+    SOLUTION,
     STEP_TOLERANCE,
     VECTOR,
-    back_substitute,
-    copy,
-    differentiate,
-    dot,
-    is_far,
-    largest,
-    newton,
-    predict,
-    repetitions,
+    WORKSPACE,
+    Border,
+    Factors,
+    Setting,
+    Unknowns,
+    Workspace,
 )
+
+if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
+    from bayesperiodic.periodic._kernels.linear import (
+        LOWER,
+        OPTIONS,
+        REACH,
+        STATES,
+        WIDTH,
+        back_substitute,
+        copy,
+        factorise,
+        fold,
+        unfold,
+    )
+    from bayesperiodic.periodic._kernels.newton import (
+        CHORD_RATE,
+        FAR,
+        SMALLEST_PART,
+        differentiate,
+        dot,
+        is_far,
+        largest,
+        newton,
+        predict,
+        repetitions,
+    )
 
 MAX_CHORDS = 6
 PREDICTION_RATE = 30.0
 LEAST_STIFFNESS, MOST_STIFFNESS = 0.3, 3.0
 POLISHED = 1e-12
+LARGEST_PART = 1.0 / 16.0
 
 
-@njit(f"float64({VECTOR}, {VECTOR})", **OPTIONS)
+@njit(NUMBER(VECTOR, VECTOR), **OPTIONS)
 def in_units(reached, amplitude):
-    """Return the largest of what each state has reached, in units of its amplitude; no state at rest counts."""
+    """Return the largest of the values of each state in units of its amplitude; zeros do not count."""
     result = 0.0
     for s in range(reached.size):
         if reached[s] > 0.0:
@@ -55,43 +83,48 @@ def in_units(reached, amplitude):
 
 
 @njit(
-    f"Tuple((boolean, int64, float64))({FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR}, "
-    f"float64, float64, boolean, {MATRIX}, {MATRIX}, {MATRIX}, {FACTORS}, {MATRIX}, {MATRIX})",
+    types.Tuple([FLAG, COUNT, NUMBER])(
+        FUNCTIONS, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, FACTORS, MATRIX, MATRIX
+    ),
     **OPTIONS,
 )
-def chord(
-    residual, grid, inputs, parameters, tau, frequency, drift, amplitude, stiffness, predicted, polish, z, states,
-    change, factors, left, right,
-):  # fmt: skip
-    """Improve z in place with the factors of a nearby solution; return whether that converged, the steps, and how far.
+def newton_chord(
+    functions, grid, setting, amplitude, stiffness, predicted, polish, z, states, change, factors, left, right
+):
+    """Improve z in place with the factors of a nearby solution; return whether it converged, the steps, their length.
 
     `states` are left as they were before the last step. A step above `CHORD_RATE` times the one before ends it. The
-    ratio of two steps tells how much smaller the next one will be; that of the first step to the prediction tells the
-    order of magnitude, since the prediction is a chord step too, but for terms of second order: `PREDICTION_RATE` times
-    it was above all but two of a hundred rates found.
+    ratio of two steps predicts how much smaller the next one will be. The ratio of the first step to the prediction
+    gives the order of magnitude, since the prediction is a chord step except for terms of second order:
+    `PREDICTION_RATE` times it exceeded all but two of a hundred observed rates.
 
-    Where ∂g/∂z is nearly singular, steps with another point's factors say little of what is left in the direction that
-    it makes smallest, and after a change of its stiffness there, or of its sign, they go the wrong way. So this
-    direction takes the stiffness expected of the present ∂g/∂z, and factors whose own is too far from it are not used.
+    Where ∂g/∂z is nearly singular, steps with the factors of another point are wrong in the direction that it makes
+    smallest, and of the wrong sign where the stiffness in that direction has changed its sign. So this direction takes
+    the stiffness expected of the present ∂g/∂z, and factors whose own stiffness differs too much are not used.
 
     Parameters
     ----------
-    residual : compiled grid function of the model
+    functions : Functions
+    grid : Grid
+    setting : Setting
     amplitude : array (states,)
         Units of the steps.
     stiffness : float
         Expected of the present ∂g/∂z in this direction, in units of that of the factors.
     predicted : float
-        The change that the prediction made, in these units.
+        Size of the change by the prediction, in units of the amplitude.
     polish : bool
-        Go on until a step is below `POLISHED` or down to rounding, for derivatives of what is compared with the data.
-    change : array (points, states)
-        Work array.
+        Go on until a step is below `POLISHED` or at rounding level, for derivatives of the outputs.
+    z, states, change : array (points, states), (points, 3·states), (points, states)
+        The last two are work arrays.
+    factors : Factors
     left : array (points, states)
         Weights of the equations that are largest for a residual in this direction.
     right : array (points, states)
-        The direction, so long that its stiffness is 1 for the ∂g/∂z of the factors.
+        The direction, scaled to a stiffness of 1 for the ∂g/∂z of the factors.
     """
+    residual = grid_function_at(functions.residual)
+    inputs, parameters, frequency, drift = setting
     count = STATES if STATES > 0 else z.shape[1]
     position, step, reached = z.reshape(z.size), change.reshape(z.size), np.empty(count)
     weights, direction = left.reshape(left.size), right.reshape(right.size)
@@ -100,8 +133,8 @@ def chord(
     correction, tolerance = 1.0 / stiffness - 1.0, STEP_TOLERANCE * min(1.0, stiffness)
     previous, moved, rate, converged = predicted, 0.0, PREDICTION_RATE, False
     for iteration in range(MAX_CHORDS):
-        differentiate(z, drift, grid, tau, frequency, states)
-        residual(states, inputs, parameters, tau, frequency, change)
+        differentiate(z, drift, grid, frequency, states)
+        residual(states, inputs, parameters, grid.tau, frequency, change)
         along = correction * dot(weights, step) if correction != 0.0 else 0.0
         back_substitute(grid, factors, change)
         for k in range(step.size):
@@ -123,9 +156,19 @@ def chord(
     return converged, MAX_CHORDS, moved
 
 
-@njit(f"boolean({MATRIX}, int64)", **OPTIONS)
+@njit(types.Tuple([COUNT, COUNT])(FUNCTIONS, GRID, SETTING, MATRIX, MATRIX, WORKSPACE), **OPTIONS)
+def driven_newton(functions, grid, setting, z, history, work):
+    """Solve g(z) = 0 in place; return status and iterations."""
+    nothing, table = np.empty(0), np.empty((0, 0))
+    unknowns = Unknowns(nothing, nothing, nothing, table, np.empty((0, 0, 0)), -1)
+    border = Border(table, table, table, table, np.empty(0, dtype=np.int64))
+    code, iterations, _ = newton(functions, grid, setting, unknowns, border, MAX_HALVINGS, z, history, work)
+    return code, iterations
+
+
+@njit(FLAG(MATRIX, COUNT), **OPTIONS)
 def was_damped(history, iterations):
-    """Return whether Newton's iteration took a shortened step."""
+    """Return whether the Newton iteration took a shortened step."""
     for iteration in range(iterations):
         if history[iteration, 2] < 1.0:
             return True
@@ -133,32 +176,29 @@ def was_damped(history, iterations):
 
 
 @njit(
-    f"Tuple((int64, int64))({FUNCTION}, {GRID}, int64, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {VECTOR}, "
-    f"{MATRIX}, {CUBE}, boolean, {MATRIX}, {MATRIX}, {MATRIX}, {MATRIX}, {FACTORS})",
+    types.Tuple([COUNT, COUNT])(FUNCTIONS, GRID, COUNT, SETTING, VECTOR, MATRIX, CUBE, FLAG, MATRIX, MATRIX, WORKSPACE),
     **OPTIONS,
 )
-def creep(
-    residual_jacobian, grid, periods, inputs, parameters, tau, frequency, drift, anchor_parameters, anchor_z,
-    sensitivities, leapt, z, history, states, columns, factors,
-):  # fmt: skip
-    """Follow an orbit from the anchor's parameters to others in small steps; return status and iterations.
+def continue_from_anchor(
+    functions, grid, periods, setting, anchor_parameters, anchor_z, sensitivities, leapt, z, history, work
+):
+    """Follow an orbit from the anchor's parameters to those of the setting in small steps; return status, iterations.
 
-    A step that fails, or leads too far, is halved. `leapt` says that the orbit was lost before by a leap.
+    A step that fails, or leads too far, is halved. `leapt` is true if a solve has converged to another orbit before.
     """
     points, count = anchor_z.shape
     predicted, here, last = np.empty((points, count)), np.empty((points, count)), np.empty((points, count))
     once, used, done, step, before = repetitions(anchor_z, periods), 0, 0.0, LARGEST_PART, LARGEST_PART
     copy(anchor_z, here)
-    predict(anchor_z, sensitivities, anchor_parameters, parameters, -before, last)
+    predict(anchor_z, sensitivities, anchor_parameters, setting.parameters, -before, last)
     while done < 1.0:
         for i in range(points):
             for s in range(count):
                 predicted[i, s] = here[i, s] + (here[i, s] - last[i, s]) * (step / before)
         copy(predicted, z)
-        between = anchor_parameters + (parameters - anchor_parameters) * (done + step)
-        code, more = newton(
-            residual_jacobian, grid, inputs, between, tau, frequency, drift, z, history, states, columns, factors
-        )  # fmt: skip
+        between = anchor_parameters + (setting.parameters - anchor_parameters) * (done + step)
+        there = Setting(setting.inputs, between, setting.frequency, setting.drift)
+        code, more = driven_newton(functions, grid, there, z, history, work)
         used += more
         if code == CONVERGED and repetitions(z, periods) > once:
             return OTHER_ORBIT, used
@@ -175,150 +215,287 @@ def creep(
 
 
 @njit(
-    f"void({PLACES}, {GRID}, int64, {CUBE}, {CUBE}, {VECTOR}, {VECTOR}, {MATRIX}, {MATRIX}, "
-    f"{CUBE}, {GAINS}, {MATRIX}, {MATRIX}, {VECTOR}, "
-    f"Tuple(({CUBE}, {INDICES}, {GAINS}, float64[:,:,:,:,::1], {GAINS}, {INDICES}, {MATRIX}, {INDICES})), "
-    f"{CUBE}, {CUBE}, {CUBE}, {PLACES}, int64, int64, boolean, boolean, {GAINS}, {GAINS}, {CUBE}, {INDICES}, "
-    f"{INDICES})",
+    types.void(FUNCTIONS, GRID, COUNT, SETS, ANCHORS, CUBE, CUBE, PLACES, COUNT, COUNT, FLAG, FLAG, SOLUTION, CUBE),
     **OPTIONS,
 )
 def solve_many(
-    functions,
-    grid,
-    periods,
-    inputs,
-    parameters,
-    tau,
-    frequency,
-    drift,
-    anchor_parameters,
-    anchor_z,
-    anchor_sensitivities,
-    anchor_amplitude,
-    anchor_softening,
-    anchor_near,
-    anchor_factors,
-    anchor_left,
-    anchor_right,
-    data,
-    measured,
-    start,
-    stop,
-    polish,
-    rates,
-    kept_z,
-    y,
-    squares,
-    status,
-    iterations,
+    functions, grid, periods, sets, anchors, parameters, data, measured, start, stop, polish, rates, solution, squares
 ):
     """Solve for input sets times parameter vectors, those of the flat indices start … stop (vectors run fastest).
 
     Each solve starts from the linear prediction of its set's anchor: chord steps with the anchor's factors, else
-    Newton's iteration, else that from the anchor itself. Where all fail, or the result is far from the prediction of a
-    solved anchor or of a shorter period than it, small steps are taken along the way from the anchor's parameters.
-    Where they lead is where the orbit went; if one leaps, or the period becomes shorter, the status is "other orbit".
-    Nothing depends on the order of the solves.
+    the Newton iteration, else that from the anchor itself. Where all fail, or the result is far from the prediction of
+    a solved anchor or of a shorter period than it, the orbit is followed in small steps from the anchor's parameters;
+    if a step leaps, or the period becomes shorter, the status is "other orbit". The results do not depend on the order
+    of the solves.
 
     Parameters
     ----------
-    functions : int array (3,)
-        Addresses of the model's `residual`, `residual_jacobian` and `outputs`.
-    inputs : array (sets, points, 3·inputs)
+    functions : Functions
+    grid : Grid
+    periods : int
+        Forcing periods in the response period.
+    sets : Sets
+    anchors : Anchors
     parameters : array (sets, solves, parameters)
-    frequency : array (sets,)
-    drift : array (sets, states)
-    anchor_parameters, anchor_z, anchor_sensitivities, anchor_factors, anchor_left, anchor_right : arrays (sets, …)
-    anchor_amplitude : array (sets, states)
-        The largest absolute value of each state.
-    anchor_softening : array (sets, parameters)
-        Derivatives of the stiffness that `chord` takes.
-    anchor_near : array (sets,)
-        How far chord steps may lead, in units of the amplitude, without `is_far` being asked.
     data : array (sets, points, measured)
     measured : int array (measured,)
         The channels that the data are of.
+    start, stop : int
     polish : bool
-        As `chord` takes it.
+        As `newton_chord` takes it.
     rates : bool
         Whether the outputs depend on q̇ or q̈.
-    kept_z : array (sets, solves, points, states), or without entries if z is not wanted
-    y : array (sets, solves, points, channels), or without entries if the outputs are not wanted
+    solution : BatchSolution
+        Filled except for the frequency; z, and the outputs, only if they have entries.
     squares : array (sets, solves, measured)
         Filled with the sums of squares of data minus outputs.
-    status, iterations : int arrays (sets, solves)
     """
-    residual, residual_jacobian = grid_function_at(functions[0]), grid_function_at(functions[1])
-    outputs = grid_function_at(functions[2])
-    bands, pivots, inverses, gains, transfers, ends, reduced, reduced_pivots = anchor_factors
-    points, count = anchor_z.shape[1], STATES if STATES > 0 else anchor_z.shape[2]
-    solves = parameters.shape[1]
+    outputs = grid_function_at(functions.outputs)
+    points, count = anchors.z.shape[1], STATES if STATES > 0 else anchors.z.shape[2]
+    solves, kept, y, all_factors = parameters.shape[1], solution.z, solution.outputs, anchors.factors
     states, z = np.empty((points, 3 * count)), np.empty((points, count))
     predicted, change, room = np.empty((points, count)), np.empty((points, count)), np.empty((points, y.shape[3]))
     reached, residuals = np.empty(count), np.empty(points)
     columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MAX_ITERATIONS, 3))
-    own = (
-        np.empty_like(bands[0]), np.empty_like(pivots[0]), np.empty_like(inverses[0]), np.empty_like(gains[0]),
-        np.empty_like(transfers[0]), np.empty_like(ends[0]), np.empty_like(reduced[0]),
-        np.empty_like(reduced_pivots[0]),
-    )  # fmt: skip
+    bands, pivots, inverses, gains, transfers, ends, interfaces, interface_pivots = all_factors
+    own = Factors(
+        np.empty_like(bands[0]),
+        np.empty_like(pivots[0]),
+        np.empty_like(inverses[0]),
+        np.empty_like(gains[0]),
+        np.empty_like(transfers[0]),
+        np.empty_like(ends[0]),
+        np.empty_like(interfaces[0]),
+        np.empty_like(interface_pivots[0]),
+    )
+    work = Workspace(states, columns, np.empty((0, 0)), own)
     for index in range(start, stop):
         e, b = index // solves, index % solves
-        theta, at, turn, f = parameters[e, b], anchor_z[e], drift[e], frequency[e]
-        kept = (
-            bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], reduced[e], reduced_pivots[e]
-        )  # fmt: skip
-        predict(at, anchor_sensitivities[e], anchor_parameters[e], theta, 1.0, predicted)
+        at, theta = anchors.z[e], parameters[e, b]
+        setting = Setting(sets.inputs[e], theta, sets.frequency[e], sets.drift[e])
+        sensitivities, anchor_parameters = anchors.sensitivities[e], anchors.parameters[e]
+        predict(at, sensitivities, anchor_parameters, theta, 1.0, predicted)
         copy(predicted, z)
-        close, used, code, doubtful, moved = False, 0, CONVERGED, False, np.inf
-        if ends[e, 0] >= 0:
+        known, close, used, code, doubtful, moved = ends[e, 0] != NO_FACTORS, False, 0, CONVERGED, False, np.inf
+        if known:
             stiffness = 1.0
             for p in range(theta.size):
-                stiffness += anchor_softening[e, p] * (theta[p] - anchor_parameters[e, p])
+                stiffness += anchors.stiffness_gradient[e, p] * (theta[p] - anchor_parameters[p])
             for i in range(points):
                 for s in range(count):
                     change[i, s] = predicted[i, s] - at[i, s]
             largest(change, reached)
-            close, used, moved = chord(
-                residual, grid, inputs[e], theta, tau, f, turn, anchor_amplitude[e], stiffness,
-                in_units(reached, anchor_amplitude[e]), polish, z, states, change, kept, anchor_left[e],
-                anchor_right[e],
+            amplitude = anchors.amplitude[e]
+            factors = Factors(
+                bands[e], pivots[e], inverses[e], gains[e], transfers[e], ends[e], interfaces[e], interface_pivots[e]
+            )
+            close, used, moved = newton_chord(
+                functions, grid, setting, amplitude, stiffness, in_units(reached, amplitude), polish, z, states,
+                change, factors, anchors.left[e], anchors.right[e],
             )  # fmt: skip
         if not close:
             moved = np.inf
             copy(predicted, z)
-            code, more = newton(
-                residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, history, states, columns, own
-            )  # fmt: skip
+            code, more = driven_newton(functions, grid, setting, z, history, work)
             used += more
             doubtful = was_damped(history, more)
             if code != CONVERGED:
                 copy(at, z)
-                code, more = newton(
-                    residual_jacobian, grid, inputs[e], theta, tau, f, turn, z, history, states, columns, own
-                )  # fmt: skip
+                code, more = driven_newton(functions, grid, setting, z, history, work)
                 used += more
                 doubtful = True
         once = repetitions(at, periods)
-        far = moved > anchor_near[e] and is_far(z, predicted, at)
-        if ends[e, 0] >= 0 and (doubtful or far or repetitions(z, periods) > once):
-            code, more = creep(
-                residual_jacobian, grid, periods, inputs[e], theta, tau, f, turn, anchor_parameters[e], at,
-                anchor_sensitivities[e], code == CONVERGED, z, history, states, columns, own,
+        far = moved > anchors.near[e] and is_far(z, predicted, at)
+        if known and (doubtful or far or repetitions(z, periods) > once):
+            code, more = continue_from_anchor(
+                functions, grid, periods, setting, anchor_parameters, at, sensitivities, code == CONVERGED, z, history,
+                work,
             )  # fmt: skip
             used += more
         if rates:
-            differentiate(z, turn, grid, tau, f, states)
+            differentiate(z, setting.drift, grid, setting.frequency, states)
         else:
             for i in range(points):
                 for s in range(count):
-                    states[i, s] = z[i, s] + turn[s] * tau[i]
+                    states[i, s] = z[i, s] + setting.drift[s] * grid.tau[i]
         out = y[e, b] if y.size > 0 else room
-        outputs(states, inputs[e], theta, tau, f, out)
+        outputs(states, setting.inputs, theta, grid.tau, setting.frequency, out)
         for m in range(measured.size):
             for i in range(points):
                 residuals[i] = out[i, measured[m]] - data[e, i, m]
             squares[e, b, m] = dot(residuals, residuals)
-        if kept_z.size > 0:
-            copy(z, kept_z[e, b])
-        status[e, b], iterations[e, b] = code, used
+        if kept.size > 0:
+            copy(z, kept[e, b])
+        solution.status[e, b], solution.iterations[e, b] = code, used
+
+
+@njit(inline="always")
+def substitute_transposed(flat, pivots, below, reach, x):
+    """Solve Aᵀ·x = b in place for one right-hand side (size,)."""
+    size, one = np.uint64(x.size), np.uint64(1)
+    next_row = below + reach
+    inside, known, half = size - min(below, size), min(reach, size), reach // np.uint64(2)
+    for i in range(known):
+        diagonal = i * (next_row + one) + below
+        value = x[i]
+        for k in range(i):
+            value -= flat[diagonal - (i - k) * next_row] * x[k]
+        x[i] = value * flat[diagonal]
+    for i in range(known, size):
+        diagonal = i * (next_row + one) + below
+        value, far = x[i], 0.0
+        for k in range(half):
+            far += flat[diagonal - (reach - k) * next_row] * x[i - (reach - k)]
+        value -= far
+        for k in range(half, reach):
+            value -= flat[diagonal - (reach - k) * next_row] * x[i - (reach - k)]
+        x[i] = value * flat[diagonal]
+    for back in range(size):
+        j = size - one - back
+        diagonal = j * (next_row + one) + below
+        value = x[j]
+        if j < inside:
+            for k in range(below):
+                value -= flat[diagonal + (below - k) * next_row] * x[j + below - k]
+        else:
+            for k in range(back):
+                value -= flat[diagonal + (back - k) * next_row] * x[j + back - k]
+        pivot = np.uint64(pivots[j])
+        x[j] = x[pivot]
+        x[pivot] = value
+
+
+@njit(types.void(MATRIX, COUNT, COUNT, PLACES, MATRIX), **OPTIONS)
+def solve_transposed(band, lower, upper, pivots, right):
+    """Solve Aᵀ·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
+    flat = band.reshape(band.size)
+    for c in range(right.shape[0]):
+        if LOWER > 0 and lower == LOWER and upper == LOWER:
+            substitute_transposed(flat, pivots, np.uint64(LOWER), np.uint64(2 * LOWER), right[c])
+        else:
+            substitute_transposed(flat, pivots, np.uint64(lower), np.uint64(lower + upper), right[c])
+
+
+@njit(types.void(GRID, FACTORS, MATRIX), **OPTIONS)
+def back_substitute_transposed(grid, factors, right):
+    """Solve (∂g/∂z)ᵀ·x = b in place, b (points, states), with the factors of `factorise`."""
+    inverses, gains, transfer, ends, lead = factors.inverses, factors.gains, factors.transfer, factors.ends, grid.lead
+    points, count = right.shape[0], STATES if STATES > 0 else right.shape[1]
+    reach, segments = REACH if REACH > 0 else gains.shape[1], ends[0]
+    if segments == 0:
+        lower = grid.half_width * count + count - 1
+        folded = np.empty((1, points * count))
+        fold(right, grid, folded[0])
+        solve_transposed(factors.band, lower, lower, factors.pivots, folded)
+        unfold(folded[0], grid, right)
+        return
+    block = reach * count
+    size = segments * block
+    x = np.zeros((1, size))
+    start = 0
+    for q in range(segments):
+        stop = ends[q + 1] + 1
+        for c in range(block):
+            total = 0.0
+            for e in range(count):
+                for j in range(start, stop):
+                    total += transfer[e, c, j] * right[j, e]
+            x[0, q * block + c] = total
+        start = stop
+    matrix = factors.interface[: size * (3 * size - 2)].reshape((size, 3 * size - 2))
+    solve_transposed(matrix, size - 1, size - 1, factors.interface_pivots, x)
+    forced = right.copy()
+    for q in range(segments):
+        for d in range(reach):
+            for e in range(count):
+                forced[ends[q + 1] - d, e] += x[0, (q + 1) % segments * block + d * count + e]
+    start = 0
+    for q in range(segments):
+        stop = ends[q + 1] + 1
+        for j in range(stop - 1, start, -1):
+            for d in range(min(reach, j - start)):
+                for s in range(count):
+                    value = forced[j - 1 - d, s]
+                    for e in range(count):
+                        value += gains[j, d, e, s] * forced[j, e]
+                    forced[j - 1 - d, s] = value
+        start = stop
+    for k in range(points):
+        j = k + lead if k + lead < points else k + lead - points
+        for s in range(count):
+            value = 0.0
+            for e in range(count):
+                value += inverses[j, e, s] * forced[j, e]
+            right[k, s] = value
+
+
+@njit(types.void(MATRIX, MATRIX, MATRIX), **OPTIONS)
+def concatenate(states, others, both):
+    """Fill `both` with the columns of `states` (q, q̇, q̈), then those of `others`."""
+    first, second = 3 * STATES if STATES > 0 else states.shape[1], others.shape[1]
+    one, other, out = states.reshape(states.size), others.reshape(others.size), both.reshape(both.size)
+    for i in range(states.shape[0]):
+        for s in range(first):
+            out[np.uint64((first + second) * i + s)] = one[np.uint64(first * i + s)]
+        for s in range(second):
+            out[np.uint64((first + second) * i + first + s)] = other[np.uint64(second * i + s)]
+
+
+@njit(types.void(PLACES, GRID, SETS, MATRIX, CUBE, CUBE, FACTORS, COUNT, COUNT, MATRIX), **OPTIONS)
+def vjp_many(addresses, grid, sets, parameters, z, weights, factors, start, stop, gradients):
+    """Fill Σ weights · ∂ŷ/∂θ (sets, moving) of the input sets start … stop at one solution each; NaN where singular.
+
+    Parameters
+    ----------
+    addresses : int array (3,)
+        Of the model's `residual_jacobian`, `outputs_vjp` and `equations_vjp`.
+    grid : Grid
+    sets : Sets
+    parameters : array (sets, parameters)
+    z : array (sets, points, states)
+    weights : array (sets, points, channels)
+    factors : Factors
+        Work arrays.
+    start, stop : int
+    gradients : array (sets, moving)
+    """
+    residual_jacobian, outputs_vjp = grid_function_at(addresses[0]), grid_function_at(addresses[1])
+    equations_vjp, tau = grid_function_at(addresses[2]), grid.tau
+    points, count, channels = z.shape[1], STATES if STATES > 0 else z.shape[2], weights.shape[2]
+    states, columns = np.empty((points, 3 * count)), np.empty((points, count * (1 + 3 * count)))
+    weighed, slopes = np.empty((points, 3 * count + channels)), np.empty(points * 3 * count + gradients.shape[1])
+    adjoint, extended, amplitude = np.empty((points, count)), np.empty((points, 4 * count)), np.empty(count)
+    width = WIDTH if WIDTH > 0 else grid.first.size
+    for k in range(start, stop):
+        inputs, theta, frequency, gradient = sets.inputs[k], parameters[k], sets.frequency[k], gradients[k]
+        squared = frequency**2
+        differentiate(z[k], sets.drift[k], grid, frequency, states)
+        residual_jacobian(states, inputs, theta, tau, frequency, columns)
+        largest(z[k], amplitude)
+        for s in range(count):
+            amplitude[s] = amplitude[s] if amplitude[s] > 0.0 else 1.0
+        if not factorise(columns, grid, frequency, amplitude, factors):
+            for p in range(gradient.size):
+                gradient[p] = np.nan
+            continue
+        concatenate(states, weights[k], weighed)
+        outputs_vjp(weighed, inputs, theta, tau, frequency, slopes.reshape((1, slopes.size)))
+        for i in range(points):
+            for s in range(count):
+                adjoint[i, s] = 0.0
+        for i in range(points):
+            for s in range(count):
+                row = np.uint64(3 * count * i + s)
+                rate = slopes[row + np.uint64(count)] * frequency
+                acceleration = slopes[row + np.uint64(2 * count)] * squared
+                if rate != 0.0 or acceleration != 0.0:
+                    for o in range(width):
+                        weight = grid.first[o] * rate + grid.second[o] * acceleration
+                        adjoint[np.uint64(grid.neighbours[i, o]), s] += weight
+                adjoint[i, s] += slopes[row]
+        back_substitute_transposed(grid, factors, adjoint)
+        concatenate(states, adjoint, extended)
+        equations_vjp(extended, inputs, theta, tau, frequency, gradient.reshape((1, gradient.size)))
+        for p in range(gradient.size):
+            gradient[p] += slopes[3 * count * points + p]

@@ -113,7 +113,7 @@ def normalise(vector):
 
 
 @njit(f"void({CUBE}, complex128[:,::1], int64, complex128[:,::1])", **OPTIONS)
-def along(steps, at, length, result):
+def forward_eigenfunction(steps, at, length, result):
     """Fill an eigenfunction (points, size) of unit length from its values `at` every `length`-th point."""
     points, size = result.shape
     for k in range(points):
@@ -129,7 +129,7 @@ def along(steps, at, length, result):
 
 
 @njit(f"void({CUBE}, complex128[:,::1], int64, complex128[:,::1])", **OPTIONS)
-def across(steps, at, length, result):
+def adjoint_eigenfunction(steps, at, length, result):
     """Fill an eigenfunction of the adjoint (points, size) likewise, backwards."""
     points, size = result.shape
     for p in range(size):
@@ -149,7 +149,7 @@ def across(steps, at, length, result):
 
 
 @njit(f"Tuple((boolean, float64, float64))({CUBE}, float64[::1], int64, float64)", **OPTIONS)
-def largest(steps, vector, sweeps, tolerance):
+def dominant_multiplier(steps, vector, sweeps, tolerance):
     """Carry a vector round the period until its direction stays; return whether it does, log|μ| and the sign of μ."""
     points, size, _ = steps.shape
     start, after = np.empty(size), np.empty(size)

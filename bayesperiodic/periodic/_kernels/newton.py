@@ -1,248 +1,67 @@
-"""The compiled code of the periodic solver, generic in the model: linear algebra, discretisation, Newton's iteration.
+"""Compiled Newton iteration: discretisation, residual norms, phase condition, driven and bordered solves.
 
-This text is compiled through the kernel cache. Import the functions from `compiled`, which puts in the sizes for which
-loops are unrolled: the numbers of states, start points and offsets, and the band's half-width.
-
-**Linear systems** with the cyclic block band ∂g/∂z are factored in one of two ways, both right however stable or
-unstable the orbit is, which one march through the period would not be:
-
-- Segments: where the scheme allows it, the equations are solved for the newest point and marched from `reach` unknown
-  start points, until what they multiply has grown by `GROWTH`; there the next segment starts. The start points of all
-  segments are coupled by a small dense system, solved with pivoting.
-- Folded band: in the folded order of `schemes.CyclicGrid` a cyclic band is an ordinary one, factored with pivoting.
-  Rows of the band are stored side by side: entry (i, j) of the matrix is ``band[i, j - i + lower]``, the width is
-  2·lower + upper + 1 and leaves room for the fill-in of row exchanges. It is read through flat, unsigned indices,
-  which spares a test for negative ones at every access.
-
-The Newton iteration is that of de Kraker, Verbeek & van de Wouw (1997), eq. (3): damped, with step halving. A failed
-solve is a status, not an exception.
+The iteration is that of de Kraker, Verbeek & van de Wouw (1997), eq. (3): damped, with step halving. Further unknowns
+(the frequency of an autonomous model, the parameter of a continuation) border the linear systems. A failed solve is a
+status, not an exception.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from numba import njit
+from numba import njit, types
 
-from bayesperiodic.models.code_generation import GRID_SIGNATURE
+from bayesperiodic.models.code_generation import grid_function_at
+from bayesperiodic.periodic.compiled import (
+    BORDER,
+    CONVERGED,
+    COUNT,
+    CUBE,
+    FLAG,
+    FUNCTIONS,
+    GRID,
+    MATRIX,
+    MAX_ITERATIONS,
+    NOT_FINITE,
+    NUMBER,
+    SAME,
+    SETTING,
+    SINGULAR,
+    STALLED,
+    STEP_TOLERANCE,
+    UNKNOWNS,
+    VECTOR,
+    WORKSPACE,
+    Setting,
+)
 
-STATES, REACH, WIDTH, HALF = 0, 0, 0, 0  # 0: any number, taken from the arrays
-LOWER = HALF * STATES + STATES - 1 if HALF > 0 else 0  # half-width of the folded band
+if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
+    from bayesperiodic.periodic._kernels.linear import (
+        OPTIONS,
+        STATES,
+        WIDTH,
+        assemble,
+        back_substitute,
+        copy,
+        factor_bordered,
+        factorise,
+        fold,
+        solve_bordered,
+        unfold,
+    )
 
-CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT = range(5)
-
-STEP_TOLERANCE = 1e-9
-MAX_ITERATIONS = 50
-MAX_HALVINGS = 20
 CHORD_RATE = 0.2
 ROUNDING = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
-NARROW = 5
 FAR = 0.3
-SAME = 1e-6
-LARGEST_PART, SMALLEST_PART = 1.0 / 16.0, 1.0 / 256.0
-
-GROWTH, TOO_MUCH_GROWTH = 1e4, 1e8
-MAX_SEGMENTS = 12
-CHECK_EVERY = 8
-
-MATRIX, VECTOR, INDICES, PLACES = "float64[:,::1]", "float64[::1]", "int64[:,::1]", "int64[::1]"
-CUBE, GAINS = "float64[:,:,::1]", "float64[:,:,:,::1]"
-FUNCTION = f"FunctionType({GRID_SIGNATURE})"
-GRID = f"Tuple(({VECTOR}, {VECTOR}, {INDICES}, {INDICES}, {PLACES}, int64, int64))"
-FACTORS = f"Tuple(({MATRIX}, {PLACES}, {CUBE}, {GAINS}, {CUBE}, {PLACES}, {VECTOR}, {PLACES}))"
-OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
+SMALLEST_PART = 1.0 / 256.0  # smallest step of a continuation from an anchor
 
 
-@njit(f"void({MATRIX}, {MATRIX})", **OPTIONS)
-def copy(source, target):
-    """Copy one array into another of the same shape; a slice assignment would bring in the text of its error."""
-    one, other = source.reshape(source.size), target.reshape(target.size)
-    for k in range(one.size):
-        other[k] = one[k]
-
-
-@njit(f"boolean({VECTOR}, uint64, {PLACES})", **OPTIONS)
-def factor_narrow(flat, stop, pivots):
-    """Do as `factor` for the rows before `stop` of a band of half-width `LOWER`, every loop of a known length."""
-    one, below, row = np.uint64(1), np.uint64(LOWER), np.uint64(3 * LOWER)
-    for j in range(stop):
-        diagonal = j * (row + one) + below
-        pivot, largest = np.uint64(0), abs(flat[diagonal])
-        for i in range(LOWER):
-            m = np.uint64(i) + one
-            value = abs(flat[diagonal + m * row])
-            if value > largest:
-                pivot, largest = m, value
-        pivots[j] = j + pivot
-        if not (largest > 0.0 and largest < np.inf):
-            return False
-        if pivot != 0:
-            other = diagonal + pivot * row
-            for i in range(2 * LOWER + 1):
-                k = np.uint64(i)
-                flat[diagonal + k], flat[other + k] = flat[other + k], flat[diagonal + k]
-        inverse = 1.0 / flat[diagonal]
-        flat[diagonal] = inverse
-        for i in range(LOWER):
-            start = diagonal + (np.uint64(i) + one) * row
-            multiplier = flat[start] * inverse
-            flat[start] = multiplier
-            for k in range(2 * LOWER):
-                flat[start + one + np.uint64(k)] -= multiplier * flat[diagonal + one + np.uint64(k)]
-    return True
-
-
-@njit(f"boolean({MATRIX}, int64, int64, {PLACES})", **OPTIONS)
-def factor(band, lower, upper, pivots):
-    """Factor in place, P·A = L·U, the pivots kept as their inverses; return False for one that is zero or not finite.
-
-    Parameters
-    ----------
-    band : array (size, 2·lower + upper + 1)
-    lower, upper : int
-        Half-widths below and above the diagonal.
-    pivots : int array (size,)
-        Filled with the row exchanged with each row.
-    """
-    flat = band.reshape(band.size)
-    size, one, below, above = np.uint64(band.shape[0]), np.uint64(1), np.uint64(lower), np.uint64(upper)
-    next_row = np.uint64(band.shape[1]) - one
-    first, last = np.uint64(0), np.uint64(0)
-    if 0 < LOWER <= NARROW and lower == LOWER and upper == LOWER and size > 3 * LOWER:
-        # Near the end the rows are shorter.
-        first = size - np.uint64(3 * LOWER)
-        last = first + np.uint64(2 * LOWER - 1)
-        if not factor_narrow(flat, first, pivots):
-            return False
-    for j in range(first, size):
-        end = min(j + below, size - one)
-        diagonal = j * (next_row + one) + below
-        pivot, largest = j, abs(flat[diagonal])
-        for m in range(one, end - j + one):
-            value = abs(flat[diagonal + m * next_row])
-            if value > largest:
-                pivot, largest = j + m, value
-        pivots[j] = pivot
-        if not (largest > 0.0 and largest < np.inf):
-            return False
-        last = max(last, min(pivot + above, size - one))
-        width = last - j
-        if pivot != j:
-            other = diagonal + (pivot - j) * next_row
-            for k in range(width + one):
-                flat[diagonal + k], flat[other + k] = flat[other + k], flat[diagonal + k]
-        inverse = 1.0 / flat[diagonal]
-        flat[diagonal] = inverse
-        for m in range(one, end - j + one):
-            start = diagonal + m * next_row
-            multiplier = flat[start] * inverse
-            flat[start] = multiplier
-            if multiplier != 0.0:
-                for k in range(one, width + one):
-                    flat[start + k] -= multiplier * flat[diagonal + k]
-    return True
-
-
-@njit(inline="always")
-def substitute(flat, pivots, below, reach, x):
-    """Solve A·x = b in place for one right-hand side (size,)."""
-    size, one = np.uint64(x.size), np.uint64(1)
-    next_row = below + reach
-    inside, known, half = size - min(below, size), min(reach, size), reach // np.uint64(2)
-    for j in range(size):
-        pivot = np.uint64(pivots[j])
-        value = x[pivot]
-        x[pivot] = x[j]
-        x[j] = value
-        diagonal = j * (next_row + one) + below
-        if j < inside:
-            for m in range(one, below + one):
-                x[j + m] -= flat[diagonal + m * next_row] * value
-        else:
-            for m in range(one, size - j):
-                x[j + m] -= flat[diagonal + m * next_row] * value
-    for back in range(known):
-        i = size - one - back
-        diagonal = i * (next_row + one) + below
-        value = x[i]
-        for k in range(back):
-            value -= flat[diagonal + back - k] * x[i + back - k]
-        x[i] = value * flat[diagonal]
-    for back in range(known, size):
-        i = size - one - back
-        diagonal = i * (next_row + one) + below
-        value, far = x[i], 0.0
-        # The latest unknowns last: they alone have to be waited for.
-        for k in range(half):
-            far += flat[diagonal + reach - k] * x[i + reach - k]
-        value -= far
-        for k in range(half, reach):
-            value -= flat[diagonal + reach - k] * x[i + reach - k]
-        x[i] = value * flat[diagonal]
-
-
-@njit(inline="always")
-def substitute_transposed(flat, pivots, below, reach, x):
-    """Solve Aᵀ·x = b in place for one right-hand side (size,)."""
-    size, one = np.uint64(x.size), np.uint64(1)
-    next_row = below + reach
-    inside, known, half = size - min(below, size), min(reach, size), reach // np.uint64(2)
-    for i in range(known):
-        diagonal = i * (next_row + one) + below
-        value = x[i]
-        for k in range(i):
-            value -= flat[diagonal - (i - k) * next_row] * x[k]
-        x[i] = value * flat[diagonal]
-    for i in range(known, size):
-        diagonal = i * (next_row + one) + below
-        value, far = x[i], 0.0
-        for k in range(half):
-            far += flat[diagonal - (reach - k) * next_row] * x[i - (reach - k)]
-        value -= far
-        for k in range(half, reach):
-            value -= flat[diagonal - (reach - k) * next_row] * x[i - (reach - k)]
-        x[i] = value * flat[diagonal]
-    for back in range(size):
-        j = size - one - back
-        diagonal = j * (next_row + one) + below
-        value = x[j]
-        if j < inside:
-            for k in range(below):
-                value -= flat[diagonal + (below - k) * next_row] * x[j + below - k]
-        else:
-            for k in range(back):
-                value -= flat[diagonal + (back - k) * next_row] * x[j + back - k]
-        pivot = np.uint64(pivots[j])
-        x[j] = x[pivot]
-        x[pivot] = value
-
-
-@njit(f"void({MATRIX}, int64, int64, {PLACES}, {MATRIX})", **OPTIONS)
-def solve(band, lower, upper, pivots, right):
-    """Solve A·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
-    flat = band.reshape(band.size)
-    for c in range(right.shape[0]):
-        if LOWER > 0 and lower == LOWER and upper == LOWER:
-            substitute(flat, pivots, np.uint64(LOWER), np.uint64(2 * LOWER), right[c])
-        else:
-            substitute(flat, pivots, np.uint64(lower), np.uint64(lower + upper), right[c])
-
-
-@njit(f"void({MATRIX}, int64, int64, {PLACES}, {MATRIX})", **OPTIONS)
-def solve_transposed(band, lower, upper, pivots, right):
-    """Solve Aᵀ·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
-    flat = band.reshape(band.size)
-    for c in range(right.shape[0]):
-        if LOWER > 0 and lower == LOWER and upper == LOWER:
-            substitute_transposed(flat, pivots, np.uint64(LOWER), np.uint64(2 * LOWER), right[c])
-        else:
-            substitute_transposed(flat, pivots, np.uint64(lower), np.uint64(lower + upper), right[c])
-
-
-@njit(f"void({MATRIX}, {VECTOR}, {GRID}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
-def differentiate(z, drift, grid, tau, frequency, states):
+@njit(types.void(MATRIX, VECTOR, GRID, NUMBER, MATRIX), **OPTIONS)
+def differentiate(z, drift, grid, frequency, states):
     """Fill `states` (points, 3·states) with q = z + drift·tau and its time derivatives by the scheme."""
-    first, second, neighbours, _, _, _, _ = grid
+    first, second, neighbours, tau = grid.first, grid.second, grid.neighbours, grid.tau
     points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
-    # Offsets in a row, as they are where their number is known, start with the lowest; in the middle none is cyclic.
+    # Offsets are consecutive where their number is known, the lowest first; in the middle no neighbour is cyclic.
     start, inside = ((points - neighbours[0, 0]) % points, points - WIDTH + 1) if WIDTH > 0 else (0, 0)
     squared, all_states = frequency**2, np.uint64(count)
     flat, rest = z.reshape(z.size), tau[start:]
@@ -271,241 +90,13 @@ def differentiate(z, drift, grid, tau, frequency, states):
             states[i, 2 * count + s] = acceleration * squared
 
 
-@njit(f"void({MATRIX}, {GRID}, int64, float64, {MATRIX})", **OPTIONS)
-def assemble(columns, grid, states, frequency, band):
-    """Fill the folded band of ∂g/∂z from the columns g, ∂g/∂(q, q̇, q̈) of the model's grid function."""
-    first, second, _, shift, place, half_width, _ = grid
-    points, count = columns.shape[0], STATES if STATES > 0 else states
-    lower, width = half_width * count + count - 1, WIDTH if WIDTH > 0 else first.size
-    one, two = first * frequency, second * frequency**2
-    flat, source = band.reshape(band.size), columns.reshape(columns.size)
-    for k in range(flat.size):
-        flat[k] = 0.0
-    for i in range(points):
-        for e in range(count):
-            diagonal = (place[i] * count + e) * band.shape[1] + lower - e
-            column = np.uint64(i * columns.shape[1] + count + e * 3 * count)
-            for j in range(count):
-                s, all_states = np.uint64(j), np.uint64(count)
-                damping, inertia = source[column + all_states + s], source[column + all_states + all_states + s]
-                for o in range(width):
-                    entry = np.uint64(diagonal + j + shift[i, o] * count)
-                    flat[entry] += damping * one[o] + inertia * two[o]
-                flat[np.uint64(diagonal + j)] += source[column + s]
-
-
-@njit(f"boolean({MATRIX}, {MATRIX}, int64)", **OPTIONS)
-def invert(matrix, inverse, size):
-    """Invert by Gauss-Jordan elimination with row exchanges; `matrix` is destroyed. Return False if singular."""
-    count = STATES if STATES > 0 else size
-    for e in range(count):
-        for s in range(count):
-            inverse[e, s] = 1.0 if e == s else 0.0
-    for j in range(count):
-        pivot = j
-        for e in range(j + 1, count):
-            if abs(matrix[e, j]) > abs(matrix[pivot, j]):
-                pivot = e
-        if not (abs(matrix[pivot, j]) > 0.0 and abs(matrix[pivot, j]) < np.inf):
-            return False
-        if pivot != j:
-            for s in range(count):
-                matrix[pivot, s], matrix[j, s] = matrix[j, s], matrix[pivot, s]
-                inverse[pivot, s], inverse[j, s] = inverse[j, s], inverse[pivot, s]
-        scale = 1.0 / matrix[j, j]
-        for s in range(count):
-            matrix[j, s] *= scale
-            inverse[j, s] *= scale
-        for e in range(count):
-            multiplier = matrix[e, j]
-            if e != j and multiplier != 0.0:
-                for s in range(count):
-                    matrix[e, s] -= multiplier * matrix[j, s]
-                    inverse[e, s] -= multiplier * inverse[j, s]
-    return True
-
-
-@njit(f"boolean({MATRIX}, {GRID}, float64, {VECTOR}, {CUBE}, {GAINS}, {CUBE}, {PLACES})", **OPTIONS)
-def march(columns, grid, frequency, amplitude, inverses, gains, transfer, ends):
-    """Express every point by its segment's start points; return False where the scheme or the matrix forbids it.
-
-    Parameters
-    ----------
-    columns : array (points, states·(1 + 3·states))
-    amplitude : array (states,)
-        Units in which growth is judged.
-    inverses : array (points, states, states)
-        Filled: what multiplies the right-hand side at the newest point of each equation.
-    gains : array (points, reach, states, states)
-        Filled: what multiplies the points before it.
-    transfer : array (states, reach·states, points)
-        Filled: what multiplies the start points, the latest first.
-    ends : int array (1 + MAX_SEGMENTS,)
-        Filled: the number of segments, then the last point of each.
-    """
-    first, second, _, _, _, _, lead = grid
-    points, count = columns.shape[0], STATES if STATES > 0 else inverses.shape[1]
-    reach = REACH if REACH > 0 else gains.shape[1]
-    one, two, here = first * frequency, second * frequency**2, reach - lead
-    block, inverse = np.empty((count, count)), np.empty((count, count))
-    segments, start = 0, 0
-    for j in range(points):
-        row = columns[j - lead if j >= lead else j - lead + points]
-        for e in range(count):
-            for s in range(count):
-                column = count + e * 3 * count + s
-                value = row[column + count] * one[reach] + row[column + 2 * count] * two[reach]
-                block[e, s] = value + row[column] if here == reach else value
-        if not invert(block, inverse, count):
-            return False
-        for e in range(count):
-            for s in range(count):
-                inverses[j, e, s] = inverse[e, s]
-            for c in range(reach * count):
-                transfer[e, c, j] = 0.0
-        for d in range(reach):
-            o, back = reach - 1 - d, j - 1 - d
-            for e in range(count):
-                for s in range(count):
-                    column = count + e * 3 * count + s
-                    value = row[column + count] * one[o] + row[column + 2 * count] * two[o]
-                    block[e, s] = value + row[column] if here == o else value
-            for e in range(count):
-                for s in range(count):
-                    value = 0.0
-                    for t in range(count):
-                        value -= inverse[e, t] * block[t, s]
-                    gains[j, d, e, s] = value
-                    if back >= start:
-                        for c in range(reach * count):
-                            transfer[e, c, j] += value * transfer[s, c, back]
-                    else:
-                        transfer[e, (start - 1 - back) * count + s, j] += value
-        if j % CHECK_EVERY == CHECK_EVERY - 1 or j == points - 1:
-            growth = 0.0
-            for e in range(count):
-                for d in range(reach):
-                    for s in range(count):
-                        growth = max(growth, abs(transfer[e, d * count + s, j]) * amplitude[s] / amplitude[e])
-            if not growth < TOO_MUCH_GROWTH:
-                return False
-            if (growth > GROWTH or j == points - 1) and j - start >= reach - 1:
-                if segments == MAX_SEGMENTS:
-                    return False
-                segments, start = segments + 1, j + 1
-                ends[segments] = j
-    ends[0] = segments
-    return start == points
-
-
-@njit(f"boolean({CUBE}, {PLACES}, {VECTOR}, {PLACES})", **OPTIONS)
-def join(transfer, ends, reduced, pivots):
-    """Factor the cyclic system that couples the start points of the segments; return False if it is singular."""
-    count = STATES if STATES > 0 else transfer.shape[0]
-    reach, segments = transfer.shape[1] // count, ends[0]
-    block = reach * count
-    size = segments * block
-    matrix = reduced[: size * (3 * size - 2)].reshape((size, 3 * size - 2))
-    matrix[:] = 0.0
-    for q in range(segments):
-        after = (q + 1) % segments
-        for d in range(reach):
-            for e in range(count):
-                i = after * block + d * count + e
-                matrix[i, size - 1] += 1.0
-                for c in range(block):
-                    matrix[i, q * block + c - i + size - 1] -= transfer[e, c, ends[q + 1] - d]
-    return factor(matrix, size - 1, size - 1, pivots)
-
-
-@njit(f"boolean({MATRIX}, {GRID}, float64, {VECTOR}, {FACTORS})", **OPTIONS)
-def factorise(columns, grid, frequency, amplitude, factors):
-    """Factor ∂g/∂z by segments, or else in the folded order; return False if it is singular or not finite."""
-    band, pivots, inverses, gains, transfer, ends, reduced, reduced_pivots = factors
-    if grid[6] >= 0 and march(columns, grid, frequency, amplitude, inverses, gains, transfer, ends):
-        if join(transfer, ends, reduced, reduced_pivots):
-            return True
-    ends[0] = 0
-    count = inverses.shape[1]
-    lower = grid[5] * count + count - 1
-    assemble(columns, grid, count, frequency, band)
-    return factor(band, lower, lower, pivots)
-
-
-@njit(f"void({GRID}, {FACTORS}, {MATRIX})", **OPTIONS)
-def back_substitute(grid, factors, right):
-    """Solve ∂g/∂z·x = b in place, b (points, states), with the factors of `factorise`."""
-    band, pivots, inverses, gains, transfer, ends, reduced, reduced_pivots = factors
-    place, half_width, lead = grid[4], grid[5], grid[6]
-    points, count = right.shape[0], STATES if STATES > 0 else right.shape[1]
-    reach, segments = REACH if REACH > 0 else gains.shape[1], ends[0]
-    if segments == 0:
-        lower = half_width * count + count - 1
-        folded = np.empty((1, points * count))
-        for i in range(points):
-            for s in range(count):
-                folded[0, place[i] * count + s] = right[i, s]
-        solve(band, lower, lower, pivots, folded)
-        for i in range(points):
-            for s in range(count):
-                right[i, s] = folded[0, place[i] * count + s]
-        return
-    forced = np.empty((points, count))
-    for k in range(points):
-        j = k + lead if k + lead < points else k + lead - points
-        for e in range(count):
-            value = 0.0
-            for s in range(count):
-                value += inverses[j, e, s] * right[k, s]
-            forced[j, e] = value
-    flat, gain, start = forced.reshape(points * count), gains.reshape(gains.size), 0
-    for q in range(segments):
-        stop = ends[q + 1] + 1
-        for j in range(start, start + reach):
-            for d in range(j - start):
-                for e in range(count):
-                    for s in range(count):
-                        forced[j, e] += gains[j, d, e, s] * forced[j - 1 - d, s]
-        before, after = flat[start * count :], flat[(start + reach) * count :]
-        rows = gain[(start + reach) * reach * count * count :]
-        for k in range(stop - start - reach):
-            for e in range(count):
-                value = after[k * count + e]
-                # The latest points last: they alone have to be waited for.
-                for d in range(reach - 1, -1, -1):
-                    for s in range(count):
-                        own = ((k * reach + d) * count + e) * count + s
-                        value += rows[own] * before[(k + reach - 1 - d) * count + s]
-                after[k * count + e] = value
-        start = stop
-    block = reach * count
-    size = segments * block
-    x = np.empty((1, size))
-    for q in range(segments):
-        for d in range(reach):
-            for e in range(count):
-                x[0, (q + 1) % segments * block + d * count + e] = forced[ends[q + 1] - d, e]
-    matrix = reduced[: size * (3 * size - 2)].reshape((size, 3 * size - 2))
-    solve(matrix, size - 1, size - 1, reduced_pivots, x)
-    start, moved, out = 0, transfer.reshape(transfer.size), right.reshape(points * count)
-    for q in range(segments):
-        for e in range(count):
-            for k in range(ends[q + 1] + 1 - start):
-                j = np.uint64(start + k)
-                value = flat[j * np.uint64(count) + np.uint64(e)]
-                for c in range(block):
-                    value += moved[np.uint64((e * block + c) * points) + j] * x[0, q * block + c]
-                out[j * np.uint64(count) + np.uint64(e)] = value
-        start = ends[q + 1] + 1
-
-
-@njit(f"void({MATRIX}, {MATRIX}, {GRID}, {VECTOR}, float64, {VECTOR}, {VECTOR})", **OPTIONS)
+@njit(types.void(MATRIX, MATRIX, GRID, VECTOR, NUMBER, VECTOR, VECTOR), **OPTIONS)
 def scales(columns, states, grid, amplitude, frequency, size, rounding):
     """Fill, for each equation, the size of its terms and the rounding error that its residual cannot fall below.
 
-    About `SCALE_POINTS` points are looked at, all of them if an equation's terms vanish there.
+    About `SCALE_POINTS` points are used, all of them if the terms of an equation vanish there.
     """
-    first, second = grid[0], grid[1]
+    first, second = grid.first, grid.second
     points, count = states.shape[0], STATES if STATES > 0 else amplitude.size
     one, two = 0.0, 0.0
     for o in range(first.size):
@@ -530,9 +121,9 @@ def scales(columns, states, grid, amplitude, frequency, size, rounding):
         rounding[e] *= ROUNDING
 
 
-@njit(f"void({MATRIX}, {VECTOR})", **OPTIONS)
+@njit(types.void(MATRIX, VECTOR), **OPTIONS)
 def largest(z, amplitude):
-    """Fill the largest absolute value of each state; four maxima at a time, none of which waits for another."""
+    """Fill the largest absolute value of each state; four independent maxima at a time."""
     points = z.shape[0]
     whole = points - points % 4
     for s in range(STATES if STATES > 0 else z.shape[1]):
@@ -545,16 +136,16 @@ def largest(z, amplitude):
         amplitude[s] = max(a, b, c, d)
 
 
-@njit(f"float64({VECTOR}, {VECTOR})", fastmath={"reassoc"}, **OPTIONS)
+@njit(NUMBER(VECTOR, VECTOR), fastmath={"reassoc"}, **OPTIONS)
 def dot(one, other):
-    """Return the sum of products, in whatever order is fastest on this machine."""
+    """Return the sum of products, in any order."""
     total = 0.0
     for i in range(one.size):
         total += one[i] * other[i]
     return total
 
 
-@njit(f"float64({MATRIX}, {VECTOR})", **OPTIONS)
+@njit(NUMBER(MATRIX, VECTOR), **OPTIONS)
 def norm(columns, size):
     """Return the root of the mean square of the residuals, each in units of its equation's size.
 
@@ -570,7 +161,7 @@ def norm(columns, size):
     return np.sqrt(total / (columns.shape[0] * count))
 
 
-@njit(f"float64({MATRIX}, {MATRIX})", **OPTIONS)
+@njit(NUMBER(MATRIX, MATRIX), **OPTIONS)
 def scaled_step(z, step):
     """Return the largest step of any state in units of that state's largest value; infinite if not finite."""
     result = 0.0
@@ -587,38 +178,169 @@ def scaled_step(z, step):
     return result
 
 
+@njit(NUMBER(MATRIX, MATRIX, GRID, VECTOR), **OPTIONS)
+def phase_row(z, states, grid, row):
+    """Fill the row (size,), folded, of the phase condition ∫ q_z'·(q − q_z) dτ = 0 against z; return row · z.
+
+    States are in units of their range; the row has unit length. `states` are those of z.
+    """
+    points, count = z.shape[0], z.shape[1]
+    rates, square, target = np.empty((points, count)), 0.0, 0.0
+    for s in range(count):
+        low, high, mean = np.inf, -np.inf, 0.0
+        for i in range(points):
+            low, high = min(low, z[i, s]), max(high, z[i, s])
+            mean += states[i, count + s] / points
+        unit = high - low if high > low else 1.0
+        for i in range(points):
+            rates[i, s] = (states[i, count + s] - mean) / unit**2
+            square += rates[i, s] ** 2
+    length = np.sqrt(square) if square > 0.0 else 1.0
+    for i in range(points):
+        for s in range(count):
+            rates[i, s] /= length
+            target += rates[i, s] * z[i, s]
+    fold(rates, grid, row)
+    return target
+
+
+@njit(NUMBER(SETTING, UNKNOWNS, VECTOR, MATRIX, VECTOR), **OPTIONS)
+def fill_setting(setting, unknowns, values, inputs, parameters):
+    """Fill inputs and parameters at values of the unknowns, from the setting at zeros; return the frequency."""
+    count, frequency = inputs.shape[1] // 3, setting.frequency
+    copy(setting.inputs, inputs)
+    for p in range(parameters.size):
+        parameters[p] = setting.parameters[p]
+    for k in range(values.size):
+        for p in range(parameters.size):
+            parameters[p] += values[k] * unknowns.parameters[k, p]
+        for i in range(unknowns.inputs.shape[1]):
+            for j in range(3 * count):
+                inputs[i, j] += values[k] * unknowns.inputs[k, i, j]
+        if k == unknowns.frequency:
+            frequency = values[k]
+    if frequency != setting.frequency:
+        ratio = frequency / setting.frequency
+        for i in range(inputs.shape[0]):
+            for j in range(count):
+                inputs[i, count + j] *= ratio
+                inputs[i, 2 * count + j] *= ratio**2
+    return frequency
+
+
+@njit(types.void(FUNCTIONS, GRID, SETTING, UNKNOWNS, MATRIX, MATRIX, MATRIX, MATRIX), **OPTIONS)
+def fill_slopes(functions, grid, setting, unknowns, states, columns, table, slopes):
+    """Fill the first rows of `slopes` with ∂g/∂(unknowns), z held as a function of tau, folded.
+
+    `states` and `columns` are those of `residual_jacobian` at z; `table` has room for the columns of `derivatives`.
+    """
+    points, parameters, frequency = states.shape[0], setting.parameters.size, setting.frequency
+    count, inputs = states.shape[1] // 3, setting.inputs.shape[1]
+    grid_function_at(functions.derivatives)(states, setting.inputs, setting.parameters, grid.tau, frequency, table)
+    by_input, by_frequency = count * parameters, count * (parameters + inputs)
+    for k in range(unknowns.values.size):
+        for i in range(points):
+            for e in range(count):
+                value = 0.0
+                for p in range(parameters):
+                    value += table[i, e * parameters + p] * unknowns.parameters[k, p]
+                if unknowns.inputs.shape[1] > 0:
+                    for j in range(inputs):
+                        value += table[i, by_input + e * inputs + j] * unknowns.inputs[k, i, j]
+                if k == unknowns.frequency:
+                    value += table[i, by_frequency + e]
+                    for s in range(3 * count):
+                        value += columns[i, count + e * 3 * count + s] * (s // count) * states[i, s] / frequency
+                    for j in range(inputs):
+                        order = 3 * j // inputs
+                        value += table[i, by_input + e * inputs + j] * order * setting.inputs[i, j] / frequency
+                slopes[k, grid.place[i] * count + e] = value
+
+
+@njit(NUMBER(MATRIX, VECTOR, GRID), **OPTIONS)
+def folded_product(z, row, grid):
+    """Return row · z, the row (size,) in the folded order."""
+    total, count = 0.0, z.shape[1]
+    for i in range(z.shape[0]):
+        for s in range(count):
+            total += row[grid.place[i] * count + s] * z[i, s]
+    return total
+
+
 @njit(
-    f"Tuple((int64, int64))({FUNCTION}, {GRID}, {MATRIX}, {VECTOR}, {VECTOR}, float64, {VECTOR}, {MATRIX}, {MATRIX}, "
-    f"{MATRIX}, {MATRIX}, {FACTORS})",
+    types.Tuple([NUMBER, NUMBER])(
+        FUNCTIONS, GRID, SETTING, UNKNOWNS, BORDER, MATRIX, MATRIX, MATRIX, MATRIX, WORKSPACE, VECTOR
+    ),
     **OPTIONS,
 )
-def newton(
-    residual_jacobian, grid, inputs, parameters, tau, frequency, drift, z, history, states, columns, factors
-):  # fmt: skip
-    """Solve g(z) = 0 in place and return (status, iterations).
+def bordered_step(functions, grid, setting, unknowns, border, states, columns, z, step, work, change):
+    """Fill the Newton step of z and of the unknowns' values; return its size and the orientation, 0 if singular."""
+    borders, count, factors = unknowns.values.size, z.shape[1], work.factors
+    fill_slopes(functions, grid, setting, unknowns, states, columns, work.derivatives, border.columns)
+    assemble(columns, grid, count, setting.frequency, factors.band)
+    orientation = factor_bordered(factors.band, factors.pivots, border)
+    if orientation == 0.0:
+        return np.inf, 0.0
+    right, below, size = np.empty((1, z.size)), np.empty((1, borders)), 0.0
+    fold(step, grid, right[0])
+    for b in range(borders):
+        below[0, b] = unknowns.targets[b] - folded_product(z, border.rows[b], grid)
+        for c in range(borders):
+            below[0, b] -= border.corner[b, c] * unknowns.values[c]
+    solve_bordered(factors.band, factors.pivots, border, right, below)
+    unfold(right[0], grid, step)
+    for k in range(borders):
+        change[k] = below[0, k]
+        own = abs(change[k]) / max(unknowns.scales[k], abs(unknowns.values[k]))
+        size = max(size, own) if own < np.inf else np.inf
+    return size, orientation
 
-    An iteration ends the search when its step, or the one expected next at the rate seen, is below `STEP_TOLERANCE` of
-    the state, or when the residual is down to rounding.
+
+@njit(
+    types.Tuple([COUNT, COUNT, NUMBER])(FUNCTIONS, GRID, SETTING, UNKNOWNS, BORDER, COUNT, MATRIX, MATRIX, WORKSPACE),
+    **OPTIONS,
+)
+def newton(functions, grid, setting, unknowns, border, halvings, z, history, work):
+    """Solve g(z, values) = 0 and the conditions of the unknowns in place; return status, iterations and orientation.
+
+    An iteration ends the search when its step, or the next step expected from the observed rate, is below
+    `STEP_TOLERANCE`, or when the residual is at rounding level.
 
     Parameters
     ----------
-    residual_jacobian : compiled grid function of the model
-    grid : see `schemes.CyclicGrid.packed`
-    inputs : array (points, 3·inputs)
-    parameters, tau, frequency : as the grid function takes them
-    drift : array (states,)
-        Secular rate of each state, per forcing period (a winding angle).
+    functions : Functions
+    grid : Grid
+    setting : Setting
+        At values of zero, except for the frequency.
+    unknowns : Unknowns
+        `values` are overwritten. There may be none; ∂g/∂z must then be regular.
+    border : Border
+        Rows and corner of the conditions.
+    halvings : int
+        The largest number of trial steps of an iteration, each half as long as the one before.
     z : array (points, states)
         The guess, overwritten by the periodic part of the solution.
     history : array (MAX_ITERATIONS, 3)
         Filled for each iteration with the scaled residual before it, the scaled full step, and the damping factor.
-    states, columns, factors : work arrays
-        Left as they are at the last iterate; the factors are those of the last but one.
+    work : Workspace
+        `states` and `columns` are left at the last iterate, the factors at the last but one.
+
+    Returns
+    -------
+    int, int, float
+        The last is the sign of the determinant of the bordered matrix at the last but one iterate, 0 without a border.
     """
-    points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
+    residual_jacobian, drift, factors = grid_function_at(functions.residual_jacobian), setting.drift, work.factors
+    states, columns, tau = work.states, work.columns, grid.tau
+    points, count, borders = z.shape[0], STATES if STATES > 0 else z.shape[1], unknowns.values.size
     size, rounding, amplitude = np.empty(count), np.empty(count), np.empty(count)
     step, trial = np.empty((points, count)), np.empty((points, count))
-    differentiate(z, drift, grid, tau, frequency, states)
+    inputs, parameters, frequency = setting.inputs, setting.parameters, setting.frequency
+    values, change, orientation = np.empty(borders), np.empty(borders), 0.0
+    if borders > 0:
+        inputs, parameters = np.empty_like(inputs), np.empty_like(parameters)
+        frequency = fill_setting(setting, unknowns, unknowns.values, inputs, parameters)
+    differentiate(z, drift, grid, frequency, states)
     residual_jacobian(states, inputs, parameters, tau, frequency, columns)
     previous = np.inf
     for iteration in range(MAX_ITERATIONS):
@@ -626,47 +348,64 @@ def newton(
         scales(columns, states, grid, amplitude, frequency, size, rounding)
         before = norm(columns, size)
         if not np.isfinite(before):
-            return NOT_FINITE, iteration
-        if iteration == 0 and norm(columns, rounding) <= 1.0 and np.all(amplitude > 0.0):
-            return CONVERGED, 0
+            return NOT_FINITE, iteration, orientation
+        if iteration == 0 and borders == 0 and norm(columns, rounding) <= 1.0 and np.all(amplitude > 0.0):
+            return CONVERGED, 0, orientation
         for s in range(count):
             if amplitude[s] == 0.0:
                 amplitude[s] = 1.0
-        if not factorise(columns, grid, frequency, amplitude, factors):
-            return SINGULAR, iteration
         for i in range(points):
             for s in range(count):
                 step[i, s] = -columns[i, s]
-        back_substitute(grid, factors, step)
-        full = scaled_step(z, step)
+        full = 0.0
+        if borders > 0:
+            here = Setting(inputs, parameters, frequency, drift)
+            full, orientation = bordered_step(
+                functions, grid, here, unknowns, border, states, columns, z, step, work, change
+            )
+            if orientation == 0.0:
+                return SINGULAR, iteration, orientation
+        else:
+            if not factorise(columns, grid, frequency, amplitude, factors):
+                return SINGULAR, iteration, orientation
+            back_substitute(grid, factors, step)
+        full = max(full, scaled_step(z, step))
         if full == np.inf:
-            return SINGULAR, iteration
+            return SINGULAR, iteration, orientation
         history[iteration, 0], history[iteration, 1] = before, full
         damping, accepted = 1.0, False
-        for _ in range(MAX_HALVINGS):
+        for _ in range(halvings):
             for i in range(points):
                 for s in range(count):
                     trial[i, s] = z[i, s] + damping * step[i, s]
-            differentiate(trial, drift, grid, tau, frequency, states)
-            residual_jacobian(states, inputs, parameters, tau, frequency, columns)
-            after = norm(columns, size)
-            if after <= (1.0 - 1e-4 * damping) * before or full <= STEP_TOLERANCE:
-                accepted = True
-                break
+            for k in range(borders):
+                values[k] = unknowns.values[k] + damping * change[k]
+            if borders == 0 or unknowns.frequency < 0 or values[unknowns.frequency] > 0.0:
+                if borders > 0:
+                    frequency = fill_setting(setting, unknowns, values, inputs, parameters)
+                differentiate(trial, drift, grid, frequency, states)
+                residual_jacobian(states, inputs, parameters, tau, frequency, columns)
+                after = norm(columns, size)
+                accepted = after <= (1.0 - 1e-4 * damping) * before or full <= STEP_TOLERANCE
+                if accepted or (borders > 0 and norm(columns, rounding) <= 1.0):
+                    accepted = True
+                    break
             damping *= 0.5
         history[iteration, 2] = damping
         if not accepted:
-            return STALLED, iteration + 1
+            return STALLED, iteration + 1, orientation
         copy(trial, z)
+        for k in range(borders):
+            unknowns.values[k] = values[k]
         if full <= STEP_TOLERANCE or (damping == 1.0 and norm(columns, rounding) <= 1.0):
-            return CONVERGED, iteration + 1
+            return CONVERGED, iteration + 1, orientation
         if damping == 1.0 and full < CHORD_RATE * previous < np.inf and full**2 <= STEP_TOLERANCE * previous:
-            return CONVERGED, iteration + 1
+            return CONVERGED, iteration + 1, orientation
         previous = full if damping == 1.0 else np.inf
-    return STALLED, MAX_ITERATIONS
+    return STALLED, MAX_ITERATIONS, orientation
 
 
-@njit(f"void({MATRIX}, {CUBE}, {VECTOR}, {VECTOR}, float64, {MATRIX})", **OPTIONS)
+@njit(types.void(MATRIX, CUBE, VECTOR, VECTOR, NUMBER, MATRIX), **OPTIONS)
 def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fraction, z):
     """Fill z with the anchor's linear prediction, at a fraction of the way from the anchor's parameters."""
     copy(anchor_z, z)
@@ -678,9 +417,9 @@ def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fract
                 flat[k] += slope[k] * change
 
 
-@njit(f"boolean({MATRIX}, {MATRIX}, {MATRIX})", **OPTIONS)
+@njit(FLAG(MATRIX, MATRIX, MATRIX), **OPTIONS)
 def is_far(z, predicted, anchor_z):
-    """Return whether z is further from the prediction than `FAR` of the anchor's range and of the predicted change."""
+    """Return whether z differs from the prediction by more than `FAR` of the anchor's range and of the predicted change."""
     for s in range(STATES if STATES > 0 else z.shape[1]):
         off, change, low, high = 0.0, 0.0, np.inf, -np.inf
         for i in range(z.shape[0]):
@@ -692,9 +431,9 @@ def is_far(z, predicted, anchor_z):
     return False
 
 
-@njit(f"int64({MATRIX}, int64)", **OPTIONS)
+@njit(COUNT(MATRIX, COUNT), **OPTIONS)
 def repetitions(z, periods):
-    """Return how many times z repeats itself within so many forcing periods: 1 if that is its shortest period."""
+    """Return how often z repeats itself in a number of forcing periods: once if that is its shortest period."""
     points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
     for times in range(periods, 1, -1):
         if periods % times == 0:

@@ -1,44 +1,35 @@
-"""Periodic equations with further scalar unknowns: a period, a parameter, the frequency, the scale of an input."""
+"""Pseudo-arclength continuation of periodic equations with further scalar unknowns."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
 from bayesperiodic.periodic.batch import Anchor
-from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, SINGULAR, STALLED
-from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations
-from bayesperiodic.periodic.sensitivity import frequency_derivatives
+from bayesperiodic.periodic.compiled import CONVERGED, Border, Unknowns
+from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
 
 INPUTS, PARAMETERS = "inputs", "parameters"
 
 
-class Found(NamedTuple):
-    """What the bordered Newton iteration ended with."""
-
-    z: np.ndarray
-    values: np.ndarray
-    code: int
-    history: np.ndarray
-
-
 @dataclass(frozen=True)
-class Family:
-    """Equations that depend on free scalars.
+class ParametrisedEquations:
+    """Periodic equations that depend on further scalar unknowns.
 
     Attributes
     ----------
     equations : PeriodicEquations
     parameters : array (parameters,)
     free : tuple of str
-        "frequency", "inputs" or "parameters" (what multiplies `input_change` or `parameter_change`), or a parameter's
+        "frequency", "inputs" or "parameters" (the factor of `input_change` or `parameter_change`), or a parameter's
         name.
     input_change : array (points, 3·inputs)
-        The inputs are those of `equations` plus a scalar times this.
+        Change of the inputs per unit of the unknown "inputs", which is zero for those of `equations`.
     parameter_change : array (parameters,)
-        The parameters are `parameters` plus a scalar times this.
+        Change of the parameters per unit of the unknown "parameters", which is zero for `parameters`.
     """
 
     equations: PeriodicEquations
@@ -47,120 +38,91 @@ class Family:
     input_change: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
     parameter_change: np.ndarray = field(default_factory=lambda: np.empty(0))
 
-    def at(self, values: np.ndarray) -> tuple[PeriodicEquations, np.ndarray]:
-        """Return equations and parameters at values of the free scalars."""
-        equations, parameters = self.equations, self.parameters
-        for name, value in zip(self.free, values, strict=True):
-            if name == FREQUENCY:
-                equations = equations.at_frequency(float(value))
-            elif name == INPUTS:
-                equations = equations.with_inputs(equations.inputs + value * self.input_change)
+    @cached_property
+    def _base(self) -> np.ndarray:
+        """The parameters where all unknowns are zero."""
+        base = self.parameters.copy()
+        base[[self.equations.model.parameters.index(name) for name in self.free if name in self._names]] = 0.0
+        return base
+
+    @cached_property
+    def _names(self) -> set[str]:
+        return {*self.free} - {FREQUENCY, INPUTS, PARAMETERS}
+
+    def _unknowns(self, values: np.ndarray, targets: np.ndarray, scales: np.ndarray) -> Unknowns:
+        parameters = np.zeros((len(self.free), self.parameters.size))
+        inputs = np.zeros((len(self.free), *(self.equations.inputs.shape if INPUTS in self.free else (0, 0))))
+        for k, name in enumerate(self.free):
+            if name == INPUTS:
+                inputs[k] = self.input_change
             elif name == PARAMETERS:
-                parameters = parameters + value * self.parameter_change
-            else:
-                parameters = parameters.copy()
-                parameters[self.equations.model.parameters.index(name)] = value
-        return equations, parameters
+                parameters[k] = self.parameter_change
+            elif name != FREQUENCY:
+                parameters[k, self.equations.model.parameters.index(name)] = 1.0
+        frequency = self.free.index(FREQUENCY) if FREQUENCY in self.free else -1
+        return Unknowns(values.copy(), targets, scales, parameters, inputs, frequency)
+
+    def at(self, values: np.ndarray) -> tuple[PeriodicEquations, np.ndarray]:
+        """Return equations and parameters at values of the unknowns."""
+        equations, unknowns = self.equations, self._unknowns(values, values, values)
+        inputs, parameters = np.empty_like(equations.inputs), np.empty_like(self.parameters)
+        frequency = equations.kernels.fill_setting(equations.setting(self._base), unknowns, values, inputs, parameters)
+        return replace(equations, frequency=frequency, inputs=inputs), parameters
 
     def slopes(self, values: np.ndarray, z: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return ∂g/∂(free scalars), (scalars, points, states)."""
+        """Return ∂g/∂(unknowns), (unknowns, points, states)."""
         equations, parameters = self.at(values)
-        d = equations.derivatives(z, parameters)
-        result = np.empty((len(self.free), *z.shape))
-        for k, name in enumerate(self.free):
-            if name == FREQUENCY:
-                result[k] = frequency_derivatives(equations, z, columns, d)[0]
-            elif name == INPUTS:
-                result[k] = np.einsum("neu,nu->ne", d.g_u, self.input_change)
-            elif name == PARAMETERS:
-                result[k] = d.g_theta @ self.parameter_change
-            else:
-                result[k] = d.g_theta[:, :, equations.model.parameters.index(name)]
-        return result
-
-
-def solve_family(
-    family: Family,
-    z: np.ndarray,
-    values: np.ndarray,
-    rows: np.ndarray,
-    corner: np.ndarray,
-    targets: np.ndarray,
-    value_scales: np.ndarray,
-) -> Found:
-    """Solve g(z, values) = 0 and rows·z + corner·values = targets by a damped Newton method with step halving.
-
-    It stops as the compiled iteration for z alone does.
-
-    Parameters
-    ----------
-    family : Family
-    z : array (points, states)
-    values : array (scalars,)
-    rows : array (scalars, points, states)
-    corner : array (scalars, scalars)
-    targets : array (scalars,)
-    value_scales : array (scalars,)
-        Steps of the scalars are judged against these, or their size if that is larger.
-    """
-    kernels = family.equations.kernels
-    count, previous = family.equations.count, np.inf
-    history: list[tuple[float, float, float]] = []
-    z, values = z.copy(), values.copy()
-    equations, parameters = family.at(values)
-    columns = equations.residual_jacobian(z, parameters)
-    for _ in range(kernels.MAX_ITERATIONS):
-        size, rounding = equations.scales(z, columns)
-        before = kernels.norm(columns, size)
-        if not np.isfinite(before):
-            return Found(z, values, NOT_FINITE, np.array(history).reshape(-1, 3))
-        missing = targets - np.einsum("rps,ps->r", rows, z) - corner @ values
-        step = equations.factors(columns).solve_bordered(
-            family.slopes(values, z, columns), rows, corner, -columns[None, :, :count], missing[None]
+        table = np.empty((len(z), equations.model.kernels.columns("derivatives")))
+        folded = np.empty((len(self.free), z.size))
+        equations.kernels.fill_slopes(
+            equations.functions,
+            equations.grid.packed,
+            equations.setting(parameters),
+            self._unknowns(values, values, values),
+            equations.states(z),
+            columns,
+            table,
+            folded,
         )
-        if step is None:
-            return Found(z, values, SINGULAR, np.array(history).reshape(-1, 3))
-        z_step, value_step = np.ascontiguousarray(step[0][0]), step[1][0]
-        full = max(
-            kernels.scaled_step(z, z_step), float(np.max(abs(value_step) / np.maximum(value_scales, abs(values))))
-        )
-        damping, accepted = 1.0, False
-        for _ in range(kernels.MAX_HALVINGS):
-            trial, trial_values = z + damping * z_step, values + damping * value_step
-            if FREQUENCY not in family.free or trial_values[family.free.index(FREQUENCY)] > 0.0:
-                equations, parameters = family.at(trial_values)
-                columns = equations.residual_jacobian(trial, parameters)
-                after = kernels.norm(columns, size)
-                rounded = kernels.norm(columns, rounding) <= 1.0
-                if after <= (1.0 - 1e-4 * damping) * before or full <= kernels.STEP_TOLERANCE or rounded:
-                    accepted = True
-                    break
-            damping *= 0.5
-        history.append((before, full, damping))
-        if not accepted:
-            return Found(z, values, STALLED, np.array(history))
-        z, values = trial, trial_values
-        if full <= kernels.STEP_TOLERANCE or (
-            damping == 1.0
-            and (
-                rounded
-                or (full < kernels.CHORD_RATE * previous < np.inf and full**2 <= kernels.STEP_TOLERANCE * previous)
-            )
-        ):
-            return Found(z, values, CONVERGED, np.array(history))
-        previous = full if damping == 1.0 else np.inf
-    return Found(z, values, STALLED, np.array(history))
+        return np.ascontiguousarray(folded.reshape(-1, *z.shape)[:, equations.grid.place])
+
+    def solve(
+        self,
+        z: np.ndarray,
+        values: np.ndarray,
+        rows: np.ndarray,
+        corner: np.ndarray,
+        targets: np.ndarray,
+        scales: np.ndarray,
+    ) -> Solved:
+        """Solve g(z, values) = 0 and rows·z + corner·values = targets.
+
+        Parameters
+        ----------
+        z : array (points, states)
+        values : array (unknowns,)
+        rows : array (unknowns, points, states)
+        corner : array (unknowns, unknowns)
+        targets : array (unknowns,)
+        scales : array (unknowns,)
+            Steps of the values are measured in these, or in the value if that is larger.
+        """
+        border = Border.empty(len(values), z.size)
+        border.rows.reshape(rows.shape)[:, self.equations.grid.place] = rows
+        border.corner[:] = corner
+        return self.equations.solve_with(self._base, z, self._unknowns(values, targets, scales), border)
 
 
-def solve_autonomous(family: Family, z: np.ndarray, frequency: float) -> Found:
-    """Solve for an orbit of unknown frequency, its phase the one that stays closest to the guess.
+def solve_autonomous(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, frequency: float) -> Solved:
+    """Solve for an orbit of unknown frequency, with the phase that is closest to the guess.
 
     The phase condition is ∫ q_guess'·(q − q_guess) dτ = 0.
     """
-    row = family.equations.phase_row(z)
+    row = equations.phase_row(z)
     target = np.array([np.sum(row * z)])
     start = np.array([frequency])
-    return solve_family(family, z, start, row[None], np.zeros((1, 1)), target, start)
+    free = ParametrisedEquations(equations, parameters, (FREQUENCY,))
+    return free.solve(z, start, row[None], np.zeros((1, 1)), target, start)
 
 
 MAX_POINTS = 2000
@@ -185,7 +147,7 @@ class Tracer:
 
     Parameters
     ----------
-    family : Family
+    equations : ParametrisedEquations
         Its first free scalar is the one varied; an autonomous model's second is the frequency.
     size : array (states,)
         What scales the states, such as the range of the starting orbit.
@@ -194,9 +156,9 @@ class Tracer:
         Where the first scalar shall get to; the distance scales it.
     """
 
-    def __init__(self, family: Family, size: np.ndarray, values: np.ndarray, until: float):
-        self.family = family
-        points = family.equations.grid.points
+    def __init__(self, equations: ParametrisedEquations, size: np.ndarray, values: np.ndarray, until: float):
+        self.parametrised = equations
+        points = equations.equations.grid.points
         self._size = np.where(size > 0, size, 1.0)
         self._weights = 1.0 / (self._size**2 * points * len(size))
         self._value_scales = np.maximum(np.abs(values), 1e-12)
@@ -214,14 +176,12 @@ class Tracer:
         self, z: np.ndarray, values: np.ndarray, before: tuple[np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the unit tangent at a point that continues an earlier one; None if it is not unique."""
-        equations, parameters = self.family.at(values)
+        equations, parameters = self.parametrised.at(values)
         columns = equations.residual_jacobian(z, parameters)
-        rows, corner = self._conditions(z, before)
-        below = np.zeros((1, len(values)))
-        below[0, 0] = 1.0
-        solved = equations.factors(columns).solve_bordered(
-            self.family.slopes(values, z, columns), rows, corner, np.zeros((1, *z.shape)), below
+        factors = equations.bordered(
+            columns, self.parametrised.slopes(values, z, columns), *self._conditions(z, before)
         )
+        solved = factors.solve_bordered(np.zeros((1, *z.shape)), np.eye(1, len(values)))
         if solved is None:
             return None
         return self._unit((solved[0][0], solved[1][0]))
@@ -260,7 +220,7 @@ class Tracer:
         self, start: Point, z: np.ndarray, values: np.ndarray, rows: np.ndarray, corner: np.ndarray, step: float
     ) -> tuple[Point, int] | None:
         targets = np.einsum("rps,ps->r", rows, z) + corner @ values
-        found = solve_family(self.family, z, values, rows, corner, targets, self._value_scales)
+        found = self.parametrised.solve(z, values, rows, corner, targets, self._value_scales)
         if found.code != CONVERGED:
             return None
         tangent = self.tangent(found.z, found.values, start.tangent)
@@ -274,7 +234,7 @@ class Tracer:
         rows, corner = np.zeros((scalars, *z.shape)), np.zeros((scalars, scalars))
         rows[0], corner[0] = tangent[0] * self._weights, tangent[1] / self._value_scales**2
         if scalars > 1:
-            rows[1] = self.family.equations.phase_row(z)
+            rows[1] = self.parametrised.equations.phase_row(z)
         return rows, corner
 
     def _product(self, a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> float:
@@ -290,7 +250,7 @@ class Tracer:
 
 
 def trace(
-    family: Family,
+    equations: ParametrisedEquations,
     z: np.ndarray,
     values: np.ndarray,
     *,
@@ -305,7 +265,7 @@ def trace(
 
     Parameters
     ----------
-    family : Family
+    equations : ParametrisedEquations
     z : array (points, states)
         A solution.
     values : array (scalars,)
@@ -317,7 +277,7 @@ def trace(
     refine : callable, optional
         Given the tracer and two neighbouring points, returns points to be yielded between them.
     """
-    tracer = Tracer(family, np.ptp(z, axis=0) if size is None else size, values, until)
+    tracer = Tracer(equations, np.ptp(z, axis=0) if size is None else size, values, until)
     origin = float(values[0])
     direction = 1.0 if until > origin else -1.0
     tangent = tracer.first_tangent(z, values, direction)
@@ -378,7 +338,7 @@ ARRIVED, ROUND_FOLDS, FOLD, EQUILIBRIUM, SHORTER, LOST = (
 STEP, MOST_POINTS = 0.1, 300
 
 
-def reach(equations: PeriodicEquations, anchor: Anchor, parameters: np.ndarray) -> str:
+def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.ndarray) -> str:
     """Return how the branch through an anchor ends on the straight way from its parameters to others.
 
     Returns
@@ -395,11 +355,11 @@ def reach(equations: PeriodicEquations, anchor: Anchor, parameters: np.ndarray) 
     free = (PARAMETERS, FREQUENCY) if autonomous else (PARAMETERS,)
     here = equations.at_frequency(anchor.frequency) if autonomous else equations
     values = np.array([0.0, anchor.frequency]) if autonomous else np.zeros(1)
-    family = Family(here, anchor.parameters, free, parameter_change=change)
+    parametrised = ParametrisedEquations(here, anchor.parameters, free, parameter_change=change)
     once, folded = equations.kernels.repetitions(anchor.z, equations.grid.periods), False
     before = anchor.z
     with np.errstate(all="ignore"):
-        for point in islice(trace(family, anchor.z, values, until=1.0, step=STEP), MOST_POINTS):
+        for point in islice(trace(parametrised, anchor.z, values, until=1.0, step=STEP), MOST_POINTS):
             if autonomous and _is_reversed(point.z, before):
                 return EQUILIBRIUM
             if equations.kernels.repetitions(point.z, equations.grid.periods) > once:
