@@ -117,7 +117,7 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     for name in solved:
         verdicts[name] = np.full(count, STATUSES[CONVERGED], dtype=object)
     for name, i in tqdm(failed, desc="failed solves", disable=not (progress and failed)):
-        verdicts[name][i], why = ENDS[problem.responses.reach(theta[i], name)]
+        verdicts[name][i], why = ENDS[problem.responses.path_outcome(theta[i], name)]
         causes[f"{verdicts[name][i]} ({STATUSES[solved[name].status[i]]}): {why}"] += 1
     outputs, converged = problem.outputs(theta)
     if not converged.any():

@@ -16,7 +16,7 @@ from bayesperiodic.periodic.solve import solve_forced, solve_free
 from bayesperiodic.posterior.noise import LENGTHSCALE, SPECTRAL, Block
 from bayesperiodic.posterior.observation import Response
 from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.posterior.simulator import leading_multipliers
+from bayesperiodic.posterior.simulator import orbit_multipliers
 
 # Correlation lengths tried, in response periods; white noise beside them has this prior probability.
 LENGTHSCALES = np.geomspace(1e-3, 3.0, 40)
@@ -306,7 +306,7 @@ def _on_twice_the_points(
     if solved.code != CONVERGED:
         return None
     count = 0 if experiment.multipliers is None else experiment.multipliers.size
-    found = leading_multipliers(equations, parameters, solved.z, count)
+    found = orbit_multipliers(equations, parameters, solved.z, count)
     outputs = equations.outputs(solved.z, parameters)[::2]
     return Response(outputs, np.array(equations.frequency), np.log(np.abs(found)), np.array(delay))
 

@@ -147,7 +147,7 @@ NO_BORDER = Border.empty(0, 0)
 
 
 class Workspace(NamedTuple):
-    """Arrays that the Newton iteration overwrites: states, columns of `residual_jacobian` and `derivatives`, factors."""
+    """Arrays that the Newton iteration overwrites; `columns` are those of `residual_jacobian`."""
 
     states: np.ndarray
     columns: np.ndarray

@@ -325,7 +325,7 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
 def _parametrised(
     equations: PeriodicEquations, parameters: np.ndarray, vary: str
 ) -> tuple[ParametrisedEquations, np.ndarray]:
-    """Return the equations with the varied quantity (and the frequency of an autonomous model) free, and their values."""
+    """Return the equations with the varied quantity (and an autonomous model's frequency) free, and its values."""
     model = equations.model
     allowed = [*model.parameters, *model.inputs, *([] if model.autonomous else [FREQUENCY])]
     _checks.one_of("vary", vary, allowed)

@@ -9,11 +9,11 @@ import numpy as np
 from bayesperiodic._parallel import available_cores, in_threads
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.models.model import Model
+from bayesperiodic.periodic.arclength import LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch, BatchSolution
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
-from bayesperiodic.periodic.family import LOST, reach
-from bayesperiodic.periodic.floquet import leading_multipliers, first_order_matrix
+from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, describe
@@ -391,15 +391,15 @@ class Responses:
         for (_, maps, batch), orbit, own in zip(self._batches, orbits, weights, strict=True):
             assert isinstance(batch, Batch)
             by_parameter = np.zeros(orbit.values.shape)
-            by_parameter[:, maps.moving] = batch.pull(orbit.values[:, :-1], orbit.z, own, maps.moving)
+            by_parameter[:, maps.moving] = batch.vjp(orbit.values[:, :-1], orbit.z, own, maps.moving)
             parts.append(maps.pulled(orbit.values, by_parameter))
         return np.concatenate(parts).sum(axis=0)
 
-    def reach(self, theta: np.ndarray, experiment: str) -> str:
-        """Return how the branch through an experiment's anchor ends on the way to a θ (names,), see `reach.reach`."""
+    def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
+        """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""
         assert self._anchors is not None
         anchor, parameters = self._anchors[experiment], self.parameters(theta[None], experiment)[0]
-        return LOST if anchor.sensitivities is None else reach(self.equations[experiment], anchor, parameters)
+        return LOST if anchor.sensitivities is None else path_outcome(self.equations[experiment], anchor, parameters)
 
     def _log_multipliers(
         self, experiment: Experiment, z: np.ndarray, frequency: np.ndarray, parameters: np.ndarray, status: np.ndarray
@@ -411,7 +411,7 @@ class Responses:
         result = np.full((len(z), measured.size), np.nan)
         for i in np.flatnonzero(status == CONVERGED):
             equations = self.equations[experiment.name].at_frequency(float(frequency[i]))
-            found = leading_multipliers(equations, parameters[i], z[i], measured.size)
+            found = orbit_multipliers(equations, parameters[i], z[i], measured.size)
             if found.size < measured.size:
                 status[i] = SINGULAR
             elif np.any(np.sign(found.real) != np.sign(measured)):
@@ -425,7 +425,7 @@ class Responses:
         parameters, result = self.parameters(theta, experiment), np.full(len(theta), np.nan)
         for i in np.flatnonzero(solved.status == CONVERGED):
             equations = self.equations[experiment].at_frequency(float(solved.response.frequency[i]))
-            result[i] = np.abs(leading_multipliers(equations, parameters[i], solved.z[i], 1)).max(initial=0.0)
+            result[i] = np.abs(orbit_multipliers(equations, parameters[i], solved.z[i], 1)).max(initial=0.0)
         return result
 
     def solutions(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
@@ -499,7 +499,7 @@ class Responses:
             values = maps.values(theta[None])[:, 0]
             z, outputs = np.stack([solved[n][1] for n in names]), np.stack([weights[n].outputs for n in names])
             by_parameter = np.zeros(values.shape)
-            by_parameter[:, maps.moving] = batch.pull(values[:, :-1], z, outputs, maps.moving)
+            by_parameter[:, maps.moving] = batch.vjp(values[:, :-1], z, outputs, maps.moving)
             by_parameter[:, -1] = [weights[n].delay for n in names]
             result |= dict(zip(names, maps.pulled(values, by_parameter), strict=True))
         for name, (response, z) in solved.items():
@@ -509,7 +509,7 @@ class Responses:
         return result
 
 
-def leading_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int) -> np.ndarray:
+def orbit_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int) -> np.ndarray:
     """Return the `count` largest multipliers of a solution z, or fewer, without an autonomous orbit's trivial 1."""
     if not count:
         return np.empty(0)

@@ -13,7 +13,8 @@ from scipy.linalg import lapack
 
 import bayesperiodic as bp
 from bayesperiodic.periodic.batch import Anchor, Batch
-from bayesperiodic.periodic.equations import PeriodicEquations, empty_factors
+from bayesperiodic.periodic.compiled import MAX_HALVINGS, MAX_ITERATIONS, NO_BORDER, NO_UNKNOWNS
+from bayesperiodic.periodic.equations import PeriodicEquations, workspace
 from studies.common import available_cores
 from studies.gear import GEAR, RIG, gear_problem, gear_runs
 from studies.timing import Action, gain_of_cores, interleaved, slope
@@ -131,16 +132,13 @@ def newton_iteration(drive: str, scheme: str, repeats: int) -> dict[str, Any]:
 
 def _prepared(equations: PeriodicEquations, theta: np.ndarray, guess: np.ndarray) -> tuple[Callable[[], Any], int]:
     """Return a solve from a guess with preallocated work arrays, and its number of Newton iterations."""
-    z, grid = guess.copy(), equations.grid
-    states, columns = equations.states(z), equations.residual_jacobian(z, theta)
-    history, factors = np.empty((equations.kernels.MAX_ITERATIONS, 3)), empty_factors(grid, equations.count)
+    z, history = guess.copy(), np.empty((MAX_ITERATIONS, 3))
+    before = equations.functions, equations.grid.packed, equations.setting(theta), NO_UNKNOWNS, NO_BORDER, MAX_HALVINGS
+    work = workspace(equations, bordered=False)
 
-    def solve() -> tuple[int, int]:
+    def solve() -> tuple[int, int, float]:
         z[:] = guess
-        return equations.kernels.newton(
-            equations.model.kernels.residual_jacobian, grid.packed, equations.inputs, theta, grid.tau,
-            equations.frequency, equations.drift, z, history, states, columns, factors,
-        )  # fmt: skip
+        return equations.kernels.newton(*before, z, history, work)
 
     return solve, solve()[1]
 

@@ -5,8 +5,8 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
-from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Bordered
-from bayesperiodic.periodic.compiled import CONVERGED, autonomous_kernels
+from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, phase_bordered
+from bayesperiodic.periodic.compiled import CONVERGED, kernels
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.solve import collapsed, has_shorter_period
 from tests.known import grid
@@ -59,18 +59,17 @@ def test_bordered_solve_and_orientation_agree_with_dense_algebra(scheme):
         z = solution.states["x"][:, None] + spread * generator.standard_normal((21, 1))
         theta, f, h = np.array([0.8, 0.3]), solution.frequency, 1e-5
         equations = built(ODD, f, 21, scheme)
-        bordered = Bordered(equations, theta, z, f)
+        bordered, row = phase_bordered(equations, theta, z), equations.phase_row(z)
         above, below = (built(ODD, f + sign * h, 21, scheme).residual_jacobian(z, theta)[:, 0] for sign in (1, -1))
         matrix = dense(equations, equations.residual_jacobian(z, theta))
-        whole = np.block([[matrix, (above - below)[:, None] / (2 * h)], [bordered.row[None], np.zeros((1, 1))]])
-        assert bordered.row == pytest.approx(equations.phase_row(z).ravel(), abs=1e-12)
+        whole = np.block([[matrix, (above - below)[:, None] / (2 * h)], [row.reshape(1, -1), np.zeros((1, 1))]])
+        flow = equations.states(z)[:, 1:2]
+        assert row == pytest.approx(flow / np.linalg.norm(flow), abs=1e-12)
         assert bordered.orientation == np.linalg.slogdet(whole)[0]
         right = generator.standard_normal(22)
-        folded = np.empty((1, 21))
-        folded[0, equations.grid.place] = right[:21]
-        change = autonomous_kernels().bordered_solve(bordered.parts, right[21], folded)
+        x, change = bordered.solve_bordered(right[None, :21, None], right[None, 21:])
         expected = np.linalg.solve(whole, right)
-        found = np.append(folded[0, equations.grid.place], change)
+        found = np.append(x, change)
         assert found == pytest.approx(expected, rel=1e-6, abs=1e-6 * np.abs(expected).max())
         signs.add(bordered.orientation)
     assert signs == {-1.0, 1.0}
@@ -78,17 +77,16 @@ def test_bordered_solve_and_orientation_agree_with_dense_algebra(scheme):
 
 def test_steps_near_an_anchor_converge_with_its_factors_alone():
     equations, anchor = anchor_of(solved(1.0))
-    bordered = Bordered(equations, anchor.parameters, anchor.z, anchor.frequency)
-    other = Bordered(equations, anchor.parameters, anchor.z, anchor.frequency)
-    target, theta, z = bordered.row @ anchor.z.ravel(), anchor.parameters + np.array([0.01, 0.0]), anchor.z.copy()
-    close, steps, frequency = autonomous_kernels().secant(
-        ODD.kernels.residual_jacobian, equations.grid.packed, equations.inputs, theta, equations.grid.tau,
-        anchor.frequency, equations.drift, z, bordered.parts, target, other.work,
+    factors, row = phase_bordered(equations, anchor.parameters, anchor.z), equations.phase_row(anchor.z)
+    target, theta, z = np.sum(row * anchor.z), anchor.parameters + np.array([0.01, 0.0]), anchor.z.copy()
+    close, steps, frequency = kernels("autonomous", 1, equations.grid.stencil).broyden(
+        equations.functions, equations.grid.packed, equations.setting(theta), factors.band, factors.pivots,
+        factors.border, target, z, equations.states(z), z.copy(),
     )  # fmt: skip
     assert close and 2 <= steps <= 5
     assert frequency == pytest.approx(solved(1.01).frequency, rel=1e-9)
     assert equations.at_frequency(frequency).scaled_residual(z, theta) < 1e-9
-    assert bordered.row @ z.ravel() == pytest.approx(target, abs=1e-12)
+    assert np.sum(row * z) == pytest.approx(target, abs=1e-12)
 
 
 @pytest.mark.parametrize("scheme", ["central4", "fourier"])
@@ -159,5 +157,5 @@ def test_shrunk_and_repeated_orbits_are_detected_as_by_the_solver(size):
     waves = [np.stack([np.cos(2 * np.pi * k * tau), np.sin(2 * np.pi * 2 * k * tau)], axis=-1) for k in (1, 2, 3)]
     for z in (start, *waves, waves[1] + waves[2], waves[1] + size * start):
         z = size * z + 5.0
-        assert autonomous_kernels().has_shrunk(z, start) == collapsed(z, start)
-        assert autonomous_kernels().has_shorter_period(z) == has_shorter_period(z)
+        assert kernels("autonomous", 1, (2, 5, 4)).has_shrunk(z, start) == collapsed(z, start)
+        assert kernels("autonomous", 1, (2, 5, 4)).has_shorter_period(z) == has_shorter_period(z)

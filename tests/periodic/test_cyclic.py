@@ -4,7 +4,8 @@ import pytest
 from bayesperiodic.periodic.compiled import kernels
 from bayesperiodic.periodic.schemes import CyclicGrid, backward2, central2
 
-factor, solve = kernels(1, (2, 3, 2)).factor, kernels(1, (2, 3, 2)).solve
+linear = kernels("linear", 1, (2, 3, 2))
+factor, solve = linear.factor, linear.solve
 
 
 def banded(matrix: np.ndarray, half: int) -> np.ndarray:

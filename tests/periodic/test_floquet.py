@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.periodic.floquet import leading_multipliers, first_order_matrix, floquet
+from bayesperiodic.periodic.floquet import first_order_matrix, floquet, leading_multipliers
 from tests.known import grid
 
 PERIOD = 1.7

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.periodic.arclength import path_outcome
 from bayesperiodic.periodic.batch import Anchor
 from bayesperiodic.periodic.equations import PeriodicEquations
-from bayesperiodic.periodic.family import reach
 from bayesperiodic.periodic.solve import solve_free
 from studies import shooting
 from tests.known import CYCLE, SADDLE_NODE, grid
@@ -21,7 +21,7 @@ def test_a_saddle_node_ends_the_branch(a, end):
     """ẋ = a − x² has the equilibria ±√a for a > 0 and none for a < 0."""
     equations = built(SADDLE_NODE, {"u": np.zeros(100)}, 1.0)
     anchor = Anchor.at(equations, np.array([1.0]), np.ones((100, 1)))
-    assert reach(equations, anchor, np.array([a])) == end
+    assert path_outcome(equations, anchor, np.array([a])) == end
 
 
 @pytest.mark.parametrize(("mu", "end"), [(2.0, "arrived"), (0.05, "arrived"), (-0.05, "equilibrium")])
@@ -31,7 +31,7 @@ def test_a_hopf_point_ends_the_branch(mu, end):
     guess = {"x": np.cos(TURN * tau), "y": np.sin(TURN * tau)}
     equations, solved, _ = solve_free(built(CYCLE, {}, 3.0 / TURN, scheme="central4"), theta, guess)
     assert np.ptp(solved.z[:, 0]) == pytest.approx(2.0, rel=1e-4)
-    assert reach(equations, Anchor.at(equations, theta, solved.z), np.array([mu, 3.0])) == end
+    assert path_outcome(equations, Anchor.at(equations, theta, solved.z), np.array([mu, 3.0])) == end
 
 
 @pytest.mark.parametrize(("further", "end"), [(0.3, "arrived"), (0.7, "shorter period")])
@@ -45,7 +45,7 @@ def test_a_period_doubling_ends_the_branch(further, end):
     theta = np.array([PENDULUM[name] for name in bp.models.pendulum.parameters])
     z = equations.solve(theta, (solution.states["phi"] - TURN * known.winding * solution.tau / 4)[:, None]).z
     there = theta * (1.0 + further * np.array([0.51, 0.189, 0, 0, 0, 0, 0, 0]))
-    assert reach(equations, Anchor.at(equations, theta, z), there) == end
+    assert path_outcome(equations, Anchor.at(equations, theta, z), there) == end
 
 
 def test_a_branch_may_come_back_after_two_folds():
@@ -53,9 +53,9 @@ def test_a_branch_may_come_back_after_two_folds():
     equations = built(bp.models.duffing, {"force": 5.0 * np.cos(TURN * grid(200))}, 0.05, samples=200)
     theta = np.array([1.0, 0.1, 1.0, 0.5])
     anchor = Anchor.at(equations, theta, equations.solve(theta, equations.static_guess(theta)).z)
-    assert reach(equations, anchor, theta * [1.5, 1.0, 1.0, 1.0]) == "arrived"
-    assert reach(equations, anchor, theta * [2.0, 1.0, 1.0, 1.0]) == "round folds"
-    assert reach(equations, anchor, np.full(4, np.nan)) == "lost"
+    assert path_outcome(equations, anchor, theta * [1.5, 1.0, 1.0, 1.0]) == "arrived"
+    assert path_outcome(equations, anchor, theta * [2.0, 1.0, 1.0, 1.0]) == "round folds"
+    assert path_outcome(equations, anchor, np.full(4, np.nan)) == "lost"
 
 
 def test_a_branch_that_turns_back_past_its_start_ends_in_a_fold():
@@ -64,4 +64,4 @@ def test_a_branch_that_turns_back_past_its_start_ends_in_a_fold():
     theta = np.array([1.0, 0.1, 1.0, 0.5])
     upper = equations.solve(theta, 2.0 * np.cos(TURN * grid(100))[:, None])
     assert np.ptp(upper.z) > 2.0
-    assert reach(equations, Anchor.at(equations, theta, upper.z), np.array([1.0, 0.1, 0.1, 0.2])) == "fold"
+    assert path_outcome(equations, Anchor.at(equations, theta, upper.z), np.array([1.0, 0.1, 0.1, 0.2])) == "fold"

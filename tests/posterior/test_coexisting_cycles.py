@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 
 import bayesperiodic as bp
-from bayesperiodic.periodic.batch import Bordered
+from bayesperiodic.periodic.arclength import ARRIVED
+from bayesperiodic.periodic.batch import phase_bordered
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT
-from bayesperiodic.periodic.family import ARRIVED
 from studies.flutter.reference import RIG, SENSORS, hopf
 
 SPEED, SAMPLES = 15.0, 16
@@ -51,7 +51,7 @@ def test_stable_and_unstable_cycles_are_never_confused():
     assert 200 < both.sum() < 400 and np.all(unstable[both] < 0.99 * stable[both])
     for i in (*np.flatnonzero(both)[:5], *np.flatnonzero(~both)[:15]):
         for name, kind in KINDS.items():
-            ending = stated.responses.reach(theta[i], name)
+            ending = stated.responses.path_outcome(theta[i], name)
             assert (ending == ARRIVED) == (solved[name].status[i] == CONVERGED), ending
             if ending == ARRIVED:
                 alone = stated.responses.solve(theta[i : i + 1], keep=True)[name]
@@ -65,7 +65,8 @@ def test_determinant_changes_sign_between_cycles_on_both_sides_of_a_fold():
     found = []
     for name, cycle in cycles().items():
         z = np.stack([cycle.states[state] for state in bp.models.flutter.states], axis=-1)
-        found.append(Bordered(stated.responses.equations[name], parameters, z, cycle.frequency).orientation)
+        equations = stated.responses.equations[name].at_frequency(cycle.frequency)
+        found.append(phase_bordered(equations, parameters, z).orientation)
     assert found[0] * found[1] == -1.0
 
 

@@ -189,7 +189,7 @@ def has_shorter_period(z):
 
 @njit(FLAG(MATRIX, MATRIX, MATRIX, NUMBER, NUMBER), **OPTIONS)
 def has_leapt(z, predicted, start, frequency, expected):
-    """Return whether an orbit does not continue the one at `start`: far from the prediction, shrunk, or of a shorter period."""
+    """Return whether an orbit is not a continuation of `start`: unpredicted, shrunk, or of a shorter period."""
     if is_far(z, predicted, start) or abs(frequency - expected) > FAR * expected:
         return True
     return has_shrunk(z, start) or has_shorter_period(z)

@@ -419,7 +419,7 @@ def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fract
 
 @njit(FLAG(MATRIX, MATRIX, MATRIX), **OPTIONS)
 def is_far(z, predicted, anchor_z):
-    """Return whether z differs from the prediction by more than `FAR` of the anchor's range and of the predicted change."""
+    """Return whether z is off the prediction by more than `FAR` of the anchor's range and of the change."""
     for s in range(STATES if STATES > 0 else z.shape[1]):
         off, change, low, high = 0.0, 0.0, np.inf, -np.inf
         for i in range(z.shape[0]):
