@@ -38,8 +38,8 @@ from .periodic.hopf import emerging_cycle as emerging_cycle
 from .periodic.hopf import hopf_points as hopf_points
 from .periodic.schemes import Scheme as Scheme
 from .periodic.solution import PeriodicSolution as PeriodicSolution
+from .periodic.solution import multiplier_sensitivities as multiplier_sensitivities
 from .periodic.solve import solve_periodic as solve_periodic
-from .periodic.stability import multiplier_sensitivities as multiplier_sensitivities
 from .posterior import noise as noise
 from .posterior.joint_priors import MultivariateNormal as MultivariateNormal
 from .posterior.priors import HalfNormal as HalfNormal

@@ -9,8 +9,7 @@ from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.models.model import Model
 from bayesperiodic.orbits.orbit import Orbit, Orbits
-from bayesperiodic.periodic.solution import PeriodicSolution
-from bayesperiodic.periodic.stability import multiplier_sensitivities
+from bayesperiodic.periodic.solution import PeriodicSolution, multiplier_sensitivities
 
 # Directions with less information than this fraction of the largest are ignored.
 LEAST_EIGENVALUE = 1e-10

@@ -66,7 +66,9 @@ class ParametrisedEquations:
         """Return equations and parameters at values of the unknowns."""
         equations, unknowns = self.equations, self._unknowns(values, values, values)
         inputs, parameters = np.empty_like(equations.inputs), np.empty_like(self.parameters)
-        frequency = equations.kernels.fill_setting(equations.setting(self._base), unknowns, values, inputs, parameters)
+        frequency = equations.bordered_kernels.fill_setting(
+            equations.setting(self._base), unknowns, values, inputs, parameters
+        )
         return replace(equations, frequency=frequency, inputs=inputs), parameters
 
     def slopes(self, values: np.ndarray, z: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -74,7 +76,7 @@ class ParametrisedEquations:
         equations, parameters = self.at(values)
         table = np.empty((len(z), equations.model.kernels.columns("derivatives")))
         folded = np.empty((len(self.free), z.size))
-        equations.kernels.fill_slopes(
+        equations.bordered_kernels.fill_slopes(
             equations.functions,
             equations.grid.packed,
             equations.setting(parameters),
@@ -110,7 +112,7 @@ class ParametrisedEquations:
         border = Border.empty(len(values), z.size)
         border.rows.reshape(rows.shape)[:, self.equations.grid.place] = rows
         border.corner[:] = corner
-        return self.equations.solve_with(self._base, z, self._unknowns(values, targets, scales), border)
+        return self.equations.solve(self._base, z, self._unknowns(values, targets, scales), border)
 
 
 def solve_autonomous(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, frequency: float) -> Solved:
@@ -133,7 +135,7 @@ GROWTH = 1.5
 
 
 class Point(NamedTuple):
-    """A point of a branch: z (points, states), the free scalars, the unit tangent, how far along, what is special."""
+    """A point of a branch: z (points, states), the unknowns' values, the unit tangent, the arclength, the kind."""
 
     z: np.ndarray
     values: np.ndarray
@@ -143,17 +145,17 @@ class Point(NamedTuple):
 
 
 class Tracer:
-    """The corrector of a continuation, with the scales that make lengths comparable.
+    """Predictor and corrector of a continuation, with the scales of arclength.
 
     Parameters
     ----------
     equations : ParametrisedEquations
-        Its first free scalar is the one varied; an autonomous model's second is the frequency.
+        The first unknown is varied; an autonomous model's second is the frequency.
     size : array (states,)
-        What scales the states, such as the range of the starting orbit.
-    values : array (scalars,)
+        Scales of the states, such as the range of the starting orbit.
+    values : array (unknowns,)
     until : float
-        Where the first scalar shall get to; the distance scales it.
+        Target of the first unknown; the distance to it is its scale.
     """
 
     def __init__(self, equations: ParametrisedEquations, size: np.ndarray, values: np.ndarray, until: float):
@@ -167,7 +169,7 @@ class Tracer:
     def first_tangent(
         self, z: np.ndarray, values: np.ndarray, direction: float
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the unit tangent along which the first scalar goes in a direction (±1)."""
+        """Return the unit tangent along which the first unknown moves in a direction (±1)."""
         plain = np.zeros_like(z), np.zeros_like(values)
         plain[1][0] = direction * self._value_scales[0]
         return self.tangent(z, values, plain)
@@ -193,7 +195,7 @@ class Tracer:
         return self._solve(start, z, values, rows, corner, step)
 
     def stop_at(self, start: Point, end: Point, value: float) -> Point | None:
-        """Return the point between two others where the first scalar has a value."""
+        """Return the point between two others where the first unknown has a value."""
         share = (value - start.values[0]) / (end.values[0] - start.values[0])
         z, values = start.z + share * (end.z - start.z), start.values + share * (end.values - start.values)
         rows, corner = self._conditions(z, start.tangent)
@@ -207,11 +209,11 @@ class Tracer:
         return solved[0]._replace(values=exact)
 
     def length(self, change: tuple[np.ndarray, np.ndarray]) -> float:
-        """Return the length of a change of z and the scalars."""
+        """Return the length of a change of z and the values."""
         return float(np.sqrt(self._product(change, change)))
 
     def longest(self, point: Point, largest: float) -> float:
-        """Return how long a step may be: longer for a larger orbit, but never above the largest in the first scalar."""
+        """Return the largest step: longer for a larger orbit, but never above the largest in the first unknown."""
         grown = max(1.0, float((np.ptp(point.z, axis=0) / self._size).max()))
         share = abs(point.tangent[1][0]) / self._value_scales[0]
         return largest * min(grown, 1.0 / max(share, 1e-12))
@@ -230,10 +232,10 @@ class Tracer:
 
     def _conditions(self, z: np.ndarray, tangent: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and corner of: distance along a tangent; for an autonomous model, the phase against z."""
-        scalars = len(tangent[1])
-        rows, corner = np.zeros((scalars, *z.shape)), np.zeros((scalars, scalars))
+        unknowns = len(tangent[1])
+        rows, corner = np.zeros((unknowns, *z.shape)), np.zeros((unknowns, unknowns))
         rows[0], corner[0] = tangent[0] * self._weights, tangent[1] / self._value_scales**2
-        if scalars > 1:
+        if unknowns > 1:
             rows[1] = self.parametrised.equations.phase_row(z)
         return rows, corner
 
@@ -259,21 +261,21 @@ def trace(
     size: np.ndarray | None = None,
     refine: Callable[["Tracer", Point, Point], list[Point]] | None = None,
 ) -> Iterator[Point]:
-    """Yield the points of a branch from a solution until the first scalar gets to a value or leaves on the other side.
+    """Yield the points of a branch from a solution until the first unknown reaches a value or passes its start.
 
-    The solution alone is yielded where the branch has no unique tangent, or turns back there (at a fold).
+    Only the solution is yielded if the branch has no unique tangent there or turns back (at a fold).
 
     Parameters
     ----------
     equations : ParametrisedEquations
     z : array (points, states)
         A solution.
-    values : array (scalars,)
+    values : array (unknowns,)
     until : float
     step : float
-        The largest step of the first scalar.
+        The largest step of the first unknown.
     size : array (states,), optional
-        What scales the states; by default the range of z.
+        Scales of the states; by default the range of z.
     refine : callable, optional
         Given the tracer and two neighbouring points, returns points to be yielded between them.
     """
@@ -339,16 +341,15 @@ STEP, MOST_POINTS = 0.1, 300
 
 
 def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.ndarray) -> str:
-    """Return how the branch through an anchor ends on the straight way from its parameters to others.
+    """Return how the branch through an anchor ends on the straight path from its parameters to others.
 
     Returns
     -------
     str
-        "arrived" where it leads to an orbit there; "round folds" where it does after turning back and forth, so that it
-        is not the orbit that small steps follow; "fold" where it turns back for good or past its start; "equilibrium"
-        where the cycle of an autonomous model shrinks to nothing (a Hopf point); "shorter period" where an orbit merges
-        with one of fewer forcing periods (a period doubling); "lost" where the continuation fails, so that nothing is
-        known.
+        "arrived" if it leads to an orbit at the other parameters; "round folds" if it does so after folds, so that
+        it is not the orbit that small steps follow; "fold" if it turns back and does not return, or passes its start;
+        "equilibrium" if the cycle of an autonomous model shrinks to nothing (a Hopf point); "shorter period" if an
+        orbit merges with one of fewer forcing periods (a period doubling); "lost" if the continuation fails.
     """
     change = parameters - anchor.parameters
     autonomous = equations.model.autonomous

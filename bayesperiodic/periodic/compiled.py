@@ -261,13 +261,23 @@ ORBITS = named(Orbits, MATRIX, CUBE, VECTOR, GAINS, MATRIX, CUBE, INDICES, ALL_B
 SOLUTION = named(BatchSolution, GAINS, GAINS, MATRIX, INDICES, INDICES)
 
 
+# What each module of compiled functions is compiled from: the source, and the module whose names are defined in it.
+MODULES = {
+    "linear": ("linear", None),
+    "border": ("border", "linear"),
+    "newton": ("newton", "linear"),
+    "bordered newton": ("newton", "border"),
+    "batch": ("batch", "newton"),
+    "autonomous": ("autonomous", "bordered newton"),
+}
+
+
 def kernels(name: str, states: int, stencil: tuple[int, int, int]) -> ModuleType:
-    """Return the compiled functions of a source for a number of states and the stencil of a `schemes.CyclicGrid`.
+    """Return one of `MODULES` for a number of states and the stencil of a `schemes.CyclicGrid`.
 
     Parameters
     ----------
     name : str
-        "linear", "newton", "batch" or "autonomous".
     states : int
     stencil : tuple of int
         `schemes.CyclicGrid.stencil`.
@@ -276,14 +286,11 @@ def kernels(name: str, states: int, stencil: tuple[int, int, int]) -> ModuleType
     return _kernels(name, sizes)
 
 
-SHARED = {"newton": "linear", "batch": "newton", "autonomous": "newton"}
-
-
 @cache
 def _kernels(name: str, sizes: tuple[int, ...]) -> ModuleType:
-    constants = {"SIZES": sizes, "DEFINITIONS": _digest()}
-    shared = _kernels(SHARED[name], sizes) if name in SHARED else None
-    return load(source(name), constants, shared)
+    text, shared = MODULES[name]
+    constants = {"SIZES": sizes, "BORDERED": shared == "border", "DEFINITIONS": _digest()}
+    return load(source(text), constants, _kernels(shared, sizes) if shared else None)
 
 
 def source(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Branches of periodic solutions: followed in one quantity, with folds and period doublings; branch switching."""
+"""Branches of periodic solutions in one quantity, with folds and period doublings; branch switching."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ class Branch(Result, Sequence):
     Attributes
     ----------
     vary : str
-        What was varied: "frequency" [Hz], a parameter, or an input (its scale, 1 at the start).
+        The varied quantity: "frequency" [Hz], a parameter, or an input (its scale, 1 at the start).
     units : dict of str to str
-        Of what was varied (under its own name), and of the model's parameters, states, inputs and outputs, if known.
+        Of the varied quantity and of the model's parameters, states, inputs and outputs, if known.
     values : array (points,)
-        Of what was varied, in its unit.
+        Of the varied quantity, in its unit.
     solutions : tuple of PeriodicSolution
         Without sensitivities.
     kinds : tuple of str
         "fold", "period doubling" or "" for each.
     complete : bool
-        True if the branch got to the end wanted, or back to its start value, and did not get stuck.
+        True if the branch reached the requested end or returned to its start value.
 
     Examples
     --------
@@ -148,9 +148,8 @@ def continue_periodic(
     """Follow a periodic solution, stable or unstable, along a parameter, the frequency or an input's scale.
 
     Pseudo-arclength continuation [1]_ with steps adapted to the curvature passes folds; folds and period doublings are
-    located to 1e-9 of a step. It ends where the quantity gets to `until`, or back to its start value, or where the
-    steps get too small (then the branch is not `complete`; nor is it if the start is a fold that turns away from
-    `until`).
+    located to 1e-9 of a step. It ends where the quantity reaches `until` or its start value, or where the steps become
+    too small (then the branch is not `complete`, as if the start is a fold that turns away from `until`).
 
     Parameters
     ----------
@@ -161,8 +160,8 @@ def continue_periodic(
         "frequency", a parameter's name, or an input's name (its scale, 1 at the start).
     until : float
     step : float, optional
-        The largest step in what is varied; by default a fiftieth of the way. Changes of the orbit by its own size
-        count as much as the way to `until`.
+        The largest step of the varied quantity; by default 1/50 of the way. A change of the orbit by its own range
+        counts as much as the way to `until`.
     progress : bool
         Show a progress bar.
 
@@ -208,7 +207,7 @@ def continue_periodic(
 def iterate_periodic(
     model: Model, solution: PeriodicSolution, vary: str, *, until: float, step: float | None = None
 ) -> Iterator[tuple[float, PeriodicSolution, str]]:
-    """Yield the points of `continue_periodic` one by one: the value of what is varied, the solution, the kind.
+    """Yield the points of `continue_periodic` one by one: value of the varied quantity, solution, kind.
 
     Parameters
     ----------
@@ -239,15 +238,14 @@ def iterate_periodic(
     equations, parameters, z = equations_of(model, solution)
     if not solution.converged:
         raise ValueError(
-            f"solution: status {solution.status!r} is not allowed; it must have converged. Solve again from another "
-            "guess."
+            f"solution: must have converged, got status {solution.status!r}. Solve again from another guess."
         )
     parametrised, values = _parametrised(equations, parameters, vary)
     until = _checks.finite_number("until", until)
     if vary == FREQUENCY:
         _checks.positive("until", until)
     if until == values[0]:
-        raise ValueError(f"until: {until!r} is not allowed; {vary} has that value at the start, give another.")
+        raise ValueError(f"until: must differ from the start value of {vary}, got {until!r}.")
     step = abs(until - values[0]) / STEPS if step is None else _checks.positive("step", step)
     for point in trace(parametrised, z, values, until=until, step=step, refine=_special_points):
         yield float(point.values[0]), _solution(parametrised, point), point.kind
@@ -262,13 +260,13 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
     solution : PeriodicSolution
         One of ``branch.period_doublings``.
     vary : str
-        What the branch was followed in; it is free in this step, too.
+        The quantity that the branch varies; it is also free in this step.
 
     Returns
     -------
     PeriodicSolution
         Of twice the periods (for an autonomous model, twice the samples at half the frequency), half a per cent of the
-        orbit's size away from the old one; or with the status "singular" where the step fails.
+        orbit's size away from the old one; or with the status "singular" if the step fails.
 
     Raises
     ------
@@ -290,12 +288,11 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
     equations, parameters, z = equations_of(model, solution)
     if not solution.converged:
         raise ValueError(
-            f"solution: status {solution.status!r} is not allowed; it must have converged. Take one of "
-            "branch.period_doublings."
+            f"solution: must have converged, got status {solution.status!r}. Take one of branch.period_doublings."
         )
     if np.min(abs(solution.multipliers + 1.0)) > 0.1:
         raise ValueError(
-            f"solution: multipliers {solution.multipliers} are not allowed; one must be near -1. Take one of "
+            f"solution: must have a multiplier near -1, got {solution.multipliers}. Take one of "
             "branch.period_doublings."
         )
     twice = PeriodicEquations.build(
@@ -358,7 +355,7 @@ def _special_points(tracer: Tracer, before: Point, after: Point) -> list[Point]:
 def _locate(
     tracer: Tracer, before: Point, after: Point, kind: str, test: Callable[[Tracer, Point], float]
 ) -> list[Point]:
-    """Return the point where a test changes sign, in a list that is empty if the branch is lost on the way."""
+    """Return the point where a test function is zero, in a list that is empty if a correction fails."""
     span = after.distance - before.distance
     known: dict[float, Point] = {0.0: before, span: after}
 
@@ -383,12 +380,12 @@ class _Lost(Exception):
 
 
 def _fold_test(tracer: Tracer, point: Point) -> float:
-    """Return how fast the quantity varied changes along the branch."""
+    """Return the slope of the varied quantity along the branch."""
     return float(point.tangent[1][0])
 
 
 def _doubling_test(tracer: Tracer, point: Point) -> float:
-    """Return a number that changes sign where a multiplier passes −1."""
+    """Return a test function that changes its sign where a multiplier passes −1."""
     solution = _solution(tracer.parametrised, point)
     exponents = solution.floquet.exponents if solution.floquet is not None else np.array([np.nan])
     growth = np.abs(exponents.real)
@@ -397,7 +394,7 @@ def _doubling_test(tracer: Tracer, point: Point) -> float:
 
 
 def solutions_at(model: Model, branch: Branch, value: float) -> tuple[PeriodicSolution, ...]:
-    """Return the orbits of a branch, stable and unstable, at one value of what was varied.
+    """Return the orbits of a branch, stable and unstable, at one value of the varied quantity.
 
     Every passage of the branch through the value is solved again, from between its neighbours.
 
@@ -416,8 +413,8 @@ def solutions_at(model: Model, branch: Branch, value: float) -> tuple[PeriodicSo
     Raises
     ------
     ValueError
-        If the branch has no orbit there: the nearest fold or end is told. If it is of another model, or was followed in
-        an input.
+        If the branch has no orbit there (the message names the nearest fold or end), is of another model or varies an
+        input.
 
     Examples
     --------
@@ -430,9 +427,9 @@ def solutions_at(model: Model, branch: Branch, value: float) -> tuple[PeriodicSo
     [True, False, True]
     """
     if branch[0].model != model.name:
-        raise ValueError(f"model: {model.name!r} is not allowed; the branch is one of {branch[0].model!r}.")
+        raise ValueError(f"model: must be {branch[0].model!r}, as of the branch, got {model.name!r}.")
     if branch.vary not in (*model.parameters, FREQUENCY):
-        raise ValueError(f"branch: one in the input {branch.vary!r} is not allowed; take a parameter or the frequency.")
+        raise ValueError(f"branch: must be one in a parameter or the frequency, got one in the input {branch.vary!r}.")
     value = _checks.finite_number("value", value)
     found = []
     for (low, before), (high, after) in pairwise(zip(branch.values, branch.solutions, strict=True)):
@@ -470,6 +467,6 @@ def _absent(branch: Branch, value: float) -> str:
     place, unit = branch.values[index], branch.units.get(branch.vary, "")
     kind = branch.kinds[index] or ("end" if index in (0, len(branch) - 1) else "turn")
     return (
-        f"value: {branch.vary} = {value:.6g} {unit} is not allowed; the branch of {branch[0].model!r} has no orbit "
-        f"there, the nearest is at its {kind} at {place:.6g} {unit}."
+        f"value: must be on the branch of {branch[0].model!r}, got {branch.vary} = {value:.6g} {unit}; the nearest "
+        f"orbit is at its {kind} at {place:.6g} {unit}."
     )

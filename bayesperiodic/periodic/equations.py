@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,7 +48,7 @@ class CyclicFactors:
 
     def __init__(self, grid: CyclicGrid, columns: np.ndarray, states: int, frequency: float):
         self._grid, self._states = grid, states
-        self._compiled: Any = kernels("linear", states, grid.stencil)
+        self._compiled = kernels("linear", states, grid.stencil)
         self._lower = grid.half_width * states + states - 1
         size = grid.points * states
         self.band = np.empty((size, 3 * self._lower + 1))
@@ -120,6 +120,7 @@ class BorderedFactors(CyclicFactors):
         self.border.columns[:-1] = self._fold(self._sides)
         self.border.rows[:] = self._fold(self._rows)
         self.border.corner[:] = self._corner
+        self._compiled = kernels("border", self._states, self._grid.stencil)
         self.orientation = self._compiled.factor_bordered(self.band, self.pivots, self.border)
         return self.orientation != 0.0
 
@@ -186,7 +187,7 @@ class PeriodicEquations:
     inputs : array (points, 3·inputs)
         u, u̇, ü.
     drift : array (states,)
-        What an angle advances per forcing period.
+        Advance of each angle per forcing period.
 
     References
     ----------
@@ -216,8 +217,8 @@ class PeriodicEquations:
         grid = CyclicGrid(find_scheme(scheme), samples, periods)
         if model.autonomous and grid.periods > 1:
             raise ValueError(
-                f"periods: {periods!r} is not allowed; {model.name!r} is autonomous, there is no forcing period to "
-                "count. Give the frequency of the whole orbit."
+                f"periods: must be 1, got {periods!r}; {model.name!r} is autonomous and has no forcing period. Give "
+                "the frequency of the whole orbit."
             )
         _checks.same_names("inputs", inputs or {}, model.inputs)
         columns: list[list[np.ndarray]] = [[], [], []]
@@ -238,8 +239,13 @@ class PeriodicEquations:
 
     @property
     def kernels(self) -> ModuleType:
-        """The compiled functions of the solver."""
-        return kernels("newton", self.count, self.grid.stencil)
+        """The compiled functions of the Newton iteration for z alone or, for an autonomous model, with unknowns."""
+        return kernels("bordered newton" if self.model.autonomous else "newton", self.count, self.grid.stencil)
+
+    @property
+    def bordered_kernels(self) -> ModuleType:
+        """The compiled functions of the Newton iteration with further unknowns."""
+        return kernels("bordered newton", self.count, self.grid.stencil)
 
     @property
     def functions(self) -> Functions:
@@ -284,15 +290,18 @@ class PeriodicEquations:
             states[0, :count] -= np.linalg.lstsq(stiffness, residual, rcond=None)[0]
         return np.tile(solution, (self.grid.points, 1))
 
-    def solve(self, parameters: np.ndarray, guess: np.ndarray) -> Solved:
-        """Run the Newton iteration from a guess (points, states) for the periodic part."""
-        return self.solve_with(parameters, guess, NO_UNKNOWNS, NO_BORDER)
-
-    def solve_with(self, parameters: np.ndarray, guess: np.ndarray, unknowns: Unknowns, border: Border) -> Solved:
-        """Run the Newton iteration for z and further unknowns from a guess; see `_kernels/newton.py`."""
-        z = np.array(guess, dtype=float, order="C")
+    def solve(
+        self,
+        parameters: np.ndarray,
+        guess: np.ndarray,
+        unknowns: Unknowns = NO_UNKNOWNS,
+        border: Border = NO_BORDER,
+    ) -> Solved:
+        """Run the Newton iteration for z and further unknowns from a guess (points, states) for the periodic part."""
+        z, bordered = np.array(guess, dtype=float, order="C"), unknowns.values.size > 0
         history = np.zeros((MAX_ITERATIONS, 3))
-        code, iterations, _ = self.kernels.newton(
+        name = "bordered newton" if bordered else "newton"
+        code, iterations, _ = kernels(name, self.count, self.grid.stencil).newton(
             self.functions,
             self.grid.packed,
             self.setting(parameters),
@@ -301,7 +310,7 @@ class PeriodicEquations:
             MAX_HALVINGS,
             z,
             history,
-            workspace(self, bordered=unknowns.values.size > 0),
+            workspace(self, bordered=bordered),
         )
         return Solved(z, code, history[:iterations], unknowns.values)
 
@@ -381,7 +390,7 @@ class PeriodicEquations:
 def phase_row(grid: CyclicGrid, z: np.ndarray, states: np.ndarray) -> np.ndarray:
     """Return the row (points, states) of the phase condition against z, given q, q̇, q̈ side by side."""
     folded = np.empty(z.size)
-    kernels("newton", z.shape[1], grid.stencil).phase_row(np.ascontiguousarray(z), states, grid.packed, folded)
+    kernels("border", z.shape[1], grid.stencil).phase_row(np.ascontiguousarray(z), states, grid.packed, folded)
     return np.ascontiguousarray(folded.reshape(z.shape)[grid.place])
 
 
@@ -425,12 +434,12 @@ def winding_numbers(model: Model, winding: int | Mapping[str, int]) -> dict[str,
         turns = _checks.integer("winding", winding)
         if turns and not angles:
             raise ValueError(
-                f"winding: {winding!r} is not allowed; no state of {model.name!r} is an angle, see Model(angles=…)."
+                f"winding: must be 0, got {winding!r}; no state of {model.name!r} is an angle, see Model(angles=…)."
             )
         if turns and len(angles) > 1:
             raise ValueError(
-                f"winding: {winding!r} is not allowed; the model {model.name!r} has the angles {angles} among its "
-                f"states, so name them: winding={{{angles[0]!r}: {turns}}}."
+                f"winding: must name the angles {angles} of {model.name!r}, as {{{angles[0]!r}: {turns}}}, got "
+                f"{winding!r}."
             )
         return dict.fromkeys(angles, turns)
     for name, turns in winding.items():

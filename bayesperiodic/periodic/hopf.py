@@ -1,4 +1,4 @@
-"""Hopf points: where an equilibrium of an autonomous model loses its stability to a cycle, and that cycle."""
+"""Hopf points of autonomous models, and the cycles that start there."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OSCILLATING = 1e-9
 
 @dataclass(frozen=True)
 class HopfPoint(Result):
-    """Where a pair of complex eigenvalues of an equilibrium crosses the imaginary axis.
+    """Hopf point: a pair of complex eigenvalues of an equilibrium crosses the imaginary axis.
 
     Attributes
     ----------
@@ -72,11 +72,11 @@ def hopf_points(
     model : Model
         An autonomous one.
     parameters : mapping of str to float
-        A value for every parameter; that of `vary` is not looked at.
+        A value for every parameter; that of `vary` is ignored.
     vary : str
         A parameter.
     between : (low, high)
-        Where to look. A pair of eigenvalues that crosses the axis and comes back within 1/64 of the way is not seen.
+        Searched range. A pair of eigenvalues that crosses the axis twice within 1/64 of the range is not found.
 
     Returns
     -------
@@ -96,13 +96,11 @@ def hopf_points(
     (True, 0.95493)
     """
     if not model.autonomous:
-        raise ValueError(
-            f"model: {model.name!r} is not allowed; it is driven and never at rest. Give an autonomous one."
-        )
+        raise ValueError(f"model: must be autonomous, got {model.name!r}, which is driven and has no equilibrium.")
     _checks.one_of("vary", vary, model.parameters)
     low, high = (_checks.finite_number(f"between[{i}]", value) for i, value in enumerate(between))
     if not low < high:
-        raise ValueError(f"between: {between!r} is not allowed; the first value must be below the second.")
+        raise ValueError(f"between: must be in ascending order, got {between!r}.")
     given = dict(parameters) | {vary: low}
     _checks.same_names("parameters", given, model.parameters)
     theta = np.array([_checks.finite_number(f"parameters[{n!r}]", given[n]) for n in model.parameters])
@@ -159,11 +157,10 @@ def emerging_cycle(
     'converged'
     """
     if point.model != model.name:
-        raise ValueError(f"model: {model.name!r} is not allowed; the point is one of {point.model!r}.")
+        raise ValueError(f"model: must be {point.model!r}, as of the point, got {model.name!r}.")
     if len(amplitude) != 1:
         raise ValueError(
-            f"amplitude: {dict(amplitude)!r} is not allowed; give that of one state, such as "
-            f"{{{model.states[0]!r}: 0.01}}."
+            f"amplitude: must be that of one state, such as {{{model.states[0]!r}: 0.01}}, got {dict(amplitude)!r}."
         )
     ((state, size),) = amplitude.items()
     _checks.one_of("amplitude", state, model.states)
@@ -171,7 +168,7 @@ def emerging_cycle(
     own = point.mode[model.states.index(state)]
     if not abs(own) > OSCILLATING:
         moving = [name for name, part in zip(model.states, point.mode, strict=True) if abs(part) > OSCILLATING]
-        raise ValueError(f"amplitude: {state!r} is not allowed; it does not move in the oscillation, {moving} do.")
+        raise ValueError(f"amplitude: must be of a state that the oscillation moves, {moving}, got {state!r}.")
     equations = _equations(model, point.frequency, samples, scheme)
     theta = np.array([point.parameters[n] for n in model.parameters])
     shape = point.mode * size / own

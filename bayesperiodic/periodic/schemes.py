@@ -44,15 +44,15 @@ class Scheme:
 
     def __post_init__(self) -> None:
         if not self.order >= 1:
-            raise ValueError(f"order: {self.order!r} is not allowed; it must be at least 1.")
+            raise ValueError(f"order: must be ≥ 1, got {self.order!r}.")
         for argument, weights, derivative in (("first", self.first, 1), ("second", self.second, 2)):
             for power in range(derivative + 1):
                 moment = sum(weight * offset**power for offset, weight in weights.items())
                 wanted = math.factorial(power) if power == derivative else 0
                 if weights and not abs(moment - wanted) < 1e-9:
                     raise ValueError(
-                        f"{argument}: {dict(weights)!r} is not allowed; it gives {moment:.6g} for the derivative of "
-                        f"t**{power} at 0, which is {wanted}."
+                        f"{argument}: must give {wanted} for the derivative of t**{power} at 0, got {moment:.6g} by "
+                        f"{dict(weights)!r}."
                     )
 
     @property
@@ -66,7 +66,7 @@ class Scheme:
         Parameters
         ----------
         points : int
-            Of the grid, which a trigonometric scheme uses all.
+            Of the grid; a trigonometric scheme uses all of them.
 
         Returns
         -------
@@ -126,7 +126,7 @@ def find_scheme(scheme: str | Scheme) -> Scheme:
 
 @dataclass(frozen=True)
 class CyclicGrid:
-    """A scheme laid on one response period: which points each point uses, and where they stand in the folded band.
+    """A scheme on the grid of one response period: the neighbours of every point, and its place in the folded band.
 
     The points are taken in the order 0, n−1, 1, n−2, …, which turns the cyclic band into an ordinary one.
 

@@ -20,7 +20,7 @@ from bayesperiodic.periodic.equations import (
     Solved,
     phase_row,
 )
-from bayesperiodic.periodic.floquet import Floquet, first_order_matrix, floquet
+from bayesperiodic.periodic.floquet import Floquet, change_factors, first_order_matrix, floquet
 from bayesperiodic.periodic.schemes import CyclicGrid, Scheme
 from bayesperiodic.periodic.sensitivity import parameter_sensitivities
 
@@ -64,7 +64,7 @@ def _respond(
     slope: np.ndarray,
     rate: np.ndarray,
 ) -> list[float]:
-    """Return how far a defect of the equations moves each state at most, and an autonomous model's frequency."""
+    """Return the largest change of each state, and of an autonomous model's frequency, by a defect of the equations."""
     points, count = z.shape
     columns = np.concatenate([np.zeros((points, count)), solution.linearisation.reshape(points, -1)], axis=1)
     matrix = grid, np.ascontiguousarray(columns), count, solution.frequency
@@ -92,7 +92,7 @@ NEWTON = "newton"
 
 @dataclass(frozen=True)
 class PeriodicSolution(Result):
-    """A periodic equilibrium state, stable or unstable, or the account of a failed attempt to find one.
+    """A periodic equilibrium state, stable or unstable, or the result of a failed solve.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class PeriodicSolution(Result):
         "converged", "stalled", "singular", "not finite" or "other orbit" (an equilibrium instead of an autonomous
         model's orbit, or an orbit whose period is a fraction of the guess's).
     found_by : str
-        "newton", or what it took: "input amplitude", "time integration", "sharpness" (see `solve_periodic`).
+        "newton", "input amplitude", "time integration" or "sharpness" (see `solve_periodic`).
     frequency : float
         Forcing frequency [Hz]; that of the orbit for an autonomous model.
     samples, periods : int
@@ -216,8 +216,8 @@ class PeriodicSolution(Result):
     def multipliers(self) -> np.ndarray:
         """Floquet multipliers over the response period, complex (multipliers,), largest modulus first.
 
-        Empty unless converged. They are those of the linearised differential equations. An autonomous model's trivial 1
-        is among them.
+        Empty unless converged. They are those of the linearised differential equations, including the trivial 1 of an
+        autonomous model.
         """
         with np.errstate(over="ignore"):
             return np.exp(self.floquet.exponents) if self.floquet is not None else np.empty(0, dtype=complex)
@@ -229,7 +229,7 @@ class PeriodicSolution(Result):
 
     @property
     def stable(self) -> bool:
-        """True if all multipliers, but for an autonomous model's trivial one, are inside the unit circle."""
+        """True if all multipliers except an autonomous model's trivial one are inside the unit circle."""
         if self.floquet is None:
             return False
         exponents = self.floquet.exponents
@@ -240,10 +240,10 @@ class PeriodicSolution(Result):
     def error_estimate(self) -> dict[str, float]:
         """Return the estimated discretisation error of each state, the largest on the grid.
 
-        Richardson's extrapolation of the scheme's derivatives, from steps h and 2h on the same grid, is carried to the
+        Richardson extrapolation of the scheme's derivatives, from steps h and 2h on the same grid, is propagated to the
         states by the linearised equations. For the fourier scheme it is the sum of the amplitudes in the upper quarter
-        of the spectrum. For an autonomous model the error of the frequency [Hz] is there too. Where smooth signs change
-        over within a step or two the grid does not see the error, and the estimate is far too small.
+        of the spectrum. An autonomous model has the error of the frequency [Hz] too. Where smooth signs change within
+        one or two steps, the grid does not resolve the error, and the estimate is far too small.
         """
         if not self.converged:
             return dict.fromkeys(self.states, np.nan)
@@ -261,7 +261,7 @@ class PeriodicSolution(Result):
 def describe(
     equations: PeriodicEquations, theta: np.ndarray, solved: Solved, found_by: str = NEWTON, sensitivities: bool = True
 ) -> PeriodicSolution:
-    """Return a solve as a PeriodicSolution, with sensitivities, if wanted, where it converged."""
+    """Return the result of a solve as a PeriodicSolution, with sensitivities, if requested, where it converged."""
     model, grid, code = equations.model, equations.grid, solved.code
     by_output: dict[str, dict[str, np.ndarray]] = {}
     by_state: dict[str, dict[str, np.ndarray]] = {}
@@ -312,7 +312,7 @@ def equations_of(model: Model, solution: PeriodicSolution) -> tuple[PeriodicEqua
         If the solution is of another model.
     """
     if solution.model != model.name:
-        raise ValueError(f"model: {model.name!r} is not allowed; the solution is one of {solution.model!r}.")
+        raise ValueError(f"model: must be {solution.model!r}, as of the solution, got {model.name!r}.")
     equations = PeriodicEquations.build(
         model,
         solution.inputs,
@@ -327,7 +327,7 @@ def equations_of(model: Model, solution: PeriodicSolution) -> tuple[PeriodicEqua
 
 
 def periodic_part(equations: PeriodicEquations, states: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return z (points, states) from named states that carry their turns."""
+    """Return z (points, states) from named states that include their turns."""
     model, grid = equations.model, equations.grid
     _checks.same_names("guess", states, model.states)
     given = [_checks.finite_vector(f"guess[{n!r}]", states[n], grid.points, "samples·periods") for n in model.states]
@@ -336,20 +336,19 @@ def periodic_part(equations: PeriodicEquations, states: Mapping[str, np.ndarray]
 
 
 def as_guess(equations: PeriodicEquations, guess: Mapping[str, np.ndarray] | PeriodicSolution) -> np.ndarray:
-    """Return z (points, states) from named states, or from a solution, brought to the grid and repeated as needed.
+    """Return z (points, states) from named states, or from a solution, interpolated to the grid and repeated as needed.
 
     Raises
     ------
     ValueError
-        For unknown or missing states, arrays of a wrong length, a solution whose periods do not divide those wanted.
+        For unknown or missing states, arrays of a wrong length, a solution whose periods do not divide the required.
     """
     if not isinstance(guess, PeriodicSolution):
         return periodic_part(equations, guess)
     _checks.same_names("guess", guess.states, equations.model.states)
     if equations.grid.periods % guess.periods:
         raise ValueError(
-            f"guess: a solution of {guess.periods} periods is not allowed; its periods must divide "
-            f"{equations.grid.periods}."
+            f"guess: must be a solution whose periods divide {equations.grid.periods}, got one of {guess.periods}."
         )
     z = np.stack([guess.states[name] - guess._turns(name) for name in equations.model.states])
     times = equations.grid.periods // guess.periods
@@ -362,3 +361,112 @@ def _by_name(
     values: np.ndarray, rows: tuple[str, ...], directions: tuple[str, ...]
 ) -> dict[str, dict[str, np.ndarray]]:
     return {row: {name: values[d, :, r].copy() for d, name in enumerate(directions)} for r, row in enumerate(rows)}
+
+
+def multiplier_sensitivities(model: Model, solution: PeriodicSolution) -> dict[str, np.ndarray]:
+    r"""Return ∂multiplier/∂parameter, and for a forced model ∂multiplier/∂frequency [per Hz].
+
+    .. math::
+
+        \mathrm{d} \log \mu = \int \frac{w^T \, \mathrm{d}A \, v}{w^T v} \, \mathrm{d}t
+
+    over the response period, with the eigenfunctions v of the linearised equations ẏ = A y and w of their adjoint; dA
+    holds the direct change and that through the orbit. A multiplier that occurs
+    twice has no derivative, and the result is not finite or large there.
+
+    Parameters
+    ----------
+    model : Model
+        That of the solution.
+    solution : PeriodicSolution
+        A converged one.
+
+    Returns
+    -------
+    dict of str to complex array (multipliers,)
+        In the order of ``solution.multipliers``.
+
+    Raises
+    ------
+    ValueError
+        If the solution has not converged or is one of another model.
+
+    Examples
+    --------
+    >>> import numpy as np, bayesperiodic as bp
+    >>> force = np.cos(2 * np.pi * np.arange(200) / 200)
+    >>> solution = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
+    ...                              frequency=0.1, samples=200)
+    >>> by_parameter = bp.multiplier_sensitivities(bp.models.duffing, solution)
+    >>> mu = solution.multipliers                    # Liouville: the product of the multipliers is exp(-c/m · period)
+    >>> round(float(sum(by_parameter["c"] / mu).real), 6) == -10.0
+    True
+    """
+    equations, theta, z = equations_of(model, solution)
+    derivative = parameter_sensitivities(equations, z, theta) if solution.converged else None
+    if solution.floquet is None or derivative is None:
+        raise ValueError(
+            f"solution: must have converged and be regular, got status {solution.status!r}. Solve again from another "
+            "guess."
+        )
+    names = [*model.parameters, FREQUENCY][: len(derivative.frequency)]
+    directions = np.eye(len(names), theta.size)
+    frequency = derivative.frequency if model.autonomous else np.eye(len(names))[-1]
+    logarithmic = logarithmic_changes(equations, theta, z, solution, derivative.states, directions, frequency)
+    return {name: solution.multipliers * change for name, change in zip(names, logarithmic, strict=True)}
+
+
+def logarithmic_changes(
+    equations: PeriodicEquations,
+    theta: np.ndarray,
+    z: np.ndarray,
+    solution: PeriodicSolution,
+    states: np.ndarray,
+    directions: np.ndarray,
+    frequency: np.ndarray,
+    count: int | None = None,
+) -> np.ndarray:
+    """Return the changes of log μ along directions, complex (directions, multipliers).
+
+    Parameters
+    ----------
+    equations : PeriodicEquations
+    theta : array (parameters,)
+    z : array (points, states)
+        A solution.
+    solution : PeriodicSolution
+        The same, with its Floquet multipliers.
+    states : array (directions, points, states)
+        Changes of z.
+    directions : array (directions, parameters)
+        Changes of the parameters.
+    frequency : array (directions,)
+        Changes of the frequency [Hz].
+    count : int, optional
+        Number of the largest multipliers to consider; by default all.
+    """
+    assert solution.floquet is not None
+    model, orders, sizes = equations.model, tuple(solution.orders.values()), solution._sizes()
+    v, w = solution.floquet.leading(len(solution.multipliers) if count is None else count)
+    v, w = v * sizes, w / sizes
+    matrix, jacobian = first_order_matrix(solution.linearisation, orders), solution.linearisation
+    left, right = change_factors(jacobian, orders, matrix, v, w)
+    overlap = np.einsum("mnp,mnp->mn", w, v)
+    stretching = np.einsum("mnp,npq,mnq->mn", w, matrix, v)
+    state_rates, input_rates = equations.frequency_changes(z)
+    moved = equations.changes(states)
+    here, change = equations.states(z), np.empty((len(z), jacobian[0].size))
+    result = np.empty((len(directions), len(v)), dtype=complex)
+    for d, direction in enumerate(directions):
+        model.jacobian_change(
+            np.ascontiguousarray(np.concatenate([here, moved[d] + frequency[d] * state_rates], axis=1)),
+            np.ascontiguousarray(np.concatenate([equations.inputs, frequency[d] * input_rates], axis=1)),
+            np.concatenate([theta, direction, frequency[d : d + 1]]),
+            equations.grid.tau,
+            equations.frequency,
+            change,
+        )
+        rates = np.einsum("mne,nej,mnj->mn", left, change.reshape(jacobian.shape), right, optimize=True)
+        rates -= frequency[d] / equations.frequency * stretching
+        result[d] = solution.period * (rates / overlap).mean(axis=1)
+    return result

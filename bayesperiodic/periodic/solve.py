@@ -1,4 +1,4 @@
-"""`solve_periodic`: from arguments to a periodic equilibrium state, with what is tried before giving up."""
+"""`solve_periodic`: find a periodic equilibrium state, with fallbacks."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -21,7 +21,7 @@ SMALLEST_SHARPENING = 1.02
 
 
 def raise_amplitude(equations: PeriodicEquations, parameters: np.ndarray, static: np.ndarray) -> Solved | None:
-    """Follow the solution while the inputs' variation about their means grows from nothing; None if that fails."""
+    """Continue the solution while the variation of the inputs about their means grows from zero; None if that fails."""
     if not equations.model.inputs:
         return None
     mean = np.zeros_like(equations.inputs)
@@ -44,7 +44,7 @@ def raise_amplitude(equations: PeriodicEquations, parameters: np.ndarray, static
 
 
 def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndarray) -> Solved | None:
-    """Solve with soft signs first and sharpen them step by step; None if that fails or there are none."""
+    """Solve with softened signs first and sharpen them step by step; None if that fails or there are none."""
     if not equations.model.smooth_signs:
         return None
     soft = PeriodicEquations(
@@ -73,9 +73,9 @@ NUDGE = 0.1
 
 
 def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: np.ndarray) -> np.ndarray | None:
-    """Return z (points, states) over the last of some tens of response periods after starting at rest at start[0].
+    """Return z (points, states) over the last of `PERIODS` response periods, integrated from rest at start[0].
 
-    None if the integration fails or an angle does not advance by the turns wanted.
+    None if the integration fails or an angle does not advance by its winding number.
     """
     grid, count = equations.grid, equations.count
     second = [i for i, state in enumerate(equations.model.states) if equations.model.orders[state] == 2]
@@ -101,10 +101,10 @@ def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: 
 
 
 def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Return z (points, states) and frequency [Hz] of the cycle that an autonomous model settles on; None without one.
+    """Return z (points, states) and frequency [Hz] of the cycle that an autonomous model approaches; None without one.
 
-    The integration starts near the equilibrium; the cycle is what lies between the last two upward passages of the
-    widest moving state through the middle of its range.
+    The integration starts near the equilibrium; the cycle lies between the last two upward passages of the state of
+    largest relative range through the middle of its range.
     """
     grid, count, model = equations.grid, equations.count, equations.model
     equilibrium = equations.static_guess(parameters)[0]
@@ -153,8 +153,8 @@ def solve_periodic(
 
     The equations are discretised with a cyclic difference scheme and solved by a damped Newton method with step
     halving ([1]_, eq. 2-4). If that fails, smooth signs are softened and sharpened again step by step; then, from the
-    static guess, the inputs' variation is raised from zero along the branch of solutions, and at last a short time
-    integration is tried.
+    static guess, the variation of the inputs is raised from zero along the branch of solutions, and finally a short
+    time integration is tried.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def solve_periodic(
     samples : int
         Grid points per forcing period.
     scheme : str or Scheme
-        "central2" (accurate for smooth responses), "backward2" (calmer where the response has kinks), "central4" or
+        "central2" (accurate for smooth responses), "backward2" (better where the response has kinks), "central4" or
         "fourier" (collocation as in harmonic balance, the most accurate for smooth responses; few points suffice).
     periods : int
         Forcing periods per response period.
@@ -176,10 +176,9 @@ def solve_periodic(
         Turns that an angle advances per response period.
     guess : "static", "integration", mapping of str to array (samples·periods,), or PeriodicSolution
         The equilibrium under the mean inputs, the end of a short time integration from there, every state (turns of
-        angles included), or an earlier solution, on any grid, of as many periods or a fraction of them. An integration
-        that fails or does not lock to the winding is no guess, and the static one is taken. An autonomous model has no
-        use for its equilibrium, so "static" means an integration from near it; the phase of its orbit is the one
-        closest to the guess.
+        angles included), or an earlier solution, on any grid, of as many periods or a fraction of them. If the
+        integration fails or does not lock to the winding number, the static guess is used. For an autonomous model
+        "static" means an integration from near the equilibrium; the phase of its orbit is the closest to the guess.
 
     Returns
     -------
@@ -190,13 +189,12 @@ def solve_periodic(
     ------
     ValueError
         For unknown or missing names, inputs of a wrong length or not finite, a frequency ≤ 0, too few samples for the
-        scheme, a winding number for what is no angle, an autonomous model whose guess is constant in time, so that no
-        phase can be fixed.
+        scheme, a winding number of a state that is not an angle, a guess constant in time for an autonomous model.
 
     Warns
     -----
     UserWarning
-        If a smooth sign changes over within fewer than four steps of the grid.
+        If the transition of a smooth sign takes fewer than four steps of the grid.
 
     References
     ----------
@@ -229,9 +227,9 @@ def solve_periodic(
     solution = describe(equations, theta, solved, found_by)
     if solution.converged and (steps := _steps_of_transitions(equations, theta, solved.z)) < FEW_STEPS:
         warnings.warn(
-            f"A smooth sign of {model.name!r} changes over within {steps:.2g} steps of the grid; "
-            f"{int(np.ceil(samples * FEW_STEPS / steps))} samples would resolve it. Until then the error may be far "
-            "larger than error_estimate says.",
+            f"The transition of a smooth sign of {model.name!r} takes {steps:.2g} steps of the grid; "
+            f"{int(np.ceil(samples * FEW_STEPS / steps))} samples would resolve it. With fewer, the error may be far "
+            "larger than error_estimate.",
             UserWarning,
             stacklevel=2,
         )
@@ -262,7 +260,7 @@ def solve_from(equations: PeriodicEquations, theta: np.ndarray, start: np.ndarra
 
 
 def solve_from_rest(equations: PeriodicEquations, theta: np.ndarray) -> tuple[Solved, str]:
-    """Solve a forced problem from its static equilibrium, by all means; return the solve and how it was found."""
+    """Solve a forced problem from its static equilibrium, trying all fallbacks; return the solve and how it was found."""
     static = equations.static_guess(theta)
 
     def integrated() -> Solved | None:
@@ -316,8 +314,8 @@ def solve_free(
         z = as_guess(equations, guess)
         if np.all(np.ptp(z, axis=0) == 0.0):
             raise ValueError(
-                f"guess: states constant in time are not allowed; {equations.model.name!r} is autonomous, and only a "
-                "guess that moves fixes the phase."
+                f"guess: must vary in time, got constant states; {equations.model.name!r} is autonomous, and the guess "
+                "fixes the phase."
             )
     equations = replace(equations, frequency=frequency)
     found = solve_autonomous(equations, theta, z, frequency)
@@ -335,14 +333,14 @@ def collapsed(z: np.ndarray, guess: np.ndarray) -> bool:
 
 
 def has_shorter_period(z: np.ndarray) -> bool:
-    """Return whether only every k-th harmonic is there, for a k of 2 or more."""
+    """Return whether only every k-th harmonic is present, for a k of 2 or more."""
     power = np.sum(np.abs(np.fft.rfft(z, axis=0)) ** 2, axis=1)[1:]
     present = np.flatnonzero(power > ABSENT**2 * power.max()) + 1
     return bool(power.max() > 0 and np.gcd.reduce(present) > 1)
 
 
 def _steps_of_transitions(equations: PeriodicEquations, theta: np.ndarray, z: np.ndarray) -> float:
-    """Return in how few steps of the grid a smooth sign goes from −0.76 to 0.76 (its argument from −1 to 1)."""
+    """Return the fewest steps of the grid in which a smooth sign's argument goes from −1 to 1."""
     if not equations.model.smooth_signs:
         return np.inf
     arguments = equations.evaluate("transitions", z, theta)

@@ -16,9 +16,8 @@ from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities
-from bayesperiodic.periodic.solution import PeriodicSolution, describe
+from bayesperiodic.periodic.solution import PeriodicSolution, describe, logarithmic_changes
 from bayesperiodic.periodic.solve import solve_forced, solve_free
-from bayesperiodic.periodic.stability import logarithmic_changes
 from bayesperiodic.posterior.observation import Observation, Response
 from bayesperiodic.posterior.parameters import ParameterMap, ParameterMaps
 

@@ -337,7 +337,7 @@ def test_branch_that_ends_early_is_incomplete():
 
 
 def test_solution_without_a_multiplier_near_minus_one_is_not_doubled(resonance):
-    with pytest.raises(ValueError, match="solution: multipliers .* are not allowed; one must be near -1"):
+    with pytest.raises(ValueError, match="solution: must have a multiplier near -1, got"):
         bp.double_period(bp.models.duffing, resonance[0], "frequency")
 
 
@@ -350,12 +350,12 @@ def test_error_names_the_unknown_quantity_of_a_doubling(rotation):
     ("changes", "message"),
     [
         ({"vary": "k4"}, "vary: must be one of .*'force', 'frequency', got 'k4'. Did you mean 'k'"),
-        ({"until": 0.1}, "until: 0.1 is not allowed; frequency has that value at the start"),
+        ({"until": 0.1}, "until: must differ from the start value of frequency, got 0.1"),
         ({"until": -0.1}, "until: must be > 0, got -0.1"),
         ({"until": np.nan}, "until: must be .*got nan"),
         ({"step": 0.0}, "step: must be > 0, got 0.0"),
-        ({"vary": "force", "until": 1.0}, "until: 1.0 is not allowed; force has that value at the start"),
-        ({"model": bp.models.dahl}, "model: 'dahl' is not allowed; the solution is one of 'duffing'"),
+        ({"vary": "force", "until": 1.0}, "until: must differ from the start value of force, got 1.0"),
+        ({"model": bp.models.dahl}, "model: must be 'duffing', as of the solution, got 'dahl'"),
     ],
 )
 def test_error_names_the_bad_argument(resonance, changes, message):
@@ -366,9 +366,9 @@ def test_error_names_the_bad_argument(resonance, changes, message):
 
 def test_unconverged_solution_is_refused(resonance):
     failed = replace(resonance[0], status="stalled")
-    with pytest.raises(ValueError, match="solution: status 'stalled' is not allowed; it must have converged"):
+    with pytest.raises(ValueError, match="solution: must have converged, got status 'stalled'"):
         bp.continue_periodic(bp.models.duffing, failed, "k", until=2.0, progress=False)
-    with pytest.raises(ValueError, match="solution: status 'stalled' is not allowed; it must have converged"):
+    with pytest.raises(ValueError, match="solution: must have converged, got status 'stalled'"):
         bp.double_period(bp.models.duffing, failed, "k")
 
 

@@ -188,10 +188,10 @@ def switch(steps: float, samples: int) -> bp.PeriodicSolution:
 
 @pytest.mark.parametrize("steps", [0.3, 2.5, 3.9])
 def test_warning_states_the_samples_that_resolve_a_narrow_transition(steps):
-    with pytest.warns(UserWarning, match="A smooth sign of 'switch' changes over within") as caught:
+    with pytest.warns(UserWarning, match="The transition of a smooth sign of 'switch' takes") as caught:
         switch(steps, 100)
     assert len(caught) == 1 and caught[0].filename == __file__
-    told, samples = re.search(r"within ([\d.]+) steps of the grid; (\d+) samples", str(caught[0].message)).groups()
+    told, samples = re.search(r"takes ([\d.]+) steps of the grid; (\d+) samples", str(caught[0].message)).groups()
     assert float(told) == pytest.approx(steps, rel=0.05)
     assert int(samples) == pytest.approx(100 * 4 / steps, rel=0.05)
     with warnings.catch_warnings():

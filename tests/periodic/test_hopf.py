@@ -65,18 +65,18 @@ def test_stable_cycles_agree_with_time_integration(branch, speed):
 
 
 def test_error_for_a_value_without_an_orbit_names_the_fold(branch):
-    with pytest.raises(ValueError, match=r"U = 14.5 m/s is not allowed.*no orbit there, the nearest is at its fold at"):
+    with pytest.raises(ValueError, match=r"got U = 14.5 m/s; the nearest orbit is at its fold at"):
         bp.solutions_at(bp.models.flutter, branch, 14.5)
-    with pytest.raises(ValueError, match=r"U = 20 m/s is not allowed.*the nearest is at its end at 18.07"):
+    with pytest.raises(ValueError, match=r"got U = 20 m/s; the nearest orbit is at its end at 18.07"):
         bp.solutions_at(bp.models.flutter, branch, 20.0)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"model": bp.models.pendulum}, "model: 'pendulum' is not allowed; it is driven"),
+        ({"model": bp.models.pendulum}, "model: must be autonomous, got 'pendulum', which is driven"),
         ({"vary": "V"}, "vary: must be .*got 'V'"),
-        ({"between": (20.0, 10.0)}, "between: .20.0, 10.0. is not allowed; the first value must be below"),
+        ({"between": (20.0, 10.0)}, "between: must be in ascending order, got .20.0, 10.0."),
         ({"parameters": {"b": 0.15}}, "parameters: "),
     ],
 )
@@ -92,7 +92,7 @@ def test_bad_amplitudes_are_refused():
         with pytest.raises(ValueError, match=message):
             bp.emerging_cycle(bp.models.flutter, point, amplitude=amplitude)
     still = replace(point, mode=np.array([1.0, 0.0, 0.5j]))
-    with pytest.raises(ValueError, match=r"'alpha' is not allowed; it does not move .*, \['h', 'w'\] do"):
+    with pytest.raises(ValueError, match=r"must be of a state that the oscillation moves, \['h', 'w'\], got 'alpha'"):
         bp.emerging_cycle(bp.models.flutter, still, amplitude={"alpha": 0.01})
     with pytest.raises(ValueError, match="the point is one of 'flutter'"):
         bp.emerging_cycle(bp.models.van_der_pol, point, amplitude={"x": 1.0})

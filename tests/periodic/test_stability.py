@@ -226,8 +226,8 @@ def test_unstable_limit_cycle_of_three_states():
 
 def test_another_model_or_an_unconverged_solution_is_refused():
     solution, _ = duffing("complex pair")
-    with pytest.raises(ValueError, match="model: 'van_der_pol' is not allowed; the solution is one of 'duffing'"):
+    with pytest.raises(ValueError, match="model: must be 'duffing', as of the solution, got 'van_der_pol'"):
         bp.multiplier_sensitivities(bp.models.van_der_pol, solution)
     wrong = replace(solution, status="stalled")
-    with pytest.raises(ValueError, match="solution: status 'stalled' is not allowed; it must have converged"):
+    with pytest.raises(ValueError, match="solution: must have converged and be regular, got status 'stalled'"):
         bp.multiplier_sensitivities(bp.models.duffing, wrong)

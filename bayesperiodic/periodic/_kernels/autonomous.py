@@ -35,17 +35,16 @@ from bayesperiodic.periodic.compiled import (
 )
 
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
-    from bayesperiodic.periodic._kernels.linear import OPTIONS, copy, fold, solve_bordered, unfold
+    from bayesperiodic.periodic._kernels.border import folded_product, phase_row, solve_bordered
+    from bayesperiodic.periodic._kernels.linear import OPTIONS, copy, fold, unfold
     from bayesperiodic.periodic._kernels.newton import (
         FAR,
         SMALLEST_PART,
         differentiate,
         dot,
-        folded_product,
         is_far,
         largest,
         newton,
-        phase_row,
         predict,
     )
 

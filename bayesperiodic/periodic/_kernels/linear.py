@@ -1,4 +1,4 @@
-"""Compiled linear algebra of the periodic solver: systems with the cyclic block band ∂g/∂z, also bordered.
+"""Compiled linear algebra of the periodic solver: systems with the cyclic block band ∂g/∂z.
 
 The band is factored in one of two ways. Both are stable for any Floquet multipliers, unlike a single march through the
 period:
@@ -10,15 +10,12 @@ period:
   Rows of the band are stored side by side: entry (i, j) of the matrix is ``band[i, j - i + lower]``, the width is
   2·lower + upper + 1 and leaves room for the fill-in of row exchanges. It is read through flat, unsigned indices,
   which avoids a test for negative ones at every access.
-
-A bordered system is solved also where ∂g/∂z is singular, as it is along the orbit of an autonomous model and at folds.
 """
 
 import numpy as np
 from numba import njit, types
 
 from bayesperiodic.periodic.compiled import (
-    BORDER,
     COUNT,
     FACTORS,
     FLAG,
@@ -414,100 +411,3 @@ def back_substitute(grid, factors, right):
                     value += moved[np.uint64((e * block + c) * points) + j] * x[0, q * block + c]
                 out[j * np.uint64(count) + np.uint64(e)] = value
         start = ends[q + 1] + 1
-
-
-@njit(NUMBER(MATRIX, PLACES), **OPTIONS)
-def determinant_sign(band, pivots):
-    """Return the sign of the determinant, without the last pivot, of a matrix factored by `factor`."""
-    sign, lower = 1.0, (band.shape[1] - 1) // 3
-    for j in range(band.shape[0] - 1):
-        if (band[j, lower] < 0.0) != (pivots[j] != j):
-            sign = -sign
-    return sign
-
-
-@njit(NUMBER(MATRIX, PLACES, BORDER), **OPTIONS)
-def factor_bordered(band, pivots, border):
-    """Factor [∂g/∂z, B; C, D] in place; return the sign of its determinant, 0 where it is singular.
-
-    The last pivot of ∂g/∂z in the folded order, where the singularity of a cyclic system gathers, is replaced by one of
-    ordinary size; the change is undone by one more bordering unknown. Along a branch of solutions the sign changes only
-    at folds.
-
-    Parameters
-    ----------
-    band : array (size, 3·lower + 1)
-        The folded band of ∂g/∂z.
-    pivots : int array (size,)
-        Filled.
-    border : Border
-        In the folded order.
-    """
-    columns, rows, small = border.columns, border.rows, border.small
-    borders, size, lower = rows.shape[0], band.shape[0], (band.shape[1] - 1) // 3
-    pivots[size - 1] = -1
-    regular = factor(band, lower, lower, pivots)
-    pivot = band[size - 1, lower]
-    if pivots[size - 1] < 0 or not abs(pivot) < np.inf:
-        return 0.0
-    logarithm, at = 0.0, size - 1
-    for j in range(size - 2, -1, -1):
-        logarithm -= np.log(abs(band[j, lower]))
-        if pivots[j] == at:
-            at = j
-        elif at == j:
-            at = pivots[j]
-    ordinary = np.exp(logarithm / max(size - 1, 1))
-    band[size - 1, lower] = 1.0 / ordinary
-    for i in range(size):
-        columns[borders, i] = 0.0
-    columns[borders, at] = ordinary - 1.0 / pivot if regular else ordinary
-    solve(band, lower, lower, pivots, columns)
-    for c in range(small.shape[0]):
-        for k in range(small.shape[1]):
-            small[c, k] = 0.0
-        for b in range(small.shape[0]):
-            entry = b - c + borders
-            sign = 1.0 if b == borders else -1.0
-            if c == borders:
-                small[c, entry] = sign * columns[b, size - 1]
-            else:
-                for i in range(size):
-                    small[c, entry] += sign * rows[c, i] * columns[b, i]
-                if b < borders:
-                    small[c, entry] += border.corner[c, b]
-    small[borders, borders] -= 1.0
-    if not factor(small, borders, borders, border.pivots):
-        return 0.0
-    last = -1.0 if small[borders, borders] < 0.0 else 1.0
-    return -determinant_sign(band, pivots) * determinant_sign(small, border.pivots) * last
-
-
-@njit(types.void(MATRIX, PLACES, BORDER, MATRIX, MATRIX), **OPTIONS)
-def solve_bordered(band, pivots, border, right, below):
-    """Solve [∂g/∂z, B; C, D]·(x, y) = (right, below) in place with the factors of `factor_bordered`.
-
-    Parameters
-    ----------
-    right : array (sides, size)
-        In the folded order; overwritten by x.
-    below : array (sides, borders)
-        Overwritten by y.
-    """
-    columns, rows = border.columns, border.rows
-    borders, size, lower = rows.shape[0], band.shape[0], (band.shape[1] - 1) // 3
-    known = np.empty((1, borders + 1))
-    solve(band, lower, lower, pivots, right)
-    for r in range(right.shape[0]):
-        for c in range(borders):
-            known[0, c] = below[r, c]
-            for i in range(size):
-                known[0, c] -= rows[c, i] * right[r, i]
-        known[0, borders] = -right[r, size - 1]
-        solve(border.small, borders, borders, border.pivots, known)
-        for c in range(borders):
-            below[r, c] = known[0, c]
-            for i in range(size):
-                right[r, i] -= known[0, c] * columns[c, i]
-        for i in range(size):
-            right[r, i] += known[0, borders] * columns[borders, i]

@@ -1,8 +1,10 @@
-"""Compiled Newton iteration: discretisation, residual norms, phase condition, driven and bordered solves.
+"""Compiled Newton iteration, with the discretisation, residual norms, and predictions from anchors.
 
 The iteration is that of de Kraker, Verbeek & van de Wouw (1997), eq. (3): damped, with step halving. Further unknowns
 (the frequency of an autonomous model, the parameter of a continuation) border the linear systems. A failed solve is a
 status, not an exception.
+
+The source is compiled with and without further unknowns (`BORDERED`); without, in half the time.
 """
 
 from typing import TYPE_CHECKING
@@ -35,20 +37,17 @@ from bayesperiodic.periodic.compiled import (
 )
 
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
+    from bayesperiodic.periodic._kernels.border import bordered_step, fill_setting
     from bayesperiodic.periodic._kernels.linear import (
         OPTIONS,
         STATES,
         WIDTH,
-        assemble,
         back_substitute,
         copy,
-        factor_bordered,
         factorise,
-        fold,
-        solve_bordered,
-        unfold,
     )
 
+BORDERED = globals().get("BORDERED", True)
 CHORD_RATE = 0.2
 ROUNDING = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
@@ -178,124 +177,6 @@ def scaled_step(z, step):
     return result
 
 
-@njit(NUMBER(MATRIX, MATRIX, GRID, VECTOR), **OPTIONS)
-def phase_row(z, states, grid, row):
-    """Fill the row (size,), folded, of the phase condition ∫ q_z'·(q − q_z) dτ = 0 against z; return row · z.
-
-    States are in units of their range; the row has unit length. `states` are those of z.
-    """
-    points, count = z.shape[0], z.shape[1]
-    rates, square, target = np.empty((points, count)), 0.0, 0.0
-    for s in range(count):
-        low, high, mean = np.inf, -np.inf, 0.0
-        for i in range(points):
-            low, high = min(low, z[i, s]), max(high, z[i, s])
-            mean += states[i, count + s] / points
-        unit = high - low if high > low else 1.0
-        for i in range(points):
-            rates[i, s] = (states[i, count + s] - mean) / unit**2
-            square += rates[i, s] ** 2
-    length = np.sqrt(square) if square > 0.0 else 1.0
-    for i in range(points):
-        for s in range(count):
-            rates[i, s] /= length
-            target += rates[i, s] * z[i, s]
-    fold(rates, grid, row)
-    return target
-
-
-@njit(NUMBER(SETTING, UNKNOWNS, VECTOR, MATRIX, VECTOR), **OPTIONS)
-def fill_setting(setting, unknowns, values, inputs, parameters):
-    """Fill inputs and parameters at values of the unknowns, from the setting at zeros; return the frequency."""
-    count, frequency = inputs.shape[1] // 3, setting.frequency
-    copy(setting.inputs, inputs)
-    for p in range(parameters.size):
-        parameters[p] = setting.parameters[p]
-    for k in range(values.size):
-        for p in range(parameters.size):
-            parameters[p] += values[k] * unknowns.parameters[k, p]
-        for i in range(unknowns.inputs.shape[1]):
-            for j in range(3 * count):
-                inputs[i, j] += values[k] * unknowns.inputs[k, i, j]
-        if k == unknowns.frequency:
-            frequency = values[k]
-    if frequency != setting.frequency:
-        ratio = frequency / setting.frequency
-        for i in range(inputs.shape[0]):
-            for j in range(count):
-                inputs[i, count + j] *= ratio
-                inputs[i, 2 * count + j] *= ratio**2
-    return frequency
-
-
-@njit(types.void(FUNCTIONS, GRID, SETTING, UNKNOWNS, MATRIX, MATRIX, MATRIX, MATRIX), **OPTIONS)
-def fill_slopes(functions, grid, setting, unknowns, states, columns, table, slopes):
-    """Fill the first rows of `slopes` with ∂g/∂(unknowns), z held as a function of tau, folded.
-
-    `states` and `columns` are those of `residual_jacobian` at z; `table` has room for the columns of `derivatives`.
-    """
-    points, parameters, frequency = states.shape[0], setting.parameters.size, setting.frequency
-    count, inputs = states.shape[1] // 3, setting.inputs.shape[1]
-    grid_function_at(functions.derivatives)(states, setting.inputs, setting.parameters, grid.tau, frequency, table)
-    by_input, by_frequency = count * parameters, count * (parameters + inputs)
-    for k in range(unknowns.values.size):
-        for i in range(points):
-            for e in range(count):
-                value = 0.0
-                for p in range(parameters):
-                    value += table[i, e * parameters + p] * unknowns.parameters[k, p]
-                if unknowns.inputs.shape[1] > 0:
-                    for j in range(inputs):
-                        value += table[i, by_input + e * inputs + j] * unknowns.inputs[k, i, j]
-                if k == unknowns.frequency:
-                    value += table[i, by_frequency + e]
-                    for s in range(3 * count):
-                        value += columns[i, count + e * 3 * count + s] * (s // count) * states[i, s] / frequency
-                    for j in range(inputs):
-                        order = 3 * j // inputs
-                        value += table[i, by_input + e * inputs + j] * order * setting.inputs[i, j] / frequency
-                slopes[k, grid.place[i] * count + e] = value
-
-
-@njit(NUMBER(MATRIX, VECTOR, GRID), **OPTIONS)
-def folded_product(z, row, grid):
-    """Return row · z, the row (size,) in the folded order."""
-    total, count = 0.0, z.shape[1]
-    for i in range(z.shape[0]):
-        for s in range(count):
-            total += row[grid.place[i] * count + s] * z[i, s]
-    return total
-
-
-@njit(
-    types.Tuple([NUMBER, NUMBER])(
-        FUNCTIONS, GRID, SETTING, UNKNOWNS, BORDER, MATRIX, MATRIX, MATRIX, MATRIX, WORKSPACE, VECTOR
-    ),
-    **OPTIONS,
-)
-def bordered_step(functions, grid, setting, unknowns, border, states, columns, z, step, work, change):
-    """Fill the Newton step of z and of the unknowns' values; return its size and the orientation, 0 if singular."""
-    borders, count, factors = unknowns.values.size, z.shape[1], work.factors
-    fill_slopes(functions, grid, setting, unknowns, states, columns, work.derivatives, border.columns)
-    assemble(columns, grid, count, setting.frequency, factors.band)
-    orientation = factor_bordered(factors.band, factors.pivots, border)
-    if orientation == 0.0:
-        return np.inf, 0.0
-    right, below, size = np.empty((1, z.size)), np.empty((1, borders)), 0.0
-    fold(step, grid, right[0])
-    for b in range(borders):
-        below[0, b] = unknowns.targets[b] - folded_product(z, border.rows[b], grid)
-        for c in range(borders):
-            below[0, b] -= border.corner[b, c] * unknowns.values[c]
-    solve_bordered(factors.band, factors.pivots, border, right, below)
-    unfold(right[0], grid, step)
-    for k in range(borders):
-        change[k] = below[0, k]
-        own = abs(change[k]) / max(unknowns.scales[k], abs(unknowns.values[k]))
-        size = max(size, own) if own < np.inf else np.inf
-    return size, orientation
-
-
 @njit(
     types.Tuple([COUNT, COUNT, NUMBER])(FUNCTIONS, GRID, SETTING, UNKNOWNS, BORDER, COUNT, MATRIX, MATRIX, WORKSPACE),
     **OPTIONS,
@@ -313,7 +194,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     setting : Setting
         At values of zero, except for the frequency.
     unknowns : Unknowns
-        `values` are overwritten. There may be none; ∂g/∂z must then be regular.
+        `values` are overwritten. There are none unless `BORDERED`; ∂g/∂z must then be regular.
     border : Border
         Rows and corner of the conditions.
     halvings : int
@@ -337,7 +218,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     step, trial = np.empty((points, count)), np.empty((points, count))
     inputs, parameters, frequency = setting.inputs, setting.parameters, setting.frequency
     values, change, orientation = np.empty(borders), np.empty(borders), 0.0
-    if borders > 0:
+    if BORDERED:
         inputs, parameters = np.empty_like(inputs), np.empty_like(parameters)
         frequency = fill_setting(setting, unknowns, unknowns.values, inputs, parameters)
     differentiate(z, drift, grid, frequency, states)
@@ -349,7 +230,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
         before = norm(columns, size)
         if not np.isfinite(before):
             return NOT_FINITE, iteration, orientation
-        if iteration == 0 and borders == 0 and norm(columns, rounding) <= 1.0 and np.all(amplitude > 0.0):
+        if iteration == 0 and not BORDERED and norm(columns, rounding) <= 1.0 and np.all(amplitude > 0.0):
             return CONVERGED, 0, orientation
         for s in range(count):
             if amplitude[s] == 0.0:
@@ -358,7 +239,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
             for s in range(count):
                 step[i, s] = -columns[i, s]
         full = 0.0
-        if borders > 0:
+        if BORDERED:
             here = Setting(inputs, parameters, frequency, drift)
             full, orientation = bordered_step(
                 functions, grid, here, unknowns, border, states, columns, z, step, work, change
@@ -380,14 +261,14 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
                     trial[i, s] = z[i, s] + damping * step[i, s]
             for k in range(borders):
                 values[k] = unknowns.values[k] + damping * change[k]
-            if borders == 0 or unknowns.frequency < 0 or values[unknowns.frequency] > 0.0:
-                if borders > 0:
+            if not BORDERED or unknowns.frequency < 0 or values[unknowns.frequency] > 0.0:
+                if BORDERED:
                     frequency = fill_setting(setting, unknowns, values, inputs, parameters)
                 differentiate(trial, drift, grid, frequency, states)
                 residual_jacobian(states, inputs, parameters, tau, frequency, columns)
                 after = norm(columns, size)
                 accepted = after <= (1.0 - 1e-4 * damping) * before or full <= STEP_TOLERANCE
-                if accepted or (borders > 0 and norm(columns, rounding) <= 1.0):
+                if accepted or (BORDERED and norm(columns, rounding) <= 1.0):
                     accepted = True
                     break
             damping *= 0.5
