@@ -240,10 +240,11 @@ class Batch:
         functions = model.kernels.residual_jacobian, products.outputs_vjp, products.equations_vjp
         addresses, gradients = np.array([f.address for f in functions]), np.empty((self._size, len(moving)))
         points = [np.ascontiguousarray(part) for part in (parameters, z, weights)]
+        compiled = kernels("adjoint", self._first.count, grid.stencil)
 
         def part(block: tuple[int, int]) -> None:
             factors = empty_factors(grid, self._first.count)
-            self._kernels.vjp_many(addresses, grid.packed, self._sets, *points, factors, *block, gradients)
+            compiled.vjp_many(addresses, grid.packed, self._sets, *points, factors, *block, gradients)
 
         _in_blocks(part, self._size, SMALLEST_PART, threads, each=1)
         return gradients

@@ -268,6 +268,7 @@ MODULES = {
     "newton": ("newton", "linear"),
     "bordered newton": ("newton", "border"),
     "batch": ("batch", "newton"),
+    "adjoint": ("adjoint", "batch"),
     "autonomous": ("autonomous", "bordered newton"),
 }
 

@@ -260,7 +260,7 @@ def solve_from(equations: PeriodicEquations, theta: np.ndarray, start: np.ndarra
 
 
 def solve_from_rest(equations: PeriodicEquations, theta: np.ndarray) -> tuple[Solved, str]:
-    """Solve a forced problem from its static equilibrium, trying all fallbacks; return the solve and how it was found."""
+    """Solve a driven problem from its static equilibrium, with all fallbacks; return the solve and how it was found."""
     static = equations.static_guess(theta)
 
     def integrated() -> Solved | None:

@@ -144,8 +144,8 @@ def with_noise_of_the_input(experiment: bp.Experiment, theta: Mapping[str, float
 
     columns = []
     with warnings.catch_warnings():
-        # The warning on a grid too coarse for the friction is shown once, by the fit.
-        warnings.filterwarnings("ignore", "A smooth sign of")
+        # Of a grid that is coarse for the friction: the fit says so once.
+        warnings.filterwarnings("ignore", "The transition of a smooth sign")
         centre = moved(experiment.inputs[FORCE], "static")
         for wave in amplitudes(experiment, FORCE).T:
             ends = [moved(experiment.inputs[FORCE] + sign * STEP * wave, centre.states) for sign in (1.0, -1.0)]

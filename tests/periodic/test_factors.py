@@ -113,7 +113,7 @@ def test_transposed_solves_by_segments_and_by_the_band_match_dense_algebra(schem
     assert (factors.ends[0] > 0) == (scheme != "central4")
     right = np.random.default_rng(2).standard_normal((120, states))
     solved = right.copy()
-    adjoint = compiled.kernels("batch", states, equations.grid.stencil)
+    adjoint = compiled.kernels("adjoint", states, equations.grid.stencil)
     adjoint.back_substitute_transposed(equations.grid.packed, factors, solved)
     expected = np.linalg.solve(dense(equations, columns).T, right.ravel())
     assert solved.ravel() == pytest.approx(expected, rel=1e-8, abs=1e-8 * np.abs(expected).max())
