@@ -1,4 +1,4 @@
-"""Many parameter vectors times many input sets of a forced model, shared among the cores."""
+"""Solves at many parameter vectors: of many input sets of a driven model, or of many autonomous orbits."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ SMALLEST_PART, PARTS_EACH = 4, 4
 
 @dataclass(frozen=True)
 class Anchor:
-    """A solved point from which others are predicted: z ≈ z₀ + z_θ (θ − θ₀); or, without z_θ, a mere guess.
+    """A solved point from which others are predicted: z ≈ z₀ + z_θ (θ − θ₀); or, without z_θ, an unconverged guess.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Anchor:
         [Hz].
     sensitivities : array (parameters, points, states), or None
     frequency_sensitivities : array (parameters,), or None
-        Zero for a forced model.
+        Zero for a driven model.
     """
 
     parameters: np.ndarray
@@ -55,7 +55,7 @@ class Anchor:
 
     @classmethod
     def at(cls, equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> "Anchor":
-        """Return the anchor at a solution z; a mere guess where ∂g/∂z is singular."""
+        """Return the anchor at a solution z; without sensitivities if ∂g/∂z is singular."""
         derivative = parameter_sensitivities(equations, z, parameters)
         return cls.of(equations, parameters, z, derivative, np.arange(parameters.size))
 

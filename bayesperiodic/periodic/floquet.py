@@ -1,11 +1,11 @@
-"""Floquet multipliers and eigenfunctions of linear periodic equations, however stable or unstable.
+"""Floquet multipliers and eigenfunctions of linear periodic equations of any stability.
 
 The multipliers are those of the equations linearised on the orbit, ẏ = A(t) y, not of a difference scheme's recurrence,
 which has parasitic ones. Between neighbouring grid points A is interpolated and the equations are integrated by
 collocation at three Gauss points (order 6, [1]_, table II.7.4), in up to 32 parts where the equations are stiff (beyond
-that, multipliers near zero come out larger than they are). The transfer matrices are multiplied only while that is
-harmless; through the remaining factors an orthogonal basis is swept round the period until it turns into itself. This
-finds the invariant subspaces of each modulus, and every multiplier comes from the equations restricted to its own.
+that, multipliers near zero are overestimated). The transfer matrices are multiplied only while the products are well
+conditioned; an orthogonal basis is swept through the remaining factors, period after period, until it is invariant.
+This finds the invariant subspaces of each modulus, and each multiplier is computed from its own subspace.
 
 References
 ----------
@@ -62,7 +62,7 @@ class Floquet:
     def eigenfunctions(self) -> tuple[np.ndarray, np.ndarray]:
         """For each multiplier v of ẏ = A y and w of the adjoint ẇ = −Aᵀ w, complex arrays (size, points, size).
 
-        They are given without their growth, each of unit length at each grid point.
+        They are normalised to unit length at each grid point.
         """
         return self.leading(len(self.exponents))
 
@@ -173,10 +173,10 @@ def floquet(matrix: np.ndarray, period: float) -> Floquet:
 
 
 def leading_multipliers(matrix: np.ndarray, period: float, count: int) -> np.ndarray | None:
-    """Return the largest multipliers of ẏ = A(t) y, complex (count,) or fewer; None where that takes `floquet`.
+    """Return the largest multipliers of ẏ = A(t) y, complex (count,) or fewer; None if they require `floquet`.
 
-    A vector carried round the period turns in a few rounds into the eigenvector of the largest one, if that is real
-    and stands well apart; and where the product of all transfer matrices is harmless, its eigenvalues are all there is.
+    Power iteration over the period converges quickly if the largest multiplier is real and well separated; if the
+    product of all transfer matrices is well conditioned, the multipliers are its eigenvalues.
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ def _spread(matrices: np.ndarray) -> np.ndarray:
 
 
 def _invariant_bases(groups: np.ndarray, splits: list[int] | None = None) -> tuple[list[int], np.ndarray]:
-    """Sweep an orthogonal basis through the factors until it turns into itself.
+    """Sweep an orthogonal basis through the factors until its subspaces are invariant.
 
     Returns the sizes j for which its first j vectors span the subspace of the j largest multipliers (to rounding), and
     the basis before each factor, (factors, size, size).

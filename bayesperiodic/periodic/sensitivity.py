@@ -18,7 +18,7 @@ class Sensitivities(NamedTuple):
     states : array (directions, points, states)
     outputs : array (directions, points, channels)
     frequency : array (directions,)
-        That of the solution's frequency [Hz per unit]; zero for a forced model.
+        Of the solution's frequency [Hz per unit]; zero for a driven model.
     """
 
     states: np.ndarray
@@ -38,10 +38,9 @@ def directional_sensitivities(
 def parameter_sensitivities(
     equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray
 ) -> Sensitivities | None:
-    """Return derivatives to every parameter and, for a forced model, last to the frequency; None if singular.
+    """Return derivatives to every parameter and, for a driven model, last to the frequency; None if singular.
 
-    For an autonomous model the phase moves so that the change of the orbit stays orthogonal to the flow, states in
-    units of their range.
+    For an autonomous model the change of the orbit is orthogonal to the flow, states in units of their range.
     """
     d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
     g, f = np.moveaxis(d.g_theta, 2, 0), np.moveaxis(d.f_theta, 2, 0)
@@ -96,16 +95,16 @@ def respond(
 def smallest_singular_vectors(
     equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return about the singular vectors of a regular ∂g/∂z with its smallest singular value, by inverse iteration.
+    """Return approximate singular vectors of the smallest singular value of a regular ∂g/∂z, by inverse iteration.
 
-    States count in units of their largest values, equations in those of their largest terms.
+    States are in units of their largest values, equations in those of their largest terms.
 
     Returns
     -------
     left : array (points, states)
         Over the equations.
     right : array (points, 3·states)
-        The change of the states and of their time derivatives, so long that left · (∂g/∂z) · change is 1.
+        The change of the states and of their time derivatives, scaled so that left · (∂g/∂z) · change is 1.
     """
     factors, amplitude = equations.factors(columns), np.abs(z).max(axis=0)
     size, _ = equations.scales(z, columns)
@@ -135,7 +134,7 @@ def stiffness_gradient(
     Parameters
     ----------
     sensitivities : array (parameters, points, states)
-        Of the solution z; a parameter without any counts as one that does not matter.
+        Of the solution z; the derivative by a parameter without sensitivities is 0.
     left, right
         As `smallest_singular_vectors` returns them.
     """

@@ -239,7 +239,7 @@ def solve_periodic(
 def solve_forced(
     equations: PeriodicEquations, theta: np.ndarray, guess: str | Mapping[str, np.ndarray] | PeriodicSolution
 ) -> tuple[Solved, str]:
-    """Solve a forced problem from any guess; return the solve and how it was found (`PeriodicSolution.found_by`)."""
+    """Solve a driven problem from any guess; return the solve and how it was found (`PeriodicSolution.found_by`)."""
     if not isinstance(guess, str):
         start = as_guess(equations, guess)
         solved, found_by = solve_from(equations, theta, start)
@@ -253,7 +253,7 @@ def solve_forced(
 
 
 def solve_from(equations: PeriodicEquations, theta: np.ndarray, start: np.ndarray) -> tuple[Solved, str]:
-    """Solve a forced problem from a guess; return the solve and how it was found (`PeriodicSolution.found_by`)."""
+    """Solve a driven problem from a guess; return the solve and how it was found (`PeriodicSolution.found_by`)."""
     return _first_success(
         (NEWTON, lambda: equations.solve(theta, start)), ("sharpness", lambda: sharpen(equations, theta, start))
     )

@@ -43,14 +43,14 @@ def solve(matrix, right):
 
 @njit(f"void({CUBE}, {CUBE}, int64, float64, {MATRIX}, float64[::1], {CUBE})", **OPTIONS)
 def transfer_matrices(matrix, weights, first, step, gauss, sums, result):
-    """Fill the transfer matrices (points, size, size) from each grid point to the next; NaN where they do not exist.
+    """Fill the transfer matrices (points, size, size) from each grid point to the next; NaN where singular.
 
     Parameters
     ----------
     matrix : array (points, size, size)
         A of ẏ = A y on the grid.
     weights : array (parts, 3, width)
-        What interpolates A at the Gauss points of each part of a step, from grid points `first`, first + 1, … on.
+        Interpolation of A at the Gauss points of each part of a step from the grid points `first`, first + 1, ….
     first : int
     step : float
         Length of a part.
@@ -150,7 +150,7 @@ def adjoint_eigenfunction(steps, at, length, result):
 
 @njit(f"Tuple((boolean, float64, float64))({CUBE}, float64[::1], int64, float64)", **OPTIONS)
 def dominant_multiplier(steps, vector, sweeps, tolerance):
-    """Carry a vector round the period until its direction stays; return whether it does, log|μ| and the sign of μ."""
+    """Iterate a vector over the period until its direction is constant; return whether it is, log|μ|, the sign of μ."""
     points, size, _ = steps.shape
     start, after = np.empty(size), np.empty(size)
     for _ in range(sweeps):
