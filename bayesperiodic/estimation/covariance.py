@@ -12,7 +12,7 @@ from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.sensitivity import input_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
-from bayesperiodic.periodic.solve import solve_forced, solve_free
+from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.posterior.noise import LENGTHSCALE, SPECTRAL, Block
 from bayesperiodic.posterior.observation import Response
 from bayesperiodic.posterior.problem import Problem
@@ -302,7 +302,7 @@ def _on_twice_the_points(
     if problem.model.autonomous:
         equations, solved, _ = solve_free(equations, parameters, coarse)
     else:
-        solved, _ = solve_forced(equations, parameters, coarse)
+        solved, _ = solve_driven(equations, parameters, coarse)
     if solved.code != CONVERGED:
         return None
     count = 0 if experiment.multipliers is None else experiment.multipliers.size

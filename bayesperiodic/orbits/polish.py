@@ -17,7 +17,7 @@ from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import describe
-from bayesperiodic.periodic.solve import solve_forced
+from bayesperiodic.periodic.solve import solve_driven
 
 # In units of the attractor's size: solutions that coincide, the largest range of a state of rest.
 SAME, STILL = 1e-5, 1e-6
@@ -210,7 +210,7 @@ class _Polisher:
 
     def _solve(self, orbit: Orbit, winding: int, states: np.ndarray) -> tuple[Orbit, str]:
         equations = self._equations(orbit, winding)
-        solved, found_by = solve_forced(equations, self.theta, dict(zip(self.model.states, states.T, strict=True)))
+        solved, found_by = solve_driven(equations, self.theta, dict(zip(self.model.states, states.T, strict=True)))
         if solved.code not in (CONVERGED, OTHER_ORBIT):
             return orbit, f"the periodic solve ended with {STATUSES[solved.code]!r}"
         columns = [self.model.outputs.index(name) for name in orbit.coordinates]

@@ -119,14 +119,14 @@ class PeriodicSolution(Result):
         Time in forcing periods, end point excluded; points = samples · periods.
     states, inputs, outputs : dict of str to array (points,)
     sensitivities : dict of str to dict of str to array (points,)
-        ∂output/∂parameter, ``sensitivities[output][parameter]`` ([1]_, eq. 4), and for a forced model
+        ∂output/∂parameter, ``sensitivities[output][parameter]`` ([1]_, eq. 4), and for a driven model
         ``sensitivities[output]["frequency"]`` [per Hz; −frequency² times that is per second of period], inputs held as
         functions of tau; empty unless converged. For an autonomous model the phase moves so that the change stays
         orthogonal to the flow, states in units of their range.
     state_sensitivities : dict of str to dict of str to array (points,)
         The same of the states.
     frequency_sensitivities : dict of str to float
-        ∂frequency/∂parameter of an autonomous model's orbit (−period² times that: ∂period); zero for a forced one.
+        ∂frequency/∂parameter of an autonomous model's orbit (−period² times that: ∂period); zero for a driven one.
     linearisation : array (points, states, 3·states)
         ∂g/∂(q, q̇, q̈) on the orbit.
     iterations : int
@@ -364,7 +364,7 @@ def _by_name(
 
 
 def multiplier_sensitivities(model: Model, solution: PeriodicSolution) -> dict[str, np.ndarray]:
-    r"""Return ∂multiplier/∂parameter, and for a forced model ∂multiplier/∂frequency [per Hz].
+    r"""Return ∂multiplier/∂parameter, and for a driven model ∂multiplier/∂frequency [per Hz].
 
     .. math::
 

@@ -223,7 +223,7 @@ def solve_periodic(
     if model.autonomous:
         equations, solved, found_by = solve_free(equations, theta, guess)
     else:
-        solved, found_by = solve_forced(equations, theta, guess)
+        solved, found_by = solve_driven(equations, theta, guess)
     solution = describe(equations, theta, solved, found_by)
     if solution.converged and (steps := _steps_of_transitions(equations, theta, solved.z)) < FEW_STEPS:
         warnings.warn(
@@ -236,7 +236,7 @@ def solve_periodic(
     return solution
 
 
-def solve_forced(
+def solve_driven(
     equations: PeriodicEquations, theta: np.ndarray, guess: str | Mapping[str, np.ndarray] | PeriodicSolution
 ) -> tuple[Solved, str]:
     """Solve a driven problem from any guess; return the solve and how it was found (`PeriodicSolution.found_by`)."""

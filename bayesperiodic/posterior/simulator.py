@@ -17,7 +17,7 @@ from bayesperiodic.periodic.floquet import first_order_matrix, leading_multiplie
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, describe, logarithmic_changes
-from bayesperiodic.periodic.solve import solve_forced, solve_free
+from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.posterior.observation import Observation, Response
 from bayesperiodic.posterior.parameters import ParameterMap, ParameterMaps
 
@@ -280,7 +280,7 @@ class Responses:
         guess = next(e.guess for e in self.experiments if e.name == experiment) or "static"
         if self.model.autonomous:
             return solve_free(equations, parameters, guess)[:2]
-        return equations, solve_forced(equations, parameters, guess)[0]
+        return equations, solve_driven(equations, parameters, guess)[0]
 
     @cached_property
     def groups(self) -> list[tuple[Experiment, ...]]:
@@ -339,7 +339,7 @@ class Responses:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the sums of squares (blocks, solves) of each of `groups`, one below the other, and the worst status.
 
-        For a forced model without measured multipliers.
+        For a driven model without measured multipliers.
 
         Parameters
         ----------
@@ -360,7 +360,7 @@ class Responses:
     def orbits(self, theta: np.ndarray, misfits: Sequence[Misfits]) -> tuple[list[Orbits], int]:
         """Return the solutions of each of `groups` at one θ (names,), and the worst status.
 
-        For a forced model without measured multipliers.
+        For a driven model without measured multipliers.
 
         Parameters
         ----------
@@ -480,7 +480,7 @@ class Responses:
     def pulled(
         self, theta: np.ndarray, solved: Mapping[str, tuple[Response, np.ndarray]], weights: Mapping[str, Response]
     ) -> dict[str, np.ndarray]:
-        """Return Σ weights · derivatives of a forced model's responses by θ (names,), NaN where they do not exist.
+        """Return Σ weights · derivatives of a driven model's responses by θ (names,), NaN where they do not exist.
 
         That of the outputs takes one transposed solve an experiment.
 
@@ -522,7 +522,7 @@ def orbit_multipliers(equations: PeriodicEquations, parameters: np.ndarray, z: n
 def _easy_multipliers(
     equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, count: int
 ) -> np.ndarray | None:
-    """Return the largest multipliers of a forced model where `floquet.leading_multipliers` finds them."""
+    """Return the largest multipliers of a driven model where `floquet.leading_multipliers` finds them."""
     orders = tuple(equations.model.orders.values())
     columns = equations.residual_jacobian(z, parameters)[:, equations.count :]
     try:
