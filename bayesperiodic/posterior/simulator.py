@@ -259,7 +259,7 @@ class Responses:
             if name in found and found[name].status[0] == CONVERGED:
                 here, z = equations.at_frequency(float(found[name].response.frequency[0])), found[name].z[0]
             else:
-                here, (z, code, _) = self._from_start(name, parameters)
+                here, (z, code, *_) = self._from_start(name, parameters)
                 if code != CONVERGED:
                     other._anchors[name] = Anchor(parameters, z, equations.frequency)
                     other._derivatives[name] = None
