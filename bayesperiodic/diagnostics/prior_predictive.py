@@ -11,18 +11,18 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics.predictive import Bands, bands
-from bayesperiodic.periodic import family
+from bayesperiodic.periodic import arclength
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 from bayesperiodic.posterior.problem import Problem
 
 NO_ORBIT, OTHER, FAILED = "no orbit", "other orbit", "solver failed"
 ENDS = {
-    family.FOLD: (NO_ORBIT, "the branch ends in a fold"),
-    family.EQUILIBRIUM: (NO_ORBIT, "the cycle shrinks to an equilibrium"),
-    family.SHORTER: (NO_ORBIT, "the orbit merges with one of a shorter period"),
-    family.ROUND_FOLDS: (OTHER, "the branch folds back to another orbit at the same parameters"),
-    family.ARRIVED: (FAILED, "the orbit exists"),
-    family.LOST: (FAILED, "the branch cannot be followed"),
+    arclength.FOLD: (NO_ORBIT, "the branch ends in a fold"),
+    arclength.EQUILIBRIUM: (NO_ORBIT, "the cycle shrinks to an equilibrium"),
+    arclength.SHORTER: (NO_ORBIT, "the orbit merges with one of a shorter period"),
+    arclength.ROUND_FOLDS: (OTHER, "the branch folds back to another orbit at the same parameters"),
+    arclength.ARRIVED: (FAILED, "the orbit exists"),
+    arclength.LOST: (FAILED, "the branch cannot be followed"),
 }
 
 
