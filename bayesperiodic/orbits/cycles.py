@@ -196,19 +196,15 @@ def _distinct(
                 break
         else:
             found.append((maps.wrap(chains[k]), [(members[k], 0)]))
-    return [_candidate(maps, section, cycle, group) for cycle, group in found]
-
-
-def _candidate(
-    maps: ReturnMap, section: np.ndarray, cycle: np.ndarray, group: list[tuple[np.ndarray, int]]
-) -> Candidate:
-    steps = np.arange(len(cycle) + 1)
-    starts = np.concatenate([members for members, _ in group])
-    shifts = np.concatenate([np.full(len(members), shift) for members, shift in group])
-    expected = cycle[(steps + shifts[:, None]) % len(cycle)]
-    away = np.abs(maps.wrap(section[starts[:, None] + steps] - expected)).max((1, 2))
-    closest = int(np.argmin(away))
-    return Candidate(cycle, len(starts), int(starts[closest]), int(shifts[closest]))
+    result = []
+    for cycle, group in found:
+        steps = np.arange(len(cycle) + 1)
+        starts = np.concatenate([first for first, _ in group])
+        shifts = np.concatenate([np.full(len(first), shift) for first, shift in group])
+        expected = cycle[(steps + shifts[:, None]) % len(cycle)]
+        closest = int(np.argmin(np.abs(maps.wrap(section[starts[:, None] + steps] - expected)).max((1, 2))))
+        result.append(Candidate(cycle, len(starts), int(starts[closest]), int(shifts[closest])))
+    return result
 
 
 def refine(maps: ReturnMap, points: np.ndarray, neighbours: int) -> Estimate | None:

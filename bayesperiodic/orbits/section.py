@@ -14,6 +14,8 @@ DEGREES = 180.0 / np.pi
 FEWEST_SAMPLES, FEWEST_POINTS, CYCLE_SAMPLES = 8, 200, 64
 # Local polynomials: degree for the values; degree and number of samples for the variance of the noise.
 DEGREE, NOISE_DEGREE, NOISE_SAMPLES = 7, 11, 14
+# Half the number of samples in the smallest window.
+SMALLEST = (DEGREE + 1) // 2
 # The window is narrower by this factor than the first window with a significant bias.
 MARGIN = 1.6
 BLOCK = 20_000
@@ -280,8 +282,8 @@ class PoincareSection(Result):
             return None
         knots = np.arange(period + 1)
         at = np.interp(np.arange(samples * period) / samples, knots, self.instants[index : index + period + 1])
-        values = _interpolate(self.time, self.signals, at)
-        shift = self.points[index] - _interpolate(self.time, self.signals, self.instants[index : index + 1])[0]
+        values = _fit(self.time, self.signals, at)[0]
+        shift = self.points[index] - _fit(self.time, self.signals, self.instants[index : index + 1])[0][0]
         for k, name in enumerate(self.coordinates):
             if name in self.angles:
                 values[:, k] += 2.0 * np.pi * np.round(shift[k] / (2.0 * np.pi))
@@ -390,10 +392,6 @@ def _upward_crossings(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def _interpolate(time: np.ndarray, signals: np.ndarray, at: np.ndarray) -> np.ndarray:
-    return _fit(time, signals, at, (DEGREE + 1) // 2)[0]
-
-
 def _estimate(time: np.ndarray, signals: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return signals (instants, channels) at given instants, and the standard deviation of their errors (channels,).
 
@@ -403,13 +401,12 @@ def _estimate(time: np.ndarray, signals: np.ndarray, at: np.ndarray) -> tuple[np
     narrower than the first significant one it is 40 times smaller, and negligible even in averages over hundreds of
     instants.
     """
-    smallest = (DEGREE + 1) // 2
-    narrow, narrow_gain, _ = _fit(time, signals, at, smallest)
+    narrow, narrow_gain, _ = _fit(time, signals, at)
     # A higher degree on few samples: noise dominates the residual.
     variance = _fit(time, signals, at, NOISE_SAMPLES // 2, NOISE_DEGREE)[2].mean(0)
     count = signals.shape[1]
-    halves, unbiased = [smallest], np.ones(count, dtype=bool)
-    widest = max(smallest, int(0.5 * (time.size - 1) / (time[-1] - time[0]) * np.median(np.diff(at))))
+    halves, unbiased = [SMALLEST], np.ones(count, dtype=bool)
+    widest = max(SMALLEST, int(0.5 * (time.size - 1) / (time[-1] - time[0]) * np.median(np.diff(at))))
     first_biased = np.full(count, widest)
     while (half := halves[-1] + max(1, halves[-1] // 5)) <= widest and unbiased.any():
         wide, gain, _ = _fit(time, signals, at, half)
@@ -420,15 +417,15 @@ def _estimate(time: np.ndarray, signals: np.ndarray, at: np.ndarray) -> tuple[np
         halves.append(half)
     values, sd = narrow.copy(), np.sqrt(variance * narrow_gain.mean())
     for channel in range(count):
-        half = max(h for h in halves if h == smallest or h * MARGIN <= first_biased[channel])
-        if half > smallest:
+        half = max(h for h in halves if h == SMALLEST or h * MARGIN <= first_biased[channel])
+        if half > SMALLEST:
             fitted, gain, _ = _fit(time, signals[:, [channel]], at, half)
             values[:, channel], sd[channel] = fitted[:, 0], np.sqrt(variance[channel] * gain.mean())
     return values, sd
 
 
 def _fit(
-    time: np.ndarray, signals: np.ndarray, at: np.ndarray, half: int, degree: int = DEGREE
+    time: np.ndarray, signals: np.ndarray, at: np.ndarray, half: int = SMALLEST, degree: int = DEGREE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return values, their variance for unit noise, and the residual variance of polynomials on 2·half samples each."""
     count = 2 * half
