@@ -21,7 +21,7 @@ from studies.benchmark.integration import (
     tune,
 )
 from studies.benchmark.problems import SCHEMES, Setting
-from studies.benchmark.scipy import BVP, INITIAL, Initial, tune_boundary, tune_initial
+from studies.benchmark.scipy import BVP, INITIAL, tune_boundary, tune_initial
 from studies.timing import Action, gradient_error, interleaved, ratio, spread
 
 OWN_WARM, OWN_CALL, OWN_BATCHED, OWN_COLD = (
@@ -196,7 +196,7 @@ def add_scipy(contest: Contest, compiled: Compiled, *, quick: bool = False) -> N
             ready, error = tuned
             tolerances = [one.relative for one in ready]
             note = f"rtol {min(tolerances):.0e} … {max(tolerances):.0e}; 2 cycles timed, times as many as it takes"
-            seconds = partial(_seconds, contest, ready, start, [m.sweeps for m in compiled[STEADY, start]])
+            seconds = partial(seconds_until_steady, contest, ready, start, [m.sweeps for m in compiled[STEADY, start]])
             contest.add(name, error, Action(seconds, 1, 1), note)
     for start in (ESTIMATE,) if quick else (EQUILIBRIUM, ESTIMATE):
         found = reference.tuned(lambda k, *rest: tune_boundary(every[k], start, *rest), SLOW_DRAWS)  # noqa: B023
@@ -209,7 +209,7 @@ def add_scipy(contest: Contest, compiled: Compiled, *, quick: bool = False) -> N
         contest.add(f"{BVP} {start}", error, action, f"tol {min(tolerances):.0e} … {max(tolerances):.0e}")
 
 
-def _seconds(contest: Contest, ready: Sequence[Initial], start: str, cycles: Sequence[float]) -> float:
+def seconds_until_steady(contest: Contest, ready: Sequence[Any], start: str, cycles: Sequence[float]) -> float:
     """Return the seconds of one log-posterior by integrations until steady."""
     parameters = contest.reference.parameters
     return sum(one.seconds(p[0], start, n) for one, p, n in zip(ready, parameters, cycles, strict=True))

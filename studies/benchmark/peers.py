@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from studies.benchmark.contenders import SLOW_DRAWS, SLOW_REPEATS, Compiled, Contest, integrate
+from studies.benchmark.contenders import SLOW_DRAWS, SLOW_REPEATS, Compiled, Contest, integrate, seconds_until_steady
 from studies.benchmark.equations import JAX, FirstOrder
-from studies.benchmark.integration import EQUILIBRIUM, ESTIMATE, LOOSE, PREDICTED, STEADY, Discretised
+from studies.benchmark.integration import EQUILIBRIUM, ESTIMATE, LOOSE, PREDICTED, STEADY, Discretised, loosest
 from studies.benchmark.problems import DUFFING, Case
 from studies.timing import Action
 
@@ -93,11 +93,7 @@ def _sign_of_derivatives() -> float:
 
 def tune_balanced(one: Discretised, parameters: np.ndarray, exact: np.ndarray, allowed: float) -> Balanced | None:
     """Return the fewest harmonics that are accurate enough at the draws; None if there are none."""
-    for harmonics in HARMONICS:
-        found = Balanced(one, harmonics)
-        if np.max([abs(found(p) - e) for p, e in zip(parameters, exact, strict=True)]) <= allowed:
-            return found
-    return None
+    return loosest(partial(Balanced, one), HARMONICS, parameters, exact, allowed)
 
 
 NEEDED = ("diffrax", "jax")
@@ -271,11 +267,7 @@ def _both(model: Any) -> Callable[..., Any]:
 
 def tune_diffrax(one: Discretised, parameters: np.ndarray, exact: np.ndarray, allowed: float) -> Integrated | None:
     """Return diffrax with the loosest tolerance that is accurate enough at the draws; None if there is none."""
-    for relative in RELATIVE:
-        found = Integrated(one, relative)
-        if np.max([abs(found(p) - e) for p, e in zip(parameters, exact, strict=True)]) <= allowed:
-            return found
-    return None
+    return loosest(partial(Integrated, one), RELATIVE, parameters, exact, allowed)
 
 
 DIFFRAX = "diffrax"
@@ -315,7 +307,7 @@ def _add_diffrax(contest: Contest, compiled: Compiled) -> None:
         if (STEADY, start) not in compiled:
             contest.refuse(name, "not steady within 5000 cycles")
             continue
-        seconds = partial(_seconds, contest, ready, start, [m.sweeps for m in compiled[STEADY, start]])
+        seconds = partial(seconds_until_steady, contest, ready, start, [m.sweeps for m in compiled[STEADY, start]])
         contest.add(name, error, Action(seconds, 1, 1), f"{note}; 2 cycles timed, times as many as it takes")
     action = Action(partial(integrate, contest, ready, SLOW_DRAWS), SLOW_DRAWS, SLOW_REPEATS)
     contest.add(DIFFRAX_ROWS[2], error, action, f"{note}, one chord step")
@@ -323,11 +315,6 @@ def _add_diffrax(contest: Contest, compiled: Compiled) -> None:
     off = contest.gradient_error(by_theta + contest.setting.problem.joint_prior.gradient(contest.setting.theta[0]))
     both = Action(partial(_gradients, contest, ready), 1, SLOW_REPEATS)
     contest.add(DIFFRAX_ROWS[3], error, both, f"{note}, one chord step, by its adjoint", off)
-
-
-def _seconds(contest: Contest, ready: Sequence[Integrated], start: str, cycles: Sequence[float]) -> float:
-    parameters = contest.reference.parameters
-    return sum(one.seconds(p[0], start, n) for one, p, n in zip(ready, parameters, cycles, strict=True))
 
 
 def _gradients(contest: Contest, ready: Sequence[Integrated]) -> None:

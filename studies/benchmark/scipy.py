@@ -2,14 +2,14 @@
 
 import time
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.integrate import solve_bvp, solve_ivp
 from scipy.interpolate import CubicSpline
 
 from studies.benchmark.equations import NUMPY, FirstOrder
-from studies.benchmark.integration import EQUILIBRIUM, LOOSE, PREDICTED, Discretised
+from studies.benchmark.integration import EQUILIBRIUM, LOOSE, PREDICTED, Discretised, loosest
 from studies.benchmark.problems import Case
 
 LSODA, RADAU, BVP = "LSODA", "Radau", "solve_bvp"
@@ -78,11 +78,7 @@ def tune_initial(
     one: Discretised, method: str, parameters: np.ndarray, exact: np.ndarray, allowed: float
 ) -> Initial | None:
     """Return solve_ivp with the loosest tolerance that is accurate enough at the draws; None if there is none."""
-    for relative in RELATIVE:
-        found = Initial(one, method, relative)
-        if np.max([abs(found(p) - e) for p, e in zip(parameters, exact, strict=True)]) <= allowed:
-            return found
-    return None
+    return loosest(partial(Initial, one, method), RELATIVE, parameters, exact, allowed)
 
 
 class Boundary:
@@ -135,7 +131,6 @@ class Solved:
     """solve_bvp from a mesh and the states on it, those of the estimate or of equilibrium."""
 
     boundary: Boundary
-    start: str
     times: np.ndarray  # (nodes,)
     guess: np.ndarray  # (size, nodes)
 
@@ -148,16 +143,12 @@ def tune_boundary(
     one: Discretised, start: str, parameters: np.ndarray, exact: np.ndarray, allowed: float
 ) -> Solved | None:
     """Return solve_bvp with the loosest tolerance that is accurate enough at the draws; None if there is none."""
-    for relative in RELATIVE:
+
+    def solved(relative: float) -> Solved:
         boundary = Boundary(one.case, relative)
-        mesh = boundary.constant()
-        if start != EQUILIBRIUM:
-            mesh = _at_the_estimate(one, boundary)
-        found = Solved(boundary, start, *mesh)
-        errors = [abs(found(p) - e) for p, e in zip(parameters, exact, strict=True)]
-        if np.max(errors) <= allowed:
-            return found
-    return None
+        return Solved(boundary, *(boundary.constant() if start == EQUILIBRIUM else _at_the_estimate(one, boundary)))
+
+    return loosest(solved, RELATIVE, parameters, exact, allowed)
 
 
 def _at_the_estimate(one: Discretised, boundary: Boundary) -> tuple[np.ndarray, np.ndarray]:
