@@ -126,7 +126,7 @@ def assert_example(documented: dict[str, str], called: str = "") -> None:
     assert not any(doctest.SKIP in example.options for example in examples)
 
 
-def test_all_kinds_of_public_names_are_looked_at():
+def test_every_public_name_is_a_function_class_model_or_constant():
     assert NAMES.keys() == {*FUNCTIONS, *CLASSES, *MODELS, *CONSTANTS}
 
 
@@ -136,7 +136,7 @@ def test_module_docstrings_are_present(name):
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_functions(name):
+def test_docstrings_of_functions_are_complete(name):
     function = FUNCTIONS[name]
     documented = sections(function.__doc__)
     assert documented[""].strip()
@@ -148,7 +148,7 @@ def test_functions(name):
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_classes(name):
+def test_docstrings_of_classes_are_complete(name):
     cls = CLASSES[name]
     documented = sections(cls.__doc__)
     described = documented.get("Parameters", "") + documented.get("Attributes", "")
@@ -168,7 +168,7 @@ def _has_source(function: Any) -> bool:
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_methods(name):
+def test_docstrings_of_methods_are_complete(name):
     cls, method, function = METHODS[name]
     documented = sections(function.__doc__)
     assert documented[""].strip()
@@ -183,7 +183,7 @@ def test_methods(name):
 
 
 @pytest.mark.parametrize("name", PROPERTIES)
-def test_properties(name):
+def test_docstrings_of_properties_are_complete(name):
     prop = PROPERTIES[name]
     getter = prop.fget if isinstance(prop, property) else prop.func
     text = sections(prop.__doc__)[""].strip()
@@ -193,7 +193,7 @@ def test_properties(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_models(name):
+def test_docstrings_of_models_are_complete(name):
     model = MODELS[name]
     documented = sections(model.__doc__)
     assert model.__doc__ != bp.Model.__doc__

@@ -24,7 +24,7 @@ def mean_period(angle):
 
 
 @pytest.mark.slow
-def test_frequency_and_its_standard_error():
+def test_frequency_errors_have_the_stated_standard_error():
     """400 recordings: z-scores have unit variance or, the larger of two estimates being taken, up to a quarter less.
 
     The band is the two-sided 1 % band of χ².
@@ -94,7 +94,7 @@ def test_scatter_is_that_of_one_cycle_within_the_kept_harmonics():
     assert np.mean(values) == pytest.approx(0.05 * np.sqrt(11 / 119.37), rel=0.05)
 
 
-def test_variance_of_the_mean_amplitudes():
+def test_variance_of_the_mean_amplitudes_is_the_observed_one():
     experiments = [recording(seed=s, cycles=12.1).fold(100, frequency=FREQUENCY, harmonics=5) for s in range(300)]
     amplitudes = np.array([np.fft.rfft(e.outputs["y"])[1:6] * 2 / 100 for e in experiments])
     stated = np.mean([e.amplitude_variance["y"][1:] for e in experiments], axis=0)
@@ -108,7 +108,7 @@ def test_origin_shifts_the_phase():
     assert e.outputs["y"] == pytest.approx(mean_period(start + 2 * np.pi * (grid(100) + 0.25)), abs=1e-8)
 
 
-def test_response_of_two_forcing_periods():
+def test_response_of_two_forcing_periods_is_folded_exactly():
     time = np.arange(3000) / 100.3
     x, y = np.cos(2 * np.pi * FREQUENCY * time), np.cos(np.pi * FREQUENCY * time) + np.sin(2 * np.pi * FREQUENCY * time)
     e = bp.Recording.from_arrays(time, {"y": y}, {"x": x}).fold(50, periods=2)

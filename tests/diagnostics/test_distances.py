@@ -91,7 +91,7 @@ def test_a_widened_normal_fills_ellipsoids_as_chi_squared_says(dimension, widene
 
 
 @pytest.mark.parametrize("k", [0.2, 0.7, 1.2])
-def test_pareto_k_of_pareto_weights(k):
+def test_pareto_k_of_pareto_weights_is_their_shape(k):
     """The weights U^(−k) have exactly this shape; three errors of a fit to 300 of them, with its prior at 0.5."""
     log_weights = k * np.random.default_rng(3).exponential(size=10_000)
     assert pareto_k(log_weights) == pytest.approx((300 * k + 10 * 0.5) / 310, abs=3 * (1 + k) / np.sqrt(300))
@@ -99,7 +99,7 @@ def test_pareto_k_of_pareto_weights(k):
     assert pareto_k(zeros) == pytest.approx((300 * k + 10 * 0.5) / 310, abs=3 * (1 + k) / np.sqrt(300))
 
 
-def test_pareto_k_of_equal_and_of_missing_weights():
+def test_pareto_k_of_equal_weights_is_zero_and_of_missing_weights_infinite():
     assert pareto_k(1e-9 * np.random.default_rng(4).standard_normal(1000)) == 0.0
     assert pareto_k(np.where(np.arange(1000) < 100, 0.0, -np.inf)) == np.inf
     assert pareto_k(np.full(1000, -np.inf)) == np.inf

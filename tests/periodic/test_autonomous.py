@@ -52,7 +52,7 @@ def turning_point(solution: bp.PeriodicSolution) -> float:
 
 
 @pytest.mark.parametrize(("mu", "known"), CYCLES)
-def test_cycle_with_the_fourth_order_scheme(mu, known):
+def test_cycle_by_the_fourth_order_scheme_agrees_with_the_reference(mu, known):
     period, amplitude, multiplier = known
     solution = cycle(mu, 800)
     assert solution.converged and solution.stable
@@ -63,7 +63,7 @@ def test_cycle_with_the_fourth_order_scheme(mu, known):
 
 
 @pytest.mark.parametrize(("mu", "known"), CYCLES)
-def test_cycle_with_the_fourier_scheme(mu, known):
+def test_cycle_by_the_fourier_scheme_agrees_with_the_reference(mu, known):
     period, amplitude, multiplier = known
     solution = cycle(mu, 256, "fourier")
     assert solution.converged and solution.stable

@@ -75,7 +75,7 @@ def test_folds_of_a_frequency_response_agree_with_the_poincare_map(resonance):
 
 
 @pytest.mark.parametrize(("samples", "scheme", "tolerance"), [(200, "central2", 3e-5), (200, "central4", 1e-8)])
-def test_folds_with_difference_schemes(samples, scheme, tolerance):
+def test_folds_by_difference_schemes_have_their_accuracy(samples, scheme, tolerance):
     start = duffing_start(samples, scheme)
     branch = bp.continue_periodic(bp.models.duffing, start, "frequency", until=0.4, step=0.02, progress=False)
     assert [fold.frequency for fold in branch.folds] == pytest.approx([0.303382264798, 0.242089115564], abs=tolerance)
@@ -185,7 +185,7 @@ def test_both_unstable_rotations_lie_on_one_branch_with_a_fold_between():
     assert branch[-1].multipliers == pytest.approx(np.array(shooting.UNSTABLE[3].multipliers), rel=1e-5)
 
 
-def test_scale_of_an_input():
+def test_continuation_in_the_scale_of_an_input_gives_the_scaled_solution():
     """Three times the force, its mean included, along the branch and in the inputs that the solutions carry."""
     start = duffing_start(100, "central4", mean=0.4)
     branch = bp.continue_periodic(bp.models.duffing, start, "force", until=3.0, progress=False)
@@ -222,7 +222,7 @@ def test_scaling_one_of_several_inputs_leaves_the_others():
     assert branch[-1].states["x"] == pytest.approx(exact.real, abs=1e-10)
 
 
-def test_parameter_of_a_limit_cycle():
+def test_continuation_of_a_limit_cycle_in_its_parameter_agrees_with_shooting():
     start = bp.solve_periodic(
         bp.models.van_der_pol, {"mu": 0.5, "omega": 1.0}, frequency=0.15, samples=400, scheme="central4"
     )
@@ -238,7 +238,7 @@ def test_parameter_of_a_limit_cycle():
     assert middle.period == pytest.approx(period, rel=1e-6)
 
 
-def test_period_doubling_of_a_limit_cycle_and_the_doubled_one():
+def test_period_doubling_of_a_limit_cycle_agrees_with_shooting():
     """Rössler's equations, a = b = 0.2, against shooting with the period as a further state."""
     start = bp.solve_periodic(ROESSLER, {"a": 0.2, "b": 0.2, "c": 2.6}, frequency=0.17, samples=200, scheme="central4")
     branch = bp.continue_periodic(ROESSLER, start, "c", until=3.0, step=0.1, progress=False)

@@ -123,7 +123,7 @@ def compare(
 @pytest.mark.parametrize(
     ("case", "expected"), [("complex pair", "pair"), ("real pair", "stable"), ("unstable", "unstable")]
 )
-def test_forced_oscillator(case, expected):
+def test_multiplier_sensitivities_of_a_forced_oscillator_equal_differences(case, expected):
     solution, arguments = duffing(case)
     mu = solution.multipliers
     kind = "pair" if abs(mu[0].imag) > 0.1 else "unstable" if abs(mu[0]) > 1 else "stable"
@@ -148,7 +148,7 @@ def test_multipliers_obey_liouville_in_closed_form(case):
     assert logarithmic["k3"] == pytest.approx(0.0, abs=1e-8)
 
 
-def test_mixed_orders_with_an_inertia_that_depends_on_the_state():
+def test_multiplier_sensitivities_with_mixed_orders_equal_differences():
     force = 4.0 * np.cos(2 * np.pi * grid(96)) + 1.0
     arguments = {"inputs": {"force": force}, "frequency": 0.6, "samples": 96, "scheme": "fourier"}
     solution = bp.solve_periodic(MIXED, MIXED_AT, **arguments)
@@ -157,7 +157,7 @@ def test_mixed_orders_with_an_inertia_that_depends_on_the_state():
 
 
 @pytest.mark.parametrize("known", ROTATIONS, ids=lambda k: f"multiplier {k.multipliers[0]:.3f}")
-def test_unstable_rotations(known):
+def test_multiplier_sensitivities_of_unstable_rotations_equal_differences(known):
     solution = pendulum_solution(known, 400, "central4")
     arguments = {"frequency": solution.frequency, "samples": 400, "scheme": "central4", "winding": 1}
     compare(bp.models.pendulum, solution, arguments, without=("v0",))
@@ -165,14 +165,14 @@ def test_unstable_rotations(known):
     assert bp.multiplier_sensitivities(bp.models.pendulum, solution)["v0"] == pytest.approx(np.zeros(2), abs=1e-9)
 
 
-def test_orbit_of_period_two():
+def test_multiplier_sensitivities_of_a_period_two_orbit_equal_differences():
     solution = pendulum_solution(shooting.STABLE[1], 200, "central4")
     arguments = {"frequency": solution.frequency, "samples": 200, "scheme": "central4", "winding": 2, "periods": 2}
     compare(bp.models.pendulum, solution, arguments, without=("v0",))
 
 
 @pytest.mark.parametrize("mu", [0.3, 1.0])
-def test_limit_cycle(mu):
+def test_multiplier_sensitivities_of_a_limit_cycle_equal_differences(mu):
     """Of the multipliers all but the trivial one, which stays 1."""
     arguments = {"frequency": 0.3, "samples": 128, "scheme": "fourier"}
     solution = bp.solve_periodic(CYCLE, {"mu": mu, "omega": 2.0}, **arguments)
@@ -198,7 +198,7 @@ def test_sensitivity_of_a_limit_cycles_multiplier_to_its_parameter_agrees_with_s
     assert -solution.frequency_sensitivities["mu"] / solution.frequency**2 == pytest.approx(expected[0], rel=1e-6)
 
 
-def test_unstable_limit_cycle_of_three_states():
+def test_multiplier_sensitivities_of_an_unstable_cycle_of_three_states_equal_differences():
     """The solution is the guess of its neighbours, so that their phases are fixed as the sensitivities assume."""
     period, start = 1.5586522107162, np.array([-13.763610682134, -19.578751942452, 27.0])
 

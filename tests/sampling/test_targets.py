@@ -58,7 +58,7 @@ def check(
 
 @pytest.mark.filterwarnings("ignore:The data do not change under")
 @pytest.mark.parametrize("dimension", [2, *(pytest.param(d, marks=pytest.mark.slow) for d in (10, 20))])
-def test_correlated_normal(dimension):
+def test_draws_of_a_correlated_normal_have_its_moments(dimension):
     """A joint prior that the data do not change, correlations of 0.9 between neighbours, scales from 1e-6 to 1."""
     names = [f"p{i}" for i in range(dimension)]
     quiet = model(f"normal_{dimension}", names, lambda p: {"force": 1 + 1e-12 * sum(getattr(p, n) for n in names)})
@@ -75,7 +75,7 @@ def test_correlated_normal(dimension):
 
 
 @pytest.mark.slow
-def test_banana():
+def test_draws_of_a_banana_density_have_its_moments():
     """Rosenbrock's: a ~ N(1, 0.5), b = a² + N(0, 0.1)."""
     banana = model("banana", ["a", "b"], lambda p: {"first": p.a, "second": p.b - p.a**2})
     wide = {"a": bp.Normal(0.0, 1e3), "b": bp.Normal(0.0, 1e4)}
@@ -85,7 +85,7 @@ def test_banana():
     check(posterior, {"a": (1.0, 0.5), "b": of_b}, {"a": stats.norm(1.0, 0.5).cdf})
 
 
-def test_two_modes_of_opposite_sign():
+def test_two_modes_of_opposite_sign_are_both_sampled_or_not_converged():
     """Only a² is measured: half the draws have each sign, or the result is "not converged"."""
     signed = model("square", ["a"], lambda p: {"force": p.a**2})
     problem = bp.Problem(signed, [run(force=1.0)], priors={"a": bp.Normal(0.0, 2.0)}, fixed=known(force=0.1))
@@ -96,7 +96,7 @@ def test_two_modes_of_opposite_sign():
 
 
 @pytest.mark.filterwarnings("ignore:The estimate of 'a', 0.9.*, lies at the end")
-def test_edge_of_a_uniform_prior():
+def test_draws_at_the_edge_of_a_uniform_prior_follow_a_truncated_normal():
     """The likelihood peaks beyond the bound of the prior: a normal truncated one sd below its mean."""
     edged = model("edged", ["a"], lambda p: {"force": p.a})
     problem = bp.Problem(edged, [run(force=1.0)], priors={"a": bp.Uniform(0.0, 0.9)}, fixed=known(force=0.1))
@@ -114,7 +114,7 @@ def ridge(priors: dict) -> tuple[bp.Problem, bp.MapEstimate]:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The data do not change under")
-def test_ridge_of_a_product():
+def test_draws_of_a_product_ridge_have_the_sd_of_a_quadrature():
     """Priors N(1, 1) cut at zero: sd(a) = 0.595 by quadrature; a short natural chain is not converged."""
     cut = bp.TruncatedNormal(1.0, 1.0, 0.0, np.inf)
     problem, fit = ridge({"a": cut, "b": cut})
@@ -142,7 +142,7 @@ def test_ridge_with_a_second_branch_is_converged_only_if_both_are_sampled():
 
 
 @pytest.mark.filterwarnings("ignore:The data do not change under")
-def test_mode_over_the_logarithms_on_a_narrow_ridge():
+def test_joint_mode_on_a_narrow_ridge_is_that_over_the_logarithms():
     """a²·b = 1 to 1e-6; with ln a ~ N(0, ½²) and ln b ~ N(ln 3, 1) the mode over ln a, ln b is at ln a = −ln(3)/4."""
     problem = bp.Problem(
         model("square_times_other", ["a", "b"], lambda p: {"y": p.a**2 * p.b}),

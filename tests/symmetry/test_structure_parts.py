@@ -73,7 +73,7 @@ def test_unknown_functions_of_two_arguments_raise():
         series(sp.Function("f")(x, y), {x: np.ones((2, 1), complex), y: np.ones((2, 1), complex)})
 
 
-def test_derivatives_of_power_series():
+def test_differentiated_power_series_has_the_exact_coefficients():
     np.testing.assert_array_equal(differentiated(np.array([1.0, 2.0, 3.0, 4.0])), [2.0, 6.0, 12.0, 0.0])
 
 
