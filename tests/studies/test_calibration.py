@@ -61,4 +61,4 @@ def test_every_case_can_be_simulated_and_only_one_miscounts(name):
 
 def test_bad_number_of_replicates_is_rejected(tmp_path, capsys):
     assert main(["calibration", "--out", str(tmp_path), "--replicates", "-1"]) == 1
-    assert "--replicates: -1 is not allowed" in capsys.readouterr().err
+    assert "--replicates: must be at least 0, got -1" in capsys.readouterr().err

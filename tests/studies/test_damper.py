@@ -81,7 +81,7 @@ def test_quick_run_reports_that_it_reached_its_limit(quick):
 
 def test_errors_are_one_line_with_an_exit_status(tmp_path, capsys):
     assert main(["damper", "--data", "nowhere.csv", "--out", str(tmp_path)]) == 1
-    assert capsys.readouterr().err == "error: --data: 'nowhere.csv' is not allowed; there is no such file.\n"
+    assert capsys.readouterr().err == "error: --data: must be an existing file, got 'nowhere.csv'.\n"
     assert main(["dampper"]) == 2
     (tmp_path / "bad.csv").write_text("time_s,displacement_mm,force_N\n0,1,2\n0.1,2,x\n")
     assert main(["damper", "--data", str(tmp_path / "bad.csv"), "--out", str(tmp_path)]) == 1
