@@ -125,17 +125,16 @@ class TaskPool:
         self._stack = ExitStack()
 
     def __enter__(self) -> "TaskPool":
-        executor = self._executor
-        if executor is None:
-            executor = self._stack.enter_context(ThreadPoolExecutor(available_cores()))
-        elif isinstance(executor, int):
-            executor = self._stack.enter_context(
-                ProcessPoolExecutor(executor, get_context("spawn"), _ignore_interrupts)
-            )
-        self._stack.callback(self._cancel)
-        with self._stack:
+        with self._stack as stack:
+            executor = self._executor
+            if executor is None:
+                executor = stack.enter_context(ThreadPoolExecutor(available_cores()))
+            elif isinstance(executor, int):
+                pool = ProcessPoolExecutor(executor, get_context("spawn"), _ignore_interrupts)
+                executor = stack.enter_context(pool)
+            stack.callback(self._cancel)
             self._connect(executor)
-            self._stack = self._stack.pop_all()
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *error: Any) -> None:

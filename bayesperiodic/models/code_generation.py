@@ -246,24 +246,15 @@ class SymbolicModel:
 
     def vjp_source(self, moving: tuple[int, ...]) -> str:
         """Return the generated module of `VjpKernels` as text."""
-        g, f, q = self.equations, self.outputs, self.states
         by = tuple(self.parameters[i] for i in moving)
-        weights, adjoint = (
-            tuple(sp.Symbol(f"{letter}_{i}", real=True) for i in range(len(e))) for letter, e in (("w", f), ("l", g))
-        )
-        functions = [
-            _function(
-                name,
-                _vjp(factors, rows, columns),
-                self._arguments((*q, *factors), self.inputs, self.parameters),
-                len(by),
-            )
-            for name, factors, rows, columns in (
-                ("outputs_vjp", weights, f, (*q, *by)),
-                ("equations_vjp", adjoint, tuple(-e for e in g), by),
-            )
-        ]
-        return _module(functions)
+
+        def function(name: str, letter: str, rows: tuple[sp.Expr, ...], columns: tuple[sp.Symbol, ...]) -> str:
+            factors = tuple(sp.Symbol(f"{letter}_{i}", real=True) for i in range(len(rows)))
+            arguments = self._arguments((*self.states, *factors), self.inputs, self.parameters)
+            return _function(name, _vjp(factors, rows, columns), arguments, len(by))
+
+        outputs = function("outputs_vjp", "w", self.outputs, (*self.states, *by))
+        return _module([outputs, function("equations_vjp", "l", tuple(-e for e in self.equations), by)])
 
     def _arguments(
         self, states: tuple[sp.Symbol, ...], inputs: tuple[sp.Symbol, ...], parameters: tuple[sp.Symbol, ...]

@@ -160,8 +160,8 @@ class Structure(Result):
         order = list(self.table.index)
         groups = {tuple(sorted((n, *p.split(", ")), key=order.index)) for n, p in self.table["partners"].items() if p}
         if groups:
-            told = [", ".join(group) for group in sorted(groups, key=lambda g: order.index(g[0]))]
-            lines.append(f"  Knowing one of a group determines the rest of it: {'; '.join(told)}.")
+            listed = [", ".join(group) for group in sorted(groups, key=lambda g: order.index(g[0]))]
+            lines.append(f"  Knowing one of a group determines the rest of it: {'; '.join(listed)}.")
         return lines
 
     def _confirmation(self) -> str:
