@@ -59,6 +59,16 @@ def bands(
     return Bands(median, low, high, PROBABILITY, count, int(count - converged.sum()))
 
 
+def draws_of(
+    problem: Problem, posterior: Posterior, places: slice | np.ndarray | list[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return some draws of θ (draws, names) and of all noise parameters (draws, noise_names)."""
+    every = (*problem.names, *problem.free_noise)
+    values = np.stack([posterior.draws(name)[places] for name in every], axis=-1)
+    theta, free = np.split(values, [len(problem.names)], axis=1)
+    return np.ascontiguousarray(theta), problem.likelihood.complete(free)
+
+
 Run = Callable[[dict[str, float]], Recording]
 
 
@@ -309,13 +319,9 @@ def predict(
         raise ValueError(f"experiment: must be given together with `run`, got {experiment!r} without `run`.")
     every = (*problem.names, *problem.free_noise)
     _checks.contains("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
-    columns = {name: posterior.draws(name) for name in posterior.names}
-    chosen = np.linspace(0, next(iter(columns.values())).size - 1, count).astype(int)
-    best = int(np.argmax(posterior.data["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()))
-    free = np.array([columns[name][chosen] for name in problem.free_noise]).reshape(-1, count).T
-    noise = problem.likelihood.complete(free)
-    points = np.stack([columns[name][chosen] for name in problem.names], axis=-1)
-    peak = np.array([columns[name][best] for name in problem.names])
+    lp = posterior.data["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()
+    points, noise = draws_of(problem, posterior, np.linspace(0, lp.size - 1, count).astype(int))
+    peak = draws_of(problem, posterior, [int(np.argmax(lp))])[0][0]
     runs = [e.name for e in problem.experiments]
     anchored = problem.anchored(peak, posterior.guesses(runs, problem.model.states))
     solved = anchored.responses.solve(points)
