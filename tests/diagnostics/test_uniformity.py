@@ -1,4 +1,4 @@
-"""Tests of uniformity: false-alarm rates and power."""
+"""The tests of uniformity: false alarm rates and power."""
 
 import numpy as np
 import pytest
