@@ -25,8 +25,8 @@ def test_all_checks_of_the_study_are_met(done):
     _, results, printed = done
     assert len(results["checks"]) >= 20
     assert [check["what"] for check in results["checks"] if not check["met"]] == []
-    account, cost = printed.split("What it costs")
-    assert "What must show" in account and "NO " not in account
+    account, cost = printed.split("\nCost\n")
+    assert "\nTargets\n" in account and "NO " not in account
     assert len(results["cost"]["checks"]) >= 10 and cost.count("\n") > 10  # what is timed has no verdict here
     assert results["quick"] is True and "computed" in results["data"]
     assert set(results["seconds"]) > {"orders", "pendulum", "total"} and "numba" in results["versions"]
