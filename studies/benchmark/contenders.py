@@ -152,7 +152,7 @@ def add_compiled(contest: Contest) -> Compiled:
 def _steps(methods: Sequence[Method]) -> str:
     steps, sweeps = [m.discretised.steps for m in methods], [m.sweeps for m in methods]
     between = f"{min(steps)}" if len(set(steps)) == 1 else f"{min(steps)} … {max(steps)}"
-    return f"{between} steps a cycle, {min(sweeps):.3g} … {max(sweeps):.3g} cycles"
+    return f"{between} steps per cycle, {min(sweeps):.3g} … {max(sweeps):.3g} cycles"
 
 
 def integrate(contest: Contest, methods: Sequence[Callable[[np.ndarray], float]], count: int) -> None:
@@ -195,7 +195,7 @@ def add_scipy(contest: Contest, compiled: Compiled, *, quick: bool = False) -> N
                 continue
             ready, error = tuned
             tolerances = [one.relative for one in ready]
-            note = f"rtol {min(tolerances):.0e} … {max(tolerances):.0e}; 2 cycles timed, times as many as it takes"
+            note = f"rtol {min(tolerances):.0e} … {max(tolerances):.0e}; 2 cycles timed, scaled to the number needed"
             seconds = partial(seconds_until_steady, contest, ready, start, [m.sweeps for m in compiled[STEADY, start]])
             contest.add(name, error, Action(seconds, 1, 1), note)
     for start in (ESTIMATE,) if quick else (EQUILIBRIUM, ESTIMATE):

@@ -242,7 +242,7 @@ class Reference:
 
     setting: Setting
     parameters: list[np.ndarray]  # (draws, parameters + 1): One an experiment
-    exact: list[np.ndarray]  # (draws,): Log-likelihoods, one an experiment
+    exact: list[np.ndarray]  # (draws,): Log-likelihoods, one per experiment
     uncertainty: float  # By how much steps twice as long would change a log-posterior
 
     @property

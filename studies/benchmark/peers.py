@@ -308,7 +308,7 @@ def _add_diffrax(contest: Contest, compiled: Compiled) -> None:
             contest.refuse(name, "not steady within 5000 cycles")
             continue
         seconds = partial(seconds_until_steady, contest, ready, start, [m.sweeps for m in compiled[STEADY, start]])
-        contest.add(name, error, Action(seconds, 1, 1), f"{note}; 2 cycles timed, times as many as it takes")
+        contest.add(name, error, Action(seconds, 1, 1), f"{note}; 2 cycles timed, scaled to the number needed")
     action = Action(partial(integrate, contest, ready, SLOW_DRAWS), SLOW_DRAWS, SLOW_REPEATS)
     contest.add(DIFFRAX_ROWS[2], error, action, f"{note}, one chord step")
     by_theta = np.sum([one.value_and_gradient(p[0])[1] for one, p in zip(ready, reference.parameters, strict=True)], 0)

@@ -44,7 +44,7 @@ def measure(setting: Setting, contest: Mapping[str, Any], methods: Sequence[Meth
     """Return the samplers, and emcee with every timed method.
 
     `setting`: With one channel, all harmonics, and positive parameters that are the model's own. `contest`: What
-    `contenders.measured` returned. `methods`: The fastest contender's, one an experiment.
+    `contenders.measured` returned. `methods`: Those of the fastest method, one per experiment.
     """
     walked = _emcee(setting, methods, seed)
     found = {name: _own(setting, seed, options) for name, options in OWN.items()}

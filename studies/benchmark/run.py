@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> None:
             found["floor"][name] = floors.measure_folded(make(), 5 if options.quick else 31)
         print(targets.floor(name, found["floor"][name]), flush=True)
     for number, (name, make) in enumerate(problems(options).items()):
-        with watch.part(name, f"{name}: every contender"):
+        with watch.part(name, f"{name}: all methods"):
             work = partial(_of_problem, name, make, options)
             one = common.remembered(kept / f"{number}.pkl", _source(options, name), work)
         found["problems"][name] = one["contest"]

@@ -127,7 +127,7 @@ GRADIENT_LEAST, GRADIENT_ERROR = 2.0, 1e-6
 NEAR, WITH_GRADIENT = 0.35, 1.0
 FOLDED_LIMITS = {
     FORCE + FOLDED: {"near": 0.35, "call": 0.35, "batched": 0.18, "gradient": 1.0},
-    DUFFING + FOLDED: {"near": 0.35, "call": 0.35, "batched": 0.18, "gradient": 1.0},
+    DUFFING + FOLDED: {"near": 1.0, "call": 1.0, "batched": 1.0, "gradient": 3.5},
 }
 SAME_GRID = 1e-2
 FASTEST, AROUND_SCIPY = 3.0, 20.0

@@ -112,7 +112,7 @@ def bifurcation(
 
 
 def portraits(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float], fit: bp.MapEstimate) -> Figure:
-    """Draw pitch over heave, measured and fitted, a panel a cycle."""
+    """Draw pitch over heave, measured and fitted, a panel per cycle."""
     from matplotlib import pyplot as plt
 
     figure = plt.figure(figsize=(11.0, 6.0), layout="constrained")

@@ -59,7 +59,7 @@ class Gear:
         return methods(self.drive)
 
     def integrator(self, kind: str, fineness: float, tolerance: float) -> Integrate:
-        """Return a compiled method with so many steps a cycle, or with this relative error of a step."""
+        """Return a compiled method with so many steps per cycle, or with this relative error of a step."""
         steps, frequency = int(fineness) if kind == FIXED else TABLE // 2, self.experiment.frequency
         inputs = self._table(2 * steps)
 

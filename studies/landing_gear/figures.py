@@ -113,7 +113,7 @@ def _interval(verdict: Verdict) -> tuple[float, float]:
 
 
 def drops(dropped: Mapping[str, Dropped]) -> Figure:
-    """Draw the drop test, a column a truth: the first 2.5 s, and by how much the displacement is off over 30 s."""
+    """Draw the drop test, a column per truth: the first 2.5 s, and by how much the displacement is off over 30 s."""
     from matplotlib import pyplot as plt
 
     figure = plt.figure(figsize=(5.0 * len(dropped) + 1.0, 9.0), layout="constrained")
@@ -158,7 +158,7 @@ def _drop(column: np.ndarray, found: Dropped) -> None:
 
 
 def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
-    """Draw the quality-control chart: every unit's deviation from the reference, a row a parameter."""
+    """Draw the quality-control chart: every unit's deviation from the reference, a row per parameter."""
     from matplotlib import pyplot as plt
 
     figure, grid = plt.subplots(len(MEANINGS), 1, figsize=(9.0, 9.5), sharex=True, layout="constrained")

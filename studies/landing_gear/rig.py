@@ -3,8 +3,8 @@
 Everything is SYNTHETIC. A servo-hydraulic actuator moves the axle about a mean compression of 0.12 m. Its oil supply
 limits the speed to 0.25 m/s (2.9 kW at the largest force), 2π · frequency · half stroke, so that large strokes are slow
 and fast ones small. The motion is a sine with the harmonics of a servo valve, 0.4 % second and 0.3 % third. Recorded
-are displacement, force on the axle and gas pressure through 40 cycles at 353.275 samples a cycle, each sample with its
-own normal noise: of full scale (0.2 m, 20 kN, 2.5 MPa) 0.02 % for the displacement, 0.3 % for force and pressure.
+are displacement, force on the axle and gas pressure over 40 cycles at 353.275 samples per cycle, with independent
+normal noise: of full scale (0.2 m, 20 kN, 2.5 MPa) 0.02 % for the displacement, 0.3 % for force and pressure.
 
 The two dampers behind the synthetic measurements of the landing gear study: eq. (9), and one with more physics.
 
