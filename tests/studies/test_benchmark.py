@@ -158,7 +158,7 @@ def test_every_contender_is_accurate_before_it_is_timed(setting):
     contest.add("wrong", 0.02, Action(lambda: pytest.fail("timed")))
     found = contenders.measured(contest, scheme, 2)
     rows = {row["name"]: row for row in found["rows"]}
-    assert rows["wrong"]["milliseconds"] is None and "not right enough" in rows["wrong"]["note"]
+    assert rows["wrong"]["milliseconds"] is None and "not accurate enough" in rows["wrong"]["note"]
     for row in found["rows"]:
         assert (row["milliseconds"] is None) == (row["error"] is None or row["error"] > found["allowed"])
     timed = {name for name, row in rows.items() if row["milliseconds"]}
