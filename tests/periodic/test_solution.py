@@ -296,7 +296,7 @@ def test_windings_of_two_angles_are_given_by_name():
         equations=lambda s, p, u: [s.dda + p.k * sp.sin(s.a - s.b), s.ddb + sp.cos(2 * sp.pi * s.tau)],
         outputs=lambda s, p, u: {"difference": s.a - s.b},
     )
-    with pytest.raises(ValueError, match=r"so name them: winding=\{'a': 2\}"):
+    with pytest.raises(ValueError, match=r"winding: must name the angles .* as \{'a': 2\}, got 2"):
         bp.solve_periodic(twin, {"k": 1.0}, frequency=1.0, samples=20, winding=2)
 
 
