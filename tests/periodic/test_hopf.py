@@ -88,7 +88,7 @@ def test_bad_arguments_of_hopf_points_are_refused(changes, message):
 
 def test_bad_amplitudes_are_refused():
     (point,) = bp.hopf_points(bp.models.flutter, VALUES, "U", between=(5.0, 25.0))
-    for amplitude, message in (({"beta": 1.0}, "got 'beta'"), ({}, "give that of one state")):
+    for amplitude, message in (({"beta": 1.0}, "got 'beta'"), ({}, "must be that of one state")):
         with pytest.raises(ValueError, match=message):
             bp.emerging_cycle(bp.models.flutter, point, amplitude=amplitude)
     still = replace(point, mode=np.array([1.0, 0.0, 0.5j]))
