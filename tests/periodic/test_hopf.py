@@ -94,5 +94,5 @@ def test_bad_amplitudes_are_refused():
     still = replace(point, mode=np.array([1.0, 0.0, 0.5j]))
     with pytest.raises(ValueError, match=r"must be of a state that the oscillation moves, \['h', 'w'\], got 'alpha'"):
         bp.emerging_cycle(bp.models.flutter, still, amplitude={"alpha": 0.01})
-    with pytest.raises(ValueError, match="the point is one of 'flutter'"):
+    with pytest.raises(ValueError, match="must be 'flutter', as of the point"):
         bp.emerging_cycle(bp.models.van_der_pol, point, amplitude={"x": 1.0})
