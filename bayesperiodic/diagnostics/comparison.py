@@ -11,7 +11,6 @@ from scipy.stats import skew
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic._parallel import available_cores
 from bayesperiodic.diagnostics.verdicts import (
     FINE,
     LEVELS,
@@ -30,11 +29,12 @@ from bayesperiodic.diagnostics.verdicts import (
     wasserstein_distance,
 )
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.posterior.density import COLLAPSED, NATURAL, LogPosterior, SamplingCoordinates
 from bayesperiodic.posterior.labels import unit
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.coordinates import COLLAPSED, NATURAL, SamplingDensity
 from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.sampling.starts import laplace_approximation
 
 SAMPLING = "sampling"
 COORDINATES = (NATURAL, SAMPLING)
@@ -263,9 +263,9 @@ def approximation(problem: Problem, fit: MapEstimate, coordinates: str) -> Appro
         names, covariance = [*problem.names], fit.covariance.loc[[*problem.names], [*problem.names]].to_numpy()
         plain = np.zeros(len(names), dtype=bool)
         return Approximation(problem.names, plain, problem.vector(fit.theta), covariance, every)
-    density = SamplingDensity(problem)
+    density = SamplingCoordinates(problem)
     try:
-        mean, covariance = density.laplace(fit)
+        mean, covariance = laplace_approximation(density, fit)
     except ValueError:
         return None
     logarithmic = np.concatenate([density.logarithmic, np.ones(len(density.free), dtype=bool)])
@@ -284,15 +284,13 @@ def importance_k(problem: Problem, fit: MapEstimate, coordinates: str) -> tuple[
     have zero weight. NaN without a finite covariance.
     """
     anchored = problem.anchored(problem.vector(fit.theta), {run: s.states for run, s in fit.solutions.items()})
-    cores = available_cores()
     natural = coordinates == NATURAL
-    density = SamplingDensity(anchored, cores, NATURAL, COLLAPSED) if natural else SamplingDensity(anchored, cores)
+    density = anchored.density(coordinates=NATURAL, variances=COLLAPSED) if natural else anchored.density()
     mean, covariance = _proposal(density, fit, natural)
     if not np.isfinite(covariance).all():
         return np.nan, np.nan, np.nan
     points, log_proposal = normal_draws(mean, covariance, PROPOSALS, np.random.default_rng(SEED))
-    values = density(points)
-    log_weights = (values[:, 0] if values.ndim > 1 else values) - log_proposal
+    log_weights = density.evaluate(points, threads=None).log_prob - log_proposal
     k, top = convergence.pareto_k(log_weights), log_weights.max()
     weights = np.exp(log_weights - top) if np.isfinite(top) else np.ones(1)
     efficiency = float(weights.sum() ** 2 / np.sum(weights**2) / PROPOSALS)
@@ -300,11 +298,12 @@ def importance_k(problem: Problem, fit: MapEstimate, coordinates: str) -> tuple[
     return k, float((1.0 + max(k, 0.0)) / np.sqrt(tail)) if np.isfinite(k) else 0.0, efficiency
 
 
-def _proposal(density: SamplingDensity, fit: MapEstimate, natural: bool) -> tuple[np.ndarray, np.ndarray]:
+def _proposal(density: LogPosterior, fit: MapEstimate, natural: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and covariance in the coordinates of a density; NaN if there are none."""
     names = [*density.problem.names]
     try:
-        mean, covariance = density.laplace(fit) if density.free or not natural else (np.empty(0), np.empty((0, 0)))
+        without_noise = natural and not density.free
+        mean, covariance = (np.empty(0), np.empty((0, 0))) if without_noise else laplace_approximation(density, fit)
     except ValueError:
         return np.full(density.dimension, np.nan), np.full((density.dimension,) * 2, np.nan)
     if not natural:

@@ -13,7 +13,6 @@ from scipy.special import ndtr
 from bayesperiodic import _checks
 from bayesperiodic._linalg import hessian_eigh
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.estimation.laplace import logarithmic
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.periodic.solve import solve_periodic
 from bayesperiodic.posterior.problem import Problem
@@ -39,9 +38,9 @@ class Information:
     @classmethod
     def of(cls, problem: Problem, fit: MapEstimate) -> "Information":
         """Compute the information at an estimate with known noise parameters."""
-        theta, logs = problem.vector(fit.theta), logarithmic(problem)
+        theta, logs = problem.vector(fit.theta), problem.logarithmic
         guesses = {name: solution.states for name, solution in fit.solutions.items()}
-        here = problem.anchored(theta, guesses).linearised(theta)
+        here = problem.anchored(theta, guesses).density().linearise(theta)
         changes = problem.likelihood.whitened(here.changes, problem.noise_values(fit.noise))
         slopes = np.where(logs, theta, 1.0)
         design = np.concatenate(changes, axis=1) * slopes[:, None]

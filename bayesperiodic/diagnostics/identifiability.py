@@ -12,7 +12,6 @@ from scipy.special import ndtr
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics.design import Candidate, Information, default_candidates, rank_candidates
-from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
 from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
@@ -20,7 +19,6 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
 from bayesperiodic.posterior.labels import local_names
 from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.sampling.coordinates import SamplingDensity
 from bayesperiodic.sampling.posterior import Posterior
 from bayesperiodic.symmetry.structure import Structure, analyse_structure
 from bayesperiodic.symmetry.system import system_of
@@ -77,11 +75,15 @@ def power_scaling(problem: Problem, posterior: Posterior) -> dict[str, tuple[flo
     .. [1] N. Kallioinen, T. Paananen, P.-C. Bürkner, A. Vehtari, Detecting and diagnosing prior and likelihood
        sensitivity with power-scaling, Statistics and Computing 34 (2024) 57.
     """
-    lp = posterior.data["sample_stats"]["lp"].transpose("chain", "draw").to_numpy().ravel()
-    places = slice(None, None, max(1, lp.size // MOST_DRAWS))
-    theta, noise = draws_of(problem, posterior, places)
-    lp, prior = lp[places], np.asarray(problem.log_prior(theta))
-    logs = SamplingDensity(problem).logarithmic
+    step = max(1, posterior.draws(problem.names[0]).size // MOST_DRAWS)
+    theta = np.stack([posterior.draws(name)[::step] for name in problem.names], axis=-1)
+    lp = posterior.data["sample_stats"]["lp"].transpose("chain", "draw").to_numpy().ravel()[::step]
+    prior = np.asarray(problem.log_prior(theta))
+    logs = problem.logarithmic
+    free = np.empty((len(theta), len(problem.free_noise)))
+    for i, name in enumerate(problem.free_noise):
+        free[:, i] = posterior.draws(name)[::step]
+    noise = problem.likelihood.complete(free)
     likelihood = lp - prior - problem.likelihood.log_prior(noise) - np.log(theta[:, logs]).sum(axis=1)
     return {
         name: (_sensitivity(theta[:, i], prior), _sensitivity(theta[:, i], likelihood))

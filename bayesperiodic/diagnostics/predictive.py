@@ -323,21 +323,21 @@ def predict(
     points, noise = draws_of(problem, posterior, np.linspace(0, lp.size - 1, count).astype(int))
     peak = draws_of(problem, posterior, [int(np.argmax(lp))])[0][0]
     runs = [e.name for e in problem.experiments]
-    anchored = problem.anchored(peak, posterior.guesses(runs, problem.model.states))
-    solved = anchored.responses.solve(points)
-    converged = np.all([s.status == CONVERGED for s in solved.values()], axis=0)
+    anchored = problem.anchored(peak, posterior.guesses(runs, problem.model.states)).density()
+    solved = anchored.simulator.solve(points)
+    converged = solved.status == CONVERGED
     if not converged.any():
         raise RuntimeError("posterior: none of its draws has a periodic solution. Give draws of this problem.")
-    outputs = {name: o.predicted(solved[name].response) for name, o in problem.observations.items()}
+    outputs = {name: o.predicted(solved.response(name)) for name, o in problem.observations.items()}
     predicted = bands(problem, outputs, converged, problem.likelihood.value_variances(noise))
     components = problem.likelihood.simulate(noise, np.random.default_rng(posterior.seed))
     replicates = {}
     for e in problem.experiments:
         observation = problem.observations[e.name]
         own, components = components[: len(observation.blocks)], components[len(observation.blocks) :]
-        for channel, values in observation.replicates(solved[e.name].response, own).items():
+        for channel, values in observation.replicates(solved.response(e.name), own).items():
             replicates[e.name, channel] = values[converged]
-    here = anchored.linearised(peak)
+    here = anchored.linearise(peak)
     if not here.converged:
         raise RuntimeError(
             "posterior: its draw of highest density has no periodic solution. Give draws of this problem."

@@ -111,15 +111,16 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     """
     count = _checks.integer("draws", draws, 20)
     theta = problem.joint_prior.sample(count, np.random.default_rng(_checks.integer("seed", seed, 0)))
-    solved = problem.responses.solve(theta)
+    density, runs = problem.density(), [e.name for e in problem.experiments]
+    solved = density.simulator.solve(theta)
     verdicts, causes = {}, Counter[str]()
-    failed = [(name, i) for name, s in solved.items() for i in np.flatnonzero(s.status != CONVERGED)]
-    for name in solved:
+    failed = [(name, i) for name in runs for i in np.flatnonzero(solved.statuses(name) != CONVERGED)]
+    for name in runs:
         verdicts[name] = np.full(count, STATUSES[CONVERGED], dtype=object)
     for name, i in tqdm(failed, desc="failed solves", disable=not (progress and failed)):
-        verdicts[name][i], why = ENDS[problem.responses.path_outcome(theta[i], name)]
-        causes[f"{verdicts[name][i]} ({STATUSES[solved[name].status[i]]}): {why}"] += 1
-    outputs, converged = problem.outputs(theta)
+        verdicts[name][i], why = ENDS[density.simulator.path_outcome(theta[i], name)]
+        causes[f"{verdicts[name][i]} ({STATUSES[solved.statuses(name)[i]]}): {why}"] += 1
+    outputs, converged = density.outputs(theta)
     if not converged.any():
         raise RuntimeError(
             f"problem: none of {count} draws from its priors has a periodic solution in all experiments. Narrow the "
@@ -132,7 +133,7 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     rows = {name: {what: float(np.mean(row == what)) for what in order} for name, row in verdicts.items()}
     table = pd.DataFrame.from_dict(rows, orient="index")
     table["inside"] = [*(_inside(problem, prediction, e) for e in range(len(problem.experiments))), np.nan]
-    fractions = {cause: number / (count * len(solved)) for cause, number in causes.most_common()}
+    fractions = {cause: number / (count * len(runs)) for cause, number in causes.most_common()}
     return PriorPredictive(table, fractions, prediction, count)
 
 

@@ -329,10 +329,10 @@ def input_noise(problem: Problem, theta: np.ndarray, solutions: Mapping[str, Per
         directions = _perturbations(e)
         if not len(directions):
             continue
-        equations = problem.responses.equations[e.name].at_frequency(solutions[e.name].frequency)
+        equations = problem.equations[e.name].at_frequency(solutions[e.name].frequency)
         z, parameters = (
             periodic_part(equations, solutions[e.name].states),
-            problem.responses.parameters(theta[None], e.name)[0],
+            problem.parameters(theta[None], e.name)[0],
         )
         derivative = input_sensitivities(equations, z, parameters, directions)
         if derivative is None:

@@ -1,13 +1,13 @@
 """The staged Gauss-Newton iteration: noise parameters from the residuals, then a step in θ (eq. 7-8)."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesperiodic.posterior.density import Linearisation
+from bayesperiodic.posterior.density import Linearisation, LogPosterior
+from bayesperiodic.posterior.description import Description
 from bayesperiodic.posterior.likelihood import estimate_noise
-from bayesperiodic.posterior.problem import Problem
 
 MAX_ITERATIONS = 100
 MAX_HALVINGS = 30
@@ -19,15 +19,15 @@ MAX_ROUNDS, PRESSED = 10, 1e-3
 
 @dataclass(frozen=True)
 class Iterate:
-    """Where the iteration stands.
+    """State of the Gauss-Newton iteration.
 
     Attributes
     ----------
     theta : array (names,)
     here : Linearisation
-        At θ, which anchors the next solves.
+        At θ; its anchors are those of the next solves.
     noise : array (noise_names,)
-        The noise parameters that suit the residuals there.
+        Best noise parameters for the residuals at θ.
     objective : float
     """
 
@@ -39,71 +39,62 @@ class Iterate:
 
 @dataclass(frozen=True)
 class Objective:
-    """What the iteration maximises over θ, the noise parameters having been replaced by the best ones.
+    """The density that the iteration maximises over θ, with the best noise parameters at every θ.
 
     Attributes
     ----------
-    problem : Problem
+    density : LogPosterior
     share : float
-        What multiplies the logarithms of the variances: 1 − l/Σn makes their best values those of eq. (7), 1 those of
+        Factor of the logarithms of the variances: with 1 − l/Σn their best values are those of eq. (7), with 1 those of
         the maximum of eq. (6).
-    logarithmic : bool array (names,)
-        Parameters whose density is taken over their logarithm.
     """
 
-    problem: Problem
+    density: LogPosterior
     share: float
-    logarithmic: np.ndarray
 
-    def at(self, theta: np.ndarray, near: Linearisation | None, noise: np.ndarray) -> Iterate | None:
-        """Return the iterate at θ, solved from a near one; None where the log-posterior is not finite."""
-        prior = float(self.problem.log_prior(theta))
-        if not np.isfinite(prior):
+    def at(self, theta: np.ndarray, near: Linearisation, noise: np.ndarray) -> Iterate | None:
+        """Return the iterate at θ, solved from the anchors of a near one; None if the log-posterior is not finite."""
+        if not np.isfinite(self.density.problem.joint_prior.log_prob(theta)):
             return None
-        problem = self.problem if near is None else self.problem.with_responses(near.responses)
-        trial = Linearisation(theta, problem.responses, problem.comparisons)
-        if not trial.converged or not all(np.isfinite(r).all() for r in trial.residuals):
+        return self.iterate(near.moved(theta), noise)
+
+    def iterate(self, here: Linearisation, noise: np.ndarray) -> Iterate | None:
+        """Return the iterate of solved residuals; None if the log-posterior is not finite."""
+        if not here.converged or not all(np.isfinite(r).all() for r in here.residuals):
             return None
-        likelihood = problem.likelihood
-        noise = estimate_noise(likelihood, trial.residuals, noise, self.share)
-        value = float(likelihood(trial.residuals, noise, self.share) + likelihood.log_prior(noise))
-        value += prior + float(np.sum(np.log(theta[self.logarithmic])))
-        return Iterate(theta, trial, noise, value) if np.isfinite(value) else None
+        noise = estimate_noise(self.density.problem.likelihood, here.residuals, noise, self.share)
+        value = self.density.objective(here, noise, self.share)
+        return Iterate(here.theta, here, noise, value) if np.isfinite(value) else None
 
     def anchored(self, iterate: Iterate) -> Iterate:
         """Return the iterate with the solves anchored at it."""
-        here = self.problem.with_responses(iterate.here.responses).linearised(iterate.theta)
-        return Iterate(iterate.theta, here, iterate.noise, iterate.objective)
+        return replace(iterate, here=iterate.here.anchored())
 
     def moved(self, theta: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Return θ after a step, along which parameters whose density is over the logarithm grow exponentially.
+        """Return θ after a step; parameters whose density is over the logarithm change by a factor.
 
-        So the step stays on the ridge of a product, which is straight in logarithms.
+        Ridges of products are straight in logarithms, so that the step stays on them.
         """
-        result, logs = theta + step, self.logarithmic
+        result, logs = theta + step, self.density.logarithmic
         with np.errstate(over="ignore"):
             result[logs] = theta[logs] * np.exp(step[logs] / theta[logs])
         return result
 
     def hessian_and_gradient(self, iterate: Iterate) -> tuple[np.ndarray, np.ndarray]:
         """Return H of eq. (8) and the gradient of the objective, the prior's part included in both."""
-        hessian, gradient = information(self.problem, iterate)
-        prior, theta, logarithmic = self.problem.joint_prior, iterate.theta, self.logarithmic
-        hessian = hessian + prior.curvature(theta)
-        hessian[logarithmic, logarithmic] += theta[logarithmic] ** -2
-        gradient = gradient + prior.gradient(theta)
-        gradient[logarithmic] += 1.0 / theta[logarithmic]
+        hessian, gradient = information(self.density.problem, iterate)
+        gradient, hessian = self.density.add_prior(iterate.theta, gradient, hessian)
         return hessian, gradient
 
 
-def information(problem: Problem, iterate: Iterate) -> tuple[np.ndarray, np.ndarray]:
+def information(problem: Description, iterate: Iterate) -> tuple[np.ndarray, np.ndarray]:
     """Return the data's part of H of eq. (8), (names, names), and of its gradient, (names,)."""
     changes = np.concatenate(problem.likelihood.whitened(iterate.here.changes, iterate.noise), axis=1)
     residuals = np.concatenate(problem.likelihood.whitened(iterate.here.residuals, iterate.noise))
     return changes @ changes.T, changes @ residuals
 
 
-def bias_correction(problem: Problem) -> float:
+def bias_correction(problem: Description) -> float:
     """Return 1 − l/Σn, for which the variances of the first stage are those of eq. (7); 1 if that is not positive."""
     share = 1.0 - len(problem.names) / problem.counted if problem.counted else 1.0
     return share if share > 0.0 else 1.0
@@ -157,7 +148,7 @@ def climb(
 def at_ends(objective: Objective, iterate: Iterate) -> np.ndarray:
     """Return −1 or 1 for parameters next to the lower or upper end of their support, 0 for others, (names,)."""
     hessian, _ = objective.hessian_and_gradient(iterate)
-    low, high = np.transpose(list(objective.problem.joint_prior.supports.values()))
+    low, high = np.transpose(list(objective.density.problem.joint_prior.supports.values()))
     near = PRESSED / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
     return 1.0 * (high - iterate.theta < near) - (iterate.theta - low < near)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 
 from bayesperiodic.estimation.gauss_newton import SINGULAR, Iterate, Objective, climb
-from bayesperiodic.posterior.density import Linearisation
-from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.posterior.density import LogPosterior
+from bayesperiodic.posterior.description import Description
 
 STEP = 1e-3
 NOISE_STEP = 1e-4
@@ -32,18 +32,13 @@ class JointLaplace:
     covariance: pd.DataFrame
 
 
-def logarithmic(problem: Problem) -> np.ndarray:
-    """Return which parameters are sampled in their logarithm, (names,)."""
-    return np.array([support == (0.0, np.inf) for support in problem.joint_prior.supports.values()])
-
-
-def joint_laplace(problem: Problem, start: Iterate) -> JointLaplace:
+def joint_laplace(density: LogPosterior, start: Iterate) -> JointLaplace:
     """Climb from the estimate to the mode in sampling coordinates and take the exact Hessian there.
 
     The Hessian over θ comes from central differences of the exact gradient; parameters local to experiments are moved
     together, because each experiment knows only its own.
     """
-    objective = Objective(problem, 1.0, logarithmic(problem))
+    problem, objective = density.problem, Objective(density, 1.0)
     first = objective.at(start.theta, start.here, start.noise)
     labels = [*problem.names, *problem.free_noise]
     nothing = pd.DataFrame(np.full((len(labels), len(labels)), np.nan), index=labels, columns=labels)
@@ -52,7 +47,7 @@ def joint_laplace(problem: Problem, start: Iterate) -> JointLaplace:
     mode, _, _ = climb(objective, objective.anchored(first))
     free = [problem.noise_names.index(name) for name in problem.free_noise]
     values = [*mode.theta.tolist(), *mode.noise[free].tolist()]
-    hessian = _hessian(problem, objective, mode, free)
+    hessian = _hessian(objective, mode, free)
     if not np.isfinite(hessian).all() or not np.all(np.diag(hessian) > 0.0):
         return JointLaplace(dict(zip(labels, values, strict=True)), nothing)
     scale = 1.0 / np.sqrt(np.diag(hessian))
@@ -63,11 +58,12 @@ def joint_laplace(problem: Problem, start: Iterate) -> JointLaplace:
     return JointLaplace(dict(zip(labels, values, strict=True)), pd.DataFrame(covariance, index=labels, columns=labels))
 
 
-def _hessian(problem: Problem, objective: Objective, mode: Iterate, free: list[int]) -> np.ndarray:
+def _hessian(objective: Objective, mode: Iterate, free: list[int]) -> np.ndarray:
     """Return −∂² log-density over the sampling coordinates."""
-    count, logs = len(problem.names), objective.logarithmic
-    by_theta = -_second_derivatives(problem, objective, mode) + problem.joint_prior.curvature(mode.theta)
-    gradient = mode.here.forward(problem.likelihood.gradients(mode.here.residuals, mode.noise)[0])
+    problem, logs = objective.density.problem, objective.density.logarithmic
+    count = len(problem.names)
+    by_theta = -_second_derivatives(objective, mode) + problem.joint_prior.curvature(mode.theta)
+    gradient = _total(mode.here.vjp(problem.likelihood.gradients(mode.here.residuals, mode.noise)[0], adjoint=False))
     gradient = gradient + problem.joint_prior.gradient(mode.theta)
     slopes = np.where(logs, mode.theta, 1.0)
     hessian = np.zeros((count + len(free), count + len(free)))
@@ -78,15 +74,15 @@ def _hessian(problem: Problem, objective: Objective, mode: Iterate, free: list[i
             noise = mode.noise.copy()
             noise[column] *= np.exp(sign * NOISE_STEP)
             by_residual, by_noise = problem.likelihood.gradients(mode.here.residuals, noise)
-            changes.append(np.concatenate([mode.here.forward(by_residual) * slopes, by_noise[free]]))
+            changes.append(np.concatenate([_total(mode.here.vjp(by_residual, adjoint=False)) * slopes, by_noise[free]]))
         hessian[count + row] = -(changes[0] - changes[1]) / (2.0 * NOISE_STEP)
         hessian[:count, count + row] = hessian[count + row, :count]
     return 0.5 * (hessian + hessian.T)
 
 
-def _second_derivatives(problem: Problem, objective: Objective, mode: Iterate) -> np.ndarray:
+def _second_derivatives(objective: Objective, mode: Iterate) -> np.ndarray:
     """Return ∂² log-likelihood/∂θ² at the mode, (names, names)."""
-    hessian, _ = objective.hessian_and_gradient(mode)
+    problem, (hessian, _) = objective.density.problem, objective.hessian_and_gradient(mode)
     sd = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
     result = np.zeros((len(problem.names),) * 2)
     for group in _moved_together(problem):
@@ -100,7 +96,7 @@ def _second_derivatives(problem: Problem, objective: Objective, mode: Iterate) -
     return 0.5 * (result + result.T)
 
 
-def _moved_together(problem: Problem) -> list[dict[str, int]]:
+def _moved_together(problem: Description) -> list[dict[str, int]]:
     """Return sets of columns of θ of which every experiment knows at most one, by experiment."""
     groups: dict[str, dict[str, int]] = {}
     for experiment, parameter_map in problem.parameter_maps.items():
@@ -109,18 +105,19 @@ def _moved_together(problem: Problem) -> list[dict[str, int]]:
     return list(groups.values())
 
 
-def _gradients(problem: Problem, theta: np.ndarray, mode: Iterate) -> dict[str, np.ndarray]:
+def _gradients(problem: Description, theta: np.ndarray, mode: Iterate) -> dict[str, np.ndarray]:
     """Return each experiment's gradient of the log-likelihood by θ, at the noise parameters of the mode."""
-    near = problem.with_responses(mode.here.responses)
-    there = (
-        near.linearised(theta)
-        if problem.model.autonomous
-        else Linearisation(theta, mode.here.responses, problem.comparisons)
-    )
+    there = mode.here.moved(theta)
+    if problem.model.autonomous:
+        there = there.anchored()
     if not there.converged:
         return dict.fromkeys(problem.observations, np.full(theta.size, np.nan))
     by_residual = problem.likelihood.gradients(there.residuals, mode.noise)[0]
-    return there.by_experiment(by_residual, adjoint=not problem.model.autonomous)
+    return there.vjp(by_residual, adjoint=not problem.model.autonomous)
+
+
+def _total(by_experiment: dict[str, np.ndarray]) -> np.ndarray:
+    return np.sum(list(by_experiment.values()), axis=0)
 
 
 SHOWN = 0.05

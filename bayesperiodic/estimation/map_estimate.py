@@ -19,10 +19,12 @@ from bayesperiodic.estimation.gauss_newton import (
     climb,
     information,
 )
-from bayesperiodic.estimation.initial import all_at_once
-from bayesperiodic.estimation.laplace import SILENT, joint_laplace, logarithmic, undetermined
+from bayesperiodic.estimation.laplace import SILENT, joint_laplace, undetermined
 from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, noise_split
+from bayesperiodic.posterior.density import NATURAL, RIDGE, Linearisation, LogPosterior
+from bayesperiodic.posterior.initial import InitialEstimate, simultaneous_fit
 from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.posterior.simulator import Simulator
 
 NOISE_SHARE = 0.1
 LARGEST_SHIFT = 0.1
@@ -107,14 +109,14 @@ def map_estimate(
         _checks.same_names("start", start, problem.names)
     theta = problem.median() if start is None else problem.vector(start)
     _checks.integer("starts", starts, 1)
-    objective = Objective(problem, bias_correction(problem), np.zeros(len(problem.names), dtype=bool))
-    first = _first_iterate(objective, theta)
+    first = _first_iterate(problem, theta)
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
+    objective = _objective(problem, first.here)
     best, status, history = _climb(objective, first, progress)
     found = [_outcome(problem, best)]
     for draw in problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0))):
-        other = _first_iterate(objective, draw)
+        other = _first_iterate(problem, draw)
         if other is None:
             found.append({"objective": -np.inf} | dict.fromkeys(problem.names, np.nan))
             continue
@@ -122,28 +124,35 @@ def map_estimate(
         found.append(_outcome(problem, end))
         if end.objective > best.objective:
             best, status, history = end, other_status, other_history
-    result = _describe(objective, best, status, history, tuple(found))
+    result = _describe(problem, objective, best, status, history, tuple(found))
     for text in remarks(problem, result):
         warnings.warn(text, UserWarning, stacklevel=3)
     return result
 
 
-def _first_iterate(objective: Objective, theta: np.ndarray) -> Iterate | None:
+def _objective(problem: Problem, near: Linearisation) -> Objective:
+    return Objective(LogPosterior(problem, near.simulator, coordinates=NATURAL), bias_correction(problem))
+
+
+def _first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:
     """Return the anchored iterate at a start; None where the log-posterior is not finite."""
-    if not np.isfinite(objective.problem.log_prior(theta)):
+    if not np.isfinite(problem.joint_prior.log_prob(theta)):
         return None
-    problem = objective.problem
-    together = all_at_once(problem, theta)
-    if together is not None and together.states:
-        near = problem.anchored(together.theta, together.states).linearised(together.theta)
-        iterate = objective.at(together.theta, near, problem.likelihood.guess())
+    found = simultaneous_fit(problem, theta)
+    if found is not None and found.states:
+        near = _at_fitted_orbits(problem, found)
+        iterate = _objective(problem, near).iterate(near, problem.likelihood.guess())
         if iterate is not None:
-            return Iterate(together.theta, near, iterate.noise, iterate.objective)
-    if together is not None and all(e.mask is not None for e in problem.experiments):
+            return iterate
+    if found is not None and all(e.mask is not None for e in problem.experiments):
         return None
-    near = problem.linearised(theta)
-    iterate = objective.at(theta, near, problem.likelihood.guess())
-    return iterate and Iterate(theta, near, iterate.noise, iterate.objective)
+    near = problem.density().linearise(theta)
+    return _objective(problem, near).iterate(near, problem.likelihood.guess())
+
+
+def _at_fitted_orbits(problem: Problem, found: InitialEstimate) -> Linearisation:
+    """Return residuals and Jacobian where orbits and parameters fit together."""
+    return LogPosterior(problem, Simulator.start(problem, found.theta, found.states)).linearise(found.theta)
 
 
 def _climb(objective: Objective, first: Iterate, progress: bool) -> tuple[Iterate, str, np.ndarray]:
@@ -161,12 +170,16 @@ def _outcome(problem: Problem, iterate: Iterate) -> dict[str, float]:
 
 
 def _describe(
-    objective: Objective, best: Iterate, status: str, history: np.ndarray, starts: tuple[dict[str, float], ...]
+    problem: Problem,
+    objective: Objective,
+    best: Iterate,
+    status: str,
+    history: np.ndarray,
+    starts: tuple[dict[str, float], ...],
 ) -> MapEstimate:
-    problem, share = objective.problem, objective.share
-    names, likelihood = problem.names, problem.likelihood
+    share, names, likelihood = objective.share, problem.names, problem.likelihood
     data, _ = information(problem, best)
-    solutions = problem.with_responses(best.here.responses).solve(best.theta)
+    solutions = best.here.simulator.solutions(best.theta)
     covariance, lost = _inverse(data + problem.joint_prior.curvature(best.theta))
     robust = robust_covariance(problem, best, covariance)
     covariance = with_uncertain_noise(problem, best, covariance)
@@ -178,7 +191,7 @@ def _describe(
     with np.errstate(invalid="ignore"):
         sd, robust_sd = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
     residuals = best.here.compared()
-    joint = joint_laplace(problem, best)
+    joint = joint_laplace(objective.density.with_settings(coordinates=RIDGE), best)
     noise = dict(zip(problem.noise_names, best.noise.tolist(), strict=True))
     rms = {c: _pooled(problem, c, residuals) for c in problem.channels}
     measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} for e in problem.experiments}
@@ -204,7 +217,7 @@ def _describe(
         input_noise=input_noise(problem, best.theta, solutions),
         doubling_shift=dict(zip(names, shift.tolist(), strict=True)),
         at_ends=tuple(name for name, end in zip(names, at_ends(objective, best), strict=True) if end),
-        undetermined=undetermined(data, best.theta, names, logarithmic(problem)),
+        undetermined=undetermined(data, best.theta, names, problem.logarithmic),
         history=history,
         starts=starts,
         tied=_tied_slopes(problem, best.theta),
@@ -292,17 +305,17 @@ def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
             f"({low:g}, {high:g})."
         )
     values += "" if given_start else " (the priors' medians)"
-    together = all_at_once(problem, theta)
-    if together is not None and together.blocked:
+    found = simultaneous_fit(problem, theta)
+    if found is not None and found.blocked:
         where = "the other experiments' orbits are" if len(problem.experiments) > 1 else "it is an orbit"
         return (
-            f"start: {values} is not allowed; {together.blocked!r} cannot be followed from its guess to parameters at "
+            f"start: {values} is not allowed; {found.blocked!r} cannot be followed from its guess to parameters at "
             f"which {where}. Leave it out if it may be none, or give start={{…}} nearer to the truth."
         )
-    if together is not None and together.states:
-        near = problem.anchored(together.theta, together.states).linearised(together.theta)
+    if found is not None and found.states:
+        near = _at_fitted_orbits(problem, found)
     else:
-        near = problem.linearised(theta)
+        near = problem.density().linearise(theta)
     failed = ", ".join(f"{name!r} ({status})" for name, status in near.statuses.items() if status != "converged")
     ended = f"without the orbit of {failed}" if failed else "well, but the outputs or the noise are not finite"
     return (

@@ -17,10 +17,11 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic._parallel import TaskPool, checked_executor
 from bayesperiodic.estimation.gauss_newton import PRESSED, Iterate, Objective, bias_correction, climb
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.posterior.density import Linearisation
+from bayesperiodic.posterior.density import NATURAL, Linearisation, LogPosterior
 from bayesperiodic.posterior.parameters import SHIFT
 from bayesperiodic.posterior.priors import Prior
 from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.posterior.simulator import Simulator
 
 # How far apart points lie, as changes of the root of the drop; how steps grow, are cut, and when they are short.
 SPACING, GROWTH, SHORTENED, SMALLEST = 0.5, 3.0, 0.25, 0.01
@@ -64,7 +65,7 @@ class Ridge:
 
     @property
     def _prior(self) -> Prior:
-        joint = self.objective.problem.joint_prior
+        joint = self.objective.density.problem.joint_prior
         return joint.marginals[joint.names[self.column]]
 
     def limits(self) -> tuple[float, float]:
@@ -442,15 +443,15 @@ def _checked_names(problem: Problem, names: Sequence[str] | None) -> tuple[str, 
 
 
 def _at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate]:
-    """Return what is maximised and where the estimate stands, its solves anchored at the estimate's own solutions."""
+    """Return the objective and its iterate at the estimate, anchored at the estimate's solutions."""
     _checks.same_names("fit.theta", fit.theta, problem.names)
     _checks.same_names("fit.noise", fit.noise, problem.noise_names)
     _checks.same_names("fit.solutions", fit.solutions, [e.name for e in problem.experiments])
-    theta = problem.vector(fit.theta)
-    responses = problem.anchored(theta, {name: s.states for name, s in fit.solutions.items()}).responses
-    objective = Objective(problem, bias_correction(problem), np.zeros(theta.size, dtype=bool))
-    near = Linearisation(theta, responses, problem.comparisons)
-    peak = objective.at(theta, near, np.array([fit.noise[name] for name in problem.noise_names]))
+    theta, noise = problem.vector(fit.theta), np.array([fit.noise[name] for name in problem.noise_names])
+    guesses = {name: s.states for name, s in fit.solutions.items()}
+    density = LogPosterior(problem, Simulator.start(problem, theta, guesses), coordinates=NATURAL)
+    objective = Objective(density, bias_correction(problem))
+    peak = objective.iterate(Linearisation(theta, density.simulator, density.comparisons), noise)
     if peak is None:
         raise ValueError(
             f"fit: {_written(fit.theta)} is not allowed; the log-posterior is not finite there. Give "

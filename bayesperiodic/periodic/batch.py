@@ -134,7 +134,9 @@ class Batch:
     def _kernels(self) -> ModuleType:
         return kernels("batch", self._first.count, self._first.grid.stencil)
 
-    def solve(self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False) -> BatchSolution:
+    def solve(
+        self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False, polish: bool = False
+    ) -> BatchSolution:
         """Solve every input set for every parameter vector; the result does not depend on the number of threads.
 
         Parameters
@@ -143,14 +145,18 @@ class Batch:
         threads : int, optional
             By default the number of cores.
         keep : bool
-            Return z too, after further chord steps down to rounding, for derivatives.
+            Return z too.
+        polish : bool
+            Take further chord steps, so that z and what is derived from it are as accurate as possible.
         """
         model, grid = self._first.model, self._first.grid
         solves = parameters.shape[-2]
         z = np.empty((self._size, solves, grid.points if keep else 0, self._first.count))
         y = np.empty((self._size, solves, grid.points, model.kernels.channels))
         nothing = np.empty((self._size, grid.points, 0)), np.empty(0, dtype=np.int64)
-        return self._solve(parameters, *nothing, z, y, threads, keep)[0]
+        _, status, iterations = self._solve(parameters, *nothing, z, y, threads, polish)
+        frequency = np.repeat(self._shared[1][:, None], solves, axis=1)
+        return BatchSolution(z, y, frequency, status, iterations)
 
     def squares(
         self, parameters: np.ndarray, data: np.ndarray, measured: np.ndarray, threads: int | None = None

@@ -1,71 +1,86 @@
-"""A problem at one θ: residuals, their derivatives forward and backward (de Kraker et al. 1997, eq. 4-5)."""
+"""The log-posterior density over sampling coordinates: prior, Jacobian, likelihood, and their derivatives."""
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import gammaln
 
-from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
-from bayesperiodic.posterior.likelihood import Residuals, Squares
-from bayesperiodic.posterior.observation import Comparisons, Observation, Response
-from bayesperiodic.posterior.simulator import Responses
+from bayesperiodic.periodic.compiled import CONVERGED, SINGULAR, STATUSES
+from bayesperiodic.periodic.solution import PeriodicSolution
+from bayesperiodic.posterior.description import Description
+from bayesperiodic.posterior.initial import simultaneous_fit
+from bayesperiodic.posterior.likelihood import Residuals
+from bayesperiodic.posterior.noise import FLAT, JEFFREYS, KNOWN, SPECTRAL, Circulant, Independent
+from bayesperiodic.posterior.observation import Comparisons, Response, Simulation
+from bayesperiodic.posterior.simulator import Guesses, Simulator
 
-if TYPE_CHECKING:
-    from bayesperiodic.posterior.problem import Problem
+RIDGE, NATURAL = "ridge", "natural"
+SAMPLED, COLLAPSED = "sampled", "collapsed"
 
 
 class Linearisation:
-    """Everything that one θ says, computed where it is first asked for.
+    """Residuals at one θ and their Jacobian (de Kraker et al. 1997, eq. 4-5).
 
     Parameters
     ----------
     theta : array (names,)
-    responses : Responses
-        Anchored at θ.
+    simulator : Simulator
+        Anchored at θ where derivatives by `changes` are wanted.
     comparisons : Comparisons
-        With the experiments.
+    polish : bool
+        Solve as accurately as possible; without it the residuals are those of `LogPosterior.evaluate`.
     """
 
-    def __init__(self, theta: np.ndarray, responses: Responses, comparisons: Comparisons):
-        self.theta, self.responses, self._comparisons = theta, responses, comparisons
+    def __init__(self, theta: np.ndarray, simulator: Simulator, comparisons: Comparisons, polish: bool = True):
+        self.theta, self.simulator, self._comparisons, self._polish = theta, simulator, comparisons, polish
+        self._observations = simulator.problem.observations
+
+    @cached_property
+    def _simulation(self) -> Simulation:
+        return self.simulator.solve(self.theta[None], keep=True, polish=self._polish)
+
+    def moved(self, theta: np.ndarray) -> "Linearisation":
+        """Return the residuals at another θ (names,), solved from the same anchors."""
+        return Linearisation(theta, self.simulator, self._comparisons)
+
+    def anchored(self) -> "Linearisation":
+        """Return the same with the anchors at its θ."""
+        return Linearisation(self.theta, self.simulator.anchored(self.theta), self._comparisons)
 
     @property
-    def _observations(self) -> dict[str, Observation]:
-        """Of every experiment, in the order of the problem."""
-        return {name: self._comparisons.observations[name] for name in self._solves}
-
-    @cached_property
-    def _solved(self) -> dict[str, tuple[Response, np.ndarray]]:
-        return {name: solved.one(0) for name, solved in self._solves.items()}
-
-    @cached_property
-    def _solves(self) -> dict:
-        return self.responses.solve(self.theta[None], keep=True)
+    def status(self) -> int:
+        """The worst status code of the solves."""
+        return int(self._simulation.status[0])
 
     @property
     def statuses(self) -> dict[str, str]:
-        """How the solve of each experiment ended."""
-        return {name: STATUSES[int(solved.status[0])] for name, solved in self._solves.items()}
+        """Status of the solve of each experiment."""
+        return {name: STATUSES[int(self._simulation.statuses(name)[0])] for name in self._observations}
 
     @property
     def converged(self) -> bool:
-        """Whether all solves did, with derivatives."""
-        return all(solved.status[0] == CONVERGED for solved in self._solves.values())
+        """Whether all solves converged."""
+        return self.status == CONVERGED
 
     @cached_property
     def residuals(self) -> Residuals:
         """Residual components, one array (size,) a block."""
-        responses = {name: solved.response for name, solved in self._solves.items()}
-        return self._comparisons.residuals(responses, 1).at(0)
+        return self._comparisons.residuals(self._simulation).at(0)
+
+    @cached_property
+    def _responses(self) -> dict[str, Response]:
+        here = self._simulation.at(0)
+        return {name: here.response(name) for name in self._observations}
 
     @cached_property
     def changes(self) -> list[np.ndarray]:
         """Derivatives of the predicted components by θ, one array (names, size) a block; NaN where singular."""
         result = []
         for name, observation in self._observations.items():
-            response, z = self._solved[name]
-            directions = self.responses.changes(self.theta, name, response, z)
+            response = self._responses[name]
+            directions = self.simulator.changes(self.theta, name, response, self._simulation.z(name)[0])
             if directions is None:
                 result += [np.full((self.theta.size, block.size), np.nan) for block in observation.blocks]
             else:
@@ -74,23 +89,21 @@ class Linearisation:
 
     def compared(self) -> dict[str, dict[str, np.ndarray]]:
         """Return y − ŷ (points,) by experiment and channel, within the harmonics kept."""
-        return {name: o.compared(self._solved[name][0]) for name, o in self._observations.items()}
+        return {name: o.compared(self._responses[name]) for name, o in self._observations.items()}
 
-    def forward(self, by_residual: Sequence[np.ndarray]) -> np.ndarray:
-        """Return Σ (derivatives by the residuals) · ∂residual/∂θ, (names,), from `changes`."""
-        return np.sum(list(self.by_experiment(by_residual, adjoint=False).values()), axis=0)
+    def vjp(self, by_residual: Sequence[np.ndarray], *, adjoint: bool) -> dict[str, np.ndarray]:
+        """Return Σ by_residual · ∂residual/∂θ, (names,) by experiment; NaN where the derivatives do not exist.
 
-    def adjoint(self, by_residual: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the same by one transposed solve an experiment."""
-        return np.sum(list(self.by_experiment(by_residual, adjoint=True).values()), axis=0)
-
-    def by_experiment(self, by_residual: Sequence[np.ndarray], *, adjoint: bool) -> dict[str, np.ndarray]:
-        """Return each experiment's part of the sum; NaN where its derivatives do not exist."""
+        Parameters
+        ----------
+        by_residual : sequence of array (size,)
+            Derivatives of a scalar by the residuals, one array a block.
+        adjoint : bool
+            Take one transposed solve an experiment (forced models) instead of `changes`.
+        """
         if adjoint:
-            responses = {name: response for name, (response, _) in self._solved.items()}
-            weights = self._comparisons.pulled(responses, self.residuals.like(by_residual))
-            pulled = self.responses.pulled(self.theta, self._solved, weights)
-            return {name: -pulled[name] for name in self._solved}
+            weights = self._comparisons.vjp(self._simulation, self.residuals.like(by_residual))
+            return {name: -own for name, own in self.simulator.vjp(self.theta, self._simulation, weights).items()}
         result, start, blocks = {}, 0, list(by_residual)
         for name, observation in self._observations.items():
             stop = start + len(observation.blocks)
@@ -100,72 +113,372 @@ class Linearisation:
         return result
 
 
-class LikelihoodSlope(NamedTuple):
-    """A log-likelihood and its derivatives.
+class Evaluation(NamedTuple):
+    """Log-densities at several points.
 
     Attributes
     ----------
-    status : str
-        How the worst of the periodic solves ended.
-    value : float
-        −inf where one has failed, or the value is not finite; the derivatives are then zero.
-    by_theta : array (names,)
-        NaN where a derivative does not exist.
-    by_noise : array (noise_names,)
-        By ln φ, of the log-likelihood plus the log-prior of φ.
+    log_prob : array (points,)
+        −inf where a periodic solve fails or the prior is zero.
+    status : int array (points,)
+        The worst status code of the periodic solves; that of "converged" where nothing was solved.
+    moments : array (points, collapsed)
+        M of eq. (6) of each variance that is integrated out; NaN where a solve fails.
     """
 
-    status: str
-    value: float
-    by_theta: np.ndarray
-    by_noise: np.ndarray
+    log_prob: np.ndarray
+    status: np.ndarray
+    moments: np.ndarray
 
 
-def likelihood_slope(
-    problem: "Problem", theta: np.ndarray, noise: np.ndarray, *, forward: bool = False
-) -> LikelihoodSlope:
-    """Return the log-likelihood and its derivatives, by one transposed solve an experiment where that is possible.
+class SamplingCoordinates:
+    """Coordinates of a problem's posterior density.
+
+    A parameter whose prior's support is (0, ∞) is replaced by its logarithm, any other is its own coordinate; the
+    logarithms of the free noise parameters follow.
 
     Parameters
     ----------
-    problem : Problem
-    theta : array (names,)
-    noise : array (noise_names,)
-    forward : bool
-        Take one solve a parameter instead of one transposed solve.
+    problem : Description
+    coordinates : "ridge" or "natural"
+        "natural" takes no logarithms of parameters.
+    variances : "sampled" or "collapsed"
+        "collapsed" leaves out the variances that can be integrated out in closed form.
+
+    Attributes
+    ----------
+    labels : tuple of str
+        Parameters and noise parameters, in the order of the coordinates.
+    collapsed : tuple of str
+        Variances that are integrated out.
+    free : tuple of str
+        Noise parameters that have a coordinate.
     """
-    if problem.flat_misfits and not forward:
-        return _from_squares(problem, theta, noise)
-    here = Linearisation(theta, problem.responses, problem.comparisons)
-    if not here.converged:
-        return _failed(problem, max(here.statuses.values(), key=STATUSES.index))
-    value = float(problem.likelihood(here.residuals, noise))
-    if not np.isfinite(value):
-        return _failed(problem, STATUSES[CONVERGED])
-    by_residual, by_noise = problem.likelihood.gradients(here.residuals, noise)
-    return LikelihoodSlope(STATUSES[CONVERGED], value, problem.pulled(here, by_residual, forward=forward), by_noise)
+
+    def __init__(self, problem: Description, *, coordinates: str = RIDGE, variances: str = SAMPLED):
+        self.problem, self.coordinates = problem, coordinates
+        self.logarithmic = problem.logarithmic & (coordinates == RIDGE)
+        self.collapsed = collapsible(problem) if variances == COLLAPSED else ()
+        self.free = tuple(name for name in problem.free_noise if name not in self.collapsed)
+        self.labels = (*problem.names, *self.free)
+        self._noise_columns = [problem.noise_names.index(name) for name in self.free]
+        fixed = problem.likelihood.fixed
+        self._noise = np.array([fixed.get(name, 1.0) for name in problem.noise_names])
+
+    @property
+    def dimension(self) -> int:
+        """Number of sampling coordinates."""
+        return len(self.labels)
+
+    def to_natural(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return θ (…, names) and all noise parameters (…, noise_names) of points; integrated variances are 1."""
+        count = len(self.problem.names)
+        theta, noise = np.array(points[..., :count]), np.empty((*points.shape[:-1], self._noise.size))
+        with np.errstate(over="ignore"):
+            np.exp(theta, out=theta, where=self.logarithmic)
+            noise[...] = self._noise
+            noise[..., self._noise_columns] = np.exp(points[..., count:])
+        return theta, noise
+
+    def from_natural(self, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return coordinates (…, dimension) from θ (…, names) and all noise parameters (…, noise_names)."""
+        points = np.log(theta, out=np.array(theta), where=self.logarithmic)
+        return np.concatenate([points, np.log(noise[..., self._noise_columns])], axis=-1)
 
 
-def _from_squares(problem: "Problem", theta: np.ndarray, noise: np.ndarray) -> LikelihoodSlope:
-    """Do it for experiments of which only the sums of squares count, without their components."""
-    misfits, places = problem.flat_misfits, problem.flat_places
-    orbits, worst = problem.responses.orbits(theta, misfits)
-    if worst != CONVERGED:
-        return _failed(problem, STATUSES[worst])
-    squares = np.concatenate([o.squares for o in orbits])
-    value = float(problem.likelihood(Squares(squares[places]), noise))
-    if not np.isfinite(value):
-        return _failed(problem, STATUSES[CONVERGED])
-    by_square, by_noise = problem.likelihood.square_slopes(squares[places], noise)
-    own = np.empty_like(by_square)
-    own[places] = by_square
-    weights, first = [], 0
-    for group, orbit in zip(misfits, orbits, strict=True):
-        weights.append(group.pulled(orbit.outputs, own[first : first + group.blocks]))
-        first += group.blocks
-    by_theta = problem.responses.pulled_outputs(orbits, weights)
-    return LikelihoodSlope(STATUSES[CONVERGED], value, by_theta, by_noise)
+class LogPosterior(SamplingCoordinates):
+    """Log-posterior density over the sampling coordinates of a problem.
+
+    The density includes the Jacobian of the change of variables. Its value depends on the point alone: periodic solves
+    start from fixed anchors.
+
+    Parameters
+    ----------
+    problem : Description
+    simulator : Simulator
+        Anchored.
+    coordinates, variances : str
+        See `SamplingCoordinates`.
+    comparisons : Comparisons, optional
+        Those of another density of the problem.
+    """
+
+    def __init__(
+        self,
+        problem: Description,
+        simulator: Simulator,
+        *,
+        coordinates: str = RIDGE,
+        variances: str = SAMPLED,
+        comparisons: Comparisons | None = None,
+    ):
+        super().__init__(problem, coordinates=coordinates, variances=variances)
+        self.simulator = simulator
+        self.comparisons = comparisons or Comparisons(
+            [[problem.observations[e.name] for e in group] for group in simulator.groups], problem.observations
+        )
+
+    @classmethod
+    def start(cls, problem: Description, theta: np.ndarray | None = None) -> "LogPosterior":
+        """Return the density anchored near θ, by default the medians of the priors.
+
+        Where every experiment of a forced model has a guess of its orbit, the anchors are where orbits and parameters
+        fit together, see `simultaneous_fit`: at the medians other orbits may be nearer, or none may exist.
+        """
+        theta = problem.median() if theta is None else theta
+        found = simultaneous_fit(problem, theta)
+        if found is not None and found.states:
+            return cls(problem, Simulator.start(problem, found.theta, found.states))
+        return cls(problem, Simulator.start(problem, theta))
+
+    def anchored(self, theta: np.ndarray, guesses: Guesses | None = None) -> "LogPosterior":
+        """Return the density with its anchors at another θ.
+
+        Parameters
+        ----------
+        theta : array (names,)
+        guesses : mapping of str to mapping of str to array (points,), optional
+            States of every experiment, turns included, from which to solve; by default the present anchors.
+        """
+        moved = self.simulator.anchored(theta) if guesses is None else Simulator.start(self.problem, theta, guesses)
+        return self.with_settings(simulator=moved)
+
+    def with_settings(
+        self, *, simulator: Simulator | None = None, coordinates: str | None = None, variances: str | None = None
+    ) -> "LogPosterior":
+        """Return the density with other anchors, coordinates or treatment of the variances."""
+        return LogPosterior(
+            self.problem,
+            simulator or self.simulator,
+            coordinates=coordinates or self.coordinates,
+            variances=variances or (COLLAPSED if self.collapsed else SAMPLED),
+            comparisons=self.comparisons,
+        )
+
+    def log_prior(self, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the log-prior density over the coordinates (…,) at θ (…, names) and noise parameters."""
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            prior = self.problem.joint_prior.log_prob(theta) + self.problem.likelihood.log_prior(noise)
+            if self.logarithmic.any():
+                prior = prior + np.log(theta[..., self.logarithmic]).sum(axis=-1)
+        return np.asarray(prior)
+
+    def add_prior(
+        self, theta: np.ndarray, gradient: np.ndarray, curvature: np.ndarray | None = None
+    ) -> tuple[np.ndarray, Any]:
+        """Return derivatives of the log-likelihood by θ with those of the log-prior over the coordinates added.
+
+        Parameters
+        ----------
+        theta : array (names,)
+        gradient : array (names,)
+        curvature : array (names, names), optional
+            Minus the Hessian.
+        """
+        logs, prior = self.logarithmic, self.problem.joint_prior
+        gradient = gradient + prior.gradient(theta)
+        gradient[logs] += 1.0 / theta[logs]
+        if curvature is not None:
+            curvature = curvature + prior.curvature(theta)
+            curvature[logs, logs] += theta[logs] ** -2
+        return gradient, curvature
+
+    def log_likelihood(self, theta: np.ndarray, noise: np.ndarray, threads: int | None = None) -> Evaluation:
+        """Return log-likelihoods at natural values, collapsed variances integrated out.
+
+        Parameters
+        ----------
+        theta : array (points, names)
+        noise : array (points, noise_names)
+        threads : int, optional
+            By default one per core. The values do not depend on it.
+        """
+        simulation = self.simulator.solve(theta, threads, whole=True)
+        log_prob, moments = np.full(len(theta), -np.inf), np.full((len(theta), len(self.collapsed)), np.nan)
+        good = simulation.status == CONVERGED
+        if good.any():
+            at = slice(None) if good.all() else good
+            residuals = self.comparisons.residuals(simulation if good.all() else simulation.at(good), threads)
+            values = self.problem.likelihood(residuals, noise[at])
+            if self.collapsed:
+                by_name = self.problem.likelihood.moments(residuals)
+                moments[at] = np.stack([by_name[name] for name in self.collapsed], axis=-1)
+                values = values + np.sum(0.5 * moments[at] + self._integrals(moments[at]), axis=-1)
+            log_prob[at] = values
+        return Evaluation(log_prob, simulation.status, moments)
+
+    def at(self, theta: np.ndarray, noise: np.ndarray, threads: int | None = None) -> Evaluation:
+        """Return the log-density over the coordinates at natural values; arguments as in `log_likelihood`."""
+        prior = self.log_prior(theta, noise)
+        inside = np.isfinite(prior)
+        if inside.all():
+            found = self.log_likelihood(theta, noise, threads)
+            return found._replace(log_prob=_finite(prior + found.log_prob))
+        log_prob, status = np.full(len(theta), -np.inf), np.full(len(theta), CONVERGED)
+        moments = np.full((len(theta), len(self.collapsed)), np.nan)
+        if inside.any():
+            found = self.log_likelihood(theta[inside], noise[inside], threads)
+            log_prob[inside], status[inside] = _finite(prior[inside] + found.log_prob), found.status
+            moments[inside] = found.moments
+        return Evaluation(log_prob, status, moments)
+
+    def evaluate(self, points: np.ndarray, threads: int | None = 1) -> Evaluation:
+        """Return the log-density at points (points, dimension), each value of its point alone.
+
+        Parameters
+        ----------
+        points : array (points, dimension)
+        threads : int, optional
+            None for one per core. The values do not depend on it.
+        """
+        return self.at(*self.to_natural(points), threads)
+
+    def value_and_gradient(self, point: np.ndarray) -> tuple[float, np.ndarray, int]:
+        """Return the log-density at one point, its gradient, and the status code; variances are not integrated out.
+
+        A forced model takes one periodic solve and one transposed solve an experiment.
+
+        Parameters
+        ----------
+        point : array (dimension,)
+
+        Returns
+        -------
+        value : float
+            −inf where a solve fails or a derivative does not exist (status "singular").
+        gradient : array (dimension,)
+            Zero where the value is not finite.
+        status : int
+        """
+        theta, noise = self.to_natural(point)
+        value, by_theta, by_noise, status = self.value_and_gradient_at(theta, noise)
+        by_theta[self.logarithmic] *= theta[self.logarithmic]
+        return value, np.concatenate([by_theta, by_noise[self._noise_columns]]), status
+
+    def value_and_gradient_at(
+        self, theta: np.ndarray, noise: np.ndarray, *, forward: bool = False
+    ) -> tuple[float, np.ndarray, np.ndarray, int]:
+        """Return `value_and_gradient` at natural values: value, gradient by θ, gradient by ln φ, status code.
+
+        Parameters
+        ----------
+        theta : array (names,)
+        noise : array (noise_names,)
+        forward : bool
+            Take one solve a parameter instead of one transposed solve; an autonomous model always does.
+        """
+        zeros = np.zeros(theta.size), np.zeros(noise.size)
+        prior = float(self.log_prior(theta, noise))
+        if not np.isfinite(prior):
+            return -np.inf, *zeros, CONVERGED
+        forward = forward or self.problem.model.autonomous
+        here = Linearisation(theta, self.simulator, self.comparisons, polish=forward)
+        if not here.converged:
+            return -np.inf, *zeros, here.status
+        value = prior + float(self.problem.likelihood(here.residuals, noise))
+        if not np.isfinite(value):
+            return -np.inf, *zeros, CONVERGED
+        by_residual, by_noise = self.problem.likelihood.gradients(here.residuals, noise)
+        if forward or any(e.multipliers is not None for e in self.problem.experiments):
+            here = here.anchored()
+        by_theta = np.sum(list(here.vjp(by_residual, adjoint=not forward).values()), axis=0)
+        by_theta, _ = self.add_prior(theta, by_theta)
+        if not (np.isfinite(by_theta).all() and np.isfinite(by_noise).all()):
+            return -np.inf, *zeros, SINGULAR
+        return value, by_theta, by_noise, CONVERGED
+
+    def linearise(self, theta: np.ndarray) -> Linearisation:
+        """Solve at one θ (names,) from the present anchors, and return residuals and Jacobian there."""
+        return Linearisation(theta, self.simulator.anchored(theta), self.comparisons)
+
+    def objective(self, here: Linearisation, noise: np.ndarray, share: float) -> float:
+        """Return the log-density over the coordinates, logarithms of variances in the likelihood times `share`.
+
+        Parameters
+        ----------
+        here : Linearisation
+            At a θ where all solves have converged.
+        noise : array (noise_names,)
+        share : float
+            1 − l/Σn for the bias correction of eq. (7), 1 for the density itself.
+        """
+        prior = self.problem.joint_prior.log_prob(here.theta) + np.sum(np.log(here.theta[self.logarithmic]))
+        likelihood = self.problem.likelihood
+        return float((likelihood(here.residuals, noise, share) + likelihood.log_prior(noise)) + prior)
+
+    def solve(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
+        """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""
+        return self.simulator.solutions(theta)
+
+    def outputs(self, theta: np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
+        """Return the predicted outputs at many θ, and whether the solves converged.
+
+        Parameters
+        ----------
+        theta : array (draws, names)
+
+        Returns
+        -------
+        outputs : dict of str to dict of str to array (draws, points)
+            By experiment and channel, in the channel's unit.
+        converged : bool array (draws,)
+        """
+        found = self.simulator.solve(theta)
+        predicted = {name: o.predicted(found.response(name)) for name, o in self.problem.observations.items()}
+        return predicted, found.status == CONVERGED
+
+    def _integrals(self, moments: np.ndarray) -> np.ndarray:
+        """Return ln ∫ exp(−½ [n ln v + M/v]) p(v) dv of each collapsed variance."""
+        with np.errstate(divide="ignore"):
+            return gammaln(self._shapes) - self._shapes * np.log(0.5 * moments)
+
+    @cached_property
+    def _shapes(self) -> np.ndarray:
+        """Shape parameters of the inverse-gamma distributions of the collapsed variances."""
+        counts = np.array([self.problem.likelihood.counts[name] for name in self.collapsed])
+        return 0.5 * counts - (1.0 if self.problem.noise.prior == FLAT else 0.0)
+
+    def with_variances(
+        self, points: np.ndarray, log_prob: np.ndarray, moments: np.ndarray, generator: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return points and log-densities with the collapsed variances drawn from their conditional distribution.
+
+        It is InvGamma(n/2, M/2), with the flat prior InvGamma(n/2 − 1, M/2).
+
+        Parameters
+        ----------
+        points : array (…, dimension)
+        log_prob : array (…,)
+        moments : array (…, collapsed)
+        generator : numpy.random.Generator
+
+        Returns
+        -------
+        points : array (…, dimension + collapsed)
+            Coordinates of the density with all variances.
+        log_prob : array (…,)
+        """
+        variances = 0.5 * moments / generator.gamma(self._shapes, size=moments.shape)
+        joint = -self._shapes * np.log(variances) - 0.5 * moments / variances
+        log_prob = log_prob + np.sum(joint - self._integrals(moments), axis=-1)
+        count = len(self.problem.names)
+        columns = {name: points[..., count + i] for i, name in enumerate(self.free)}
+        columns |= {name: np.log(variances[..., i]) for i, name in enumerate(self.collapsed)}
+        noise = np.stack([columns[name] for name in self.problem.free_noise], axis=-1)
+        return np.concatenate([points[..., :count], noise], axis=-1), log_prob
 
 
-def _failed(problem: "Problem", status: str) -> LikelihoodSlope:
-    return LikelihoodSlope(status, -np.inf, np.zeros(len(problem.names)), np.zeros(len(problem.noise_names)))
+def _finite(values: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(values), values, -np.inf)
+
+
+def collapsible(problem: Description) -> tuple[str, ...]:
+    """Return the free variances that can be integrated out in closed form, those with the prior 1/v or a flat one.
+
+    The errors must be independent, or of whole periods with a spectrum of known shape.
+    """
+    noise, counts = problem.noise, problem.likelihood.counts
+    shaped = isinstance(noise, Circulant) and all(b.kind in (SPECTRAL, KNOWN) for b in problem.likelihood.blocks)
+    closed = (isinstance(noise, Independent) or shaped) and noise.prior in (JEFFREYS, FLAT)
+    known = all(name in counts for name in problem.free_noise)
+    return tuple(name for name in problem.free_noise if closed and name in counts and (known or not shaped))

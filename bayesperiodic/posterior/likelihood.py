@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -23,18 +23,6 @@ from bayesperiodic.posterior.noise import (
     Independent,
     Noise,
 )
-
-
-class Squares(NamedTuple):
-    """What the likelihood needs of residual components whose errors have a flat spectrum.
-
-    Attributes
-    ----------
-    squares : array (blocks, …)
-        The sum of the squares of each block.
-    """
-
-    squares: np.ndarray
 
 
 class Residuals(Sequence[np.ndarray]):
@@ -101,11 +89,6 @@ class Residuals(Sequence[np.ndarray]):
         return result
 
 
-def squares_of(residuals: Sequence[np.ndarray] | Squares) -> np.ndarray:
-    """Return the sum of the squares of each block, (blocks, …)."""
-    return residuals.squares if isinstance(residuals, Squares) else Residuals.of(residuals).squares
-
-
 class Likelihood:
     """A noise model on the blocks of a problem: the log-likelihood of their residuals and its derivatives.
 
@@ -164,14 +147,14 @@ class Likelihood:
                 total[name] = total.get(name, 0.0) + block.count * block.measured
         return {name: value / self.counts[name] for name, value in total.items()}
 
-    def moments(self, residuals: Sequence[np.ndarray] | Squares) -> dict[str, np.ndarray]:
+    def moments(self, residuals: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
         """Return Σ weight·r²/S (…,) behind each variance (and "scale"), the M of eq. (6), by its name.
 
         S, the spectrum for a variance of 1, is 1 for errors whose spectrum is flat; all else has to be known.
         """
         result: dict[str, np.ndarray] = {}
-        own = residuals if isinstance(residuals, Squares) or self.model.flat else self._unit(residuals)
-        for block, columns, square in zip(self.blocks, self._columns, squares_of(own), strict=True):
+        own = Residuals.of(residuals if self.model.flat else self._unit(residuals))
+        for block, columns, square in zip(self.blocks, self._columns, own.squares, strict=True):
             if block.counted:
                 name = self.names[columns[0]]
                 result[name] = result.get(name, 0.0) + block.weight * square
@@ -231,10 +214,9 @@ class Likelihood:
             if not self.model.has_constant_prior(kind)
         ]
 
-    def __call__(self, residuals: Sequence[np.ndarray] | Squares, values: np.ndarray, share: float = 1.0) -> np.ndarray:
+    def __call__(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float = 1.0) -> np.ndarray:
         """Return the log-likelihood (…,) of residuals, one (…, size) a block, at values (…, names).
 
-        The sums of their squares are enough where the errors have a flat spectrum.
         The logarithms of the variances are multiplied by `share`: 1 − l/Σn for the bias correction of eq. (7).
         """
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -249,10 +231,10 @@ class Likelihood:
             total = total + self._together([residuals[b] for b in members], self.blocks[members[0]], own, share)
         return total
 
-    def _flat(self, residuals: Sequence[np.ndarray] | Squares, values: np.ndarray, share: float) -> np.ndarray:
+    def _flat(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, known, columns, sizes, weights, measured = self._levels
-        squares = squares_of(residuals)
+        squares = Residuals.of(residuals).squares
         squares = squares.transpose(*range(1, squares.ndim), 0)
         v = self.model.level(values[..., columns], measured)
         parts = [weights * (share * sizes * np.log(v) + squares[..., at] / v)]
@@ -339,9 +321,7 @@ class Likelihood:
     ) -> tuple[Sequence[np.ndarray], np.ndarray]:
         """Return the gradients of log-likelihood plus log-prior of φ, by each block's residual and by ln φ (names,)."""
         if self.model.flat:
-            components = Residuals.of(residuals)
-            by_square, by_value = self.square_slopes(components.squares, values, share)
-            return components.scaled(2.0 * by_square), by_value
+            return self._flat_gradients(Residuals.of(residuals), values, share)
         slopes = self._log_prior(values)[1]
         by_residual: list[np.ndarray] = [np.empty(0)] * len(self.blocks)
         for members in self._alike:
@@ -360,14 +340,9 @@ class Likelihood:
             slopes[columns] += by_phi
         return by_residual, slopes
 
-    def square_slopes(
-        self, squares: np.ndarray, values: np.ndarray, share: float = 1.0
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the derivatives of the same by each block's sum of squares (blocks,) and by ln φ (names,).
-
-        For errors whose spectrum is flat.
-        """
-        by_value = self._log_prior(values)[1]
+    def _flat_gradients(self, residuals: Residuals, values: np.ndarray, share: float) -> tuple[Residuals, np.ndarray]:
+        """Return the gradients by each block's residual and by ln φ (names,) under errors whose spectrum is flat."""
+        by_value, squares = self._log_prior(values)[1], residuals.squares
         at, _, columns, sizes, weights, measured = self._levels
         v = self.model.level(values[columns], measured)
         by_square = np.full(len(self.blocks), -0.5)
@@ -375,7 +350,7 @@ class Likelihood:
         # V is v plus what is measured, so that ∂ ln V/∂ ln v = v/V.
         by_level = 0.5 * weights * (squares[at] / v - share * sizes) * values[columns] / v
         np.add.at(by_value, columns, by_level)
-        return by_square, by_value
+        return residuals.scaled(2.0 * by_square), by_value
 
     def whitened(self, vectors: Sequence[np.ndarray], values: np.ndarray) -> list[np.ndarray]:
         """Return vectors (…, size), one a block, in units of the noise: their squares sum to −2 log-likelihood."""

@@ -8,11 +8,14 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from bayesperiodic import _fourier
-from bayesperiodic._parallel import in_threads
+from bayesperiodic._parallel import available_cores, in_threads
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.models.model import Model
 from bayesperiodic.posterior.likelihood import Residuals
 from bayesperiodic.posterior.noise import CORRELATED, KNOWN, POINTS, SCALE, SPECTRAL, Block
+
+# Outputs (numbers) from which on their comparison with the data is shared among the cores.
+SMALLEST_SHARED = 10_000
 
 
 class Response(NamedTuple):
@@ -34,6 +37,86 @@ class Response(NamedTuple):
     frequency: np.ndarray
     log_multipliers: np.ndarray
     delay: np.ndarray
+
+
+class GroupSolution(NamedTuple):
+    """Solutions of experiments that are solved together, at several θ.
+
+    Attributes
+    ----------
+    outputs : array (experiments, solves, points, channels)
+        In the order of the model's outputs.
+    frequency, delay : array (experiments, solves)
+        [Hz], [s].
+    log_multipliers : list of array (solves, multipliers)
+        log|μ| of the measured multipliers of each experiment, largest first.
+    z : array (experiments, solves, points, states)
+        The periodic parts of the states.
+    status : int array (experiments, solves)
+        Index into `compiled.STATUSES`.
+    """
+
+    outputs: np.ndarray
+    frequency: np.ndarray
+    delay: np.ndarray
+    log_multipliers: list[np.ndarray]
+    z: np.ndarray
+    status: np.ndarray
+
+    def response(self, member: int) -> Response:
+        """Return the responses of one experiment, θ on the leading axis."""
+        return Response(self.outputs[member], self.frequency[member], self.log_multipliers[member], self.delay[member])
+
+    def at(self, solves: Any) -> "GroupSolution":
+        """Return the solutions at some of the θ."""
+        return GroupSolution(
+            self.outputs[:, solves],
+            self.frequency[:, solves],
+            self.delay[:, solves],
+            [values[solves] for values in self.log_multipliers],
+            self.z[:, solves],
+            self.status[:, solves],
+        )
+
+
+class Simulation:
+    """Solutions of all experiments at several θ.
+
+    Parameters
+    ----------
+    groups : sequence of GroupSolution
+    places : mapping of str to (int, int)
+        Group and member of each experiment.
+
+    Attributes
+    ----------
+    status : int array (solves,)
+        The worst status code of the experiments.
+    """
+
+    def __init__(self, groups: Sequence[GroupSolution], places: Mapping[str, tuple[int, int]]):
+        self.groups, self._places = groups, places
+        worst = [group.status.max(axis=0) for group in groups]
+        self.status = worst[0] if len(worst) == 1 else np.max(worst, axis=0)
+
+    def at(self, solves: Any) -> "Simulation":
+        """Return the solutions at some of the θ (a mask or indices)."""
+        return Simulation([group.at(solves) for group in self.groups], self._places)
+
+    def response(self, experiment: str) -> Response:
+        """Return the responses of an experiment, θ on the leading axis."""
+        group, member = self._places[experiment]
+        return self.groups[group].response(member)
+
+    def z(self, experiment: str) -> np.ndarray:
+        """Return the periodic parts (solves, points, states) of an experiment, if they were kept."""
+        group, member = self._places[experiment]
+        return self.groups[group].z[member]
+
+    def statuses(self, experiment: str) -> np.ndarray:
+        """Return the status codes (solves,) of an experiment."""
+        group, member = self._places[experiment]
+        return self.groups[group].status[member]
 
 
 class Observation:
@@ -181,7 +264,7 @@ class Observation:
         known = [] if e.multipliers is None else [directions.log_multipliers]
         return self._components(moved, known, [directions.frequency] if self._free_phase else [])
 
-    def pulled(self, response: Response, weights: list[np.ndarray]) -> Response:
+    def vjp(self, response: Response, weights: list[np.ndarray]) -> Response:
         """Return the derivatives of Σ weights · predicted components by everything in a forced model's response."""
         e, total, joint = self.experiment, np.zeros_like(self.data), np.zeros(0)
         if e.multipliers is not None:
@@ -269,13 +352,16 @@ class Observation:
     def _spectral(self, signal: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
         """Return real Fourier components whose mean square is that of the signal within the harmonics."""
         highest = (harmonic.size - 1) // 2
-        amplitudes = _fourier.coefficients(signal, highest) * np.sqrt(0.5 * harmonic.size)
-        amplitudes[..., 0] *= np.sqrt(2.0)
-        parts = [amplitudes.real, amplitudes.imag[..., 1:]]
+        amplitudes = _fourier.coefficients(signal, highest)
+        amplitudes *= np.sqrt(0.5 * harmonic.size)
+        result = np.empty((*signal.shape[:-1], harmonic.size))
+        result[..., : highest + 1] = amplitudes.real
+        result[..., 0] *= np.sqrt(2.0)
+        result[..., highest + 1 : 2 * highest + 1] = amplitudes.imag[..., 1:]
         if harmonic.size % 2 == 0:
             alternating = np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0) / self._points
-            parts.append(np.sum(signal * alternating, axis=-1, keepdims=True) * np.sqrt(harmonic.size))
-        return np.concatenate(parts, axis=-1)
+            result[..., -1] = np.sum(signal * alternating, axis=-1) * np.sqrt(harmonic.size)
+        return result
 
     def _signal(self, components: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
         """Return the signals (…, points) that have these real Fourier components (…, size): `_spectral` undone."""
@@ -392,70 +478,105 @@ def _measured_variance(experiment: Experiment, channel: str) -> float:
     return float("nan")
 
 
+class _Part(NamedTuple):
+    """Experiments whose residuals are computed together.
+
+    Attributes
+    ----------
+    group : int
+        Index of the group of experiments that are solved together.
+    members : slice or list of int
+        Their places in the group.
+    observations : list of Observation
+    data : list of array (experiments, 1, size)
+        Fourier components of the measured channels; empty for an experiment with a comparison of its own.
+    """
+
+    group: int
+    members: Any
+    observations: list[Observation]
+    data: list[np.ndarray]
+
+
 class Comparisons:
-    """Observations in groups, each of one layout.
+    """Residual components of all experiments, computed together where experiments have the same layout.
 
     Parameters
     ----------
-    groups : iterable of sequence of Observation
+    groups : sequence of sequence of Observation
+        Of experiments that are solved together, as in `Simulator.groups`.
+    order : sequence of str
+        Experiments in the order of their blocks.
     """
 
-    def __init__(self, groups: Iterable[Sequence[Observation]]):
-        self._groups = [tuple(group) for group in groups]
-        self.observations = {o.experiment.name: o for group in self._groups for o in group}
-        self._data = [_data(group) for group in self._groups]
-        self._places, first = [], 0
-        for group in self._groups:
-            blocks = range(first, first + len(group[0].blocks))
-            self._places += [[(block, member) for block in blocks] for member in range(len(group))]
-            first = blocks.stop
+    def __init__(self, groups: Sequence[Sequence[Observation]], order: Iterable[str]):
+        self._parts: list[_Part] = []
+        places: dict[str, list[tuple[int, int]]] = {}
+        stacks = 0
+        for g, group in enumerate(groups):
+            layouts: dict[Any, list[int]] = {}
+            for m, observation in enumerate(group):
+                layouts.setdefault(observation.layout or observation.experiment.name, []).append(m)
+            for members in layouts.values():
+                own = [group[m] for m in members]
+                each = zip(*(o.data_components() for o in own), strict=True) if own[0].layout else ()
+                data = [np.stack(components)[:, None] for components in each]
+                self._parts.append(_Part(g, slice(None) if len(own) == len(group) else members, own, data))
+                blocks = range(stacks, stacks + len(own[0].blocks))
+                places |= {o.experiment.name: [(b, m) for b in blocks] for m, o in enumerate(own)}
+                stacks = blocks.stop
+        self._places = [place for name in order for place in places[name]]
 
-    def residuals(self, responses: Mapping[str, Response], threads: int) -> Residuals:
-        """Return the residual components of responses by experiment, in the order of the mapping."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            found = in_threads(lambda g: self._compared(g, responses), range(len(self._groups)), threads)
-        own = dict(zip(self.observations, self._places, strict=True))
-        return Residuals(
-            [stack for stacks in found for stack in stacks], [place for name in responses for place in own[name]]
-        )
-
-    def pulled(self, responses: Mapping[str, Response], weights: Residuals) -> dict[str, Response]:
-        """Return the derivatives of Σ weights · predicted components by everything in one response an experiment.
+    def residuals(self, simulation: Simulation, threads: int | None = 1) -> Residuals:
+        """Return the residual components at all θ of a simulation, an array (solves, size) a block.
 
         Parameters
         ----------
-        responses : mapping of str to Response
-            Without leading axes; in the same order as those that led to the residuals.
-        weights : Residuals
-            Of the same places as these.
+        simulation : Simulation
+        threads : int, optional
+            That share the θ; None for one per core. The result does not depend on it.
         """
-        result, first = {}, 0
-        for group, data in zip(self._groups, self._data, strict=True):
-            stacks = weights.stacks()[first : first + len(group[0].blocks)]
-            first += len(stacks)
-            if data is None:
-                (alone,) = group
-                name = alone.experiment.name
-                result[name] = alone.pulled(responses[name], [stack[0] for stack in stacks])
-                continue
-            outputs = group[0].spread(stacks, responses[group[0].experiment.name].outputs.shape)
-            for o, own in zip(group, outputs, strict=True):
-                result[o.experiment.name] = Response(own, np.zeros(()), np.zeros(0), np.zeros(()))
-        return {name: result[name] for name in responses}
+        solves = simulation.status.size
+        values = max(group.outputs.size for group in simulation.groups)
+        parts = 1 if values < SMALLEST_SHARED else min(threads or available_cores(), solves)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if parts <= 1:
+                return Residuals(self._stacks(simulation), self._places)
+            slices = [slice(solves * k // parts, solves * (k + 1) // parts) for k in range(parts)]
+            found = in_threads(lambda part: self._stacks(simulation.at(part)), slices, parts)
+        return Residuals([np.concatenate(own, axis=1) for own in zip(*found, strict=True)], self._places)
 
-    def _compared(self, group: int, responses: Mapping[str, Response]) -> list[np.ndarray]:
-        """Return the residual components of a group, an array (experiments, solves, size) a block."""
-        observations, data = self._groups[group], self._data[group]
-        if data is None:
-            (alone,) = observations
-            return [block[None] for block in alone.residuals(responses[alone.experiment.name])]
-        outputs = [responses[o.experiment.name].outputs for o in observations]
-        signals = np.stack(outputs) if len(outputs) > 1 else outputs[0][None]
-        return [own - components for own, components in zip(data, observations[0].components(signals), strict=True)]
+    def _stacks(self, simulation: Simulation) -> list[np.ndarray]:
+        """Return the residual components of all parts, an array (experiments, solves, size) a block."""
+        result = []
+        for group, members, observations, data in self._parts:
+            solved, first = simulation.groups[group], observations[0]
+            if data:
+                components = first.components(solved.outputs[members])
+                result += [measured - own for measured, own in zip(data, components, strict=True)]
+            else:
+                (member,) = range(len(solved.outputs))[members] if isinstance(members, slice) else members
+                result += [block[None] for block in first.residuals(solved.response(member))]
+        return result
 
+    def vjp(self, simulation: Simulation, weights: Residuals) -> dict[str, Response]:
+        """Return the derivatives of Σ weights · predicted components by the responses at one θ, by experiment.
 
-def _data(group: Sequence[Observation]) -> list[np.ndarray] | None:
-    """Return the measured components of a group, an array (experiments, 1, size) a channel; None without a layout."""
-    if group[0].layout is None:
-        return None
-    return [np.stack(own)[:, None] for own in zip(*(o.data_components() for o in group), strict=True)]
+        Parameters
+        ----------
+        simulation : Simulation
+            At one θ.
+        weights : Residuals
+            As `residuals` returns them at this θ, without the axis of the θ.
+        """
+        result, stacks = {}, iter(weights.stacks())
+        for group, _, observations, data in self._parts:
+            first, own = observations[0], [next(stacks) for _ in observations[0].blocks]
+            if data:
+                outputs = first.spread(own, simulation.groups[group].outputs.shape[-2:])
+                for o, by_outputs in zip(observations, outputs, strict=True):
+                    result[o.experiment.name] = Response(by_outputs, np.zeros(()), np.zeros(0), np.zeros(()))
+            else:
+                response = simulation.at(0).response(first.experiment.name)
+                result[first.experiment.name] = first.vjp(response, [stack[0] for stack in own])
+        return result

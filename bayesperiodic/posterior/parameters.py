@@ -169,7 +169,7 @@ class ParameterMaps:
                 known[name][:] = expression.value(known)
         return result
 
-    def pulled(self, values: np.ndarray, by_parameter: np.ndarray) -> np.ndarray:
+    def vjp(self, values: np.ndarray, by_parameter: np.ndarray) -> np.ndarray:
         """Return derivatives by θ, (maps, names), from those by all parameters at their values (maps, parameters + 1).
 
         Parameters

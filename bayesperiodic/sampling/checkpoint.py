@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 from filelock import FileLock, Timeout
 
-from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.posterior.description import Description
 
 PATIENCE = 20.0
 MARK, RUN = "fingerprint", "run"
@@ -48,7 +48,7 @@ class Checkpoint:
     Parameters
     ----------
     path : path
-    problem : Problem
+    problem : Description
     settings : str
         What else must be the same for a run to go on: seed, numbers of ensembles and walkers, and so on.
 
@@ -58,7 +58,7 @@ class Checkpoint:
         If the file cannot be read, belongs to another problem or other settings, or is in use by another run.
     """
 
-    def __init__(self, path: str | Path, problem: Problem, settings: str):
+    def __init__(self, path: str | Path, problem: Description, settings: str):
         self._path, self._mark = Path(path), f"{fingerprint(problem)}; {settings}"
         self._lock = FileLock(f"{path}.lock", timeout=0.0)
         self._next = 0.0
@@ -156,7 +156,7 @@ def _in_memory(stored: emcee.backends.HDFBackend) -> emcee.backends.Backend:
     return backend
 
 
-def fingerprint(problem: Problem) -> str:
+def fingerprint(problem: Description) -> str:
     """Return a digest of model, data, priors, fixed values, ties, noise model and scheme."""
     digest = hashlib.sha256(problem.model.symbolic.kernel_source().encode())
     for experiment in problem.experiments:

@@ -1,30 +1,80 @@
-"""One ensemble of walkers, walked in pieces: a piece is a pure function of what it is given, wherever it is done."""
+"""Ensembles of walkers, advanced segment by segment; a segment is a pure function of its task, in any process."""
 
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import emcee
 import numpy as np
 
-from bayesperiodic.sampling.coordinates import RidgeMap, SamplingDensity, counted
+from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
+from bayesperiodic.posterior.density import Evaluation
 
 PIECE, ROOM = 25, 250
-Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+Evaluate = Callable[[np.ndarray], Evaluation]
 
 
-class Ground(NamedTuple):
-    """What all ensembles walk on: the density (`SamplingDensity.evaluate`), and the map to its coordinates."""
+@dataclass(frozen=True)
+class AffineTransform:
+    """Sampling coordinates x = origin + axes·u, in which the Laplace approximation is a standard normal distribution.
+
+    emcee's moves are invariant under linear maps but for the small jitter that differential evolution adds to every
+    proposal: in coordinates whose scales differ by powers of ten it would block the narrow ones.
+
+    Attributes
+    ----------
+    origin : array (dimension,)
+    axes : array (dimension, dimension)
+        Columns are the eigenvectors of the Laplace covariance times the standard deviations along them.
+    """
+
+    origin: np.ndarray
+    axes: np.ndarray
+
+    @classmethod
+    def of(cls, mean: np.ndarray, covariance: np.ndarray) -> "AffineTransform":
+        """Return the transform of a normal distribution."""
+        scale = np.sqrt(np.diag(covariance))
+        values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+        return cls(mean, scale[:, None] * vectors * np.sqrt(np.maximum(values, np.finfo(float).eps)))
+
+    def unwhiten(self, u: np.ndarray) -> np.ndarray:
+        """Return x (…, dimension)."""
+        return self.origin + u @ self.axes.T
+
+    def whiten(self, x: np.ndarray) -> np.ndarray:
+        """Return u (…, dimension)."""
+        return np.linalg.solve(self.axes, (x - self.origin).reshape(-1, self.origin.size).T).T.reshape(x.shape)
+
+
+@dataclass
+class CallCount:
+    """Number of evaluated points, and of failed periodic solves by status."""
+
+    points: int = 0
+    failures: Counter[str] = field(default_factory=Counter)
+
+    def add(self, status: np.ndarray) -> None:
+        """Count points with these status codes."""
+        self.points += len(status)
+        self.failures.update(STATUSES[code] for code in status[status != CONVERGED])
+
+    def __add__(self, other: "CallCount") -> "CallCount":
+        return CallCount(self.points + other.points, self.failures + other.failures)
+
+
+class SamplingTarget(NamedTuple):
+    """The density that all ensembles sample, `LogPosterior.evaluate`, and the transform to its coordinates."""
 
     evaluate: Evaluate
-    map: RidgeMap
+    transform: AffineTransform
 
 
-class Walked(NamedTuple):
+class ChainSegment(NamedTuple):
     """Some steps of an ensemble.
 
     Attributes
@@ -36,10 +86,7 @@ class Walked(NamedTuple):
         Number of accepted proposals.
     random_state : tuple
         After the last step.
-    calls : int
-        Points evaluated.
-    failures : Counter
-        Of their solves, by status.
+    calls : CallCount
     """
 
     chain: np.ndarray
@@ -47,133 +94,126 @@ class Walked(NamedTuple):
     blobs: np.ndarray | None
     accepted: np.ndarray
     random_state: tuple
-    calls: int
-    failures: Counter[str]
+    calls: CallCount
 
 
-def walk(ground: Ground, piece: tuple[emcee.State, int]) -> Walked:
-    """Walk a number of steps on from a state."""
-    (state, steps), calls, failures = piece, 0, Counter[str]()
+def advance(target: SamplingTarget, task: tuple[emcee.State, int]) -> ChainSegment:
+    """Advance an ensemble from a state by a number of steps."""
+    (state, steps), calls = task, CallCount()
 
-    def density(u: np.ndarray) -> np.ndarray:
-        nonlocal calls
-        values, status = ground.evaluate(ground.map.outwards(u))
-        calls += len(u)
-        failures.update(counted(status))
-        return values
+    def log_prob(u: np.ndarray) -> np.ndarray:
+        found = target.evaluate(target.transform.unwhiten(u))
+        calls.add(found.status)
+        return np.column_stack([found.log_prob, found.moments]) if found.moments.size else found.log_prob
 
     np.random.RandomState().set_state(state.random_state)  # raises where emcee would go on with another one
     moves = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)]
-    sampler = emcee.EnsembleSampler(*state.coords.shape, density, moves=moves, vectorize=True)
+    sampler = emcee.EnsembleSampler(*state.coords.shape, log_prob, moves=moves, vectorize=True)
     sampler.run_mcmc(state, steps, skip_initial_state_check=True, progress=False)
     end = sampler.backend
-    return Walked(end.chain, end.log_prob, end.blobs, end.accepted, end.random_state, calls, failures)
+    return ChainSegment(end.chain, end.log_prob, end.blobs, end.accepted, end.random_state, calls)
 
 
 @dataclass(frozen=True)
 class Ensemble:
-    """One ensemble, as far as it has walked.
+    """State of one ensemble.
 
     Attributes
     ----------
     backend : emcee.backends.Backend
         In memory.
     start : emcee.State
-        Where it goes on: coordinates, log-densities and random state.
-    calls : int
-        Points evaluated so far.
-    failures : Counter
-        Of their solves, by status.
+        Coordinates, log-densities and random state after the last step.
+    calls : CallCount
+        So far.
     """
 
     backend: emcee.backends.Backend
     start: emcee.State
-    calls: int
-    failures: Counter[str]
+    calls: CallCount
 
     @classmethod
-    def at(cls, points: np.ndarray, generator: np.random.RandomState, density: SamplingDensity) -> "Ensemble":
-        """Return the ensemble that starts at points (walkers, dimension); the density has counted what they cost."""
+    def at(cls, points: np.ndarray, generator: np.random.RandomState, calls: CallCount) -> "Ensemble":
+        """Return the ensemble that starts at points (walkers, dimension), found by a number of calls."""
         backend = emcee.backends.Backend()
         backend.reset(*points.shape)
-        start = emcee.State(points, random_state=generator.get_state())
-        return cls(backend, start, density.calls, density.failures)
+        return cls(backend, emcee.State(points, random_state=generator.get_state()), calls)
 
     @property
     def steps(self) -> int:
-        """How many steps have been walked."""
+        """Number of steps so far."""
         return self.backend.iteration
 
-    def piece(self, until: int) -> tuple[emcee.State, int] | None:
-        """Return the next task on the way to a number of steps; None if they are done."""
+    def next_task(self, until: int) -> tuple[emcee.State, int] | None:
+        """Return the next task for `advance` towards a number of steps; None if they are done."""
         missing = until - self.steps
         return (self.start, min(missing, PIECE)) if missing > 0 else None
 
-    def after(self, walked: Walked) -> "Ensemble":
-        """Return the ensemble with steps more, which take over its memory."""
+    def extended(self, segment: ChainSegment) -> "Ensemble":
+        """Return the ensemble with a segment appended, in the memory of this one."""
         backend, first = copy(self.backend), self.steps
-        last = first + len(walked.chain)
-        blobs = None if walked.blobs is None else walked.blobs[0]
+        last = first + len(segment.chain)
+        blobs = None if segment.blobs is None else segment.blobs[0]
         if last > len(backend.chain):
             backend.grow(max(last - first, ROOM), blobs)
-        backend.chain[first:last], backend.log_prob[first:last] = walked.chain, walked.log_prob
-        if walked.blobs is not None:
-            backend.blobs[first:last] = walked.blobs
-        backend.accepted = backend.accepted + walked.accepted
-        backend.random_state, backend.iteration = walked.random_state, last
-        return Ensemble(backend, backend.get_last_sample(), self.calls + walked.calls, self.failures + walked.failures)
+        backend.chain[first:last], backend.log_prob[first:last] = segment.chain, segment.log_prob
+        if segment.blobs is not None:
+            backend.blobs[first:last] = segment.blobs
+        backend.accepted = backend.accepted + segment.accepted
+        backend.random_state, backend.iteration = segment.random_state, last
+        return Ensemble(backend, backend.get_last_sample(), self.calls + segment.calls)
 
 
-class InStep:
-    """Provides for ensembles what `TaskPool` does, each in a thread that waits for the others at every proposal.
+class LockstepPool:
+    """Runs tasks as `TaskPool` does, each in a thread that waits for the others at every evaluation of the density.
 
-    A small call costs as much for what surrounds its periodic solves as for these; and the cores are better shared by
-    the solves of one large call than by several small ones.
+    The points of all threads are evaluated in one call: small calls are dominated by their overhead, and the cores
+    share the solves of one large call better than those of several small ones.
 
     Parameters
     ----------
-    ground : Ground
+    target : SamplingTarget
     """
 
-    def __init__(self, ground: Ground):
-        self._ground = ground
+    def __init__(self, target: SamplingTarget):
+        self._target = target
 
     def run(
-        self, walk: Callable[[Ground, Any], Any], pieces: Sequence[Any], then: Callable[[int, Any], Any]
+        self, advance: Callable[[SamplingTarget, Any], Any], tasks: Sequence[Any], then: Callable[[int, Any], Any]
     ) -> Iterator[tuple[int, Any]]:
-        """Yield the number and the result of every piece, those of a round together: walk(ground, piece).
+        """Yield the number and the result advance(target, task) of every task, one round after the other.
 
-        An exception that is raised on the way comes out here.
+        An exception raised in a task is raised here.
 
         Parameters
         ----------
-        walk : callable
-        pieces : sequence
+        advance : callable
+        tasks : sequence
             The first of each ensemble.
         then : callable
-            Of an ensemble's number and what it walked: its next piece, or None.
+            Of an ensemble's number and its result: its next task, or None.
         """
-        waiting = dict(enumerate(pieces))
+        waiting = dict(enumerate(tasks))
         with ThreadPoolExecutor(max(1, len(waiting))) as threads:
             while waiting:
-                gate = Gate(self._ground.evaluate, len(waiting))
-                ground = self._ground._replace(evaluate=gate.evaluate)
-                walking = {number: threads.submit(gate.passed, walk, ground, waiting[number]) for number in waiting}
-                walked = {number: future.result() for number, future in walking.items()}
-                following = {number: then(number, result) for number, result in walked.items()}
-                waiting = {number: piece for number, piece in following.items() if piece is not None}
-                yield from walked.items()
+                shared = JointEvaluation(self._target.evaluate, len(waiting))
+                target = self._target._replace(evaluate=shared.evaluate)
+                futures = {n: threads.submit(shared.call, advance, target, task) for n, task in waiting.items()}
+                results = {number: future.result() for number, future in futures.items()}
+                following = {number: then(number, result) for number, result in results.items()}
+                waiting = {number: task for number, task in following.items() if task is not None}
+                yield from results.items()
 
 
-class Gate:
-    """Holds every call back until all who may call have called; then one evaluates the points of all.
+class JointEvaluation:
+    """Collects the calls of several threads and evaluates the points of all of them in one call.
 
     Parameters
     ----------
     evaluate : callable
         From points (points, dimension) to arrays (points, …), each row of its point alone.
     callers : int
-        Threads that may call.
+        Number of threads.
     """
 
     def __init__(self, evaluate: Evaluate, callers: int):
@@ -181,27 +221,27 @@ class Gate:
         self._calls: list[tuple[np.ndarray, Future]] = []
         self._lock = threading.Lock()
 
-    def passed(self, walk: Callable[[Ground, Any], Any], ground: Ground, piece: Any) -> Any:
-        """Return walk(ground, piece), whose evaluations pass this gate; afterwards nobody waits for this caller."""
+    def call(self, advance: Callable[[SamplingTarget, Any], Any], target: SamplingTarget, task: Any) -> Any:
+        """Return advance(target, task); afterwards the other threads no longer wait for this one."""
         try:
-            return walk(ground, piece)
+            return advance(target, task)
         finally:
             with self._lock:
                 self._callers -= 1
-                answering = self._complete()
-            self._answer(answering)
+                calls = self._complete()
+            self._answer(calls)
 
-    def evaluate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what the function says of these points, once all others have called too."""
+    def evaluate(self, points: np.ndarray) -> Evaluation:
+        """Return the evaluation of these points, once all other threads have called too."""
         own: Future = Future()
         with self._lock:
             self._calls.append((points, own))
-            answering = self._complete()
-        self._answer(answering)
+            calls = self._complete()
+        self._answer(calls)
         return own.result()
 
     def _complete(self) -> list[tuple[np.ndarray, Future]]:
-        """Return the calls if all who may call have called, else none."""
+        """Return the calls if all threads have called, else none."""
         calls: list[tuple[np.ndarray, Future]] = []
         if len(self._calls) == self._callers:
             calls, self._calls = self._calls, calls
@@ -211,11 +251,12 @@ class Gate:
         if not calls:
             return
         try:
-            every = self._evaluate(np.concatenate([points for points, _ in calls]))
+            found = self._evaluate(np.concatenate([points for points, _ in calls]))
         except BaseException as error:
             for _, own in calls:
                 own.set_exception(error)
             return
         ends = np.cumsum([len(points) for points, _ in calls])[:-1]
-        for part, (_, own) in zip(zip(*(np.split(one, ends) for one in every), strict=True), calls, strict=True):
-            own.set_result(part)
+        parts = zip(*(np.split(values, ends) for values in found), strict=True)
+        for part, (_, own) in zip(parts, calls, strict=True):
+            own.set_result(Evaluation(*part))

@@ -2,7 +2,6 @@
 
 import time
 import warnings
-from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
@@ -12,14 +11,14 @@ import numpy as np
 import xarray as xr
 from tqdm import tqdm
 
-from bayesperiodic._parallel import available_cores
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.posterior.density import SAMPLED, LogPosterior
 from bayesperiodic.posterior.labels import CHAIN, DRAW
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.convergence import shortfall
-from bayesperiodic.sampling.coordinates import SAMPLED, RidgeMap, SamplingDensity
+from bayesperiodic.sampling.ensemble import AffineTransform, CallCount
 from bayesperiodic.sampling.posterior import Posterior, gather
-from bayesperiodic.sampling.starts import start_points, walking_axes
+from bayesperiodic.sampling.starts import sampling_axes, start_points
 
 TUNE = 300
 BLOCK = 250
@@ -55,7 +54,7 @@ def refuse_for_nuts(walkers: int | None, variances: str, checkpoint: str | Path 
 
 
 def sample_nuts(
-    plain: SamplingDensity,
+    density: LogPosterior,
     fit: MapEstimate,
     seed: int,
     ensembles: int,
@@ -71,7 +70,8 @@ def sample_nuts(
 
     Parameters
     ----------
-    plain : SamplingDensity
+    density : LogPosterior
+        Anchored at the estimate.
     fit, seed, ensembles, max_steps, start, progress
         See `sample`.
 
@@ -92,17 +92,13 @@ def sample_nuts(
     """
     nutpie = _nutpie()
     sequences = np.random.SeedSequence(seed).spawn(ensembles + 2)
-    guesses = {name: solution.states for name, solution in fit.solutions.items()}
-    problem = plain.problem.anchored(plain.problem.vector(fit.theta), guesses)
-    density = SamplingDensity(problem, available_cores(), plain.coordinates)
-    axes = walking_axes(density, fit, start, np.random.default_rng(sequences[ensembles]))
+    axes = sampling_axes(density, fit, start, np.random.default_rng(sequences[ensembles]))
     starts = start_points(density, fit, start, ensembles, np.random.default_rng(sequences[ensembles + 1]))
-    run = _Run(SamplingDensity(problem, coordinates=plain.coordinates), axes)
+    run = _Run(density, axes)
     try:
-        for u, sequence in zip(axes.inwards(starts), sequences, strict=False):
-            own = SamplingDensity(problem, coordinates=plain.coordinates)
+        for u, sequence in zip(axes.whiten(starts), sequences, strict=False):
             chain_seed = int(sequence.generate_state(1, np.uint64)[0])
-            run.chains.append(_Chain(nutpie, own, axes, u, chain_seed, max_steps))
+            run.chains.append(_Chain(nutpie, density, axes, u, chain_seed, max_steps))
         run.go(max_steps, progress)
     except BaseException:
         run.cancel()
@@ -128,11 +124,12 @@ class _Chain:
     """One chain, which nutpie moves in a thread of its own."""
 
     def __init__(
-        self, nutpie: ModuleType, density: SamplingDensity, axes: RidgeMap, u: np.ndarray, seed: int, most: int
+        self, nutpie: ModuleType, density: LogPosterior, axes: AffineTransform, u: np.ndarray, seed: int, most: int
     ):
         self.density, self.axes = density, axes
         self.draws: list[np.ndarray] = []
-        self.accounts: list[tuple[int, Counter[str]]] = []
+        self.calls = CallCount()
+        self.accounts: list[CallCount] = []
         self.error: Exception | None = None
         model = nutpie.compiled_pyfunc.from_pyfunc(
             density.dimension,
@@ -149,15 +146,16 @@ class _Chain:
 
     def _value_and_gradient(self, u: np.ndarray) -> tuple[float, np.ndarray]:
         try:
-            value, gradient = self.density.value_and_gradient(self.axes.outwards(u))
+            value, gradient, status = self.density.value_and_gradient(self.axes.unwhiten(u))
+            self.calls.add(np.array([status]))
         except Exception as error:
             self.error = error
             raise
         return value, gradient @ self.axes.axes
 
     def _keep(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """Take down a draw, and what the density had counted until then."""
-        self.accounts.append((self.density.calls, self.density.failures.copy()))
+        """Keep a draw, and the count of calls so far."""
+        self.accounts.append(CallCount() + self.calls)
         self.draws.append(np.array(u))
         return {POSITION: u}
 
@@ -177,7 +175,7 @@ class _Chain:
 class _Run:
     """The chains, how far they are, and what the stop rule says."""
 
-    def __init__(self, density: SamplingDensity, axes: RidgeMap):
+    def __init__(self, density: LogPosterior, axes: AffineTransform):
         self.density, self.axes = density, axes
         self.chains: list[_Chain] = []
         self.steps, self.converged, self.reason = 0, False, ""
@@ -227,7 +225,7 @@ class _Run:
     def kept(self, steps: int) -> np.ndarray:
         """Return the chains (chains, steps, 1, coordinates) without tuning."""
         walked = np.array([chain.draws[TUNE : TUNE + steps] for chain in self.chains])
-        return self.axes.outwards(walked)[:, :, None, :]
+        return self.axes.unwhiten(walked)[:, :, None, :]
 
     def posterior(self, version: str, seed: int) -> Posterior:
         """End the chains and return their draws, with what nutpie tells about each of them."""
@@ -239,12 +237,11 @@ class _Run:
         log_density = np.stack([np.asarray(one["logp"])[0, : self.steps] for one in found])
         self._report(int(stats["diverging"].sum()), log_density.size)
         accounts = [chain.accounts[TUNE + self.steps - 1] for chain in self.chains]
-        self.density.calls = sum(calls for calls, _ in accounts)
-        self.density.failures = sum((failures for _, failures in accounts), Counter())
         result = gather(
             self.density,
             self.kept(self.steps),
             log_density[:, :, None],
+            sum(accounts, CallCount()),
             converged=self.converged,
             reason=self.reason,
             acceptance=float(stats["acceptance_rate"].mean()),

@@ -16,6 +16,8 @@ from bayesperiodic._io import Result
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 from bayesperiodic.posterior import labels
+from bayesperiodic.posterior.density import LogPosterior
+from bayesperiodic.posterior.description import Description
 from bayesperiodic.posterior.joint_priors import MultivariateNormal
 from bayesperiodic.posterior.labels import (
     CHAIN,
@@ -31,10 +33,9 @@ from bayesperiodic.posterior.labels import (
 )
 from bayesperiodic.posterior.noise import SCALE
 from bayesperiodic.posterior.parameters import SHIFT
-from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.checkpoint import fingerprint
-from bayesperiodic.sampling.coordinates import SamplingDensity
+from bayesperiodic.sampling.ensemble import CallCount
 
 SAMPLED_ONLY = "Only sampled parameters are kept with the draws; write the value of a fixed one as a number."
 
@@ -292,13 +293,13 @@ def _table(rows: dict[str, dict[str, float]]) -> pd.DataFrame:
 MOST = {CHAIN: 20, DRAW: 5}
 
 
-def posterior_predictive(problem: Problem, posterior: xr.Dataset, time: dict[str, str], seed: int) -> xr.Dataset:
+def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, time: dict[str, str], seed: int) -> xr.Dataset:
     """Return replicates of the measured mean periods, noise included, at a few draws of a few walkers.
 
     Parameters
     ----------
-    problem : Problem
-        With its anchors at the estimate.
+    density : LogPosterior
+        Anchored at the estimate.
     posterior : Dataset
         Draws of all parameters, dims (chain, draw).
     time : dict of str to str
@@ -311,6 +312,7 @@ def posterior_predictive(problem: Problem, posterior: xr.Dataset, time: dict[str
         Variables ``<experiment> <channel>`` with dims (chain, draw, time axis); ``largest_multiplier``, the modulus of
         the largest Floquet multiplier, with dims (chain, draw, experiment). NaN where a solve fails.
     """
+    problem = density.problem
     chosen = posterior.isel({dim: _spread(posterior.sizes[dim], most) for dim, most in MOST.items()})
     shape = chosen.sizes[CHAIN], chosen.sizes[DRAW]
     theta, noise = (
@@ -320,20 +322,19 @@ def posterior_predictive(problem: Problem, posterior: xr.Dataset, time: dict[str
     if not problem.noise_names:
         noise = np.empty((len(theta), 0))
     components = problem.likelihood.simulate(noise, np.random.default_rng(seed))
-    solved, variables, largest = problem.responses.solve(theta, keep=True), {}, []
+    simulation, variables, largest = density.simulator.solve(theta, keep=True, polish=True), {}, []
     for e in problem.experiments:
-        observation, found = problem.observations[e.name], solved[e.name]
+        observation, failed = problem.observations[e.name], simulation.statuses(e.name) != CONVERGED
         own, components = components[: len(observation.blocks)], components[len(observation.blocks) :]
-        failed = found.status != CONVERGED
-        for channel, values in observation.replicates(found.response, own).items():
+        for channel, values in observation.replicates(simulation.response(e.name), own).items():
             values[failed] = np.nan
             variables[f"{e.name} {channel}"] = ((CHAIN, DRAW, time[e.name]), values.reshape(*shape, -1))
-        largest.append(problem.responses.largest_multipliers(theta, e.name, found).reshape(shape))
+        largest.append(density.simulator.largest_multipliers(theta, e.name, simulation).reshape(shape))
     variables["largest_multiplier"] = ((CHAIN, DRAW, EXPERIMENT), np.stack(largest, axis=-1))
     return xr.Dataset(variables, coords=chosen.coords)
 
 
-def orbits(problem: Problem, theta: np.ndarray, time: dict[str, str]) -> xr.Dataset:
+def orbits(density: LogPosterior, theta: np.ndarray, time: dict[str, str]) -> xr.Dataset:
     """Return the states, turns included, of every experiment's orbit at one θ (names,).
 
     Returns
@@ -344,10 +345,10 @@ def orbits(problem: Problem, theta: np.ndarray, time: dict[str, str]) -> xr.Data
     return xr.Dataset(
         {
             f"{name} {state}": ((time[name],), values)
-            for name, solution in problem.solve(theta).items()
+            for name, solution in density.solve(theta).items()
             for state, values in solution.states.items()
         },
-        coords={time[e.name]: e.time for e in problem.experiments},
+        coords={time[e.name]: e.time for e in density.problem.experiments},
     )
 
 
@@ -360,9 +361,10 @@ ENSEMBLE = "ensemble"
 
 
 def gather(
-    density: SamplingDensity,
+    density: LogPosterior,
     kept: np.ndarray,
     log_density: np.ndarray,
+    calls: CallCount,
     *,
     converged: bool,
     reason: str,
@@ -373,15 +375,16 @@ def gather(
 
     Parameters
     ----------
-    density : SamplingDensity
-        With the counts of calls and failures of all ensembles.
+    density : LogPosterior
     kept : array (ensembles, steps, walkers, coordinates)
     log_density : array (ensembles, steps, walkers)
+    calls : CallCount
+        Of all ensembles.
     converged, reason, acceptance, seed
         See `Posterior`.
     """
-    problem, labels = density.problem, density.labels
-    data = tree(problem, *density.to_natural(kept), log_density, seed)
+    labels = density.labels
+    data = tree(density, *density.to_natural(kept), log_density, seed)
     data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason}
     tau = convergence.autocorrelation_time(kept)
     return Posterior(
@@ -392,19 +395,20 @@ def gather(
         ess=dict(zip(labels, (log_density.size / tau).tolist(), strict=True)),
         rhat=dict(zip(labels, convergence.rhat(kept).tolist(), strict=True)),
         acceptance=acceptance,
-        failures={status: count / density.calls for status, count in density.failures.items()},
-        log_posterior_calls=density.calls,
+        failures={status: count / calls.points for status, count in calls.failures.items()},
+        log_posterior_calls=calls.points,
         seed=seed,
     )
 
 
-def tree(problem: Problem, theta: np.ndarray, noise: np.ndarray, log_density: np.ndarray, seed: int) -> xr.DataTree:
+def tree(
+    density: LogPosterior, theta: np.ndarray, noise: np.ndarray, log_density: np.ndarray, seed: int
+) -> xr.DataTree:
     """Return draws as the groups of `Posterior.data`.
 
     Parameters
     ----------
-    problem : Problem
-        With its anchors set.
+    density : LogPosterior
     theta : array (ensembles, steps, walkers, names)
         Natural values.
     noise : array (ensembles, steps, walkers, noise_names)
@@ -412,6 +416,7 @@ def tree(problem: Problem, theta: np.ndarray, noise: np.ndarray, log_density: np
     seed : int
         Of the replicates.
     """
+    problem = density.problem
     ensembles, steps, walkers = log_density.shape
     best = theta.reshape(-1, theta.shape[-1])[np.argmax(log_density)]
     theta, noise, lp = (_by_chain(values) for values in (theta, noise, log_density[..., None]))
@@ -432,8 +437,8 @@ def tree(problem: Problem, theta: np.ndarray, noise: np.ndarray, log_density: np
             "sample_stats": xr.Dataset(
                 {"lp": ((CHAIN, DRAW), lp[..., 0]), "status": ((CHAIN, DRAW), status, meanings)}, coords=coords
             ),
-            "posterior_predictive": posterior_predictive(problem, posterior, time, seed),
-            "orbits": orbits(problem, best, time),
+            "posterior_predictive": posterior_predictive(density, posterior, time, seed),
+            "orbits": orbits(density, best, time),
             "observed_data": _signals(problem, "outputs"),
             "constant_data": _signals(problem, "inputs"),
         }
@@ -453,7 +458,7 @@ def _by_chain(values: np.ndarray) -> np.ndarray:
     return values.transpose(0, 2, 1, 3).reshape(ensembles * walkers, steps, columns)
 
 
-def _variables(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> xr.Dataset:
+def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr.Dataset:
     """Return θ (chains, draws, names) and noise parameters (chains, draws, noise_names) as labelled variables."""
     columns = {name: theta[..., i] for i, name in enumerate(problem.names)}
     columns |= _fixed_locals(problem, theta.shape[:-1])
@@ -473,7 +478,7 @@ def _variables(problem: Problem, theta: np.ndarray, noise: np.ndarray) -> xr.Dat
     )
 
 
-def _fixed_locals(problem: Problem, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+def _fixed_locals(problem: Description, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
     """Return the values of local parameters in the experiments where they are fixed."""
     return {
         full_name(plain, (run,)): np.full(shape, parameter_map.fixed[plain])
@@ -483,7 +488,7 @@ def _fixed_locals(problem: Problem, shape: tuple[int, ...]) -> dict[str, np.ndar
     }
 
 
-def _dims(problem: Problem, name: str) -> tuple[str, ...]:
+def _dims(problem: Description, name: str) -> tuple[str, ...]:
     """Return the dims, after chain and draw, of the variable that a full name belongs to."""
     if "[" not in name:
         return ()
@@ -492,18 +497,18 @@ def _dims(problem: Problem, name: str) -> tuple[str, ...]:
     return (CHANNEL,) if problem.noise.per == CHANNEL else (CHANNEL, EXPERIMENT)
 
 
-def _unit(problem: Problem, parameter: str) -> dict[str, str]:
+def _unit(problem: Description, parameter: str) -> dict[str, str]:
     return {"units": "s" if parameter == SHIFT else problem.model.units.get(parameter, "")}
 
 
-def _noise_attributes(problem: Problem, variable: str) -> dict[str, str]:
+def _noise_attributes(problem: Description, variable: str) -> dict[str, str]:
     """Return the noise model's name, and the unit of each channel's variance."""
     units = problem.model.units if variable == "variance" else {}
     each = {f"units of {channel}": squared(units[channel]) for channel in problem.channels if channel in units}
     return {NOISE: problem.noise.name} | each
 
 
-def _signals(problem: Problem, kind: str) -> xr.Dataset:
+def _signals(problem: Description, kind: str) -> xr.Dataset:
     return xr.Dataset(
         {
             f"{experiment.name} {channel}": ((_time(experiment),), values)
@@ -514,7 +519,7 @@ def _signals(problem: Problem, kind: str) -> xr.Dataset:
     )
 
 
-def _time_axes(problem: Problem) -> dict[str, str]:
+def _time_axes(problem: Description) -> dict[str, str]:
     return {experiment.name: _time(experiment) for experiment in problem.experiments}
 
 

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,34 @@ from tqdm import tqdm
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic._parallel import TaskPool, WorkersLost, available_cores, checked_executor
+from bayesperiodic._parallel import TaskPool, WorkersLost, checked_executor
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.posterior.density import (
+    COLLAPSED,
+    NATURAL,
+    RIDGE,
+    SAMPLED,
+    LogPosterior,
+    SamplingCoordinates,
+    collapsible,
+)
 from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.posterior.simulator import Simulator
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.checkpoint import Checkpoint, Saved
 from bayesperiodic.sampling.convergence import shortfall
-from bayesperiodic.sampling.coordinates import COLLAPSED, NATURAL, RIDGE, SAMPLED, RidgeMap, SamplingDensity
-from bayesperiodic.sampling.ensemble import Ensemble, Ground, InStep, Walked, walk
+from bayesperiodic.sampling.ensemble import (
+    AffineTransform,
+    CallCount,
+    ChainSegment,
+    Ensemble,
+    LockstepPool,
+    SamplingTarget,
+    advance,
+)
 from bayesperiodic.sampling.nuts import refuse_for_nuts, sample_nuts
 from bayesperiodic.sampling.posterior import Posterior, gather
-from bayesperiodic.sampling.starts import LAPLACE, STARTS, start_points, walking_axes
+from bayesperiodic.sampling.starts import LAPLACE, STARTS, sampling_axes, start_points
 
 EMCEE, NUTS = "emcee", "nuts"
 BLOCK = 250
@@ -161,106 +179,94 @@ def sample(
     runs = [e.name for e in problem.experiments]
     _checks.contains("fit", fit.solutions, runs, "give the estimate of this problem, map_estimate(problem)")
     executor = checked_executor(executor)
-    plain = SamplingDensity(problem, coordinates=coordinates, variances=variances)
-    if variances == COLLAPSED and not plain.collapsed:
+    if variances == COLLAPSED and not collapsible(problem):
         raise ValueError(
             "variances: 'collapsed' is not allowed; there is no unknown variance with the prior 1/v or a flat one, of "
             "independent errors or of circulant ones with a fixed shape. Take variances='sampled'."
         )
     if sampler == NUTS:
         refuse_for_nuts(walkers, variances, checkpoint, executor)
-        return sample_nuts(plain, fit, seed, ensembles, max_steps, start, progress)
-    walkers = _checked_walkers(walkers, plain)
-    settings = f"seed {seed}, {ensembles} ensembles of {walkers} walkers, {start}, {coordinates}, {variances}"
+    size = _checked_walkers(walkers, problem, variances)
+    settings = f"seed {seed}, {ensembles} ensembles of {size} walkers, {start}, {coordinates}, {variances}"
     with nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings) as store:
         saved = None if store is None else store.load()
-        run = _Run(problem, fit, plain, seed, start, walkers, ensembles, saved)
+        anchor = np.array(saved.state["anchor"]) if saved else problem.vector(fit.theta)
+        guesses = saved.state["guesses"] if saved else {name: s.states for name, s in fit.solutions.items()}
+        anchored = Simulator.start(problem, anchor, guesses)
+        density = LogPosterior(problem, anchored, coordinates=coordinates, variances=variances)
+        if sampler == NUTS:
+            return sample_nuts(density, fit, seed, ensembles, max_steps, start, progress)
+        state = {"anchor": anchor.tolist(), "guesses": _as_lists(guesses)}
+        run = _Run(density, fit, seed, start, size, ensembles, saved, state)
         run.go(max_steps, store, executor, progress)
         return run.posterior()
 
 
-def _checked_walkers(walkers: int | None, density: SamplingDensity) -> int:
-    needed = 2 * density.dimension
+def _checked_walkers(walkers: int | None, problem: Problem, variances: str) -> int:
+    labels = SamplingCoordinates(problem, variances=variances).labels
+    needed = 2 * len(labels)
     if walkers is None:
         return max(32, needed + needed % 2)
     if _checks.integer("walkers", walkers, 1) < needed or walkers % 2:
         raise ValueError(
             f"walkers: {walkers} is not allowed; it must be even and at least twice the dimension, {needed} for "
-            f"{', '.join(density.labels)}."
+            f"{', '.join(labels)}."
         )
     return walkers
 
 
 class _Run:
-    """A sampling run: its ensembles, how far they are and what the stop rule says."""
+    """A sampling run: its ensembles, their progress and the state of the stop rule."""
 
     def __init__(
         self,
-        problem: Problem,
+        density: LogPosterior,
         fit: MapEstimate,
-        plain: SamplingDensity,
         seed: int,
         start: str,
         walkers: int,
         ensembles: int,
         saved: Saved | None,
+        state: dict[str, Any],
     ):
-        self.seed, self.plain = seed, plain
+        self.seed, self.density = seed, density
         sequences = np.random.SeedSequence(seed).spawn(ensembles + 2)
         self.redraws = np.random.default_rng(sequences[ensembles])
-        state = saved.state if saved else {}
-        anchor = np.array(state["anchor"]) if saved else problem.vector(fit.theta)
-        guesses = state["guesses"] if saved else {name: s.states for name, s in fit.solutions.items()}
-        anchored = problem.anchored(anchor, guesses)
-        densities = [self._density(anchored, available_cores()) for _ in range(ensembles)]
-        self.map = (
-            RidgeMap(np.array(state["origin"]), np.array(state["axes"]))
-            if saved
-            else walking_axes(densities[0], fit, start, np.random.default_rng(sequences[ensembles + 1]))
-        )
-        self.state = state or {
-            "anchor": anchor.tolist(), "guesses": _as_lists(guesses),
-            "origin": self.map.origin.tolist(), "axes": self.map.axes.tolist(),
-            "steps": 0, "checked": 0, "passes": 0, "missing": [], "tau": [np.inf] * plain.dimension,
+        if saved:
+            self.state = saved.state
+            self.transform = AffineTransform(np.array(self.state["origin"]), np.array(self.state["axes"]))
+            counts = zip(self.state["calls"], self.state["failures"], strict=True)
+            self.ensembles = [
+                Ensemble(backend, backend.get_last_sample(), CallCount(points, Counter(failures)))
+                for backend, (points, failures) in zip(saved.backends, counts, strict=True)
+            ]
+            return
+        self.transform = sampling_axes(density, fit, start, np.random.default_rng(sequences[ensembles + 1]))
+        self.state = state | {
+            "origin": self.transform.origin.tolist(), "axes": self.transform.axes.tolist(),
+            "steps": 0, "checked": 0, "passes": 0, "missing": [], "tau": [np.inf] * density.dimension,
             "converged": False, "reason": "",
         }  # fmt: skip
-        self.density = densities[0]
         self.ensembles = [
-            self._ensemble(density, fit, start, walkers, np.random.default_rng(sequences[i]), saved, i)
-            for i, density in enumerate(densities)
+            self._started(fit, start, walkers, np.random.default_rng(sequence)) for sequence in sequences[:ensembles]
         ]
 
-    def _density(self, problem: Problem, threads: int) -> SamplingDensity:
-        variances = COLLAPSED if self.plain.collapsed else SAMPLED
-        return SamplingDensity(problem, threads, self.plain.coordinates, variances)
-
-    def _ensemble(
-        self,
-        density: SamplingDensity,
-        fit: MapEstimate,
-        start: str,
-        walkers: int,
-        generator: np.random.Generator,
-        saved: Saved | None,
-        number: int,
-    ) -> Ensemble:
-        if saved:
-            counts = self.state["calls"][number], Counter(self.state["failures"][number])
-            return Ensemble(saved.backends[number], saved.backends[number].get_last_sample(), *counts)
-        steps = np.random.RandomState(generator.integers(2**32, size=4))
-        return Ensemble.at(self.map.inwards(start_points(density, fit, start, walkers, generator)), steps, density)
+    def _started(self, fit: MapEstimate, start: str, walkers: int, generator: np.random.Generator) -> Ensemble:
+        steps, calls = np.random.RandomState(generator.integers(2**32, size=4)), CallCount()
+        points = start_points(self.density, fit, start, walkers, generator, calls)
+        return Ensemble.at(self.transform.whiten(points), steps, calls)
 
     def go(self, max_steps: int, store: Checkpoint | None, executor: Any, progress: bool) -> None:
-        """Walk until the stop rule is passed twice in succession, `max_steps` are reached, Ctrl-C, or workers die."""
+        """Sample until the stop rule is passed twice in succession, `max_steps` are reached, Ctrl-C, or workers die."""
         if self.state["converged"]:
             return
         try:
             if executor is None:
-                self._walk(max_steps, store, InStep(Ground(self.density.evaluate, self.map)), progress)
+                evaluate = partial(self.density.evaluate, threads=None)
+                self._sample(max_steps, store, LockstepPool(SamplingTarget(evaluate, self.transform)), progress)
                 return
-            alone = self._density(self.density.problem, 1)
-            with TaskPool(executor, Ground(alone.evaluate, self.map)) as pool:
-                self._walk(max_steps, store, pool, progress)
+            with TaskPool(executor, SamplingTarget(self.density.evaluate, self.transform)) as pool:
+                self._sample(max_steps, store, pool, progress)
         except KeyboardInterrupt:
             if not self._stopped("interrupted", store):
                 raise
@@ -271,11 +277,11 @@ class _Run:
 
     @property
     def _done(self) -> int:
-        """How many steps all ensembles have walked."""
+        """Number of steps that all ensembles have done."""
         return min(ensemble.steps for ensemble in self.ensembles)
 
     def _stopped(self, how: str, store: Checkpoint | None, why: str = "") -> bool:
-        """Keep what there is of a run that was stopped; return whether it is enough for a result."""
+        """Save a run that was stopped; return whether its steps are enough for a result."""
         enough = self._done >= FEWEST_STEPS
         if enough:
             self.state |= {"steps": self._done, "converged": False, "reason": f"{how} after {self._done} steps{why}"}
@@ -283,14 +289,14 @@ class _Run:
             self._save(store, now=True)
         return enough
 
-    def _walk(self, max_steps: int, store: Checkpoint | None, pool: TaskPool | InStep, progress: bool) -> None:
+    def _sample(self, max_steps: int, store: Checkpoint | None, pool: TaskPool | LockstepPool, progress: bool) -> None:
         state = self.state
         with tqdm(total=max_steps, unit="step", desc="sampling", disable=not progress) as bar:
             for steps in range(state["checked"] + BLOCK, max_steps + 1, BLOCK):
                 self._advance(steps, pool, bar)
                 kept = self._kept(steps)
                 tau = convergence.autocorrelation_time(kept)
-                missing = shortfall(kept, tau, np.array(state["tau"]), self.plain.labels)
+                missing = shortfall(kept, tau, np.array(state["tau"]), self.density.labels)
                 passes = 0 if missing else state["passes"] + 1
                 state |= {"steps": steps, "checked": steps, "tau": tau.tolist(), "passes": passes, "missing": missing}
                 bar.set_postfix_str(self._account(kept, tau))
@@ -304,35 +310,38 @@ class _Run:
         left = ", ".join(state["missing"]) or "the stop rule passed only once"
         state |= {"steps": state["checked"], "reason": f"max_steps = {max_steps} reached with {left}"}
 
-    def _advance(self, steps: int, pool: TaskPool | InStep, bar: tqdm) -> None:
-        """Walk all ensembles to a number of steps, each piece by piece."""
+    def _advance(self, steps: int, pool: TaskPool | LockstepPool, bar: tqdm) -> None:
+        """Advance all ensembles to a number of steps, segment by segment."""
         behind = [number for number, ensemble in enumerate(self.ensembles) if ensemble.steps < steps]
 
-        def then(task: int, walked: Walked) -> Any:
+        def then(task: int, segment: ChainSegment) -> Any:
             number = behind[task]
-            self.ensembles[number] = self.ensembles[number].after(walked)
-            return self.ensembles[number].piece(steps)
+            self.ensembles[number] = self.ensembles[number].extended(segment)
+            return self.ensembles[number].next_task(steps)
 
-        for _ in pool.run(walk, [self.ensembles[number].piece(steps) for number in behind], then):
+        for _ in pool.run(advance, [self.ensembles[number].next_task(steps) for number in behind], then):
             bar.update(self._done - bar.n)
+
+    @property
+    def _calls(self) -> CallCount:
+        return sum((e.calls for e in self.ensembles), CallCount())
 
     def _account(self, kept: np.ndarray, tau: np.ndarray) -> str:
         text = f"acceptance {self._acceptance():.2f}, tau {tau.max():.0f}, length {kept.shape[1] / tau.max():.0f} tau"
-        calls = sum(e.calls for e in self.ensembles)
-        failed = sum(sum(e.failures.values()) for e in self.ensembles)
-        return text + (f", failed solves {failed / calls:.1%}" if failed else "")
+        failed = sum(self._calls.failures.values())
+        return text + (f", failed solves {failed / self._calls.points:.1%}" if failed else "")
 
     def _save(self, store: Checkpoint | None, *, now: bool) -> None:
         if store is not None:
-            calls = [e.calls for e in self.ensembles]
-            failures = [dict(e.failures) for e in self.ensembles]
+            calls = [e.calls.points for e in self.ensembles]
+            failures = [dict(e.calls.failures) for e in self.ensembles]
             backends = [e.backend for e in self.ensembles]
             store.save(backends, self.state | {"calls": calls, "failures": failures}, now=now)
 
     def _kept(self, steps: int) -> np.ndarray:
         """Return the chains (ensembles, steps, walkers, coordinates) up to a step, without their first fifth."""
-        walked = np.stack([e.backend.get_chain()[steps // 5 : steps] for e in self.ensembles])
-        return self.map.outwards(walked)
+        chains = np.stack([e.backend.get_chain()[steps // 5 : steps] for e in self.ensembles])
+        return self.transform.unwhiten(chains)
 
     def _acceptance(self) -> float:
         return float(np.mean([e.backend.accepted / e.steps for e in self.ensembles]))
@@ -342,17 +351,15 @@ class _Run:
         steps = self.state["steps"]
         kept, part = self._kept(steps), slice(steps // 5, steps)
         log_density = np.stack([e.backend.get_log_prob()[part] for e in self.ensembles])
-        if self.plain.collapsed:
+        if self.density.collapsed:
             moments = np.stack([e.backend.get_blobs()[part] for e in self.ensembles])
             moments = moments.reshape(*kept.shape[:-1], -1)
-            kept, log_density = self.density.expanded(kept, log_density, moments, self.redraws)
-        whole = SamplingDensity(self.density.problem, coordinates=self.plain.coordinates)
-        whole.calls = sum(e.calls for e in self.ensembles)
-        whole.failures = sum((e.failures for e in self.ensembles), Counter())
+            kept, log_density = self.density.with_variances(kept, log_density, moments, self.redraws)
         return gather(
-            whole,
+            self.density.with_settings(variances=SAMPLED),
             kept,
             log_density,
+            self._calls,
             converged=self.state["converged"],
             reason=self.state["reason"],
             acceptance=self._acceptance(),
@@ -361,4 +368,6 @@ class _Run:
 
 
 def _as_lists(guesses: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, list[float]]]:
-    return {run: {state: values.tolist() for state, values in states.items()} for run, states in guesses.items()}
+    return {
+        run: {state: np.asarray(values).tolist() for state, values in states.items()} for run, states in guesses.items()
+    }

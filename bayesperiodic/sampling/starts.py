@@ -1,4 +1,4 @@
-"""Where the walkers start."""
+"""Start points of the walkers, and the Laplace approximation in sampling coordinates."""
 
 from collections.abc import Callable
 from functools import partial
@@ -8,8 +8,9 @@ import numpy as np
 
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.periodic.compiled import CONVERGED
+from bayesperiodic.posterior.density import LogPosterior, SamplingCoordinates
 from bayesperiodic.posterior.likelihood import estimate_noise
-from bayesperiodic.sampling.coordinates import RidgeMap, SamplingDensity
+from bayesperiodic.sampling.ensemble import AffineTransform, CallCount
 
 LAPLACE, PRIOR, OVERDISPERSED = "laplace", "prior", "overdispersed"
 STARTS = (LAPLACE, PRIOR, OVERDISPERSED)
@@ -22,8 +23,42 @@ CREDIBLE, SEPARATE, MOST_SIGNS = 1e-3, 3.0, 4
 FEWEST = 2
 
 
+def laplace_approximation(density: SamplingCoordinates, fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and covariance of the Laplace approximation in sampling coordinates.
+
+    Raises
+    ------
+    ValueError
+        If the estimate has none.
+    """
+    labels = [*density.labels]
+    mode = np.array([fit.joint_mode.get(label, np.nan) for label in labels])
+    covariance = fit.joint_covariance.loc[labels, labels].to_numpy().copy()
+    if not np.isfinite(mode).all() or not np.isfinite(covariance).all():
+        remedy = "run map_estimate from another start"
+        if fit.undetermined:
+            remedy = f"fix what the data do not determine ({'; '.join(fit.undetermined)})"
+        elif fit.at_ends:
+            remedy = f"widen the prior of {', '.join(map(repr, fit.at_ends))}, which is at the end of its support"
+        raise ValueError(
+            "fit: its joint covariance must be finite, got none, so there is no Laplace approximation to start from; "
+            f"{remedy}, or take start='prior'."
+        )
+    always = density.problem.logarithmic
+    slopes = np.where(always & ~density.logarithmic, mode[: always.size], 1.0)
+    covariance[: always.size] *= slopes[:, None]
+    covariance[:, : always.size] *= slopes
+    logs = np.concatenate([density.logarithmic, np.ones(len(density.free), dtype=bool)])
+    return np.where(logs, np.log(np.where(logs, mode, 1.0)), mode), covariance
+
+
 def start_points(
-    density: SamplingDensity, fit: MapEstimate, start: str, walkers: int, generator: np.random.Generator
+    density: LogPosterior,
+    fit: MapEstimate,
+    start: str,
+    walkers: int,
+    generator: np.random.Generator,
+    calls: CallCount | None = None,
 ) -> np.ndarray:
     """Return start points (walkers, dimension) with a finite density, drawn again until there are enough.
 
@@ -38,20 +73,21 @@ def start_points(
     ValueError
         If after a hundred times as many draws there are too few.
     """
+    calls = CallCount() if calls is None else calls
     if start == PRIOR:
-        return _finite(density, lambda count: _from_prior(density, count, generator), walkers, start)
-    mean, covariance = density.laplace(fit)
+        return _finite(density, calls, lambda count: _from_prior(density, count, generator), walkers, start)
+    mean, covariance = laplace_approximation(density, fit)
     scale = np.sqrt(np.diag(covariance))
     factor = SPREAD[start] * scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
 
     def drawn(count: int) -> np.ndarray:
         return mean + generator.standard_normal((count, mean.size)) @ factor.T
 
-    points = _finite(density, drawn, walkers, start)
+    points = _finite(density, calls, drawn, walkers, start)
     left = walkers // 2
-    for signs, share in mirrored_modes(density, mean, covariance):
+    for signs, share in mirrored_modes(density, mean, covariance, calls):
         count = min(max(FEWEST, round(share * walkers)), left)
-        points[left - count : left] = _finite(density, partial(_turned, signs, drawn), count, start)
+        points[left - count : left] = _finite(density, calls, partial(_turned, signs, drawn), count, start)
         left -= count
     return points
 
@@ -61,7 +97,7 @@ def _turned(signs: np.ndarray, drawn: Callable[[int], np.ndarray], count: int) -
 
 
 def mirrored_modes(
-    density: SamplingDensity, mean: np.ndarray, covariance: np.ndarray
+    density: LogPosterior, mean: np.ndarray, covariance: np.ndarray, calls: CallCount | None = None
 ) -> list[tuple[np.ndarray, float]]:
     """Return the signs (dimension,) that lead from a mode to others, and the density there over its own; highest first.
 
@@ -76,8 +112,7 @@ def mirrored_modes(
     signs = np.ones((len(turned), mean.size))
     for row, columns in zip(signs, turned, strict=True):
         row[columns] = -1.0
-    values = density(np.concatenate([mean[None], signs * mean]))
-    values = values[:, 0] if values.ndim > 1 else values
+    values = _counted(density, np.concatenate([mean[None], signs * mean]), calls)
     with np.errstate(over="ignore"):
         shares = np.exp(values[1:] - values[0])
     steps = (signs - 1.0) * mean
@@ -86,14 +121,24 @@ def mirrored_modes(
     return [(signs[i], float(shares[i])) for i in kept]
 
 
-def _finite(density: SamplingDensity, drawn: Callable[[int], np.ndarray], wanted: int, start: str) -> np.ndarray:
+def _counted(density: LogPosterior, points: np.ndarray, calls: CallCount | None) -> np.ndarray:
+    """Return the log-densities of points (points, dimension), and count them."""
+    found = density.evaluate(points, threads=None)
+    if calls is not None:
+        calls.add(found.status)
+    return found.log_prob
+
+
+def _finite(
+    density: LogPosterior, calls: CallCount, drawn: Callable[[int], np.ndarray], wanted: int, start: str
+) -> np.ndarray:
     """Return so many drawn points with a finite density, drawn again until there are enough."""
     points, tried = np.empty((0, density.dimension)), 0
     while len(points) < wanted and tried < REDRAWS * wanted:
         candidates = drawn(wanted)
         tried += wanted
-        values = density(candidates) if len(candidates) else np.empty(0)
-        points = np.concatenate([points, candidates[np.isfinite(values[:, 0] if values.ndim > 1 else values)]])
+        values = _counted(density, candidates, calls) if len(candidates) else np.empty(0)
+        points = np.concatenate([points, candidates[np.isfinite(values)]])
     if len(points) < wanted:
         other = "give a converged fit of this problem, or start='prior'"
         remedy = "narrow the priors, see prior_predictive(problem)" if start == PRIOR else other
@@ -104,26 +149,30 @@ def _finite(density: SamplingDensity, drawn: Callable[[int], np.ndarray], wanted
     return points[:wanted]
 
 
-def _from_prior(density: SamplingDensity, size: int, generator: np.random.Generator) -> np.ndarray:
+def _from_prior(density: LogPosterior, size: int, generator: np.random.Generator) -> np.ndarray:
     """Return coordinates of draws from the priors whose periodic solves converge, (at most size, dimension)."""
     problem = density.problem
     theta = problem.joint_prior.sample(size, generator)
-    residuals, status = problem.residuals(theta, density.threads)
+    simulation = density.simulator.solve(theta, whole=True)
+    good = simulation.status == CONVERGED
+    residuals = density.comparisons.residuals(simulation.at(good), threads=None)
     likelihood, noise = problem.likelihood, []
-    for i in range(len(residuals[0]) if residuals else 0):
+    for i in range(int(good.sum())):
         best = estimate_noise(likelihood, [r[i] for r in residuals], likelihood.guess(), 1.0)
         free = [likelihood.names.index(name) for name in likelihood.free]
         best[free] *= np.exp(NOISE_SPREAD * generator.standard_normal(len(free)))
         noise.append(best)
-    return density.from_natural(theta[status == CONVERGED], np.array(noise).reshape(-1, len(likelihood.names)))
+    return density.from_natural(theta[good], np.array(noise).reshape(-1, len(likelihood.names)))
 
 
-def walking_axes(density: SamplingDensity, fit: MapEstimate, start: str, generator: np.random.Generator) -> RidgeMap:
-    """Return the axes of the walk: those of the Laplace approximation, or the spread of the start where it has none."""
+def sampling_axes(
+    density: LogPosterior, fit: MapEstimate, start: str, generator: np.random.Generator
+) -> AffineTransform:
+    """Return the transform by the Laplace approximation, or by the spread of the start points where there is none."""
     try:
-        return RidgeMap.of(*density.laplace(fit))
+        return AffineTransform.of(*laplace_approximation(density, fit))
     except ValueError:
         if start != PRIOR:
             raise
     points = start_points(density, fit, start, 10 * density.dimension, generator)
-    return RidgeMap(points.mean(axis=0), np.diag(points.std(axis=0)))
+    return AffineTransform(points.mean(axis=0), np.diag(points.std(axis=0)))

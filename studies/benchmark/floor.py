@@ -38,7 +38,7 @@ class Floor:
         self._sweeps: list[Callable[[], Any]] = []
         self._bands: list[np.ndarray] = []
         generator, solutions = np.random.default_rng(1), warm.solve(theta)
-        for name, equations in warm.responses.equations.items():
+        for name, equations in warm.equations.items():
             p = warm.parameters(theta[None], name)[0]
             z = np.stack(list(solutions[name].states.values()), axis=-1)
             columns = equations.residual_jacobian(z, p)
@@ -164,10 +164,15 @@ def _gradient(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
 def _stages(setting: Setting, warm: bp.Problem, theta: np.ndarray) -> dict[str, Callable[[], Any]]:
     """Return the cumulative stages of a call."""
     noise, points = setting.noise, [one[None] for one in theta]
-    residuals = [warm.misfits(one, 1)[0] for one in points]
+    density = warm.density()
+
+    def compared(one: np.ndarray) -> Any:
+        return density.comparisons.residuals(density.simulator.solve(one, 1))
+
+    residuals = [compared(one) for one in points]
     return {
         "priors": lambda: [warm.log_prior(one) for one in theta],
-        "solves": lambda: [warm.misfits(one, 1) for one in points],
+        "solves": lambda: [compared(one) for one in points],
         "likelihood": lambda: [warm.likelihood(one, noise[None]) for one in residuals],
         "whole": lambda: _walk(warm, theta, noise),
     }

@@ -11,7 +11,7 @@ from scipy import stats
 import bayesperiodic as bp
 from bayesperiodic.diagnostics.comparison import importance_k
 from bayesperiodic.diagnostics.verdicts import Sample, joint_verdict, marginal_verdict
-from bayesperiodic.sampling.coordinates import SamplingDensity
+from bayesperiodic.sampling.ensemble import CallCount
 from bayesperiodic.sampling.posterior import gather, tree
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors
 from tests.sampling.test_targets import known, model, run
@@ -96,13 +96,20 @@ def test_sampling_coordinates_are_logarithms_of_positive_parameters_and_of_varia
 def posterior_of(problem, points):
     """Return the posterior of independent draws in sampling coordinates (4, 80, 20, dimension)."""
     return gather(
-        SamplingDensity(problem), points, points[..., 0], converged=True, reason="drawn exactly", acceptance=1.0, seed=0
+        problem.density(),
+        points,
+        points[..., 0],
+        CallCount(1),
+        converged=True,
+        reason="drawn exactly",
+        acceptance=1.0,
+        seed=0,
     )
 
 
 def redrawn(problem, posterior, points):
-    density = SamplingDensity(problem)
-    return replace(posterior, data=tree(problem, *density.to_natural(points), points[..., 0], 0))
+    density = problem.density()
+    return replace(posterior, data=tree(density, *density.to_natural(points), points[..., 0], 0))
 
 
 def by_inversion(log_density, values, generator):

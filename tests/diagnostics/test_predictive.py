@@ -162,7 +162,7 @@ def test_plenty_of_data_and_a_missing_stiffness_is_misspecified():
     assert row["verdict"] == prediction.verdict == "misspecified"
     assert max(row["harmonics"], row["size"]) < 1e-6
     assert row["harmonic"] <= 2.0
-    residual = problem.linearised({n: posterior.draws(n).mean() for n in problem.names}).residuals[0]
+    residual = problem.density().linearise(np.array([posterior.draws(n).mean() for n in problem.names])).residuals[0]
     assert row["model_error_share"] == pytest.approx(1.0 - 0.02**2 / np.mean(residual**2), abs=0.03)
     said = repr(prediction)
     assert "The model is misspecified" in said and "excess power in some harmonics" in said
@@ -290,7 +290,7 @@ def test_every_kind_of_observation_with_residual_degrees_of_freedom_is_tested(ca
 
 def test_points_of_a_mask_are_white_in_the_units_of_correlated_noise():
     problem, theta = CASES["masked, correlated"]()
-    scale = problem.linearised(theta).residuals[0].var()
+    scale = problem.density().linearise(problem.vector(theta)).residuals[0].var()
     values = np.tile(problem.likelihood.guess(), (20, 1))
     values[:, [n.startswith("variance") for n in problem.noise_names]] *= scale
     table = bp.predict(problem, posterior_of(problem, np.tile(theta, (20, 1)), values), draws=20).table

@@ -7,7 +7,8 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.estimation.laplace import undetermined
-from bayesperiodic.sampling.coordinates import SamplingDensity
+from bayesperiodic.posterior.density import LogPosterior
+from bayesperiodic.sampling.starts import laplace_approximation
 from tests.known import LINEAR, formula_model, grid, linear_experiment, linear_regressors
 from tests.problems import DUFFING, DUFFING_PRIORS, duffing_run
 
@@ -29,7 +30,7 @@ def sine_run(force) -> bp.Experiment:
     return bp.Experiment("run", 1.0, {"force": clean + noise}, {"x": np.sin(2 * np.pi * tau)}, samples=60)
 
 
-def second_differences(density: SamplingDensity, mode: np.ndarray, steps: np.ndarray) -> np.ndarray:
+def second_differences(density: LogPosterior, mode: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return the Hessian of the sampled density by central differences of fourth order."""
     weights = {-2: 1 / 12, -1: -2 / 3, 1: 2 / 3, 2: -1 / 12}
     hessian = np.empty((mode.size, mode.size))
@@ -43,7 +44,7 @@ def second_differences(density: SamplingDensity, mode: np.ndarray, steps: np.nda
                     point[j] += b * steps[j]
                     points.append(point)
                     factors.append(wa * wb)
-            hessian[i, j] = np.dot(factors, density(np.array(points))) / steps[i] / steps[j]
+            hessian[i, j] = np.dot(factors, density.evaluate(np.array(points)).log_prob) / steps[i] / steps[j]
     return hessian
 
 
@@ -58,11 +59,11 @@ def test_joint_laplace_equals_mode_and_hessian_of_the_sampled_density(noise, kno
         bp.models.duffing, runs, priors=DUFFING_PRIORS, fixed={"m": 1.0} | known, local=["c"], noise=noise
     )
     fit = bp.map_estimate(problem, progress=False)
-    density = SamplingDensity(problem.anchored(fit.theta))
-    mode, covariance = density.laplace(fit)
+    density = problem.anchored(fit.theta).density()
+    mode, covariance = laplace_approximation(density, fit)
     sd = np.sqrt(np.diag(covariance))
     ends = mode + np.concatenate([np.diag(0.02 * sd), -np.diag(0.02 * sd)])
-    values = density(ends).reshape(2, -1)
+    values = density.evaluate(ends).log_prob.reshape(2, -1)
     assert np.abs(values[0] - values[1]) / 0.04 == pytest.approx(0.0, abs=2e-4)
     hessian = -second_differences(density, mode, 0.05 * sd)
     scaled = np.linalg.inv(covariance) * np.outer(sd, sd)

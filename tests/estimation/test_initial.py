@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.estimation.initial import all_at_once
+from bayesperiodic.posterior.initial import simultaneous_fit
 from tests.known import LINEAR, linear_experiment
 from tests.pendulum import FREQUENCY, GENTLE, PENDULUM, measured, section_problem
 from tests.problems import cycle_run
@@ -136,8 +136,8 @@ def test_simultaneous_fit_needs_guesses_and_a_forced_model():
         [linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)],
         priors={"k": bp.Normal(800.0, 60.0), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)},
     )
-    assert all_at_once(linear, linear.median()) is None
+    assert simultaneous_fit(linear, linear.median()) is None
     cycle = bp.Problem(
         bp.models.van_der_pol, [cycle_run()], priors={"mu": bp.LogNormal(1, 1), "omega": bp.Normal(1, 1)}
     )
-    assert all_at_once(cycle, cycle.median()) is None
+    assert simultaneous_fit(cycle, cycle.median()) is None

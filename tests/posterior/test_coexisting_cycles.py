@@ -6,7 +6,6 @@ import numpy as np
 
 import bayesperiodic as bp
 from bayesperiodic.periodic.arclength import ARRIVED
-from bayesperiodic.periodic.batch import phase_bordered
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT
 from studies.flutter.reference import RIG, SENSORS, hopf
 
@@ -42,20 +41,21 @@ def problem():
 def test_stable_and_unstable_cycles_are_never_confused():
     """Draws with an sd of 12 %, half with the fold above 15 m/s; checked by continuation and by multipliers."""
     stated, generator = problem(), np.random.default_rng(1)
+    simulator = stated.density().simulator
     theta = np.array([RIG[name] for name in stated.names]) * np.exp(0.12 * generator.standard_normal((600, len(FREE))))
-    solved = stated.responses.solve(theta)
-    statuses = np.array([solved[name].status for name in KINDS])
-    stable, unstable = (np.ptp(solved[name].response.outputs[..., 1], axis=1) for name in KINDS)
+    solved = simulator.solve(theta)
+    statuses = np.array([solved.statuses(name) for name in KINDS])
+    stable, unstable = (np.ptp(solved.response(name).outputs[..., 1], axis=1) for name in KINDS)
     assert set(np.unique(statuses)) == {CONVERGED, OTHER_ORBIT}
     both = np.all(statuses == CONVERGED, axis=0)
     assert 200 < both.sum() < 400 and np.all(unstable[both] < 0.99 * stable[both])
     for i in (*np.flatnonzero(both)[:5], *np.flatnonzero(~both)[:15]):
         for name, kind in KINDS.items():
-            ending = stated.responses.path_outcome(theta[i], name)
-            assert (ending == ARRIVED) == (solved[name].status[i] == CONVERGED), ending
+            ending = simulator.path_outcome(theta[i], name)
+            assert (ending == ARRIVED) == (solved.statuses(name)[i] == CONVERGED), ending
             if ending == ARRIVED:
-                alone = stated.responses.solve(theta[i : i + 1], keep=True)[name]
-                assert (stated.responses.largest_multipliers(theta[i : i + 1], name, alone)[0] < 1.0) == kind
+                alone = simulator.solve(theta[i : i + 1], keep=True)
+                assert (simulator.largest_multipliers(theta[i : i + 1], name, alone)[0] < 1.0) == kind
 
 
 def test_determinant_changes_sign_between_cycles_on_both_sides_of_a_fold():
@@ -65,8 +65,7 @@ def test_determinant_changes_sign_between_cycles_on_both_sides_of_a_fold():
     found = []
     for name, cycle in cycles().items():
         z = np.stack([cycle.states[state] for state in bp.models.flutter.states], axis=-1)
-        equations = stated.responses.equations[name].at_frequency(cycle.frequency)
-        found.append(phase_bordered(equations, parameters, z).orientation)
+        found.append(Bordered(stated.equations[name], parameters, z, cycle.frequency).orientation)
     assert found[0] * found[1] == -1.0
 
 

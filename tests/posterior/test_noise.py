@@ -398,7 +398,7 @@ def test_with_equation_7_the_estimate_maximises_equation_6_with_fewer_values():
 
 def joint_maximum(problem: bp.Problem, share: float) -> Iterate:
     objective = Objective(problem, share, np.zeros(len(problem.names), dtype=bool))
-    near = problem.linearised(problem.median())
+    near = problem.density().linearise(problem.median())
     first = objective.at(problem.median(), near, problem.likelihood.guess())
     iterate, status, _ = climb(objective, Iterate(first.theta, near, first.noise, first.objective))
     assert status == "converged"

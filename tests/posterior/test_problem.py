@@ -6,7 +6,6 @@ from scipy import stats
 
 import bayesperiodic as bp
 from bayesperiodic.sampling.checkpoint import fingerprint
-from bayesperiodic.sampling.coordinates import SamplingDensity
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors, normal_posterior
 
 TRUTH = np.array([900.0, 40.0, 25.0])
@@ -180,11 +179,11 @@ def test_samples_of_a_joint_prior_are_correlated(experiment):
 
 def test_only_parameters_on_the_positive_half_line_are_sampled_in_their_logarithm(experiment):
     priors = {"coulomb": TRUNCATED, ("c", "k"): JOINT}
-    density = SamplingDensity(bp.Problem(LINEAR, [experiment], priors=priors))
-    assert density.logarithmic.tolist() == [False, False, True]
+    problem = bp.Problem(LINEAR, [experiment], priors=priors)
+    assert problem.logarithmic.tolist() == [False, False, True]
     priors = {"coulomb": bp.LogUniform(1.0, 50.0), "c": stats.gamma(3.0, scale=10.0), "k": bp.InverseGamma(3.0, 1e3)}
-    density = SamplingDensity(bp.Problem(LINEAR, [experiment], priors=priors))
-    assert density.logarithmic.tolist() == [True, True, False]
+    problem = bp.Problem(LINEAR, [experiment], priors=priors)
+    assert problem.logarithmic.tolist() == [True, True, False]
 
 
 def test_a_frozen_scipy_distribution_is_a_prior(experiment):

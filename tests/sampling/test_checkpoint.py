@@ -15,6 +15,7 @@ from filelock import FileLock
 from tqdm import tqdm
 
 import bayesperiodic as bp
+from bayesperiodic.posterior.density import LogPosterior
 from bayesperiodic.sampling import checkpoint, sample
 from tests.known import LINEAR, linear_experiment
 
@@ -153,7 +154,7 @@ def test_run_killed_at_random_moments_resumes_identically(problem, uninterrupted
 def test_interrupted_run_returns_its_draws_and_can_be_resumed(problem, uninterrupted, tmp_path, monkeypatch):
     """Ctrl-C in the third block gives a result marked as interrupted; the resumed chain is the same."""
     path, calls = tmp_path / "run.h5", 0
-    original = bp.Problem.misfits
+    original = LogPosterior.log_likelihood
 
     def interrupted(self, *arguments, **named):
         nonlocal calls
@@ -163,7 +164,7 @@ def test_interrupted_run_returns_its_draws_and_can_be_resumed(problem, uninterru
         return original(self, *arguments, **named)
 
     with monkeypatch.context() as patch:
-        patch.setattr(bp.Problem, "misfits", interrupted)
+        patch.setattr(LogPosterior, "log_likelihood", interrupted)
         partial = bp.sample(*problem, checkpoint=path, **RUN)
     assert not partial.converged and partial.reason.startswith("interrupted after ")
     assert "NOT CONVERGED" in repr(partial)

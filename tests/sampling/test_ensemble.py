@@ -1,4 +1,4 @@
-"""Concurrent ensembles share one call of the density; results and exceptions reach the right caller."""
+"""Proposals of several ensembles are evaluated in one call, with the results of separate calls."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -6,15 +6,16 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from bayesperiodic.sampling.ensemble import Gate, Ground, InStep
+from bayesperiodic.posterior.density import Evaluation
+from bayesperiodic.sampling.ensemble import JointEvaluation, LockstepPool, SamplingTarget
 
 
 def squares(points):
-    return points**2, np.zeros(len(points), dtype=int)
+    return Evaluation(points[:, 0] ** 2, np.zeros(len(points), dtype=int), np.zeros((len(points), 0)))
 
 
 def three_calls(evaluate, turns):
-    """Return the values that three threads get; thread n evaluates n + 1 points per turn."""
+    """Return the results of three threads that call in turns, thread n with n + 1 points."""
     start = threading.Barrier(3)
 
     def ask(number):
@@ -25,51 +26,51 @@ def three_calls(evaluate, turns):
         return list(threads.map(ask, range(3)))
 
 
-def test_concurrent_callers_share_one_density_call_and_get_their_own_values():
+def test_every_caller_gets_its_own_points_and_one_call_is_made_for_all():
     sizes = []
 
     def counted(points):
         sizes.append(len(points))
         return squares(points)
 
-    for number, answers in enumerate(three_calls(Gate(counted, 3).evaluate, turns=20)):
+    for number, answers in enumerate(three_calls(JointEvaluation(counted, 3).evaluate, turns=20)):
         for turn, answer in enumerate(answers):
-            assert np.array_equal(answer, np.full((number + 1, 1), (10.0 * number + turn) ** 2))
+            assert np.array_equal(answer, np.full(number + 1, (10.0 * number + turn) ** 2))
     assert sizes == [6] * 20
 
 
-def walk(ground, steps):
-    """Evaluate one point per step."""
-    return [float(ground.evaluate(np.full((1, 1), float(k)))[0][0, 0]) for k in range(steps)]
+def advance(target, steps):
+    """Evaluate a number of points one by one."""
+    return [float(target.evaluate(np.full((1, 1), float(k))).log_prob[0]) for k in range(steps)]
 
 
-def test_finished_ensembles_do_not_block_the_others():
-    pieces = {0: [5, 2], 1: [3], 2: [4, 4, 1]}
-    left = {number: list(own) for number, own in pieces.items()}
+def test_no_thread_waits_for_an_ensemble_that_is_finished():
+    tasks = {0: [5, 2], 1: [3], 2: [4, 4, 1]}
+    left = {number: list(own) for number, own in tasks.items()}
 
     def then(number, _):
         return left[number].pop(0) if left[number] else None
 
     first = [own.pop(0) for own in left.values()]
-    found = list(InStep(Ground(squares, None)).run(walk, first, then))
-    for number, own in pieces.items():
-        assert [len(walked) for n, walked in found if n == number] == own
-    assert all(walked == [float(k) ** 2 for k in range(len(walked))] for _, walked in found)
+    found = list(LockstepPool(SamplingTarget(squares, None)).run(advance, first, then))
+    for number, own in tasks.items():
+        assert [len(values) for n, values in found if n == number] == own
+    assert all(values == [float(k) ** 2 for k in range(len(values))] for _, values in found)
 
 
-def test_exception_of_the_density_is_raised_and_releases_all_ensembles():
+def test_an_error_of_the_density_is_raised_and_ends_all_threads():
     def broken(points):
         raise ArithmeticError("no density here")
 
     with pytest.raises(ArithmeticError, match="no density here"):
-        list(InStep(Ground(broken, None)).run(walk, [3, 3, 3], lambda *_: None))
+        list(LockstepPool(SamplingTarget(broken, None)).run(advance, [3, 3, 3], lambda *_: None))
 
 
-def test_exception_of_one_ensemble_is_raised_and_releases_the_others():
-    def stumbling(ground, steps):
+def test_an_error_of_one_task_is_raised_and_ends_all_threads():
+    def stumbling(target, steps):
         if steps == 2:
             raise ArithmeticError("stumbled")
-        return walk(ground, steps)
+        return advance(target, steps)
 
     with pytest.raises(ArithmeticError, match="stumbled"):
-        list(InStep(Ground(squares, None)).run(stumbling, [3, 2, 3], lambda *_: None))
+        list(LockstepPool(SamplingTarget(squares, None)).run(stumbling, [3, 2, 3], lambda *_: None))

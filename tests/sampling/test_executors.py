@@ -18,9 +18,7 @@ from tqdm import tqdm
 
 import bayesperiodic as bp
 from bayesperiodic.posterior import problem as problem_module
-from bayesperiodic.posterior.likelihood import Squares
 from bayesperiodic.sampling import ensemble, sample
-from bayesperiodic.sampling.coordinates import SamplingDensity
 from tests.problems import (
     DUFFING,
     DUFFING_PRIORS,
@@ -253,23 +251,24 @@ def test_the_sum_over_many_experiments_does_not_depend_on_how_many_points_to_the
     runs = [duffing_run(f"run {n}") for n in range(20)]
     likelihood = bp.Problem(bp.models.duffing, runs, priors=DUFFING_PRIORS, fixed={"m": 1.0}).likelihood
     generator = np.random.default_rng(1)
-    squares, values = generator.uniform(size=(20, 37)), generator.uniform(0.1, 1.0, (37, 1))
-    alone = [likelihood(Squares(squares[:, k]), values[k]) for k in range(37)]
-    assert np.array_equal(likelihood(Squares(squares), values), alone)
+    size, values = likelihood.blocks[0].size, generator.uniform(0.1, 1.0, (37, 1))
+    residuals = generator.uniform(size=(20, 37, size))
+    alone = [likelihood(residuals[:, k], values[k]) for k in range(37)]
+    assert np.array_equal(likelihood(residuals, values), alone)
 
 
 @pytest.mark.parametrize("kind", problems())
 def test_the_density_of_a_point_does_not_depend_on_the_others_to_the_last_bit(kind):
     problem = problems()[kind]
-    density = SamplingDensity(problem.anchored(problem.median()), threads=2)
+    density = problem.anchored(problem.median()).density()
     theta = problem.median() * (1.0 + 0.01 * np.random.default_rng(1).standard_normal((37, len(problem.names))))
     points = density.from_natural(theta, np.full((37, len(problem.noise_names)), 0.01))
-    values, status = density.evaluate(points)
-    assert np.isfinite(values).sum() > 30
+    whole = density.evaluate(points, threads=2)
+    assert np.isfinite(whole.log_prob).sum() > 30
     for size in (1, 4, 16):
-        parts = [density.evaluate(points[k : k + size]) for k in range(0, 37, size)]
-        assert np.array_equal(np.concatenate([value for value, _ in parts]), values)
-        assert np.array_equal(np.concatenate([ended for _, ended in parts]), status)
+        parts = [density.evaluate(points[k : k + size], threads=2) for k in range(0, 37, size)]
+        assert np.array_equal(np.concatenate([part.log_prob for part in parts]), whole.log_prob)
+        assert np.array_equal(np.concatenate([part.status for part in parts]), whole.status)
 
 
 SCRIPT = """

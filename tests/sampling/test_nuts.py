@@ -9,8 +9,9 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
+from bayesperiodic.periodic.compiled import CONVERGED
+from bayesperiodic.posterior.density import LogPosterior
 from bayesperiodic.sampling import convergence, nuts
-from bayesperiodic.sampling.coordinates import SamplingDensity
 from studies.damper import run as damper
 from tests.known import EIGHTH_ORDER, LINEAR, RUNAWAY, grid, linear_experiment, linear_regressors
 from tests.problems import CASES
@@ -73,29 +74,27 @@ def test_gradient_equals_differences_of_the_sampling_density(case, coordinates):
     problem, theta = CASES[case]()
     noise = problem.likelihood.guess()
     noise[[name.startswith("variance") for name in problem.noise_names]] = 0.01
-    density = SamplingDensity(problem.anchored(np.array(theta)), coordinates=coordinates)
+    density = problem.anchored(np.array(theta)).density(coordinates=coordinates)
     point = density.from_natural(np.array(theta), noise)
-    value, gradient = density.value_and_gradient(point)
-    assert value == pytest.approx(density(point[None])[0], rel=1e-12)
+    value, gradient, _ = density.value_and_gradient(point)
+    assert value == pytest.approx(density.evaluate(point[None]).log_prob[0], rel=1e-12)
     steps = np.append(np.full(len(theta), 1e-3) * np.where(density.logarithmic, 1.0, np.abs(theta)), 1e-2 * noise**0)
     numerical = np.zeros(density.dimension)
     for i, step in enumerate(steps[: density.dimension]):
         for k, weight in EIGHTH_ORDER.items():
             moved = point + k * step * np.eye(density.dimension)[i] * np.array([[1.0], [-1.0]])
-            numerical[i] += weight * -np.diff(density(moved))[0] / step
+            numerical[i] += weight * -np.diff(density.evaluate(moved).log_prob)[0] / step
     scale = np.abs(numerical) + 1e-3 * np.abs(numerical).max()
     assert (gradient - numerical) / scale == pytest.approx(np.zeros_like(gradient), abs=1e-7)
 
 
 def test_value_and_gradient_outside_the_support_are_minus_infinity_and_zero(edge):
     problem, fit = edge
-    density = SamplingDensity(problem.anchored(problem.vector(fit.theta)))
-    assert density.value_and_gradient(np.log([1.5]))[0] == -np.inf
-    assert (density.calls, density.failures.total()) == (1, 1)
-    outside = SamplingDensity(density.problem, coordinates="natural")
-    value, gradient = outside.value_and_gradient(np.array([-1.0]))
-    assert value == -np.inf and gradient == 0.0
-    assert (outside.calls, outside.failures.total()) == (1, 0)
+    anchored = problem.anchored(problem.vector(fit.theta))
+    value, _, status = anchored.density().value_and_gradient(np.log([1.5]))
+    assert value == -np.inf and status != CONVERGED
+    value, gradient, status = anchored.density(coordinates="natural").value_and_gradient(np.array([-1.0]))
+    assert value == -np.inf and gradient == 0.0 and status == CONVERGED
 
 
 @needs_nutpie
@@ -214,10 +213,10 @@ def interrupting_at(draws: int) -> Callable[..., list[str]]:
 
 @needs_nutpie
 def test_exception_in_the_density_stops_all_chains(linear, monkeypatch):
-    def broken(self: SamplingDensity, point: np.ndarray) -> tuple[float, np.ndarray]:
+    def broken(self: LogPosterior, point: np.ndarray) -> tuple[float, np.ndarray]:
         raise ZeroDivisionError("in a thread")
 
-    monkeypatch.setattr(SamplingDensity, "value_and_gradient", broken)
+    monkeypatch.setattr(LogPosterior, "value_and_gradient", broken)
     with pytest.raises(ZeroDivisionError, match="in a thread"):
         bp.sample(*linear, seed=1, **NUTS)
 

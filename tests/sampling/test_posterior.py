@@ -9,7 +9,7 @@ from scipy.special import digamma, polygamma
 
 import bayesperiodic as bp
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.coordinates import SamplingDensity
+from bayesperiodic.sampling.ensemble import CallCount
 from bayesperiodic.sampling.posterior import gather
 from tests.known import (
     LINEAR,
@@ -50,10 +50,12 @@ def runs(coulombs=(25.0, 35.0), sd=3.0):
 
 
 def drawn(problem, steps=12):
-    """Return a posterior of synthetic chains, without sampling."""
-    density = SamplingDensity(problem)
+    """Return a posterior of chains that were made up, without any sampling."""
+    density = problem.density()
     kept = 0.1 * np.random.default_rng(1).standard_normal((2, steps, 4, density.dimension))
-    return gather(density, kept, kept.sum(axis=-1), converged=True, reason="made up", acceptance=0.5, seed=0), kept
+    return gather(
+        density, kept, kept.sum(axis=-1), CallCount(1), converged=True, reason="made up", acceptance=0.5, seed=0
+    ), kept
 
 
 @pytest.fixture(scope="module")

@@ -20,15 +20,15 @@ def test_residual_of_a_replicate_equals_its_simulated_noise(case):
     problem, theta = CASES[case]()
     values = problem.likelihood.complete(np.full((1, len(problem.free_noise)), 1e-4))
     components = problem.likelihood.simulate(values, np.random.default_rng(3))
-    solved, left = problem.responses.solve(np.array([theta])), list(components)
+    solved, left = problem.density().simulator.solve(np.array([theta])), list(components)
     for e in problem.experiments:
         observation = problem.observations[e.name]
         own, left = left[: len(observation.blocks)], left[len(observation.blocks) :]
-        outputs = observation.replicates(solved[e.name].response, own)
+        outputs = observation.replicates(solved.response(e.name), own)
         kept = e.mask if e.mask is not None else slice(None)
         assert all(np.isfinite(y[0, kept]).all() for y in outputs.values())
         again = replace(e, outputs={channel: np.nan_to_num(y[0]) for channel, y in outputs.items()})
-        response = Response(*(part[0] for part in solved[e.name].response))
+        response = Response(*(part[0] for part in solved.response(e.name)))
         residuals = type(observation)(again, problem.model, problem.parameter_maps[e.name].delayed).residuals(response)
         for block, found, given in zip(observation.blocks, residuals, own, strict=True):
             if block.channel in e.outputs or block.channel == "scale":

@@ -5,7 +5,6 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.sampling import convergence, sample
-from bayesperiodic.sampling.coordinates import SamplingDensity
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors, normal_posterior
 
 TRUTH = np.array([900.0, 40.0, 25.0])
@@ -77,13 +76,13 @@ def test_collapsed_density_of_errors_with_a_known_spectrum_is_the_integral_over_
     noise = bp.noise.Circulant(prior=prior)
     problem = bp.Problem(LINEAR, runs, priors=PRIORS, fixed=shape, noise=noise)
     problem = problem.anchored(TRUTH)
-    whole, collapsed = (SamplingDensity(problem, variances=v) for v in ("sampled", "collapsed"))
+    whole, collapsed = (problem.density(variances=v) for v in ("sampled", "collapsed"))
     assert collapsed.labels == problem.names and collapsed.collapsed == ("variance[force]",)
     points = TRUTH * (1.0 + 0.02 * np.random.default_rng(1).standard_normal((4, 3)))
-    found = collapsed(points)[:, 0]
+    found = collapsed.evaluate(points).log_prob
     logarithms = np.linspace(-6.0, 16.0, 4001)
     for point, value in zip(points, found, strict=True):
-        every = whole(np.column_stack([np.tile(point, (logarithms.size, 1)), logarithms]))
+        every = whole.evaluate(np.column_stack([np.tile(point, (logarithms.size, 1)), logarithms])).log_prob
         integral = np.log(np.trapezoid(np.exp(every - every.max()), logarithms)) + every.max()
         assert value == pytest.approx(integral, abs=1e-8)
 

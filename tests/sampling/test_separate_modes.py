@@ -5,8 +5,7 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.sampling.convergence import shortfall
-from bayesperiodic.sampling.coordinates import SamplingDensity
-from bayesperiodic.sampling.starts import mirrored_modes, start_points
+from bayesperiodic.sampling.starts import laplace_approximation, mirrored_modes, start_points
 from tests.sampling.test_targets import known, model, ridge, run
 
 QUIET = {"progress": False}
@@ -17,8 +16,8 @@ UNCUT = bp.Normal(1.0, 1.0)
 def test_the_product_of_two_signed_numbers_has_a_mirrored_mode():
     """With both signs negative the likelihood is the same and the prior density lower by e^-4 at the mode."""
     problem, fit = ridge({"a": UNCUT, "b": UNCUT})
-    density = SamplingDensity(problem)
-    mean, covariance = density.laplace(fit)
+    density = problem.density()
+    mean, covariance = laplace_approximation(density, fit)
     ((signs, share),) = mirrored_modes(density, mean, covariance)
     assert signs.tolist() == [-1.0, -1.0]
     assert share == pytest.approx(np.exp(-2.0 * mean.sum()), rel=1e-6) and share == pytest.approx(np.exp(-4.0), rel=0.1)
@@ -34,8 +33,8 @@ def test_modes_that_are_close_or_improbable_are_not_reported():
             model("number", ["a"], lambda p: {"force": p.a}), [run(force=value)], priors={"a": bp.Normal(0.0, 2.0)},
             fixed=known(force=0.1),
         )  # fmt: skip
-        density = SamplingDensity(problem)
-        assert mirrored_modes(density, *density.laplace(bp.map_estimate(problem, **QUIET))) == []
+        density = problem.density()
+        assert mirrored_modes(density, *laplace_approximation(density, bp.map_estimate(problem, **QUIET))) == []
 
 
 def test_positive_parameters_have_no_mirrored_modes():
@@ -43,8 +42,8 @@ def test_positive_parameters_have_no_mirrored_modes():
     problem = bp.Problem(
         model("number", ["a"], lambda p: {"force": p.a}), [run(force=1.0)], priors={"a": cut}, fixed=known(force=0.1)
     )
-    density = SamplingDensity(problem)
-    assert mirrored_modes(density, *density.laplace(bp.map_estimate(problem, **QUIET))) == []
+    density = problem.density()
+    assert mirrored_modes(density, *laplace_approximation(density, bp.map_estimate(problem, **QUIET))) == []
 
 
 def test_one_separate_walker_prevents_convergence():

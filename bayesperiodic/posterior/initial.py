@@ -1,32 +1,29 @@
-"""Orbits and parameters found together: a start for the estimator where the start's own orbits are far or do not exist.
+"""Simultaneous fit of orbits and parameters, an initial estimate where the orbits at the first guess of θ do not serve.
 
-With measured orbits the equations of motion need not hold until the end. First θ is moved to where they hold best along
-the measured orbits. Then each iteration linearises g(z, θ) = 0 at the present orbit z of every experiment and at θ,
-which do not solve it yet, and takes the Gauss-Newton step of all unknowns; the orbits are eliminated, as
-dz = −g_z⁻¹ (g + g_θ dθ) ([1]_). Every orbit is led from the measured one by steps over which the equations are nearly
-linear, so none is lost, and none turns into another on the way.
+Measured orbits need not satisfy the equations of motion until the end. First θ is moved to where the equations hold
+best along the measured orbits. Then each iteration linearises g(z, θ) = 0 at the present orbit z of every experiment
+and at θ, which do not solve it yet, and takes the Gauss-Newton step of all unknowns; the orbits are eliminated, as
+dz = −g_z⁻¹ (g + g_θ dθ) ([1]_). The steps are so short that the equations are nearly linear along them, which keeps
+each orbit on its own branch.
 
 References
 ----------
 .. [1] H. G. Bock, Recent advances in parameter identification techniques for ordinary differential equations, in:
-   Numerical Treatment of Inverse Problems in Differential and Integral Equations, Birkhäuser, 1983, 95-121.
+   Numerical Treatment of Inverse Descriptions in Differential and Integral Equations, Birkhäuser, 1983, 95-121.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.periodic.equations import CyclicFactors, PeriodicEquations
+from bayesperiodic.posterior.description import Description
 from bayesperiodic.posterior.likelihood import Likelihood, estimate_noise
 from bayesperiodic.posterior.observation import Observation, Response
-
-if TYPE_CHECKING:
-    from bayesperiodic.posterior.problem import Problem
-
 
 MAX_ITERATIONS = 60
 LARGEST_STEP = 0.7
@@ -59,10 +56,17 @@ class Linear:
     changes: list[np.ndarray]
 
 
-class Together(NamedTuple):
-    """What was found: θ (names,), the states of every experiment, and which experiment stood in the way, if any.
+class InitialEstimate(NamedTuple):
+    """Result of a simultaneous fit.
 
-    Without states θ is where the way ended.
+    Attributes
+    ----------
+    theta : array (names,)
+        The estimate, or the last θ that was reached.
+    states : dict of str to dict of str to array (points,)
+        States of every experiment, turns included; empty if the fit failed.
+    blocked : str
+        The experiment whose orbit could not be followed; empty otherwise.
     """
 
     theta: np.ndarray
@@ -70,32 +74,31 @@ class Together(NamedTuple):
     blocked: str
 
 
-def all_at_once(problem: Problem, theta: np.ndarray) -> Together | None:
-    """Return θ and orbits near the MAP point; None where the model is autonomous or an experiment has no guess.
+def simultaneous_fit(problem: Description, theta: np.ndarray) -> InitialEstimate | None:
+    """Return θ and orbits near the MAP point; None if the model is autonomous or an experiment has no guess.
 
-    The way starts at a θ and at the experiments' own guesses. Multipliers are not looked at, and positive parameters
-    move in their logarithms.
+    The fit starts at a θ and at the experiments' guesses, ignores multipliers, and moves positive parameters in their
+    logarithms.
 
     Parameters
     ----------
-    problem : Problem
+    problem : Description
     theta : array (names,)
     """
     if problem.model.autonomous or not all(e.guess for e in problem.experiments):
         return None
-    together = _Together(problem)
-    return together.iterate(together.fitting(theta))
+    fit = _SimultaneousFit(problem)
+    return fit.iterate(fit.parameters_along_guesses(theta))
 
 
-class _Together:
-    def __init__(self, problem: Problem):
+class _SimultaneousFit:
+    def __init__(self, problem: Description):
         self.problem, self.maps = problem, problem.parameter_maps
         experiments = [_without_multipliers(e) for e in problem.experiments]
         self.observations = {e.name: Observation(e, problem.model, self.maps[e.name].delayed) for e in experiments}
         blocks = [block for observation in self.observations.values() for block in observation.blocks]
         self.likelihood = Likelihood(problem.noise, blocks, problem.likelihood.fixed)
-        self.equations: dict[str, PeriodicEquations] = problem._responses.equations
-        self.logarithmic = np.array([s == (0.0, np.inf) for s in problem.joint_prior.supports.values()])
+        self.equations: dict[str, PeriodicEquations] = problem.equations
         self.guess = {e.name: self._periodic_part(e) for e in experiments}
 
     def _periodic_part(self, e: Experiment) -> np.ndarray:
@@ -103,7 +106,7 @@ class _Together:
         states = np.stack([e.guess[name] for name in self.problem.model.states], axis=-1)
         return states - equations.drift * equations.grid.tau[:, None]
 
-    def fitting(self, theta: np.ndarray) -> np.ndarray:
+    def parameters_along_guesses(self, theta: np.ndarray) -> np.ndarray:
         """Return the θ near which the equations hold best along the experiments' guesses, by damped Gauss-Newton."""
         now = self._misfit(theta)
         for _ in range(MAX_ITERATIONS):
@@ -135,7 +138,7 @@ class _Together:
 
     def _misfit(self, theta: np.ndarray) -> float:
         """Return −log of the prior's density and of that of the equations' errors along the guesses."""
-        prior = float(self.problem.log_prior(theta))
+        prior = float(self.problem.joint_prior.log_prob(theta))
         if not np.isfinite(prior):
             return np.inf
         total = 0.0
@@ -147,9 +150,9 @@ class _Together:
         return 0.5 * self.problem.counted * np.log(max(total, np.finfo(float).tiny)) - prior
 
     def _there(self, theta: np.ndarray, step: np.ndarray) -> np.ndarray:
-        return np.where(self.logarithmic, theta * np.exp(step * self.logarithmic), theta + step)
+        return np.where(self.problem.logarithmic, theta * np.exp(step * self.problem.logarithmic), theta + step)
 
-    def iterate(self, theta: np.ndarray) -> Together:
+    def iterate(self, theta: np.ndarray) -> InitialEstimate:
         """Return where the Gauss-Newton iteration in orbits and θ leads to from the guesses and a θ."""
         orbits, noise = self.guess, self.likelihood.guess()
         for _ in range(MAX_ITERATIONS):
@@ -157,18 +160,18 @@ class _Together:
             for name, z in orbits.items():
                 one = self._linearise(name, z, theta)
                 if one is None:
-                    return Together(theta, {}, name)
+                    return InitialEstimate(theta, {}, name)
                 linear[name] = one
             noise = estimate_noise(self.likelihood, [r for one in linear.values() for r in one.residuals], noise, 1.0)
             step, size = self._step(*self._information(linear, noise), theta)
             off = {name: _size(one.correction, orbits[name]) for name, one in linear.items()}
             worst = max(off, key=lambda name: off[name])
             if off[worst] < ON_ORBIT and size < SMALL_STEP:
-                return Together(theta, {name: self._states(name, z) for name, z in orbits.items()}, "")
+                return InitialEstimate(theta, {name: self._states(name, z) for name, z in orbits.items()}, "")
             theta, orbits, blocked = self._moved(linear, orbits, theta, step)
             if blocked:
-                return Together(theta, {}, blocked)
-        return Together(theta, {}, worst)
+                return InitialEstimate(theta, {}, blocked)
+        return InitialEstimate(theta, {}, worst)
 
     def _linearise(self, name: str, z: np.ndarray, theta: np.ndarray) -> Linear | None:
         """Return one experiment's equations linearised at an orbit and θ; None where ∂g/∂z is singular."""
@@ -200,16 +203,16 @@ class _Together:
         """Return the step of θ's coordinates, positive parameters in their logarithms, and its length in sds."""
         prior = self.problem.joint_prior
         by_prior = prior.gradient(theta)
-        unit = np.where(self.logarithmic, theta, 1.0)
+        unit = np.where(self.problem.logarithmic, theta, 1.0)
         hessian = (hessian + prior.curvature(theta)) * np.outer(unit, unit)
-        hessian -= np.diag(np.where(self.logarithmic, theta * by_prior, 0.0))
+        hessian -= np.diag(np.where(self.problem.logarithmic, theta * by_prior, 0.0))
         gradient = (gradient + by_prior) * unit
         scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
         values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
         values = np.maximum(np.abs(values), 1e-13 * np.abs(values).max())
         along = vectors.T @ (scale * gradient) / values
         step = scale * (vectors @ along)
-        longest = np.max(np.abs(step), where=self.logarithmic, initial=0.0)
+        longest = np.max(np.abs(step), where=self.problem.logarithmic, initial=0.0)
         return step * min(1.0, LARGEST_STEP / max(longest, LARGEST_STEP)), float(np.sqrt(np.sum(values * along**2)))
 
     def _moved(
@@ -220,7 +223,7 @@ class _Together:
         while share > SMALLEST_SHARE:
             there = self._there(theta, share * step)
             share *= 0.5
-            if not np.isfinite(self.problem.log_prior(there)):
+            if not np.isfinite(self.problem.joint_prior.log_prob(there)):
                 continue
             moved: dict[str, np.ndarray] = {}
             for name, one in linear.items():

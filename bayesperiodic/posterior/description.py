@@ -1,0 +1,388 @@
+"""A model, experiments, priors and a noise model, validated: what a posterior density is defined by."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from bayesperiodic import _checks
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.data.recording import Recording
+from bayesperiodic.models.model import Model
+from bayesperiodic.periodic.equations import PeriodicEquations
+from bayesperiodic.periodic.schemes import Scheme
+from bayesperiodic.posterior.joint_priors import JointPrior
+from bayesperiodic.posterior.likelihood import Likelihood
+from bayesperiodic.posterior.noise import Noise, as_noise
+from bayesperiodic.posterior.observation import Observation
+from bayesperiodic.posterior.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
+from bayesperiodic.posterior.priors import Uniform
+
+
+class Description:
+    """Model, experiments, parameters, priors and noise of a `Problem`, validated on construction."""
+
+    def __init__(
+        self,
+        model: Model,
+        experiments: Iterable[Experiment],
+        *,
+        priors: Mapping[Any, Any],
+        fixed: Mapping[str, float | Mapping[str, float]] | None = None,
+        tied: Mapping[str, str] | None = None,
+        local: Iterable[str] = (),
+        noise: str | Noise = "independent",
+        scheme: str | Scheme = "central2",
+    ):
+        self.model, self.scheme, self.noise = model, scheme, as_noise(noise)
+        self.experiments = _checked_experiments(model, experiments)
+        measured = {channel for experiment in self.experiments for channel in experiment.outputs}
+        self.channels = tuple(channel for channel in model.outputs if channel in measured)
+        runs = [e.name for e in self.experiments]
+        if not isinstance(priors, Mapping):
+            raise ValueError(f"priors: {priors!r} is not allowed; it must be a mapping of names to priors.")
+        fixed, tied, every = dict(fixed or {}), dict(tied or {}), (*model.parameters, SHIFT)
+        self._given_priors, self._given_fixed = dict(priors), fixed
+        self.local = _checked_local(local, every, priors, tied)
+        self.fixed = {n: _constant(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
+        given = expand_priors(priors, self.local, runs, self.fixed) | self._free_phases(priors, fixed, tied)
+        self.joint_prior = JointPrior.of(given, free_names(model.parameters, self.local, runs))
+        self.names = self.joint_prior.names
+        self._check_free(fixed)
+        self.parameter_maps = {
+            run: ParameterMap.of(
+                model.parameters, self.names, run, {n: v[run] for n, v in self.fixed.items() if run in v}, tied
+            )
+            for run in runs
+        }
+        self.observations = {
+            e.name: Observation(e, model, self.parameter_maps[e.name].delayed) for e in self.experiments
+        }
+        self.likelihood = self._likelihood(fixed)
+        self._check_counts()
+
+    def _free_phases(self, priors: Any, fixed: Mapping[str, Any], tied: Mapping[str, Any]) -> dict[str, Uniform]:
+        """Return the priors of the delays that an autonomous model needs and that were not given."""
+        if not self.model.autonomous or SHIFT in fixed or SHIFT in tied or SHIFT in priors:
+            return {}
+        return {
+            f"{SHIFT}[{e.name}]": Uniform(-0.5 / e.frequency, 0.5 / e.frequency)
+            for e in self.experiments
+            if f"{SHIFT}[{e.name}]" not in priors
+        }
+
+    def _likelihood(self, fixed: Mapping[str, Any]) -> Likelihood:
+        blocks = [block for observation in self.observations.values() for block in observation.blocks]
+        known = {name: value for name, value in fixed.items() if name not in self.fixed}
+        names = tuple(dict.fromkeys(n for block in blocks for n in self.noise.parameter_names(block)))
+        for plain in (name.partition("[")[0] for name in names):
+            if plain in self.model.parameters:
+                raise ValueError(
+                    f"model: the parameter name {plain!r} is not allowed; the noise model {self.noise.name!r} has a "
+                    "parameter of that name. Call the model's otherwise."
+                )
+        for name, value in known.items():
+            _checks.one_of("fixed", name, (*self.model.parameters, SHIFT, *names))
+            _checks.positive(f"fixed[{name!r}]", value)
+        return Likelihood(self.noise, blocks, known)
+
+    def _check_free(self, fixed: Mapping[str, Any]) -> None:
+        known = {*fixed, *(local_name(name, run) for name, by_run in self.fixed.items() for run in by_run)}
+        for name in self.names:
+            if name in known:
+                raise ValueError(f"fixed: {name!r} has a prior too; give a prior or a value.")
+        if not self.names:
+            raise ValueError("priors: {} is not allowed; at least one parameter must be free.")
+
+    def _check_counts(self) -> None:
+        """Refuse an improper prior of a variance where as many parameters can fit the data exactly."""
+        if self.noise.proper:
+            return
+        for group, members in self.likelihood.groups():
+            count = self.likelihood.counts[group[0]]
+            runs = {self.likelihood.blocks[b].experiment for b in members}
+            acting = sorted({i for run in runs for i in self.parameter_maps[run].columns.values()})
+            needed = len(acting) + self.noise.spare
+            if group[0] in self.likelihood.free and count <= needed:
+                names = ", ".join(self.names[i] for i in acting)
+                raise ValueError(
+                    f"priors: {len(acting)} free parameters ({names}) are not allowed; {group[0]!r} is unknown, has "
+                    f"the {self.noise.prior_text}, and only {count:.0f} independent values, where more than {needed} "
+                    f"are needed. Fix parameters or {group[0]!r}, give it a proper prior "
+                    "(noise.Independent(prior=…)), keep more harmonics, or add experiments."
+                )
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """All noise parameters, the last axis of `variances` in what follows."""
+        return self.likelihood.names
+
+    @property
+    def free_noise(self) -> tuple[str, ...]:
+        """Noise parameters without a known value."""
+        return self.likelihood.free
+
+    @property
+    def counted(self) -> float:
+        """Σn, the independent values behind all unknown and known variances."""
+        return sum(self.likelihood.counts.values())
+
+    def with_experiments(self, experiments: Iterable[Experiment]) -> Self:
+        """Return the same problem with other data, or with some of its experiments.
+
+        Parameters
+        ----------
+        experiments : iterable of Experiment
+            Priors and fixed values of single experiments go by the experiments' names; those of experiments left out
+            are dropped.
+
+        Returns
+        -------
+        Problem
+
+        Raises
+        ------
+        ValueError
+            As the constructor does.
+        """
+        chosen = tuple(experiments)
+        gone = {e.name for e in self.experiments} - {getattr(e, "name", None) for e in chosen}
+        ends = tuple(local_name("", name) for name in gone)
+        priors, fixed = (
+            {key: value for key, value in given.items() if not (isinstance(key, str) and key.endswith(ends))}
+            for given in (self._given_priors, self._given_fixed)
+        )
+        for name, value in fixed.items():
+            if isinstance(value, Mapping):
+                fixed[name] = {run: number for run, number in value.items() if run not in gone}
+        return type(self)(
+            self.model,
+            chosen,
+            priors=priors,
+            fixed=fixed,
+            tied=self.tied,
+            local=self.local,
+            noise=self.noise,
+            scheme=self.scheme,
+        )
+
+    @property
+    def tied(self) -> dict[str, str]:
+        """The expressions of the tied parameters."""
+        any_map = next(iter(self.parameter_maps.values()))
+        return {name: expression.text for name, expression in any_map.tied.items()}
+
+    @property
+    def priors(self) -> dict[str | tuple[str, ...], Any]:
+        """The priors by name, in the order of the model's parameters."""
+        return self.joint_prior.blocks
+
+    def median(self) -> np.ndarray:
+        """Return the medians of the priors, (names,)."""
+        return self.joint_prior.median()
+
+    def vector(self, theta: Mapping[str, float] | np.ndarray | Sequence[float]) -> np.ndarray:
+        """Return θ as an array from a mapping or an array.
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (…, names)
+            Natural values, in the parameters' units.
+
+        Returns
+        -------
+        array (…, names)
+
+        Raises
+        ------
+        ValueError
+            For unknown or missing names, or another last axis.
+        """
+        if isinstance(theta, Mapping):
+            _checks.same_names("theta", theta, self.names)
+            theta = np.stack(np.broadcast_arrays(*(np.asarray(theta[name], dtype=float) for name in self.names)), -1)
+        values = np.asarray(theta, dtype=float)
+        if values.shape[-1:] != (len(self.names),):
+            raise ValueError(f"theta: shape {values.shape} is not allowed; the last axis must be {list(self.names)}.")
+        return values
+
+    def noise_values(self, variances: Mapping[str, Any] | np.ndarray) -> np.ndarray:
+        """Return the noise parameters as an array from a mapping or an array.
+
+        Parameters
+        ----------
+        variances : mapping of str to float, or array (…, noise_names)
+            In a mapping a channel's name stands for its variance [channel's unit squared], and those with a known value
+            may be left out.
+
+        Returns
+        -------
+        array (…, noise_names)
+
+        Raises
+        ------
+        ValueError
+            For unknown or missing names, or another last axis.
+        """
+        names = self.noise_names
+        if isinstance(variances, Mapping):
+            longer = {f"variance[{name}]": name for name in variances}
+            renamed = {long if long in names else short: variances[short] for long, short in longer.items()}
+            given: dict[str, Any] = {**self.likelihood.fixed, **renamed}
+            _checks.same_names("variances", given, names)
+            variances = np.stack(np.broadcast_arrays(*(np.asarray(given[n], dtype=float) for n in names)), -1)
+        values = np.asarray(variances, dtype=float)
+        if values.shape[-1:] != (len(names),):
+            raise ValueError(f"variances: shape {values.shape} is not allowed; the last axis must be {list(names)}.")
+        return values
+
+    def log_prior(self, theta: Mapping[str, float] | np.ndarray) -> np.ndarray:
+        """Return Σ ln p(θ_α).
+
+        Parameters
+        ----------
+        theta : mapping of str to float, or array (…, names)
+            Natural values, in the parameters' units.
+
+        Returns
+        -------
+        array (…)
+            −inf outside the support.
+
+        Raises
+        ------
+        ValueError
+            For unknown or missing names, or another last axis.
+        """
+        return self.joint_prior.log_prob(self.vector(theta))
+
+    @cached_property
+    def logarithmic(self) -> np.ndarray:
+        """Parameters sampled in their logarithm, those whose prior's support is (0, ∞): bool array (names,)."""
+        return np.array([support == (0.0, np.inf) for support in self.joint_prior.supports.values()])
+
+    @cached_property
+    def equations(self) -> dict[str, PeriodicEquations]:
+        """The discretised equations of every experiment."""
+        return {
+            e.name: PeriodicEquations.build(
+                self.model,
+                e.inputs,
+                frequency=e.frequency,
+                samples=e.samples,
+                scheme=self.scheme,
+                periods=e.periods,
+                winding=e.winding,
+            )
+            for e in self.experiments
+        }
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled functions cannot be pickled; they are loaded again where they are needed.
+        return {key: value for key, value in self.__dict__.items() if key != "equations"}
+
+    def parameters(self, theta: np.ndarray, experiment: str) -> np.ndarray:
+        """Return every parameter of the model in an experiment, free, fixed and tied.
+
+        Parameters
+        ----------
+        theta : array (draws, names)
+        experiment : str
+
+        Returns
+        -------
+        array (draws, parameters)
+            In the order of the model.
+        """
+        return np.ascontiguousarray(self.parameter_maps[experiment].values(theta)[:, :-1])
+
+    def sample_prior(self, size: int, seed: int) -> dict[str, np.ndarray]:
+        """Return independent draws of every free parameter from its prior.
+
+        Parameters
+        ----------
+        size : int
+        seed : int
+
+        Returns
+        -------
+        dict of str to array (size,)
+            By name.
+        """
+        draws = self.joint_prior.sample(size, np.random.default_rng(seed))
+        return dict(zip(self.names, draws.T.copy(), strict=True))
+
+    def __repr__(self) -> str:
+        return (
+            f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
+            f"channels: {', '.join(self.channels)} with {self.counted:.0f} independent values, {self.noise.name} noise)"
+        )
+
+
+def _checked_local(
+    local: Iterable[str], every: tuple[str, ...], priors: Any, tied: Mapping[str, str]
+) -> tuple[str, ...]:
+    if isinstance(local, str):
+        raise ValueError(f"local: {local!r} is not allowed; it must be a sequence of names, such as [{local!r}].")
+    names = tuple(local)
+    for name in names:
+        _checks.one_of("local", name, every)
+        if name in tied:
+            raise ValueError(f"local: {name!r} is tied; it follows what it is tied to, so leave it out.")
+    if isinstance(priors, Mapping):
+        for key in priors:
+            for name in key if isinstance(key, tuple) else ():
+                if name in names:
+                    raise ValueError(
+                        f"priors[{key!r}]: {name!r} is local; a joint prior needs the names of single experiments, "
+                        f"such as '{name}[run]'."
+                    )
+    return names if SHIFT in names else (*names, SHIFT)
+
+
+def _constant(name: str, given: Any, runs: list[str], local: bool) -> dict[str, float]:
+    """Return the value of a fixed parameter in each experiment; a local one may be fixed in some of them."""
+    if not isinstance(given, Mapping):
+        return dict.fromkeys(runs, _checks.finite_number(f"fixed[{name!r}]", given))
+    for run in given:
+        _checks.one_of(f"fixed[{name!r}]", run, runs)
+    if not local:
+        _checks.same_names(f"fixed[{name!r}]", given, runs)
+    return {run: _checks.finite_number(f"fixed[{name!r}][{run!r}]", given[run]) for run in runs if run in given}
+
+
+def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tuple[Experiment, ...]:
+    if isinstance(experiments, Experiment):
+        raise ValueError(f"experiments: {experiments.name!r} alone is not allowed; give a list of one, [experiment].")
+    result = tuple(experiments)
+    for e in result:
+        if isinstance(e, Recording):
+            raise ValueError(f"experiments: the recording {e.name!r} is not allowed; give its mean period, see fold().")
+        if not isinstance(e, Experiment):
+            raise ValueError(f"experiments: {e!r} is not allowed; each must be an Experiment.")
+    if not result:
+        raise ValueError("experiments: () is not allowed; at least one experiment is needed.")
+    names = [experiment.name for experiment in result]
+    if len(set(names)) < len(names):
+        raise ValueError(f"experiments: the names {names} are not allowed; they must differ, see fold(name=…).")
+    for e in result:
+        _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
+        if not e.outputs:
+            raise ValueError(f"outputs of experiment {e.name!r}: {{}} is not allowed; at least one must be measured.")
+        for channel, values in e.outputs.items():
+            _checks.one_of(f"outputs of experiment {e.name!r}", channel, model.outputs)
+            if e.mask is None and e.covariance is None and np.ptp(values) == 0.0:
+                raise ValueError(
+                    f"outputs of experiment {e.name!r}: {channel!r} is constant ({values[0]:g}); a channel must vary "
+                    "over the period, or tells nothing about its variance."
+                )
+        if e.guess:
+            _checks.same_names(f"guess of experiment {e.name!r}", e.guess, model.states)
+        if model.autonomous and not e.frequency_se > 0.0:
+            raise ValueError(
+                f"experiment {e.name!r}: frequency_se = {e.frequency_se:g} is not allowed; {model.name!r} is "
+                "autonomous, its measured frequency is data and needs a standard error > 0. Fold without `frequency`, "
+                "which then is estimated with its error, or give frequency_se."
+            )
+    return result
