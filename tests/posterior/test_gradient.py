@@ -82,7 +82,7 @@ def test_singular_transposed_solve_gives_minus_infinity_and_zero_gradient(monkey
 
 def test_gradient_needs_a_point_inside_the_support():
     problem = duffing(duffing_run())
-    with pytest.raises(ValueError, match="theta: .* the log-posterior is not finite there"):
+    with pytest.raises(ValueError, match="theta: the log-posterior must be finite, got -inf at"):
         problem.gradient({"c": -1.0, "k": 1.0, "k3": 0.5}, {"displacement": 0.01})
     with pytest.raises(ValueError, match="method: must be one of 'adjoint', 'forward', got 'reverse'"):
         problem.gradient({"c": 0.2, "k": 1.0, "k3": 0.5}, {"displacement": 0.01}, method="reverse")

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.sampling import convergence, sample
+from bayesperiodic.periodic import batch
+from bayesperiodic.posterior import observation
+from bayesperiodic.sampling import convergence
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors, normal_posterior
 
 TRUTH = np.array([900.0, 40.0, 25.0])
@@ -132,7 +134,8 @@ def test_same_seed_gives_identical_draws_and_another_seed_others(known_variance)
 
 def test_draws_do_not_depend_on_the_number_of_cores(known_variance, monkeypatch):
     two = bp.sample(*known_variance, seed=5, max_steps=250, **PAIR)
-    monkeypatch.setattr(sample, "available_cores", lambda: 1)
+    for module in (observation, batch):
+        monkeypatch.setattr(module, "available_cores", lambda: 1)
     assert np.array_equal(two.draws("k"), bp.sample(*known_variance, seed=5, max_steps=250, **PAIR).draws("k"))
 
 
