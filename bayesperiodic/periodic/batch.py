@@ -154,9 +154,7 @@ class Batch:
         z = np.empty((self._size, solves, grid.points if keep else 0, self._first.count))
         y = np.empty((self._size, solves, grid.points, model.kernels.channels))
         nothing = np.empty((self._size, grid.points, 0)), np.empty(0, dtype=np.int64)
-        _, status, iterations = self._solve(parameters, *nothing, z, y, threads, polish)
-        frequency = np.repeat(self._shared[1][:, None], solves, axis=1)
-        return BatchSolution(z, y, frequency, status, iterations)
+        return self._solve(parameters, *nothing, z, y, threads, polish)[0]
 
     def squares(
         self, parameters: np.ndarray, data: np.ndarray, measured: np.ndarray, threads: int | None = None

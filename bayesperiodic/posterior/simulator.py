@@ -9,15 +9,14 @@ import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.periodic.arclength import LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
-from bayesperiodic.periodic.family import LOST, reach
-from bayesperiodic.periodic.floquet import first_order_matrix
+from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
 from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities
-from bayesperiodic.periodic.solution import PeriodicSolution, describe
-from bayesperiodic.periodic.solve import solve_free
-from bayesperiodic.periodic.stability import logarithmic_changes
+from bayesperiodic.periodic.solution import PeriodicSolution, describe, logarithmic_changes
+from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.posterior.description import Description
 from bayesperiodic.posterior.observation import GroupSolution, Response, Simulation
 from bayesperiodic.posterior.parameters import ParameterMaps
@@ -170,9 +169,13 @@ class Simulator:
         return Simulation(found, self._places)
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
-        """Return how the branch through an experiment's anchor ends on the way to a θ (names,), see `family.reach`."""
+        """Return how the branch through an experiment's anchor ends on the way to a θ (names,), see `arclength.path_outcome`."""
         anchor, parameters = self._anchors[experiment], self.problem.parameters(theta[None], experiment)[0]
-        return LOST if anchor.sensitivities is None else reach(self.problem.equations[experiment], anchor, parameters)
+        return (
+            LOST
+            if anchor.sensitivities is None
+            else path_outcome(self.problem.equations[experiment], anchor, parameters)
+        )
 
     def _log_multipliers(
         self, experiment: Experiment, z: np.ndarray, frequency: np.ndarray, parameters: np.ndarray, status: np.ndarray
@@ -184,7 +187,7 @@ class Simulator:
         result = np.full((len(z), measured.size), np.nan)
         for i in np.flatnonzero(status == CONVERGED):
             equations = self.problem.equations[experiment.name].at_frequency(float(frequency[i]))
-            found = leading_multipliers(equations, parameters[i], z[i], measured.size)
+            found = orbit_multipliers(equations, parameters[i], z[i], measured.size)
             if found.size < measured.size:
                 status[i] = SINGULAR
             elif np.any(np.sign(found.real) != np.sign(measured)):
@@ -199,7 +202,7 @@ class Simulator:
         frequency, z = simulation.response(experiment).frequency, simulation.z(experiment)
         for i in np.flatnonzero(simulation.statuses(experiment) == CONVERGED):
             equations = self.problem.equations[experiment].at_frequency(float(frequency[i]))
-            result[i] = np.abs(leading_multipliers(equations, parameters[i], z[i], 1)).max(initial=0.0)
+            result[i] = np.abs(orbit_multipliers(equations, parameters[i], z[i], 1)).max(initial=0.0)
         return result
 
     def solutions(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
@@ -270,7 +273,7 @@ class Simulator:
             values = maps.values(theta[None])[:, 0]
             outputs = np.stack([weights[n].outputs for n in names])
             by_parameter = np.zeros(values.shape)
-            by_parameter[:, maps.moving] = batch.pull(values[:, :-1], solved.z[:, 0], outputs, maps.moving)
+            by_parameter[:, maps.moving] = batch.vjp(values[:, :-1], solved.z[:, 0], outputs, maps.moving)
             by_parameter[:, -1] = [weights[n].delay for n in names]
             result |= dict(zip(names, maps.vjp(values, by_parameter), strict=True))
         for e in self.problem.experiments:

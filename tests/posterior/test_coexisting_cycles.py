@@ -6,6 +6,7 @@ import numpy as np
 
 import bayesperiodic as bp
 from bayesperiodic.periodic.arclength import ARRIVED
+from bayesperiodic.periodic.batch import phase_bordered
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT
 from studies.flutter.reference import RIG, SENSORS, hopf
 
@@ -41,8 +42,8 @@ def problem():
 def test_stable_and_unstable_cycles_are_never_confused():
     """Draws with an sd of 12 %, half with the fold above 15 m/s; checked by continuation and by multipliers."""
     stated, generator = problem(), np.random.default_rng(1)
-    simulator = stated.density().simulator
     theta = np.array([RIG[name] for name in stated.names]) * np.exp(0.12 * generator.standard_normal((600, len(FREE))))
+    simulator = stated.density().simulator
     solved = simulator.solve(theta)
     statuses = np.array([solved.statuses(name) for name in KINDS])
     stable, unstable = (np.ptp(solved.response(name).outputs[..., 1], axis=1) for name in KINDS)
@@ -65,7 +66,8 @@ def test_determinant_changes_sign_between_cycles_on_both_sides_of_a_fold():
     found = []
     for name, cycle in cycles().items():
         z = np.stack([cycle.states[state] for state in bp.models.flutter.states], axis=-1)
-        found.append(Bordered(stated.equations[name], parameters, z, cycle.frequency).orientation)
+        equations = stated.equations[name].at_frequency(cycle.frequency)
+        found.append(phase_bordered(equations, parameters, z).orientation)
     assert found[0] * found[1] == -1.0
 
 
