@@ -80,7 +80,7 @@ class Simulator:
             if found is not None and found.statuses(name)[0] == CONVERGED:
                 here, z = equations.at_frequency(float(found.response(name).frequency[0])), found.z(name)[0]
             else:
-                here, (z, code, _) = self._from_guess(name, parameters)
+                here, (z, code, *_) = self._from_guess(name, parameters)
                 if code != CONVERGED:
                     anchors[name], derivatives[name] = Anchor(parameters, z, equations.frequency), None
                     continue
@@ -169,7 +169,7 @@ class Simulator:
         return Simulation(found, self._places)
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
-        """Return how the branch through an experiment's anchor ends on the way to a θ (names,), see `arclength.path_outcome`."""
+        """Return how the branch through an experiment's anchor ends on the way to θ, see `arclength.path_outcome`."""
         anchor, parameters = self._anchors[experiment], self.problem.parameters(theta[None], experiment)[0]
         return (
             LOST
