@@ -12,9 +12,9 @@ from .diagnostics.comparison import compare as compare
 from .diagnostics.identifiability import Identifiability as Identifiability
 from .diagnostics.identifiability import identifiability as identifiability
 from .diagnostics.predictive import Prediction as Prediction
+from .diagnostics.predictive import PriorPredictive as PriorPredictive
 from .diagnostics.predictive import predict as predict
-from .diagnostics.prior_predictive import PriorPredictive as PriorPredictive
-from .diagnostics.prior_predictive import prior_predictive as prior_predictive
+from .diagnostics.predictive import prior_predictive as prior_predictive
 from .estimation.map_estimate import map_estimate as map_estimate
 from .estimation.profile import Profile as Profile
 from .estimation.profile import profile as profile

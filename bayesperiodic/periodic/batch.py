@@ -153,72 +153,15 @@ class Batch:
         solves = parameters.shape[-2]
         z = np.empty((self._size, solves, grid.points if keep else 0, self._first.count))
         y = np.empty((self._size, solves, grid.points, model.kernels.channels))
-        nothing = np.empty((self._size, grid.points, 0)), np.empty(0, dtype=np.int64)
-        return self._solve(parameters, *nothing, z, y, threads, polish)[0]
-
-    def squares(
-        self, parameters: np.ndarray, data: np.ndarray, measured: np.ndarray, threads: int | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Solve likewise, and return no more than the sums of squares of data minus outputs, and the status.
-
-        Parameters
-        ----------
-        parameters : array (sets, solves, parameters)
-        data : array (sets, points, measured)
-        measured : int array (measured,)
-            The channels that the data are of.
-        threads : int, optional
-
-        Returns
-        -------
-        squares : array (sets, solves, measured)
-        status : int array (sets, solves)
-        """
-        solves, channels = parameters.shape[-2], self._first.model.kernels.channels
-        z, y = np.empty((self._size, solves, 0, self._first.count)), np.empty((self._size, solves, 0, channels))
-        solution, squares = self._solve(parameters, data, measured, z, y, threads)
-        return squares, solution.status
-
-    def orbits(
-        self, parameters: np.ndarray, data: np.ndarray, measured: np.ndarray, threads: int | None = None
-    ) -> tuple[BatchSolution, np.ndarray]:
-        """Solve for one parameter vector of every input set, z as it is after the solve, and return `squares` too.
-
-        Parameters
-        ----------
-        parameters : array (sets, 1, parameters)
-        data : array (sets, points, measured)
-        measured : int array (measured,)
-            The channels that the data are of.
-        threads : int, optional
-        """
-        model, points = self._first.model, self._first.grid.points
-        z = np.empty((self._size, 1, points, self._first.count))
-        y = np.empty((self._size, 1, points, model.kernels.channels))
-        return self._solve(parameters, data, measured, z, y, threads)
-
-    def _solve(
-        self,
-        parameters: np.ndarray,
-        data: np.ndarray,
-        measured: np.ndarray,
-        z: np.ndarray,
-        y: np.ndarray,
-        threads: int | None,
-        polish: bool = False,
-    ) -> tuple[BatchSolution, np.ndarray]:
-        """Fill z and y where they have entries; return them with sums of squares."""
-        grid, solves = self._first.grid, z.shape[1]
         every = np.empty((self._size, solves, parameters.shape[-1]))
         every[:] = parameters
-        squares, status = np.empty((self._size, solves, measured.size)), np.empty((2, self._size, solves), dtype=int)
+        status, iterations = np.empty((2, self._size, solves), dtype=int)
         frequency = np.repeat(self._sets.frequency[:, None], solves, axis=1)
-        solution = BatchSolution(z, y, frequency, *status)
-        before = self._functions, grid.packed, grid.periods, self._sets, self._anchors, every, data, measured
-        after = polish, self._first.model.kernels.output_rates, solution, squares
-        solve_many = self._kernels.solve_many
+        solution = BatchSolution(z, y, frequency, status, iterations)
+        before = self._functions, grid.packed, grid.periods, self._sets, self._anchors, every
+        after, solve_many = (polish, model.kernels.output_rates, solution), self._kernels.solve_many
         _in_blocks(lambda block: solve_many(*before, *block, *after), self._size * solves, SMALLEST_PART, threads)
-        return solution, squares
+        return solution
 
     def vjp(
         self,

@@ -37,7 +37,7 @@ def posterior_of(problem: bp.Problem, theta: np.ndarray, noise: np.ndarray, seed
     density = anchored.log_posterior(theta, noise)
     names = [*problem.names, *problem.free_noise]
     return bp.Posterior(
-        data=tree(anchored, theta, noise, density, seed),
+        data=tree(anchored.density(), theta, noise, density, seed),
         converged=True,
         reason="independent draws",
         tau=dict.fromkeys(names, 1.0),

@@ -18,7 +18,7 @@ SIZES = np.concatenate([np.geomspace(1e-300, 1e300, 1201), np.linspace(0.01, 40.
 @pytest.fixture(scope="module")
 def functions():
     text = Path(compilation.__file__).with_name("_kernels").joinpath("elementary.py").read_text(encoding="utf-8")
-    return load(text, NAMES)
+    return vars(load(text))
 
 
 @pytest.mark.parametrize("name", NAMES)

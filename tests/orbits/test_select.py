@@ -20,8 +20,7 @@ def test_the_information_is_the_inverse_covariance_of_the_estimate(polished):
     """Over a flat prior and at scale 1, relative to the values: the Laplace covariance of the same orbit alone."""
     orbit, names = polished[2], ["l", "k3"]
     problem = section_problem([orbit.experiment(samples=400)], *names)
-    exact = {name: PENDULUM[name] for name in names}
-    at = problem.density().linearise(exact)
+    at = problem.density().linearise(np.array([PENDULUM[name] for name in names]))
     changes = np.concatenate(problem.likelihood.whitened(at.changes, np.ones(1)), axis=1)
     expected = changes @ changes.T * np.outer([0.3, 4.5e-4], [0.3, 4.5e-4])
     assert orbit_information(orbit, names) == pytest.approx(expected, rel=1e-5)

@@ -67,7 +67,7 @@ def test_batch_equals_single_solves(equations, batch):
 def test_kept_solutions_are_converged_to_rounding(equations, batch):
     """Those that are not end where the next chord step would be below 1e-9 of the amplitude."""
     parameters = spread(20, sd=0.005)
-    (kept,), *_, (status,), _ = batch.solve(parameters, keep=True)
+    (kept,), *_, (status,), _ = batch.solve(parameters, keep=True, polish=True)
     assert not status.any()
     for theta, z in zip(parameters, kept, strict=True):
         columns = equations.residual_jacobian(z, theta)
@@ -186,7 +186,7 @@ def test_an_orbit_of_period_two_does_not_become_one_of_period_one():
     column = bp.models.pendulum.parameters.index("a")
     parameters[:, column] *= np.linspace(0.9, 1.1, 41)
     anchor = Anchor.at(equations, theta, equations.solve(theta, periodic[:, None]).z)
-    (z,), _, _, (status,), _ = Batch([equations], [anchor]).solve(parameters, keep=True)
+    (z,), _, _, (status,), _ = Batch([equations], [anchor]).solve(parameters, keep=True, polish=True)
     one, lost = rotation[-1], 0
     for values, found, code in zip(parameters, z[:, :, 0], status, strict=True):
         one = bp.solve_periodic(

@@ -50,7 +50,7 @@ def test_solves_with_reused_factors_equal_solves_from_scratch(drive, scheme, spr
     parameters = np.tile(THETA, (60, 1))
     parameters[:, FREE] *= 1.0 + np.array(spread) * np.random.default_rng(1).standard_normal((60, 3))
     parameters[:, NAMES.index("theta11")] = -1e5 * parameters[:, NAMES.index("theta4")]
-    found = Batch(sets, anchors).solve(parameters, keep=True)
+    found = Batch(sets, anchors).solve(parameters, keep=True, polish=True)
     assert not found.status.any()
     for equations, z in zip(sets, found.z, strict=True):
         for i in (3, 17, 40):

@@ -74,7 +74,7 @@ def test_singular_transposed_solve_gives_minus_infinity_and_zero_gradient(monkey
     problem = duffing(duffing_run())
     theta, noise = {"c": 0.2, "k": 1.0, "k3": 0.5}, {"displacement": 0.01}
     assert np.isfinite(problem.value_and_gradient(theta, noise)[0])
-    monkeypatch.setattr(Batch, "pull", lambda self, p, z, weights, moving: np.full((len(p), len(moving)), np.nan))
+    monkeypatch.setattr(Batch, "vjp", lambda self, p, z, weights, moving: np.full((len(p), len(moving)), np.nan))
     value, gradient = problem.value_and_gradient(theta, noise)
     assert value == -np.inf
     assert gradient.tolist() == [0.0] * 4

@@ -397,10 +397,10 @@ def test_with_equation_7_the_estimate_maximises_equation_6_with_fewer_values():
 
 
 def joint_maximum(problem: bp.Problem, share: float) -> Iterate:
-    objective = Objective(problem, share, np.zeros(len(problem.names), dtype=bool))
-    near = problem.density().linearise(problem.median())
-    first = objective.at(problem.median(), near, problem.likelihood.guess())
-    iterate, status, _ = climb(objective, Iterate(first.theta, near, first.noise, first.objective))
+    density = problem.density(coordinates="natural")
+    objective = Objective(density, share)
+    first = objective.iterate(density.linearise(problem.median()), problem.likelihood.guess())
+    iterate, status, _ = climb(objective, first)
     assert status == "converged"
     return iterate
 
@@ -439,7 +439,7 @@ def test_without_the_correction_the_gradient_of_the_posterior_vanishes(model):
     experiments = [replace(e, scatter={"force": 0.6, "moment": 2.0}, cycles=4) for e in two_channel_experiments()]
     problem = bp.Problem(TWO, experiments, priors=TWO_PRIORS, noise=model)
     found = joint_maximum(problem, 1.0)
-    hessian, _ = Objective(problem, 1.0, np.zeros(2, dtype=bool)).hessian_and_gradient(found)
+    hessian, _ = Objective(problem.density(coordinates="natural"), 1.0).hessian_and_gradient(found)
     in_sd = np.append(1.0 / np.sqrt(np.diag(hessian)), np.ones(found.noise.size))
     assert np.all(np.abs(problem.gradient(found.theta, found.noise) * in_sd) < 2e-5)
 

@@ -17,7 +17,8 @@ from scipy import stats
 from tqdm import tqdm
 
 import bayesperiodic as bp
-from bayesperiodic.posterior import problem as problem_module
+from bayesperiodic.periodic import batch
+from bayesperiodic.posterior import observation
 from bayesperiodic.sampling import ensemble, sample
 from tests.problems import (
     DUFFING,
@@ -69,8 +70,9 @@ def alike(one: bp.Posterior, other: bp.Posterior) -> bool:
 
 @pytest.mark.parametrize("cores", [1, 2, 4])
 def test_chains_are_identical_for_any_number_of_threads(posed, serial, cores, monkeypatch):
-    monkeypatch.setattr(sample, "available_cores", lambda: cores)
-    monkeypatch.setattr(problem_module, "SMALLEST_SHARED", 1)
+    for module in (observation, batch):
+        monkeypatch.setattr(module, "available_cores", lambda: cores)
+    monkeypatch.setattr(observation, "SMALLEST_SHARED", 1)
     assert alike(sampled(posed), serial[0])
 
 

@@ -91,7 +91,7 @@ def test_records_that_drift_or_are_too_short_are_excluded_with_a_reason():
     ]
     admitted, refused = rig.usable(records)
     assert list(admitted) == ["steady"]
-    assert "is not steady" in refused["growing"] and "at least 3 cycles are needed" in refused["short"]
+    assert "must be steady" in refused["growing"] and "at least 3 cycles" in refused["short"]
 
 
 def test_amplitudes_of_draws_agree_with_branches_continued_at_their_values():

@@ -201,12 +201,10 @@ def continue_from_anchor(
 
 
 @njit(
-    types.void(FUNCTIONS, GRID, COUNT, SETS, ANCHORS, CUBE, CUBE, PLACES, COUNT, COUNT, FLAG, FLAG, SOLUTION, CUBE),
+    types.void(FUNCTIONS, GRID, COUNT, SETS, ANCHORS, CUBE, COUNT, COUNT, FLAG, FLAG, SOLUTION),
     **OPTIONS,
 )
-def solve_many(
-    functions, grid, periods, sets, anchors, parameters, data, measured, start, stop, polish, rates, solution, squares
-):
+def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop, polish, rates, solution):
     """Solve for input sets times parameter vectors, those of the flat indices start … stop (vectors run fastest).
 
     Each solve starts from the linear prediction of its set's anchor: chord steps with the anchor's factors, else
@@ -224,25 +222,19 @@ def solve_many(
     sets : Sets
     anchors : Anchors
     parameters : array (sets, solves, parameters)
-    data : array (sets, points, measured)
-    measured : int array (measured,)
-        The channels that the data are of.
     start, stop : int
     polish : bool
         As `newton_chord` takes it.
     rates : bool
         Whether the outputs depend on q̇ or q̈.
     solution : BatchSolution
-        Filled except for the frequency; z, and the outputs, only if they have entries.
-    squares : array (sets, solves, measured)
-        Filled with the sums of squares of data minus outputs.
+        Filled except for the frequency; z only if it has entries.
     """
     outputs = grid_function_at(functions.outputs)
     points, count = anchors.z.shape[1], STATES if STATES > 0 else anchors.z.shape[2]
     solves, kept, y, all_factors = parameters.shape[1], solution.z, solution.outputs, anchors.factors
     states, z = np.empty((points, 3 * count)), np.empty((points, count))
-    predicted, change, room = np.empty((points, count)), np.empty((points, count)), np.empty((points, y.shape[3]))
-    reached, residuals = np.empty(count), np.empty(points)
+    predicted, change, reached = np.empty((points, count)), np.empty((points, count)), np.empty(count)
     columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MAX_ITERATIONS, 3))
     bands, pivots, inverses, gains, transfers, ends, interfaces, interface_pivots = all_factors
     own = Factors(
@@ -308,12 +300,7 @@ def solve_many(
             for i in range(points):
                 for s in range(count):
                     states[i, s] = z[i, s] + setting.drift[s] * grid.tau[i]
-        out = y[e, b] if y.size > 0 else room
-        outputs(states, setting.inputs, theta, grid.tau, setting.frequency, out)
-        for m in range(measured.size):
-            for i in range(points):
-                residuals[i] = out[i, measured[m]] - data[e, i, m]
-            squares[e, b, m] = dot(residuals, residuals)
+        outputs(states, setting.inputs, theta, grid.tau, setting.frequency, y[e, b])
         if kept.size > 0:
             copy(z, kept[e, b])
         solution.status[e, b], solution.iterations[e, b] = code, used
