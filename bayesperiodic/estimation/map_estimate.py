@@ -125,7 +125,7 @@ def map_estimate(
         if end.objective > best.objective:
             best, status, history = end, other_status, other_history
     result = _describe(problem, objective, best, status, history, tuple(found))
-    for text in remarks(problem, result):
+    for text in estimation_warnings(problem, result):
         warnings.warn(text, UserWarning, stacklevel=3)
     return result
 
@@ -236,8 +236,8 @@ def _inverse(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return inverse, np.any(np.abs(vectors[:, ~curved]) > LOST, axis=1)
 
 
-def remarks(problem: Problem, fit: MapEstimate) -> Iterator[str]:
-    """Give what must be said of an estimate: what it may not be trusted for, and what to do about it."""
+def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
+    """Yield the warnings about an estimate: its limitations, and what to do about them."""
     for channel, noise in fit.input_noise.items():
         if noise > NOISE_SHARE * fit.rms[channel]:
             yield (

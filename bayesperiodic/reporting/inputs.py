@@ -16,7 +16,7 @@ from bayesperiodic import _checks
 from bayesperiodic.diagnostics.comparison import Comparison, compare
 from bayesperiodic.diagnostics.identifiability import Identifiability, identifiability
 from bayesperiodic.diagnostics.predictive import Prediction, predict
-from bayesperiodic.estimation.map_estimate import remarks
+from bayesperiodic.estimation.map_estimate import estimation_warnings
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
 from bayesperiodic.posterior import labels
@@ -121,7 +121,7 @@ class ReportInputs:
     @property
     def warnings(self) -> list[str]:
         """All warnings on the estimate."""
-        return [*remarks(self.problem, self.fit), *self.underestimated_sds]
+        return [*estimation_warnings(self.problem, self.fit), *self.underestimated_sds]
 
     def unit(self, name: str) -> str:
         """Return the formatted unit of a parameter, a channel or a noise parameter, by its full name."""

@@ -86,8 +86,8 @@ QUANTILE_SPREAD = 0.25
 APART = 8.0
 
 
-def shortfall(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: Sequence[str]) -> list[str]:
-    """Return what the stop rule misses, in words; nothing if it is passed.
+def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: Sequence[str]) -> list[str]:
+    """Return the criteria of the stop rule that are not met, in words.
 
     An ensemble of 32 walkers that is 50 autocorrelation times long holds 1600 independent draws, a walker alone would
     hold 50, so that it has to be 500 long; all else is the same for both. The mean of a walker scatters by its standard

@@ -15,7 +15,7 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.density import SAMPLED, LogPosterior
 from bayesperiodic.posterior.labels import CHAIN, DRAW
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.convergence import shortfall
+from bayesperiodic.sampling.convergence import unmet_criteria
 from bayesperiodic.sampling.ensemble import AffineTransform, CallCount
 from bayesperiodic.sampling.posterior import Posterior, gather
 from bayesperiodic.sampling.starts import sampling_axes, start_points
@@ -181,7 +181,7 @@ class _Run:
         self.steps, self.converged, self.reason = 0, False, ""
 
     def cancel(self) -> None:
-        """End the chains for nothing."""
+        """Abort all chains."""
         for chain in self.chains:
             with suppress(RuntimeError):  # That of a chain that failed.
                 chain.sampler.cancel()
@@ -203,7 +203,7 @@ class _Run:
                 self._wait(steps, bar)
                 self.steps, kept = steps, self.kept(steps)
                 tau = convergence.autocorrelation_time(kept)
-                missing, last = shortfall(kept, tau, last, self.density.labels), tau
+                missing, last = unmet_criteria(kept, tau, last, self.density.labels), tau
                 bar.set_postfix_str(f"tau {tau.max():.1f}, length {steps / tau.max():.0f} tau")
                 passes = 0 if missing else passes + 1
                 if passes >= PASSES:

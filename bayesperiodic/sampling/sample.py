@@ -27,7 +27,7 @@ from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import Simulator
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.checkpoint import Checkpoint, Saved
-from bayesperiodic.sampling.convergence import shortfall
+from bayesperiodic.sampling.convergence import unmet_criteria
 from bayesperiodic.sampling.ensemble import (
     AffineTransform,
     CallCount,
@@ -296,7 +296,7 @@ class _Run:
                 self._advance(steps, pool, bar)
                 kept = self._kept(steps)
                 tau = convergence.autocorrelation_time(kept)
-                missing = shortfall(kept, tau, np.array(state["tau"]), self.density.labels)
+                missing = unmet_criteria(kept, tau, np.array(state["tau"]), self.density.labels)
                 passes = 0 if missing else state["passes"] + 1
                 state |= {"steps": steps, "checked": steps, "tau": tau.tolist(), "passes": passes, "missing": missing}
                 bar.set_postfix_str(self._account(kept, tau))

@@ -175,9 +175,9 @@ def test_too_few_draws_are_not_converged_and_nuts_statistics_are_kept(linear, br
 
 def test_single_nuts_chain_needs_as_many_draws_as_an_ensemble():
     draws = np.random.default_rng(3).standard_normal((4, 400, 8, 1))
-    nearly = convergence.shortfall(draws[:, :, :1], np.ones(1), np.ones(1), ("k",))
+    nearly = convergence.unmet_criteria(draws[:, :, :1], np.ones(1), np.ones(1), ("k",))
     assert nearly[0] == "length only 400 tau"
-    assert convergence.shortfall(draws, np.ones(1), np.ones(1), ("k",)) == []
+    assert convergence.unmet_criteria(draws, np.ones(1), np.ones(1), ("k",)) == []
 
 
 @needs_nutpie
@@ -195,7 +195,7 @@ def test_failed_solves_and_trajectories_that_end_in_them_are_counted(edge, brief
 
 @needs_nutpie
 def test_interrupted_run_returns_its_draws(linear, briefly, monkeypatch):
-    monkeypatch.setattr(nuts, "shortfall", interrupting_at(250))
+    monkeypatch.setattr(nuts, "unmet_criteria", interrupting_at(250))
     posterior = bp.sample(*linear, seed=1, **(briefly | {"max_steps": 5000}))
     assert not posterior.converged
     assert posterior.reason == f"interrupted after {posterior.data['posterior'].sizes['draw']} draws"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.sampling.convergence import shortfall
+from bayesperiodic.sampling.convergence import unmet_criteria
 from bayesperiodic.sampling.starts import laplace_approximation, mirrored_modes, start_points
 from tests.sampling.test_targets import known, model, ridge, run
 
@@ -50,12 +50,12 @@ def test_one_separate_walker_prevents_convergence():
     """One of 128 independent walkers that is off by one sd hardly changes any quantile."""
     kept = np.random.default_rng(1).standard_normal((4, 2000, 32, 2))
     tau = np.ones(2)
-    assert shortfall(kept, tau, tau, ("a", "b")) == []
+    assert unmet_criteria(kept, tau, tau, ("a", "b")) == []
     kept[2, :, 5, 1] += 1.0
-    assert [text[:22] for text in shortfall(kept, tau, tau, ("a", "b"))] == ["walkers that stay apar"]
+    assert [text[:22] for text in unmet_criteria(kept, tau, tau, ("a", "b"))] == ["walkers that stay apar"]
 
 
 def test_error_names_the_coordinate_that_does_not_move():
     kept = np.zeros((4, 2000, 32, 2))
-    still = shortfall(kept, np.array([1.0, np.inf]), np.ones(2), ("a", "b"))
+    still = unmet_criteria(kept, np.array([1.0, np.inf]), np.ones(2), ("a", "b"))
     assert still == ["'b' not moving, as every proposal is refused"]
