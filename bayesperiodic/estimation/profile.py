@@ -285,7 +285,7 @@ class Profile(Result):
             For any other probability.
         """
         if not 0.0 < _checks.finite_number("probability", probability) <= WIDEST:
-            raise ValueError(f"probability: {probability!r} is not allowed; it must be above 0 and at most {WIDEST}.")
+            raise ValueError(f"probability: must be above 0 and at most {WIDEST}, got {probability!r}.")
         level = float(ndtri(0.5 + 0.5 * probability))
         result = {}
         for name, values in self.values.items():

@@ -263,7 +263,7 @@ class MapEstimate(Result):
             If the probability is not between 0 and 1.
         """
         if not 0.0 < _checks.finite_number("probability", probability) < 1.0:
-            raise ValueError(f"probability: {probability!r} is not allowed; it must be between 0 and 1.")
+            raise ValueError(f"probability: must be between 0 and 1, got {probability!r}.")
         width = float(stdtrit(min(self.degrees_of_freedom, 1e9), 0.5 + 0.5 * probability))
         sd = self.robust_sd if robust else self.sd
         return {name: (value - width * sd[name], value + width * sd[name]) for name, value in self.theta.items()}

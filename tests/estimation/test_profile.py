@@ -294,7 +294,7 @@ def test_error_names_what_cannot_be_profiled(linear):
     for names in ("k", []):
         with pytest.raises(ValueError, match="names: .* is not allowed; it must be a sequence of names"):
             bp.profile(problem, fit, names)
-    with pytest.raises(ValueError, match=r"probability: 0.999 is not allowed; it must be above 0 and at most 0.99"):
+    with pytest.raises(ValueError, match=r"probability: must be above 0 and at most 0.99, got 0.999"):
         profile.interval(0.999)
     run = linear_experiment(TRUTH, 3.0, seed=1)
     other = bp.Problem(LINEAR, [run], priors=PRIORS | {"c": bp.Uniform(0.0, 1.0)}, fixed={"variance[force]": 9.0})
