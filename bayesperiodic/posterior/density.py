@@ -120,15 +120,15 @@ class Evaluation(NamedTuple):
     ----------
     log_prob : array (points,)
         −inf where a periodic solve fails or the prior is zero.
-    status : int array (points,)
-        The worst status code of the periodic solves; that of "converged" where nothing was solved.
     moments : array (points, collapsed)
         M of eq. (6) of each variance that is integrated out; NaN where a solve fails.
+    status : int array (points,)
+        The worst status code of the periodic solves; that of "converged" where nothing was solved.
     """
 
     log_prob: np.ndarray
-    status: np.ndarray
     moments: np.ndarray
+    status: np.ndarray
 
 
 class SamplingCoordinates:
@@ -294,18 +294,29 @@ class LogPosterior(SamplingCoordinates):
             By default one per core. The values do not depend on it.
         """
         simulation = self.simulator.solve(theta, threads, whole=True)
-        log_prob, moments = np.full(len(theta), -np.inf), np.full((len(theta), len(self.collapsed)), np.nan)
         good = simulation.status == CONVERGED
+        if good.all():
+            return Evaluation(*self._log_likelihood(simulation, noise, threads), simulation.status)
+        log_prob, moments = self._nothing(len(theta))
         if good.any():
-            at = slice(None) if good.all() else good
-            residuals = self.comparisons.residuals(simulation if good.all() else simulation.at(good), threads)
-            values = self.problem.likelihood(residuals, noise[at])
-            if self.collapsed:
-                by_name = self.problem.likelihood.moments(residuals)
-                moments[at] = np.stack([by_name[name] for name in self.collapsed], axis=-1)
-                values = values + np.sum(0.5 * moments[at] + self._integrals(moments[at]), axis=-1)
-            log_prob[at] = values
-        return Evaluation(log_prob, simulation.status, moments)
+            log_prob[good], moments[good] = self._log_likelihood(simulation.at(good), noise[good], threads)
+        return Evaluation(log_prob, moments, simulation.status)
+
+    def _log_likelihood(
+        self, simulation: Simulation, noise: np.ndarray, threads: int | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return log-likelihoods and moments of converged solutions."""
+        residuals = self.comparisons.residuals(simulation, threads)
+        values = self.problem.likelihood(residuals, noise)
+        if not self.collapsed:
+            return values, np.empty((len(values), 0))
+        by_name = self.problem.likelihood.moments(residuals)
+        moments = np.stack([by_name[name] for name in self.collapsed], axis=-1)
+        return values + np.sum(0.5 * moments + self._integrals(moments), axis=-1), moments
+
+    def _nothing(self, points: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return log-densities and moments of points without a solution."""
+        return np.full(points, -np.inf), np.full((points, len(self.collapsed)), np.nan)
 
     def at(self, theta: np.ndarray, noise: np.ndarray, threads: int | None = None) -> Evaluation:
         """Return the log-density over the coordinates at natural values; arguments as in `log_likelihood`."""
@@ -314,13 +325,12 @@ class LogPosterior(SamplingCoordinates):
         if inside.all():
             found = self.log_likelihood(theta, noise, threads)
             return found._replace(log_prob=_finite(prior + found.log_prob))
-        log_prob, status = np.full(len(theta), -np.inf), np.full(len(theta), CONVERGED)
-        moments = np.full((len(theta), len(self.collapsed)), np.nan)
+        (log_prob, moments), status = self._nothing(len(theta)), np.full(len(theta), CONVERGED)
         if inside.any():
             found = self.log_likelihood(theta[inside], noise[inside], threads)
             log_prob[inside], status[inside] = _finite(prior[inside] + found.log_prob), found.status
             moments[inside] = found.moments
-        return Evaluation(log_prob, status, moments)
+        return Evaluation(log_prob, moments, status)
 
     def evaluate(self, points: np.ndarray, threads: int | None = 1) -> Evaluation:
         """Return the log-density at points (points, dimension), each value of its point alone.

@@ -16,6 +16,7 @@ from bayesperiodic.posterior.noise import CORRELATED, KNOWN, POINTS, SCALE, SPEC
 
 # Outputs (numbers) from which on their comparison with the data is shared among the cores.
 SMALLEST_SHARED = 10_000
+LARGEST_TRANSFORM = 16_384
 
 
 class Response(NamedTuple):
@@ -351,17 +352,28 @@ class Observation:
 
     def _spectral(self, signal: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
         """Return real Fourier components whose mean square is that of the signal within the harmonics."""
-        highest = (harmonic.size - 1) // 2
-        amplitudes = _fourier.coefficients(signal, highest)
-        amplitudes *= np.sqrt(0.5 * harmonic.size)
         result = np.empty((*signal.shape[:-1], harmonic.size))
+        step = max(1, LARGEST_TRANSFORM // self._points)
+        if signal.ndim < 3 or signal.size <= LARGEST_TRANSFORM:
+            self._transform(signal, result)
+        else:  # In parts that stay in the cache; larger ones cost more for their memory than for the transform.
+            for own, components in zip(signal, result, strict=True):
+                for first in range(0, len(own), step):
+                    self._transform(own[first : first + step], components[first : first + step])
+        return result
+
+    def _transform(self, signal: np.ndarray, result: np.ndarray) -> None:
+        """Fill in the real Fourier components (…, size) of signals (…, points)."""
+        size = result.shape[-1]
+        highest = (size - 1) // 2
+        amplitudes = _fourier.coefficients(signal, highest)
+        amplitudes *= np.sqrt(0.5 * size)
         result[..., : highest + 1] = amplitudes.real
         result[..., 0] *= np.sqrt(2.0)
         result[..., highest + 1 : 2 * highest + 1] = amplitudes.imag[..., 1:]
-        if harmonic.size % 2 == 0:
+        if size % 2 == 0:
             alternating = np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0) / self._points
-            result[..., -1] = np.sum(signal * alternating, axis=-1) * np.sqrt(harmonic.size)
-        return result
+            result[..., -1] = np.sum(signal * alternating, axis=-1) * np.sqrt(size)
 
     def _signal(self, components: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
         """Return the signals (…, points) that have these real Fourier components (…, size): `_spectral` undone."""

@@ -11,7 +11,7 @@ from bayesperiodic.sampling.ensemble import JointEvaluation, LockstepPool, Sampl
 
 
 def squares(points):
-    return Evaluation(points[:, 0] ** 2, np.zeros(len(points), dtype=int), np.zeros((len(points), 0)))
+    return Evaluation(points[:, 0] ** 2, np.zeros((len(points), 0)), np.zeros(len(points), dtype=int))
 
 
 def three_calls(evaluate, turns):
