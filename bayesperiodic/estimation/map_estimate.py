@@ -301,16 +301,17 @@ def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
         low, high = problem.joint_prior.supports[names[0]]
         excluded = ", ".join(f"{name} = {given[name]:.6g}" for name in names)
         return (
-            f"start: {excluded} is not allowed; the log-posterior is not finite there, the prior's support is "
-            f"({low:g}, {high:g})."
+            f"start: must be inside the prior's support ({low:g}, {high:g}), got {excluded}, where the log-posterior "
+            "is not finite."
         )
     values += "" if given_start else " (the priors' medians)"
     found = simultaneous_fit(problem, theta)
     if found is not None and found.blocked:
         where = "the other experiments' orbits are" if len(problem.experiments) > 1 else "it is an orbit"
         return (
-            f"start: {values} is not allowed; {found.blocked!r} cannot be followed from its guess to parameters at "
-            f"which {where}. Leave it out if it may be none, or give start={{…}} nearer to the truth."
+            f"start: must be a point from which the orbits can be followed, got {values}; {found.blocked!r} cannot be "
+            f"followed from its guess to parameters at which {where}. Leave it out if it may be no orbit, or give "
+            "start={…} nearer to the truth."
         )
     if found is not None and found.states:
         near = _at_fitted_orbits(problem, found)
@@ -319,6 +320,6 @@ def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
     failed = ", ".join(f"{name!r} ({status})" for name, status in near.statuses.items() if status != "converged")
     ended = f"without the orbit of {failed}" if failed else "well, but the outputs or the noise are not finite"
     return (
-        f"start: {values} is not allowed; the log-posterior is not finite there, the periodic solve ended {ended}. "
-        "Give start={…}, or priors with other medians, at which problem.solve(theta) converges."
+        f"start: must have a finite log-posterior, got {values}, where the periodic solve ended {ended}. Give "
+        "start={…}, or priors with other medians, at which problem.solve(theta) converges."
     )

@@ -436,7 +436,7 @@ def _checked_names(problem: Problem, names: Sequence[str] | None) -> tuple[str, 
     if names is None:
         return problem.names
     if isinstance(names, str) or not len(names):
-        raise ValueError(f"names: {names!r} is not allowed; it must be a sequence of names, such as {problem.names!r}.")
+        raise ValueError(f"names: must be a sequence of names such as {problem.names!r}, got {names!r}.")
     for name in names:
         _checks.one_of("names", name, problem.names)
     return tuple(dict.fromkeys(names))
@@ -454,8 +454,8 @@ def _at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate
     peak = objective.iterate(Linearisation(theta, density.simulator, density.comparisons), noise)
     if peak is None:
         raise ValueError(
-            f"fit: {_written(fit.theta)} is not allowed; the log-posterior is not finite there. Give "
-            "an estimate of this problem."
+            f"fit: must have a finite log-posterior, got {_written(fit.theta)}, where it is not. Give an estimate of "
+            "this problem."
         )
     return objective, objective.anchored(peak)
 

@@ -292,7 +292,7 @@ class MapEstimate(Result):
         Raises
         ------
         ValueError
-            For an expression that is not allowed or has no finite value at the estimate, a new name that is no
+            For an invalid expression or one without a finite value at the estimate, a new name that is no
             identifier or that a parameter has, an unknown experiment.
 
         Examples
@@ -319,8 +319,7 @@ class MapEstimate(Result):
         for name, value in at.items():
             if not np.isfinite(value):
                 raise ValueError(
-                    f"expressions[{name!r}]: {quantities[name].text!r} is not allowed; it is {value} at the estimate "
-                    "and must be finite."
+                    f"expressions[{name!r}]: must be finite at the estimate, got {value} for {quantities[name].text!r}."
                 )
         covariance = _carried(self.covariance, [self._gradient(q, values, named) for q in quantities.values()])
         with np.errstate(invalid="ignore"):
@@ -381,8 +380,8 @@ class MapEstimate(Result):
         covariance = self.covariance.loc[[*key], [*key]].to_numpy()
         if lost := [name for name, variance in zip(key, np.diag(covariance), strict=True) if not np.isfinite(variance)]:
             raise ValueError(
-                f"names: {', '.join(map(repr, lost))} is not allowed; the data do not determine it, so its standard "
-                "deviation is not finite. Leave it out, or fix a parameter, see fit.undetermined."
+                f"names: must be parameters with a finite standard deviation, got {', '.join(map(repr, lost))}, which "
+                "the data do not determine. Leave it out, or fix a parameter, see fit.undetermined."
             )
         return MultivariateNormal(mean, covariance)
 

@@ -50,7 +50,7 @@ def refuse_for_nuts(walkers: int | None, variances: str, checkpoint: str | Path 
         ("executor", executor, None, "its chains run in threads of this process, so leave it out"),
     ):
         if value is not default and value != default:
-            raise ValueError(f"{argument}: {value!r} is not allowed with sampler='nuts'; {hint}.")
+            raise ValueError(f"{argument}: must be {default!r} with sampler='nuts', got {value!r}; {hint}.")
 
 
 def sample_nuts(

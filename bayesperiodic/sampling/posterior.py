@@ -196,7 +196,7 @@ class Posterior(Result):
         Raises
         ------
         ValueError
-            For an expression that is not allowed or not finite at some draw, a new name that is no identifier or that a
+            For an invalid expression or one that is not finite at some draw, a new name that is no identifier or that a
             parameter has, an unknown experiment.
         """
         group, noise = self._group, self._noise
@@ -212,8 +212,8 @@ class Posterior(Result):
             draws = np.broadcast_to(quantity.value(values), (group.sizes["chain"], group.sizes["draw"]))
             if bad := int(np.sum(~np.isfinite(draws))):
                 raise ValueError(
-                    f"expressions[{name!r}]: {quantity.text!r} is not allowed; it is NaN or infinite at {bad} of "
-                    f"{draws.size} draws and must be finite at all of them."
+                    f"expressions[{name!r}]: must be finite at all draws, got NaN or infinity at {bad} of {draws.size} "
+                    f"for {quantity.text!r}."
                 )
             rows[name] = _described(draws.ravel(), self._effective_size(draws))
         return _table(rows)

@@ -181,8 +181,8 @@ def sample(
     executor = checked_executor(executor)
     if variances == COLLAPSED and not collapsible(problem):
         raise ValueError(
-            "variances: 'collapsed' is not allowed; there is no unknown variance with the prior 1/v or a flat one, of "
-            "independent errors or of circulant ones with a fixed shape. Take variances='sampled'."
+            "variances: must be 'sampled' for this problem, got 'collapsed'; it needs an unknown variance with the "
+            "prior 1/v or a flat one, of independent errors or of circulant ones with a fixed shape."
         )
     if sampler == NUTS:
         refuse_for_nuts(walkers, variances, checkpoint, executor)
@@ -209,8 +209,7 @@ def _checked_walkers(walkers: int | None, problem: Problem, variances: str) -> i
         return max(32, needed + needed % 2)
     if _checks.integer("walkers", walkers, 1) < needed or walkers % 2:
         raise ValueError(
-            f"walkers: {walkers} is not allowed; it must be even and at least twice the dimension, {needed} for "
-            f"{', '.join(labels)}."
+            f"walkers: must be even and at least twice the dimension, {needed} for {', '.join(labels)}, got {walkers}."
         )
     return walkers
 

@@ -143,8 +143,8 @@ def _finite(
         other = "give a converged fit of this problem, or start='prior'"
         remedy = "narrow the priors, see prior_predictive(problem)" if start == PRIOR else other
         raise ValueError(
-            f"start: {start!r} is not allowed; of {tried} start points drawn {1 - len(points) / tried:.1%} have no "
-            f"finite log-posterior, so the walkers cannot start; {remedy}."
+            f"start: must give points with a finite log-posterior, got {start!r}; {1 - len(points) / tried:.1%} of "
+            f"{tried} start points drawn have none, so the walkers cannot start; {remedy}."
         )
     return points[:wanted]
 

@@ -292,13 +292,13 @@ def test_error_names_what_cannot_be_profiled(linear):
     with pytest.raises(ValueError, match="names: must be .*got 'kk'.*Did you mean 'k'"):
         bp.profile(problem, fit, ["kk"])
     for names in ("k", []):
-        with pytest.raises(ValueError, match="names: .* is not allowed; it must be a sequence of names"):
+        with pytest.raises(ValueError, match="names: must be a sequence of names .*, got"):
             bp.profile(problem, fit, names)
     with pytest.raises(ValueError, match=r"probability: must be above 0 and at most 0.99, got 0.999"):
         profile.interval(0.999)
     run = linear_experiment(TRUTH, 3.0, seed=1)
     other = bp.Problem(LINEAR, [run], priors=PRIORS | {"c": bp.Uniform(0.0, 1.0)}, fixed={"variance[force]": 9.0})
-    with pytest.raises(ValueError, match=r"fit: k = .* is not allowed; the log-posterior is not finite there"):
+    with pytest.raises(ValueError, match=r"fit: must have a finite log-posterior, got k = "):
         bp.profile(other, fit)
     fewer = bp.Problem(LINEAR, [run], priors={"k": PRIORS["k"]}, fixed={"c": 40.0, "coulomb": 25.0})
     with pytest.raises(ValueError, match="fit.theta: must be .*got 'c'"):

@@ -385,7 +385,10 @@ def test_error_names_what_cannot_become_a_prior(solved, local):
     with pytest.warns(UserWarning, match=r"The estimate has not converged \(stalled\)"):
         replace(fit, status="stalled").as_prior(("k",))
     assert "NOT CONVERGED: stalled; try another start" in repr(replace(fit, status="stalled"))
-    with pytest.raises(ValueError, match="names: 'k', 'c' is not allowed; the data do not determine it"):
+    with pytest.raises(
+        ValueError,
+        match="names: must be parameters with a finite standard deviation, got 'k', 'c', which",
+    ):
         replace(fit, covariance=fit.covariance * np.inf).as_prior(("k", "c"))
 
 
