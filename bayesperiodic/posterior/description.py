@@ -41,7 +41,7 @@ class Description:
         self.channels = tuple(channel for channel in model.outputs if channel in measured)
         runs = [e.name for e in self.experiments]
         if not isinstance(priors, Mapping):
-            raise ValueError(f"priors: {priors!r} is not allowed; it must be a mapping of names to priors.")
+            raise ValueError(f"priors: must be a mapping of names to priors, got {priors!r}.")
         fixed, tied, every = dict(fixed or {}), dict(tied or {}), (*model.parameters, SHIFT)
         self._given_priors, self._given_fixed = dict(priors), fixed
         self.local = _checked_local(local, every, priors, tied)
@@ -79,8 +79,8 @@ class Description:
         for plain in (name.partition("[")[0] for name in names):
             if plain in self.model.parameters:
                 raise ValueError(
-                    f"model: the parameter name {plain!r} is not allowed; the noise model {self.noise.name!r} has a "
-                    "parameter of that name. Call the model's otherwise."
+                    f"model: parameters must have other names than those of the noise model {self.noise.name!r}, got "
+                    f"{plain!r}. Rename the model's parameter."
                 )
         for name, value in known.items():
             _checks.one_of("fixed", name, (*self.model.parameters, SHIFT, *names))
@@ -93,7 +93,7 @@ class Description:
             if name in known:
                 raise ValueError(f"fixed: {name!r} has a prior too; give a prior or a value.")
         if not self.names:
-            raise ValueError("priors: {} is not allowed; at least one parameter must be free.")
+            raise ValueError("priors: must have at least one free parameter, got {}.")
 
     def _check_counts(self) -> None:
         """Refuse an improper prior of a variance where as many parameters can fit the data exactly."""
@@ -107,10 +107,10 @@ class Description:
             if group[0] in self.likelihood.free and count <= needed:
                 names = ", ".join(self.names[i] for i in acting)
                 raise ValueError(
-                    f"priors: {len(acting)} free parameters ({names}) are not allowed; {group[0]!r} is unknown, has "
-                    f"the {self.noise.prior_text}, and only {count:.0f} independent values, where more than {needed} "
-                    f"are needed. Fix parameters or {group[0]!r}, give it a proper prior "
-                    "(noise.Independent(prior=…)), keep more harmonics, or add experiments."
+                    f"priors: an unknown {group[0]!r} with the {self.noise.prior_text} must have more than {needed} "
+                    f"independent values for {len(acting)} free parameters ({names}), got only {count:.0f}. Fix "
+                    f"parameters or {group[0]!r}, give it a proper prior (noise.Independent(prior=…)), keep more "
+                    "harmonics, or add experiments."
                 )
 
     @property
@@ -204,7 +204,7 @@ class Description:
             theta = np.stack(np.broadcast_arrays(*(np.asarray(theta[name], dtype=float) for name in self.names)), -1)
         values = np.asarray(theta, dtype=float)
         if values.shape[-1:] != (len(self.names),):
-            raise ValueError(f"theta: shape {values.shape} is not allowed; the last axis must be {list(self.names)}.")
+            raise ValueError(f"theta: last axis must be {list(self.names)}, got shape {values.shape}.")
         return values
 
     def noise_values(self, variances: Mapping[str, Any] | np.ndarray) -> np.ndarray:
@@ -234,7 +234,7 @@ class Description:
             variances = np.stack(np.broadcast_arrays(*(np.asarray(given[n], dtype=float) for n in names)), -1)
         values = np.asarray(variances, dtype=float)
         if values.shape[-1:] != (len(names),):
-            raise ValueError(f"variances: shape {values.shape} is not allowed; the last axis must be {list(names)}.")
+            raise ValueError(f"variances: last axis must be {list(names)}, got shape {values.shape}.")
         return values
 
     def log_prior(self, theta: Mapping[str, float] | np.ndarray) -> np.ndarray:
@@ -324,7 +324,7 @@ def _checked_local(
     local: Iterable[str], every: tuple[str, ...], priors: Any, tied: Mapping[str, str]
 ) -> tuple[str, ...]:
     if isinstance(local, str):
-        raise ValueError(f"local: {local!r} is not allowed; it must be a sequence of names, such as [{local!r}].")
+        raise ValueError(f"local: must be a sequence of names, got {local!r}. Give [{local!r}].")
     names = tuple(local)
     for name in names:
         _checks.one_of("local", name, every)
@@ -354,22 +354,24 @@ def _constant(name: str, given: Any, runs: list[str], local: bool) -> dict[str, 
 
 def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tuple[Experiment, ...]:
     if isinstance(experiments, Experiment):
-        raise ValueError(f"experiments: {experiments.name!r} alone is not allowed; give a list of one, [experiment].")
+        raise ValueError(
+            f"experiments: must be a sequence, got {experiments.name!r}. Give a list of one, [experiment]."
+        )
     result = tuple(experiments)
     for e in result:
         if isinstance(e, Recording):
-            raise ValueError(f"experiments: the recording {e.name!r} is not allowed; give its mean period, see fold().")
+            raise ValueError(f"experiments: must be experiments, got the recording {e.name!r}. Fold it, see fold().")
         if not isinstance(e, Experiment):
-            raise ValueError(f"experiments: {e!r} is not allowed; each must be an Experiment.")
+            raise ValueError(f"experiments: must each be an Experiment, got {e!r}.")
     if not result:
-        raise ValueError("experiments: () is not allowed; at least one experiment is needed.")
+        raise ValueError("experiments: must have at least one experiment, got ().")
     names = [experiment.name for experiment in result]
     if len(set(names)) < len(names):
-        raise ValueError(f"experiments: the names {names} are not allowed; they must differ, see fold(name=…).")
+        raise ValueError(f"experiments: names must differ, got {names}. Name them with fold(name=…).")
     for e in result:
         _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
         if not e.outputs:
-            raise ValueError(f"outputs of experiment {e.name!r}: {{}} is not allowed; at least one must be measured.")
+            raise ValueError(f"outputs of experiment {e.name!r}: must have at least one channel, got {{}}.")
         for channel, values in e.outputs.items():
             _checks.one_of(f"outputs of experiment {e.name!r}", channel, model.outputs)
             if e.mask is None and e.covariance is None and np.ptp(values) == 0.0:
@@ -381,8 +383,8 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
             _checks.same_names(f"guess of experiment {e.name!r}", e.guess, model.states)
         if model.autonomous and not e.frequency_se > 0.0:
             raise ValueError(
-                f"experiment {e.name!r}: frequency_se = {e.frequency_se:g} is not allowed; {model.name!r} is "
-                "autonomous, its measured frequency is data and needs a standard error > 0. Fold without `frequency`, "
-                "which then is estimated with its error, or give frequency_se."
+                f"experiment {e.name!r}: frequency_se must be > 0, got {e.frequency_se:g}; {model.name!r} is "
+                "autonomous, so that its measured frequency is data. Fold without `frequency`, which is then estimated with its "
+                "error, or give frequency_se."
             )
     return result

@@ -171,7 +171,7 @@ class MultivariateNormal:
     def _points(self, x: np.ndarray) -> np.ndarray:
         x = np.asarray(x, dtype=float)
         if x.shape[-1:] != (self.dimension,):
-            raise ValueError(f"x: shape {x.shape} is not allowed; the last axis must have {self.dimension} values.")
+            raise ValueError(f"x: last axis must have {self.dimension} values, got shape {x.shape}.")
         return x
 
     def __repr__(self) -> str:
@@ -188,20 +188,20 @@ def _covariance(argument: str, value: Any, size: int) -> np.ndarray:
     try:
         matrix = np.array(value, dtype=float)
     except (TypeError, ValueError):
-        raise ValueError(f"{argument}: {value!r} is not allowed; it must be a matrix of real numbers.") from None
+        raise ValueError(f"{argument}: must be a matrix of real numbers, got {value!r}.") from None
     if matrix.shape != (size, size):
-        raise ValueError(f"{argument}: shape {matrix.shape} is not allowed; the mean asks for {(size, size)}.")
+        raise ValueError(f"{argument}: must have the shape {(size, size)} of the mean, got {matrix.shape}.")
     if not np.isfinite(matrix).all():
-        raise ValueError(f"{argument}: {matrix.tolist()} is not allowed; every entry must be finite.")
+        raise ValueError(f"{argument}: must be finite, got {matrix.tolist()}.")
     variances = np.diag(matrix)
     if size and np.all(variances > 0.0):
         scale = np.outer(np.sqrt(variances), np.sqrt(variances))
         if np.any(np.abs(matrix - matrix.T) > 1e-8 * scale):
-            raise ValueError(f"{argument}: {matrix.tolist()} is not allowed; it must be symmetric.")
+            raise ValueError(f"{argument}: must be symmetric, got {matrix.tolist()}.")
         matrix = 0.5 * (matrix + matrix.T)
         if np.linalg.eigvalsh(matrix / scale).min() > size * np.finfo(float).eps:
             return matrix
-    raise ValueError(f"{argument}: {matrix.tolist()} is not allowed; it must be positive definite.")
+    raise ValueError(f"{argument}: must be positive definite, got {matrix.tolist()}.")
 
 
 class FromScipy(Univariate):
@@ -356,12 +356,12 @@ class JointPrior:
         for key, value in priors.items():
             members = key if isinstance(key, tuple) else (key,)
             if not members:
-                raise ValueError("priors: the key () is not allowed; a joint prior needs names, such as ('k', 'c').")
+                raise ValueError("priors: key must be a tuple of names, such as ('k', 'c'), got ().")
             for name in members:
                 if str(name).startswith("variance["):
                     raise ValueError(
-                        f"priors: {name!r} is not allowed; it belongs to the noise, so give its prior there, "
-                        "noise=noise.Independent(prior=…), or its value in `fixed`."
+                        f"priors: must be of parameters of the model, got the noise parameter {name!r}. Give its prior "
+                        "as noise=noise.Independent(prior=…), or its value in `fixed`."
                     )
                 _checks.one_of("priors", name, known)
                 if name in keys:
@@ -482,22 +482,22 @@ def as_prior(argument: str, value: Any) -> Prior:
     (-inf, inf)
     """
     if isinstance(value, MultivariateNormal):
-        raise ValueError(f"{argument}: {value!r} is not allowed; a joint prior needs a tuple of names as its key.")
+        raise ValueError(
+            f"{argument}: must be a prior of one parameter, got {value!r}. Give a tuple of names as its key."
+        )
     if isinstance(value, rv_frozen):
         text = as_written(value)
         if not isinstance(value.dist, stats.rv_continuous):
-            raise ValueError(f"{argument}: {text} is not allowed; it is discrete, and parameters are continuous.")
+            raise ValueError(f"{argument}: must be continuous, got the discrete {text}.")
         if np.shape(value.support()[0]) or np.shape(value.ppf(0.5)):
-            raise ValueError(f"{argument}: {text} is not allowed; it must be of one variable, without arrays.")
+            raise ValueError(f"{argument}: must be of one variable, without arrays, got {text}.")
         if not np.isfinite(value.ppf(0.5)):
-            raise ValueError(f"{argument}: {text} is not allowed; its parameters must be in scipy.stats' range.")
+            raise ValueError(f"{argument}: parameters must be in the range of scipy.stats, got {text}.")
         return FromScipy(value)
     if isinstance(value, stats.rv_continuous):
-        raise ValueError(
-            f"{argument}: scipy.stats.{value.name} is not allowed; it must be frozen, scipy.stats.{value.name}(…)."
-        )
+        raise ValueError(f"{argument}: must be frozen, got scipy.stats.{value.name}. Give scipy.stats.{value.name}(…).")
     if isinstance(value, type) or not isinstance(value, Prior):
-        raise ValueError(f"{argument}: {value!r} is not allowed; it must be {ALLOWED}.")
+        raise ValueError(f"{argument}: must be {ALLOWED}, got {value!r}.")
     return value
 
 
@@ -505,12 +505,11 @@ def _joint(key: tuple[str, ...], value: Any) -> MultivariateNormal:
     if not isinstance(value, MultivariateNormal):
         text = as_written(value) if isinstance(value, rv_frozen) else repr(value)
         raise ValueError(
-            f"priors[{key!r}]: {text} is not allowed; the prior of a tuple of names must be "
-            "MultivariateNormal(mean, covariance)."
+            f"priors[{key!r}]: must be MultivariateNormal(mean, covariance) for a tuple of names, got {text}."
         )
     if value.dimension != len(key):
         raise ValueError(
-            f"priors[{key!r}]: a MultivariateNormal of {value.dimension} parameters is not allowed; the key has "
-            f"{len(key)} names."
+            f"priors[{key!r}]: must be a MultivariateNormal of {len(key)} parameters, one per name, "
+            f"got {value.dimension}."
         )
     return value

@@ -134,11 +134,11 @@ def local_hint(names: Iterable[str], experiment: str | None) -> str:
 def checked_key(names: Any, free: Iterable[str], noise: Iterable[str]) -> tuple[str, ...]:
     """Return the names of a joint prior; raise a ValueError unless they are a tuple of different free parameters."""
     if not isinstance(names, tuple) or not names:
-        raise ValueError(f"names: {names!r} is not allowed; it must be a tuple of names, such as ('k', 'c').")
+        raise ValueError(f"names: must be a tuple of names, such as ('k', 'c'), got {names!r}.")
     for name in names:
         if name in [*noise]:
-            raise ValueError(f"names: {name!r} is not allowed; it belongs to the noise, which has priors of its own.")
+            raise ValueError(f"names: must be parameters of the model, got the noise parameter {name!r}.")
         _checks.one_of("names", name, free)
         if names.count(name) > 1:
-            raise ValueError(f"names: {names!r} is not allowed; {name!r} is in it twice.")
+            raise ValueError(f"names: must differ, got {names!r}.")
     return names

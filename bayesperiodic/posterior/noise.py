@@ -125,7 +125,7 @@ class Noise(ABC):
             return
         prior = as_prior("prior", self.prior)
         if prior.support[0] < 0.0:
-            raise ValueError(f"prior: {self.prior!r} is not allowed; a variance is positive, and its support is not.")
+            raise ValueError(f"prior: must have positive support, as a variance has, got {self.prior!r}.")
 
     @property
     def proper(self) -> bool:
@@ -159,18 +159,18 @@ class Noise(ABC):
         for block in (b for b in blocks if b.kind in (SPECTRAL, POINTS)):
             if self.needs_scatter and not block.measured > 0.0:
                 raise ValueError(
-                    f"noise: {self.name!r} is not allowed; experiment {block.experiment!r} has no scatter of "
-                    f"{block.channel!r}. Give scatter and cycles, or take 'independent'."
+                    f"noise: must be 'independent' without measured scatter, got {self.name!r}; experiment "
+                    f"{block.experiment!r} has no scatter of {block.channel!r}. Give scatter and cycles."
                 )
             if not self.flat and points.setdefault(self.label(block), block.points) != block.points:
                 raise ValueError(
-                    f"noise: {self.name!r} is not allowed; experiments have {points[self.label(block)]} and "
-                    f"{block.points} points in the response period, and share the correlation of {block.channel!r}. "
-                    "Give all the same samples and periods, or take per='experiment'."
+                    f"noise: must have per='experiment' for grids that differ, got {self.name!r}; experiments with "
+                    f"{points[self.label(block)]} and {block.points} points in the response period share the "
+                    f"correlation of {block.channel!r}. Or give all the same samples and periods."
                 )
 
     def label(self, block: Block) -> str:
-        """Return what stands in the brackets of a block's noise parameters.
+        """Return the text in brackets of the names of a block's noise parameters.
 
         Parameters
         ----------
@@ -482,7 +482,7 @@ def as_noise(given: str | Noise) -> Noise:
     if isinstance(given, Noise):
         return given
     if not isinstance(given, str):
-        raise ValueError(f"noise: {given!r} is not allowed; it must be a name or a model such as noise.Independent().")
+        raise ValueError(f"noise: must be a name or a model such as noise.Independent(), got {given!r}.")
     _checks.one_of("noise", given, NAMED)
     return NAMED[given]()
 

@@ -83,7 +83,7 @@ class ParameterMap:
         Raises
         ------
         ValueError
-            For a parameter that is none of the three or two of them, an unknown name, an expression that is not allowed
+            For a parameter that is none of the three or two of them, an unknown name, an invalid expression
             or that comes back to itself.
         """
         every = (*parameters, SHIFT)
@@ -198,6 +198,6 @@ def _ordered(expressions: dict[str, Expression]) -> dict[str, Expression]:
         ]
         if not ready:
             circle = {name: e.text for name, e in expressions.items() if name not in result}
-            raise ValueError(f"tied: {circle!r} is not allowed; these expressions come back to themselves.")
+            raise ValueError(f"tied: must not be circular, got {circle!r}.")
         result |= {name: expressions[name] for name in ready}
     return result

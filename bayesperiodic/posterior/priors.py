@@ -170,6 +170,16 @@ class _Positive(Univariate):
         return 0.0, math.inf
 
 
+class _Interval(Univariate):
+    low: float
+    high: float
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """The interval."""
+        return self.low, self.high
+
+
 @dataclass(frozen=True)
 class Normal(Univariate):
     """The normal distribution, the paper's prior (de Kraker et al. 1997, section 3).
@@ -188,7 +198,6 @@ class Normal(Univariate):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.Normal(mean=10.0, sd=2.0).quantile([0.05, 0.5, 0.95]).round(3).tolist()
     [6.71, 10.0, 13.29]
     """
@@ -230,7 +239,6 @@ class LogNormal(_Positive):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.LogNormal(median=10.0, spread=0.5).quantile([0.05, 0.5, 0.95]).round(3).tolist()
     [4.394, 10.0, 22.76]
     """
@@ -258,7 +266,7 @@ class LogNormal(_Positive):
 
 
 @dataclass(frozen=True)
-class TruncatedNormal(Univariate):
+class TruncatedNormal(_Interval):
     """The normal distribution within an interval, normalised there.
 
     The density is measured from the end of the interval next to the mean, so that it stays exact where the interval
@@ -280,7 +288,6 @@ class TruncatedNormal(Univariate):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> prior = bp.TruncatedNormal(mean=1.0, sd=2.0, low=0.0, high=float("inf"))
     >>> prior.support
     (0.0, inf)
@@ -297,11 +304,6 @@ class TruncatedNormal(Univariate):
         self._store(mean=_checks.finite_number("mean", self.mean), sd=_checks.positive("sd", self.sd))
         self._store(low=_bound("low", self.low), high=_bound("high", self.high))
         _require_order(self.low, self.high)
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """The interval."""
-        return self.low, self.high
 
     @cached_property
     def _tail(self) -> tuple[float, float, float, float]:
@@ -371,7 +373,6 @@ class HalfNormal(_Positive):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.HalfNormal(scale=2.0).quantile([0.05, 0.5, 0.95]).round(3).tolist()
     [0.125, 1.349, 3.92]
     """
@@ -395,7 +396,7 @@ class HalfNormal(_Positive):
 
 
 @dataclass(frozen=True)
-class Uniform(Univariate):
+class Uniform(_Interval):
     """The uniform distribution on an interval.
 
     Parameters
@@ -410,7 +411,6 @@ class Uniform(Univariate):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.Uniform(low=2.0, high=4.0).quantile([0.05, 0.5, 0.95]).round(3).tolist()
     [2.1, 3.0, 3.9]
     """
@@ -421,11 +421,6 @@ class Uniform(Univariate):
     def __post_init__(self) -> None:
         self._store(low=_checks.finite_number("low", self.low), high=_checks.finite_number("high", self.high))
         _require_order(self.low, self.high)
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """The interval."""
-        return self.low, self.high
 
     def _log_density(self, x: np.ndarray) -> Any:
         return -math.log(self.high - self.low)
@@ -441,7 +436,7 @@ class Uniform(Univariate):
 
 
 @dataclass(frozen=True)
-class LogUniform(Univariate):
+class LogUniform(_Interval):
     """The distribution on a positive interval whose logarithm is uniform: every decade is as probable as another.
 
     Its log-density is convex, so that it flattens the peak of a posterior instead of sharpening it.
@@ -458,7 +453,6 @@ class LogUniform(Univariate):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.LogUniform(low=1.0, high=100.0).quantile([0.05, 0.5, 0.95]).round(3).tolist()
     [1.259, 10.0, 79.433]
     """
@@ -469,11 +463,6 @@ class LogUniform(Univariate):
     def __post_init__(self) -> None:
         self._store(low=_checks.positive("low", self.low), high=_checks.positive("high", self.high))
         _require_order(self.low, self.high)
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """The interval."""
-        return self.low, self.high
 
     @cached_property
     def _width(self) -> float:
@@ -514,7 +503,6 @@ class StudentT(Univariate):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.StudentT(mean=10.0, scale=2.0, dof=4.0).quantile([0.05, 0.5, 0.95]).round(3).tolist()
     [5.736, 10.0, 14.264]
     """
@@ -564,7 +552,6 @@ class InverseGamma(_Positive):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.InverseGamma(shape=3.0, scale=2.0).quantile([0.05, 0.5, 0.95]).round(3).tolist()
     [0.318, 0.748, 2.446]
     """
@@ -595,13 +582,13 @@ def _bound(argument: str, value: Any) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if math.isnan(number):
-        raise ValueError(f"{argument}: {value!r} is not allowed; it must be a real number or infinite.")
+        raise ValueError(f"{argument}: must be a real number or infinite, got {value!r}.")
     return number
 
 
 def _require_order(low: float, high: float) -> None:
     if not low < high:
-        raise ValueError(f"low: {low!r} is not allowed; it must be less than high = {high!r}.")
+        raise ValueError(f"low: must be less than high = {high!r}, got {low!r}.")
 
 
 def _tail_mass(distance: float, t: np.ndarray) -> np.ndarray:

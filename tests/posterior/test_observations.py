@@ -278,7 +278,7 @@ def test_the_phase_of_a_cycle_is_the_likeliest_one_of_all_channels():
         ({"local": ["coulom"]}, "local: must be .*got 'coulom'.*Did you mean 'coulomb'"),
         (
             {"local": "coulomb"},
-            r"local: 'coulomb' is not allowed; it must be a sequence of names, such as \['coulomb'\]",
+            r"local: must be a sequence of names, got 'coulomb'. Give \['coulomb'\]",
         ),
         ({"priors": PRIORS | {"coulomb[run 1]": PRIORS["k"]}}, r"priors: must be .*got 'coulomb\[run 1\]'"),
         ({"local": ["k"], "fixed": {"k": {"run 1": 1.0}}, "priors": PRIORS | {"k[run 1]": PRIORS["k"]}}, "fixed: 'k"),
@@ -302,7 +302,7 @@ def test_error_names_the_argument_that_does_not_fit(changes, message):
 
 def test_circulant_noise_shared_by_different_grids_is_rejected():
     runs = [linear_experiment(TRUTH, 3.0, seed=1), linear_experiment(TRUTH, 3.0, seed=2, samples=60, name="fine")]
-    with pytest.raises(ValueError, match="noise: 'circulant' is not allowed; experiments have 40 and 60 points"):
+    with pytest.raises(ValueError, match="noise: must have .*, got 'circulant'; experiments with 40 and 60 points"):
         bp.Problem(LINEAR, runs, priors=PRIORS, noise="circulant")
     bp.Problem(LINEAR, runs, priors=PRIORS, noise=bp.noise.Circulant(per="experiment"))
     bp.Problem(LINEAR, runs, priors=PRIORS)

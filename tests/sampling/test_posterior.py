@@ -370,13 +370,13 @@ def test_error_names_what_cannot_become_a_prior(solved, local):
     _, fit, posterior = solved
     for result in (fit, posterior):
         for names in ("k", ["k", "c"], ()):
-            with pytest.raises(ValueError, match=r"names: .* is not allowed; it must be a tuple of names"):
+            with pytest.raises(ValueError, match=r"names: must be a tuple of names.*got"):
                 result.as_prior(names)
         with pytest.raises(ValueError, match="names: must be one of 'k', 'c', 'coulomb', got 'kk'. Did you mean 'k'"):
             result.as_prior(("kk", "c"))
-        with pytest.raises(ValueError, match=r"names: \('k', 'k'\) is not allowed; 'k' is in it twice"):
+        with pytest.raises(ValueError, match=r"names: must differ, got \('k', 'k'\)"):
             result.as_prior(("k", "k"))
-        with pytest.raises(ValueError, match=r"names: 'variance\[force\]' is not allowed; it belongs to the noise"):
+        with pytest.raises(ValueError, match=r"names: must be .*got the noise parameter 'variance\[force\]'"):
             result.as_prior(("k", "variance[force]"))
     with pytest.raises(ValueError, match="must be one of 'k', 'c', 'coulomb.run 7.', .*got 'coulomb'"):
         local[2].as_prior(("coulomb",))
