@@ -384,7 +384,7 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
         if model.autonomous and not e.frequency_se > 0.0:
             raise ValueError(
                 f"experiment {e.name!r}: frequency_se must be > 0, got {e.frequency_se:g}; {model.name!r} is "
-                "autonomous, so that its measured frequency is data. Fold without `frequency`, which is then estimated with its "
-                "error, or give frequency_se."
+                "autonomous, so that its measured frequency is data. Fold without `frequency`, which is then "
+                "estimated with its error, or give frequency_se."
             )
     return result

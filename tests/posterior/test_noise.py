@@ -559,7 +559,7 @@ def test_error_names_the_bad_noise_of_a_problem(changes, message):
 )
 def test_improper_prior_is_rejected_if_the_data_can_be_fitted_exactly(model, needed):
     """Three free parameters fit three values; the flat prior diverges with two values more."""
-    with pytest.raises(ValueError, match=rf"only {needed} independent values, where more than {needed} are needed"):
+    with pytest.raises(ValueError, match=rf"must have more than {needed} independent values .*, got only {needed}"):
         bp.Problem(LINEAR, [run(40, independent={"force": needed})], priors=PRIORS, noise=model)
     bp.Problem(LINEAR, [run(40, independent={"force": needed + 1})], priors=PRIORS, noise=model)
     proper = replace(model, prior=bp.InverseGamma(2.0, 1.0))

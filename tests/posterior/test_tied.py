@@ -57,7 +57,7 @@ def test_ties_are_part_of_the_fingerprint():
     ("tied", "fixed", "message"),
     [
         ({"c": "k2/20"}, {}, r"tied\['c'\].*got 'k2'.*Did you mean 'k'"),
-        ({"c": "2*c"}, {}, "tied: .* come back to themselves"),
+        ({"c": "2*c"}, {}, "tied: must not be circular, got"),
         ({"damping": "k"}, {}, "tied: must be .*got 'damping'"),
         ({"c": "k", "k": "c"}, {}, "tied: 'k' is in priors too"),
         ({"c": "k"}, {"c": 1.0}, "tied: 'c' is in fixed too"),
