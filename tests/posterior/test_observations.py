@@ -316,7 +316,7 @@ def test_data_without_information_are_rejected():
     with pytest.raises(ValueError, match=r"unknown 'variance\[force\]' with the Jeffreys prior 1/v .* got only 3"):
         bp.Problem(LINEAR, [few], priors=PRIORS)
     bp.Problem(LINEAR, [few], priors=PRIORS, noise=bp.noise.Independent(prior=bp.InverseGamma(3.0, 20.0)))
-    with pytest.raises(ValueError, match="frequency_se = 0 is not .* autonomous, .* Fold without `frequency`"):
+    with pytest.raises(ValueError, match="frequency_se must be > 0, got 0; .* autonomous, .* Fold without `frequency`"):
         bp.Problem(bp.models.van_der_pol, [replace(cycle_run(), frequency_se=0.0)], priors={"mu": PRIORS["k"]})
 
 
