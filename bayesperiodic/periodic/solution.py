@@ -285,7 +285,7 @@ def describe(
 
 
 def equations_of(model: Model, solution: PeriodicSolution) -> tuple[PeriodicEquations, np.ndarray, np.ndarray]:
-    """Return the equations, the parameters and z of a converged solution; others, or of other models, raise errors."""
+    """Return equations, parameters and z of a solution; raise a ValueError unless it is a converged one of the model."""
     if solution.model != model.name:
         raise ValueError(f"model: must be {solution.model!r}, as of the solution, got {model.name!r}.")
     if not solution.converged:
