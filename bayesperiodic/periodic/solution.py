@@ -285,7 +285,7 @@ def describe(
 
 
 def equations_of(model: Model, solution: PeriodicSolution) -> tuple[PeriodicEquations, np.ndarray, np.ndarray]:
-    """Return equations, parameters and z of a solution; raise a ValueError unless it is a converged one of the model."""
+    """Return equations, parameters and z; raise a ValueError for a solution unconverged or of another model."""
     if solution.model != model.name:
         raise ValueError(f"model: must be {solution.model!r}, as of the solution, got {model.name!r}.")
     if not solution.converged:
