@@ -482,16 +482,19 @@ def test_a_branch_that_turns_back_past_its_start_ends_in_a_fold():
 
 
 def test_a_parameter_may_be_called_inputs():
-    """Of a spring: x = u/k."""
-    spring = bp.Model(
-        "spring",
+    """ẋ + k x = u has the gain 1/(k + iω)."""
+    relaxation = bp.Model(
+        "relaxation",
         states=["x"],
         inputs=["u"],
         parameters=["inputs"],
-        equations=lambda s, p, u: [p.inputs * s.x - u.u],
+        equations=lambda s, p, u: [s.dx + p.inputs * s.x - u.u],
         outputs=lambda s, p, u: {"x": s.x},
     )
-    start = bp.solve_periodic(spring, {"inputs": 1.0}, {"u": np.cos(TURN * grid(20))}, frequency=1.0, samples=20)
-    branch = bp.continue_periodic(spring, start, "inputs", until=2.0, progress=False)
+    wave = np.exp(1j * TURN * grid(21))
+    start = bp.solve_periodic(
+        relaxation, {"inputs": 1.0}, {"u": wave.real}, frequency=1.0, samples=21, scheme="fourier"
+    )
+    branch = bp.continue_periodic(relaxation, start, "inputs", until=2.0, progress=False)
     assert branch[-1].parameters == {"inputs": 2.0}
-    assert branch[-1].states["x"] == pytest.approx(0.5 * np.cos(TURN * grid(20)), abs=1e-9)
+    assert branch[-1].states["x"] == pytest.approx((wave / (2.0 + 1j * TURN)).real, abs=1e-9)
