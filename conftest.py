@@ -59,12 +59,32 @@ def duffing_calibration() -> bp.Calibration:
 FORCE = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
 
 
+PARAMETERS = {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}
+
+
+@cache
+def duffing_solution() -> bp.PeriodicSolution:
+    """Return the periodic response of a Duffing oscillator to one harmonic force."""
+    return bp.solve_periodic(bp.models.duffing, PARAMETERS, FORCE, frequency=0.1, samples=32, scheme="fourier")
+
+
+@cache
+def duffing_branch() -> bp.Branch:
+    """Return its frequency response from there to 0.4 Hz."""
+    return bp.continue_periodic(bp.models.duffing, duffing_solution(), "frequency", until=0.4, progress=False)
+
+
+@cache
+def hopf_point() -> bp.HopfPoint:
+    """Return where the equilibrium of van der Pol's oscillator loses its stability."""
+    return bp.hopf_points(bp.models.van_der_pol, {"mu": 0.0, "omega": 6.0}, "mu", between=(-1.0, 1.5))[0]
+
+
 @cache
 def duffing_run() -> bp.Experiment:
-    """Return the folded response of a Duffing oscillator to one harmonic force."""
-    parameters = {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}
+    """Return its folded response from a simulation with noise."""
     recording = bp.simulate(
-        bp.models.duffing, parameters, FORCE, frequency=0.1, duration=400, sampling_rate=4,
+        bp.models.duffing, PARAMETERS, FORCE, frequency=0.1, duration=400, sampling_rate=4,
         noise={"displacement": 0.01}, seed=1,
     )  # fmt: skip
     return recording.fold(32)
@@ -94,6 +114,9 @@ EXAMPLES: dict[str, Callable[[], Any]] = {
     "np": lambda: np,
     "bp": lambda: bp,
     "force": lambda: FORCE,
+    "solution": duffing_solution,
+    "branch": duffing_branch,
+    "hopf_point": hopf_point,
     "run": duffing_run,
     "problem": duffing_problem,
     "fit": duffing_fit,

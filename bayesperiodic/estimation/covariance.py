@@ -9,8 +9,7 @@ from bayesperiodic import _fourier
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.estimation.gauss_newton import Iterate, information
 from bayesperiodic.periodic.compiled import CONVERGED
-from bayesperiodic.periodic.equations import PeriodicEquations
-from bayesperiodic.periodic.sensitivity import input_sensitivities
+from bayesperiodic.periodic.equations import PeriodicEquations, input_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.posterior.noise import LENGTHSCALE, SPECTRAL, Block

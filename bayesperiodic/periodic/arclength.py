@@ -12,24 +12,15 @@ from bayesperiodic.periodic.batch import Anchor
 from bayesperiodic.periodic.compiled import CONVERGED, Border, Unknowns
 from bayesperiodic.periodic.equations import FREQUENCY, PeriodicEquations, Solved
 
-INPUTS, PARAMETERS = "inputs", "parameters"
+INPUTS, PARAMETERS = "all inputs", "all parameters"  # no model's parameter has a name with a space
 
 
 @dataclass(frozen=True)
 class ParametrisedEquations:
     """Periodic equations that depend on further scalar unknowns.
 
-    Attributes
-    ----------
-    equations : PeriodicEquations
-    parameters : array (parameters,)
-    free : tuple of str
-        "frequency", "inputs" or "parameters" (the factor of `input_change` or `parameter_change`), or a parameter's
-        name.
-    input_change : array (points, 3·inputs)
-        Change of the inputs per unit of the unknown "inputs", which is zero for those of `equations`.
-    parameter_change : array (parameters,)
-        Change of the parameters per unit of the unknown "parameters", which is zero for `parameters`.
+    The unknowns `free` are `FREQUENCY`, names of parameters, `INPUTS`, the factor of `input_change` (points, 3·inputs)
+    that is added to the inputs of `equations`, or `PARAMETERS`, that of `parameter_change` (parameters,).
     """
 
     equations: PeriodicEquations
@@ -41,13 +32,7 @@ class ParametrisedEquations:
     @cached_property
     def _base(self) -> np.ndarray:
         """The parameters where all unknowns are zero."""
-        base = self.parameters.copy()
-        base[[self.equations.model.parameters.index(name) for name in self.free if name in self._names]] = 0.0
-        return base
-
-    @cached_property
-    def _names(self) -> set[str]:
-        return {*self.free} - {FREQUENCY, INPUTS, PARAMETERS}
+        return np.where([name in self.free for name in self.equations.model.parameters], 0.0, self.parameters)
 
     def _unknowns(self, values: np.ndarray, targets: np.ndarray, scales: np.ndarray) -> Unknowns:
         parameters = np.zeros((len(self.free), self.parameters.size))
@@ -74,17 +59,11 @@ class ParametrisedEquations:
     def slopes(self, values: np.ndarray, z: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Return ∂g/∂(unknowns), (unknowns, points, states)."""
         equations, parameters = self.at(values)
+        unknowns, states = self._unknowns(values, values, values), equations.states(z)
         table = np.empty((len(z), equations.model.kernels.columns("derivatives")))
-        folded = np.empty((len(self.free), z.size))
+        folded, setting = np.empty((len(self.free), z.size)), equations.setting(parameters)
         equations.bordered_kernels.fill_slopes(
-            equations.functions,
-            equations.grid.packed,
-            equations.setting(parameters),
-            self._unknowns(values, values, values),
-            equations.states(z),
-            columns,
-            table,
-            folded,
+            equations.functions, equations.grid.packed, setting, unknowns, states, columns, table, folded
         )
         return np.ascontiguousarray(folded.reshape(-1, *z.shape)[:, equations.grid.place])
 
@@ -97,17 +76,9 @@ class ParametrisedEquations:
         targets: np.ndarray,
         scales: np.ndarray,
     ) -> Solved:
-        """Solve g(z, values) = 0 and rows·z + corner·values = targets.
+        """Solve g(z, values) = 0 and rows·z + corner·values = targets from a guess of z and values.
 
-        Parameters
-        ----------
-        z : array (points, states)
-        values : array (unknowns,)
-        rows : array (unknowns, points, states)
-        corner : array (unknowns, unknowns)
-        targets : array (unknowns,)
-        scales : array (unknowns,)
-            Steps of the values are measured in these, or in the value if that is larger.
+        `rows` is (unknowns, points, states), `corner` (unknowns, unknowns); for the scales see `compiled.Unknowns`.
         """
         border = Border.empty(len(values), z.size)
         border.rows.reshape(rows.shape)[:, self.equations.grid.place] = rows
@@ -116,10 +87,7 @@ class ParametrisedEquations:
 
 
 def solve_autonomous(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray, frequency: float) -> Solved:
-    """Solve for an orbit of unknown frequency, with the phase that is closest to the guess.
-
-    The phase condition is ∫ q_guess'·(q − q_guess) dτ = 0.
-    """
+    """Solve for an orbit of unknown frequency with the phase condition ∫ q_guess'·(q − q_guess) dτ = 0."""
     row = equations.phase_row(z)
     target = np.array([np.sum(row * z)])
     start = np.array([frequency])
@@ -134,12 +102,15 @@ FEW_ITERATIONS, MANY_ITERATIONS = 3, 6
 GROWTH = 1.5
 
 
+Change = tuple[np.ndarray, np.ndarray]  # of z (points, states) and of the unknowns' values (unknowns,)
+
+
 class Point(NamedTuple):
-    """A point of a branch: z (points, states), the unknowns' values, the unit tangent, the arclength, the kind."""
+    """A point of a branch: z, the unknowns' values, the unit tangent, the arclength, the kind."""
 
     z: np.ndarray
     values: np.ndarray
-    tangent: tuple[np.ndarray, np.ndarray]
+    tangent: Change
     distance: float
     kind: str = ""
 
@@ -147,15 +118,8 @@ class Point(NamedTuple):
 class Tracer:
     """Predictor and corrector of a continuation, with the scales of arclength.
 
-    Parameters
-    ----------
-    equations : ParametrisedEquations
-        The first unknown is varied; an autonomous model's second is the frequency.
-    size : array (states,)
-        Scales of the states, such as the range of the starting orbit.
-    values : array (unknowns,)
-    until : float
-        Target of the first unknown; the distance to it is its scale.
+    The first of the unknowns, which are `values` at the start, is varied, and its distance to `until` is its scale; an
+    autonomous model's second unknown is the frequency. `size` (states,) holds the scales of the states.
     """
 
     def __init__(self, equations: ParametrisedEquations, size: np.ndarray, values: np.ndarray, until: float):
@@ -166,17 +130,13 @@ class Tracer:
         self._value_scales = np.maximum(np.abs(values), 1e-12)
         self._value_scales[0] = abs(until - values[0])
 
-    def first_tangent(
-        self, z: np.ndarray, values: np.ndarray, direction: float
-    ) -> tuple[np.ndarray, np.ndarray] | None:
+    def first_tangent(self, z: np.ndarray, values: np.ndarray, direction: float) -> Change | None:
         """Return the unit tangent along which the first unknown moves in a direction (±1)."""
         plain = np.zeros_like(z), np.zeros_like(values)
         plain[1][0] = direction * self._value_scales[0]
         return self.tangent(z, values, plain)
 
-    def tangent(
-        self, z: np.ndarray, values: np.ndarray, before: tuple[np.ndarray, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray] | None:
+    def tangent(self, z: np.ndarray, values: np.ndarray, before: Change) -> Change | None:
         """Return the unit tangent at a point that continues an earlier one; None if it is not unique."""
         equations, parameters = self.parametrised.at(values)
         columns = equations.residual_jacobian(z, parameters)
@@ -186,7 +146,7 @@ class Tracer:
         solved = factors.solve_bordered(np.zeros((1, *z.shape)), np.eye(1, len(values)))
         if solved is None:
             return None
-        return self._unit((solved[0][0], solved[1][0]))
+        return self.unit((solved[0][0], solved[1][0]))
 
     def correct(self, start: Point, step: float) -> tuple[Point, int] | None:
         """Return the point of the branch a step along the tangent from another, and the iterations it took."""
@@ -208,7 +168,7 @@ class Tracer:
         exact[0] = value
         return solved[0]._replace(values=exact)
 
-    def length(self, change: tuple[np.ndarray, np.ndarray]) -> float:
+    def length(self, change: Change) -> float:
         """Return the length of a change of z and the values."""
         return float(np.sqrt(self._product(change, change)))
 
@@ -230,7 +190,7 @@ class Tracer:
             return None
         return Point(found.z, found.values, tangent, start.distance + step), len(found.history)
 
-    def _conditions(self, z: np.ndarray, tangent: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def _conditions(self, z: np.ndarray, tangent: Change) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and corner of: distance along a tangent; for an autonomous model, the phase against z."""
         unknowns = len(tangent[1])
         rows, corner = np.zeros((unknowns, *z.shape)), np.zeros((unknowns, unknowns))
@@ -239,16 +199,18 @@ class Tracer:
             rows[1] = self.parametrised.equations.phase_row(z)
         return rows, corner
 
-    def _product(self, a: tuple[np.ndarray, np.ndarray], b: tuple[np.ndarray, np.ndarray]) -> float:
+    def _product(self, a: Change, b: Change) -> float:
         return float(np.sum(a[0] * b[0] * self._weights) + np.sum(a[1] * b[1] / self._value_scales**2))
 
-    def _unit(self, change: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def unit(self, change: Change) -> Change:
+        """Return a change divided by its length."""
         length = self.length(change)
         return change[0] / length, change[1] / length
 
-    def turn(self, a: Point, b: Point) -> float:
-        """Return the cosine of the angle between the tangents of two points."""
-        return self._product(a.tangent, b.tangent)
+    def follows(self, before: Point, after: Point, step: float) -> bool:
+        """Return whether a corrected point continues the branch, and did not jump to another."""
+        moved = self.length((after.z - before.z, after.values - before.values))
+        return moved < 2.0 * step and self._product(before.tangent, after.tangent) > LARGEST_TURN
 
 
 def trace(
@@ -263,21 +225,9 @@ def trace(
 ) -> Iterator[Point]:
     """Yield the points of a branch from a solution until the first unknown reaches a value or passes its start.
 
-    Only the solution is yielded if the branch has no unique tangent there or turns back (at a fold).
-
-    Parameters
-    ----------
-    equations : ParametrisedEquations
-    z : array (points, states)
-        A solution.
-    values : array (unknowns,)
-    until : float
-    step : float
-        The largest step of the first unknown.
-    size : array (states,), optional
-        Scales of the states; by default the range of z.
-    refine : callable, optional
-        Given the tracer and two neighbouring points, returns points to be yielded between them.
+    Only the solution is yielded if the branch has no unique tangent there or turns back (at a fold). `step` is the
+    largest step of the first unknown; `size` (states,) the scales of the states, by default the range of z; `refine`
+    returns the points to be yielded between two neighbouring ones.
     """
     tracer = Tracer(equations, np.ptp(z, axis=0) if size is None else size, values, until)
     origin = float(values[0])
@@ -292,7 +242,7 @@ def trace(
     for _ in range(MAX_POINTS):
         corrected = tracer.correct(here, length)
         after, iterations, limit = None, 0, None
-        if corrected is not None and _follows(tracer, here, corrected[0], length):
+        if corrected is not None and tracer.follows(here, corrected[0], length):
             after, iterations = corrected
             limit = _passed(after.values[0], origin, until)
             if limit == origin and here.distance == 0.0:
@@ -323,33 +273,18 @@ def _passed(value: float, origin: float, until: float) -> float | None:
     return origin if direction * (value - origin) < 0.0 else None
 
 
-def _follows(tracer: Tracer, before: Point, after: Point, size: float) -> bool:
-    """Return whether a corrected point continues the branch, and did not jump to another."""
-    moved = tracer.length((after.z - before.z, after.values - before.values))
-    return moved < 2.0 * size and tracer.turn(before, after) > LARGEST_TURN
-
-
-ARRIVED, ROUND_FOLDS, FOLD, EQUILIBRIUM, SHORTER, LOST = (
-    "arrived",
-    "round folds",
-    "fold",
-    "equilibrium",
-    "shorter period",
-    "lost",
-)
+ARRIVED, ROUND_FOLDS, FOLD = "arrived", "round folds", "fold"
+EQUILIBRIUM, SHORTER, LOST = "equilibrium", "shorter period", "lost"
 STEP, MOST_POINTS = 0.1, 300
 
 
 def path_outcome(equations: PeriodicEquations, anchor: Anchor, parameters: np.ndarray) -> str:
     """Return how the branch through an anchor ends on the straight path from its parameters to others.
 
-    Returns
-    -------
-    str
-        "arrived" if it leads to an orbit at the other parameters; "round folds" if it does so after folds, so that
-        it is not the orbit that small steps follow; "fold" if it turns back and does not return, or passes its start;
-        "equilibrium" if the cycle of an autonomous model shrinks to nothing (a Hopf point); "shorter period" if an
-        orbit merges with one of fewer forcing periods (a period doubling); "lost" if the continuation fails.
+    "arrived": it leads to an orbit at the other parameters; "round folds": it does so after folds, so that it is not
+    the orbit that small steps follow; "fold": it turns back and does not return, or passes its start; "equilibrium":
+    the cycle of an autonomous model shrinks to nothing (a Hopf point); "shorter period": the orbit merges with one of
+    fewer forcing periods (a period doubling); "lost": the continuation fails.
     """
     change = parameters - anchor.parameters
     autonomous = equations.model.autonomous

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from types import ModuleType
 
 import numpy as np
 
@@ -20,38 +19,30 @@ from bayesperiodic.periodic.compiled import (
     Sets,
     kernels,
 )
-from bayesperiodic.periodic.equations import BorderedFactors, PeriodicEquations, empty_factors, workspace
-from bayesperiodic.periodic.sensitivity import (
+from bayesperiodic.periodic.equations import (
+    BorderedFactors,
+    PeriodicEquations,
     Sensitivities,
+    empty_factors,
     frequency_derivatives,
     parameter_sensitivities,
-    smallest_singular_vectors,
-    stiffness_gradient,
+    workspace,
 )
 
 SMALLEST_PART, PARTS_EACH = 4, 4
+SWEEPS = 3
+SMALL = 1e-4
 
 
 @dataclass(frozen=True)
 class Anchor:
-    """A solved point from which others are predicted: z ≈ z₀ + z_θ (θ − θ₀); or, without z_θ, an unconverged guess.
+    """A solved point from which others are predicted: z ≈ z₀ + z_θ (θ − θ₀); or, without z_θ, an unconverged guess."""
 
-    Attributes
-    ----------
-    parameters : array (parameters,)
-    z : array (points, states)
-    frequency : float
-        [Hz].
-    sensitivities : array (parameters, points, states), or None
-    frequency_sensitivities : array (parameters,), or None
-        Zero for a driven model.
-    """
-
-    parameters: np.ndarray
-    z: np.ndarray
-    frequency: float
-    sensitivities: np.ndarray | None = None
-    frequency_sensitivities: np.ndarray | None = None
+    parameters: np.ndarray  # (parameters,)
+    z: np.ndarray  # (points, states)
+    frequency: float  # [Hz]
+    sensitivities: np.ndarray | None = None  # (parameters, points, states)
+    frequency_sensitivities: np.ndarray | None = None  # (parameters,), zero for a driven model
 
     @classmethod
     def at(cls, equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> "Anchor":
@@ -77,14 +68,9 @@ class Anchor:
 
 
 class Batch:
-    """Driven input sets with their anchors, solved for many parameter vectors.
+    """Driven input sets of one model on one grid with an anchor each, solved for many parameter vectors.
 
-    Parameters
-    ----------
-    sets : sequence of PeriodicEquations
-        Of one driven model on one grid; inputs, frequencies and winding numbers may differ.
-    anchors : sequence of Anchor
-        One per set.
+    Inputs, frequencies and winding numbers may differ.
     """
 
     def __init__(self, sets: Sequence[PeriodicEquations], anchors: Sequence[Anchor]):
@@ -127,12 +113,8 @@ class Batch:
         )
 
     @cached_property
-    def _functions(self) -> Functions:
-        return self._first.functions
-
-    @cached_property
-    def _kernels(self) -> ModuleType:
-        return kernels("batch", self._first.count, self._first.grid.stencil)
+    def _compiled(self) -> tuple[Callable[..., None], Functions]:
+        return kernels("batch", self._first.count, self._first.grid.stencil).solve_many, self._first.functions
 
     def solve(
         self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False, polish: bool = False
@@ -149,18 +131,13 @@ class Batch:
         polish : bool
             Take further chord steps, so that z and what is derived from it are as accurate as possible.
         """
-        model, grid = self._first.model, self._first.grid
-        solves = parameters.shape[-2]
-        z = np.empty((self._size, solves, grid.points if keep else 0, self._first.count))
-        y = np.empty((self._size, solves, grid.points, model.kernels.channels))
-        every = np.empty((self._size, solves, parameters.shape[-1]))
-        every[:] = parameters
-        status, iterations = np.empty((2, self._size, solves), dtype=int)
-        frequency = np.repeat(self._sets.frequency[:, None], solves, axis=1)
-        solution = BatchSolution(z, y, frequency, status, iterations)
-        before = self._functions, grid.packed, grid.periods, self._sets, self._anchors, every
-        after, solve_many = (polish, model.kernels.output_rates, solution), self._kernels.solve_many
-        _in_blocks(lambda block: solve_many(*before, *block, *after), self._size * solves, SMALLEST_PART, threads)
+        first, grid = self._first, self._first.grid
+        every, solution = _unsolved(first, self._size, parameters, keep)
+        solution.frequency[:] = self._sets.frequency[:, None]
+        solve_many, functions = self._compiled
+        before = functions, grid.packed, grid.periods, self._sets, self._anchors, every
+        after = polish, first.model.kernels.output_rates, solution
+        _in_blocks(lambda block: solve_many(*before, *block, *after), solution.status.size, SMALLEST_PART, threads)
         return solution
 
     def vjp(
@@ -173,14 +150,7 @@ class Batch:
     ) -> np.ndarray:
         """Return Σ weights · ∂ŷ/∂θ (sets, moving) at one solution of every input set; NaN where it is singular.
 
-        Parameters
-        ----------
-        parameters : array (sets, parameters)
-        z : array (sets, points, states)
-        weights : array (sets, points, channels)
-        moving : tuple of int
-            Indices of the parameters θ.
-        threads : int, optional
+        `weights` is (sets, points, channels); `moving` are the indices of the parameters θ.
         """
         model, grid = self._first.model, self._first.grid
         products = model.vjp_kernels(moving)
@@ -207,15 +177,7 @@ def _in_blocks(
 
 
 class AutonomousBatch:
-    """Autonomous orbits with their anchors, followed to many parameter vectors.
-
-    Parameters
-    ----------
-    sets : sequence of PeriodicEquations
-        Of one autonomous model on one grid.
-    anchors : sequence of Anchor
-        One per orbit.
-    """
+    """Orbits of one autonomous model on one grid with an anchor each, followed to many parameter vectors."""
 
     def __init__(self, sets: Sequence[PeriodicEquations], anchors: Sequence[Anchor]):
         self._first = sets[0]
@@ -223,9 +185,6 @@ class AutonomousBatch:
         frequency = np.array([a.frequency for a in anchors])
         self._sets = Sets(np.stack([e.inputs for e in here]), frequency, np.stack([e.drift for e in here]))
         factors = [phase_bordered(e, a.parameters, a.z) for e, a in zip(here, anchors, strict=True)]
-        rows = [
-            f.border.rows[0].reshape(a.z.shape)[e.grid.place] for e, f, a in zip(here, factors, anchors, strict=True)
-        ]
         z, parameters = np.stack([a.z for a in anchors]), np.stack([a.parameters for a in anchors])
         known = [a.sensitivities is not None for a in anchors]
         sensitivities, slopes = np.zeros((*parameters.shape, *z.shape[1:])), np.zeros(parameters.shape)
@@ -241,42 +200,40 @@ class AutonomousBatch:
             np.stack([f.band for f in factors]),
             np.stack([f.pivots for f in factors]),
             Border(*(np.stack(parts) for parts in zip(*(f.border for f in factors), strict=True))),
-            np.array([float(np.sum(row * a.z)) for row, a in zip(rows, anchors, strict=True)]),
+            np.array([np.sum(e.phase_row(a.z) * a.z) for e, a in zip(here, anchors, strict=True)]),
             np.where(known, [f.orientation for f in factors], 0.0),
         )
 
     def solve(
         self, parameters: np.ndarray, threads: int | None = None, *, keep: bool = False, whole: bool = False
     ) -> BatchSolution:
-        """Follow every orbit to its parameter vectors; the result does not depend on the number of threads.
+        """Follow every orbit to its parameter vectors, see `Batch.solve`.
 
-        Parameters
-        ----------
-        parameters, threads, keep
-            See `batch.Batch.solve`.
-        whole : bool
-            A parameter vector needs all of its orbits. Where one is lost, others that would take more effort
-            are not followed, and get its status.
+        If `whole`, a parameter vector needs all of its orbits: where one is lost, others that would take more effort
+        are not followed, and get its status.
         """
-        first, (sets, points, states) = self._first, self._orbits.z.shape
-        solves = parameters.shape[-2]
-        every = np.empty((sets, solves, parameters.shape[-1]))
-        every[:] = parameters
-        solution = BatchSolution(
-            np.empty((sets, solves, points if keep else 0, states)),
-            np.empty((sets, solves, points, first.model.kernels.channels)),
-            np.empty((sets, solves)),
-            *np.empty((2, sets, solves), dtype=int),
-        )
-        follow_many = kernels("autonomous", states, first.grid.stencil).follow_many
+        first = self._first
+        every, solution = _unsolved(first, len(self._orbits.z), parameters, keep)
+        follow_many = kernels("autonomous", first.count, first.grid.stencil).follow_many
         before = first.functions, first.grid.packed, self._sets, self._orbits, every
-        _in_blocks(
-            lambda block: follow_many(*before, *block, whole, workspace(first, bordered=True), solution),
-            solves,
-            1,
-            threads,
-        )
+
+        def part(block: tuple[int, int]) -> None:
+            follow_many(*before, *block, whole, workspace(first, bordered=True), solution)
+
+        _in_blocks(part, every.shape[1], 1, threads)
         return solution
+
+
+def _unsolved(
+    equations: PeriodicEquations, sets: int, parameters: np.ndarray, keep: bool
+) -> tuple[np.ndarray, BatchSolution]:
+    """Return the parameters (sets, solves, parameters) and arrays for the solutions."""
+    every = np.empty((sets, *parameters.shape[-2:]))
+    every[:] = parameters
+    shape, points = every.shape[:2], equations.grid.points
+    z = np.empty((*shape, points if keep else 0, equations.count))
+    outputs = np.empty((*shape, points, equations.model.kernels.channels))
+    return every, BatchSolution(z, outputs, np.empty(shape), *np.empty((2, *shape), dtype=int))
 
 
 def phase_bordered(equations: PeriodicEquations, parameters: np.ndarray, z: np.ndarray) -> BorderedFactors:
@@ -284,3 +241,55 @@ def phase_bordered(equations: PeriodicEquations, parameters: np.ndarray, z: np.n
     columns, derivatives = equations.residual_jacobian(z, parameters), equations.derivatives(z, parameters)
     slope = frequency_derivatives(equations, z, columns, derivatives)[0]
     return equations.bordered(columns, slope[None], equations.phase_row(z)[None])
+
+
+def smallest_singular_vectors(
+    equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return approximate singular vectors of the smallest singular value of a regular ∂g/∂z, by inverse iteration.
+
+    States are in units of their largest values, equations in those of their largest terms. The left vector (points,
+    states) is over the equations; the right one (points, 3·states) is the change of the states and of their time
+    derivatives, scaled so that left · (∂g/∂z) · change is 1.
+    """
+    factors, amplitude = equations.factors(columns), np.abs(z).max(axis=0)
+    size, _ = equations.scales(z, columns)
+    units, terms = np.where(amplitude > 0, amplitude, 1.0), np.where(size > 0, size, 1.0)
+    right = np.broadcast_to(units, z.shape)
+    for _ in range(SWEEPS):
+        left = factors.solve_transposed(right / units**2) * terms**2
+        left /= np.linalg.norm(left / terms)
+        right = factors.solve(left)
+        right /= np.linalg.norm(right / units)
+    left = left / terms**2
+    change = equations.changes(right[None])[0]
+    g_q = columns[:, equations.count :].reshape(len(z), equations.count, -1)
+    return left / np.einsum("ne,neq,nq->", left, g_q, change), change
+
+
+def stiffness_gradient(
+    equations: PeriodicEquations,
+    z: np.ndarray,
+    parameters: np.ndarray,
+    sensitivities: np.ndarray,
+    left: np.ndarray,
+    right: np.ndarray,
+) -> np.ndarray:
+    """Return the derivatives (parameters,) of left · (∂g/∂z) · right along the solutions, by central differences.
+
+    The derivative by a parameter whose sensitivities (points, states) are zero is 0.
+    """
+    amplitude, result = np.abs(z).max(axis=0), np.zeros(parameters.size)
+    units = np.where(amplitude > 0.0, amplitude, 1.0)
+    for p in np.flatnonzero(sensitivities.any(axis=(1, 2))):
+        small = SMALL / np.max(np.abs(sensitivities[p]) / units)
+        small = min(small, SMALL * abs(parameters[p])) if parameters[p] != 0.0 else small
+        ends = []
+        for step in (small, -small):
+            moved = parameters.copy()
+            moved[p] += step
+            columns = equations.residual_jacobian(z + step * sensitivities[p], moved)
+            g_q = columns[:, equations.count :].reshape(len(z), equations.count, -1)
+            ends.append(np.einsum("ne,neq,nq->", left, g_q, right))
+        result[p] = (ends[0] - ends[1]) / (2.0 * small)
+    return result

@@ -27,7 +27,7 @@ SAME = 1e-6  # largest difference of repetitions, in units of the range
 SHRUNK = 1e-6  # largest range of an equilibrium, in units of the guess's
 ABSENT = 1e-6  # largest relative amplitude of an absent harmonic
 
-FLAG, COUNT, NUMBER, COMPLEX = types.boolean, types.int64, types.float64, types.complex128
+FLAG, COUNT, NUMBER = types.boolean, types.int64, types.float64
 VECTOR, MATRIX, CUBE, GAINS = (types.Array(NUMBER, dimensions, "C") for dimensions in (1, 2, 3, 4))
 PLACES, INDICES = (types.Array(COUNT, dimensions, "C") for dimensions in (1, 2))
 
@@ -60,16 +60,12 @@ class Grid(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """Arguments of the equations besides the states.
+    """Arguments of the equations besides the states."""
 
-    inputs (points, 3·inputs), parameters (parameters,), frequency [Hz], drift (states,): the mean rate of each state
-    per forcing period, not zero for a winding angle.
-    """
-
-    inputs: np.ndarray
-    parameters: np.ndarray
-    frequency: float
-    drift: np.ndarray
+    inputs: np.ndarray  # (points, 3·inputs)
+    parameters: np.ndarray  # (parameters,)
+    frequency: float  # [Hz]
+    drift: np.ndarray  # (states,), mean rate of each state per forcing period, not zero for a winding angle
 
 
 class Factors(NamedTuple):
@@ -86,25 +82,13 @@ class Factors(NamedTuple):
 
 
 class Border(NamedTuple):
-    """The border of [∂g/∂z, B; C, D] and its factors.
+    """The border of [∂g/∂z, B; C, D] and its factors."""
 
-    Attributes
-    ----------
-    columns : array (borders + 1, size)
-        B, overwritten by the factors; the last row is for the deflation of ∂g/∂z.
-    rows : array (borders, size)
-        C.
-    corner : array (borders, borders)
-        D.
-    small : array (borders + 1, 3·borders + 1)
-    pivots : int array (borders + 1,)
-    """
-
-    columns: np.ndarray
-    rows: np.ndarray
-    corner: np.ndarray
-    small: np.ndarray
-    pivots: np.ndarray
+    columns: np.ndarray  # (borders + 1, size): B, overwritten by the factors; the last row deflates ∂g/∂z
+    rows: np.ndarray  # (borders, size): C
+    corner: np.ndarray  # (borders, borders): D
+    small: np.ndarray  # (borders + 1, 3·borders + 1)
+    pivots: np.ndarray  # (borders + 1,)
 
     @classmethod
     def empty(cls, borders: int, size: int) -> "Border":
@@ -119,27 +103,14 @@ class Border(NamedTuple):
 
 
 class Unknowns(NamedTuple):
-    """Further scalar unknowns of the equations, and the conditions C·z + D·values = targets that fix them.
+    """Further scalar unknowns of the equations, and the conditions C·z + D·values = targets that fix them."""
 
-    Attributes
-    ----------
-    values, targets : array (unknowns,)
-    scales : array (unknowns,)
-        Steps of the values are measured in these, or in the value if that is larger.
-    parameters : array (unknowns, parameters)
-        Change of the parameters per unit of each.
-    inputs : array (unknowns, points, 3·inputs)
-        Change of the inputs per unit of each.
-    frequency : int
-        Index of the unknown that is the frequency, or −1.
-    """
-
-    values: np.ndarray
-    targets: np.ndarray
-    scales: np.ndarray
-    parameters: np.ndarray
-    inputs: np.ndarray
-    frequency: int
+    values: np.ndarray  # (unknowns,)
+    targets: np.ndarray  # (unknowns,)
+    scales: np.ndarray  # (unknowns,); steps are measured in these, or in the values if those are larger
+    parameters: np.ndarray  # (unknowns, parameters), change of the parameters per unit of each
+    inputs: np.ndarray  # (unknowns, points, 3·inputs), change of the inputs per unit of each
+    frequency: int  # index of the unknown that is the frequency, or −1
 
 
 NO_UNKNOWNS = Unknowns(np.empty(0), np.empty(0), np.empty(0), np.empty((0, 0)), np.empty((0, 0, 0)), -1)
@@ -147,98 +118,59 @@ NO_BORDER = Border.empty(0, 0)
 
 
 class Workspace(NamedTuple):
-    """Arrays that the Newton iteration overwrites; `columns` are those of `residual_jacobian`."""
+    """Arrays that the Newton iteration overwrites."""
 
     states: np.ndarray
-    columns: np.ndarray
+    columns: np.ndarray  # of the model's function `residual_jacobian`
     derivatives: np.ndarray
     factors: Factors
 
 
 class Sets(NamedTuple):
-    """Input sets of a batch: inputs (sets, points, 3·inputs), frequency (sets,) [Hz], drift (sets, states)."""
+    """Input sets of a batch."""
 
-    inputs: np.ndarray
-    frequency: np.ndarray
-    drift: np.ndarray
+    inputs: np.ndarray  # (sets, points, 3·inputs)
+    frequency: np.ndarray  # (sets,) [Hz]
+    drift: np.ndarray  # (sets, states)
 
 
 class Anchors(NamedTuple):
-    """Anchors of the input sets of a driven batch, arrays (sets, …).
-
-    Attributes
-    ----------
-    parameters, z, sensitivities
-        See `batch.Anchor`.
-    amplitude : array (sets, states)
-        The largest absolute value of each state.
-    stiffness_gradient : array (sets, parameters)
-        See `sensitivity.stiffness_gradient`.
-    near : array (sets,)
-        Length of the path of chord steps, in units of the amplitude, below which an orbit cannot be far.
-    factors : Factors
-        Of ∂g/∂z; the first of `ends` is −1 where there are none.
-    left, right : array (sets, points, states)
-        See `sensitivity.smallest_singular_vectors`.
-    """
+    """Anchors of the input sets of a driven batch, arrays (sets, …); see `batch.Anchor`."""
 
     parameters: np.ndarray
     z: np.ndarray
     sensitivities: np.ndarray
-    amplitude: np.ndarray
-    stiffness_gradient: np.ndarray
-    near: np.ndarray
-    factors: Factors
-    left: np.ndarray
+    amplitude: np.ndarray  # (sets, states), largest absolute value of each state
+    stiffness_gradient: np.ndarray  # (sets, parameters), see `batch.stiffness_gradient`
+    near: np.ndarray  # (sets,), length of the path of chord steps in amplitudes below which an orbit cannot be far
+    factors: Factors  # of ∂g/∂z; the first of `ends` is −1 where there are none
+    left: np.ndarray  # (sets, points, states), see `batch.smallest_singular_vectors`
     right: np.ndarray
 
 
 class Orbits(NamedTuple):
-    """Anchors of an autonomous batch, arrays (sets, …).
-
-    Attributes
-    ----------
-    parameters, z, frequency, sensitivities, frequency_sensitivities
-        See `batch.Anchor`.
-    band, pivots, border
-        Factors of the equations bordered by the phase condition.
-    target, orientation : array (sets,)
-        Value of the phase condition; orientation of the factors, 0 for a guess without factors.
-    """
+    """Anchors of an autonomous batch, arrays (sets, …); see `batch.Anchor`."""
 
     parameters: np.ndarray
     z: np.ndarray
     frequency: np.ndarray
     sensitivities: np.ndarray
     frequency_sensitivities: np.ndarray
-    band: np.ndarray
+    band: np.ndarray  # with the next two, factors of the equations bordered by the phase condition
     pivots: np.ndarray
     border: Border
-    target: np.ndarray
-    orientation: np.ndarray
+    target: np.ndarray  # (sets,), value of the phase condition
+    orientation: np.ndarray  # (sets,), of the factors; 0 for a guess without factors
 
 
 class BatchSolution(NamedTuple):
-    """Solutions of a batch.
+    """Solutions of a batch."""
 
-    Attributes
-    ----------
-    z : array (sets, solves, points, states)
-        The periodic parts; without entries unless requested.
-    outputs : array (sets, solves, points, channels)
-    frequency : array (sets, solves)
-        [Hz].
-    status : int array (sets, solves)
-        Index into `STATUSES`.
-    iterations : int array (sets, solves)
-        Steps with the anchor's factors and Newton iterations.
-    """
-
-    z: np.ndarray
-    outputs: np.ndarray
-    frequency: np.ndarray
-    status: np.ndarray
-    iterations: np.ndarray
+    z: np.ndarray  # (sets, solves, points, states), periodic parts; without entries unless requested
+    outputs: np.ndarray  # (sets, solves, points, channels)
+    frequency: np.ndarray  # (sets, solves) [Hz]
+    status: np.ndarray  # (sets, solves), index into `STATUSES`
+    iterations: np.ndarray  # (sets, solves), steps with the anchor's factors and Newton iterations
 
 
 def named(kind: type, *fields: types.Type) -> types.NamedTuple:
@@ -274,15 +206,7 @@ MODULES = {
 
 
 def kernels(name: str, states: int, stencil: tuple[int, int, int]) -> ModuleType:
-    """Return one of `MODULES` for a number of states and the stencil of a `schemes.CyclicGrid`.
-
-    Parameters
-    ----------
-    name : str
-    states : int
-    stencil : tuple of int
-        `schemes.CyclicGrid.stencil`.
-    """
+    """Return one of `MODULES` for a number of states and a `schemes.CyclicGrid.stencil`."""
     sizes = (states, *stencil) if states <= UNROLLED_STATES and any(stencil) else (0, 0, 0, 0)
     return _kernels(name, sizes)
 

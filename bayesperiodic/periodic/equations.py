@@ -1,4 +1,4 @@
-"""The discretised equations of one periodic problem: residuals, linearisation, Newton's iteration."""
+"""The discretised equations of one periodic problem: residuals, linearisation, Newton's iteration, sensitivities."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -29,21 +29,9 @@ from bayesperiodic.periodic.schemes import CyclicGrid, Scheme, find_scheme
 
 
 class CyclicFactors:
-    """Factors of the folded band of ∂g/∂z, with pivoting.
+    """Factors of the folded band of ∂g/∂z, with pivoting; not `regular` if a pivot is zero or not finite.
 
-    Parameters
-    ----------
-    grid : CyclicGrid
-    columns : array (points, states·(1 + 3·states))
-        g and ∂g/∂(q, q̇, q̈), as the model's grid function gives them.
-    states : int
-    frequency : float
-        [Hz].
-
-    Attributes
-    ----------
-    regular : bool
-        False if a pivot is zero or not finite; then only `BorderedFactors` may exist.
+    `columns` (points, states·(1 + 3·states)) are g and ∂g/∂(q, q̇, q̈), as `residual_jacobian` returns them.
     """
 
     def __init__(self, grid: CyclicGrid, columns: np.ndarray, states: int, frequency: float):
@@ -86,20 +74,8 @@ class CyclicFactors:
 class BorderedFactors(CyclicFactors):
     """Factors of [∂g/∂z, B; C, D], also where ∂g/∂z is singular.
 
-    Parameters
-    ----------
-    grid, columns, states, frequency
-        As `CyclicFactors` takes them.
-    sides, rows : array (borders, points, states)
-        B and C.
-    corner : array (borders, borders)
-        D, by default zero.
-
-    Attributes
-    ----------
-    orientation : float
-        The sign of the determinant, which changes along a branch only at folds; 0 if the matrix is singular.
-    border : Border
+    B and C are `sides` and `rows` (borders, points, states), D is `corner` (borders, borders). The `orientation` is the
+    sign of the determinant, which changes along a branch only at folds; 0 if the matrix is singular.
     """
 
     def __init__(
@@ -125,17 +101,9 @@ class BorderedFactors(CyclicFactors):
         return self.orientation != 0.0
 
     def solve_bordered(self, right: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Solve [∂g/∂z, B; C, D]·(x, y) = (right, below); None if the matrix is singular.
+        """Return x and y of [∂g/∂z, B; C, D]·(x, y) = (right, below); None if the matrix is singular.
 
-        Parameters
-        ----------
-        right : array (sides, points, states)
-        below : array (sides, borders)
-
-        Returns
-        -------
-        x : array (sides, points, states)
-        y : array (sides, borders)
+        x and `right` are (sides, points, states), y and `below` (sides, borders).
         """
         if not self.regular:
             return None
@@ -178,27 +146,13 @@ class Derivatives(NamedTuple):
 
 @dataclass(frozen=True)
 class PeriodicEquations:
-    """g(z, θ) = 0 for one model, one set of inputs and one grid ([1]_, eq. 2-4).
-
-    Attributes
-    ----------
-    frequency : float
-        Forcing frequency [Hz]; for an autonomous model that of the solution, an unknown.
-    inputs : array (points, 3·inputs)
-        u, u̇, ü.
-    drift : array (states,)
-        Advance of each angle per forcing period.
-
-    References
-    ----------
-    .. [1] de Kraker, Verbeek & van de Wouw 1997.
-    """
+    """g(z, θ) = 0 for one model, one set of inputs and one grid (de Kraker et al. 1997, eq. 2-4)."""
 
     model: Model
     grid: CyclicGrid
-    frequency: float
-    inputs: np.ndarray
-    drift: np.ndarray
+    frequency: float  # forcing frequency [Hz]; for an autonomous model that of the solution, an unknown
+    inputs: np.ndarray  # (points, 3·inputs): u, u̇, ü
+    drift: np.ndarray  # (states,), advance of each angle per forcing period
 
     @classmethod
     def build(
@@ -208,11 +162,11 @@ class PeriodicEquations:
         *,
         frequency: float,
         samples: int,
-        scheme: str | Scheme,
-        periods: int,
-        winding: int | Mapping[str, int],
+        scheme: str | Scheme = "central2",
+        periods: int = 1,
+        winding: int | Mapping[str, int] = 0,
     ) -> "PeriodicEquations":
-        """Check the arguments and differentiate the inputs spectrally; see `solution.solve_periodic`."""
+        """Check the arguments and differentiate the inputs spectrally; see `solve.solve_periodic`."""
         frequency = _checks.positive("frequency", frequency)
         grid = CyclicGrid(find_scheme(scheme), samples, periods)
         if model.autonomous and grid.periods > 1:
@@ -230,7 +184,9 @@ class PeriodicEquations:
                 rate = _fourier.derivative(amplitudes, frequency / grid.periods, order)
                 columns[order].append(_fourier.on_grid(rate, grid.points))
         stacked = as_columns([column for order in columns for column in order], grid.points)
-        return cls(model, grid, frequency, stacked, _drift(model, winding, grid.periods))
+        turns = _winding_numbers(model, winding)
+        drift = np.array([2.0 * np.pi * turns.get(state, 0) / grid.periods for state in model.states])
+        return cls(model, grid, frequency, stacked, drift)
 
     @property
     def count(self) -> int:
@@ -260,18 +216,13 @@ class PeriodicEquations:
     def winding(self) -> dict[str, int]:
         """Turns of each angle per response period."""
         turns = np.rint(self.drift * self.grid.periods / (2 * np.pi)).astype(int).tolist()
-        named = dict(zip(self.model.states, turns, strict=True))
-        return {state: named[state] for state in self.model.states if state in self.model.angles}
+        return {s: own for s, own in zip(self.model.states, turns, strict=True) if s in self.model.angles}
 
     def at_frequency(self, frequency: float) -> "PeriodicEquations":
         """Return the same equations at another frequency, the inputs unchanged as functions of tau."""
         ratio, width = frequency / self.frequency, len(self.model.inputs)
         inputs = self.inputs * np.repeat([1.0, ratio, ratio**2], width)
         return replace(self, frequency=frequency, inputs=inputs)
-
-    def with_inputs(self, inputs: np.ndarray) -> "PeriodicEquations":
-        """Return the same equations with other inputs, (points, 3·inputs)."""
-        return replace(self, inputs=np.ascontiguousarray(inputs))
 
     def static_guess(self, parameters: np.ndarray) -> np.ndarray:
         """Return the equilibrium under the mean inputs, (points, states); least squares where it is not unique."""
@@ -291,26 +242,14 @@ class PeriodicEquations:
         return np.tile(solution, (self.grid.points, 1))
 
     def solve(
-        self,
-        parameters: np.ndarray,
-        guess: np.ndarray,
-        unknowns: Unknowns = NO_UNKNOWNS,
-        border: Border = NO_BORDER,
+        self, parameters: np.ndarray, guess: np.ndarray, unknowns: Unknowns = NO_UNKNOWNS, border: Border = NO_BORDER
     ) -> Solved:
         """Run the Newton iteration for z and further unknowns from a guess (points, states) for the periodic part."""
         z, bordered = np.array(guess, dtype=float, order="C"), unknowns.values.size > 0
-        history = np.zeros((MAX_ITERATIONS, 3))
-        name = "bordered newton" if bordered else "newton"
-        code, iterations, _ = kernels(name, self.count, self.grid.stencil).newton(
-            self.functions,
-            self.grid.packed,
-            self.setting(parameters),
-            unknowns,
-            border,
-            MAX_HALVINGS,
-            z,
-            history,
-            workspace(self, bordered=bordered),
+        history, work = np.zeros((MAX_ITERATIONS, 3)), workspace(self, bordered=bordered)
+        compiled = kernels("bordered newton" if bordered else "newton", self.count, self.grid.stencil)
+        code, iterations, _ = compiled.newton(
+            self.functions, self.grid.packed, self.setting(parameters), unknowns, border, MAX_HALVINGS, z, history, work
         )
         return Solved(z, code, history[:iterations], unknowns.values)
 
@@ -422,12 +361,7 @@ def empty_factors(grid: CyclicGrid, states: int, sets: tuple[int, ...] = ()) -> 
     )
 
 
-def _drift(model: Model, winding: int | Mapping[str, int], periods: int) -> np.ndarray:
-    winding = winding_numbers(model, winding)
-    return np.array([2.0 * np.pi * winding.get(state, 0) / periods for state in model.states])
-
-
-def winding_numbers(model: Model, winding: int | Mapping[str, int]) -> dict[str, int]:
+def _winding_numbers(model: Model, winding: int | Mapping[str, int]) -> dict[str, int]:
     """Return the winding number of every angle among the states."""
     angles = [state for state in model.states if state in model.angles]
     if not isinstance(winding, Mapping):
@@ -446,3 +380,77 @@ def winding_numbers(model: Model, winding: int | Mapping[str, int]) -> dict[str,
         _checks.one_of("winding", name, angles)
         _checks.integer(f"winding[{name!r}]", turns)
     return dict.fromkeys(angles, 0) | dict(winding)
+
+
+class Sensitivities(NamedTuple):
+    """Derivatives along several directions, on the grid."""
+
+    states: np.ndarray  # (directions, points, states)
+    outputs: np.ndarray  # (directions, points, channels)
+    frequency: np.ndarray  # (directions,), of the solution's frequency [Hz per unit]; zero for a driven model
+
+
+def directional_sensitivities(
+    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
+) -> Sensitivities | None:
+    """Return derivatives along directions (directions, parameters) of the parameters; None if singular."""
+    d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
+    g, f = np.einsum("nep,dp->dne", d.g_theta, directions), np.einsum("ncp,dp->dnc", d.f_theta, directions)
+    return respond(equations, z, columns, d, g, f)
+
+
+def parameter_sensitivities(
+    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray
+) -> Sensitivities | None:
+    """Return derivatives to every parameter and, for a driven model, last to the frequency; None if singular.
+
+    For an autonomous model the change of the orbit is orthogonal to the flow, states in units of their range.
+    """
+    d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
+    g, f = np.moveaxis(d.g_theta, 2, 0), np.moveaxis(d.f_theta, 2, 0)
+    if not equations.model.autonomous:
+        g_frequency, f_frequency = frequency_derivatives(equations, z, columns, d)
+        g, f = np.concatenate([g, g_frequency[None]]), np.concatenate([f, f_frequency[None]])
+    return respond(equations, z, columns, d, g, f)
+
+
+def input_sensitivities(
+    equations: PeriodicEquations, z: np.ndarray, parameters: np.ndarray, directions: np.ndarray
+) -> Sensitivities | None:
+    """Return derivatives along perturbations (directions, points, 3·inputs) of (u, u̇, ü); None if singular."""
+    d, columns = equations.derivatives(z, parameters), equations.residual_jacobian(z, parameters)
+    g = np.einsum("neu,dnu->dne", d.g_u, directions)
+    f = np.einsum("ncu,dnu->dnc", d.f_u, directions)
+    return respond(equations, z, columns, d, g, f)
+
+
+def frequency_derivatives(
+    equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray, d: Derivatives
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return dg/dfrequency (points, states) and df/dfrequency (points, channels), z and inputs held in tau."""
+    states, inputs = equations.frequency_changes(z)
+    _, g_u, g_frequency, f_q, _, f_u, f_frequency = d
+    g_q = columns[:, equations.count :].reshape(len(z), equations.count, -1)
+    g = g_frequency[:, :, 0] + np.einsum("neq,nq->ne", g_q, states) + np.einsum("neu,nu->ne", g_u, inputs)
+    f = f_frequency[:, :, 0] + np.einsum("ncq,nq->nc", f_q, states) + np.einsum("ncu,nu->nc", f_u, inputs)
+    return g, f
+
+
+def respond(
+    equations: PeriodicEquations, z: np.ndarray, columns: np.ndarray, d: Derivatives, g: np.ndarray, f: np.ndarray
+) -> Sensitivities | None:
+    """Return the response to changes of g (directions, points, states) and f (directions, points, channels)."""
+    if equations.model.autonomous:
+        g_frequency, f_frequency = frequency_derivatives(equations, z, columns, d)
+        factors = equations.bordered(columns, g_frequency[None], equations.phase_row(z)[None])
+        solved = factors.solve_bordered(-g, np.zeros((len(g), 1)))
+        if solved is None:
+            return None
+        z_change, frequency = solved[0], solved[1][:, 0]
+        f = f + frequency[:, None, None] * f_frequency
+    else:
+        regular = equations.factors(columns)
+        if not regular.regular:
+            return None
+        z_change, frequency = regular.solve(-g), np.zeros(len(g))
+    return Sensitivities(z_change, f + np.einsum("ncq,dnq->dnc", d.f_q, equations.changes(z_change)), frequency)

@@ -13,7 +13,7 @@ References
 """
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from types import ModuleType
 
 import numpy as np
@@ -44,55 +44,32 @@ def _kernels() -> ModuleType:
 
 @dataclass(frozen=True)
 class Floquet:
-    """Multipliers and eigenfunctions.
+    """Multipliers and eigenfunctions."""
 
-    Attributes
-    ----------
-    exponents : complex array (size,)
-        log μ of the whole period, largest real part first; the imaginary part is in (−π, π].
-    """
-
-    exponents: np.ndarray
+    exponents: np.ndarray  # (size,), log μ of the whole period, largest real part first; imaginary part in (−π, π]
     _steps: np.ndarray
     _every: int
     _along: np.ndarray
     _across: np.ndarray
 
-    @cached_property
-    def eigenfunctions(self) -> tuple[np.ndarray, np.ndarray]:
-        """For each multiplier v of ẏ = A y and w of the adjoint ẇ = −Aᵀ w, complex arrays (size, points, size).
+    def leading(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return for the first multipliers v of ẏ = A y and w of the adjoint ẇ = −Aᵀ w, complex (count, points, size).
 
         They are normalised to unit length at each grid point.
         """
-        return self.leading(len(self.exponents))
-
-    def leading(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the eigenfunctions of the first multipliers only, arrays (count, points, size)."""
         result = np.empty((2, count, *self._steps.shape[:2]), dtype=complex)
-        for k in range(count):
-            _kernels().forward_eigenfunction(
-                self._steps, np.ascontiguousarray(self._along[k]), self._every, result[0, k]
-            )
-            _kernels().adjoint_eigenfunction(
-                self._steps, np.ascontiguousarray(self._across[k]), self._every, result[1, k]
-            )
+        for adjoint, starts in ((False, self._along), (True, self._across)):
+            for k in range(count):
+                at = np.ascontiguousarray(starts[k])
+                _kernels().eigenfunction(self._steps, at, self._every, adjoint, result[int(adjoint), k])
         return result[0], result[1]
 
 
 def first_order_matrix(linearisation: np.ndarray, orders: tuple[int, ...]) -> np.ndarray:
     """Return A (points, size, size) [1/s] of ẏ = A y, y = δq and the rates of the second-order states.
 
-    Parameters
-    ----------
-    linearisation : array (points, states, 3·states)
-        ∂g/∂(q, q̇, q̈).
-    orders : tuple of int
-        Of each state.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the equations cannot be solved for the highest derivatives.
+    The linearisation (points, states, 3·states) is ∂g/∂(q, q̇, q̈). A numpy.linalg.LinAlgError is raised if the
+    equations cannot be solved for the highest derivatives.
     """
     highest, lower = _split(linearisation, orders)
     return _companion(-np.linalg.solve(highest, lower), orders)
@@ -103,13 +80,7 @@ def change_factors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a (multipliers, points, states) and b (…, 3·states) for which wᵀ dA v = aᵀ d∂g/∂(q, q̇, q̈) b.
 
-    Parameters
-    ----------
-    linearisation : array (points, states, 3·states)
-    orders : tuple of int
-    matrix : array (points, size, size)
-        A of the same, `first_order_matrix`.
-    v, w : complex arrays (multipliers, points, size)
+    `matrix` is A, see `first_order_matrix`; v and w are (multipliers, points, size).
     """
     count = len(orders)
     second = [i for i, order in enumerate(orders) if order == 2]
@@ -146,12 +117,7 @@ def _split(linearisation: np.ndarray, orders: tuple[int, ...]) -> tuple[np.ndarr
 def floquet(matrix: np.ndarray, period: float) -> Floquet:
     """Return multipliers and eigenfunctions of ẏ = A(t) y.
 
-    Parameters
-    ----------
-    matrix : array (points, size, size)
-        A [1/s] on an equidistant grid of one period, end point excluded.
-    period : float
-        [s].
+    `matrix` (points, size, size) is A [1/s] on an equidistant grid of one period [s], end point excluded.
     """
     points, size, _ = matrix.shape
     steps = _transfer_matrices(matrix, period / points)
@@ -159,32 +125,20 @@ def floquet(matrix: np.ndarray, period: float) -> Floquet:
     splits, right = _invariant_bases(groups)
     _, left = _invariant_bases(np.swapaxes(groups[::-1], 1, 2), splits)
     left = np.roll(left[::-1], 1, axis=0)
-    exponents: list[complex] = []
-    v: list[np.ndarray] = []
-    w: list[np.ndarray] = []
+    found: list[tuple[complex, np.ndarray, np.ndarray]] = []
     for start, stop in zip([0, *splits], [*splits, size], strict=True):
-        x, y = _eigenspaces(right, left, start, stop)
-        for exponent, along, across in _block(groups, x, y):
-            exponents.append(exponent)
-            v.append(along)
-            w.append(across)
-    order = np.argsort([-e.real for e in exponents], kind="stable")
-    return Floquet(np.array(exponents)[order], steps, length, np.array(v)[order], np.array(w)[order])
+        found += _block(groups, *_eigenspaces(right, left, start, stop))
+    exponents, v, w = (np.array(part) for part in zip(*found, strict=True))
+    order = np.argsort(-exponents.real, kind="stable")
+    return Floquet(exponents[order], steps, length, v[order], w[order])
 
 
 def leading_multipliers(matrix: np.ndarray, period: float, count: int) -> np.ndarray | None:
     """Return the largest multipliers of ẏ = A(t) y, complex (count,) or fewer; None if they require `floquet`.
 
     Power iteration over the period converges quickly if the largest multiplier is real and well separated; if the
-    product of all transfer matrices is well conditioned, the multipliers are its eigenvalues.
-
-    Parameters
-    ----------
-    matrix : array (points, size, size)
-        A [1/s] on an equidistant grid of one period, end point excluded.
-    period : float
-        [s].
-    count : int
+    product of all transfer matrices is well conditioned, the multipliers are its eigenvalues. `matrix` and `period`
+    are those of `floquet`.
     """
     points, size, _ = matrix.shape
     steps = _transfer_matrices(matrix, period / points)

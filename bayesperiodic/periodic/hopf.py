@@ -30,23 +30,20 @@ class HopfPoint(Result):
     ----------
     model : str
     vary : str
-        The parameter that was varied.
+        The varied parameter.
     value : float
         Of that parameter.
     frequency : float
         Of the oscillation that starts there [Hz].
     parameters : dict of str to float
-        All of them, at the point.
     equilibrium : dict of str to float
-        The states there.
+        The states.
     mode : complex array (states,)
         Amplitudes of the states in the oscillation, in the model's order, the largest of them 1.
 
     Examples
     --------
-    >>> import bayesperiodic as bp
-    >>> point, = bp.hopf_points(bp.models.van_der_pol, {"mu": 0.0, "omega": 6.0}, "mu", between=(-1.0, 1.5))
-    >>> point.vary, point.equilibrium, round(point.frequency, 4)
+    >>> hopf_point.vary, hopf_point.equilibrium, round(hopf_point.frequency, 4)
     ('mu', {'x': 0.0}, 0.9549)
     """
 
@@ -90,7 +87,6 @@ def hopf_points(
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> point, = bp.hopf_points(bp.models.van_der_pol, {"mu": 0.0, "omega": 6.0}, "mu", between=(-1.0, 1.5))
     >>> abs(point.value) < 1e-9, round(point.frequency, 6)
     (True, 0.95493)
@@ -104,10 +100,13 @@ def hopf_points(
     given = dict(parameters) | {vary: low}
     _checks.same_names("parameters", given, model.parameters)
     theta = np.array([_checks.finite_number(f"parameters[{n!r}]", given[n]) for n in model.parameters])
-    equations = _equations(model, 1.0, FEWEST, "fourier")
+    equations = PeriodicEquations.build(model, None, frequency=1.0, samples=FEWEST, scheme="fourier")
+
+    def at(value: float) -> np.ndarray:
+        return np.where(np.array(model.parameters) == vary, value, theta)
 
     def growth(value: float) -> float:
-        return _leading(equations, _with(model, theta, vary, value))[0].real
+        return _leading(equations, at(value))[0].real
 
     grid = np.linspace(low, high, INTERVALS + 1)
     rates = [growth(value) for value in grid]
@@ -115,7 +114,7 @@ def hopf_points(
     for (a, b), (before, after) in zip(pairwise(grid), pairwise(rates), strict=True):
         if before * after < 0.0 or (after == 0.0 and before != 0.0):
             value = float(brentq(growth, a, b, xtol=1e-13 * max(abs(a), abs(b)), rtol=1e-14))
-            found.append(_describe(equations, _with(model, theta, vary, value), vary, value))
+            found.append(_describe(equations, at(value), vary, value))
     return tuple(found)
 
 
@@ -151,9 +150,7 @@ def emerging_cycle(
 
     Examples
     --------
-    >>> import bayesperiodic as bp
-    >>> point, = bp.hopf_points(bp.models.van_der_pol, {"mu": 0.0, "omega": 6.0}, "mu", between=(-1.0, 1.5))
-    >>> bp.emerging_cycle(bp.models.van_der_pol, point, amplitude={"x": 0.5}, samples=100).status
+    >>> bp.emerging_cycle(bp.models.van_der_pol, hopf_point, amplitude={"x": 0.5}, samples=100).status
     'converged'
     """
     if point.model != model.name:
@@ -169,7 +166,7 @@ def emerging_cycle(
     if not abs(own) > OSCILLATING:
         moving = [name for name, part in zip(model.states, point.mode, strict=True) if abs(part) > OSCILLATING]
         raise ValueError(f"amplitude: must be of a state that the oscillation moves, {moving}, got {state!r}.")
-    equations = _equations(model, point.frequency, samples, scheme)
+    equations = PeriodicEquations.build(model, None, frequency=point.frequency, samples=samples, scheme=scheme)
     theta = np.array([point.parameters[n] for n in model.parameters])
     shape = point.mode * size / own
     wave = np.exp(2j * np.pi * equations.grid.tau)
@@ -184,23 +181,8 @@ def emerging_cycle(
     return describe(equations, theta, found, "Hopf point", sensitivities=False)
 
 
-def _equations(model: Model, frequency: float, samples: int, scheme: str | Scheme) -> PeriodicEquations:
-    return PeriodicEquations.build(
-        model, None, frequency=frequency, samples=samples, scheme=scheme, periods=1, winding=0
-    )
-
-
-def _with(model: Model, theta: np.ndarray, name: str, value: float) -> np.ndarray:
-    other = theta.copy()
-    other[model.parameters.index(name)] = value
-    return other
-
-
 def _leading(equations: PeriodicEquations, theta: np.ndarray) -> tuple[complex, np.ndarray, np.ndarray]:
-    """Return the oscillating eigenvalue [1/s] of largest real part, its vector, and the equilibrium (states,).
-
-    NaN without one.
-    """
+    """Return the oscillating eigenvalue [1/s] of largest real part (NaN without one), its vector, the equilibrium."""
     z, count = equations.static_guess(theta), equations.count
     columns = equations.residual_jacobian(z, theta)[:1, count:].reshape(1, count, -1)
     values, vectors = np.linalg.eig(first_order_matrix(columns, tuple(equations.model.orders.values()))[0])

@@ -66,7 +66,7 @@ class Scheme:
         Parameters
         ----------
         points : int
-            Of the grid; a trigonometric scheme uses all of them.
+            Number of points of the grid.
 
         Returns
         -------
@@ -129,19 +129,11 @@ class CyclicGrid:
     """A scheme on the grid of one response period: the neighbours of every point, and its place in the folded band.
 
     The points are taken in the order 0, n−1, 1, n−2, …, which turns the cyclic band into an ordinary one.
-
-    Parameters
-    ----------
-    scheme : Scheme
-    samples : int
-        Points per forcing period.
-    periods : int
-        Forcing periods per response period.
     """
 
     scheme: Scheme
-    samples: int
-    periods: int = 1
+    samples: int  # points per forcing period
+    periods: int = 1  # forcing periods per response period
 
     def __post_init__(self) -> None:
         _checks.integer("periods", self.periods, 1)

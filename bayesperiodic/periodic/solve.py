@@ -10,7 +10,7 @@ from bayesperiodic import _checks, _fourier
 from bayesperiodic.models.integrate import integrate
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
-from bayesperiodic.periodic.compiled import ABSENT, CONVERGED, NOT_FINITE, OTHER_ORBIT, SHRUNK
+from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, OTHER_ORBIT
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, as_guess, describe
@@ -27,7 +27,7 @@ def raise_amplitude(equations: PeriodicEquations, parameters: np.ndarray, static
     mean = np.zeros_like(equations.inputs)
     width = len(equations.model.inputs)
     mean[:, :width] = equations.inputs[:, :width].mean(axis=0)
-    start = equations.with_inputs(mean)
+    start = replace(equations, inputs=mean)
     scaled = ParametrisedEquations(start, parameters, (INPUTS,), equations.inputs - mean)
     beginning = start.solve(parameters, static)
     if beginning.code != CONVERGED:
@@ -47,9 +47,7 @@ def sharpen(equations: PeriodicEquations, parameters: np.ndarray, guess: np.ndar
     """Solve with softened signs first and sharpen them step by step; None if that fails or there are none."""
     if not equations.model.smooth_signs:
         return None
-    soft = PeriodicEquations(
-        equations.model.softened(), equations.grid, equations.frequency, equations.inputs, equations.drift
-    )
+    soft = replace(equations, model=equations.model.softened())
     sharpness, factor, z = SOFTEST, SHARPENING, guess
     solved = soft.solve(np.append(parameters, sharpness), z)
     if solved.code != CONVERGED:
@@ -98,6 +96,12 @@ def settled_period(equations: PeriodicEquations, parameters: np.ndarray, start: 
     z[:, turns] -= 2 * np.pi * np.round(z[0, turns] / (2 * np.pi))
     slip = np.abs(z[-1] - z[0])[angles]
     return None if np.any(slip > np.pi) else z
+
+
+def settle(equations: PeriodicEquations, parameters: np.ndarray, start: np.ndarray) -> Solved | None:
+    """Solve from the end of a time integration from rest at start[0]; None if that fails."""
+    settled = settled_period(equations, parameters, start)
+    return None if settled is None else equations.solve(parameters, settled)
 
 
 def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tuple[np.ndarray, float] | None:
@@ -203,14 +207,19 @@ def solve_periodic(
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = np.cos(2 * np.pi * np.arange(800) / 800)
-    >>> solution = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
-    ...                              frequency=0.1)
-    >>> solution.status
-    'converged'
-    >>> solution.stable
-    True
+    >>> response = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0}, force, frequency=0.1,
+    ...                              samples=32, scheme="fourier")
+    >>> response.status, response.stable
+    ('converged', True)
+
+    This spring is linear, so the amplitude is 1/|1 − ω² + 0.2iω|:
+
+    >>> omega, amplitude = 0.2 * np.pi, np.sqrt(2) * response.states["x"].std()
+    >>> round(float(amplitude * np.hypot(1 - omega**2, 0.2 * omega)), 9)
+    1.0
+
+    An autonomous model, whose period is part of the solution:
+
     >>> orbit = bp.solve_periodic(bp.models.van_der_pol, {"mu": 0.5, "omega": 1}, frequency=0.15, scheme="central4")
     >>> round(orbit.period, 4)
     6.3807
@@ -249,42 +258,31 @@ def solve_driven(
         settled = settled_period(equations, theta, equations.static_guess(theta))
         if settled is not None:
             return solve_from(equations, theta, settled)
-    return solve_from_rest(equations, theta)
+    return solve_from(equations, theta, equations.static_guess(theta), at_rest=True)
 
 
-def solve_from(equations: PeriodicEquations, theta: np.ndarray, start: np.ndarray) -> tuple[Solved, str]:
-    """Solve a driven problem from a guess; return the solve and how it was found (`PeriodicSolution.found_by`)."""
-    return _first_success(
-        (NEWTON, lambda: equations.solve(theta, start)), ("sharpness", lambda: sharpen(equations, theta, start))
-    )
+def solve_from(
+    equations: PeriodicEquations, theta: np.ndarray, start: np.ndarray, *, at_rest: bool = False
+) -> tuple[Solved, str]:
+    """Solve a driven problem from a guess, with all fallbacks if it is the static one; return the solve and its route.
 
-
-def solve_from_rest(equations: PeriodicEquations, theta: np.ndarray) -> tuple[Solved, str]:
-    """Solve a driven problem from its static equilibrium, with all fallbacks; return the solve and how it was found."""
-    static = equations.static_guess(theta)
-
-    def integrated() -> Solved | None:
-        settled = settled_period(equations, theta, static)
-        return None if settled is None else equations.solve(theta, settled)
-
-    return _first_success(
-        (NEWTON, lambda: equations.solve(theta, static)),
-        ("sharpness", lambda: sharpen(equations, theta, static)),
-        ("input amplitude", lambda: raise_amplitude(equations, theta, static)),
-        ("time integration", integrated),
-    )
-
-
-def _first_success(*routes: tuple[str, Callable[[], Solved | None]]) -> tuple[Solved, str]:
-    """Return the first solve that converges and its route's name; the first one of all if none does."""
-    first: Solved | None = None
-    for name, route in routes:
+    The first solve is returned if none converges.
+    """
+    routes: dict[str, Callable[[], Solved | None]] = {
+        NEWTON: lambda: equations.solve(theta, start),
+        "sharpness": lambda: sharpen(equations, theta, start),
+    }
+    if at_rest:
+        routes["input amplitude"] = lambda: raise_amplitude(equations, theta, start)
+        routes["time integration"] = lambda: settle(equations, theta, start)
+    first = None
+    for name, route in routes.items():
         solved = route()
         if solved is not None and solved.code == CONVERGED:
             return solved, name
         first = first or solved
     assert first is not None
-    return first, routes[0][0]
+    return first, NEWTON
 
 
 def _same_orbit(equations: PeriodicEquations, solved: Solved, guess: np.ndarray) -> Solved:
@@ -321,22 +319,11 @@ def solve_free(
     found = solve_autonomous(equations, theta, z, frequency)
     equations = equations.at_frequency(float(found.values[0]))
     code = found.code
-    shorter = code == CONVERGED and has_shorter_period(found.z)
-    if shorter or (code != NOT_FINITE and collapsed(found.z, z)):
+    orbits = equations.bordered_kernels
+    shorter = code == CONVERGED and orbits.has_shorter_period(found.z)
+    if shorter or (code != NOT_FINITE and orbits.has_shrunk(found.z, z)):
         code = OTHER_ORBIT
     return equations, found._replace(code=code), found_by
-
-
-def collapsed(z: np.ndarray, guess: np.ndarray) -> bool:
-    """Return whether an orbit has shrunk to an equilibrium."""
-    return bool(np.all(np.ptp(z, axis=0) <= SHRUNK * np.ptp(guess, axis=0)))
-
-
-def has_shorter_period(z: np.ndarray) -> bool:
-    """Return whether only every k-th harmonic is present, for a k of 2 or more."""
-    power = np.sum(np.abs(np.fft.rfft(z, axis=0)) ** 2, axis=1)[1:]
-    present = np.flatnonzero(power > ABSENT**2 * power.max()) + 1
-    return bool(power.max() > 0 and np.gcd.reduce(present) > 1)
 
 
 def _steps_of_transitions(equations: PeriodicEquations, theta: np.ndarray, z: np.ndarray) -> float:

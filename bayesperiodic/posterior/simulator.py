@@ -12,9 +12,8 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.periodic.arclength import LOST, path_outcome
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, SINGULAR
-from bayesperiodic.periodic.equations import PeriodicEquations, Solved
+from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, Solved, directional_sensitivities
 from bayesperiodic.periodic.floquet import first_order_matrix, leading_multipliers
-from bayesperiodic.periodic.sensitivity import Sensitivities, directional_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, describe, logarithmic_changes
 from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.posterior.description import Description

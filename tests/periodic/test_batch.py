@@ -6,22 +6,21 @@ from bayesperiodic.periodic.batch import Anchor, Batch
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT
 from bayesperiodic.periodic.equations import PeriodicEquations
 from studies import shooting
-from tests.known import grid
+from tests.known import GEAR, grid
 from tests.pendulum import PENDULUM, pendulum_solution
 
 DUFFING = np.array([0.45, 1.3, 900.0, 4e5])
+# The landing gear, whose equations are singular at theta16 = 0.
+GEAR_NAMES = list(GEAR)
+GEAR_FREE = [GEAR_NAMES.index(name) for name in ("theta4", "theta6", "theta16")]
+GEAR_THETA = np.array([GEAR[name] for name in GEAR_NAMES])
+GEAR_SAMPLES = 400
+# Frequency [Hz], force amplitude about 4.5 kN [N], displacement amplitude about 0.12 m [m].
+GEAR_RUNS = ((0.05, 1500.0, 0.080), (0.3, 1100.0, 0.048), (1.0, 700.0, 0.021), (6.0, 600.0, 0.0021))
 
 
 def build(force: np.ndarray, frequency: float = 5.0) -> PeriodicEquations:
-    return PeriodicEquations.build(
-        bp.models.duffing,
-        {"force": force},
-        frequency=frequency,
-        samples=force.size,
-        scheme="central2",
-        periods=1,
-        winding=0,
-    )
+    return PeriodicEquations.build(bp.models.duffing, {"force": force}, frequency=frequency, samples=force.size)
 
 
 def anchored(equations: PeriodicEquations, guess: np.ndarray | None = None) -> Anchor:
@@ -199,3 +198,44 @@ def test_an_orbit_of_period_two_does_not_become_one_of_period_one():
             assert code == OTHER_ORBIT
             lost += 1
     assert 10 < lost < 31
+
+
+def rig(drive: str, scheme: str) -> list[PeriodicEquations]:
+    wave = np.cos(2 * np.pi * grid(GEAR_SAMPLES))
+    return [
+        PeriodicEquations.build(
+            bp.models.landing_gear(drive),
+            {drive: 4500.0 + force * wave if drive == "force" else 0.12 + stroke * wave},
+            frequency=frequency,
+            samples=GEAR_SAMPLES,
+            scheme=scheme,
+        )
+        for frequency, force, stroke in GEAR_RUNS
+    ]
+
+
+@pytest.mark.parametrize(
+    "spread",
+    [(5e-6, 1e-5, 1e-2), (0.05, 0.05, 0.05), (5e-6, 1e-5, 2.0), (5e-6, 1e-5, 5.0)],
+    ids=["posterior", "5 %", "theta16 twice its value", "theta16 five times its value"],
+)
+@pytest.mark.parametrize("scheme", ["backward2", "central2"])
+@pytest.mark.parametrize("drive", ["force", "displacement"])
+def test_solves_with_reused_factors_equal_solves_from_scratch(drive, scheme, spread):
+    """Spreads are standard deviations relative to theta4, theta6 and theta16; many theta16 are negative.
+
+    At theta16 = -0.006 the smallest singular value is 1/350 of the anchor's, and 350 times as much is left after a step
+    of 1e-9 with the anchor's factors, unless the step minds the softest direction.
+    """
+    sets = rig(drive, scheme)
+    anchors = [Anchor.at(e, GEAR_THETA, e.solve(GEAR_THETA, e.static_guess(GEAR_THETA)).z) for e in sets]
+    parameters = np.tile(GEAR_THETA, (60, 1))
+    parameters[:, GEAR_FREE] *= 1.0 + np.array(spread) * np.random.default_rng(1).standard_normal((60, 3))
+    parameters[:, GEAR_NAMES.index("theta11")] = -1e5 * parameters[:, GEAR_NAMES.index("theta4")]
+    found = Batch(sets, anchors).solve(parameters, keep=True, polish=True)
+    assert not found.status.any()
+    for equations, z in zip(sets, found.z, strict=True):
+        for i in (3, 17, 40):
+            alone = equations.solve(parameters[i], equations.static_guess(parameters[i]))
+            assert alone.code == 0
+            assert np.all(np.abs(z[i] - alone.z).max(axis=0) <= 1e-7 * np.abs(alone.z).max(axis=0))

@@ -1,3 +1,7 @@
+"""Factors of ∂g/∂z and of bordered systems, and the loading of the compiled functions."""
+
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -11,6 +15,22 @@ SCHEMES = ["backward2", "central2", "central4", "fourier"]
 # Schemes with gaps between the offsets and without offsets before the point.
 GAPS = bp.Scheme("gaps", 2, first={-3: -1 / 6, 3: 1 / 6}, second={-3: 1 / 9, 0: -2 / 9, 3: 1 / 9})
 FORWARD = bp.Scheme("forward", 1, first={0: -1.0, 1: 1.0}, second={0: 1.0, 1: -2.0, 2: 1.0})
+LINEAR = compiled.kernels("linear", 1, (2, 3, 2))
+ORIGINAL = compiled._kernels
+CALLED = """from numba import njit
+
+
+@njit("float64(float64)", cache=CACHE)
+def shifted(x):
+    return x + {added} + SIZES[0]
+"""
+CALLING = """from numba import njit
+
+
+@njit("float64(float64)", cache=CACHE)
+def twice(x):
+    return 2.0 * shifted(x)
+"""
 
 
 def growing(states: int) -> bp.Model:
@@ -34,9 +54,7 @@ def growing(states: int) -> bp.Model:
 
 def equations_of(model: bp.Model, scheme: str, samples: int) -> PeriodicEquations:
     wave = np.cos(2 * np.pi * grid(samples))
-    return PeriodicEquations.build(
-        model, {"u": wave}, frequency=1.0, samples=samples, scheme=scheme, periods=1, winding=0
-    )
+    return PeriodicEquations.build(model, {"u": wave}, frequency=1.0, samples=samples, scheme=scheme)
 
 
 def dense(equations: PeriodicEquations, columns: np.ndarray) -> np.ndarray:
@@ -198,3 +216,63 @@ def test_bordered_systems_are_solved_where_the_block_is_singular(scheme, rate):
     if rate < 1e-10:
         null = null_vector(equations.grid, columns, 2, equations.frequency)
         assert np.abs(matrix @ null.ravel()).max() < 1e-9
+
+
+@pytest.mark.parametrize("half", [1, 2, 5])
+def test_factors_solve_random_systems_that_need_pivoting(half):
+    generator = np.random.default_rng(half)
+    size = 60
+    matrix = np.triu(np.tril(generator.standard_normal((size, size)), half), -half)
+    np.fill_diagonal(matrix, 1e-8 * np.diag(matrix))
+    right = generator.standard_normal((3, size))
+    expected = np.linalg.solve(matrix, right.T).T
+    band, pivots = rows_of_band(matrix, half), np.empty(size, dtype=np.int64)
+    assert LINEAR.factor(band, half, half, pivots)
+    LINEAR.solve(band, half, half, pivots, right)
+    assert right == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
+
+
+def test_singular_and_not_finite_matrices_are_detected():
+    for bad in (0.0, np.nan):
+        band = rows_of_band(np.eye(5), 1)
+        band[2, 1] = bad
+        assert not LINEAR.factor(band, 1, 1, np.empty(5, dtype=np.int64))
+
+
+@pytest.mark.parametrize("exponent", [-40.0, -20.0, 20.0, 40.0])
+def test_folded_band_is_accurate_for_stable_and_unstable_orbits(exponent):
+    """W' = λ w + u on the cyclic grid of central2, multiplier e^λ over the period, against the discrete closed form."""
+    shape = CyclicGrid(find_scheme("central2"), 800)
+    size, half, tau = shape.points, shape.half_width, shape.tau
+    symbol = 1j * np.sin(2 * np.pi / size) * size - exponent
+    forcing, expected = np.cos(2 * np.pi * tau), (np.exp(2j * np.pi * tau) / symbol).real
+    matrix = np.zeros((size, 3 * half + 1))
+    for i in range(size):
+        row = shape.place[i]
+        matrix[row, half] -= exponent
+        for neighbour, weight in zip(shape.neighbours[i], shape.first, strict=True):
+            matrix[row, shape.place[neighbour] - row + half] += weight
+    right = np.empty((1, size))
+    right[0, shape.place] = forcing
+    pivots = np.empty(size, dtype=np.int64)
+    assert LINEAR.factor(matrix, half, half, pivots)
+    LINEAR.solve(matrix, half, half, pivots, right)
+    assert right[0, shape.place] == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize(("scheme", "half_width"), [("central2", 2), ("backward2", 6)])
+@pytest.mark.parametrize("points", [20, 21])
+def test_folded_order_has_the_expected_half_width(scheme, half_width, points):
+    shape = CyclicGrid(find_scheme(scheme), points)
+    assert sorted(shape.place) == list(range(points))
+    assert shape.half_width == half_width
+
+
+def test_changed_kernels_recompile_their_callers(monkeypatch, tmp_path):
+    monkeypatch.setenv("BAYESPERIODIC_CACHE", str(tmp_path))
+    for added, states in ((1.0, 0), (3.0, 0), (3.0, 2), (1.0, 0)):
+        texts = {"linear": CALLED.format(added=added), "newton": CALLING}
+        monkeypatch.setattr(compiled, "source", texts.__getitem__)
+        monkeypatch.setattr(compiled, "_kernels", cache(ORIGINAL.__wrapped__))
+        caller = compiled.kernels("newton", states, (1, 1, 1))
+        assert caller.twice(1.0) == 2.0 * (1.0 + added + states)

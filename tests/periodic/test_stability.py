@@ -229,5 +229,5 @@ def test_another_model_or_an_unconverged_solution_is_refused():
     with pytest.raises(ValueError, match="model: must be 'duffing', as of the solution, got 'van_der_pol'"):
         bp.multiplier_sensitivities(bp.models.van_der_pol, solution)
     wrong = replace(solution, status="stalled")
-    with pytest.raises(ValueError, match="solution: must have converged and be regular, got status 'stalled'"):
+    with pytest.raises(ValueError, match="solution: must have converged, got status 'stalled'"):
         bp.multiplier_sensitivities(bp.models.duffing, wrong)

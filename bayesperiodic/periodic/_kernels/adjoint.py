@@ -10,12 +10,9 @@ import numpy as np
 from numba import njit, types
 
 from bayesperiodic.models.code_generation import grid_function_at
-from bayesperiodic.periodic.compiled import COUNT, CUBE, FACTORS, GRID, MATRIX, PLACES, SETS
 
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
-    from bayesperiodic.periodic._kernels.batch import solve_transposed
-    from bayesperiodic.periodic._kernels.linear import OPTIONS, REACH, STATES, WIDTH, factorise, fold, unfold
-    from bayesperiodic.periodic._kernels.newton import differentiate, largest
+    from bayesperiodic.periodic._kernels.batch import *
 
 
 @njit(types.void(GRID, FACTORS, MATRIX), **OPTIONS)
@@ -87,19 +84,8 @@ def concatenate(states, others, both):
 def vjp_many(addresses, grid, sets, parameters, z, weights, factors, start, stop, gradients):
     """Fill Σ weights · ∂ŷ/∂θ (sets, moving) of the input sets start … stop at one solution each; NaN where singular.
 
-    Parameters
-    ----------
-    addresses : int array (3,)
-        Of the model's `residual_jacobian`, `outputs_vjp` and `equations_vjp`.
-    grid : Grid
-    sets : Sets
-    parameters : array (sets, parameters)
-    z : array (sets, points, states)
-    weights : array (sets, points, channels)
-    factors : Factors
-        Work arrays.
-    start, stop : int
-    gradients : array (sets, moving)
+    `addresses` are those of the model's `residual_jacobian`, `outputs_vjp` and `equations_vjp`; `weights` is (sets,
+    points, channels); the factors are work arrays.
     """
     residual_jacobian, outputs_vjp = grid_function_at(addresses[0]), grid_function_at(addresses[1])
     equations_vjp, tau = grid_function_at(addresses[2]), grid.tau

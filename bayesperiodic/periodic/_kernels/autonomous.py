@@ -6,47 +6,9 @@ import numpy as np
 from numba import njit, types
 
 from bayesperiodic.models.code_generation import grid_function_at
-from bayesperiodic.periodic.compiled import (
-    ABSENT,
-    BORDER,
-    CONVERGED,
-    COUNT,
-    CUBE,
-    FLAG,
-    FUNCTIONS,
-    GRID,
-    MATRIX,
-    MAX_ITERATIONS,
-    NUMBER,
-    ORBITS,
-    OTHER_ORBIT,
-    PLACES,
-    SETS,
-    SETTING,
-    SHRUNK,
-    SOLUTION,
-    STALLED,
-    STEP_TOLERANCE,
-    VECTOR,
-    WORKSPACE,
-    Border,
-    Setting,
-    Unknowns,
-)
 
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
-    from bayesperiodic.periodic._kernels.border import folded_product, phase_row, solve_bordered
-    from bayesperiodic.periodic._kernels.linear import OPTIONS, copy, fold, unfold
-    from bayesperiodic.periodic._kernels.newton import (
-        FAR,
-        SMALLEST_PART,
-        differentiate,
-        dot,
-        is_far,
-        largest,
-        newton,
-        predict,
-    )
+    from bayesperiodic.periodic._kernels.newton import *
 
 MAX_SECANTS, SECANT_RATE = 12, 0.5
 ANCHOR = types.Tuple([VECTOR, MATRIX, NUMBER, CUBE, VECTOR])
@@ -65,18 +27,8 @@ def broyden(functions, grid, setting, band, pivots, border, target, z, states, c
     uncorrected step must be less than `SECANT_RATE` times the step before. This way every direction in which the orbit
     is still to be improved has a stiffness of the same sign as at the anchor, and no fold is crossed.
 
-    Parameters
-    ----------
-    functions : Functions
-    grid : Grid
-    setting : Setting
-        With the predicted frequency.
-    band, pivots, border
-        Bordered factors at the anchor.
-    target : float
-        Of the phase condition.
-    z, states, change : array (points, states), (points, 3·states), (points, states)
-        The last two are work arrays.
+    The setting has the predicted frequency; `band`, `pivots` and `border` are the bordered factors at the anchor;
+    `target` is the value of the phase condition; `states` and `change` are work arrays.
 
     References
     ----------
@@ -137,55 +89,6 @@ def predicted_frequency(frequency, sensitivities, anchor_parameters, parameters,
     return result if result > 0.0 else frequency
 
 
-@njit(FLAG(MATRIX, MATRIX), **OPTIONS)
-def has_shrunk(z, start):
-    """Return whether an orbit has shrunk to an equilibrium."""
-    for s in range(z.shape[1]):
-        low, high, lowest, highest = np.inf, -np.inf, np.inf, -np.inf
-        for i in range(z.shape[0]):
-            low, high = min(low, z[i, s]), max(high, z[i, s])
-            lowest, highest = min(lowest, start[i, s]), max(highest, start[i, s])
-        if high - low > SHRUNK * (highest - lowest):
-            return False
-    return True
-
-
-@njit(NUMBER(MATRIX, COUNT), **OPTIONS)
-def power(z, harmonic):
-    """Return the power of a harmonic, summed over the states."""
-    points, total = z.shape[0], 0.0
-    for s in range(z.shape[1]):
-        real, imaginary = 0.0, 0.0
-        for i in range(points):
-            angle = 2.0 * np.pi * ((harmonic * i) % points) / points
-            real += z[i, s] * np.cos(angle)
-            imaginary += z[i, s] * np.sin(angle)
-        total += real**2 + imaginary**2
-    return total
-
-
-@njit(FLAG(MATRIX), **OPTIONS)
-def has_shorter_period(z):
-    """Return whether only every k-th harmonic is present, for a k of 2 or more."""
-    points, whole = z.shape[0], 0.0
-    for s in range(z.shape[1]):
-        for i in range(points):
-            whole += z[i, s] ** 2 * points
-    if power(z, 1) > ABSENT**2 * whole:
-        return False
-    powers, strongest, divisor = np.empty(points // 2), 0.0, 0
-    for k in range(powers.size):
-        powers[k] = power(z, k + 1)
-        strongest = max(strongest, powers[k])
-    for k in range(powers.size):
-        if powers[k] > ABSENT**2 * strongest:
-            one, other = k + 1, divisor
-            while other > 0:
-                one, other = other, one % other
-            divisor = one
-    return divisor > 1
-
-
 @njit(FLAG(MATRIX, MATRIX, MATRIX, NUMBER, NUMBER), **OPTIONS)
 def has_leapt(z, predicted, start, frequency, expected):
     """Return whether an orbit is not a continuation of `start`: unpredicted, shrunk, or of a shorter period."""
@@ -205,20 +108,8 @@ def continue_from_anchor(functions, grid, setting, anchor, orientation, border, 
     halved, and where one failed the next goes half of the remaining way, so that a fold is approached from both sides.
     If the steps become too small, the status is "other orbit".
 
-    Parameters
-    ----------
-    functions : Functions
-    grid : Grid
-    setting : Setting
-    anchor : parameters, z, frequency, sensitivities, frequency_sensitivities
-    orientation : float
-        Of the bordered factors at the anchor, 0 if unknown.
-    border : Border
-        With one row; a work array.
-    z : array (points, states)
-        Filled.
-    history : array (MAX_ITERATIONS, 3)
-    work : Workspace
+    The anchor is its parameters, z, frequency, sensitivities and frequency_sensitivities; `orientation` is that of the
+    bordered factors at the anchor, 0 if unknown. z (points, states) is filled; `border` and `history` are work arrays.
     """
     anchor_parameters, anchor_z, anchor_frequency, sensitivities, slopes = anchor
     (points, count), theta = anchor_z.shape, setting.parameters
@@ -263,40 +154,13 @@ def continue_from_anchor(functions, grid, setting, anchor, orientation, border, 
     return CONVERGED, used, now
 
 
-@njit(types.void(MATRIX, NUMBER, MATRIX), **OPTIONS)
-def scale_rates(inputs, ratio, result):
-    """Fill u, u̇, ü at another frequency, `ratio` times as high."""
-    count = inputs.shape[1] // 3
-    for i in range(inputs.shape[0]):
-        for k in range(count):
-            result[i, k] = inputs[i, k]
-            result[i, count + k] = inputs[i, count + k] * ratio
-            result[i, 2 * count + k] = inputs[i, 2 * count + k] * ratio**2
-
-
-@njit(
-    types.void(FUNCTIONS, GRID, SETS, ORBITS, CUBE, COUNT, COUNT, FLAG, WORKSPACE, SOLUTION),
-    **OPTIONS,
-)
+@njit(types.void(FUNCTIONS, GRID, SETS, ORBITS, CUBE, COUNT, COUNT, FLAG, WORKSPACE, SOLUTION), **OPTIONS)
 def follow_many(functions, grid, sets, orbits, parameters, start, stop, whole, work, solution):
     """Follow every orbit to its parameter vectors start … stop: by `broyden`, or else by `continue_from_anchor`.
 
-    The results do not depend on the order of the solves.
-
-    Parameters
-    ----------
-    functions : Functions
-    grid : Grid
-    sets : Sets
-        Inputs at the anchors' frequencies.
-    orbits : Orbits
-    parameters : array (sets, solves, parameters)
-    start, stop : int
-    whole : bool
-        Whether a parameter vector needs all of its orbits: those after a lost one get its status without a solve.
-    work : Workspace
-    solution : BatchSolution
-        Filled; z only if it has entries.
+    The results do not depend on the order of the solves. `sets` has the inputs at the anchors' frequencies;
+    `parameters` is (sets, solves, parameters). If `whole`, a parameter vector needs all of its orbits: those after a
+    lost one get its status without a solve. The solution's z is filled only if it has entries.
     """
     outputs, borders = grid_function_at(functions.outputs), orbits.border
     sets_count, points, count = orbits.z.shape

@@ -6,57 +6,9 @@ import numpy as np
 from numba import njit, types
 
 from bayesperiodic.models.code_generation import grid_function_at
-from bayesperiodic.periodic.compiled import (
-    ANCHORS,
-    BORDER,
-    CONVERGED,
-    COUNT,
-    CUBE,
-    FACTORS,
-    FLAG,
-    FUNCTIONS,
-    GRID,
-    MATRIX,
-    MAX_HALVINGS,
-    MAX_ITERATIONS,
-    NO_FACTORS,
-    NUMBER,
-    OTHER_ORBIT,
-    PLACES,
-    SETS,
-    SETTING,
-    SOLUTION,
-    STEP_TOLERANCE,
-    UNKNOWNS,
-    VECTOR,
-    WORKSPACE,
-    Border,
-    Factors,
-    Setting,
-    Unknowns,
-    Workspace,
-)
 
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
-    from bayesperiodic.periodic._kernels.linear import (
-        LOWER,
-        OPTIONS,
-        STATES,
-        back_substitute,
-        copy,
-    )
-    from bayesperiodic.periodic._kernels.newton import (
-        CHORD_RATE,
-        FAR,
-        SMALLEST_PART,
-        differentiate,
-        dot,
-        is_far,
-        largest,
-        newton,
-        predict,
-        repetitions,
-    )
+    from bayesperiodic.periodic._kernels.newton import *
 
 MAX_CHORDS = 6
 PREDICTION_RATE = 30.0
@@ -95,26 +47,11 @@ def newton_chord(
     smallest, and of the wrong sign where the stiffness in that direction has changed its sign. So this direction takes
     the stiffness expected of the present ∂g/∂z, and factors whose own stiffness differs too much are not used.
 
-    Parameters
-    ----------
-    functions : Functions
-    grid : Grid
-    setting : Setting
-    amplitude : array (states,)
-        Units of the steps.
-    stiffness : float
-        Expected of the present ∂g/∂z in this direction, in units of that of the factors.
-    predicted : float
-        Size of the change by the prediction, in units of the amplitude.
-    polish : bool
-        Go on until a step is below `POLISHED` or at rounding level, for derivatives of the outputs.
-    z, states, change : array (points, states), (points, 3·states), (points, states)
-        The last two are work arrays.
-    factors : Factors
-    left : array (points, states)
-        Weights of the equations that are largest for a residual in this direction.
-    right : array (points, states)
-        The direction, scaled to a stiffness of 1 for the ∂g/∂z of the factors.
+    Steps, and the change `predicted`, are in units of the amplitude. `stiffness` is that expected of the present ∂g/∂z
+    in this direction, in units of that of the factors; `left` (points, states) the weights of the equations that are
+    largest for a residual in this direction; `right` the direction, scaled to a stiffness of 1 for the ∂g/∂z of the
+    factors. If `polish`, the steps go on until one is below `POLISHED` or at rounding level, for derivatives of the
+    outputs. `states` and `change` are work arrays.
     """
     residual = grid_function_at(functions.residual)
     inputs, parameters, frequency, drift = setting
@@ -200,10 +137,7 @@ def continue_from_anchor(
     return CONVERGED, used
 
 
-@njit(
-    types.void(FUNCTIONS, GRID, COUNT, SETS, ANCHORS, CUBE, COUNT, COUNT, FLAG, FLAG, SOLUTION),
-    **OPTIONS,
-)
+@njit(types.void(FUNCTIONS, GRID, COUNT, SETS, ANCHORS, CUBE, COUNT, COUNT, FLAG, FLAG, SOLUTION), **OPTIONS)
 def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop, polish, rates, solution):
     """Solve for input sets times parameter vectors, those of the flat indices start … stop (vectors run fastest).
 
@@ -213,22 +147,8 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
     if a step leaps, or the period becomes shorter, the status is "other orbit". The results do not depend on the order
     of the solves.
 
-    Parameters
-    ----------
-    functions : Functions
-    grid : Grid
-    periods : int
-        Forcing periods in the response period.
-    sets : Sets
-    anchors : Anchors
-    parameters : array (sets, solves, parameters)
-    start, stop : int
-    polish : bool
-        As `newton_chord` takes it.
-    rates : bool
-        Whether the outputs depend on q̇ or q̈.
-    solution : BatchSolution
-        Filled except for the frequency; z only if it has entries.
+    `parameters` is (sets, solves, parameters); for `polish` see `newton_chord`; `rates` tells whether the outputs
+    depend on q̇ or q̈. The solution is filled except for the frequency, z only if it has entries.
     """
     outputs = grid_function_at(functions.outputs)
     points, count = anchors.z.shape[1], STATES if STATES > 0 else anchors.z.shape[2]
@@ -238,15 +158,10 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
     columns, history = np.empty((points, count * (1 + 3 * count))), np.empty((MAX_ITERATIONS, 3))
     bands, pivots, inverses, gains, transfers, ends, interfaces, interface_pivots = all_factors
     own = Factors(
-        np.empty_like(bands[0]),
-        np.empty_like(pivots[0]),
-        np.empty_like(inverses[0]),
-        np.empty_like(gains[0]),
-        np.empty_like(transfers[0]),
-        np.empty_like(ends[0]),
-        np.empty_like(interfaces[0]),
+        np.empty_like(bands[0]), np.empty_like(pivots[0]), np.empty_like(inverses[0]), np.empty_like(gains[0]),
+        np.empty_like(transfers[0]), np.empty_like(ends[0]), np.empty_like(interfaces[0]),
         np.empty_like(interface_pivots[0]),
-    )
+    )  # fmt: skip
     work = Workspace(states, columns, np.empty((0, 0)), own)
     nothing, table = np.empty(0), np.empty((0, 0))
     unknowns = Unknowns(nothing, nothing, nothing, table, np.empty((0, 0, 0)), -1)

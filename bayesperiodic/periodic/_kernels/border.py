@@ -1,6 +1,7 @@
 """Compiled functions of bordered systems: further scalar unknowns of the equations, and the phase condition.
 
 A bordered system is solved also where ∂g/∂z is singular, as it is along the orbit of an autonomous model and at folds.
+The last functions detect equilibria and repeated orbits of autonomous models.
 """
 
 from typing import TYPE_CHECKING
@@ -9,21 +10,9 @@ import numpy as np
 from numba import njit, types
 
 from bayesperiodic.models.code_generation import grid_function_at
-from bayesperiodic.periodic.compiled import (
-    BORDER,
-    FUNCTIONS,
-    GRID,
-    MATRIX,
-    NUMBER,
-    PLACES,
-    SETTING,
-    UNKNOWNS,
-    VECTOR,
-    WORKSPACE,
-)
 
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
-    from bayesperiodic.periodic._kernels.linear import OPTIONS, assemble, copy, factor, fold, solve, unfold
+    from bayesperiodic.periodic._kernels.linear import *
 
 
 @njit(NUMBER(MATRIX, PLACES), **OPTIONS)
@@ -42,16 +31,7 @@ def factor_bordered(band, pivots, border):
 
     The last pivot of ∂g/∂z in the folded order, where the singularity of a cyclic system gathers, is replaced by one of
     ordinary size; the change is undone by one more bordering unknown. Along a branch of solutions the sign changes only
-    at folds.
-
-    Parameters
-    ----------
-    band : array (size, 3·lower + 1)
-        The folded band of ∂g/∂z.
-    pivots : int array (size,)
-        Filled.
-    border : Border
-        In the folded order.
+    at folds. `band` is that of ∂g/∂z; the border is in the folded order.
     """
     columns, rows, small = border.columns, border.rows, border.small
     borders, size, lower = rows.shape[0], band.shape[0], (band.shape[1] - 1) // 3
@@ -97,12 +77,7 @@ def factor_bordered(band, pivots, border):
 def solve_bordered(band, pivots, border, right, below):
     """Solve [∂g/∂z, B; C, D]·(x, y) = (right, below) in place with the factors of `factor_bordered`.
 
-    Parameters
-    ----------
-    right : array (sides, size)
-        In the folded order; overwritten by x.
-    below : array (sides, borders)
-        Overwritten by y.
+    `right` (sides, size) is in the folded order; `below` is (sides, borders).
     """
     columns, rows = border.columns, border.rows
     borders, size, lower = rows.shape[0], band.shape[0], (band.shape[1] - 1) // 3
@@ -149,10 +124,21 @@ def phase_row(z, states, grid, row):
     return target
 
 
+@njit(types.void(MATRIX, NUMBER, MATRIX), **OPTIONS)
+def scale_rates(inputs, ratio, result):
+    """Fill u, u̇, ü at another frequency, `ratio` times as high."""
+    count = inputs.shape[1] // 3
+    for i in range(inputs.shape[0]):
+        for k in range(count):
+            result[i, k] = inputs[i, k]
+            result[i, count + k] = inputs[i, count + k] * ratio
+            result[i, 2 * count + k] = inputs[i, 2 * count + k] * ratio**2
+
+
 @njit(NUMBER(SETTING, UNKNOWNS, VECTOR, MATRIX, VECTOR), **OPTIONS)
 def fill_setting(setting, unknowns, values, inputs, parameters):
     """Fill inputs and parameters at values of the unknowns, from the setting at zeros; return the frequency."""
-    count, frequency = inputs.shape[1] // 3, setting.frequency
+    frequency = setting.frequency
     copy(setting.inputs, inputs)
     for p in range(parameters.size):
         parameters[p] = setting.parameters[p]
@@ -160,16 +146,12 @@ def fill_setting(setting, unknowns, values, inputs, parameters):
         for p in range(parameters.size):
             parameters[p] += values[k] * unknowns.parameters[k, p]
         for i in range(unknowns.inputs.shape[1]):
-            for j in range(3 * count):
+            for j in range(inputs.shape[1]):
                 inputs[i, j] += values[k] * unknowns.inputs[k, i, j]
         if k == unknowns.frequency:
             frequency = values[k]
     if frequency != setting.frequency:
-        ratio = frequency / setting.frequency
-        for i in range(inputs.shape[0]):
-            for j in range(count):
-                inputs[i, count + j] *= ratio
-                inputs[i, 2 * count + j] *= ratio**2
+        scale_rates(inputs, frequency / setting.frequency, inputs)
     return frequency
 
 
@@ -239,3 +221,52 @@ def bordered_step(functions, grid, setting, unknowns, border, states, columns, z
         own = abs(change[k]) / max(unknowns.scales[k], abs(unknowns.values[k]))
         size = max(size, own) if own < np.inf else np.inf
     return size, orientation
+
+
+@njit(FLAG(MATRIX, MATRIX), **OPTIONS)
+def has_shrunk(z, start):
+    """Return whether an orbit has shrunk to an equilibrium."""
+    for s in range(z.shape[1]):
+        low, high, lowest, highest = np.inf, -np.inf, np.inf, -np.inf
+        for i in range(z.shape[0]):
+            low, high = min(low, z[i, s]), max(high, z[i, s])
+            lowest, highest = min(lowest, start[i, s]), max(highest, start[i, s])
+        if high - low > SHRUNK * (highest - lowest):
+            return False
+    return True
+
+
+@njit(NUMBER(MATRIX, COUNT), **OPTIONS)
+def power(z, harmonic):
+    """Return the power of a harmonic, summed over the states."""
+    points, total = z.shape[0], 0.0
+    for s in range(z.shape[1]):
+        real, imaginary = 0.0, 0.0
+        for i in range(points):
+            angle = 2.0 * np.pi * ((harmonic * i) % points) / points
+            real += z[i, s] * np.cos(angle)
+            imaginary += z[i, s] * np.sin(angle)
+        total += real**2 + imaginary**2
+    return total
+
+
+@njit(FLAG(MATRIX), **OPTIONS)
+def has_shorter_period(z):
+    """Return whether only every k-th harmonic is present, for a k of 2 or more."""
+    points, whole = z.shape[0], 0.0
+    for s in range(z.shape[1]):
+        for i in range(points):
+            whole += z[i, s] ** 2 * points
+    if power(z, 1) > ABSENT**2 * whole:
+        return False
+    powers, strongest, divisor = np.empty(points // 2), 0.0, 0
+    for k in range(powers.size):
+        powers[k] = power(z, k + 1)
+        strongest = max(strongest, powers[k])
+    for k in range(powers.size):
+        if powers[k] > ABSENT**2 * strongest:
+            one, other = k + 1, divisor
+            while other > 0:
+                one, other = other, one % other
+            divisor = one
+    return divisor > 1

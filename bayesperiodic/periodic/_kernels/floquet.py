@@ -45,18 +45,9 @@ def solve(matrix, right):
 def transfer_matrices(matrix, weights, first, step, gauss, sums, result):
     """Fill the transfer matrices (points, size, size) from each grid point to the next; NaN where singular.
 
-    Parameters
-    ----------
-    matrix : array (points, size, size)
-        A of ẏ = A y on the grid.
-    weights : array (parts, 3, width)
-        Interpolation of A at the Gauss points of each part of a step from the grid points `first`, first + 1, ….
-    first : int
-    step : float
-        Length of a part.
-    gauss, sums : arrays (3, 3) and (3,)
-        Of the collocation.
-    result : array (points, size, size)
+    `matrix` is A of ẏ = A y on the grid. The weights (parts, 3, width) interpolate it at the Gauss points of each part
+    of a step, of length `step`, from the grid points `first`, first + 1, …; `gauss` (3, 3) and `sums` (3,) are the
+    coefficients of the collocation.
     """
     points, size, _ = matrix.shape
     stages, slopes = np.empty((STAGES, size, size)), np.empty((STAGES * size, size))
@@ -101,51 +92,27 @@ def transfer_matrices(matrix, weights, first, step, gauss, sums, result):
                     result[point, p, q] = product[p, q]
 
 
-@njit("void(complex128[::1])", **OPTIONS)
-def normalise(vector):
-    """Bring a vector to unit length."""
-    square = 0.0
-    for p in range(vector.size):
-        square += vector[p].real ** 2 + vector[p].imag ** 2
-    length = np.sqrt(square)
-    for p in range(vector.size):
-        vector[p] /= length
+@njit(f"void({CUBE}, complex128[:,::1], int64, boolean, complex128[:,::1])", **OPTIONS)
+def eigenfunction(steps, at, length, adjoint, result):
+    """Fill an eigenfunction (points, size) of unit length from its values `at` every `length`-th point.
 
-
-@njit(f"void({CUBE}, complex128[:,::1], int64, complex128[:,::1])", **OPTIONS)
-def forward_eigenfunction(steps, at, length, result):
-    """Fill an eigenfunction (points, size) of unit length from its values `at` every `length`-th point."""
+    An eigenfunction of the adjoint is filled backwards.
+    """
     points, size = result.shape
-    for k in range(points):
-        if k % length == 0:
-            for p in range(size):
+    for j in range(points):
+        k, before = ((points - j) % points, (points - j + 1) % points) if adjoint else (j, j - 1)
+        square = 0.0
+        for p in range(size):
+            if k % length == 0:
                 result[k, p] = at[k // length, p]
-        else:
-            for p in range(size):
+            else:
                 result[k, p] = 0.0
                 for q in range(size):
-                    result[k, p] += steps[k - 1, p, q] * result[k - 1, q]
-        normalise(result[k])
-
-
-@njit(f"void({CUBE}, complex128[:,::1], int64, complex128[:,::1])", **OPTIONS)
-def adjoint_eigenfunction(steps, at, length, result):
-    """Fill an eigenfunction of the adjoint (points, size) likewise, backwards."""
-    points, size = result.shape
-    for p in range(size):
-        result[0, p] = at[0, p]
-    normalise(result[0])
-    for k in range(points - 1, 0, -1):
-        after = (k + 1) % points
-        if k % length == 0:
-            for p in range(size):
-                result[k, p] = at[k // length, p]
-        else:
-            for p in range(size):
-                result[k, p] = 0.0
-                for q in range(size):
-                    result[k, p] += steps[k, q, p] * result[after, q]
-        normalise(result[k])
+                    result[k, p] += (steps[k, q, p] if adjoint else steps[before, p, q]) * result[before, q]
+            square += result[k, p].real ** 2 + result[k, p].imag ** 2
+        norm = np.sqrt(square)
+        for p in range(size):
+            result[k, p] /= norm
 
 
 @njit(f"Tuple((boolean, float64, float64))({CUBE}, float64[::1], int64, float64)", **OPTIONS)

@@ -15,17 +15,7 @@ period:
 import numpy as np
 from numba import njit, types
 
-from bayesperiodic.periodic.compiled import (
-    COUNT,
-    FACTORS,
-    FLAG,
-    GRID,
-    MATRIX,
-    MAX_SEGMENTS,
-    NUMBER,
-    PLACES,
-    VECTOR,
-)
+from bayesperiodic.periodic.compiled import *
 
 STATES, REACH, WIDTH, HALF = globals().get("SIZES", (0, 0, 0, 0))  # 0: any number, taken from the arrays
 LOWER = HALF * STATES + STATES - 1 if HALF > 0 else 0  # half-width of the folded band
@@ -94,15 +84,10 @@ def factor_narrow(flat, stop, pivots):
 
 @njit(FLAG(MATRIX, COUNT, COUNT, PLACES), **OPTIONS)
 def factor(band, lower, upper, pivots):
-    """Factor in place, P·A = L·U, the pivots kept as their inverses; return False for one that is zero or not finite.
+    """Factor in place, P·A = L·U; return False for a pivot that is zero or not finite.
 
-    Parameters
-    ----------
-    band : array (size, 2·lower + upper + 1)
-    lower, upper : int
-        Half-widths below and above the diagonal.
-    pivots : int array (size,)
-        Filled with the row exchanged with each row.
+    `lower` and `upper` are the half-widths below and above the diagonal. The pivots are kept as their inverses;
+    `pivots` (size,) is filled with the row exchanged with each row.
     """
     flat = band.reshape(band.size)
     size, one, below, above = np.uint64(band.shape[0]), np.uint64(1), np.uint64(lower), np.uint64(upper)
@@ -250,16 +235,10 @@ def invert(matrix, inverse, size):
 def condense_segments(columns, grid, frequency, amplitude, factors):
     """Express every point by the start points of its segment; return False if the march grows or is singular.
 
-    Parameters
-    ----------
-    columns : array (points, states·(1 + 3·states))
-    amplitude : array (states,)
-        Units in which growth is judged.
-    factors : Factors
-        Of these are filled the coefficients of the newest point of each equation: `inverses` (points, states, states),
-        of the right-hand side; `gains` (points, reach, states, states), of the points before it; `transfer` (states,
-        reach·states, points), of the start points, the latest first. Then `ends` (1 + MAX_SEGMENTS,), the number of
-        segments and the last point of each.
+    Growth is relative to `amplitude` (states,). Filled are the coefficients of the newest point of each equation:
+    `inverses` (points, states, states), of the right-hand side; `gains` (points, reach, states, states), of the points
+    before it; `transfer` (states, reach·states, points), of the start points, the latest first. Then `ends`
+    (1 + MAX_SEGMENTS,), the number of segments and the last point of each.
     """
     inverses, gains, transfer, ends = factors.inverses, factors.gains, factors.transfer, factors.ends
     first, second, lead = grid.first, grid.second, grid.lead

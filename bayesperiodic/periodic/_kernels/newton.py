@@ -13,39 +13,9 @@ import numpy as np
 from numba import njit, types
 
 from bayesperiodic.models.code_generation import grid_function_at
-from bayesperiodic.periodic.compiled import (
-    BORDER,
-    CONVERGED,
-    COUNT,
-    CUBE,
-    FLAG,
-    FUNCTIONS,
-    GRID,
-    MATRIX,
-    MAX_ITERATIONS,
-    NOT_FINITE,
-    NUMBER,
-    SAME,
-    SETTING,
-    SINGULAR,
-    STALLED,
-    STEP_TOLERANCE,
-    UNKNOWNS,
-    VECTOR,
-    WORKSPACE,
-    Setting,
-)
 
 if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
-    from bayesperiodic.periodic._kernels.border import bordered_step, fill_setting
-    from bayesperiodic.periodic._kernels.linear import (
-        OPTIONS,
-        STATES,
-        WIDTH,
-        back_substitute,
-        copy,
-        factorise,
-    )
+    from bayesperiodic.periodic._kernels.border import *
 
 BORDERED = globals().get("BORDERED", True)
 CHORD_RATE = 0.2
@@ -185,31 +155,14 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     """Solve g(z, values) = 0 and the conditions of the unknowns in place; return status, iterations and orientation.
 
     An iteration ends the search when its step, or the next step expected from the observed rate, is below
-    `STEP_TOLERANCE`, or when the residual is at rounding level.
+    `STEP_TOLERANCE`, or when the residual is at rounding level. The orientation is the sign of the determinant of the
+    bordered matrix at the last but one iterate, 0 without a border.
 
-    Parameters
-    ----------
-    functions : Functions
-    grid : Grid
-    setting : Setting
-        At values of zero, except for the frequency.
-    unknowns : Unknowns
-        `values` are overwritten. There are none unless `BORDERED`; ∂g/∂z must then be regular.
-    border : Border
-        Rows and corner of the conditions.
-    halvings : int
-        The largest number of trial steps of an iteration, each half as long as the one before.
-    z : array (points, states)
-        The guess, overwritten by the periodic part of the solution.
-    history : array (MAX_ITERATIONS, 3)
-        Filled for each iteration with the scaled residual before it, the scaled full step, and the damping factor.
-    work : Workspace
-        `states` and `columns` are left at the last iterate, the factors at the last but one.
-
-    Returns
-    -------
-    int, int, float
-        The last is the sign of the determinant of the bordered matrix at the last but one iterate, 0 without a border.
+    The setting holds the arguments where the unknowns are zero, except for the frequency. The values of the unknowns
+    are overwritten; there are none unless `BORDERED`, and ∂g/∂z must then be regular. The border holds the rows and the
+    corner of the conditions. An iteration takes at most `halvings` trial steps, each half as long as the one before.
+    `history` is filled for each iteration with the scaled residual before it, the scaled full step, and the damping
+    factor. The states and columns of `work` are left at the last iterate, the factors at the last but one.
     """
     residual_jacobian, drift, factors = grid_function_at(functions.residual_jacobian), setting.drift, work.factors
     states, columns, tau = work.states, work.columns, grid.tau
