@@ -7,10 +7,8 @@ identifiable.
 """
 
 import argparse
-import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from scipy.stats import binom
@@ -41,15 +39,12 @@ def run(options: argparse.Namespace) -> None:
     found = account(lines)
     print(table(found))
     results = {"synthetic": True, "seed": options.seed, "truth": TRUE, "account": found, "campaigns": lines}
-    path = common.write_results(folder, results | {"seconds": watch.total(), "versions": common.versions()})
-    print(f"results (synthetic data): {path}")
+    common.finish(folder, results, watch, synthetic=True)
 
 
 def source() -> str:
     """Return a key that identifies the version of the campaigns."""
-    files = [Path(__file__), Path(str(rig.__file__))]
-    text = common.versions()["bayesperiodic"] + "".join(common.sha256(path) for path in files)
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
+    return common.source_key(__file__, rig.__file__)
 
 
 def campaign(task: Task) -> dict[str, Any]:

@@ -27,28 +27,37 @@ CHANNELS = ("heave", "pitch")
 CURVE = 240
 
 
-def closed(values: np.ndarray) -> np.ndarray:
+def closed(values: np.ndarray, points: int = CURVE) -> np.ndarray:
     """Return a closed curve through the samples of a cycle, by its Fourier series."""
-    curve = np.fft.irfft(np.fft.rfft(values), CURVE) * CURVE / values.size
+    curve = np.fft.irfft(np.fft.rfft(values), points) * points / values.size
     return np.append(curve, curve[0])
+
+
+def half_range(values: np.ndarray, points: int = CURVE) -> float:
+    """Return half the range of a periodic signal, between its samples too."""
+    return 0.5 * float(np.ptp(closed(values, points)))
 
 
 def sizes(outputs: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Return half the range of each channel over the cycle, in sensor units."""
-    return {channel: 0.5 * float(np.ptp(closed(outputs[channel]))) for channel in CHANNELS}
+    return {channel: half_range(outputs[channel]) for channel in CHANNELS}
+
+
+def _errors_of(orbit: bp.PeriodicSolution, e: bp.Experiment) -> dict[str, Any]:
+    measured = sizes(e.outputs)
+    return {
+        "amplitude_error": {c: v / measured[c] - 1.0 for c, v in sizes(orbit.outputs).items()},
+        "frequency_error": orbit.frequency / e.frequency - 1.0,
+    }
 
 
 def errors(fitted: Fitted, experiments: Mapping[str, bp.Experiment]) -> dict[str, Any]:
     """Return the errors of the fitted cycles, and whether their stability is correct."""
     found = {}
     for name, e in experiments.items():
-        orbit, measured = fitted.fit.solutions[name], sizes(e.outputs)
-        found[name] = {
-            "amplitude_error": {c: v / measured[c] - 1.0 for c, v in sizes(orbit.outputs).items()},
-            "frequency_error": orbit.frequency / e.frequency - 1.0,
-            "stable": orbit.stable,
-            "as_measured": orbit.stable == (not name.startswith("unstable")),
-        }
+        orbit = fitted.fit.solutions[name]
+        as_measured = orbit.stable == (kind_of(name) == "stable")
+        found[name] = _errors_of(orbit, e) | {"stable": orbit.stable, "as_measured": as_measured}
     return found
 
 
@@ -58,15 +67,9 @@ def authors_errors(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str
     found: dict[str, Any] = {}
     for name, e in experiments.items():
         try:
-            orbit = along.at(name, speeds[name])
+            found[name] = _errors_of(along.at(name, speeds[name]), e)
         except ValueError as error:
             found[name] = {"amplitude_error": None, "frequency_error": None, "why": str(error)}
-            continue
-        measured = sizes(e.outputs)
-        found[name] = {
-            "amplitude_error": {c: v / measured[c] - 1.0 for c, v in sizes(orbit.outputs).items()},
-            "frequency_error": orbit.frequency / e.frequency - 1.0,
-        }
     return found
 
 
@@ -92,27 +95,16 @@ def contraction(fits: Mapping[str, Fitted]) -> dict[str, dict[str, dict[str, flo
     table: dict[str, dict[str, dict[str, float]]] = {}
     for kind, fitted in fits.items():
         fit = fitted.fit
-        values, sds = dict(fit.theta), dict(fit.sd)
-        for name, (value, sd) in springs(fit).items():
-            values[name], sds[name] = value, sd
-        for name, value in values.items():
-            row = {"estimate": value, "sd": sds[name], "over_prior": sds[name] / prior[name]}
+        # The nonlinear stiffnesses in units of the pitch sensor, independent of its scale.
+        springs = fit.derive({name.replace(" ", "_"): text for name, text in SPRINGS.items()})[["value", "sd"]]
+        rows = {name: (value, fit.sd[name]) for name, value in fit.theta.items()}
+        rows |= dict(zip(SPRINGS, springs.itertuples(index=False, name=None), strict=True))
+        for name, (value, sd) in rows.items():
+            row = {"estimate": value, "sd": sd, "over_prior": sd / prior[name]}
             if name in fit.robust_sd:
                 row["robust_sd"] = fit.robust_sd[name]
             table.setdefault(name, {})[kind] = row
     return table
-
-
-def springs(fit: bp.MapEstimate) -> dict[str, tuple[float, float]]:
-    """Return the nonlinear stiffnesses in units of the pitch sensor, independent of the scales, with their sds."""
-    gain = fit.theta["gain_pitch"]
-    found = {}
-    for power, (name, spring) in enumerate(zip(SPRINGS, ("k_alpha2", "k_alpha3"), strict=True), 1):
-        value = fit.theta[spring] / gain**power
-        slopes = np.array([value / fit.theta[spring], -power * value / gain])
-        block = fit.covariance.loc[[spring, "gain_pitch"], [spring, "gain_pitch"]].to_numpy()
-        found[name] = value, float(np.sqrt(slopes @ block @ slopes))
-    return found
 
 
 def groups(speeds: Mapping[str, float]) -> list[list[str]]:

@@ -12,6 +12,7 @@ RIG = {
     "b": 0.15, "span": 1.0, "a": -0.5, "rho": 1.204, "x_alpha": 0.234, "m": 5.3, "m_T": 16.9, "I_alpha": 0.1726,
     "c_h": 15.443, "c_alpha": 0.562767, "k_h": 3529.4, "k_alpha": 54.1162, "k_alpha2": 751.6, "k_alpha3": 5006.0,
 }  # fmt: skip
+# One unit of the heave sensor is 18 cm, the pitch sensor reads rad; so the authors' code plots them.
 SENSORS = {"gain_heave": 1 / 0.18, "gain_pitch": 1.0, "offset_heave": 3.37, "offset_pitch": 0.71}
 
 

@@ -8,10 +8,10 @@ authors' values, by continuation, are compared with eigenvalues and with a long 
 """
 
 import argparse
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 import bayesperiodic as bp
 from studies import common
@@ -39,28 +39,142 @@ from studies.flutter.rig import (
     usable,
 )
 
+Experiments = dict[str, bp.Experiment]
+SAMPLING: dict[str, Any] = {
+    "ensembles": 2, "walkers": 20, "max_steps": 12_000, "variances": "collapsed", "progress": False,
+}  # fmt: skip
+KINDS = ("stable", "unstable")
+# Of the comparison with time integration: wind speeds [m/s]; the study's grid, and one on which the series converged.
+SPEEDS = (15.6, 16.5, 17.3)
+STATES = ("h", "alpha", "w")
+GRIDS = (SAMPLES, 2 * SAMPLES)
+CURVE = 4000
 
-def introduction(
-    data: dict[str, Any], records: list[Record], experiments: dict[str, bp.Experiment], refused: dict[str, str]
-) -> str:
-    """Return the description of the records to print."""
-    lines = [f"  {'SYNTHETIC records' if data['synthetic'] else 'measured records'} {data['path']}; {RULE}"]
-    for record in records:
-        name = record.recording.name
-        if name in experiments:
-            e = experiments[name]
-            lines.append(
-                f"  {name:17s} {record.speed:5.1f} m/s  {e.frequency:.5f} Hz ± {e.frequency_se / e.frequency:.4%}  "
-                f"{e.cycles} cycles, drift of pitch {e.drift['pitch']:+.1%}"
-            )
-    lines += [f"  left out: {why}" for why in refused.values()]
+
+def run(options: argparse.Namespace) -> None:
+    """Run the study, or the campaigns that count coverage."""
+    if options.replicates:
+        campaigns.run(options)
+        return
+    watch, draws = common.Stopwatch(), 20 if options.quick else 200
+    with watch.part("read", "reading the records and folding them without an input"):
+        records, data = read_records(options.data, options.seed)
+        experiments, refused = usable(records)
+        speeds = {r.recording.name: r.speed for r in records if r.recording.name in experiments}
+    print(f"  {'SYNTHETIC records' if data['synthetic'] else 'measured records'} {data['path']}; {RULE}")
     if data["synthetic"]:
-        lines.append(f"  the measured file was not found; it is at {ADDRESS}, sha256 {SHA256}; true values {TRUE}")
-    return "\n".join(lines)
+        print(f"  the measured file was not found; it is at {ADDRESS}, sha256 {SHA256}; true values {TRUE}")
+    results = {"data": data, "seed": options.seed, "quick": options.quick, "rule": RULE, "refused": refused}
+    results["records"] = of_records(records, experiments)
+    columns = ["wind_speed", "used", "frequency", "frequency_se", "cycles", "drift"]
+    print(pd.DataFrame(results["records"]).T.reindex(columns=columns).to_string())
+    print("\n".join(f"  left out: {why}" for why in refused.values()))
+    with watch.part("authors", "following the cycles of the authors' values from the Hopf point"):
+        results["checks"], results["authors_branch"] = against_integration(), hopf_and_fold()
+        authors = questions.authors_errors(experiments, speeds)
+    print(integration_line(results["checks"]), flush=True)
+    with watch.part("map", "estimating from all cycles"):
+        both = estimate(experiments, speeds)
+    with watch.part("parts", "estimating from stable or unstable cycles alone, and with wind speeds left out"):
+        fits, results["predictions"] = parts(experiments, speeds, both, options.quick, draws)
+    with watch.part("structure", "structural identifiability"):
+        structure = bp.structure(MODEL, fixed=[n for n in MODEL.parameters if n in RIG or n in ("U", "c_h", "c_alpha")])
+    with watch.part("known noise", "estimating with the noise's shape known"):
+        stated = with_known_noise(both, experiments, speeds)
+        fit = bp.map_estimate(stated, start=both.fit.theta, progress=False)
+    posterior = verdict = compared = None
+    if not options.quick:
+        with watch.part("sample", "sampling the posterior"):
+            posterior = bp.sample(stated, fit, seed=options.seed, **SAMPLING)
+        with watch.part("verdicts", "identifiability, and Laplace against MCMC"):
+            verdict = bp.identifiability(stated, fit, posterior, profile=False, candidates=[])
+            compared = bp.compare(stated, fit, posterior)
+    with watch.part("figures", "drawing"):
+        figures = flutter_figures.all_of(experiments, speeds, fits, fit, posterior, draws)
+        paths = common.save_figures(options.out, figures)
+
+    results |= of_fits(fits, experiments, authors) | {
+        "structure": {"text": str(structure), "free_scales": questions.FREE_SCALES},
+        "verdicts": verdict and verdict.table["verdict"].to_dict(),
+        "posterior": posterior and compared and of_draws(posterior, fit, compared),
+    }
+    print("\n".join(["", tables(results), str(structure), *(str(one) for one in (verdict, compared) if one), ""]))
+    common.finish(options.out, results, watch, paths, synthetic=data["synthetic"])
 
 
-def of_records(records: list[Record], experiments: dict[str, bp.Experiment], refused: dict[str, str]) -> dict[str, Any]:
-    """Return the description of each record, and why it is used or not."""
+def parts(
+    experiments: Experiments, speeds: dict[str, float], both: Fitted, quick: bool, draws: int
+) -> tuple[dict[str, Fitted], dict[str, Any]]:
+    """Return the fits by kind of cycle, and how cycles that were not fitted are predicted: by speed and by kind."""
+    kinds = {kind: [name for name in experiments if questions.kind_of(name) != kind] for kind in KINDS}
+    left_out = {f"{other} from {kind}": kinds[kind] for kind, other in zip(KINDS, KINDS[::-1], strict=True)}
+    for group in questions.groups(speeds)[: 1 if quick else None]:
+        label = " and ".join(sorted({f"{speeds[name]:g}" for name in group}))
+        left_out[f"without {label} m/s"] = group
+    tasks = [(experiments, speeds, dict(both.fit.theta), names, draws) for names in left_out.values()]
+    found = dict(zip(left_out, common.each(questions.leave_out, tasks), strict=True))
+    fits = dict(zip(KINDS, (fitted for fitted, _ in found.values()), strict=False)) | {"both": both}
+    return fits, {label: predicted for label, (_, predicted) in found.items()}
+
+
+def with_known_noise(both: Fitted, experiments: Experiments, speeds: dict[str, float]) -> bp.Problem:
+    """Return the problem whose noise has the shape found at the MAP point; the variances stay free."""
+    shape = {name: value for name, value in both.fit.noise.items() if not name.startswith("variance")}
+    stated = problem(both.problem.experiments, speeds, frequency_error=both.frequency_error, known=shape)
+    return stated.anchored(stated.vector(both.fit.theta), {n: both.fit.solutions[n].states for n in experiments})
+
+
+def hopf_and_fold() -> dict[str, float]:
+    """Return where the authors' values have their Hopf point and their fold."""
+    along = cycles(RIG | AUTHORS | SENSORS)
+    fold = along.branches[0].folds[0]
+    return {
+        "hopf_speed": along.hopf.value,
+        "hopf_frequency": along.hopf.frequency,
+        "fold_speed": fold.parameters["U"],
+        "fold_frequency": fold.frequency,
+    }
+
+
+def against_integration() -> dict[str, Any]:
+    """Return the Hopf point and the stable cycles by both ways, and by how much they differ, by points of the grid."""
+    by_grid = {points: cycles(RIG | AUTHORS | SENSORS, points) for points in GRIDS}
+    point, (speed, frequency) = by_grid[SAMPLES].hopf, hopf()
+    return {
+        "hopf_speed": {"continuation": point.value, "eigenvalues": speed},
+        "hopf_frequency": {"continuation": point.frequency, "eigenvalues": frequency},
+        "stable_cycles": {
+            f"{points} points": {f"{at:g} m/s": _differences(along.at("stable", at), at) for at in SPEEDS}
+            for points, along in by_grid.items()
+        },
+    }
+
+
+def _differences(orbit: bp.PeriodicSolution, speed: float) -> dict[str, float]:
+    """Return the relative differences of the frequency and of each state's amplitude from a time integration's."""
+    frequency, states = settled(speed)
+    return {"frequency": float(orbit.frequency / frequency) - 1.0} | {
+        name: questions.half_range(orbit.states[name], CURVE) / questions.half_range(own, CURVE) - 1.0
+        for name, own in zip(STATES, states, strict=True)
+    }
+
+
+def integration_line(found: dict[str, Any]) -> str:
+    """Return the text to print."""
+    speed, frequency = found["hopf_speed"], found["hopf_frequency"]
+    off = ", ".join(
+        f"{max(abs(one[name]) for one in by_speed.values() for name in STATES):.1e} with {points}"
+        for points, by_speed in found["stable_cycles"].items()
+    )
+    return (
+        f"  the authors' values: Hopf point {speed['continuation']:.4f} m/s, {frequency['continuation']:.5f} Hz "
+        f"(eigenvalues {speed['eigenvalues']:.4f}, {frequency['eigenvalues']:.5f}); amplitudes of stable cycles differ "
+        f"from time integration by at most {off}"
+    )
+
+
+def of_records(records: list[Record], experiments: Experiments) -> dict[str, Any]:
+    """Return the description of each record, and whether it is used."""
     found: dict[str, Any] = {}
     for record in records:
         name = record.recording.name
@@ -78,13 +192,12 @@ def of_records(records: list[Record], experiments: dict[str, bp.Experiment], ref
                 "scatter_of_one_cycle": dict(e.scatter),
                 "amplitude": questions.sizes(e.outputs),
             }
-    return {"rule": RULE, "refused": refused, "records": found}
+    return found
 
 
-def of_fits(fits: dict[str, Fitted], experiments: dict[str, bp.Experiment], authors: dict[str, Any]) -> dict[str, Any]:
+def of_fits(fits: dict[str, Fitted], experiments: Experiments, authors: dict[str, Any]) -> dict[str, Any]:
     """Return the results of the fits."""
-    both = fits["both"]
-    fit, found = both.fit, questions.errors(both, experiments)
+    fit, found = fits["both"].fit, questions.errors(fits["both"], experiments)
     return {
         "units": {name: MODEL.units[name] for name in fit.theta},
         "map": fit.theta,
@@ -92,7 +205,7 @@ def of_fits(fits: dict[str, Fitted], experiments: dict[str, bp.Experiment], auth
         "robust_sd": fit.robust_sd,
         "status": fit.status,
         "noise": fit.noise,
-        "frequency_error_allowed": both.frequency_error,
+        "frequency_error_allowed": fits["both"].frequency_error,
         "undetermined": list(fit.undetermined),
         "doubling_shift": fit.doubling_shift,
         "misfit": {
@@ -111,56 +224,35 @@ def of_fits(fits: dict[str, Fitted], experiments: dict[str, bp.Experiment], auth
     }
 
 
-def of_posterior(
-    structure: bp.Structure,
-    fit: bp.MapEstimate,
-    posterior: bp.Posterior | None,
-    verdict: bp.Identifiability | None,
-    compared: bp.Comparison | None,
-) -> dict[str, Any]:
-    """Return the structural identifiability, and the results of the draws."""
-    return {
-        "structure": {"text": str(structure), "free_scales": questions.FREE_SCALES},
-        "verdicts": verdict and verdict.table["verdict"].to_dict(),
-        "posterior": posterior and compared and draws_of(posterior, fit, compared),
-    }
-
-
-def draws_of(posterior: bp.Posterior, fit: bp.MapEstimate, compared: bp.Comparison) -> dict[str, Any]:
+def of_draws(posterior: bp.Posterior, fit: bp.MapEstimate, compared: bp.Comparison) -> dict[str, Any]:
     """Return the results of the draws and of the Laplace approximation."""
-    names = list(fit.theta)
+    draws = {name: posterior.draws(name) for name in fit.theta}
+    # On a ridge along which their ratio stays the correlation is 1.
+    logarithms = [np.log(draws[name].ravel()) for name in ("k_alpha2", "gain_pitch")]
     return {
         "converged": posterior.converged,
         "reason": posterior.reason,
         "failures": posterior.failures,
-        "mean": {n: float(posterior.draws(n).mean()) for n in names},
-        "sd": {n: float(posterior.draws(n).std()) for n in names},
-        "laplace_sd": {n: fit.sd[n] for n in names},
-        "correlation_of_logarithms": _correlation(posterior, "k_alpha2", "gain_pitch"),
+        "mean": {n: float(values.mean()) for n, values in draws.items()},
+        "sd": {n: float(values.std()) for n, values in draws.items()},
+        "laplace_sd": dict(fit.sd),
+        "correlation_of_logarithms": float(np.corrcoef(logarithms)[0, 1]),
         "laplace_verdicts": compared.table["verdict"].to_dict(),
     }
 
 
-def _correlation(posterior: bp.Posterior, one: str, other: str) -> float:
-    """Return the correlation of two parameters' logarithms: that of a ridge on which their ratio stays is 1."""
-    return float(np.corrcoef(*(np.log(posterior.draws(name).ravel()) for name in (one, other)))[0, 1])
-
-
 def tables(results: dict[str, Any]) -> str:
-    """Return the tables to print, with their interpretation."""
+    """Return the tables to print."""
     kind = "SYNTHETIC data" if results["data"]["synthetic"] else "measured data"
     lines = [f"Flutter rig, {kind}: errors of amplitudes (heave, pitch) and of the frequency", ""]
-    for name, one in results["errors"].items():
-        theirs = results["authors_errors"][name]
-        lines.append(
-            f"  {name:17s} fitted {_per_cent(one)}    authors' values "
-            + (_per_cent(theirs) if theirs["amplitude_error"] else "no cycle")
-        )
-    misfit = results["misfit"]
+    for name, fitted in results["errors"].items():
+        own, theirs = (_per_cent(one) for one in (fitted, results["authors_errors"][name]))
+        lines.append(f"  {name:17s} fitted {own}    authors' values {theirs}")
     lines.append(
         f"  rms of the amplitudes' errors {results['errors_rms']:.1%}; the authors' "
         f"{results['authors_errors_rms_where_a_cycle_exists']:.1%} where they have a cycle"
     )
+    misfit = results["misfit"]
     for channel, error in misfit["model_error"].items():
         lines.append(
             f"  {channel}: model error {error:.3g}, measurement noise {misfit['measurement_noise'][channel]:.3g} "
@@ -172,8 +264,8 @@ def tables(results: dict[str, Any]) -> str:
     lines += ["", "cycles that were not fitted: error, in posterior sds, in sds with the model's error"]
     for case, found in results["predictions"].items():
         for name, one in found.items():
-            errors = [_missed(c, one[c]) for c in ("heave", "pitch") if c in one]
-            lines.append(f"  {case:22s} {name:17s} " + (", ".join(errors) or "no cycle"))
+            missed = ", ".join(_missed(c, one[c]) for c in questions.CHANNELS if c in one)
+            lines.append(f"  {case:22s} {name:17s} {missed or 'no cycle'}")
     return "\n".join(lines)
 
 
@@ -185,187 +277,4 @@ def _missed(channel: str, one: dict[str, float]) -> str:
 
 def _per_cent(one: dict[str, Any]) -> str:
     size = one["amplitude_error"]
-    return f"{size['heave']:+6.1%} {size['pitch']:+6.1%} {one['frequency_error']:+6.2%}"
-
-
-SPEEDS = (15.6, 16.5, 17.3)
-STATES = ("h", "alpha", "w")
-# The study's grid, and one on which the series has converged.
-GRIDS = (SAMPLES, 2 * SAMPLES)
-CURVE = 4000
-
-
-def account() -> dict[str, Any]:
-    """Return the Hopf point and the stable cycles by both ways, and by how much they differ, by points of the grid."""
-    by_grid = {points: cycles(RIG | AUTHORS | SENSORS, points) for points in GRIDS}
-    point, (speed, frequency) = by_grid[SAMPLES].hopf, hopf()
-    return {
-        "hopf_speed": {"continuation": point.value, "eigenvalues": speed},
-        "hopf_frequency": {"continuation": point.frequency, "eigenvalues": frequency},
-        "stable_cycles": {
-            f"{points} points": {f"{at:g} m/s": _differences(along.at("stable", at), at) for at in SPEEDS}
-            for points, along in by_grid.items()
-        },
-    }
-
-
-def _differences(orbit: bp.PeriodicSolution, speed: float) -> dict[str, float]:
-    """Return the relative differences of the frequency and of each state's amplitude from a time integration's."""
-    frequency, states = settled(speed)
-    return {"frequency": float(orbit.frequency / frequency) - 1.0} | {
-        name: half_range(orbit.states[name]) / half_range(own) - 1.0 for name, own in zip(STATES, states, strict=True)
-    }
-
-
-def half_range(values: np.ndarray) -> float:
-    """Return half the range of a periodic signal, between its samples too, by its Fourier series."""
-    return 0.5 * float(np.ptp(np.fft.irfft(np.fft.rfft(values), CURVE))) * CURVE / values.size
-
-
-def line(found: Mapping[str, Any]) -> str:
-    """Return the text to print."""
-    speed, frequency = found["hopf_speed"], found["hopf_frequency"]
-    off = {
-        points: max(abs(one[name]) for one in by_speed.values() for name in STATES)
-        for points, by_speed in found["stable_cycles"].items()
-    }
-    differences = ", ".join(f"{most:.1e} with {points}" for points, most in off.items())
-    return (
-        f"  the authors' values: Hopf point {speed['continuation']:.4f} m/s, {frequency['continuation']:.5f} Hz "
-        f"(eigenvalues {speed['eigenvalues']:.4f}, {frequency['eigenvalues']:.5f}); amplitudes of stable cycles off a "
-        f"time integration's by at most {differences}"
-    )
-
-
-SAMPLING: dict[str, Any] = {
-    "ensembles": 2,
-    "walkers": 20,
-    "max_steps": 12_000,
-    "variances": "collapsed",
-    "progress": False,
-}
-KINDS = ("stable", "unstable")
-
-
-class Answers(NamedTuple):
-    """Results of the fits to the cycles."""
-
-    checks: dict[str, Any]
-    authors: dict[str, Any]
-    authors_branch: dict[str, float]
-    fits: dict[str, Fitted]
-    left_out: dict[str, Any]
-    structure: bp.Structure
-
-
-class Sampled(NamedTuple):
-    """The estimate with the noise's shape known, and the posterior, None in a quick run."""
-
-    fit: bp.MapEstimate
-    posterior: bp.Posterior | None = None
-    verdict: bp.Identifiability | None = None
-    compared: bp.Comparison | None = None
-
-
-def run(options: argparse.Namespace) -> None:
-    """Run the study, or the campaigns that count coverage."""
-    if options.replicates:
-        campaigns.run(options)
-        return
-    watch = common.Stopwatch()
-    with watch.part("read", "reading the records and folding them without an input"):
-        records, data = read_records(options.data, options.seed)
-        experiments, refused = usable(records)
-        speeds = {r.recording.name: r.speed for r in records if r.recording.name in experiments}
-    print(introduction(data, records, experiments, refused))
-    found = answers(watch, experiments, speeds, options.quick)
-    sampled = sample(watch, found.fits["both"], experiments, speeds, options)
-    with watch.part("figures", "drawing"):
-        draws = 20 if options.quick else 200
-        figures = flutter_figures.all_of(experiments, speeds, found.fits, sampled.fit, sampled.posterior, draws)
-        paths = common.save_figures(options.out, figures)
-
-    results = {"data": data, "seed": options.seed, "quick": options.quick}
-    results |= of_records(records, experiments, refused)
-    results |= of_fits(found.fits, experiments, found.authors)
-    results |= {"checks": found.checks, "authors_branch": found.authors_branch, "predictions": found.left_out}
-    results |= of_posterior(found.structure, sampled.fit, *sampled[1:])
-    results |= {"seconds": watch.total(), "versions": common.versions()}
-    print("\n" + tables(results) + f"\n{found.structure}\n{sampled.verdict or ''}")
-    print(f"{sampled.compared or ''}\n")
-    path = common.write_results(options.out, results)
-    print(f"figures{' (synthetic data)' if data['synthetic'] else ''}: {', '.join(map(str, paths))}\nresults: {path}")
-
-
-def answers(
-    watch: common.Stopwatch, experiments: dict[str, bp.Experiment], speeds: dict[str, float], quick: bool
-) -> Answers:
-    """Return the results of the fits: authors' values, all cycles, subsets, and predictions of the cycles left out."""
-    with watch.part("authors", "following the cycles of the authors' values from the Hopf point"):
-        checks = account()
-        print(line(checks), flush=True)
-        authors = questions.authors_errors(experiments, speeds)
-        branch = hopf_and_fold()
-    with watch.part("map", "estimating from all cycles"):
-        both = estimate(experiments, speeds)
-    with watch.part("parts", "estimating from stable or unstable cycles alone, and with wind speeds left out"):
-        fits, left = parts(experiments, speeds, both, quick)
-    with watch.part("structure", "asking what the equations leave open"):
-        structure = bp.structure(MODEL, fixed=[n for n in MODEL.parameters if n in RIG or n in ("U", "c_h", "c_alpha")])
-    return Answers(checks, authors, branch, fits, left, structure)
-
-
-def sample(
-    watch: common.Stopwatch,
-    both: Fitted,
-    experiments: dict[str, bp.Experiment],
-    speeds: dict[str, float],
-    options: argparse.Namespace,
-) -> Sampled:
-    """Return the estimate from all cycles with the noise's shape known and, unless the run is quick, the posterior."""
-    with watch.part("known noise", "estimating with the noise's shape known"):
-        stated = with_known_noise(both, experiments, speeds)
-        fit = bp.map_estimate(stated, start=both.fit.theta, progress=False)
-    if options.quick:
-        return Sampled(fit)
-    with watch.part("sample", "sampling the posterior"):
-        posterior = bp.sample(stated, fit, seed=options.seed, **SAMPLING)
-    with watch.part("verdicts", "asking what the data determine, and where Laplace and the draws differ"):
-        verdict = bp.identifiability(stated, fit, posterior, profile=False, candidates=[])
-        return Sampled(fit, posterior, verdict, bp.compare(stated, fit, posterior))
-
-
-def hopf_and_fold() -> dict[str, float]:
-    """Return where the authors' values have their Hopf point and their fold."""
-    along = cycles(RIG | AUTHORS | SENSORS)
-    fold = along.branches[0].folds[0]
-    return {
-        "hopf_speed": along.hopf.value,
-        "hopf_frequency": along.hopf.frequency,
-        "fold_speed": fold.parameters["U"],
-        "fold_frequency": fold.frequency,
-    }
-
-
-def parts(
-    experiments: dict[str, bp.Experiment], speeds: dict[str, float], both: Fitted, quick: bool
-) -> tuple[dict[str, Fitted], dict[str, Any]]:
-    """Return the fits by kind of cycle, and how cycles that were not fitted are predicted: by speed and by kind."""
-    kinds = {kind: [name for name in experiments if questions.kind_of(name) != kind] for kind in KINDS}
-    left_out = {f"{other} from {kind}": kinds[kind] for kind, other in zip(KINDS, KINDS[::-1], strict=True)}
-    for group in questions.groups(speeds)[: 1 if quick else None]:
-        label = " and ".join(sorted({f"{speeds[name]:g}" for name in group}))
-        left_out[f"without {label} m/s"] = group
-    draws, theta = 20 if quick else 200, dict(both.fit.theta)
-    tasks = [(experiments, speeds, theta, names, draws) for names in left_out.values()]
-    found = dict(zip(left_out, common.each(questions.leave_out, tasks), strict=True))
-    fits = dict(zip(KINDS, (fitted for fitted, _ in found.values()), strict=False)) | {"both": both}
-    return fits, {label: predicted for label, (_, predicted) in found.items()}
-
-
-def with_known_noise(both: Fitted, experiments: dict[str, bp.Experiment], speeds: dict[str, float]) -> bp.Problem:
-    """Return the problem whose noise has the shape found at the MAP point; the variances stay free."""
-    shape = {name: value for name, value in both.fit.noise.items() if not name.startswith("variance")}
-    guessed = list(both.problem.experiments)
-    stated = problem(guessed, speeds, frequency_error=both.frequency_error, known=shape)
-    return stated.anchored(stated.vector(both.fit.theta), {n: both.fit.solutions[n].states for n in experiments})
+    return f"{size['heave']:+6.1%} {size['pitch']:+6.1%} {one['frequency_error']:+6.2%}" if size else "no cycle"

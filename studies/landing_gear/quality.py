@@ -16,7 +16,7 @@ from scipy.stats import binom, norm
 
 import bayesperiodic as bp
 from studies import common
-from studies.landing_gear.identification import DISPLACEMENT, fold
+from studies.landing_gear.identification import DISPLACEMENT, estimate, fold
 from studies.landing_gear.rig import GEAR, RUNS, SAME, Changed, measure
 
 CAMPAIGN = ("0.2 Hz 80 mm", "1 Hz 36 mm", "4 Hz 8 mm")
@@ -68,37 +68,21 @@ class Unit:
 
 
 def examine(kind: str, seed: int) -> Unit:
-    """Return the estimate of one unit of a kind."""
-    fit = bp.map_estimate(problem(kind, seed), progress=False)
+    """Return the estimate of one unit of a kind; seeds differ in the noise of the instruments."""
+    experiments = [fold(measure(run, (), seed, FAULTS[kind]), DISPLACEMENT) for run in RUNS if run.name in CAMPAIGN]
+    fit = estimate(experiments, DISPLACEMENT, one_conduction=True, priors=PRIORS, fixed=FIXED, tied=TIED).fit
     return Unit(kind, dict(fit.theta), dict(fit.sd), fit.converged)
 
 
-def problem(kind: str, seed: int) -> bp.Problem:
-    """Return the problem of one unit; seeds differ in the noise of the instruments."""
-    runs = [run for run in RUNS if run.name in CAMPAIGN]
-    return bp.Problem(
-        bp.models.landing_gear(DISPLACEMENT),
-        [fold(measure(run, (), seed, FAULTS[kind]), DISPLACEMENT) for run in runs],
-        priors=PRIORS,
-        fixed=FIXED,
-        tied=TIED,
-        noise=bp.noise.Independent(per="experiment"),
-    )
-
-
 def examine_all(references: int, each: int, seed: int) -> tuple[Unit, list[Unit]]:
-    """Return the reference, measured so many times, and so many units of each kind."""
+    """Return the reference, the mean of so many measurements, and so many units of each kind."""
     tasks = [(GOOD, REFERENCE_SEED * (seed + 1) + k) for k in range(references)]
     tasks += [(kind, FIRST_UNIT * (seed + 1) + k) for k, kind in enumerate(np.repeat(list(FAULTS), each).tolist())]
     found = list(common.each(examine, tasks, here=len(tasks) <= SERIALLY))
-    return _together(found[:references]), found[references:]
-
-
-def _together(units: Sequence[Unit]) -> Unit:
-    """Return the mean of repeated measurements of one gear."""
+    units = found[:references]
     theta = {name: float(np.mean([unit.theta[name] for unit in units])) for name in PRIORS}
-    sd = {name: float(np.sqrt(np.mean([unit.sd[name] ** 2 for unit in units]) / len(units))) for name in PRIORS}
-    return Unit(GOOD, theta, sd, all(unit.converged for unit in units))
+    sd = {name: float(np.sqrt(np.mean([unit.sd[name] ** 2 for unit in units]) / references)) for name in PRIORS}
+    return Unit(GOOD, theta, sd, all(unit.converged for unit in units)), found[references:]
 
 
 def deviations(reference: Unit, unit: Unit) -> dict[str, float]:

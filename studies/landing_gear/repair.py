@@ -8,15 +8,22 @@ scatter over experiments gives the standard error of the mean difference.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
 
 import bayesperiodic as bp
 from studies.common import each
-from studies.landing_gear.identification import DISPLACEMENT, FIXED, KEPT, PRIORS, TIED, fold
+from studies.landing_gear.identification import (
+    CONDUCTION,
+    DISPLACEMENT,
+    FIXED,
+    KEPT,
+    PRIORS,
+    fold,
+)
+from studies.landing_gear.identification import problem as problem_of
 from studies.landing_gear.rig import NOISE, RECORDED, RUNS, STRENGTHS, TRUTHS, damper, measure
 
 PAPER, BEST = "eq. (9)", "all four"
@@ -37,25 +44,19 @@ EFFECT_PRIORS = {
 KNOWN = {"static_load": STRENGTHS["flexure"]["static_load"]}
 FOLDS, QUICK_FOLDS = 4, 2
 SCHEME = "central4"
-CONDUCTION = "theta16"
 
 
-@dataclass(frozen=True)
-class Task:
-    """One fit.
-
-    `runs, held_out`: Names of experiments; without any held out, theta16 is each experiment's own.
-    """
+class Task(NamedTuple):
+    """One fit."""
 
     model: str
-    runs: tuple[str, ...]
-    held_out: tuple[str, ...]
+    runs: tuple[str, ...]  # Names of experiments
+    held_out: tuple[str, ...]  # Without any, theta16 is local to each experiment
     truth: str
     seed: int
 
 
-@dataclass(frozen=True)
-class Fitted:
+class Fitted(NamedTuple):
     """Results of a fit."""
 
     task: Task
@@ -95,14 +96,13 @@ def problem(task: Task, names: Sequence[str]) -> bp.Problem:
     """Return the problem of some experiments under a model."""
     model = damper(MODELS[task.model])
     recordings = [measure(run, TRUTHS[task.truth], task.seed) for run in RUNS if run.name in names]
-    return bp.Problem(
-        model,
+    return problem_of(
         [fold(recording, DISPLACEMENT) for recording in recordings],
+        DISPLACEMENT,
+        one_conduction=bool(task.held_out),
+        model=model,
         priors=PRIORS | {name: prior for name, prior in EFFECT_PRIORS.items() if name in model.parameters},
         fixed=FIXED | {name: value for name, value in KNOWN.items() if name in model.parameters},
-        tied=TIED,
-        local=[] if task.held_out else [CONDUCTION],
-        noise=bp.noise.Independent(per="experiment"),
         scheme=SCHEME,
     )
 
@@ -124,15 +124,13 @@ def score(one: bp.Problem, theta: Mapping[str, float]) -> tuple[float, dict[str,
 
 def account(fits: Sequence[Fitted]) -> dict[str, Any]:
     """Return the entries of results.json: scores by model, differences from eq. (9), theta16 with all experiments."""
-    kept = {channel: 2 * KEPT[DISPLACEMENT][channel] + 1 for channel in ("force", "pressure")}
-    noise = {channel: NOISE[channel] * float(np.sqrt(count / RECORDED)) for channel, count in kept.items()}
+    noise = {c: NOISE[c] * float(np.sqrt((2 * KEPT[DISPLACEMENT][c] + 1) / RECORDED)) for c in ("force", "pressure")}
     found: dict[str, Any] = {"noise_of_the_mean": noise, "models": {}, "theta16": {}}
-    of_paper = _scores(fits, PAPER)
-    done = {one.task.model for one in fits}
-    for model in (name for name in MODELS if name in done):
-        held_out = [one for one in fits if one.task.model == model and one.task.held_out]
-        scores = _scores(fits, model)
-        gain = np.array([scores[name] - of_paper[name] for name in of_paper])
+    by_model = {model: [one for one in fits if one.task.model == model] for model in MODELS}
+    every = {m: {name: v for one in own for name, v in one.scores.items()} for m, own in by_model.items() if own}
+    for model, scores in every.items():
+        held_out = [one for one in by_model[model] if one.task.held_out]
+        gain = np.array([scores[name] - value for name, value in every[PAPER].items()])
         errors = {name: by_channel for one in held_out for name, by_channel in one.errors.items()}
         found["models"][model] = {
             "effects": sorted(MODELS[model]),
@@ -141,25 +139,17 @@ def account(fits: Sequence[Fitted]) -> dict[str, Any]:
             "gain_over_eq_9": [float(gain.mean()), float(gain.std(ddof=1) / np.sqrt(gain.size))],
             "errors_held_out": errors,
             "experiments_predicted_better": int(np.sum(gain > 0.0)),
-            "rms_error": {
-                channel: float(np.sqrt(np.mean([e[channel] ** 2 for e in errors.values()])))
-                for channel in next(iter(errors.values()))
-            },
+            "rms_error": {c: float(np.sqrt(np.mean([e[c] ** 2 for e in errors.values()]))) for c in noise},
         }
-    for one in sorted(fits, key=lambda one: list(MODELS).index(one.task.model)):
-        if not one.task.held_out:
+        for one in (one for one in by_model[model] if not one.task.held_out):
             names = [name for name in one.theta if name.startswith(CONDUCTION)]
-            found["theta16"][one.task.model] = {
+            found["theta16"][model] = {
                 "status": one.status,
                 "estimates": {name: [one.theta[name], one.sd[name]] for name in names},
                 "p_negative_laplace": {name: float(ndtr(-one.theta[name] / one.sd[name])) for name in names},
                 "others": {n: [v, one.sd[n]] for n, v in one.theta.items() if n not in names},
             }
     return found
-
-
-def _scores(fits: Sequence[Fitted], model: str) -> dict[str, float]:
-    return {name: value for one in fits if one.task.model == model for name, value in one.scores.items()}
 
 
 def table(found: Mapping[str, Any]) -> str:

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 import bayesperiodic as bp
@@ -53,7 +52,8 @@ class Identified:
 
 def identify(orbits: bp.Orbits, *, which: Sequence[str] = tuple(FREE)) -> Identified:
     """Estimate m and l from measured orbits and the paper's start, polish all orbits there, select, estimate again."""
-    first, lost = _first_estimate([orbit for orbit in orbits if not orbit.equilibrium and _moderate(orbit)])
+    moderate = [orbit for orbit in orbits if abs(orbit.eigenvalues[0]) < LARGEST and orbit.quality >= 1e-3]
+    first, lost = _first_estimate([orbit for orbit in moderate if not orbit.equilibrium])
     values = TRUTH | first.theta
     doubt = {name: 3.0 * first.sd[name] for name in first.theta}
     polished = bp.polish_orbits(bp.models.pendulum, orbits, values, parameter_sd=doubt, samples=SAMPLES, scheme=SCHEME)
@@ -91,15 +91,8 @@ def _short(orbits: bp.Orbits) -> bp.Orbits:
 
 
 def _fit(problem: bp.Problem) -> bp.MapEstimate:
-    return bp.map_estimate(problem, start={n: _start(n) for n in problem.names}, progress=False)
-
-
-def _start(name: str) -> float:
-    return START[name] if name in START else float(PRIORS[name].quantile(0.5))
-
-
-def _moderate(orbit: bp.Orbit) -> bool:
-    return bool(abs(orbit.eigenvalues[0]) < LARGEST and orbit.quality >= 1e-3)
+    start = {name: float(prior.quantile(0.5)) for name, prior in PRIORS.items()} | START
+    return bp.map_estimate(problem, start={name: start[name] for name in problem.names}, progress=False)
 
 
 def _first_estimate(orbits: Sequence[bp.Orbit]) -> tuple[bp.MapEstimate, list[tuple[str, str]]]:
@@ -180,16 +173,10 @@ def sample(identified: Identified, seed: int, quick: bool) -> Ridge:
     )
 
 
-def combination_draws(posterior: bp.Posterior) -> dict[str, np.ndarray]:
-    """Return the draws of the identifiable combinations."""
-    mass, length, *torques = (posterior.draws(name) for name in NATURAL)
-    return {"l": length} | {f"c{i}": torque / (mass * length**2) for i, torque in enumerate(torques, 1)}
-
-
-def truths() -> dict[str, float]:
-    """Return the true values of the identifiable combinations."""
-    inertia = TRUTH["m"] * TRUTH["l"] ** 2
-    return {"l": TRUTH["l"]} | {f"c{i}": TRUTH[f"k{i}"] / inertia for i in (1, 2, 3)}
+def combinations(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the identifiable combinations of values or draws of the parameters."""
+    inertia = values["m"] * values["l"] ** 2
+    return {"l": values["l"]} | {f"c{i}": values[f"k{i}"] / inertia for i in (1, 2, 3)}
 
 
 def collect(ridge: Ridge) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -15,8 +16,7 @@ from studies.pendulum.estimates import (
     PAPER_ERRORS,
     Identified,
     Ridge,
-    combination_draws,
-    truths,
+    combinations,
 )
 from studies.pendulum.recording import TRUTH, UNITS
 
@@ -46,18 +46,16 @@ def figures(
 
 def marginals(ridge: Ridge, *, truth: bool) -> Figure:
     """Draw Laplace and MCMC of the parameters above, and of the combinations that the data determine below."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(11.0, 5.4), layout="constrained")
     grid = figure.subplots(2, 5)
     for axes, name in zip(grid[0], NATURAL, strict=True):
         unit = bp.models.pendulum.units[name]
         _marginal(axes, ridge.posterior.draws(name), ridge.fit.theta[name], ridge.fit.sd[name], TRUTH[name], truth)
         axes.set_xlabel(f"{name} [{unit}]")
-    draws = combination_draws(ridge.posterior)
+    draws, truths = combinations({name: ridge.posterior.draws(name) for name in NATURAL}), combinations(TRUTH)
     for axes, name in zip(grid[1], DETERMINED, strict=False):
         value, sd = (float(ridge.combinations[column].loc[name]) for column in ("value", "laplace_sd"))
-        _marginal(axes, draws[name], value, sd, truths()[name], truth)
+        _marginal(axes, draws[name], value, sd, truths[name], truth)
         text = name if name == "l" else f"{name} = k{name[1]}/(m l²)"
         axes.set_xlabel(f"{text} [{DETERMINED_UNITS[name]}]")
     handles, labels = grid[0, 0].get_legend_handles_labels()
@@ -86,8 +84,6 @@ def _marginal(axes: Axes, draws: np.ndarray, mean: float, sd: float, true: float
 
 def eigenvalues(table: Mapping[str, Any]) -> Figure:
     """Draw the median error of the unstable eigenvalue over the period, by noise and method, and the orbits found."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(3.4 * len(table) + 0.8, 5.6), layout="constrained")
     above, below = figure.subplots(2, len(table), sharex=True, sharey="row", squeeze=False)
     for top, bottom, (noise, methods) in zip(above, below, table.items(), strict=True):
@@ -110,8 +106,6 @@ def eigenvalues(table: Mapping[str, Any]) -> Figure:
 
 def errors(lines: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw the errors of m, l and k3 over noise seeds, beside the paper's."""
-    from matplotlib import pyplot as plt
-
     noises = sorted({line["noise"] for line in lines})
     figure = plt.figure(figsize=(7.6, 4.2), layout="constrained")
     axes = figure.add_subplot()

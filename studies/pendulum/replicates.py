@@ -1,12 +1,9 @@
 """Table 1 of the paper over many recordings: errors, coverage, failures, and multipliers as data."""
 
 import argparse
-import multiprocessing
-import os
 import time
 import warnings
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,12 +27,10 @@ def run(options: argparse.Namespace) -> None:
         truths = true_orbits(options.seed)
     lines: list[dict[str, Any]] = []
     with watch.part("replicates", f"{options.replicates} recordings at {len(NOISE_LEVELS)} noise levels"):
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
-            tasks = [pool.submit(replicate, options.seed + 1 + k, truths) for k in range(options.replicates)]
-            for number, task in enumerate(as_completed(tasks), 1):
-                lines += task.result()
-                print(f"  {number} of {len(tasks)}", flush=True)
+        tasks = [(options.seed + 1 + number, truths) for number in range(options.replicates)]
+        for number, found in enumerate(common.each(replicate, tasks), 1):
+            lines += found
+            print(f"  {number} of {len(tasks)}", flush=True)
     lines.sort(key=lambda line: (line["noise"], line["seed"]))
     table = {f"{noise:g}": summary([line for line in lines if line["noise"] == noise]) for noise in NOISE_LEVELS}
     print(account(table))
@@ -43,9 +38,7 @@ def run(options: argparse.Namespace) -> None:
     paths = common.save_figures(folder, {"errors": figures.errors(lines)})
     results = {"synthetic": True, "seed": options.seed, "drive_periods": PERIODS, "table": table, "replicates": lines}
     results["start_errors"], results["paper_errors"] = START_ERRORS, PAPER_ERRORS
-    results |= {"seconds": watch.total(), "versions": common.versions()}
-    path = common.write_results(folder, results)
-    print(f"figures (synthetic data): {', '.join(map(str, paths))}\nresults: {path}")
+    common.finish(folder, results, watch, paths, synthetic=True)
 
 
 def true_orbits(seed: int) -> list[Reference]:
@@ -108,15 +101,12 @@ def summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
     for name, paper in PAPER_ERRORS.items():
         size = np.abs([line["errors"][name] for line in whole])
-        covers = [line["covers"][name] for line in whole]
         found[name] = {
             "median_error": float(np.median(size)),
             "range_90": [float(q) for q in np.quantile(size, [0.05, 0.95])],
             "paper": paper,
-            "covered": pendulum_orbits.covered([0.0 if c else 9.0 for c in covers]),
-            "covered_with_eigenvalues": pendulum_orbits.covered(
-                [0.0 if line["eigenvalue_covers"][name] else 9.0 for line in whole]
-            ),
+            "covered": _covering(line["covers"][name] for line in whole),
+            "covered_with_eigenvalues": _covering(line["eigenvalue_covers"][name] for line in whole),
             "sd_with_eigenvalues_over_without": float(
                 np.median([line["eigenvalue_sd"][name] / line["sd"][name] for line in whole])
             ),
@@ -124,6 +114,10 @@ def summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for kind in ("eigenvalue", "point"):
         found[f"{kind}_bars"] = pendulum_orbits.covered([p for line in whole for p in line["pulls"][kind]])
     return found
+
+
+def _covering(intervals: Iterable[bool]) -> dict[str, float]:
+    return pendulum_orbits.covered([0.0 if covers else np.inf for covers in intervals])
 
 
 def account(table: dict[str, Any]) -> str:

@@ -7,12 +7,8 @@ recordings.
 """
 
 import argparse
-import multiprocessing
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import bayesperiodic as bp
 from studies import common
@@ -24,35 +20,26 @@ from studies.pendulum.estimates import PAPER_ERRORS, START_ERRORS, Identified
 from studies.pendulum.recording import section_of, with_noise
 
 
-@dataclass(frozen=True)
-class Found:
-    """Orbits found in one section.
-
-    `chained, boxes`: By the default method and by the paper's recipe.
-    """
+class Found(NamedTuple):
+    """Orbits found in one section."""
 
     section: bp.PoincareSection
-    chained: bp.Orbits
-    boxes: bp.Orbits
+    chained: bp.Orbits  # By the default method
+    boxes: bp.Orbits  # By the paper's recipe
 
 
 def search(recording: bp.Recording, noises: Sequence[float], seed: int, periods: Sequence[int]) -> dict[float, Found]:
     """Return the orbits found with each noise level added to the recording, as a fraction of the attractor's size."""
-    tasks = [(recording, noise, seed, tuple(periods)) for noise in dict.fromkeys(noises)]
-    if len(tasks) == 1:
-        return {noises[0]: _found(tasks[0])}
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(os.cpu_count() or 1, len(tasks)), mp_context=context) as pool:
-        # The noisiest takes longest.
-        found = dict(zip([t[1] for t in reversed(tasks)], pool.map(_found, reversed(tasks)), strict=True))
+    # The noisiest takes longest, and comes first.
+    levels = list(dict.fromkeys(noises))[::-1]
+    tasks = [(recording, noise, seed, tuple(periods)) for noise in levels]
+    found = dict(zip(levels, common.each(_found, tasks, here=len(tasks) == 1), strict=True))
     return {noise: found[noise] for noise in noises}
 
 
-def _found(task: tuple[bp.Recording, float, int, tuple[int, ...]]) -> Found:
-    recording, noise, seed, periods = task
+def _found(recording: bp.Recording, noise: float, seed: int, periods: tuple[int, ...]) -> Found:
     section = section_of(with_noise(recording, noise, seed) if noise > 0.0 else recording)
-    every = {method: bp.find_orbits(section, periods=periods, method=method) for method in ("chained", "boxes")}
-    return Found(section, every["chained"], every["boxes"])
+    return Found(section, *(bp.find_orbits(section, periods=periods, method=m) for m in orbits.METHODS))
 
 
 NOISE_LEVELS = (0.0, 0.001, 0.01)
@@ -99,9 +86,7 @@ def run(options: argparse.Namespace) -> None:
         table = results.get("eigenvalues", {})
         figures = pendulum_figures.figures(found[noise].section, identified, ridge, table)
         paths = common.save_figures(options.out, figures)
-    results |= {"seconds": watch.total(), "versions": common.versions()}
-    path = common.write_results(options.out, results)
-    print(f"figures{' (synthetic data)' if about['synthetic'] else ''}: {', '.join(map(str, paths))}\nresults: {path}")
+    common.finish(options.out, results, watch, paths, synthetic=about["synthetic"])
 
 
 def against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
@@ -122,10 +107,7 @@ def against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
             "largest_difference_from_shooting": max(truth.off for truth in truths),
         },
         "eigenvalues": {
-            f"{noise:g}": {
-                "chained": orbits.eigenvalue_table(one.chained, truths),
-                "boxes": orbits.eigenvalue_table(one.boxes, truths),
-            }
+            f"{noise:g}": {m: orbits.eigenvalue_table(getattr(one, m), truths) for m in orbits.METHODS}
             for noise, one in found.items()
         },
         "error_bars": {
