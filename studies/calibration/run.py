@@ -30,6 +30,7 @@ import numpy as np
 import bayesperiodic as bp
 from studies import common
 from studies.common import TaskPool
+from studies.gear import GEAR
 
 CYCLES = 10
 OVERCOUNT = 1.25
@@ -68,24 +69,16 @@ def landing_gear() -> bp.Problem:
         "theta6": bp.Normal(-2.3, 0.15),
         "theta16": bp.LogNormal(2.0, 0.5),
     }
-    fixed = {
-        "theta1": 80.0, "theta2": 0.0, "theta3": 8e3, "theta5": 1e6 / 293, "theta7": 0.0, "theta8": 150.0,
-        "theta9": 1e-4, "theta10": 300.0, "theta12": 0.0, "theta15": 17.0, "theta17": -293.0,
-    }  # fmt: skip
-    return bp.Problem(
-        bp.models.landing_gear("displacement"),
-        [run],
-        priors=priors,
-        fixed=fixed,
-        tied={"theta11": "-1e5*theta4"},
-        noise=bp.noise.Independent(prior=bp.LogNormal(50.0**2, 0.5)),
-        scheme="central4",
-    )
+    tied = {"theta11": "-1e5*theta4"}
+    fixed = {name: value for name, value in GEAR.items() if name not in (*priors, *tied)}
+    return _problem(bp.models.landing_gear("displacement"), run, priors, fixed, 50.0**2, tied)
 
 
-def _problem(model: bp.Model, run: bp.Experiment, priors: Any, fixed: Any, variance: float) -> bp.Problem:
+def _problem(
+    model: bp.Model, run: bp.Experiment, priors: Any, fixed: Any, variance: float, tied: Any = None
+) -> bp.Problem:
     noise = bp.noise.Independent(prior=bp.LogNormal(variance, 0.5))
-    return bp.Problem(model, [run], priors=priors, fixed=fixed, noise=noise, scheme="central4")
+    return bp.Problem(model, [run], priors=priors, fixed=fixed, tied=tied, noise=noise, scheme="central4")
 
 
 def _run(
@@ -112,11 +105,8 @@ def _run(
 
 
 CASES: dict[str, Callable[[], bp.Problem]] = {
-    "duffing": duffing,
-    "miscounted": miscounted,
-    "damper": damper,
-    "landing_gear": landing_gear,
-}
+    "duffing": duffing, "miscounted": miscounted, "damper": damper, "landing_gear": landing_gear,
+}  # fmt: skip
 DEFAULT, QUICK = 20, 5
 STRIDE = 4
 STEPS = 250
@@ -254,14 +244,13 @@ def _seconds(action: Callable[[], Any]) -> float:
 
 
 def _account(times: dict[str, list[float]], overhead: float, problem: bp.Problem) -> dict[str, Any]:
-    gains = {what: 2.0 * np.array(times[f"{what} 1"]) / np.array(times[f"{what} 2"]) for what in ("farm", "loop")}
-    ratio = gains["farm"] / gains["loop"]
+    farm, loop = (2.0 * np.array(times[f"{what} 1"]) / np.array(times[f"{what} 2"]) for what in ("farm", "loop"))
     replicate = float(np.median(times["farm 1"])) / EACH
     return {
-        "gain_of_two_workers": float(np.median(gains["farm"])),
-        "gain_of_two_plain_loops": float(np.median(gains["loop"])),
-        "ratio": float(np.median(gains["farm"]) / np.median(gains["loop"])),
-        "ratios_of_rounds": ratio.tolist(),
+        "gain_of_two_workers": float(np.median(farm)),
+        "gain_of_two_plain_loops": float(np.median(loop)),
+        "ratio": float(np.median(farm) / np.median(loop)),
+        "ratios_of_rounds": (farm / loop).tolist(),
         "seconds_a_replicate": replicate,
         "overhead_a_task_seconds": overhead,
         "problem_bytes": len(cloudpickle.dumps(problem)),

@@ -27,11 +27,9 @@ def read_steady_parts(given: Path | None, seed: int) -> tuple[tuple[bp.Recording
     """Return both measured steady parts, or generated ones of the same kind, and their description."""
     found = common.find_data(given, FILE)
     if found is None:
-        data = {"path": "generated", "sha256": None, "synthetic": True}
-        return generate(seed), data
-    path, name = found
+        return generate(seed), common.described(found)
     whole = bp.Recording.from_csv(
-        path,
+        found[0],
         sampling_rate=SAMPLING_RATE,
         inputs={"drive": "V1"},
         outputs={"response": "V2"},
@@ -40,13 +38,8 @@ def read_steady_parts(given: Path | None, seed: int) -> tuple[tuple[bp.Recording
     first, second = (
         whole.between((row - 0.5) / SAMPLING_RATE, (row + PERIODS * PERIOD - 0.5) / SAMPLING_RATE) for row in FIRST_ROWS
     )
-    return (first, second), {
-        "path": name,
-        "sha256": common.sha256(path),
-        "synthetic": False,
-        "first_rows": FIRST_ROWS,
-        "rows_each": PERIODS * PERIOD,
-    }
+    rows = {"first_rows": FIRST_ROWS, "rows_each": PERIODS * PERIOD}
+    return (first, second), common.described(found) | rows
 
 
 def generate(seed: int) -> tuple[bp.Recording, bp.Recording]:
@@ -59,13 +52,8 @@ def generate(seed: int) -> tuple[bp.Recording, bp.Recording]:
             name: np.tile(values, PERIODS) + SYNTHETIC_NOISE[name] * generator.standard_normal(PERIODS * PERIOD)
             for name, values in period.items()
         }
-        return bp.Recording(
-            np.arange(PERIODS * PERIOD) / SAMPLING_RATE,
-            {"response": noisy["response"]},
-            {"drive": noisy["drive"]},
-            name="synthetic Silverbox, Schroeder multisine",
-            synthetic=True,
-        )
+        time, drive = np.arange(PERIODS * PERIOD) / SAMPLING_RATE, {"drive": noisy.pop("drive")}
+        return bp.Recording(time, noisy, drive, name="synthetic Silverbox, Schroeder multisine", synthetic=True)
 
     return part(), part()
 
@@ -80,13 +68,9 @@ def steady_period() -> tuple[np.ndarray, np.ndarray]:
     tau = np.arange(PERIOD)[:, None] / PERIOD
     drive = SYNTHETIC_OFFSET + SYNTHETIC_AMPLITUDE * np.cos(2 * np.pi * tau * lines + phase).sum(axis=1)
     run = bp.simulate(
-        bp.models.silverbox,
-        {"w0": W0, **TRUE},
-        {"drive": drive},
-        frequency=FREQUENCY,
-        duration=2.0 / FREQUENCY,
+        bp.models.silverbox, {"w0": W0, **TRUE}, {"drive": drive}, frequency=FREQUENCY, duration=2.0 / FREQUENCY,
         sampling_rate=SAMPLING_RATE,
-    )
+    )  # fmt: skip
     return drive, run.outputs["response"][PERIOD : 2 * PERIOD]
 
 
@@ -124,13 +108,9 @@ def medians() -> dict[str, float]:
 def solve(theta: Mapping[str, float], experiment: bp.Experiment) -> bp.PeriodicSolution:
     """Return the periodic response, found from rest at full amplitude."""
     return bp.solve_periodic(
-        bp.models.silverbox,
-        {"w0": W0, **theta},
-        experiment.inputs,
-        frequency=experiment.frequency,
-        samples=experiment.samples,
-        scheme=SCHEME,
-    )
+        bp.models.silverbox, {"w0": W0, **theta}, experiment.inputs, frequency=experiment.frequency,
+        samples=experiment.samples, scheme=SCHEME,
+    )  # fmt: skip
 
 
 def spread(experiment: bp.Experiment) -> float:

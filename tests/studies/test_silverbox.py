@@ -8,7 +8,7 @@ import pytest
 import bayesperiodic as bp
 from studies import common
 from studies.__main__ import main
-from studies.silverbox import checks, data
+from studies.silverbox import data
 from studies.silverbox import run as silverbox
 
 REAL = common.find_data(None, data.FILE)
@@ -90,7 +90,7 @@ def test_error_found_by_doubling_is_that_against_time_integration(steady_period)
     time = np.arange(3 * drive.size) / data.SAMPLING_RATE
     recording = bp.Recording.from_arrays(time, {"response": np.tile(response, 3)}, {"drive": np.tile(drive, 3)})
     experiment = data.fold(recording, 4096, response=335)
-    grid = checks.discretisation(recording, experiment, data.TRUE)
+    grid = silverbox.discretisation(recording, experiment, data.TRUE)
     solution = data.solve(data.TRUE, experiment)
     true = np.sqrt(np.mean((solution.outputs["response"][::4] - response) ** 2)) / response.std()
     assert grid.fraction == pytest.approx(true, rel=0.15)
