@@ -230,10 +230,10 @@ def finish(folder: Path, results: Line, watch: Stopwatch, paths: Sequence[Path] 
     print(f"figures{kind}: {', '.join(map(str, paths))}\nresults: {path}" if paths else f"results{kind}: {path}")
 
 
-def legend_below(figure: Figure, columns: int, **options: Any) -> None:
-    """Draw one legend of all labels in a figure below its axes, without a frame."""
+def shared_legend(figure: Figure, columns: int, loc: Any = "outside lower center", **options: Any) -> None:
+    """Draw one legend of all labels in a figure, outside its axes."""
     handles: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    figure.legend(handles.values(), handles, frameon=False, ncols=columns, loc="outside lower center", **options)
+    figure.legend(handles.values(), handles, frameon=False, ncols=columns, loc=loc, **options)

@@ -7,7 +7,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from studies.common import legend_below
+from studies.common import shared_legend
 from studies.flutter.questions import CHANNELS, closed, contraction, drawn_sizes, laplace_draws, sizes
 from studies.flutter.rig import AUTHORS, RIG, SENSORS, Fitted, cycles
 
@@ -105,7 +105,7 @@ def bifurcation(
         axes.set_ylabel(f"amplitude of {channel} [sensor units]")
         axes.set_ylim(bottom=0.0)
     axes.set_xlabel("wind speed [m/s]")
-    legend_below(figure, 3, fontsize=9)
+    shared_legend(figure, 3, fontsize=9)
     figure.suptitle(f"Flutter rig{_kind(experiments)}: limit cycles")
     return figure
 
@@ -142,7 +142,7 @@ def contractions(fits: Mapping[str, Fitted], kind_of_data: str) -> Figure:
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
     axes.set_xlabel("Laplace sd over the prior's sd [1]")
-    legend_below(figure, 4)
+    shared_legend(figure, 4)
     figure.suptitle(f"Flutter rig{kind_of_data}: information on each parameter")
     return figure
 

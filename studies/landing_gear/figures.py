@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from studies.common import legend_below
+from studies.common import shared_legend
 from studies.landing_gear.drop import SHORT, Dropped
 from studies.landing_gear.identification import CONDUCTION, NEGATIVE, POSITIVE, UNDETERMINED, Identified, Verdict
 from studies.landing_gear.quality import FALSE_ALARM, LIMIT, MEANINGS, Unit, deviations
@@ -44,7 +44,7 @@ def histories(shown: Mapping[str, tuple[bp.Recording, Identified]]) -> Figure:
     figure, grid = _columns(shown, 8.5, "residual force [N]", sharex=True)
     for column, one in zip(grid.T, shown.values(), strict=True):
         _histories(column, *one)
-    legend_below(figure, 2)
+    shared_legend(figure, 2)
     experiment = next(iter(shown.values()))[0].name.replace(" Hz ", " Hz, ±")
     figure.suptitle(f"Landing gear at {experiment}, {TITLE}")
     return figure
@@ -77,7 +77,7 @@ def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict
         axes.set_title(TRUTH_NAMES[truth], fontsize=11)
     names = [f"{run.frequency:g} Hz\n±{1e3 * run.stroke:g} mm" for run in runs]
     grid[-1].set_xticks(range(len(runs)), names, fontsize=9)
-    legend_below(figure, 4, fontsize=9)
+    shared_legend(figure, 4, fontsize=9)
     figure.suptitle(
         f"Heat conduction theta16 by experiment, {drive} given, SYNTHETIC data\n"
         "(filled: model adequate, open: misspecified)"
@@ -113,7 +113,7 @@ def drops(dropped: Mapping[str, Dropped]) -> Figure:
     figure, grid = _columns(dropped, 9.0, "displacement minus\npredicted median [mm]")
     for column, found in zip(grid.T, dropped.values(), strict=True):
         _drop(column, found)
-    legend_below(figure, 3)
+    shared_legend(figure, 3)
     figure.suptitle(f"Drop test, predicted from the shaker's experiments, {TITLE}")
     return figure
 
@@ -163,7 +163,7 @@ def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
         for axes in grid if k else ():
             axes.axvline(number[members[0]] - 0.5, color="black", lw=0.6)
     grid[-1].set_xlabel("unit")
-    legend_below(figure, 2)
+    shared_legend(figure, 2)
     figure.suptitle(
         "Deviation from the reference gear, in common standard deviations [1], SYNTHETIC data\n"
         f"(grey: ±{LIMIT:.2f}, a false alarm in {FALSE_ALARM:.0%} of good units)"

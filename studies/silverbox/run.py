@@ -321,7 +321,7 @@ def estimates(choices: Mapping[str, Mapping[str, bp.MapEstimate]], truth: Mappin
         axes.ticklabel_format(axis="y", useOffset=False)
         axes.set_xlim(-0.5, len(noises) - 0.5)
         axes.set_ylabel(f"{name} [{bp.models.silverbox.units[name].replace('^2', '²')}]")
-    common.legend_below(figure, 5)
+    common.shared_legend(figure, 5)
     figure.suptitle(f"Silverbox{'' if truth is None else ', synthetic data'}: estimates by noise model")
     return figure
 

@@ -85,7 +85,9 @@ def _measured(
 
 
 def _expected(**tools: Mapping[str, str]) -> dict[str, dict[str, tuple[str, ...]]]:
-    return {tool: {name: (verdict,) for name, verdict in verdicts.items()} for tool, verdicts in tools.items()}
+    """Return one right verdict by tool and parameter; the prediction is adequate if not stated otherwise."""
+    stated = {**tools, PREDICT: tools.get(PREDICT, {"all": ADEQUATE})}
+    return {tool: {name: (verdict,) for name, verdict in verdicts.items()} for tool, verdicts in stated.items()}
 
 
 QUICKLY = {"ensembles": 2, "walkers": 32, "variances": "collapsed", "max_steps": 6000}
@@ -115,10 +117,7 @@ def product_ridge() -> Case:
     return _one_run(
         "only the product of a and b is identifiable", "a", PRODUCT, {"a": 1.0, "b": 1e4},
         {"a": bp.LogNormal(1.0, 0.7), "b": bp.LogNormal(1e4, 0.7)},
-        _expected(
-            identifiability={"a": COMBINATION, "b": COMBINATION}, compare={"a": SHAPE, "b": SHAPE},
-            predict={"all": ADEQUATE},
-        ),
+        _expected(identifiability={"a": COMBINATION, "b": COMBINATION}, compare={"a": SHAPE, "b": SHAPE}),
         {IDENTIFIABILITY: ("a", "b")}, noise=4.0,
     )  # fmt: skip
 
@@ -130,7 +129,6 @@ def sum_ridge() -> Case:
         {"a": bp.Normal(5e3, 2e3), "b": bp.Normal(5e3, 2e3)},
         _expected(
             identifiability={"a": COMBINATION, "b": COMBINATION}, compare={"a": FINE, "b": FINE}, joint={"all": FINE},
-            predict={"all": ADEQUATE},
         ),
         {IDENTIFIABILITY: ("a", "b")}, noise=4.0,
     )  # fmt: skip
@@ -144,15 +142,14 @@ ROTATION = 13.0 / (2 * np.pi)
 @cache
 def _rotations(samples: int = 100) -> tuple[bp.PeriodicSolution, ...]:
     """Return locked rotations of the pendulum, one turn a forcing period, at two frequencies."""
-    tau, found = np.arange(samples) / samples, []
-    for frequency in (ROTATION, 1.15 * ROTATION):
-        found.append(
-            bp.solve_periodic(
-                bp.models.pendulum, PENDULUM_TRUTH | PENDULUM_FIXED, frequency=frequency, samples=samples,
-                scheme="central4", winding=1, guess={"phi": 2 * np.pi * tau - 0.57},
-            )
-        )  # fmt: skip
-    return tuple(found)
+    guess = {"phi": 2 * np.pi * (np.arange(samples) / samples) - 0.57}
+    return tuple(
+        bp.solve_periodic(
+            bp.models.pendulum, PENDULUM_TRUTH | PENDULUM_FIXED, frequency=frequency, samples=samples,
+            scheme="central4", winding=1, guess=guess,
+        )
+        for frequency in (ROTATION, 1.15 * ROTATION)
+    )  # fmt: skip
 
 
 def scaling_symmetry() -> Case:
@@ -164,33 +161,21 @@ def scaling_symmetry() -> Case:
             if not true.converged:
                 raise RuntimeError(f"rotation {number}: no periodic solution ({true.status}).")
             size = true.samples
-            outputs = {
-                "angle": np.mod(true.outputs["angle"] + 0.01 * generator.standard_normal(size) + np.pi, 2 * np.pi)
-                - np.pi,
-                "rate": true.outputs["rate"] + 0.1 * generator.standard_normal(size),
-            }
-            runs.append(
-                bp.Experiment(
-                    f"rotation {number}", true.frequency, outputs, samples=size, winding=1, guess=true.states,
-                    synthetic=True,
-                )
-            )  # fmt: skip
+            angle = true.outputs["angle"] + 0.01 * generator.standard_normal(size)
+            rate = true.outputs["rate"] + 0.1 * generator.standard_normal(size)
+            outputs = {"angle": np.mod(angle + np.pi, 2 * np.pi) - np.pi, "rate": rate}
+            settings: dict[str, Any] = {"winding": 1, "guess": true.states, "synthetic": True}
+            runs.append(bp.Experiment(f"rotation {number}", true.frequency, outputs, samples=size, **settings))
         priors = {name: bp.LogNormal(value, 0.5) for name, value in PENDULUM_TRUTH.items()}
         return bp.Problem(bp.models.pendulum, runs, priors=priors, fixed=PENDULUM_FIXED, scheme="central4")
 
     return Case(
-        "pendulum: m, k1, k2, k3 may all grow by one factor",
-        PENDULUM_TRUTH,
-        problem,
-        "m",
-        _expected(
-            identifiability={name: COMBINATION for name in ("m", "k1", "k2", "k3")} | {"l": DETERMINED},
-            predict={"all": ADEQUATE},
-        ),
+        "pendulum: m, k1, k2, k3 may all grow by one factor", PENDULUM_TRUTH, problem, "m",
+        _expected(identifiability={name: COMBINATION for name in ("m", "k1", "k2", "k3")} | {"l": DETERMINED}),
         {IDENTIFIABILITY: ("m", "k1", "k2", "k3")},
         {"ensembles": 2, "variances": "collapsed", "max_steps": 12_000},
         drawless=True,
-    )
+    )  # fmt: skip
 
 
 def linear() -> Case:
@@ -201,7 +186,6 @@ def linear() -> Case:
         {"k": STIFFNESS, "c": bp.Normal(50.0, 50.0), "coulomb": bp.Normal(10.0, 20.0)},
         _expected(
             identifiability=dict.fromkeys(truth, DETERMINED), compare=dict.fromkeys(truth, FINE), joint={"all": FINE},
-            predict={"all": ADEQUATE},
         ),
         {},
     )  # fmt: skip
@@ -212,10 +196,7 @@ def sign_undetermined() -> Case:
     return _one_run(
         "a delay of the recording may be the damping", "c", DAMPED, {"k": 1e4, "c": 3.0},
         {"k": STIFFNESS, "c": bp.Normal(0.0, 100.0), "shift": bp.Normal(0.0, 1e-3)},
-        _expected(
-            identifiability={"k": DETERMINED, "c": SIGN}, compare=dict.fromkeys(("k", "c", "shift[run]"), FINE),
-            predict={"all": ADEQUATE},
-        ),
+        _expected(identifiability={"k": DETERMINED, "c": SIGN}, compare=dict.fromkeys(("k", "c", "shift[run]"), FINE)),
         {IDENTIFIABILITY: ("c",)}, delay=True,
     )  # fmt: skip
 
@@ -227,7 +208,6 @@ def prior_dominated() -> Case:
         {"k": STIFFNESS, "c": bp.Normal(20.0, 3.0)},
         _expected(
             identifiability={"k": DETERMINED, "c": PRIOR_ONLY}, compare={"k": FINE, "c": FINE}, joint={"all": FINE},
-            predict={"all": ADEQUATE},
         ),
         {IDENTIFIABILITY: ("c",)}, frequency=0.5,
     )  # fmt: skip
@@ -238,8 +218,7 @@ def truncated() -> Case:
     return _one_run(
         "the prior excludes the true value", "c", DAMPED, {"k": 1e4, "c": 24.5},
         {"k": STIFFNESS, "c": bp.Uniform(0.0, 20.0)},
-        _expected(identifiability={"k": DETERMINED, "c": PRIOR_ONLY}, predict={"all": ADEQUATE})
-        | {COMPARE: {"k": (FINE,), "c": (SHAPE, WIDE)}},
+        _expected(identifiability={"k": DETERMINED, "c": PRIOR_ONLY}) | {COMPARE: {"k": (FINE,), "c": (SHAPE, WIDE)}},
         {IDENTIFIABILITY: ("c",), COMPARE: ("c",)},
     )  # fmt: skip
 
@@ -250,7 +229,7 @@ def two_modes() -> Case:
     return _one_run(
         "two positions on the beam fit equally well", "position", BEAM, truth,
         {"position": bp.TruncatedNormal(0.4, 0.3, 0.0, 1.0)},
-        _expected(compare={"position": MODE}, joint={"all": MODE}, predict={"all": ADEQUATE}),
+        _expected(compare={"position": MODE}, joint={"all": MODE}),
         {COMPARE: ("position",)}, noise=4.0, fixed={"k": truth["k"]}, sampling={"start": "prior"},
     )  # fmt: skip
 
