@@ -13,7 +13,7 @@ import pickle
 import platform
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -237,3 +237,10 @@ def shared_legend(figure: Figure, columns: int, loc: Any = "outside lower center
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     figure.legend(handles.values(), handles, frameon=False, ncols=columns, loc=loc, **options)
+
+
+def shown(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
+    """Return named rows as a table under a title, entries of nested mappings as "outer.inner"; all columns or some."""
+    table = pd.json_normalize([dict(row) for row in rows.values()]).set_axis(list(rows))
+    table = table if columns is None else table.reindex(columns=list(columns))
+    return f"{title}\n{table.to_string(float_format='{:.4g}'.format, na_rep='-')}"

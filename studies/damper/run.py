@@ -194,7 +194,8 @@ def tables(results: dict[str, Any], fit: bp.MapEstimate, comparison: bp.Comparis
     }
     rho, widest = [c["map"]["rho"] for c in choices], max(c["laplace_sd"]["rho"] for c in choices)
     return "\n".join([
-        *lines, "", f"Estimates by number of displacement harmonics; the rule: {RULE}.",
+        *lines, "", f"Estimates by number of displacement harmonics; the rule: {RULE}:",
+        f"{results['harmonics']['displacement']} harmonics.",
         pd.DataFrame(by_choice).T.to_string(),
         f"rho runs from {min(rho):.3g} to {max(rho):.3g} 1/m over these choices, {np.ptp(rho) / widest:.1f} of its "
         "largest standard deviation: it depends on\nhow sharply the measured motion reverses, which the posterior does "

@@ -6,19 +6,7 @@ from typing import Any
 import numpy as np
 
 import bayesperiodic as bp
-from studies.flutter.rig import (
-    AUTHORS,
-    PRIORS,
-    RIG,
-    SENSORS,
-    SPREADS,
-    SPRINGS,
-    START,
-    Fitted,
-    cycles,
-    estimate,
-    problem,
-)
+from studies.flutter import rig
 
 NEAR = 0.25
 FEWEST = 3
@@ -51,7 +39,7 @@ def _errors_of(orbit: bp.PeriodicSolution, e: bp.Experiment) -> dict[str, Any]:
     }
 
 
-def errors(fitted: Fitted, experiments: Mapping[str, bp.Experiment]) -> dict[str, Any]:
+def errors(fitted: rig.Fitted, experiments: Mapping[str, bp.Experiment]) -> dict[str, Any]:
     """Return the errors of the fitted cycles, and whether their stability is correct."""
     found = {}
     for name, e in experiments.items():
@@ -63,7 +51,7 @@ def errors(fitted: Fitted, experiments: Mapping[str, bp.Experiment]) -> dict[str
 
 def authors_errors(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float]) -> dict[str, Any]:
     """Return the same for the authors' values and sensor units; None and the reason if there is no cycle."""
-    along = cycles(RIG | AUTHORS | SENSORS)
+    along = rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS)
     found: dict[str, Any] = {}
     for name, e in experiments.items():
         try:
@@ -84,21 +72,21 @@ def kind_of(name: str) -> str:
     return "unstable" if name.startswith("unstable") else "stable"
 
 
-def contraction(fits: Mapping[str, Fitted]) -> dict[str, dict[str, dict[str, float]]]:
+def contraction(fits: Mapping[str, rig.Fitted]) -> dict[str, dict[str, dict[str, float]]]:
     """Return estimate, Laplace and robust sd, and sd over the prior's sd, by parameter and data."""
     generator = np.random.default_rng(0)
-    prior = {name: float(np.std(one.sample(20_000, generator))) for name, one in PRIORS.items()}
-    gain = PRIORS["gain_pitch"].sample(20_000, generator)
-    draws = {n: PRIORS[n].sample(20_000, generator) for n in ("k_alpha2", "k_alpha3")}
+    prior = {name: float(np.std(one.sample(20_000, generator))) for name, one in rig.PRIORS.items()}
+    gain = rig.PRIORS["gain_pitch"].sample(20_000, generator)
+    draws = {n: rig.PRIORS[n].sample(20_000, generator) for n in ("k_alpha2", "k_alpha3")}
     prior["k_alpha2 at gain 1"] = float(np.std(draws["k_alpha2"] / gain))
     prior["k_alpha3 at gain 1"] = float(np.std(draws["k_alpha3"] / gain**2))
     table: dict[str, dict[str, dict[str, float]]] = {}
     for kind, fitted in fits.items():
         fit = fitted.fit
         # The nonlinear stiffnesses in units of the pitch sensor, independent of its scale.
-        springs = fit.derive({name.replace(" ", "_"): text for name, text in SPRINGS.items()})[["value", "sd"]]
+        springs = fit.derive({name.replace(" ", "_"): text for name, text in rig.SPRINGS.items()})[["value", "sd"]]
         rows = {name: (value, fit.sd[name]) for name, value in fit.theta.items()}
-        rows |= dict(zip(SPRINGS, springs.itertuples(index=False, name=None), strict=True))
+        rows |= dict(zip(rig.SPRINGS, springs.itertuples(index=False, name=None), strict=True))
         for name, (value, sd) in rows.items():
             row = {"estimate": value, "sd": sd, "over_prior": sd / prior[name]}
             if name in fit.robust_sd:
@@ -124,15 +112,15 @@ def leave_out(
     theta: dict[str, float],
     left: list[str],
     draws: int,
-) -> tuple[Fitted, dict[str, Any]]:
+) -> tuple[rig.Fitted, dict[str, Any]]:
     """Return the fit without some cycles, started at the estimate θ from all, and its predictions of them."""
     kept = {name: e for name, e in experiments.items() if name not in left}
-    fitted = estimate(kept, speeds, start=START | theta)
+    fitted = rig.estimate(kept, speeds, start=rig.START | theta)
     return fitted, predictions(fitted, experiments, speeds, left, draws)
 
 
 def predictions(
-    fitted: Fitted,
+    fitted: rig.Fitted,
     experiments: Mapping[str, bp.Experiment],
     speeds: Mapping[str, float],
     left: Sequence[str],
@@ -143,7 +131,7 @@ def predictions(
     `fitted`: Without them. `speeds`: [m/s]. `draws`: From the Laplace approximation; there are none where the MAP point
     itself has no such cycle.
     """
-    fit, along = fitted.fit, cycles(RIG | fitted.fit.theta)
+    fit, along = fitted.fit, rig.cycles(rig.RIG | fitted.fit.theta)
     every = laplace_draws(fit, draws)
     misses = [
         v / sizes(e.outputs)[c] - 1.0
@@ -178,7 +166,7 @@ def laplace_draws(fit: bp.MapEstimate, draws: int) -> dict[str, np.ndarray]:
     There the ridges of products, such as a stiffness and a sensor's scale, are straight.
     """
     values = np.array(list(fit.theta.values()))
-    positive = np.array([name in SPREADS for name in fit.theta])
+    positive = np.array([name in rig.SPREADS for name in fit.theta])
     slopes = np.where(positive, values, 1.0)
     covariance = fit.covariance.to_numpy() / np.outer(slopes, slopes)
     changes = np.random.default_rng(0).multivariate_normal(np.zeros(values.size), covariance, size=draws)
@@ -193,7 +181,7 @@ def drawn_sizes(
     like = bp.Experiment(
         "cycle", orbit.frequency, orbit.outputs, samples=orbit.samples, frequency_se=1e-3, guess=orbit.states
     )
-    stated = problem([like], {"cycle": orbit.parameters["U"]}, frequency_error=0.0, noise="independent")
+    stated = rig.problem([like], {"cycle": orbit.parameters["U"]}, frequency_error=0.0, noise="independent")
     rows = np.stack([draws[name] for name in stated.names], axis=-1)
     outputs, there = stated.anchored(theta, {"cycle": orbit.states}).outputs(rows)
     curves = {channel: outputs["cycle"][channel] for channel in CHANNELS}

@@ -15,29 +15,9 @@ import pandas as pd
 
 import bayesperiodic as bp
 from studies import common
-from studies.flutter import campaigns, questions
+from studies.flutter import campaigns, questions, rig
 from studies.flutter import figures as flutter_figures
 from studies.flutter.reference import hopf, settled
-from studies.flutter.rig import (
-    ADDRESS,
-    AUTHORS,
-    LARGEST_DRIFT,
-    MODEL,
-    RIG,
-    RULE,
-    SAMPLES,
-    SENSORS,
-    SHA256,
-    TRUE,
-    Fitted,
-    Record,
-    cycles,
-    estimate,
-    problem,
-    read_records,
-    spectral_frequency,
-    usable,
-)
 
 Experiments = dict[str, bp.Experiment]
 SAMPLING: dict[str, Any] = {
@@ -47,7 +27,7 @@ KINDS = ("stable", "unstable")
 # Of the comparison with time integration: wind speeds [m/s]; the study's grid, and one on which the series converged.
 SPEEDS = (15.6, 16.5, 17.3)
 STATES = ("h", "alpha", "w")
-GRIDS = (SAMPLES, 2 * SAMPLES)
+GRIDS = (rig.SAMPLES, 2 * rig.SAMPLES)
 CURVE = 4000
 
 
@@ -58,27 +38,27 @@ def run(options: argparse.Namespace) -> None:
         return
     watch, draws = common.Stopwatch(), 20 if options.quick else 200
     with watch.part("read", "reading the records and folding them without an input"):
-        records, data = read_records(options.data, options.seed)
-        experiments, refused = usable(records)
+        records, data = rig.read_records(options.data, options.seed)
+        experiments, refused = rig.usable(records)
         speeds = {r.recording.name: r.speed for r in records if r.recording.name in experiments}
-    print(f"  {'SYNTHETIC records' if data['synthetic'] else 'measured records'} {data['path']}; {RULE}")
+    print(f"  {'SYNTHETIC records' if data['synthetic'] else 'measured records'} {data['path']}; {rig.RULE}")
     if data["synthetic"]:
-        print(f"  the measured file was not found; it is at {ADDRESS}, sha256 {SHA256}; true values {TRUE}")
-    results = {"data": data, "seed": options.seed, "quick": options.quick, "rule": RULE, "refused": refused}
+        print(f"  the measured file was not found; it is at {rig.ADDRESS}, sha256 {rig.SHA256}; true values {rig.TRUE}")
+    results = {"data": data, "seed": options.seed, "quick": options.quick, "rule": rig.RULE, "refused": refused}
     results["records"] = of_records(records, experiments)
-    columns = ["wind_speed", "used", "frequency", "frequency_se", "cycles", "drift"]
-    print(pd.DataFrame(results["records"]).T.reindex(columns=columns).to_string())
-    print("\n".join(f"  left out: {why}" for why in refused.values()))
+    columns = ["wind_speed", "used", "frequency", "frequency_se", "cycles", "drift.pitch"]
+    print(common.shown("records", results["records"], columns), *refused.values(), sep="\n")
     with watch.part("authors", "following the cycles of the authors' values from the Hopf point"):
         results["checks"], results["authors_branch"] = against_integration(), hopf_and_fold()
         authors = questions.authors_errors(experiments, speeds)
     print(integration_line(results["checks"]), flush=True)
     with watch.part("map", "estimating from all cycles"):
-        both = estimate(experiments, speeds)
+        both = rig.estimate(experiments, speeds)
     with watch.part("parts", "estimating from stable or unstable cycles alone, and with wind speeds left out"):
         fits, results["predictions"] = parts(experiments, speeds, both, options.quick, draws)
     with watch.part("structure", "structural identifiability"):
-        structure = bp.structure(MODEL, fixed=[n for n in MODEL.parameters if n in RIG or n in ("U", "c_h", "c_alpha")])
+        known = (*rig.RIG, "U", "c_h", "c_alpha")
+        structure = bp.structure(rig.MODEL, fixed=[name for name in rig.MODEL.parameters if name in known])
     with watch.part("known noise", "estimating with the noise's shape known"):
         stated = with_known_noise(both, experiments, speeds)
         fit = bp.map_estimate(stated, start=both.fit.theta, progress=False)
@@ -103,8 +83,8 @@ def run(options: argparse.Namespace) -> None:
 
 
 def parts(
-    experiments: Experiments, speeds: dict[str, float], both: Fitted, quick: bool, draws: int
-) -> tuple[dict[str, Fitted], dict[str, Any]]:
+    experiments: Experiments, speeds: dict[str, float], both: rig.Fitted, quick: bool, draws: int
+) -> tuple[dict[str, rig.Fitted], dict[str, Any]]:
     """Return the fits by kind of cycle, and how cycles that were not fitted are predicted: by speed and by kind."""
     kinds = {kind: [name for name in experiments if questions.kind_of(name) != kind] for kind in KINDS}
     left_out = {f"{other} from {kind}": kinds[kind] for kind, other in zip(KINDS, KINDS[::-1], strict=True)}
@@ -117,16 +97,16 @@ def parts(
     return fits, {label: predicted for label, (_, predicted) in found.items()}
 
 
-def with_known_noise(both: Fitted, experiments: Experiments, speeds: dict[str, float]) -> bp.Problem:
+def with_known_noise(both: rig.Fitted, experiments: Experiments, speeds: dict[str, float]) -> bp.Problem:
     """Return the problem whose noise has the shape found at the MAP point; the variances stay free."""
     shape = {name: value for name, value in both.fit.noise.items() if not name.startswith("variance")}
-    stated = problem(both.problem.experiments, speeds, frequency_error=both.frequency_error, known=shape)
+    stated = rig.problem(both.problem.experiments, speeds, frequency_error=both.frequency_error, known=shape)
     return stated.anchored(stated.vector(both.fit.theta), {n: both.fit.solutions[n].states for n in experiments})
 
 
 def hopf_and_fold() -> dict[str, float]:
     """Return where the authors' values have their Hopf point and their fold."""
-    along = cycles(RIG | AUTHORS | SENSORS)
+    along = rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS)
     fold = along.branches[0].folds[0]
     return {
         "hopf_speed": along.hopf.value,
@@ -138,8 +118,8 @@ def hopf_and_fold() -> dict[str, float]:
 
 def against_integration() -> dict[str, Any]:
     """Return the Hopf point and the stable cycles by both ways, and by how much they differ, by points of the grid."""
-    by_grid = {points: cycles(RIG | AUTHORS | SENSORS, points) for points in GRIDS}
-    point, (speed, frequency) = by_grid[SAMPLES].hopf, hopf()
+    by_grid = {points: rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS, points) for points in GRIDS}
+    point, (speed, frequency) = by_grid[rig.SAMPLES].hopf, hopf()
     return {
         "hopf_speed": {"continuation": point.value, "eigenvalues": speed},
         "hopf_frequency": {"continuation": point.frequency, "eigenvalues": frequency},
@@ -173,7 +153,7 @@ def integration_line(found: dict[str, Any]) -> str:
     )
 
 
-def of_records(records: list[Record], experiments: Experiments) -> dict[str, Any]:
+def of_records(records: list[rig.Record], experiments: Experiments) -> dict[str, Any]:
     """Return the description of each record, and whether it is used."""
     found: dict[str, Any] = {}
     for record in records:
@@ -184,22 +164,22 @@ def of_records(records: list[Record], experiments: Experiments) -> dict[str, Any
             found[name] |= {
                 "frequency": e.frequency,
                 "frequency_se": e.frequency_se,
-                "spectral_frequency": spectral_frequency(record, e),
+                "spectral_frequency": rig.spectral_frequency(record, e),
                 "cycles": e.cycles,
                 "periodicity": e.periodicity,
                 "drift": dict(e.drift),
-                "largest_drift": LARGEST_DRIFT,
+                "largest_drift": rig.LARGEST_DRIFT,
                 "scatter_of_one_cycle": dict(e.scatter),
                 "amplitude": questions.sizes(e.outputs),
             }
     return found
 
 
-def of_fits(fits: dict[str, Fitted], experiments: Experiments, authors: dict[str, Any]) -> dict[str, Any]:
+def of_fits(fits: dict[str, rig.Fitted], experiments: Experiments, authors: dict[str, Any]) -> dict[str, Any]:
     """Return the results of the fits."""
     fit, found = fits["both"].fit, questions.errors(fits["both"], experiments)
     return {
-        "units": {name: MODEL.units[name] for name in fit.theta},
+        "units": {name: rig.MODEL.units[name] for name in fit.theta},
         "map": fit.theta,
         "sd": fit.sd,
         "robust_sd": fit.robust_sd,
@@ -244,37 +224,20 @@ def of_draws(posterior: bp.Posterior, fit: bp.MapEstimate, compared: bp.Comparis
 def tables(results: dict[str, Any]) -> str:
     """Return the tables to print."""
     kind = "SYNTHETIC data" if results["data"]["synthetic"] else "measured data"
-    lines = [f"Flutter rig, {kind}: errors of amplitudes (heave, pitch) and of the frequency", ""]
-    for name, fitted in results["errors"].items():
-        own, theirs = (_per_cent(one) for one in (fitted, results["authors_errors"][name]))
-        lines.append(f"  {name:17s} fitted {own}    authors' values {theirs}")
-    lines.append(
-        f"  rms of the amplitudes' errors {results['errors_rms']:.1%}; the authors' "
-        f"{results['authors_errors_rms_where_a_cycle_exists']:.1%} where they have a cycle"
-    )
-    misfit = results["misfit"]
-    for channel, error in misfit["model_error"].items():
-        lines.append(
-            f"  {channel}: model error {error:.3g}, measurement noise {misfit['measurement_noise'][channel]:.3g} "
-            f"(sensor units), whitened residual p = {misfit['whiteness'][channel]:.2g}"
-        )
-    lines += ["", "sd over the prior's sd by data (stable, unstable, both)"]
-    for name, by in results["contraction"].items():
-        lines.append(f"  {name:20s}" + "  ".join(f"{by[k]['estimate']:10.5g} ({by[k]['over_prior']:.3f})" for k in by))
-    lines += ["", "cycles that were not fitted: error, in posterior sds, in sds with the model's error"]
-    for case, found in results["predictions"].items():
-        for name, one in found.items():
-            missed = ", ".join(_missed(c, one[c]) for c in questions.CHANNELS if c in one)
-            lines.append(f"  {case:22s} {name:17s} {missed or 'no cycle'}")
-    return "\n".join(lines)
-
-
-def _missed(channel: str, one: dict[str, float]) -> str:
-    if "posterior_sds" not in one:
-        return f"{channel} {one['error']:+.1%} (few draws have the cycle)"
-    return f"{channel} {one['error']:+.1%} ({one['posterior_sds']:+.1f}, {one['sds_with_model_error']:+.1f})"
-
-
-def _per_cent(one: dict[str, Any]) -> str:
-    size = one["amplitude_error"]
-    return f"{size['heave']:+6.1%} {size['pitch']:+6.1%} {one['frequency_error']:+6.2%}" if size else "no cycle"
+    columns = [*(f"amplitude_error.{channel}" for channel in questions.CHANNELS), "frequency_error"]
+    missed = [f"{c}.{k}" for c in questions.CHANNELS for k in ("error", "posterior_sds", "sds_with_model_error")]
+    gained = [f"{kind}.{key}" for kind in (*KINDS, "both") for key in ("estimate", "over_prior")]
+    return "\n".join([
+        f"Flutter rig, {kind}",
+        common.shown("relative errors of the fitted cycles", results["errors"], columns),
+        common.shown("relative errors of the authors' values, - without a cycle", results["authors_errors"], columns),
+        f"rms of the amplitudes' errors {results['errors_rms']:.1%}; the authors' "
+        f"{results['authors_errors_rms_where_a_cycle_exists']:.1%} where they have a cycle",
+        "misfit by channel (sensor units; whiteness: p of the whitened residual)",
+        pd.DataFrame(results["misfit"]).to_string(float_format="{:.3g}".format),
+        common.shown("estimate, and sd over the prior's sd, by data", results["contraction"], gained),
+        *(
+            common.shown(f"cycles that were not fitted, {case}: relative error, in sds; - without a cycle", one, missed)
+            for case, one in results["predictions"].items()
+        ),
+    ])  # fmt: skip

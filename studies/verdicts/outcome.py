@@ -7,26 +7,16 @@ from typing import Any
 import pandas as pd
 
 import bayesperiodic as bp
-from studies.verdicts.cases import (
-    ADEQUATE,
-    CASES,
-    COMPARE,
-    DETERMINED,
-    FINE,
-    IDENTIFIABILITY,
-    JOINT,
-    PREDICT,
-    Case,
-)
+from studies.verdicts import cases
 
-GOOD = {IDENTIFIABILITY: DETERMINED, COMPARE: FINE, JOINT: FINE, PREDICT: ADEQUATE}
+GOOD = (cases.DETERMINED, cases.FINE, cases.ADEQUATE)
 
 
 @dataclass(frozen=True)
 class Outcome:
     """Estimate, draws and the verdicts of every tool; without draws the last three are None."""
 
-    case: Case
+    case: cases.Case
     problem: bp.Problem
     fit: bp.MapEstimate
     identifiability: bp.Identifiability
@@ -38,11 +28,11 @@ class Outcome:
     @property
     def verdicts(self) -> dict[str, dict[str, str]]:
         """By tool and parameter; "all" for those on the whole."""
-        found = {IDENTIFIABILITY: self.identifiability.verdicts}
+        found = {cases.IDENTIFIABILITY: self.identifiability.verdicts}
         if self.posterior is not None:
-            found[COMPARE] = dict(self.comparison.table["verdict"])
-            found[JOINT] = {"all": str(self.comparison.joint["verdict"])}
-            found[PREDICT] = dict(self.prediction.table["verdict"])
+            found[cases.COMPARE] = dict(self.comparison.table["verdict"])
+            found[cases.JOINT] = {"all": str(self.comparison.joint["verdict"])}
+            found[cases.PREDICT] = dict(self.prediction.table["verdict"])
         return found
 
     @property
@@ -81,7 +71,7 @@ class Outcome:
 
     def line(self) -> dict[str, Any]:
         """Return the stored results of a replicate."""
-        warned = any(verdict != GOOD[tool] for tool, rows in self.verdicts.items() for verdict in rows.values())
+        warned = any(verdict not in GOOD for rows in self.verdicts.values() for verdict in rows.values())
         return {
             "right": not self.wrong,
             "named": self.named,
@@ -101,7 +91,7 @@ class Outcome:
 
 def examine(name: str, data_seed: int, sampler_seed: int, *, drawless: bool = False) -> Outcome:
     """Return the verdicts on the data of one seed, sampled with another seed, or `drawless` from the estimate alone."""
-    start, case = time.perf_counter(), CASES[name]()
+    start, case = time.perf_counter(), cases.CASES[name]()
     problem = case.problem(data_seed)
     fit = bp.map_estimate(problem, progress=False)
     if drawless:
