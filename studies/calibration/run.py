@@ -210,7 +210,20 @@ def scaling(seed: int) -> dict[str, Any]:
                 times[f"loop {workers}"].append(_seconds(lambda w=workers: loops(w)))  # type: ignore[misc]
                 times[f"farm {workers}"].append(_seconds(lambda w=workers, n=number: farm(w, EACH, n)))  # type: ignore[misc]
         overhead = _overhead(clients[2])
-    return _account(times, overhead, problem)
+    gain, plain = (2.0 * np.array(times[f"{what} 1"]) / np.array(times[f"{what} 2"]) for what in ("farm", "loop"))
+    replicate = float(np.median(times["farm 1"])) / EACH
+    return {
+        "gain_of_two_workers": float(np.median(gain)),
+        "gain_of_two_plain_loops": float(np.median(plain)),
+        "ratio": float(np.median(gain) / np.median(plain)),
+        "ratios_of_rounds": (gain / plain).tolist(),
+        "seconds_a_replicate": replicate,
+        "overhead_a_task_seconds": overhead,
+        "problem_bytes": len(cloudpickle.dumps(problem)),
+        "rounds": ROUNDS,
+        "replicates_a_round_and_worker": EACH,
+        "workers_one_scheduler_feeds": int(replicate / overhead),
+    }
 
 
 def plain_loop(count: int) -> int:
@@ -241,20 +254,3 @@ def _seconds(action: Callable[[], Any]) -> float:
     before = time.perf_counter()
     action()
     return time.perf_counter() - before
-
-
-def _account(times: dict[str, list[float]], overhead: float, problem: bp.Problem) -> dict[str, Any]:
-    farm, loop = (2.0 * np.array(times[f"{what} 1"]) / np.array(times[f"{what} 2"]) for what in ("farm", "loop"))
-    replicate = float(np.median(times["farm 1"])) / EACH
-    return {
-        "gain_of_two_workers": float(np.median(farm)),
-        "gain_of_two_plain_loops": float(np.median(loop)),
-        "ratio": float(np.median(farm) / np.median(loop)),
-        "ratios_of_rounds": (farm / loop).tolist(),
-        "seconds_a_replicate": replicate,
-        "overhead_a_task_seconds": overhead,
-        "problem_bytes": len(cloudpickle.dumps(problem)),
-        "rounds": ROUNDS,
-        "replicates_a_round_and_worker": EACH,
-        "workers_one_scheduler_feeds": int(replicate / overhead),
-    }

@@ -1,6 +1,6 @@
 """Analysis of the flutter fits: gain from unstable cycles, predicted cycles, size of the misfit."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -113,32 +113,16 @@ def leave_out(
     left: list[str],
     draws: int,
 ) -> tuple[rig.Fitted, dict[str, Any]]:
-    """Return the fit without some cycles, started at the estimate θ from all, and its predictions of them."""
+    """Return the fit without some cycles, started at the estimate θ from all, and the errors of its predictions.
+
+    Errors are relative, in sds of draws of the Laplace approximation, and in sds with the model's error. There are no
+    draws where the MAP point itself has no such cycle.
+    """
     kept = {name: e for name, e in experiments.items() if name not in left}
     fitted = rig.estimate(kept, speeds, start=rig.START | theta)
-    return fitted, predictions(fitted, experiments, speeds, left, draws)
-
-
-def predictions(
-    fitted: rig.Fitted,
-    experiments: Mapping[str, bp.Experiment],
-    speeds: Mapping[str, float],
-    left: Sequence[str],
-    draws: int,
-) -> dict[str, Any]:
-    """Return the errors of cycles that were not fitted: in per cent, in posterior sds, and with the model's error.
-
-    `fitted`: Without them. `speeds`: [m/s]. `draws`: From the Laplace approximation; there are none where the MAP point
-    itself has no such cycle.
-    """
     fit, along = fitted.fit, rig.cycles(rig.RIG | fitted.fit.theta)
     every = laplace_draws(fit, draws)
-    misses = [
-        v / sizes(e.outputs)[c] - 1.0
-        for e in fitted.problem.experiments
-        for c, v in sizes(fit.solutions[e.name].outputs).items()
-    ]
-    model = float(np.sqrt(np.mean(np.square(misses))))
+    model = mean_size({e.name: _errors_of(fit.solutions[e.name], e) for e in fitted.problem.experiments}) or 0.0
     found: dict[str, Any] = {}
     for name in left:
         try:
@@ -157,7 +141,7 @@ def predictions(
                 sd = float(np.std(drawn[channel][there]))
                 with_model = float(np.hypot(sd, model * size))
                 found[name][channel] |= {"posterior_sds": off / sd, "sds_with_model_error": off / with_model}
-    return found
+    return fitted, found
 
 
 def laplace_draws(fit: bp.MapEstimate, draws: int) -> dict[str, np.ndarray]:

@@ -16,16 +16,7 @@ import bayesperiodic as bp
 from studies import common
 from studies.common import resumed
 from studies.landing_gear import identification, rig
-from studies.landing_gear.identification import (
-    CONDUCTION,
-    DISPLACEMENT,
-    NEGATIVE,
-    PRIORS,
-    Identified,
-    estimate,
-    fold,
-    judge,
-)
+from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, PRIORS, fold
 from studies.landing_gear.rig import GEAR, RUNS, TRUTHS, Run, measure
 
 FILE = "campaigns.jsonl"
@@ -58,10 +49,10 @@ def campaign(task: Task) -> dict[str, Any]:
 
 
 def _examine(run: Run, truth: str, seed: int) -> dict[str, Any]:
-    fitted = estimate([fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)], DISPLACEMENT)
+    fitted = identification.estimate([fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)], DISPLACEMENT)
     stated, fit = fitted.problem, fitted.fit
     posterior = bp.sample(stated, fit, seed=seed, **SAMPLING)
-    verdict = judge(Identified(stated, fit, posterior))
+    verdict = identification.judge(identification.Identified(stated, fit, posterior))
     ends = [0.5 - LEVEL / 2, 0.5 + LEVEL / 2]
     mcmc = {name: np.quantile(posterior.draws(name), ends) for name in stated.names}
     return {
@@ -94,7 +85,7 @@ def account(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             run: {name: float(np.median([one["sd"][name] for one in own])) for name in PRIORS}
             for run, own in by_run.items()
         },
-        "called_negative": sum(one["sign"] == NEGATIVE for one in every),
+        "called_negative": sum(one["sign"] == identification.NEGATIVE for one in every),
         "called_misspecified": sum(one["misspecified"] for one in every),
         "map_not_converged": sum(not one["map_converged"] for one in every),
         "stop_rule_passed": sum(one["stop_rule"] for one in every),

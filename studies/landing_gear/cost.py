@@ -21,6 +21,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
+from studies import common
 from studies.benchmark.equations import table as input_table
 from studies.benchmark.kernels import MAX_CYCLES
 from studies.gear import gear_at_rest
@@ -345,7 +346,7 @@ def _ratios(times: Mapping[str, np.ndarray], scipy: Mapping[str, float | None]) 
 
 
 def table(drive: str, found: Mapping[str, Any]) -> str:
-    """Return the text to print."""
+    """Return the times to print."""
     left_out = found["left_out"]
     lines = [
         f"  {drive} given: {left_out['not_positive']} of {left_out['draws']} draws excluded without a steady state, "
@@ -353,12 +354,10 @@ def table(drive: str, found: Mapping[str, Any]) -> str:
     ]
     for scheme, one in found["schemes"].items():
         worst = max(entry["error"] for entry in one["experiments"].values())
-        lines.append(
-            f"    {scheme}, error at most {worst:.0e} of the range: {one['milliseconds'][WARM]['median']:.2f} ms a "
-            "log-posterior of all experiments"
+        title = (
+            f"{scheme}, error at most {worst:.0e} of the range: {one['milliseconds'][WARM]['median']:.2f} ms a "
+            "log-posterior of all experiments, and ratios of times"
         )
-        for name, ratio in one["ratios"].items():
-            lines.append(f"      {name}: {ratio['median']:.1f} ({ratio['least']:.1f} … {ratio['largest']:.1f})")
-        for method, milliseconds in one["scipy_milliseconds"].items():
-            lines += [] if milliseconds else [f"      {method}: not as accurate at any tolerance"]
+        inaccurate = [f"{m}: not as accurate at any tolerance" for m, ms in one["scipy_milliseconds"].items() if not ms]
+        lines += [common.shown(title, one["ratios"]), *inaccurate]
     return "\n".join(lines)

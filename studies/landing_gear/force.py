@@ -21,24 +21,8 @@ import numpy as np
 from scipy.stats import chi2
 
 import bayesperiodic as bp
-from studies.landing_gear.identification import (
-    CONDUCTION,
-    DISPLACEMENT,
-    DRIVES,
-    ENSEMBLES,
-    FALSE_ALARM,
-    FIXED,
-    FORCE,
-    KEPT,
-    SAMPLES,
-    Identified,
-    Verdict,
-    draw,
-    drawn,
-    estimate,
-    fold,
-    identifiability,
-)
+from studies.landing_gear import identification
+from studies.landing_gear.identification import DISPLACEMENT, FORCE, KEPT, SAMPLES, Identified, Verdict, estimate, fold
 from studies.landing_gear.rig import GEAR, Run, imposed
 
 SLOPES = (30.0, 100.0, 300.0, 1000.0, 3000.0)
@@ -65,7 +49,7 @@ def solve(run: Run, slope: float, drive: str) -> tuple[bp.PeriodicSolution, bool
 def slope_account(runs: Sequence[Run]) -> dict[str, Any]:
     """Return by direction and slope how the solves of all experiments ended, and how many warned."""
     result: dict[str, Any] = {}
-    for drive in DRIVES:
+    for drive in identification.DRIVES:
         result[drive] = {}
         for slope in SLOPES:
             every = [solve(run, slope, drive) for run in runs]
@@ -103,17 +87,17 @@ def judge(recording: bp.Recording, seed: int, quick: bool) -> tuple[Identified, 
         for _ in range(ROUNDS):
             experiment = with_noise_of_the_input(exact.problem.experiments[0], found.fit.theta)
             found = estimate([experiment], FORCE, **SETTINGS)
-    identified = draw(found, seed, quick=quick)
+    identified = identification.draw(found, seed, quick=quick)
     # p-value of residuals as large as these, if the covariance is right: χ² of n − l values, eq. (7).
     free = identified.problem.counted - len(identified.problem.names)
     p = float(chi2.sf(identified.fit.noise["scale"] * free, free))
-    return exact, Verdict(identified, identifiability(identified), p < FALSE_ALARM, p)
+    return exact, Verdict(identified, identification.identifiability(identified), p < identification.FALSE_ALARM, p)
 
 
 def with_noise_of_the_input(experiment: bp.Experiment, theta: Mapping[str, float]) -> bp.Experiment:
     """Return the experiment at points over the period, with the covariance at θ of all that was measured."""
     model, force = bp.models.landing_gear(FORCE), experiment.inputs[FORCE]
-    parameters = FIXED | dict(theta) | {"theta11": -1e5 * theta["theta4"]}
+    parameters = identification.FIXED | dict(theta) | {"theta11": -1e5 * theta["theta4"]}
     at = np.arange(SAMPLES) % (SAMPLES // POINTS) == 0
 
     def moved(change: np.ndarray | float, guess: str | Mapping[str, np.ndarray]) -> bp.PeriodicSolution:
@@ -163,14 +147,14 @@ def given_force(forced: Mapping[str, Verdict], seed: int, *, quick: bool) -> Ide
     if len(experiments) < 2:
         return None
     found = estimate(experiments, FORCE, **SETTINGS)
-    return draw(found, seed, quick=quick, max_steps=STEPS_WITH_FORCE, executor=ENSEMBLES)
+    return identification.draw(found, seed, quick=quick, max_steps=STEPS_WITH_FORCE, executor=identification.ENSEMBLES)
 
 
 def account(identified: Identified) -> dict[str, Any]:
     """Return the entries of results.json on a joint fit."""
     posterior = identified.posterior
-    local = [name for name in identified.problem.names if name.startswith(CONDUCTION)]
-    return drawn(identified, "ess", "rhat") | {
+    local = [name for name in identified.problem.names if name.startswith(identification.CONDUCTION)]
+    return identification.drawn(identified, "ess", "rhat") | {
         "p_negative": {name: float((posterior.draws(name) < 0.0).mean()) for name in local},
         "reason": posterior.reason,
     }

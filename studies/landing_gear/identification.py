@@ -11,7 +11,7 @@ gas and its heat capacity as after filling by a manometer. theta2, theta7 and th
 
 import time
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -108,7 +108,7 @@ def jointly(recordings: Iterable[bp.Recording], seed: int, *, quick: bool, one_c
     return draw(found, seed, quick=quick, executor=ENSEMBLES)
 
 
-POSITIVE, NEGATIVE, UNDETERMINED = "positive", "negative", "undetermined"
+SIGNS = POSITIVE, UNDETERMINED, NEGATIVE = "positive", "undetermined", "negative"
 ONE_SIGN, MONTE_CARLO_ERRORS = 0.975, 3.0
 FALSE_ALARM = 0.01
 
@@ -146,6 +146,11 @@ def judge(identified: Identified) -> Verdict:
     """Return the verdict on an experiment whose posterior was sampled."""
     found, table = identifiability(identified), bp.predict(identified.problem, identified.posterior).table
     return Verdict(identified, found, str(table["verdict"]["all"]) == "misspecified", float(table["p"]["all"]))
+
+
+def judge_recording(recording: bp.Recording, seed: int, quick: bool) -> Verdict:
+    """Return the verdict on one experiment with the displacement given."""
+    return judge(draw(estimate([fold(recording, DISPLACEMENT)], DISPLACEMENT), seed, quick=quick))
 
 
 def laplace(identified: Identified) -> dict[str, Any]:
@@ -246,15 +251,3 @@ def with_others_free(run: Run, truth: str, seed: int, quick: bool) -> dict[str, 
         "ess": float(posterior.summary()["ess"][CONDUCTION]),
         "stop_rule": posterior.converged,
     }
-
-
-def table(found: Mapping[str, Mapping[str, Any]], fixed: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the text to print, with the posteriors at fixed other parameters."""
-    lines = ["  the other parameters under priors: theta16 [W/K] and P(< 0), beside those with the others fixed"]
-    for name, one in found.items():
-        other = fixed[name]["posterior"][CONDUCTION]
-        lines.append(
-            f"    {name:>14s}: {one['mean']:8.3f} ± {one['sd']:.3f}, {one['p_negative']:.3f}; fixed "
-            f"{other['mean']:8.3f} ± {other['sd']:.3f}, {fixed[name]['p_negative']:.3f}"
-        )
-    return "\n".join(lines)

@@ -46,9 +46,6 @@ FAULTS: dict[str, Changed] = {
         {"theta5": GEAR["theta5"] / (1 + LOST_OIL), "theta6": GEAR["theta6"] / (1 + LOST_OIL)}.items()
     ),
 }
-TOUCHED = {
-    GOOD: set[str](), "low gas charge": {"theta5"}, "worn friction": {"theta8"}, "leaking oil": {"theta5", "theta6"},
-}  # fmt: skip
 FALSE_ALARM = 0.01
 LIMIT = float(norm.isf(0.5 * FALSE_ALARM / len(PRIORS)))
 POWER = 0.9
@@ -107,7 +104,7 @@ def account(reference: Unit, units: Sequence[Unit]) -> dict[str, Any]:
     for kind in FAULTS:
         every = [deviations(reference, unit) for unit in units if unit.kind == kind]
         different = {name: sum(abs(z[name]) > LIMIT for z in every) for name in PRIORS}
-        touched = TOUCHED[kind]
+        touched = {name for name, _ in FAULTS[kind]}
         flagged = sum(any(abs(v) > LIMIT for v in z.values()) for z in every)
         right = sum(all((abs(z[n]) > LIMIT) == (n in touched) for n in PRIORS) for z in every)
         found["kinds"][kind] = {
@@ -130,11 +127,7 @@ def _rate(wrong: int, count: int) -> dict[str, Any]:
 
 
 def table(found: Mapping[str, Any]) -> str:
-    """Return the counts as lines to print."""
-    lines = [f"  quality control: units that differ by more than {found['limit']:.2f} standard deviations, in"]
-    names = "".join(f"{MEANINGS[name]:>17s}" for name in PRIORS)
-    lines.append(f"  {'kind of unit':16s}{'units':>6s}{'any':>5s}{names}")
-    for kind, one in found["kinds"].items():
-        counts = "".join(f"{count:17d}" for count in one["called_different"].values())
-        lines.append(f"  {kind:16s}{one['units']:6d}{one['units_with_any']:5d}{counts}")
-    return "\n".join(lines)
+    """Return the counts to print."""
+    title = f"quality control: units that differ by more than {found['limit']:.2f} standard deviations, by kind of unit"
+    different = [f"called_different.{name}" for name in PRIORS]
+    return common.shown(title, found["kinds"], ["units", "units_with_any", *different])

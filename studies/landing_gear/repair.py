@@ -14,16 +14,9 @@ import numpy as np
 from scipy.special import ndtr
 
 import bayesperiodic as bp
-from studies.common import each
-from studies.landing_gear.identification import (
-    CONDUCTION,
-    DISPLACEMENT,
-    FIXED,
-    KEPT,
-    PRIORS,
-    fold,
-)
-from studies.landing_gear.identification import problem as problem_of
+from studies import common
+from studies.landing_gear import identification
+from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, fold
 from studies.landing_gear.rig import NOISE, RECORDED, RUNS, STRENGTHS, TRUTHS, damper, measure
 
 PAPER, BEST = "eq. (9)", "all four"
@@ -80,7 +73,7 @@ def repair(names: Sequence[str], truth: str, seed: int, *, quick: bool) -> list[
         return [fit(task) for task in tasks]
     # The longest first.
     tasks = [Task(model, tuple(names), (), truth, seed) for model in (BEST, PAPER)] + tasks[::-1]
-    return list(each(fit, [(task,) for task in tasks]))
+    return list(common.each(fit, [(task,) for task in tasks]))
 
 
 def fit(task: Task) -> Fitted:
@@ -96,13 +89,14 @@ def problem(task: Task, names: Sequence[str]) -> bp.Problem:
     """Return the problem of some experiments under a model."""
     model = damper(MODELS[task.model])
     recordings = [measure(run, TRUTHS[task.truth], task.seed) for run in RUNS if run.name in names]
-    return problem_of(
+    return identification.problem(
         [fold(recording, DISPLACEMENT) for recording in recordings],
         DISPLACEMENT,
         one_conduction=bool(task.held_out),
         model=model,
-        priors=PRIORS | {name: prior for name, prior in EFFECT_PRIORS.items() if name in model.parameters},
-        fixed=FIXED | {name: value for name, value in KNOWN.items() if name in model.parameters},
+        priors=identification.PRIORS
+        | {name: prior for name, prior in EFFECT_PRIORS.items() if name in model.parameters},
+        fixed=identification.FIXED | {name: value for name, value in KNOWN.items() if name in model.parameters},
         scheme=SCHEME,
     )
 
@@ -124,7 +118,10 @@ def score(one: bp.Problem, theta: Mapping[str, float]) -> tuple[float, dict[str,
 
 def account(fits: Sequence[Fitted]) -> dict[str, Any]:
     """Return the entries of results.json: scores by model, differences from eq. (9), theta16 with all experiments."""
-    noise = {c: NOISE[c] * float(np.sqrt((2 * KEPT[DISPLACEMENT][c] + 1) / RECORDED)) for c in ("force", "pressure")}
+    noise = {
+        c: NOISE[c] * float(np.sqrt((2 * identification.KEPT[DISPLACEMENT][c] + 1) / RECORDED))
+        for c in ("force", "pressure")
+    }
     found: dict[str, Any] = {"noise_of_the_mean": noise, "models": {}, "theta16": {}}
     by_model = {model: [one for one in fits if one.task.model == model] for model in MODELS}
     every = {m: {name: v for one in own for name, v in one.scores.items()} for m, own in by_model.items() if own}
@@ -153,18 +150,15 @@ def account(fits: Sequence[Fitted]) -> dict[str, Any]:
 
 
 def table(found: Mapping[str, Any]) -> str:
-    """Return the comparison as lines to print."""
-    lines = [f"  {'model':16s}gain over eq. (9) an experiment   better in   rms error held out: force, pressure"]
+    """Return the comparison to print."""
+    rows = {}
     for model, one in found["models"].items():
         gain, error = one["gain_over_eq_9"]
-        rms = one["rms_error"]
-        lines.append(
-            f"  {model:16s}{gain:17.1f} ± {error:<10.1f}{one['experiments_predicted_better']:11d}"
-            f"{rms['force']:25.1f} N {1e-3 * rms['pressure']:8.2f} kPa"
-        )
+        rows[model] = one["rms_error"] | {
+            "gain": gain, "its error": error, "better in": one["experiments_predicted_better"]
+        }  # fmt: skip
+    lines = [common.shown("rms error held out, mean gain over eq. (9) of the score of an experiment", rows)]
     for model, one in found["theta16"].items():
-        negative = sum(p > 0.99 for p in one["p_negative_laplace"].values())
-        lines.append(
-            f"  {model}: theta16 negative with P > 99 % in {negative} of {len(one['p_negative_laplace'])} experiments"
-        )
+        chances = one["p_negative_laplace"].values()
+        lines.append(f"  {model}: theta16 negative with P > 99 % in {sum(p > 0.99 for p in chances)} of {len(chances)}")
     return "\n".join(lines)

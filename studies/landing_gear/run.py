@@ -17,21 +17,7 @@ from studies import common
 from studies.landing_gear import campaigns, cost, drop, force, identification, quality, repair, rig
 from studies.landing_gear import figures as landing_gear_figures
 from studies.landing_gear.drop import Dropped
-from studies.landing_gear.identification import (
-    CONDUCTION,
-    DISPLACEMENT,
-    FORCE,
-    NEGATIVE,
-    POSITIVE,
-    PRIORS,
-    UNDETERMINED,
-    Identified,
-    Verdict,
-    draw,
-    estimate,
-    fold,
-    judge,
-)
+from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, FORCE, PRIORS, Identified, Verdict
 from studies.landing_gear.rig import FULL_SCALE, GEAR, NOISE_SHARE, RUNS, SPEED_LIMIT, STRENGTHS, TRUTHS, Run, measure
 
 # Folder for the results of each truth until the study ends.
@@ -115,7 +101,7 @@ def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace) -> t
     with watch.part(f"rig {truth}", f"truth {truth}: simulating and recording {len(runs)} experiments"):
         recordings = {r.name: measure(r, TRUTHS[truth], seed) for r in runs}
     with watch.part(f"posteriors {truth}", f"truth {truth}: displacement given, one posterior an experiment"):
-        verdicts = _judged(_verdict, recordings, options, lambda verdict: verdict)
+        verdicts = _judged(identification.judge_recording, recordings, options, lambda verdict: verdict)
     with watch.part(f"joint {truth}", f"truth {truth}: all experiments at once, theta4 and theta6 in common"):
         joint = {DISPLACEMENT: identification.jointly(recordings.values(), seed, quick=quick)}
     with watch.part(f"sensitivity {truth}", f"truth {truth}: the other parameters under priors"):
@@ -148,10 +134,6 @@ def _judged(
         found[name] = result
         print(identification.line(name, verdict_of(result)), flush=True)
     return found
-
-
-def _verdict(recording: bp.Recording, seed: int, quick: bool) -> Verdict:
-    return judge(draw(estimate([fold(recording, DISPLACEMENT)], DISPLACEMENT), seed, quick=quick))
 
 
 def _of_all(
@@ -233,7 +215,7 @@ def _posteriors(verdicts: Mapping[str, Verdict]) -> dict[str, Any]:
     posteriors = [v.identified.posterior for v in verdicts.values()]
     return {
         "experiments": {name: identification.account(v) for name, v in verdicts.items()},
-        "signs": {s: [n for n, v in verdicts.items() if v.sign == s] for s in (POSITIVE, UNDETERMINED, NEGATIVE)},
+        "signs": {s: [n for n, v in verdicts.items() if v.sign == s] for s in identification.SIGNS},
         "misspecified": [name for name, v in verdicts.items() if v.misspecified],
         "posteriors_converged": sum(posterior.converged for posterior in posteriors),
         "seconds": sum(v.identified.seconds for v in verdicts.values()),
@@ -247,6 +229,7 @@ def account(truth: str, results: Mapping[str, Any]) -> str:
     wrong = sum(e["p_negative_laplace"][CONDUCTION] > 0.975 for e in forced["force_taken_for_exact"].values())
     moved = results["drop"]["displacement"]
     early, late = moved["share_within_the_band"].values()
+    columns = [f"posterior.{CONDUCTION}.{key}" for key in ("mean", "sd")]
     pairs = "; ".join(" against ".join(p["pair"]) for p in results["opposite_pairs"]) or "none"
     lines = [
         f"truth {truth}",
@@ -257,9 +240,10 @@ def account(truth: str, results: Mapping[str, Any]) -> str:
         f"drop: true displacement within the 90 % band for {early:.0%} of the first 2.5 s and {late:.0%} of the time "
         f"until 30 s, off the median by up to {1e3 * moved['largest_error_of_the_median']:.3f} mm",
         *(force.line(drive, one) for drive, one in results["joint"].items()),
-        identification.table(results["others_under_priors"], results["experiments"]),
+        common.shown("theta16 with the others fixed", results["experiments"], [*columns, "p_negative"]),
+        common.shown("and with the others under priors", results["others_under_priors"], ["mean", "sd", "p_negative"]),
     ]
-    return "\n".join(f"  {line.strip()}" for line in lines)
+    return "\n".join(lines)
 
 
 def _summary(drive: str, found: Mapping[str, Any]) -> list[str]:

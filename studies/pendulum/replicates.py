@@ -122,23 +122,16 @@ def _covering(intervals: Iterable[bool]) -> dict[str, float]:
 
 def account(table: dict[str, Any]) -> str:
     """Return the table to print."""
-    lines = [
-        "  noise  parameter  median error  90 % range          paper    covered (90 % intervals)  with eigenvalues"
-    ]
+    columns = ["median_error", "paper", "covered.cover", "covered.bars", "covered.band_low", "covered.band_high"]
+    columns += ["covered_with_eigenvalues.cover", "sd_with_eigenvalues_over_without"]
+    lines = []
     for noise, found in table.items():
-        for name in PAPER_ERRORS:
-            row = found[name]
-            low, high = row["range_90"]
-            c, e = row["covered"], row["covered_with_eigenvalues"]
-            band = f"(band {c['band_low']:.0f} … {c['band_high']:.0f})"
-            ratio = row["sd_with_eigenvalues_over_without"]
-            lines.append(
-                f"  {float(noise):5.1%}  {name:9s}  {row['median_error']:11.3%}  {low:8.3%} … {high:7.3%}  "
-                f"{row['paper']:6.1%}   {c['cover']} of {c['bars']} {band}    {e['cover']}, sd × {ratio:.3f}"
-            )
         bars = found["eigenvalue_bars"]
+        rows = {name: found[name] for name in PAPER_ERRORS}
+        title = f"noise {float(noise):.1%}: relative errors, coverage of 90 % intervals"
+        lines.append(common.shown(title, rows, columns))
         lines.append(
-            f"         failures {len(found['failures'])}, orbits lost {found['lost_orbits']}, selected but not true "
+            f"failures {len(found['failures'])}, orbits lost {found['lost_orbits']}, selected but not true "
             f"{found['selected_that_are_no_orbits']}; eigenvalue error bars {bars['cover']} of {bars['bars']} "
             f"(band {bars['band_low']:.0f} … {bars['band_high']:.0f}); {found['seconds_each']:.1f} s each"
         )

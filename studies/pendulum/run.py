@@ -149,34 +149,31 @@ def estimates(
 def orbit_account(results: Mapping[str, Any]) -> str:
     """Return the comparison of found and true orbits as text."""
     clean = results["found_without_noise"]
-    lines = [
+    rows = {
+        f"noise {float(noise):.1%}, {method}, period {row['period']}": row
+        for noise, methods in results["eigenvalues"].items()
+        for method, every in methods.items()
+        for row in every
+    }
+    return "\n".join([
         f"  without noise {clean['polished']} orbits of {clean['candidates']} candidates; classes by period "
         f"{clean['classes']}, wanted {clean['classes_wanted']}",
         f"  largest difference from shooting {clean['largest_difference_from_shooting']:.1e} rad, not confirmed: "
         f"{clean['not_confirmed_by_shooting'] or 'none'}",
-        "  unstable eigenvalue, median relative error (orbits/candidates) by period",
-    ]
-    for noise, methods in results["eigenvalues"].items():
-        for method, rows in methods.items():
-            cells = [
-                f"{'–' if r['median_relative_error'] is None else format(r['median_relative_error'], '.2%'):>7s} "
-                f"({r['orbits']}/{r['candidates']})"
-                for r in rows
-            ]
-            lines.append(f"    noise {float(noise):.1%} {method:8s} " + "  ".join(cells))
-    return "\n".join(lines)
+        common.shown("unstable eigenvalues", rows, ["candidates", "orbits", "median_relative_error"]),
+    ])  # fmt: skip
 
 
 def estimate_account(results: Mapping[str, Any]) -> str:
     """Return the estimates as a table to print."""
     reduction = results["data_reduction"]
-    lines = [
-        f"  {len(results['selected'])} orbits selected of {results['polished']}: of "
-        f"{reduction['numbers_in_the_recording']} numbers in the recording {reduction['numbers_used']} are used"
-    ]
-    for which, row in results["estimates"].items():
-        for name, one in row["parameters"].items():
-            error = f", error {one['relative_error']:+.3%}" if "relative_error" in one else ""
-            paper = f" (paper {PAPER_ERRORS[name]:.1%})" if which != "all five" and name in PAPER_ERRORS else ""
-            lines.append(f"    {which:9s} {name:2s} = {one['value']:.6g} ± {one['sd']:.2g}{error}{paper}")
-    return "\n".join(lines)
+    rows = {
+        f"{which}: {name}": {**one, "paper": PAPER_ERRORS.get(name) if which != pendulum_estimates.ALL else None}
+        for which, found in results["estimates"].items()
+        for name, one in found["parameters"].items()
+    }
+    return common.shown(
+        f"{len(results['selected'])} orbits selected of {results['polished']}: of "
+        f"{reduction['numbers_in_the_recording']} numbers in the recording {reduction['numbers_used']} are used",
+        rows,
+    )

@@ -28,15 +28,11 @@ from studies.verdicts.outcome import Outcome, examine
 DATA, SAMPLER = "data", "sampler"
 MOST_SAMPLER_SEEDS = 20
 ALWAYS_SAMPLED = 50
+# The data seed of the gallery itself, and of the replicates with other sampler seeds, is this times the seed.
 STRIDE = 1000
 FILE = "replicates.jsonl"
 
 Task = tuple[str, str, int, int]
-
-
-def first_seed(seed: int) -> int:
-    """Return the data seed of the gallery itself, and of the replicates with other sampler seeds."""
-    return STRIDE * seed
 
 
 def replicate(task: Task) -> dict[str, Any]:
@@ -46,13 +42,13 @@ def replicate(task: Task) -> dict[str, Any]:
     """
     name, kind, number, seed = task
     found: dict[str, Any] = {"case": name, "kind": kind, "number": number, "seed": seed, "source": source()}
-    data = first_seed(seed) + (number if kind == DATA else 0)
+    data = STRIDE * seed + (number if kind == DATA else 0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             case = CASES[name]()
             enough = case.drawless or (number >= ALWAYS_SAMPLED and set(case.fault) == {IDENTIFIABILITY})
-            return found | examine(name, data, first_seed(seed) + number, drawless=kind == DATA and enough).line()
+            return found | examine(name, data, STRIDE * seed + number, drawless=kind == DATA and enough).line()
         except (RuntimeError, ValueError) as error:
             return found | {"error": f"{type(error).__name__}: {error}"}
 
@@ -112,16 +108,13 @@ def _flips(lines: Sequence[Mapping[str, Any]], outcome: Outcome) -> dict[str, li
 
 def account_of_replicates(found: Mapping[str, Any]) -> str:
     """Return the counts as a table to print."""
-    lines = [f"  {'case':18s} {'kind':8s} replicates sampled right named warned converged  s each"]
-    for name, kinds in found.items():
-        for kind, c in kinds.items():
-            lines.append(
-                f"  {name:18s} {kind:8s} {c['replicates']:10d} {c['sampled']:7d} {c['right']:5d} {c['named']:5d} "
-                f"{c['warned']:6d} {c['converged']:9d}  {c['seconds_each']}"
-            )
-            lines += [f"      {number} times {what}" for what, number in c["wrong"].items()]
-            lines += [f"      flips: {what}: {', '.join(v)}" for what, v in c.get("verdicts_that_flip", {}).items()]
-            lines += [f"      {error}" for error in c["errors"]]
+    every = {f"{name}, {kind}": counts for name, kinds in found.items() for kind, counts in kinds.items()}
+    columns = ["replicates", "sampled", "right", "named", "warned", "converged", "seconds_each"]
+    lines = [common.shown("replicates by case, with other data or other seeds of the sampler", every, columns)]
+    for name, c in every.items():
+        lines += [f"{name}: {number} times {what}" for what, number in c["wrong"].items()]
+        lines += [f"{name}: flips: {what}: {', '.join(v)}" for what, v in c.get("verdicts_that_flip", {}).items()]
+        lines += [f"{name}: {error}" for error in c["errors"]]
     return "\n".join(lines)
 
 
@@ -213,7 +206,7 @@ def run(options: argparse.Namespace) -> None:
     outcomes: dict[str, Outcome] = {}
     for name in QUICK if options.quick else CASES:
         with watch.part(name, name.replace("_", " ")):
-            outcomes[name] = examine(name, first_seed(options.seed), options.seed)
+            outcomes[name] = examine(name, STRIDE * options.seed, options.seed)
         print(account(outcomes[name]))
     with watch.part("figures", "drawing"):
         paths = common.save_figures(options.out, figures(outcomes))
