@@ -125,7 +125,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"All data are SYNTHETIC: {count} campaigns of every case, their truths drawn from the priors.")
     results: dict[str, Any] = {}
     about = {"synthetic": True, "seed": options.seed, "replicates": count, "steps": STEPS, "overcount": OVERCOUNT}
-    with executor_of(options) as executor:
+    with _executor_of(options) as executor:
         for number, (name, case) in enumerate(CASES.items()):
             with watch.part(name, name.replace("_", " ")):
                 found = bp.calibrate(
@@ -133,7 +133,7 @@ def run(options: argparse.Namespace) -> None:
                     executor=executor, max_steps=STEPS,
                 )  # fmt: skip
             print(found)
-            results[name] = collect(found)
+            results[name] = _collect(found)
             study = about | {"cases": list(results), "seconds": watch.total(), "versions": common.versions()}
             paths = common.save_figures(options.out, {name: bp.plot.ranks(found)})
             path = common.write_results(options.out, results | {"study": study})
@@ -141,8 +141,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 @contextmanager
-def executor_of(options: argparse.Namespace) -> Iterator[Any]:
-    """Provide the executor of the replicates."""
+def _executor_of(options: argparse.Namespace) -> Iterator[Any]:
     if options.dask:
         from distributed import Client
 
@@ -157,8 +156,7 @@ def executor_of(options: argparse.Namespace) -> Iterator[Any]:
         yield options.processes
 
 
-def collect(one: bp.Calibration) -> dict[str, Any]:
-    """Return the content of results.json on one case; NaN becomes None."""
+def _collect(one: bp.Calibration) -> dict[str, Any]:
     rows = one.table.to_dict("records")
     return {
         "replicates": one.replicates,

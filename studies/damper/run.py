@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("harmonics", "repeating it with other numbers of displacement harmonics"):
         default = harmonics["displacement"]
         counts = max(1, round(default / 4)), min(58, 2 * default)
-        choices = [fit_with(recording, count) for count in counts]
+        choices = [_fit_with(recording, count) for count in counts]
     with watch.part("sample", "sampling the posterior with emcee"):
         posterior = bp.sample(problem, fit, seed=options.seed, max_steps=500 if options.quick else 20_000)
     print(f"  {posterior.reason}")
@@ -76,9 +76,9 @@ def run(options: argparse.Namespace) -> None:
         }
         paths = common.save_figures(options.out, figures)
 
-    choices = sorted([summary(experiment, fit), *choices], key=lambda choice: choice["harmonics"])
-    results = {"data": data, "seed": options.seed} | collect(experiment, fit, posterior, comparison, choices)
-    print("\n" + tables(results, fit, comparison) + "\n")
+    choices = sorted([_summary(experiment, fit), *choices], key=lambda choice: choice["harmonics"])
+    results = {"data": data, "seed": options.seed} | _collect(experiment, fit, posterior, comparison, choices)
+    print("\n" + _tables(results, fit, comparison) + "\n")
     common.finish(options.out, results, watch, paths, synthetic=data["synthetic"])
 
 
@@ -107,14 +107,12 @@ def generate(seed: int) -> bp.Recording:
     )  # fmt: skip
 
 
-def fit_with(recording: bp.Recording, count: int) -> dict[str, Any]:
-    """Return the estimate with another number of displacement harmonics."""
+def _fit_with(recording: bp.Recording, count: int) -> dict[str, Any]:
     experiment = recording.fold(harmonics={"displacement": count})
-    return summary(experiment, bp.map_estimate(bp.Problem(bp.models.dahl, [experiment], priors=PRIORS)))
+    return _summary(experiment, bp.map_estimate(bp.Problem(bp.models.dahl, [experiment], priors=PRIORS)))
 
 
-def summary(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, Any]:
-    """Return the results of one choice of harmonics."""
+def _summary(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, Any]:
     return {
         "harmonics": experiment.harmonics["displacement"],
         "map": fit.theta,
@@ -125,14 +123,13 @@ def summary(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, Any]:
     }
 
 
-def collect(
+def _collect(
     experiment: bp.Experiment,
     fit: bp.MapEstimate,
     posterior: bp.Posterior,
     comparison: bp.Comparison,
     choices: list[dict[str, Any]],
 ) -> dict[str, Any]:
-    """Return the content of results.json on the fits."""
     return {
         "units": {name: bp.models.dahl.units[name] for name in fit.theta} | {"variance[force]": "N²"},
         "frequency": {"value": experiment.frequency, "se": experiment.frequency_se},
@@ -162,8 +159,7 @@ def collect(
     }
 
 
-def tables(results: dict[str, Any], fit: bp.MapEstimate, comparison: bp.Comparison) -> str:
-    """Return the tables to print, with their interpretation."""
+def _tables(results: dict[str, Any], fit: bp.MapEstimate, comparison: bp.Comparison) -> str:
     kind = "SYNTHETIC data" if results["data"]["synthetic"] else "measured data"
     columns = {
         "unit": pd.Series(results["units"]), "robust sd": pd.Series(fit.robust_sd),

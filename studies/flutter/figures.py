@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 import bayesperiodic as bp
 from studies.common import shared_legend
 from studies.flutter.questions import CHANNELS, closed, contraction, drawn_sizes, laplace_draws, sizes
-from studies.flutter.rig import AUTHORS, RIG, SENSORS, Fitted, cycles
+from studies.flutter.rig import AUTHORS, RIG, SENSORS, Experiments, Fitted, Speeds, cycles
 
 MEASURED, MODEL, THEIRS = "black", {True: "#0072B2", False: "#D55E00"}, "#999999"
 KIND = {True: "stable", False: "unstable"}
@@ -17,8 +17,8 @@ GRID, COARSE = np.linspace(13.0, 19.0, 241), np.linspace(13.0, 19.0, 41)
 
 
 def all_of(
-    experiments: Mapping[str, bp.Experiment],
-    speeds: Mapping[str, float],
+    experiments: Experiments,
+    speeds: Speeds,
     fits: Mapping[str, Fitted],
     fit: bp.MapEstimate,
     posterior: bp.Posterior | None,
@@ -76,10 +76,7 @@ def bands(theta: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> dict[t
 
 
 def bifurcation(
-    experiments: Mapping[str, bp.Experiment],
-    speeds: Mapping[str, float],
-    fit: bp.MapEstimate,
-    draws: Mapping[str, np.ndarray],
+    experiments: Experiments, speeds: Speeds, fit: bp.MapEstimate, draws: Mapping[str, np.ndarray]
 ) -> Figure:
     """Draw amplitudes over wind speed: posterior bands of both branches, the authors' values, what was measured."""
     drawn = bands(fit.theta, draws)
@@ -110,7 +107,7 @@ def bifurcation(
     return figure
 
 
-def portraits(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float], fit: bp.MapEstimate) -> Figure:
+def portraits(experiments: Experiments, speeds: Speeds, fit: bp.MapEstimate) -> Figure:
     """Draw pitch over heave, measured and fitted, a panel per cycle."""
     figure = plt.figure(figsize=(11.0, 6.0), layout="constrained")
     for axes, (name, e) in zip(figure.subplots(2, 4, sharex=True, sharey=True).flat, experiments.items(), strict=False):
@@ -147,5 +144,5 @@ def contractions(fits: Mapping[str, Fitted], kind_of_data: str) -> Figure:
     return figure
 
 
-def _kind(experiments: Mapping[str, bp.Experiment]) -> str:
+def _kind(experiments: Experiments) -> str:
     return ", synthetic data" if any(e.synthetic for e in experiments.values()) else ""

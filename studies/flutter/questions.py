@@ -39,7 +39,7 @@ def _errors_of(orbit: bp.PeriodicSolution, e: bp.Experiment) -> dict[str, Any]:
     }
 
 
-def errors(fitted: rig.Fitted, experiments: Mapping[str, bp.Experiment]) -> dict[str, Any]:
+def errors(fitted: rig.Fitted, experiments: rig.Experiments) -> dict[str, Any]:
     """Return the errors of the fitted cycles, and whether their stability is correct."""
     found = {}
     for name, e in experiments.items():
@@ -49,7 +49,7 @@ def errors(fitted: rig.Fitted, experiments: Mapping[str, bp.Experiment]) -> dict
     return found
 
 
-def authors_errors(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float]) -> dict[str, Any]:
+def authors_errors(experiments: rig.Experiments, speeds: rig.Speeds) -> dict[str, Any]:
     """Return the same for the authors' values and sensor units; None and the reason if there is no cycle."""
     along = rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS)
     found: dict[str, Any] = {}
@@ -95,7 +95,7 @@ def contraction(fits: Mapping[str, rig.Fitted]) -> dict[str, dict[str, dict[str,
     return table
 
 
-def groups(speeds: Mapping[str, float]) -> list[list[str]]:
+def groups(speeds: rig.Speeds) -> list[list[str]]:
     """Return the names of the records by wind speed, those within a quarter of a metre per second together."""
     found: list[list[str]] = []
     for name in sorted(speeds, key=lambda name: speeds[name]):
@@ -107,11 +107,7 @@ def groups(speeds: Mapping[str, float]) -> list[list[str]]:
 
 
 def leave_out(
-    experiments: Mapping[str, bp.Experiment],
-    speeds: Mapping[str, float],
-    theta: dict[str, float],
-    left: list[str],
-    draws: int,
+    experiments: rig.Experiments, speeds: rig.Speeds, theta: dict[str, float], left: list[str], draws: int
 ) -> tuple[rig.Fitted, dict[str, Any]]:
     """Return the fit without some cycles, started at the estimate θ from all, and the errors of its predictions.
 

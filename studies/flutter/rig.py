@@ -41,6 +41,10 @@ LOWEST_SPEED, HIGHEST_SPEED, SEARCHED = 8.0, 19.5, (5.0, 25.0)
 FIRST_SHARE, ROUNDS = 0.01, 2
 
 
+Experiments = Mapping[str, bp.Experiment]
+Speeds = Mapping[str, float]  # By record [m/s]
+
+
 class Fitted(NamedTuple):
     """A problem, its MAP point, and the error [Hz] that was allowed the model's frequencies."""
 
@@ -103,13 +107,9 @@ def _along(first: bp.PeriodicSolution, until: float) -> bp.Branch:
 
 
 def problem(
-    experiments: Sequence[bp.Experiment],
-    speeds: Mapping[str, float],
-    *,
-    frequency_error: float,
-    known: Mapping[str, float] | None = None,
-    noise: Any = "circulant",
-) -> bp.Problem:
+    experiments: Sequence[bp.Experiment], speeds: Speeds, *, frequency_error: float,
+    known: Mapping[str, float] | None = None, noise: Any = "circulant",
+) -> bp.Problem:  # fmt: skip
     """Return the problem of some cycles, the model's frequency allowed an error [Hz] beside the measured one's.
 
     The delay of the outputs is fixed: cycles are compared at the phase at which the fundamentals of both sensors agree
@@ -123,12 +123,9 @@ def problem(
 
 
 def estimate(
-    experiments: Mapping[str, bp.Experiment],
-    speeds: Mapping[str, float],
-    start: Mapping[str, float] = START,
-    known: Mapping[str, float] | None = None,
-    noise: Any = "circulant",
-) -> Fitted:
+    experiments: Experiments, speeds: Speeds, start: Mapping[str, float] = START,
+    known: Mapping[str, float] | None = None, noise: Any = "circulant",
+) -> Fitted:  # fmt: skip
     """Return the MAP point; the frequency's error is what the last fit but one left, root mean square.
 
     A model whose frequency errors exceed the standard errors must not be weighted by these. Continuation starts at the

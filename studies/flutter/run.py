@@ -19,7 +19,6 @@ from studies.flutter import campaigns, questions, rig
 from studies.flutter import figures as flutter_figures
 from studies.flutter.reference import hopf, settled
 
-Experiments = dict[str, bp.Experiment]
 SAMPLING: dict[str, Any] = {
     "ensembles": 2, "walkers": 20, "max_steps": 12_000, "variances": "collapsed", "progress": False,
 }  # fmt: skip
@@ -45,22 +44,22 @@ def run(options: argparse.Namespace) -> None:
     if data["synthetic"]:
         print(f"  the measured file was not found; it is at {rig.ADDRESS}, sha256 {rig.SHA256}; true values {rig.TRUE}")
     results = {"data": data, "seed": options.seed, "quick": options.quick, "rule": rig.RULE, "refused": refused}
-    results["records"] = of_records(records, experiments)
+    results["records"] = _of_records(records, experiments)
     columns = ["wind_speed", "used", "frequency", "frequency_se", "cycles", "drift.pitch"]
     print(common.shown("records", results["records"], columns), *refused.values(), sep="\n")
     with watch.part("authors", "following the cycles of the authors' values from the Hopf point"):
-        results["checks"], results["authors_branch"] = against_integration(), hopf_and_fold()
+        results["checks"], results["authors_branch"] = _against_integration(), _hopf_and_fold()
         authors = questions.authors_errors(experiments, speeds)
-    print(integration_line(results["checks"]), flush=True)
+    print(_integration_line(results["checks"]), flush=True)
     with watch.part("map", "estimating from all cycles"):
         both = rig.estimate(experiments, speeds)
     with watch.part("parts", "estimating from stable or unstable cycles alone, and with wind speeds left out"):
-        fits, results["predictions"] = parts(experiments, speeds, both, options.quick, draws)
+        fits, results["predictions"] = _parts(experiments, speeds, both, options.quick, draws)
     with watch.part("structure", "structural identifiability"):
         known = (*rig.RIG, "U", "c_h", "c_alpha")
         structure = bp.structure(rig.MODEL, fixed=[name for name in rig.MODEL.parameters if name in known])
     with watch.part("known noise", "estimating with the noise's shape known"):
-        stated = with_known_noise(both, experiments, speeds)
+        stated = _with_known_noise(both, experiments, speeds)
         fit = bp.map_estimate(stated, start=both.fit.theta, progress=False)
     posterior = verdict = compared = None
     if not options.quick:
@@ -73,17 +72,17 @@ def run(options: argparse.Namespace) -> None:
         figures = flutter_figures.all_of(experiments, speeds, fits, fit, posterior, draws)
         paths = common.save_figures(options.out, figures)
 
-    results |= of_fits(fits, experiments, authors) | {
+    results |= _of_fits(fits, experiments, authors) | {
         "structure": {"text": str(structure), "free_scales": questions.FREE_SCALES},
         "verdicts": verdict and verdict.table["verdict"].to_dict(),
-        "posterior": posterior and compared and of_draws(posterior, fit, compared),
+        "posterior": posterior and compared and _of_draws(posterior, fit, compared),
     }
-    print("\n".join(["", tables(results), str(structure), *(str(one) for one in (verdict, compared) if one), ""]))
+    print("\n".join(["", _tables(results), str(structure), *(str(one) for one in (verdict, compared) if one), ""]))
     common.finish(options.out, results, watch, paths, synthetic=data["synthetic"])
 
 
-def parts(
-    experiments: Experiments, speeds: dict[str, float], both: rig.Fitted, quick: bool, draws: int
+def _parts(
+    experiments: rig.Experiments, speeds: dict[str, float], both: rig.Fitted, quick: bool, draws: int
 ) -> tuple[dict[str, rig.Fitted], dict[str, Any]]:
     """Return the fits by kind of cycle, and how cycles that were not fitted are predicted: by speed and by kind."""
     kinds = {kind: [name for name in experiments if questions.kind_of(name) != kind] for kind in KINDS}
@@ -97,15 +96,14 @@ def parts(
     return fits, {label: predicted for label, (_, predicted) in found.items()}
 
 
-def with_known_noise(both: rig.Fitted, experiments: Experiments, speeds: dict[str, float]) -> bp.Problem:
+def _with_known_noise(both: rig.Fitted, experiments: rig.Experiments, speeds: dict[str, float]) -> bp.Problem:
     """Return the problem whose noise has the shape found at the MAP point; the variances stay free."""
     shape = {name: value for name, value in both.fit.noise.items() if not name.startswith("variance")}
     stated = rig.problem(both.problem.experiments, speeds, frequency_error=both.frequency_error, known=shape)
     return stated.anchored(stated.vector(both.fit.theta), {n: both.fit.solutions[n].states for n in experiments})
 
 
-def hopf_and_fold() -> dict[str, float]:
-    """Return where the authors' values have their Hopf point and their fold."""
+def _hopf_and_fold() -> dict[str, float]:
     along = rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS)
     fold = along.branches[0].folds[0]
     return {
@@ -116,7 +114,7 @@ def hopf_and_fold() -> dict[str, float]:
     }
 
 
-def against_integration() -> dict[str, Any]:
+def _against_integration() -> dict[str, Any]:
     """Return the Hopf point and the stable cycles by both ways, and by how much they differ, by points of the grid."""
     by_grid = {points: rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS, points) for points in GRIDS}
     point, (speed, frequency) = by_grid[rig.SAMPLES].hopf, hopf()
@@ -139,8 +137,7 @@ def _differences(orbit: bp.PeriodicSolution, speed: float) -> dict[str, float]:
     }
 
 
-def integration_line(found: dict[str, Any]) -> str:
-    """Return the text to print."""
+def _integration_line(found: dict[str, Any]) -> str:
     speed, frequency = found["hopf_speed"], found["hopf_frequency"]
     off = ", ".join(
         f"{max(abs(one[name]) for one in by_speed.values() for name in STATES):.1e} with {points}"
@@ -153,8 +150,7 @@ def integration_line(found: dict[str, Any]) -> str:
     )
 
 
-def of_records(records: list[rig.Record], experiments: Experiments) -> dict[str, Any]:
-    """Return the description of each record, and whether it is used."""
+def _of_records(records: list[rig.Record], experiments: rig.Experiments) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for record in records:
         name = record.recording.name
@@ -175,8 +171,7 @@ def of_records(records: list[rig.Record], experiments: Experiments) -> dict[str,
     return found
 
 
-def of_fits(fits: dict[str, rig.Fitted], experiments: Experiments, authors: dict[str, Any]) -> dict[str, Any]:
-    """Return the results of the fits."""
+def _of_fits(fits: dict[str, rig.Fitted], experiments: rig.Experiments, authors: dict[str, Any]) -> dict[str, Any]:
     fit, found = fits["both"].fit, questions.errors(fits["both"], experiments)
     return {
         "units": {name: rig.MODEL.units[name] for name in fit.theta},
@@ -204,8 +199,7 @@ def of_fits(fits: dict[str, rig.Fitted], experiments: Experiments, authors: dict
     }
 
 
-def of_draws(posterior: bp.Posterior, fit: bp.MapEstimate, compared: bp.Comparison) -> dict[str, Any]:
-    """Return the results of the draws and of the Laplace approximation."""
+def _of_draws(posterior: bp.Posterior, fit: bp.MapEstimate, compared: bp.Comparison) -> dict[str, Any]:
     draws = {name: posterior.draws(name) for name in fit.theta}
     # On a ridge along which their ratio stays the correlation is 1.
     logarithms = [np.log(draws[name].ravel()) for name in ("k_alpha2", "gain_pitch")]
@@ -221,8 +215,7 @@ def of_draws(posterior: bp.Posterior, fit: bp.MapEstimate, compared: bp.Comparis
     }
 
 
-def tables(results: dict[str, Any]) -> str:
-    """Return the tables to print."""
+def _tables(results: dict[str, Any]) -> str:
     kind = "SYNTHETIC data" if results["data"]["synthetic"] else "measured data"
     columns = [*(f"amplitude_error.{channel}" for channel in questions.CHANNELS), "frequency_error"]
     missed = [f"{c}.{k}" for c in questions.CHANNELS for k in ("error", "posterior_sds", "sds_with_model_error")]

@@ -14,7 +14,6 @@ from scipy.stats import binom
 
 import bayesperiodic as bp
 from studies import common
-from studies.common import resumed
 from studies.landing_gear import identification, rig
 from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, PRIORS, fold
 from studies.landing_gear.rig import GEAR, RUNS, TRUTHS, Run, measure
@@ -31,7 +30,7 @@ Task = tuple[str, int]
 def campaigns(folder: Path, count: int, seed: int, truth: str = "A") -> list[dict[str, Any]]:
     """Compute the campaigns missing from the file in the folder, and return all of them."""
     tasks: list[Task] = [(truth, FIRST_SEED * seed + number) for number in range(count)]
-    return resumed(folder / FILE, tasks, campaign, lambda line: (line["truth"], line["seed"]), source())
+    return common.resumed(folder / FILE, tasks, campaign, lambda line: (line["truth"], line["seed"]), source())
 
 
 def source() -> str:
@@ -99,12 +98,11 @@ def _covered(every: Sequence[Mapping[str, Any]], kind: str) -> dict[str, int]:
 def table(found: Mapping[str, Any]) -> str:
     """Return the counts as text."""
     low, high = found["band"]
-    lines = [f"  {found['campaigns']} campaigns, {found['experiments']} posteriors; 90 % intervals that cover:"]
-    for kind, counts in found["covered"].items():
-        listed = ", ".join(f"{name} {count}" for name, count in counts.items())
-        lines.append(f"    {kind:8s}{listed} (band {low:.0f} … {high:.0f})")
-    lines.append(
-        f"    {CONDUCTION} called negative {found['called_negative']} times, the model misspecified "
-        f"{found['called_misspecified']} times; {found['map_not_converged']} estimates not converged"
+    title = (
+        f"{found['campaigns']} campaigns, {found['experiments']} posteriors; 90 % intervals with the truth (band "
+        f"{low:.0f} … {high:.0f})"
     )
-    return "\n".join(lines)
+    return (
+        f"{common.shown(title, found['covered'])}\n{CONDUCTION} called negative {found['called_negative']} times, the "
+        f"model misspecified {found['called_misspecified']} times; {found['map_not_converged']} estimates not converged"
+    )

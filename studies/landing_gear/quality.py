@@ -17,7 +17,7 @@ from scipy.stats import binom, norm
 import bayesperiodic as bp
 from studies import common
 from studies.landing_gear.identification import DISPLACEMENT, estimate, fold
-from studies.landing_gear.rig import GEAR, RUNS, SAME, Changed, measure
+from studies.landing_gear.rig import GEAR, RUNS, Changed, measure
 
 CAMPAIGN = ("0.2 Hz 80 mm", "1 Hz 36 mm", "4 Hz 8 mm")
 PRIORS = {
@@ -35,17 +35,14 @@ MEANINGS = {
 }  # fmt: skip
 GOOD = "good"
 LOST_GAS, WORN, LOST_OIL = 0.02, 0.2, 0.01
-FAULTS: dict[str, Changed] = {
-    GOOD: SAME,
-    "low gas charge": frozenset(
-        {"theta5": (1 - LOST_GAS) * GEAR["theta5"], "theta15": (1 - LOST_GAS) * GEAR["theta15"]}.items()
-    ),
-    "worn friction": frozenset({"theta8": (1 - WORN) * GEAR["theta8"]}.items()),
+CHANGES: dict[str, dict[str, float]] = {
+    GOOD: {},
+    "low gas charge": {name: (1 - LOST_GAS) * GEAR[name] for name in ("theta5", "theta15")},
+    "worn friction": {"theta8": (1 - WORN) * GEAR["theta8"]},
     # The same gas in a volume larger by the oil that left.
-    "leaking oil": frozenset(
-        {"theta5": GEAR["theta5"] / (1 + LOST_OIL), "theta6": GEAR["theta6"] / (1 + LOST_OIL)}.items()
-    ),
+    "leaking oil": {name: GEAR[name] / (1 + LOST_OIL) for name in ("theta5", "theta6")},
 }
+FAULTS: dict[str, Changed] = {kind: frozenset(changes.items()) for kind, changes in CHANGES.items()}
 FALSE_ALARM = 0.01
 LIMIT = float(norm.isf(0.5 * FALSE_ALARM / len(PRIORS)))
 POWER = 0.9
@@ -101,14 +98,13 @@ def account(reference: Unit, units: Sequence[Unit]) -> dict[str, Any]:
         },
         "kinds": {},
     }
-    for kind in FAULTS:
+    for kind in CHANGES:
         every = [deviations(reference, unit) for unit in units if unit.kind == kind]
         different = {name: sum(abs(z[name]) > LIMIT for z in every) for name in PRIORS}
-        touched = {name for name, _ in FAULTS[kind]}
         flagged = sum(any(abs(v) > LIMIT for v in z.values()) for z in every)
-        right = sum(all((abs(z[n]) > LIMIT) == (n in touched) for n in PRIORS) for z in every)
+        right = sum(all((abs(z[n]) > LIMIT) == (n in CHANGES[kind]) for n in PRIORS) for z in every)
         found["kinds"][kind] = {
-            "changed": {name: value / GEAR[name] - 1.0 for name, value in FAULTS[kind]},
+            "changed": {name: value / GEAR[name] - 1.0 for name, value in CHANGES[kind].items()},
             "units": len(every),
             "not_converged": sum(not unit.converged for unit in units if unit.kind == kind),
             "called_different": different,

@@ -65,8 +65,8 @@ def run(options: argparse.Namespace) -> None:
         path, source = options.out / PARTS / f"{truth}.pkl", _source(options, truth)
         every[truth], seconds = common.remembered(path, source, partial(_of_truth, truth, runs, options))
         watch.seconds |= seconds
-        results[truth] = collect(runs, every[truth])
-        print(account(truth, results[truth]))
+        results[truth] = _collect(runs, every[truth])
+        print(_account(truth, results[truth]))
     if "A" in every:
         with watch.part("cost", "what a log-posterior of truth A costs, against time integration until steady"):
             joint = every["A"].joint.items()
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> None:
         print("\n".join(cost.table(drive, one) for drive, one in results["cost"].items()))
     drawn = _of_all(runs, truths, options, watch, results)
     with watch.part("figures", "drawing"):
-        paths = common.save_figures(options.out, drawn | figures(runs, every, options.quick))
+        paths = common.save_figures(options.out, drawn | _figures(runs, every, options.quick))
     results["rig"] = {
         "experiments": {r.name: {"frequency": r.frequency, "half_stroke": r.stroke, "speed": r.speed} for r in RUNS},
         "speed_limit": SPEED_LIMIT,
@@ -162,8 +162,7 @@ def _of_all(
     return drawn
 
 
-def figures(runs: Sequence[Run], every: Mapping[str, OfTruth], quick: bool) -> dict[str, Any]:
-    """Return the figures of all truths by name."""
+def _figures(runs: Sequence[Run], every: Mapping[str, OfTruth], quick: bool) -> dict[str, Any]:
     verdicts = {truth: found.verdicts for truth, found in every.items()}
     forced = {truth: found.forced for truth, found in every.items()}
     with_force = [run for run in runs if run.name in next(iter(forced.values()))]
@@ -187,8 +186,7 @@ def figures(runs: Sequence[Run], every: Mapping[str, OfTruth], quick: bool) -> d
     return drawn
 
 
-def collect(runs: Sequence[Run], found: OfTruth) -> dict[str, Any]:
-    """Return the content of results.json on one truth."""
+def _collect(runs: Sequence[Run], found: OfTruth) -> dict[str, Any]:
     theta16 = {name: v.identified.fit.theta[CONDUCTION] for name, v in found.verdicts.items()}
     chances = {name: v.p_negative[0] for name, v in found.verdicts.items()}
     pairs = [(a.name, b.name) for a in runs for b in runs if a.frequency == b.frequency and a.stroke > b.stroke]
@@ -223,8 +221,7 @@ def _posteriors(verdicts: Mapping[str, Verdict]) -> dict[str, Any]:
     }
 
 
-def account(truth: str, results: Mapping[str, Any]) -> str:
-    """Return the text to print on a truth."""
+def _account(truth: str, results: Mapping[str, Any]) -> str:
     forced = results["force_given"]
     wrong = sum(e["p_negative_laplace"][CONDUCTION] > 0.975 for e in forced["force_taken_for_exact"].values())
     moved = results["drop"]["displacement"]

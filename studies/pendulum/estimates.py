@@ -63,10 +63,9 @@ def identify(orbits: bp.Orbits, *, which: Sequence[str] = tuple(FREE)) -> Identi
     return Identified(polished, selected, problems, fits, tuple(lost))
 
 
-def with_eigenvalues(selected: bp.Orbits, free: Sequence[str]) -> tuple[bp.Problem, bp.MapEstimate]:
-    """Return problem and estimate with the unstable eigenvalues that were estimated in the objective."""
-    problem = problem_of([o.experiment(samples=SAMPLES, multipliers=True) for o in selected], free)
-    return problem, _fit(problem)
+def with_eigenvalues(selected: bp.Orbits, free: Sequence[str]) -> bp.MapEstimate:
+    """Return the estimate with the unstable eigenvalues that were estimated in the objective."""
+    return _fit(problem_of([o.experiment(samples=SAMPLES, multipliers=True) for o in selected], free))
 
 
 def problem_of(experiments: Sequence[bp.Experiment], free: Sequence[str]) -> bp.Problem:
@@ -142,7 +141,6 @@ class Ridge:
     the identifiable combinations, by Laplace (columns value, laplace_sd) and MCMC (mean, sd).
     """
 
-    problem: bp.Problem
     fit: bp.MapEstimate
     posterior: bp.Posterior
     structure: bp.Structure  # Structural identifiability, without data
@@ -157,12 +155,10 @@ def sample(identified: Identified, seed: int, quick: bool) -> Ridge:
     problem, fit = identified.problems[ALL], identified.fits[ALL]
     settings: dict[str, Any] = {"max_steps": QUICK_STEPS} if quick else {}
     posterior = bp.sample(problem, fit, seed=seed, ensembles=2, variances="collapsed", progress=False, **settings)
-    laplace, draws = fit.derive(COMBINATIONS), posterior.derive(COMBINATIONS)
-    table = laplace.rename(columns={"sd": "laplace_sd"}).join(draws[["mean", "sd"]])
-    l_draws = posterior.draws("l")
-    table.loc["l"] = [fit.theta["l"], fit.sd["l"], l_draws.mean(), l_draws.std()]
+    table = fit.derive(COMBINATIONS).rename(columns={"sd": "laplace_sd"})
+    table = table.join(posterior.derive(COMBINATIONS)[["mean", "sd"]])
+    table.loc["l"] = [fit.theta["l"], fit.sd["l"], posterior.draws("l").mean(), posterior.draws("l").std()]
     return Ridge(
-        problem,
         fit,
         posterior,
         bp.structure(bp.models.pendulum, fixed=list(KNOWN)),
@@ -201,9 +197,7 @@ def collect(ridge: Ridge) -> dict[str, Any]:
             }
             for name in NATURAL
         },
-        "combinations": {
-            str(name): {str(k): float(v) for k, v in row.items()} for name, row in ridge.combinations.iterrows()
-        },
+        "combinations": ridge.combinations.astype(float).to_dict("index"),
         "joint": {c: str(r.joint["verdict"]) for c, r in (("natural", ridge.natural), ("logarithms", ridge.sampling))},
         "recommendation": str(ridge.natural.joint["recommendation"]),
     }

@@ -24,16 +24,16 @@ def run(options: argparse.Namespace) -> None:
     watch = common.Stopwatch()
     print("All data are SYNTHETIC: simulated from the stated truth, with noise.")
     with watch.part("truths", "the true orbits, by shooting"):
-        truths = true_orbits(options.seed)
+        truths = _true_orbits(options.seed)
     lines: list[dict[str, Any]] = []
     with watch.part("replicates", f"{options.replicates} recordings at {len(NOISE_LEVELS)} noise levels"):
         tasks = [(options.seed + 1 + number, truths) for number in range(options.replicates)]
-        for number, found in enumerate(common.each(replicate, tasks), 1):
+        for number, found in enumerate(common.each(_replicate, tasks), 1):
             lines += found
             print(f"  {number} of {len(tasks)}", flush=True)
     lines.sort(key=lambda line: (line["noise"], line["seed"]))
-    table = {f"{noise:g}": summary([line for line in lines if line["noise"] == noise]) for noise in NOISE_LEVELS}
-    print(account(table))
+    table = {f"{noise:g}": _summary([line for line in lines if line["noise"] == noise]) for noise in NOISE_LEVELS}
+    print(_account(table))
     folder = options.out / "table"
     paths = common.save_figures(folder, {"errors": figures.errors(lines)})
     results = {"synthetic": True, "seed": options.seed, "drive_periods": PERIODS, "table": table, "replicates": lines}
@@ -41,15 +41,14 @@ def run(options: argparse.Namespace) -> None:
     common.finish(folder, results, watch, paths, synthetic=True)
 
 
-def true_orbits(seed: int) -> list[Reference]:
-    """Return the orbits of a recording without noise, by shooting."""
+def _true_orbits(seed: int) -> list[Reference]:
     section = section_of(simulate(PERIODS, seed))
     found = bp.find_orbits(section, periods=range(1, LONGEST_USED + 1))
     polished = bp.polish_orbits(bp.models.pendulum, found, pendulum_orbits.TRUTH, samples=pendulum_orbits.SAMPLES)
     return pendulum_orbits.references(polished)[0]
 
 
-def replicate(seed: int, truths: Sequence[Reference]) -> list[dict[str, Any]]:
+def _replicate(seed: int, truths: Sequence[Reference]) -> list[dict[str, Any]]:
     """Return the results of one recording, whose start and noise the seed determines, at every noise level."""
     recording, lines = simulate(PERIODS, seed), []
     for noise in NOISE_LEVELS:
@@ -58,20 +57,20 @@ def replicate(seed: int, truths: Sequence[Reference]) -> list[dict[str, Any]]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
-                line |= one(with_noise(recording, noise, seed), truths)
+                line |= _one(with_noise(recording, noise, seed), truths)
             except (ValueError, RuntimeError) as error:
                 line["failure"] = f"{type(error).__name__}: {error}"
         lines.append(line | {"seconds": round(time.perf_counter() - start, 2)})
     return lines
 
 
-def one(recording: bp.Recording, truths: Sequence[Reference]) -> dict[str, Any]:
+def _one(recording: bp.Recording, truths: Sequence[Reference]) -> dict[str, Any]:
     """Return errors, sds and coverage of one recording."""
     orbits = bp.find_orbits(section_of(recording), periods=range(1, LONGEST_USED + 1))
     found = estimates.identify(orbits, which=("m and l", "k3"))
     fits = {"points": found.fits, "with eigenvalues": {}}
     for which in found.fits:
-        fits["with eigenvalues"][which] = estimates.with_eigenvalues(found.selected, FREE[which])[1]
+        fits["with eigenvalues"][which] = estimates.with_eigenvalues(found.selected, FREE[which])
     line: dict[str, Any] = {
         "orbits": len(orbits),
         "selected": len(found.selected),
@@ -88,7 +87,7 @@ def one(recording: bp.Recording, truths: Sequence[Reference]) -> dict[str, Any]:
     return line
 
 
-def summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return medians, 90 % ranges and coverage over the recordings of one noise level."""
     whole = [line for line in lines if "failure" not in line]
     found: dict[str, Any] = {
@@ -120,8 +119,7 @@ def _covering(intervals: Iterable[bool]) -> dict[str, float]:
     return pendulum_orbits.covered([0.0 if covers else np.inf for covers in intervals])
 
 
-def account(table: dict[str, Any]) -> str:
-    """Return the table to print."""
+def _account(table: dict[str, Any]) -> str:
     columns = ["median_error", "paper", "covered.cover", "covered.bars", "covered.band_low", "covered.band_high"]
     columns += ["covered_with_eigenvalues.cover", "sd_with_eigenvalues_over_without"]
     lines = []

@@ -68,16 +68,16 @@ def run(options: argparse.Namespace) -> None:
     results: dict[str, Any] = {"recording": about, "noise": noise, "seed": options.seed, "quick": options.quick}
     if about["synthetic"]:
         with watch.part("reference", "the same orbits by shooting"):
-            results |= against_shooting(found)
-        print(orbit_account(results))
+            results |= _against_shooting(found)
+        print(_orbit_account(results))
     with watch.part("estimates", "m and l, k3, and all five, from the paper's start"):
         identified = pendulum_estimates.identify(found[noise].chained)
         eigenvalue_fits = {
-            which: pendulum_estimates.with_eigenvalues(identified.selected, names)[1]
+            which: pendulum_estimates.with_eigenvalues(identified.selected, names)
             for which, names in pendulum_estimates.FREE.items()
         }
     results |= estimates(about, found[noise], identified, eigenvalue_fits)
-    print(estimate_account(results))
+    print(_estimate_account(results))
     with watch.part("ridge", "sampling the posterior of all five with emcee"):
         ridge = pendulum_estimates.sample(identified, options.seed, options.quick)
     results["all_five"] = pendulum_estimates.collect(ridge)
@@ -89,7 +89,7 @@ def run(options: argparse.Namespace) -> None:
     common.finish(options.out, results, watch, paths, synthetic=about["synthetic"])
 
 
-def against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
+def _against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
     """Return the orbits found without noise, compared with shooting, and the multipliers by noise level and method."""
     clean = found[0.0].chained
     polished = bp.polish_orbits(bp.models.pendulum, clean, pendulum_recording.TRUTH, samples=orbits.SAMPLES)
@@ -146,8 +146,7 @@ def estimates(
     }
 
 
-def orbit_account(results: Mapping[str, Any]) -> str:
-    """Return the comparison of found and true orbits as text."""
+def _orbit_account(results: Mapping[str, Any]) -> str:
     clean = results["found_without_noise"]
     rows = {
         f"noise {float(noise):.1%}, {method}, period {row['period']}": row
@@ -164,8 +163,7 @@ def orbit_account(results: Mapping[str, Any]) -> str:
     ])  # fmt: skip
 
 
-def estimate_account(results: Mapping[str, Any]) -> str:
-    """Return the estimates as a table to print."""
+def _estimate_account(results: Mapping[str, Any]) -> str:
     reduction = results["data_reduction"]
     rows = {
         f"{which}: {name}": {**one, "paper": PAPER_ERRORS.get(name) if which != pendulum_estimates.ALL else None}

@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> None:
     if data["synthetic"]:
         print(f"  the measured file was not found; it is at {ADDRESS}, sha256 {SHA256}")
     with watch.part("compile", "compiling the model, or loading it from the cache"):
-        solve(medians(), experiment)
+        solve(_medians(), experiment)
     every, within = {}, {}
     for noise in NOISES:
         with watch.part(f"map {noise}", f"finding the MAP point with the noise model {noise!r}"):
@@ -84,23 +84,26 @@ def run(options: argparse.Namespace) -> None:
     fit = every["independent"]
     with watch.part("checks", "checking the grid, the starts and the second steady part"):
         grid = discretisation(recording, experiment, fit.theta)
-        from_rest, seconds = starts_from_rest(experiment, fit.theta)
+        from_rest, seconds = _from_rest(experiment, fit.theta)
         other = bp.map_estimate(problem(experiment), start=OTHER_START)
         checks = {
             "from_rest": from_rest,
             "other_start": {"start": OTHER_START, "status": other.status, "shift": _shift(fit, other)},
-            "repetition": repetition(experiment, fit, second),
-            "beyond_drive": beyond_drive(experiment, fit),
+            "repetition": _repetition(experiment, fit, second),
+            "beyond_drive": _beyond_drive(experiment, fit),
         }
     with watch.part("figures", "drawing"):
         choices = {f"{e.harmonics['response']} harmonics": f for e, f in ((experiment, every), (in_drive, within))}
         truth = TRUE if data["synthetic"] else None
-        figures = {"spectrum": spectrum(experiment, fit, grid.difference), "estimates": estimates(choices, truth)}
+        figures = {"spectrum": _spectrum(experiment, fit, grid.difference), "estimates": _estimates(choices, truth)}
         paths = common.save_figures(options.out, figures)
 
     results = {"data": data, "seed": options.seed, "quick": options.quick}
-    results |= collect(experiment, every, grid) | checks
-    results["response_harmonics"] = {"rule": RULE, "choices": [by_noise(experiment, every), by_noise(in_drive, within)]}
+    results |= _collect(experiment, every, grid) | checks
+    results["response_harmonics"] = {
+        "rule": RULE,
+        "choices": [_by_noise(experiment, every), _by_noise(in_drive, within)],
+    }
     results |= {"seconds": watch.total() | {"from_rest": seconds}, "versions": common.versions()}
     print(f"\nSilverbox, {kind} data, w0 = 2π·65 rad/s: estimate ± Laplace sd (sandwich sd) by noise model")
     print("\n".join([*_fits_lines(every), *_check_lines(results)]))
@@ -176,8 +179,7 @@ def problem(experiment: bp.Experiment, noise: str = "independent") -> bp.Problem
     return bp.Problem(bp.models.silverbox, [experiment], priors=PRIORS, fixed={"w0": W0}, scheme=SCHEME, noise=noise)
 
 
-def medians() -> dict[str, float]:
-    """Return the medians of the priors."""
+def _medians() -> dict[str, float]:
     return {name: float(prior.quantile(0.5)) for name, prior in PRIORS.items()}
 
 
@@ -214,13 +216,13 @@ def discretisation(recording: bp.Recording, experiment: bp.Experiment, theta: Ma
     )
 
 
-def starts_from_rest(experiment: bp.Experiment, theta: Mapping[str, float]) -> tuple[list[dict[str, Any]], list[float]]:
+def _from_rest(experiment: bp.Experiment, theta: Mapping[str, float]) -> tuple[list[dict[str, Any]], list[float]]:
     """Return how the solver finds the response from rest at full amplitude, and the seconds.
 
     With a fifth of the damping Newton's method stalls, and the drive is increased in steps.
     """
     points = {
-        "prior medians": medians(),
+        "prior medians": _medians(),
         "estimate": theta,
         "estimate, a fifth of its damping": {**theta, "c": 0.2 * theta["c"]},
     }
@@ -233,7 +235,7 @@ def starts_from_rest(experiment: bp.Experiment, theta: Mapping[str, float]) -> t
     return found, seconds
 
 
-def repetition(experiment: bp.Experiment, fit: bp.MapEstimate, recording: bp.Recording) -> dict[str, Any]:
+def _repetition(experiment: bp.Experiment, fit: bp.MapEstimate, recording: bp.Recording) -> dict[str, Any]:
     """Return the part of the residual that a second recording reproduces, and the shift of the estimates.
 
     The reproducible part is model error; the rest is the noise of the mean period, whatever its spectrum.
@@ -249,7 +251,7 @@ def repetition(experiment: bp.Experiment, fit: bp.MapEstimate, recording: bp.Rec
     }
 
 
-def beyond_drive(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, float]:
+def _beyond_drive(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, float]:
     """Return the share of the residual in harmonics above the drive's last line, and data against model there."""
     residual = np.fft.rfft(fit.residuals[experiment.name]["response"])
     measured = np.fft.rfft(experiment.outputs["response"])
@@ -269,7 +271,7 @@ def _shift(fit: bp.MapEstimate, other: bp.MapEstimate) -> dict[str, float]:
     return {name: (other.theta[name] - fit.theta[name]) / fit.sd[name] for name in fit.theta}
 
 
-def collect(experiment: bp.Experiment, fits: dict[str, bp.MapEstimate], grid: Discretisation) -> dict[str, Any]:
+def _collect(experiment: bp.Experiment, fits: dict[str, bp.MapEstimate], grid: Discretisation) -> dict[str, Any]:
     """Return the content of results.json that comes from the fits with all harmonics and from the grid."""
     fit, split = fits["independent"], fits["measured"].noise_split["response"]
     return {
@@ -290,11 +292,10 @@ def collect(experiment: bp.Experiment, fits: dict[str, bp.MapEstimate], grid: Di
         "input_noise": fit.input_noise["response"],
         "discretisation_error_fraction": grid.fraction,
         "discretisation_allowed": grid.allowed,
-    } | by_noise(experiment, fits)
+    } | _by_noise(experiment, fits)
 
 
-def by_noise(experiment: bp.Experiment, fits: dict[str, bp.MapEstimate]) -> dict[str, Any]:
-    """Return the results of the noise models."""
+def _by_noise(experiment: bp.Experiment, fits: dict[str, bp.MapEstimate]) -> dict[str, Any]:
     return {
         "harmonics": experiment.harmonics["response"],
         "status": {noise: f.status for noise, f in fits.items()},
@@ -369,7 +370,7 @@ def _check_lines(results: dict[str, Any]) -> list[str]:
     return lines
 
 
-def spectrum(experiment: bp.Experiment, fit: bp.MapEstimate, difference: np.ndarray) -> Figure:
+def _spectrum(experiment: bp.Experiment, fit: bp.MapEstimate, difference: np.ndarray) -> Figure:
     """Draw the amplitudes of response, residual, standard error and grid error, odd and even harmonics apart."""
     kept = experiment.harmonics["response"]
     frequency = experiment.frequency * np.arange(kept + 1)
@@ -397,7 +398,7 @@ def spectrum(experiment: bp.Experiment, fit: bp.MapEstimate, difference: np.ndar
     return figure
 
 
-def estimates(choices: Mapping[str, Mapping[str, bp.MapEstimate]], truth: Mapping[str, float] | None) -> Figure:
+def _estimates(choices: Mapping[str, Mapping[str, bp.MapEstimate]], truth: Mapping[str, float] | None) -> Figure:
     """Draw the estimates with their standard deviations, by noise model and choice of harmonics."""
     first = next(iter(choices.values()))
     noises, names = list(first), list(next(iter(first.values())).theta)

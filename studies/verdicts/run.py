@@ -123,9 +123,8 @@ RIDGES = {"product_ridge": None, "sum_ridge": None, "scaling_symmetry": ["m", "k
 WIDTH = 72
 
 
-def figures(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
-    """Return the gallery, and a corner of every ridge."""
-    found = {"gallery": gallery(outcomes)}
+def _figures(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
+    found = {"gallery": _gallery(outcomes)}
     for name, names in RIDGES.items():
         if name in outcomes:
             outcome = outcomes[name]
@@ -134,7 +133,7 @@ def figures(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
     return found
 
 
-def gallery(outcomes: Mapping[str, Outcome]) -> Figure:
+def _gallery(outcomes: Mapping[str, Outcome]) -> Figure:
     """Draw for every case the marginal of one parameter and its verdicts."""
     figure = plt.figure(figsize=(11.0, 1.55 * len(outcomes) + 0.7), layout="constrained")
     grid = figure.subplots(len(outcomes), 2, squeeze=False, width_ratios=[1.0, 1.35])
@@ -207,10 +206,10 @@ def run(options: argparse.Namespace) -> None:
     for name in QUICK if options.quick else CASES:
         with watch.part(name, name.replace("_", " ")):
             outcomes[name] = examine(name, STRIDE * options.seed, options.seed)
-        print(account(outcomes[name]))
+        print(_account(outcomes[name]))
     with watch.part("figures", "drawing"):
-        paths = common.save_figures(options.out, figures(outcomes))
-    results: dict[str, Any] = {name: collect(outcome) for name, outcome in outcomes.items()}
+        paths = common.save_figures(options.out, _figures(outcomes))
+    results: dict[str, Any] = {name: _collect(outcome) for name, outcome in outcomes.items()}
     if options.replicates:
         with watch.part("replicates", f"{options.replicates} replicates of every case"):
             lines = replicates(options.out, tuple(outcomes), options.replicates, options.seed)
@@ -222,8 +221,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"figures (synthetic data): {', '.join(map(str, paths))}\nresults: {path}")
 
 
-def collect(outcome: Outcome) -> dict[str, Any]:
-    """Return the content of results.json on one case."""
+def _collect(outcome: Outcome) -> dict[str, Any]:
     case, posterior, joint = outcome.case, outcome.posterior, outcome.comparison.joint
     p_values = outcome.prediction.table.select_dtypes("number")
     return {
@@ -247,8 +245,7 @@ def collect(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def account(outcome: Outcome) -> str:
-    """Return the text to print on a case."""
+def _account(outcome: Outcome) -> str:
     verdicts = [f"{tool}: {', '.join(f'{n} {v}' for n, v in rows.items())}" for tool, rows in outcome.verdicts.items()]
     verdict = f"WRONG ({outcome.wrong})" if outcome.wrong else "right"
     lines = [f"  fault: {outcome.case.title}; every verdict {verdict}; {outcome.posterior.reason}", *verdicts]
