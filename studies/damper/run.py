@@ -62,7 +62,8 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("harmonics", "repeating it with other numbers of displacement harmonics"):
         default = harmonics["displacement"]
         counts = max(1, round(default / 4)), min(58, 2 * default)
-        choices = [_fit_with(recording, count) for count in counts]
+        folded = [recording.fold(harmonics={"displacement": count}) for count in counts]
+        choices = [_summary(e, bp.map_estimate(bp.Problem(bp.models.dahl, [e], priors=PRIORS))) for e in folded]
     with watch.part("sample", "sampling the posterior with emcee"):
         posterior = bp.sample(problem, fit, seed=options.seed, max_steps=500 if options.quick else 20_000)
     print(f"  {posterior.reason}")
@@ -105,11 +106,6 @@ def generate(seed: int) -> bp.Recording:
         bp.models.dahl, PUBLISHED, {"displacement": displacement}, frequency=SYNTHETIC_FREQUENCY, duration=30.0,
         sampling_rate=100.0, noise=SYNTHETIC_NOISE, seed=seed,
     )  # fmt: skip
-
-
-def _fit_with(recording: bp.Recording, count: int) -> dict[str, Any]:
-    experiment = recording.fold(harmonics={"displacement": count})
-    return _summary(experiment, bp.map_estimate(bp.Problem(bp.models.dahl, [experiment], priors=PRIORS)))
 
 
 def _summary(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, Any]:

@@ -202,15 +202,10 @@ def account(verdict: Verdict) -> dict[str, Any]:
 def line(name: str, verdict: Verdict) -> str:
     """Return the text to print on an experiment."""
     fit, (negative, error) = verdict.identified.fit, verdict.p_negative
-    if "scale" in fit.noise:
-        size = f"scale of the errors {fit.noise['scale']:.2f}"
-    else:
-        split = fit.noise_split["force"]
-        size = f"force: noise {split.measurement:.1f} N, model error {split.model:.1f} N"
     return (
         f"{name:>14s}: theta16 {fit.theta[CONDUCTION]:8.3f} ± {fit.sd[CONDUCTION]:.3f} W/K, "
         f"P(< 0) = {negative:.4f} ± {error:.4f} (Laplace {_p_negative(fit, CONDUCTION):.4f}), "
-        f"{verdict.sign}, {'misspecified' if verdict.misspecified else 'adequate'}; {size}"
+        f"{verdict.sign}, {'misspecified' if verdict.misspecified else 'adequate'}"
     )
 
 

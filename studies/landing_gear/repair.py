@@ -94,8 +94,7 @@ def problem(task: Task, names: Sequence[str]) -> bp.Problem:
         DISPLACEMENT,
         one_conduction=bool(task.held_out),
         model=model,
-        priors=identification.PRIORS
-        | {name: prior for name, prior in EFFECT_PRIORS.items() if name in model.parameters},
+        priors=identification.PRIORS | {n: prior for n, prior in EFFECT_PRIORS.items() if n in model.parameters},
         fixed=identification.FIXED | {name: value for name, value in KNOWN.items() if name in model.parameters},
         scheme=SCHEME,
     )

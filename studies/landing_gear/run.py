@@ -222,31 +222,20 @@ def _posteriors(verdicts: Mapping[str, Verdict]) -> dict[str, Any]:
 
 
 def _account(truth: str, results: Mapping[str, Any]) -> str:
-    forced = results["force_given"]
+    forced, moved = results["force_given"], results["drop"]["displacement"]
     wrong = sum(e["p_negative_laplace"][CONDUCTION] > 0.975 for e in forced["force_taken_for_exact"].values())
-    moved = results["drop"]["displacement"]
     early, late = moved["share_within_the_band"].values()
-    columns = [f"posterior.{CONDUCTION}.{key}" for key in ("mean", "sd")]
     pairs = "; ".join(" against ".join(p["pair"]) for p in results["opposite_pairs"]) or "none"
+    columns = [*(f"posterior.{CONDUCTION}.{key}" for key in ("mean", "sd")), "p_negative", "sign", "misspecified"]
+    columns += ["converged", "log_posterior_calls", "seconds"]
     lines = [
-        f"truth {truth}",
-        *_summary("displacement", results),
-        f"pairs at one frequency that differ in sign: {pairs}",
-        *_summary("force", forced),
+        common.shown(f"truth {truth}, displacement given", results["experiments"], columns),
+        common.shown("other parameters under priors", results["others_under_priors"], ["mean", "sd", "p_negative"]),
+        common.shown("force given", forced["experiments"], columns),
+        f"pairs at one frequency that differ in sign, displacement given: {pairs}",
         f"taking the force for exact, {wrong} would be negative (Laplace)",
+        *(force.line(drive, one) for drive, one in results["joint"].items()),
         f"drop: true displacement within the 90 % band for {early:.0%} of the first 2.5 s and {late:.0%} of the time "
         f"until 30 s, off the median by up to {1e3 * moved['largest_error_of_the_median']:.3f} mm",
-        *(force.line(drive, one) for drive, one in results["joint"].items()),
-        common.shown("theta16 with the others fixed", results["experiments"], [*columns, "p_negative"]),
-        common.shown("and with the others under priors", results["others_under_priors"], ["mean", "sd", "p_negative"]),
     ]
     return "\n".join(lines)
-
-
-def _summary(drive: str, found: Mapping[str, Any]) -> list[str]:
-    signs = "; ".join(f"{sign}: {', '.join(names) or 'none'}" for sign, names in found["signs"].items())
-    return [
-        f"{drive} given: {signs}; misspecified: {', '.join(found['misspecified']) or 'none'}",
-        f"{found['posteriors_converged']} of {len(found['experiments'])} posteriors converged; "
-        f"{found['log_posterior_calls']} log-posteriors in {found['seconds']:.0f} s",
-    ]

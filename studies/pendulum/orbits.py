@@ -89,11 +89,12 @@ class Reference:
     off: float  # By how much the polished orbit's section points differ [rad, 5 rad/s]
 
 
-def references(polished: bp.Orbits) -> tuple[list[Reference], list[str]]:
-    """Return the orbits that shooting from polished orbits converges to, and the names of unconfirmed ones.
+def true_orbits(orbits: bp.Orbits) -> tuple[bp.Orbits, list[Reference], list[str]]:
+    """Return polished orbits, those to which shooting from them converges, and the names of unconfirmed ones.
 
     Of a pair of symmetric partners one is integrated and the other mirrored.
     """
+    polished = bp.polish_orbits(bp.models.pendulum, orbits, TRUTH, samples=SAMPLES)
     found: dict[int, Reference] = {}
     refuted = []
     for number, orbit in enumerate(polished):
@@ -110,7 +111,7 @@ def references(polished: bp.Orbits) -> tuple[list[Reference], list[str]]:
             found[number] = Reference(orbit.period, shot.winding, shot.points, shot.multipliers, equilibrium, off)
         else:
             refuted.append(orbit.name)
-    return list(found.values()), refuted
+    return polished, list(found.values()), refuted
 
 
 def _nearest(truth: Reference, points: np.ndarray) -> Reference:

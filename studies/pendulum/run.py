@@ -7,16 +7,20 @@ recordings.
 """
 
 import argparse
-from collections.abc import Mapping, Sequence
+import time
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
 
 import bayesperiodic as bp
 from studies import common
 from studies.pendulum import estimates as pendulum_estimates
 from studies.pendulum import figures as pendulum_figures
-from studies.pendulum import orbits, replicates
+from studies.pendulum import orbits
 from studies.pendulum import recording as pendulum_recording
-from studies.pendulum.estimates import PAPER_ERRORS, START_ERRORS, Identified
+from studies.pendulum.estimates import ALL, FREE, LARGEST, LONGEST_USED, PAPER_ERRORS, START_ERRORS, Identified
 from studies.pendulum.recording import section_of, with_noise
 
 
@@ -43,6 +47,7 @@ def _found(recording: bp.Recording, noise: float, seed: int, periods: tuple[int,
 
 
 NOISE_LEVELS = (0.0, 0.001, 0.01)
+TABLE_NOISE = (0.001, 0.01)
 PERIODS, QUICK_PERIODS = range(1, 6), range(1, 4)
 
 
@@ -54,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
             f"{options.noise}."
         )
     if options.replicates:
-        replicates.run(options)
+        _replicates(options)
         return
     watch = common.Stopwatch()
     with watch.part("recording", "the recording"):
@@ -73,8 +78,7 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("estimates", "m and l, k3, and all five, from the paper's start"):
         identified = pendulum_estimates.identify(found[noise].chained)
         eigenvalue_fits = {
-            which: pendulum_estimates.with_eigenvalues(identified.selected, names)
-            for which, names in pendulum_estimates.FREE.items()
+            which: pendulum_estimates.with_eigenvalues(identified.selected, names) for which, names in FREE.items()
         }
     results |= estimates(about, found[noise], identified, eigenvalue_fits)
     print(_estimate_account(results))
@@ -92,8 +96,7 @@ def run(options: argparse.Namespace) -> None:
 def _against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
     """Return the orbits found without noise, compared with shooting, and the multipliers by noise level and method."""
     clean = found[0.0].chained
-    polished = bp.polish_orbits(bp.models.pendulum, clean, pendulum_recording.TRUTH, samples=orbits.SAMPLES)
-    truths, refuted = orbits.references(polished)
+    polished, truths, refuted = orbits.true_orbits(clean)
     return {
         "found_without_noise": {
             "candidates": len(clean),
@@ -112,8 +115,7 @@ def _against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
         },
         "error_bars": {
             f"{noise:g}": {
-                kind: orbits.covered(values)
-                for kind, values in orbits.pulls(one.chained, truths, pendulum_estimates.LARGEST).items()
+                kind: orbits.covered(values) for kind, values in orbits.pulls(one.chained, truths, LARGEST).items()
             }
             for noise, one in found.items()
         },
@@ -166,7 +168,7 @@ def _orbit_account(results: Mapping[str, Any]) -> str:
 def _estimate_account(results: Mapping[str, Any]) -> str:
     reduction = results["data_reduction"]
     rows = {
-        f"{which}: {name}": {**one, "paper": PAPER_ERRORS.get(name) if which != pendulum_estimates.ALL else None}
+        f"{which}: {name}": {**one, "paper": PAPER_ERRORS.get(name) if which != ALL else None}
         for which, found in results["estimates"].items()
         for name, one in found["parameters"].items()
     }
@@ -175,3 +177,115 @@ def _estimate_account(results: Mapping[str, Any]) -> str:
         f"{reduction['numbers_in_the_recording']} numbers in the recording {reduction['numbers_used']} are used",
         rows,
     )
+
+
+def _replicates(options: argparse.Namespace) -> None:
+    """Compute table 1 of the paper over many recordings: errors, coverage, failures, and multipliers as data."""
+    watch = common.Stopwatch()
+    print("All data are SYNTHETIC: simulated from the stated truth, with noise.")
+    with watch.part("truths", "the true orbits, by shooting"):
+        section = section_of(pendulum_recording.simulate(pendulum_recording.PERIODS, options.seed))
+        _, truths, _ = orbits.true_orbits(bp.find_orbits(section, periods=range(1, LONGEST_USED + 1)))
+    lines: list[dict[str, Any]] = []
+    with watch.part("replicates", f"{options.replicates} recordings at {len(TABLE_NOISE)} noise levels"):
+        tasks = [(options.seed + 1 + number, truths) for number in range(options.replicates)]
+        for number, found in enumerate(common.each(_replicate, tasks), 1):
+            lines += found
+            print(f"  {number} of {len(tasks)}", flush=True)
+    lines.sort(key=lambda line: (line["noise"], line["seed"]))
+    table = {f"{noise:g}": _summary([line for line in lines if line["noise"] == noise]) for noise in TABLE_NOISE}
+    print(_account(table))
+    folder = options.out / "table"
+    paths = common.save_figures(folder, {"errors": pendulum_figures.errors(lines)})
+    results = {"synthetic": True, "seed": options.seed, "drive_periods": pendulum_recording.PERIODS, "table": table}
+    results |= {"replicates": lines, "start_errors": START_ERRORS, "paper_errors": PAPER_ERRORS}
+    common.finish(folder, results, watch, paths, synthetic=True)
+
+
+def _replicate(seed: int, truths: Sequence[orbits.Reference]) -> list[dict[str, Any]]:
+    """Return the results of one recording, whose start and noise the seed determines, at every noise level."""
+    recording, lines = pendulum_recording.simulate(pendulum_recording.PERIODS, seed), []
+    for noise in TABLE_NOISE:
+        line: dict[str, Any] = {"seed": seed, "noise": noise, "errors": {}}
+        start = time.perf_counter()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                line |= _one(with_noise(recording, noise, seed), truths)
+            except (ValueError, RuntimeError) as error:
+                line["failure"] = f"{type(error).__name__}: {error}"
+        lines.append(line | {"seconds": round(time.perf_counter() - start, 2)})
+    return lines
+
+
+def _one(recording: bp.Recording, truths: Sequence[orbits.Reference]) -> dict[str, Any]:
+    """Return errors, sds and coverage of one recording."""
+    found_orbits = bp.find_orbits(section_of(recording), periods=range(1, LONGEST_USED + 1))
+    found = pendulum_estimates.identify(found_orbits, which=("m and l", "k3"))
+    every = (
+        list(found.fits.values()),
+        [pendulum_estimates.with_eigenvalues(found.selected, FREE[n]) for n in found.fits],
+    )
+    line: dict[str, Any] = {
+        "orbits": len(found_orbits),
+        "selected": len(found.selected),
+        "lost": [list(pair) for pair in found.lost],
+        "not_orbits": sum(orbits.matched(orbit, truths) is None for orbit in found.selected),
+        "pulls": orbits.pulls(found_orbits, truths, np.inf),
+        "converged": all(fit.converged for fits in every for fit in fits),
+    }
+    for key, fits in zip(("", "eigenvalue_"), every, strict=True):
+        line[f"{key}errors"] = {n: e for fit in fits for n, e in pendulum_estimates.errors(fit).items()}
+        line[f"{key}sd"] = {n: fit.sd[n] / fit.theta[n] for fit in fits for n in fit.theta}
+        line[f"{key}covers"] = {n: c for fit in fits for n, c in pendulum_estimates.covers(fit).items()}
+    line["scale"] = found.fits["m and l"].noise["scale"]
+    return line
+
+
+def _summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return medians, 90 % ranges and coverage over the recordings of one noise level."""
+    whole = [line for line in lines if "failure" not in line]
+    found: dict[str, Any] = {
+        "recordings": len(lines),
+        "failures": [line["failure"] for line in lines if "failure" in line],
+        "lost_orbits": sum(len(line["lost"]) for line in whole),
+        "selected_that_are_no_orbits": sum(line["not_orbits"] for line in whole),
+        "selected_median": float(np.median([line["selected"] for line in whole])),
+        "seconds_each": float(np.mean([line["seconds"] for line in lines])),
+    }
+    for name, paper in PAPER_ERRORS.items():
+        size = np.abs([line["errors"][name] for line in whole])
+        found[name] = {
+            "median_error": float(np.median(size)),
+            "range_90": [float(q) for q in np.quantile(size, [0.05, 0.95])],
+            "paper": paper,
+            "covered": _covering(line["covers"][name] for line in whole),
+            "covered_with_eigenvalues": _covering(line["eigenvalue_covers"][name] for line in whole),
+            "sd_with_eigenvalues_over_without": float(
+                np.median([line["eigenvalue_sd"][name] / line["sd"][name] for line in whole])
+            ),
+        }
+    for kind in ("eigenvalue", "point"):
+        found[f"{kind}_bars"] = orbits.covered([p for line in whole for p in line["pulls"][kind]])
+    return found
+
+
+def _covering(intervals: Iterable[bool]) -> dict[str, float]:
+    return orbits.covered([0.0 if covers else np.inf for covers in intervals])
+
+
+def _account(table: dict[str, Any]) -> str:
+    columns = ["median_error", "paper", "covered.cover", "covered.bars", "covered.band_low", "covered.band_high"]
+    columns += ["covered_with_eigenvalues.cover", "sd_with_eigenvalues_over_without"]
+    lines = []
+    for noise, found in table.items():
+        bars = found["eigenvalue_bars"]
+        rows = {name: found[name] for name in PAPER_ERRORS}
+        title = f"noise {float(noise):.1%}: relative errors, coverage of 90 % intervals"
+        lines.append(common.shown(title, rows, columns))
+        lines.append(
+            f"failures {len(found['failures'])}, orbits lost {found['lost_orbits']}, selected but not true "
+            f"{found['selected_that_are_no_orbits']}; eigenvalue error bars {bars['cover']} of {bars['bars']} "
+            f"(band {bars['band_low']:.0f} … {bars['band_high']:.0f}); {found['seconds_each']:.1f} s each"
+        )
+    return "\n".join(lines)

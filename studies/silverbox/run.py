@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
@@ -56,6 +55,7 @@ SHORT = 1e-4
 WRONG_PHASE = 0.5
 HUM, OVERSTATED = 50.0, 0.7
 ERROR_OF_MEAN, GRID, TRUTH = "#999999", "#009E73", "#CC79A7"
+MAP, LAPLACE = bp.plot.COLOURS["map"], bp.plot.COLOURS["laplace"]
 # Of the spectrum's ordinate [V].
 LOWEST = 1e-11
 
@@ -336,26 +336,21 @@ def _check_lines(results: dict[str, Any]) -> list[str]:
     split, repeat, beyond = results["noise_split"], results["repetition"], results["beyond_drive"]
     error, allowed = results["discretisation_error_fraction"], results["discretisation_allowed"]
     other, doubled = results["other_start"], results["doubling_shift"].values()
+    residual = {
+        "rms": results["rms"], "noise by scatter": split["measurement"], "model error by scatter": split["model"],
+        "not reproduced by a second part": repeat["does_not"], "reproduced": repeat["repeats"],
+    }  # fmt: skip
     lines = [
-        f"residual {1e3 * results['rms']:.3f} mV rms, {results['residual_fraction']:.3%} of the response's standard "
-        f"deviation; by the cycles' scatter: {1e3 * split['measurement']:.3f} mV\nmeasurement noise, "
-        f"{1e3 * split['model']:.3f} mV model error; by a second steady part: {1e3 * repeat['does_not']:.3f} mV not "
-        f"reproducible, {1e3 * repeat['repeats']:.3f} mV reproducible",
-        "the second part's estimates less the first's, in the first's Laplace sds: "
-        + ", ".join(f"{name} {shift:+.1f}" for name, shift in repeat["shift"].items()),
-        f"discretisation error ({results['scheme']}, {results['samples']} points) {error:.4%} of the response's "
-        f"standard deviation, {'below' if error < allowed else 'ABOVE'} the {allowed:.4%} allowed (a tenth of the\n"
-        f"mean period's standard error); twice the points would shift no estimate by more than "
-        f"{max(abs(s) for shifts in doubled for s in shifts.values()):.2g} standard deviations",
-        f"above the drive's last line ({FREQUENCY * DRIVE_LINES:.0f} Hz) lie {beyond['share_of_residual_power']:.0%} "
-        f"of the residual's power; at {beyond['strongest']:.0f} Hz measured over model is "
-        f"{beyond['measured_over_model']:.3f}, phase {beyond['phase_of_measured_over_model']:.2f} rad",
-        f"Found from rest at full amplitude ({results['scheme']}, {results['samples']} points):",
-        pd.DataFrame(results["from_rest"])
-        .assign(seconds=results["seconds"]["from_rest"])
-        .to_string(index=False, float_format="{:.3f}".format),
-        f"From another start ({other['status']}) the estimates differ by at most "
-        f"{max(map(abs, other['shift'].values())):.1g} standard deviations.",
+        common.shown(f"residual [V], {results['residual_fraction']:.3%} of the response's sd", {"": residual}),
+        common.shown("the second part's estimates less the first's [Laplace sd]", {"": repeat["shift"]}),
+        f"discretisation error {error:.4%} of the response's sd, {'below' if error < allowed else 'ABOVE'} the "
+        f"{allowed:.4%} allowed (a tenth of the mean period's standard error);\ntwice the points would shift no estimate "
+        f"by more than {max(abs(s) for shifts in doubled for s in shifts.values()):.2g} standard deviations",
+        common.shown(f"above the drive's last line ({FREQUENCY * DRIVE_LINES:.0f} Hz)", {"": beyond}),
+        f"from rest at full amplitude ({results['scheme']}, {results['samples']} points):",
+        pd.DataFrame(results["from_rest"]).assign(seconds=results["seconds"]["from_rest"]).to_string(index=False),
+        f"from another start ({other['status']}) the estimates differ by at most "
+        f"{max(map(abs, other['shift'].values())):.1g} standard deviations",
     ]
     if repeat["does_not"] < OVERSTATED * split["measurement"]:
         lines.append(
@@ -406,7 +401,13 @@ def _estimates(choices: Mapping[str, Mapping[str, bp.MapEstimate]], truth: Mappi
     for axes, name in zip(figure.subplots(2, 3).flat, names, strict=True):
         for number, (label, fits) in enumerate(choices.items()):
             at = np.arange(len(noises)) + 0.3 * (number - 0.5 * (len(choices) - 1))
-            _draw_estimates(axes, at, list(fits.values()), name, label, filled=number == 0)
+            values, sds, robust = ([getattr(f, k)[name] for f in fits.values()] for k in ("theta", "sd", "robust_sd"))
+            face = MAP if number == 0 else "white"
+            axes.errorbar(at, values, sds, fmt="none", ecolor=LAPLACE, elinewidth=4.0, label="Laplace sd")
+            axes.errorbar(
+                at, values, robust, fmt="none", ecolor="black", elinewidth=1.0, capsize=4, label="sandwich sd"
+            )
+            axes.plot(at, values, "o", color=MAP, mfc=face, ms=6, zorder=5, label=f"MAP, {label}")
         if truth is not None:
             axes.axhline(truth[name], color=TRUTH, lw=1.2, ls="--", label="true value")
         axes.set_xticks(range(len(noises)), noises)
@@ -417,16 +418,6 @@ def _estimates(choices: Mapping[str, Mapping[str, bp.MapEstimate]], truth: Mappi
     common.shared_legend(figure, 5)
     figure.suptitle(f"Silverbox{'' if truth is None else ', synthetic data'}: estimates by noise model")
     return figure
-
-
-def _draw_estimates(
-    axes: Axes, at: np.ndarray, fits: list[bp.MapEstimate], name: str, label: str, *, filled: bool
-) -> None:
-    values, sds, robust = ([getattr(fit, kind)[name] for fit in fits] for kind in ("theta", "sd", "robust_sd"))
-    laplace, colour = bp.plot.COLOURS["laplace"], bp.plot.COLOURS["map"]
-    axes.errorbar(at, values, sds, fmt="none", ecolor=laplace, elinewidth=4.0, label="Laplace sd")
-    axes.errorbar(at, values, robust, fmt="none", ecolor="black", elinewidth=1.0, capsize=4, label="sandwich sd")
-    axes.plot(at, values, "o", color=colour, mfc=colour if filled else "white", ms=6, zorder=5, label=f"MAP, {label}")
 
 
 def _amplitudes(values: np.ndarray, kept: int) -> np.ndarray:

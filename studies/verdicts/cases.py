@@ -72,18 +72,6 @@ def _generator(model: bp.Model, data_seed: int) -> np.random.Generator:
     return np.random.default_rng([zlib.crc32(model.name.encode()), data_seed])
 
 
-def _measured(
-    model: bp.Model, truth: Mapping[str, float], data_seed: int, *, frequency: float, noise: float, samples: int = 40
-) -> bp.Experiment:
-    """Return a synthetic run under a sine of 10 mm, white noise of this sd [N] on every sample of the force."""
-    displacement = STROKE * np.sin(2 * np.pi * np.arange(samples) / samples)
-    exact = bp.solve_periodic(
-        model, dict(truth), {"x": displacement}, frequency=frequency, samples=samples, scheme="central4"
-    )
-    force = exact.outputs["force"] + noise * _generator(model, data_seed).standard_normal(samples)
-    return bp.Experiment("run", frequency, {"force": force}, {"x": displacement}, samples=samples, synthetic=True)
-
-
 def _expected(**tools: Mapping[str, str]) -> dict[str, dict[str, tuple[str, ...]]]:
     """Return one right verdict by tool and parameter; the prediction is adequate if not stated otherwise."""
     stated = {**tools, PREDICT: tools.get(PREDICT, {"all": ADEQUATE})}
@@ -94,19 +82,24 @@ QUICKLY = {"ensembles": 2, "walkers": 32, "variances": "collapsed", "max_steps":
 
 
 def _one_run(
-    title: str, shown: str, model: bp.Model, truth: Mapping[str, float], priors: Mapping[str, Any],
-    expected: Mapping[str, Mapping[str, tuple[str, ...]]], fault: Mapping[str, tuple[str, ...]], *,
-    fitted: bp.Model | None = None, frequency: float = 2.0, noise: float = 1.0, samples: int = 40,
-    delay: bool = False, fixed: Mapping[str, float] | None = None, sampling: Mapping[str, Any] | None = None,
+    title: str, shown: str, model: bp.Model, truth: Mapping[str, float], priors: Mapping[str, Any], expected: Expected,
+    fault: Mapping[str, tuple[str, ...]], *, fitted: bp.Model | None = None, frequency: float = 2.0,
+    noise: float = 1.0, samples: int = 40, fixed: Mapping[str, float] | None = None, start: str = "laplace",
 ) -> Case:  # fmt: skip
-    """Return a case with one synthetic run of a model, fitted with the same model or another one."""
+    """Return a case with one synthetic run of a model, fitted with the same model or another one.
+
+    The displacement is a sine of 10 mm, every sample of the force has white noise of this sd [N].
+    """
+    values = {name: truth[name] for name in model.parameters}
 
     def problem(data_seed: int) -> bp.Problem:
-        run = _measured(model, truth, data_seed, frequency=frequency, noise=noise, samples=samples)
+        x = {"x": STROKE * np.sin(2 * np.pi * np.arange(samples) / samples)}
+        exact = bp.solve_periodic(model, values, x, frequency=frequency, samples=samples, scheme="central4")
+        force = exact.outputs["force"] + noise * _generator(model, data_seed).standard_normal(samples)
+        run = bp.Experiment("run", frequency, {"force": force}, x, samples=samples, synthetic=True)
         return bp.Problem(fitted or model, [run], priors=priors, fixed=fixed or {})
 
-    known = {**truth, "shift[run]": 0.0} if delay else truth
-    return Case(title, known, problem, shown, expected, fault, {**QUICKLY, **(sampling or {})})
+    return Case(title, truth, problem, shown, expected, fault, {**QUICKLY, "start": start})
 
 
 STIFFNESS = bp.Normal(8e3, 4e3)
@@ -194,10 +187,10 @@ def linear() -> Case:
 def sign_undetermined() -> Case:
     """Return a small damping and a recording delay, known to 1 ms, that acts as ±10 N s/m."""
     return _one_run(
-        "a delay of the recording may be the damping", "c", DAMPED, {"k": 1e4, "c": 3.0},
+        "a delay of the recording may be the damping", "c", DAMPED, {"k": 1e4, "c": 3.0, "shift[run]": 0.0},
         {"k": STIFFNESS, "c": bp.Normal(0.0, 100.0), "shift": bp.Normal(0.0, 1e-3)},
         _expected(identifiability={"k": DETERMINED, "c": SIGN}, compare=dict.fromkeys(("k", "c", "shift[run]"), FINE)),
-        {IDENTIFIABILITY: ("c",)}, delay=True,
+        {IDENTIFIABILITY: ("c",)},
     )  # fmt: skip
 
 
@@ -230,7 +223,7 @@ def two_modes() -> Case:
         "two positions on the beam fit equally well", "position", BEAM, truth,
         {"position": bp.TruncatedNormal(0.4, 0.3, 0.0, 1.0)},
         _expected(compare={"position": MODE}, joint={"all": MODE}),
-        {COMPARE: ("position",)}, noise=4.0, fixed={"k": truth["k"]}, sampling={"start": "prior"},
+        {COMPARE: ("position",)}, noise=4.0, fixed={"k": truth["k"]}, start="prior",
     )  # fmt: skip
 
 
