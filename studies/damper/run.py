@@ -126,7 +126,7 @@ def _collect(
     comparison: bp.Comparison,
     choices: list[dict[str, Any]],
 ) -> dict[str, Any]:
-    return {
+    return _summary(experiment, fit) | {
         "units": {name: bp.models.dahl.units[name] for name in fit.theta} | {"variance[force]": "N²"},
         "frequency": {"value": experiment.frequency, "se": experiment.frequency_se},
         "cycles": experiment.cycles,
@@ -134,15 +134,10 @@ def _collect(
         "independent_values": experiment.independent["force"],
         "harmonics": dict(experiment.harmonics),
         "whiteness": {"p": fit.whiteness["force"].p, "lag1": fit.whiteness["force"].lag1},
-        "map": fit.theta,
-        "laplace_sd": fit.sd,
         "robust_sd": fit.robust_sd,
         "noise_split": {key: getattr(fit.noise_split["force"], key) for key in ("measurement", "model", "total")},
         "posterior": posterior.summary()[["mean", "sd", "q05", "q50", "q95"]].astype(float).to_dict("index"),
         "comparison": comparison.table["verdict"].to_dict(),
-        "rms": fit.rms["force"],
-        "fvu": fit.fvu["force"],
-        "input_noise": fit.input_noise["force"],
         "input_harmonics": {"rule": RULE, "choices": choices},
         "converged": posterior.converged,
         "reason": posterior.reason,

@@ -1,13 +1,10 @@
 """Time of a log-posterior of the landing gear: the periodic solver against time integration until steady.
 
 All fourteen experiments at draws of their joint posterior, interleaved in one run. The periodic solver is timed with
-the whole log-posterior, the others with the integration alone, at the accuracy of the periodic solver or better. This
-accuracy depends on the scheme: each direction is measured with the study's scheme, the smoother one also with the
-finer scheme.
-
-The others are the compiled methods of `studies.landing_gear.integrators`, and SciPy's LSODA and Radau on the same
-compiled right-hand side. For each experiment the largest steps and loosest tolerances are chosen with which the outputs
-of all draws agree with the finest integration to the allowed fraction of their range.
+the whole log-posterior, by scheme; the compiled methods of `studies.landing_gear.integrators`, and SciPy's LSODA and
+Radau on the same compiled right-hand side, with the integration alone. For each experiment the largest steps and
+loosest tolerances are chosen with which the outputs of all draws are as accurate as those of the periodic solver,
+compared with the finest integration.
 """
 
 import os
@@ -26,7 +23,7 @@ from studies.benchmark.equations import table as input_table
 from studies.benchmark.kernels import MAX_CYCLES
 from studies.gear import gear_at_rest
 from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, FORCE, SAMPLES, Identified, problem
-from studies.landing_gear.integrators import NAMES, Methods, methods
+from studies.landing_gear.integrators import NAMES, methods
 from studies.timing import Action, interleaved, spread
 
 DRAWS, QUICK_DRAWS = 10, 2
@@ -119,7 +116,7 @@ class Gear:
         return all(integrate(parameters, self.still(parameters))[1] for parameters in self.parameters)
 
     @property
-    def _methods(self) -> Methods:
+    def _methods(self) -> Any:
         return methods(self.drive)
 
     @cached_property
@@ -281,37 +278,34 @@ def _actions(
 ) -> dict[str, Action]:
     """Return the timed actions, with the number of log-posteriors of each call."""
     many = np.resize(theta, (WALKERS, theta.shape[1]))
+
+    def cold(gear: Gear) -> bp.PeriodicSolution:
+        values, e = dict(zip(NAMES, gear.parameters[0], strict=True)), gear.experiment
+        model = bp.models.landing_gear(gear.drive)
+        return bp.solve_periodic(model, values, e.inputs, frequency=e.frequency, samples=SAMPLES, scheme=scheme)
+
+    def steady(gear: Gear, contender: Contender) -> np.ndarray:
+        # Static equilibrium if theta16 ≤ 0 at the estimate, without a steady state.
+        path, cycles = contender.integrate(gear.estimate, gear.still(gear.estimate))
+        return path[0] if cycles else gear.still(gear.estimate)
+
     actions: dict[str, Action] = {
         WARM: Action(lambda: [warm.log_posterior(one, noise) for one in theta], len(theta)),
         BATCHED: Action(lambda: warm.log_posterior(many, noise), WALKERS),
-        COLD: Action(lambda: [_cold(gear, scheme) for gear in gears]),
+        COLD: Action(lambda: [cold(gear) for gear in gears]),
     }
     for kind in COMPILED:
         contenders = [by_kind[kind] for by_kind in chosen]
-        known = [_steady(*one) for one in zip(gears, contenders, strict=True)]
+        known = [steady(*one) for one in zip(gears, contenders, strict=True)]
         actions[f"{kind} {STATIC}"] = Action(partial(_integrate, gears, contenders, None), len(theta))
         actions[f"{kind} {ESTIMATE}"] = Action(partial(_integrate, gears, contenders, known), len(theta))
     return actions
-
-
-def _steady(gear: Gear, contender: Contender) -> np.ndarray:
-    """Return the steady state at the estimate, or static equilibrium where its theta16 ≤ 0 leaves it none."""
-    path, cycles = contender.integrate(gear.estimate, gear.still(gear.estimate))
-    return path[0] if cycles else gear.still(gear.estimate)
 
 
 def _integrate(gears: Sequence[Gear], contenders: Sequence[Contender], starts: Sequence[np.ndarray] | None) -> None:
     for i, (gear, contender) in enumerate(zip(gears, contenders, strict=True)):
         for parameters in gear.parameters:
             contender.integrate(parameters, gear.still(parameters) if starts is None else starts[i])
-
-
-def _cold(gear: Gear, scheme: str) -> bp.PeriodicSolution:
-    """Solve from static equilibrium."""
-    return bp.solve_periodic(
-        bp.models.landing_gear(gear.drive), dict(zip(NAMES, gear.parameters[0], strict=True)), gear.experiment.inputs,
-        frequency=gear.experiment.frequency, samples=SAMPLES, scheme=scheme,
-    )  # fmt: skip
 
 
 def _scipy(

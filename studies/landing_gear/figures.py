@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
@@ -25,6 +24,10 @@ NORMAL_90 = 1.6448536269514722
 SIGNS = {POSITIVE: ("#009E73", "o"), UNDETERMINED: ("#999999", "D"), NEGATIVE: ("#CC79A7", "v")}
 # The scale of theta16 is linear up to here, logarithmic beyond [W/K].
 LINEAR_TO, TICKS = 3.0, (-100, -50, -20, -10, -5, -3, -2, -1, 0, 1, 2, 3, 5, 10, 20)
+STYLES: dict[str, dict[str, Any]] = {
+    "eq. (9)": {"color": "#0072B2", "lw": 3.0}, "pressure line": {"color": "#E69F00", "ls": "--"},
+    "lost motion": {"color": "#CC79A7"}, "all four": {"color": "#009E73"},
+}  # fmt: skip
 TRUTH_NAMES = {"A": "truth A: eq. (9) holds", "B": "truth B: lost motion, line lag, convection, friction heat"}
 
 
@@ -42,30 +45,26 @@ def _columns(truths: Mapping[str, Any], height: float, last: str, **options: Any
 def histories(shown: Mapping[str, tuple[bp.Recording, Identified]]) -> Figure:
     """Draw recorded and fitted displacement, force and pressure of one experiment, one column per truth."""
     figure, grid = _columns(shown, 8.5, "residual force [N]", sharex=True)
-    for column, one in zip(grid.T, shown.values(), strict=True):
-        _histories(column, *one)
+    for column, (recording, identified) in zip(grid.T, shown.values(), strict=True):
+        (experiment,), fit = identified.problem.experiments, identified.fit
+        residuals = fit.residuals[experiment.name]
+        until = 2.0 / experiment.frequency
+        kept = recording.time <= until
+        time = np.arange(2 * experiment.samples) / (experiment.samples * experiment.frequency)
+        signals = {**recording.inputs, **recording.outputs}
+        for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
+            colours, recorded = bp.plot.COLOURS, scale * signals[channel][kept]
+            axes.plot(recording.time[kept], recorded, ".", ms=2, color=colours["measured"], label="recorded")
+            if channel in residuals:
+                fitted = experiment.outputs[channel] - residuals[channel]
+                axes.plot(time, scale * np.tile(fitted, 2), color=bp.plot.COLOURS["map"], lw=1.4, label="MAP")
+        column[3].plot(time, np.tile(residuals["force"], 2), color=bp.plot.COLOURS["map"], lw=1.0)
+        column[3].axhline(0.0, color="black", lw=0.6)
+        column[3].set_xlabel("time [s]")
     shared_legend(figure, 2)
-    experiment = next(iter(shown.values()))[0].name.replace(" Hz ", " Hz, ±")
-    figure.suptitle(f"Landing gear at {experiment}, {TITLE}")
+    name = next(iter(shown.values()))[0].name.replace(" Hz ", " Hz, ±")
+    figure.suptitle(f"Landing gear at {name}, {TITLE}")
     return figure
-
-
-def _histories(column: np.ndarray, recording: bp.Recording, identified: Identified) -> None:
-    (experiment,), fit = identified.problem.experiments, identified.fit
-    residuals = fit.residuals[experiment.name]
-    until = 2.0 / experiment.frequency
-    kept = recording.time <= until
-    time = np.arange(2 * experiment.samples) / (experiment.samples * experiment.frequency)
-    signals = {**recording.inputs, **recording.outputs}
-    for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
-        colours, recorded = bp.plot.COLOURS, scale * signals[channel][kept]
-        axes.plot(recording.time[kept], recorded, ".", ms=2, color=colours["measured"], label="recorded")
-        if channel in residuals:
-            fitted = experiment.outputs[channel] - residuals[channel]
-            axes.plot(time, scale * np.tile(fitted, 2), color=bp.plot.COLOURS["map"], lw=1.4, label="MAP")
-    column[3].plot(time, np.tile(residuals["force"], 2), color=bp.plot.COLOURS["map"], lw=1.0)
-    column[3].axhline(0.0, color="black", lw=0.6)
-    column[3].set_xlabel("time [s]")
 
 
 def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict]], drive: str) -> Figure:
@@ -73,7 +72,27 @@ def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict
     figure = plt.figure(figsize=(11.0, 4.2 * len(verdicts) + 1.0), layout="constrained")
     grid = figure.subplots(len(verdicts), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (truth, by_run) in zip(grid, verdicts.items(), strict=True):
-        _conductions(axes, [by_run[run.name] for run in runs])
+        judged = [by_run[run.name] for run in runs]
+        at = np.arange(len(judged))
+        low, high = np.array([np.quantile(v.identified.posterior.draws(CONDUCTION), [0.05, 0.95]) for v in judged]).T
+        laplace = np.array([v.identified.fit.interval(0.9)[CONDUCTION] for v in judged]).T
+        axes.vlines(at - 0.1, low, high, color=bp.plot.COLOURS["mcmc"], lw=5, label="draws, 90 %")
+        axes.vlines(at + 0.1, *laplace, color=bp.plot.COLOURS["laplace"], lw=2, label="Laplace, 90 %")
+        axes.axhline(GEAR[CONDUCTION], color="black", lw=0.9, ls="--", label="true value 2 W/K")
+        axes.axhline(0.0, color="black", lw=0.6)
+        for sign, (colour, marker) in SIGNS.items():
+            axes.plot([], [], marker, color=colour, label=f"sign: {sign}")
+            for i in (i for i, v in enumerate(judged) if v.sign == sign):
+                face = "white" if judged[i].misspecified else colour
+                value = judged[i].identified.fit.theta[CONDUCTION]
+                axes.plot(i, value, marker, color=colour, mfc=face, ms=8, mew=1.8, zorder=5)
+        axes.set_yscale("symlog", linthresh=LINEAR_TO, linscale=1.5)
+        axes.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS])
+        axes.minorticks_off()
+        ends = np.concatenate([low, high, *laplace, [-0.5, GEAR[CONDUCTION] + 0.5]])
+        axes.set_ylim(1.2 * ends.min(), 1.2 * ends.max())
+        axes.set_ylabel("theta16 [W/K]")
+        axes.set_xlim(-0.6, len(judged) - 0.4)
         axes.set_title(TRUTH_NAMES[truth], fontsize=11)
     names = [f"{run.frequency:g} Hz\n±{1e3 * run.stroke:g} mm" for run in runs]
     grid[-1].set_xticks(range(len(runs)), names, fontsize=9)
@@ -85,57 +104,30 @@ def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict
     return figure
 
 
-def _conductions(axes: Axes, verdicts: Sequence[Verdict]) -> None:
-    at = np.arange(len(verdicts))
-    low, high = np.array([np.quantile(v.identified.posterior.draws(CONDUCTION), [0.05, 0.95]) for v in verdicts]).T
-    laplace = np.array([v.identified.fit.interval(0.9)[CONDUCTION] for v in verdicts]).T
-    axes.vlines(at - 0.1, low, high, color=bp.plot.COLOURS["mcmc"], lw=5, label="draws, 90 %")
-    axes.vlines(at + 0.1, *laplace, color=bp.plot.COLOURS["laplace"], lw=2, label="Laplace, 90 %")
-    axes.axhline(GEAR[CONDUCTION], color="black", lw=0.9, ls="--", label="true value 2 W/K")
-    axes.axhline(0.0, color="black", lw=0.6)
-    for sign, (colour, marker) in SIGNS.items():
-        axes.plot([], [], marker, color=colour, label=f"sign: {sign}")
-        for i in (i for i, v in enumerate(verdicts) if v.sign == sign):
-            face = "white" if verdicts[i].misspecified else colour
-            value = verdicts[i].identified.fit.theta[CONDUCTION]
-            axes.plot(i, value, marker, color=colour, mfc=face, ms=8, mew=1.8, zorder=5)
-    axes.set_yscale("symlog", linthresh=LINEAR_TO, linscale=1.5)
-    axes.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS])
-    axes.minorticks_off()
-    ends = np.concatenate([low, high, *laplace, [-0.5, GEAR[CONDUCTION] + 0.5]])
-    axes.set_ylim(1.2 * ends.min(), 1.2 * ends.max())
-    axes.set_ylabel("theta16 [W/K]")
-    axes.set_xlim(-0.6, len(verdicts) - 0.4)
-
-
 def drops(dropped: Mapping[str, Dropped]) -> Figure:
     """Draw the drop test, a column per truth: the first 2.5 s, and by how much the displacement is off over 30 s."""
     figure, grid = _columns(dropped, 9.0, "displacement minus\npredicted median [mm]")
     for column, found in zip(grid.T, dropped.values(), strict=True):
-        _drop(column, found)
+        time, band, colours = found.true.time, found.band, bp.plot.COLOURS
+        early = time <= SHORT
+        for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
+            true, low, median, high = (
+                scale * signals[channel][early] for signals in (found.true.outputs, band.low, band.median, band.high)
+            )
+            axes.plot(time[early], true, color=colours["measured"], lw=2.6, label="true")
+            axes.plot(time[early], median, "--", color=colours["mcmc"], lw=1.4, label="posterior median")
+            axes.fill_between(time[early], low, high, color=colours["mcmc"], alpha=0.3, lw=0, label="90 % band")
+            axes.tick_params(labelbottom=channel == "pressure")
+        column[2].set_xlabel("time [s]")
+        median = band.median["displacement"]
+        low, high = 1e3 * (band.low["displacement"] - median), 1e3 * (band.high["displacement"] - median)
+        column[3].fill_between(time, low, high, color=colours["mcmc"], alpha=0.3, lw=0)
+        column[3].plot(time, 1e3 * (found.true.outputs["displacement"] - median), color=colours["measured"], lw=1.2)
+        column[3].axhline(0.0, color=colours["mcmc"], ls="--", lw=1.0)
+        column[3].set_xlabel("time [s], until the gas has cooled")
     shared_legend(figure, 3)
     figure.suptitle(f"Drop test, predicted from the shaker's experiments, {TITLE}")
     return figure
-
-
-def _drop(column: np.ndarray, found: Dropped) -> None:
-    time, band, colours = found.true.time, found.band, bp.plot.COLOURS
-    early = time <= SHORT
-    for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
-        true, low, median, high = (
-            scale * signals[channel][early] for signals in (found.true.outputs, band.low, band.median, band.high)
-        )
-        axes.plot(time[early], true, color=colours["measured"], lw=2.6, label="true")
-        axes.plot(time[early], median, "--", color=colours["mcmc"], lw=1.4, label="posterior median")
-        axes.fill_between(time[early], low, high, color=colours["mcmc"], alpha=0.3, lw=0, label="90 % band")
-        axes.tick_params(labelbottom=channel == "pressure")
-    column[2].set_xlabel("time [s]")
-    median = band.median["displacement"]
-    low, high = 1e3 * (band.low["displacement"] - median), 1e3 * (band.high["displacement"] - median)
-    column[3].fill_between(time, low, high, color=colours["mcmc"], alpha=0.3, lw=0)
-    column[3].plot(time, 1e3 * (found.true.outputs["displacement"] - median), color=colours["measured"], lw=1.2)
-    column[3].axhline(0.0, color=colours["mcmc"], ls="--", lw=1.0)
-    column[3].set_xlabel("time [s], until the gas has cooled")
 
 
 def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
@@ -174,12 +166,6 @@ def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
 def repaired(found: Mapping[str, Any]) -> Figure:
     """Draw theta16 by experiment under eq. (9) and under the best model, and how each model predicts what it lacks."""
     figure, (top, bottom) = plt.subplots(2, 1, figsize=(10.0, 8.5), sharex=True, layout="constrained")
-    styles: dict[str, dict[str, Any]] = {
-        "eq. (9)": {"color": "#0072B2", "lw": 3.0},
-        "pressure line": {"color": "#E69F00", "ls": "--"},
-        "lost motion": {"color": "#CC79A7"},
-        "all four": {"color": "#009E73"},
-    }
     runs = list(next(iter(found["models"].values()))["scores"])
     order = [run.name for run in RUNS if run.name in runs]
     place = np.arange(len(order))
@@ -187,7 +173,7 @@ def repaired(found: Mapping[str, Any]) -> Figure:
         values = np.array([one["estimates"][f"{CONDUCTION}[{name}]"] for name in order])
         top.errorbar(
             place + 0.12 * (2 * k - 1), values[:, 0], NORMAL_90 * values[:, 1], fmt="o", ms=4, capsize=2,
-            color=styles[model]["color"], label=model,
+            color=STYLES[model]["color"], label=model,
         )  # fmt: skip
     top.axhline(GEAR[CONDUCTION], color="black", lw=0.8, ls=":", label="truth")
     top.axhline(0.0, color="black", lw=0.8)
@@ -200,7 +186,7 @@ def repaired(found: Mapping[str, Any]) -> Figure:
     top.legend(frameon=False)
     for model, one in found["models"].items():
         errors = [one["errors_held_out"][name]["force"] for name in order]
-        bottom.plot(place, errors, "o", ms=4, **{"lw": 1.0, "ls": "-"} | styles[model], label=model)
+        bottom.plot(place, errors, "o", ms=4, **{"lw": 1.0, "ls": "-"} | STYLES[model], label=model)
     bottom.axhline(found["noise_of_the_mean"]["force"], color="black", lw=0.8, ls=":", label="noise of the mean period")
     bottom.set_yscale("log")
     bottom.set_ylabel("rms error of the force [N]\nin experiments held out")

@@ -79,8 +79,8 @@ ROUNDS = 2
 SETTINGS: dict[str, Any] = {"noise": "independent", "scheme": "central4"}
 
 
-def judge(recording: bp.Recording, seed: int, quick: bool) -> tuple[Identified, Verdict]:
-    """Return the fit that treats the force as exact, and the verdict with the noise of the force propagated."""
+def judge(recording: bp.Recording, seed: int, quick: bool) -> Verdict:
+    """Return the verdict with the noise of the force propagated, and the fit that treats the force as exact."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The noise of the measured inputs")
         exact = found = estimate([fold(recording, FORCE)], FORCE)
@@ -91,7 +91,7 @@ def judge(recording: bp.Recording, seed: int, quick: bool) -> tuple[Identified, 
     # p-value of residuals as large as these, if the covariance is right: χ² of n − l values, eq. (7).
     free = identified.problem.counted - len(identified.problem.names)
     p = float(chi2.sf(identified.fit.noise["scale"] * free, free))
-    return exact, Verdict(identified, identification.identifiability(identified), p < identification.FALSE_ALARM, p)
+    return Verdict(identified, identification.identifiability(identified), p < identification.FALSE_ALARM, p, exact)
 
 
 def with_noise_of_the_input(experiment: bp.Experiment, theta: Mapping[str, float]) -> bp.Experiment:

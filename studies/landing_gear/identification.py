@@ -4,9 +4,9 @@ The other parameters are fixed at their true values, and theta11 is tied to thet
 The harmonics kept are fixed, so that the number of independent values does not depend on the noise. The verdicts on an
 experiment are the sign of theta16 and the adequacy of the model.
 
-The sensitivity of the sign to the fixed parameters is examined with the displacement given, by experiment, with all of
-them under priors: mass, damping and friction are as uncertain as after a test of the gear without gas, the amount of
-gas and its heat capacity as after filling by a manometer. theta2, theta7 and theta12, zero in this gear, stay fixed.
+The sensitivity of the sign to the fixed parameters is examined with all of them under priors: mass, damping and
+friction are as uncertain as after a test of the gear without gas, the amount of gas and its heat capacity as after
+filling by a manometer. theta2, theta7 and theta12, zero in this gear, stay fixed.
 """
 
 import time
@@ -121,6 +121,7 @@ class Verdict:
     identifiability: bp.Identifiability
     misspecified: bool  # At a false-alarm rate of 1 % per experiment
     p: float  # p-value of the misfit
+    exact: Any = None  # Identified with the force taken for exact, None with the displacement given
 
     @property
     def p_negative(self) -> tuple[float, float]:

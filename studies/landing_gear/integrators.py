@@ -10,7 +10,7 @@ compression q [m] and velocity [m/s] if the force is given. Parameters are in th
 """
 
 from functools import cache
-from typing import Any, NamedTuple
+from types import SimpleNamespace
 
 import numpy as np
 from scipy.integrate import RK45
@@ -135,20 +135,15 @@ def _controlled_steps(rates, size):
     return integrate
 
 
-class Methods(NamedTuple):
-    """Compiled functions for one direction."""
-
-    fixed: Any
-    controlled: Any
-    outputs: Any  # (p, u, states, out)
-    rates_in_time: Any  # (t, y, p, u, period)
-
-
 @cache
-def methods(drive: str) -> Methods:
-    """Return the compiled functions for the displacement or the force given."""
+def methods(drive: str) -> SimpleNamespace:
+    """Return the compiled functions fixed, controlled, outputs and rates_in_time of one direction."""
     model = bp.models.landing_gear(drive)
     first, generic = FirstOrder(model, ()), integrators(model, NAMES[:1])
     rates = compiled(first.function(NUMBA, first.rates))
-    steps = _fixed_steps(rates, first.size), _controlled_steps(rates, first.size)
-    return Methods(*steps, generic.outputs, generic.rates_in_time)
+    return SimpleNamespace(
+        fixed=_fixed_steps(rates, first.size),
+        controlled=_controlled_steps(rates, first.size),
+        outputs=generic.outputs,
+        rates_in_time=generic.rates_in_time,
+    )

@@ -1,10 +1,9 @@
 """Quality control as the paper proposes it: whether a new gear equals the reference, and which parameter differs.
 
-SYNTHETIC units under three experiments each. Good ones have the reference's parameters; faulty ones have too little
-gas, worn friction, or less oil, so that the gas fills a larger volume. A parameter is called "different" if it deviates
-from the reference by more than their combined standard deviations allow, at a false-alarm rate of 1 % per unit over all
-parameters. The reference is measured several times to reduce its own error. The area theta4 is machined and known; the
-gas's heat capacity theta15 is proportional to its amount, theta5/theta6.
+SYNTHETIC units under three experiments each, good or with too little gas, worn friction, or less oil. A parameter is
+called "different" if it deviates from the reference, which is measured several times, by more than their combined
+standard deviations allow, at a false-alarm rate of 1 % per unit over all parameters. The area theta4 is machined and
+known; the gas's heat capacity theta15 is proportional to its amount, theta5/theta6.
 """
 
 from collections.abc import Mapping, Sequence

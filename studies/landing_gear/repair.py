@@ -45,7 +45,6 @@ class Task(NamedTuple):
     model: str
     runs: tuple[str, ...]  # Names of experiments
     held_out: tuple[str, ...]  # Without any, theta16 is local to each experiment
-    truth: str
     seed: int
 
 
@@ -60,7 +59,7 @@ class Fitted(NamedTuple):
     errors: dict[str, dict[str, float]]  # Root mean square prediction error, by experiment and channel
 
 
-def repair(names: Sequence[str], truth: str, seed: int, *, quick: bool) -> list[Fitted]:
+def repair(names: Sequence[str], seed: int, *, quick: bool) -> list[Fitted]:
     """Return the fits of all models without each fold of the experiments, and of the first and last with all."""
     folds = QUICK_FOLDS if quick else FOLDS
     models = QUICK_MODELS if quick else tuple(MODELS)
@@ -68,11 +67,11 @@ def repair(names: Sequence[str], truth: str, seed: int, *, quick: bool) -> list[
     for k in range(folds):
         held_out = tuple(names[k::folds])
         rest = tuple(name for name in names if name not in held_out)
-        tasks += [Task(model, rest, held_out, truth, seed) for model in models]
+        tasks += [Task(model, rest, held_out, seed) for model in models]
     if quick:
         return [fit(task) for task in tasks]
     # The longest first.
-    tasks = [Task(model, tuple(names), (), truth, seed) for model in (BEST, PAPER)] + tasks[::-1]
+    tasks = [Task(model, tuple(names), (), seed) for model in (BEST, PAPER)] + tasks[::-1]
     return list(common.each(fit, [(task,) for task in tasks]))
 
 
@@ -88,7 +87,7 @@ def fit(task: Task) -> Fitted:
 def problem(task: Task, names: Sequence[str]) -> bp.Problem:
     """Return the problem of some experiments under a model."""
     model = damper(MODELS[task.model])
-    recordings = [measure(run, TRUTHS[task.truth], task.seed) for run in RUNS if run.name in names]
+    recordings = [measure(run, TRUTHS["B"], task.seed) for run in RUNS if run.name in names]
     return identification.problem(
         [fold(recording, DISPLACEMENT) for recording in recordings],
         DISPLACEMENT,

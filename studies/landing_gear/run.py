@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import bayesperiodic as bp
 from studies import common
@@ -28,7 +28,6 @@ DROPS, QUICK_DROPS = 200, 20
 # Measurements of the reference, units of each kind.
 UNITS, QUICK_UNITS = (10, 60), (1, 1)
 LARGE_STROKE, TOLERANCE = 0.06, 0.25
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,6 @@ class OfTruth:
     verdicts: dict[str, Verdict]  # The displacement given
     joint: dict[str, Identified]  # All experiments, theta4 and theta6 in common, by what is given
     sensitivity: dict[str, dict[str, Any]]  # The other parameters under priors, by experiment
-    exact: dict[str, Identified]  # The force given and treated as exact
     forced: dict[str, Verdict]  # The force given, with its noise propagated
     dropped: Dropped
 
@@ -101,7 +99,7 @@ def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace) -> t
     with watch.part(f"rig {truth}", f"truth {truth}: simulating and recording {len(runs)} experiments"):
         recordings = {r.name: measure(r, TRUTHS[truth], seed) for r in runs}
     with watch.part(f"posteriors {truth}", f"truth {truth}: displacement given, one posterior an experiment"):
-        verdicts = _judged(identification.judge_recording, recordings, options, lambda verdict: verdict)
+        verdicts = _judged(identification.judge_recording, recordings, options)
     with watch.part(f"joint {truth}", f"truth {truth}: all experiments at once, theta4 and theta6 in common"):
         joint = {DISPLACEMENT: identification.jointly(recordings.values(), seed, quick=quick)}
     with watch.part(f"sensitivity {truth}", f"truth {truth}: the other parameters under priors"):
@@ -110,29 +108,25 @@ def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace) -> t
         sensitivity = dict(zip([task[0].name for task in tasks], free, strict=True))
     with watch.part(f"force {truth}", f"truth {truth}: force given, one posterior an experiment"):
         given = {name: recording for name, recording in recordings.items() if name == SMALL or not quick}
-        both = _judged(force.judge, given, options, lambda pair: pair[1])
-        exact, forced = {n: pair[0] for n, pair in both.items()}, {n: pair[1] for n, pair in both.items()}
+        forced = _judged(force.judge, given, options)
     with watch.part(f"force joint {truth}", f"truth {truth}: force given, all experiments at once"):
         together = force.given_force(forced, seed, quick=quick)
         joint |= {FORCE: together} if together else {}
     with watch.part(f"drop {truth}", f"truth {truth}: the drop test, predicted from all experiments"):
         gear = identification.jointly(recordings.values(), seed, quick=quick, one_conduction=True)
         dropped = drop.predict(gear, TRUTHS[truth], QUICK_DROPS if quick else DROPS)
-    return OfTruth(recordings, verdicts, joint, sensitivity, exact, forced, dropped), watch.seconds
+    return OfTruth(recordings, verdicts, joint, sensitivity, forced, dropped), watch.seconds
 
 
 def _judged(
-    work: Callable[..., Result],
-    recordings: Mapping[str, bp.Recording],
-    options: argparse.Namespace,
-    verdict_of: Callable[[Result], Verdict],
-) -> dict[str, Result]:
-    """Return the results of every experiment, and print each verdict as it comes."""
+    work: Callable[..., Verdict], recordings: Mapping[str, bp.Recording], options: argparse.Namespace
+) -> dict[str, Verdict]:
+    """Return the verdict on every experiment, and print each as it comes."""
     found = {}
     tasks = [(recording, options.seed, options.quick) for recording in recordings.values()]
-    for name, result in zip(recordings, common.each(work, tasks, here=options.quick), strict=True):
-        found[name] = result
-        print(identification.line(name, verdict_of(result)), flush=True)
+    for name, verdict in zip(recordings, common.each(work, tasks, here=options.quick), strict=True):
+        found[name] = verdict
+        print(identification.line(name, verdict), flush=True)
     return found
 
 
@@ -147,7 +141,7 @@ def _of_all(
     drawn: dict[str, Any] = {}
     if "B" in truths:
         with watch.part("repair", "truth B: better models, compared by what they predict of experiments held out"):
-            fits = repair.repair([r.name for r in runs], "B", options.seed, quick=options.quick)
+            fits = repair.repair([r.name for r in runs], options.seed, quick=options.quick)
         results["repair"] = repair.account(fits)
         print(repair.table(results["repair"]))
         drawn["repair"] = landing_gear_figures.repaired(results["repair"])
@@ -190,7 +184,7 @@ def _collect(runs: Sequence[Run], found: OfTruth) -> dict[str, Any]:
     theta16 = {name: v.identified.fit.theta[CONDUCTION] for name, v in found.verdicts.items()}
     chances = {name: v.p_negative[0] for name, v in found.verdicts.items()}
     pairs = [(a.name, b.name) for a in runs for b in runs if a.frequency == b.frequency and a.stroke > b.stroke]
-    exact = {name: identification.laplace(one) for name, one in found.exact.items()}
+    exact = {name: identification.laplace(verdict.exact) for name, verdict in found.forced.items()}
     return _posteriors(found.verdicts) | {
         "joint": {drive: force.account(joint) for drive, joint in found.joint.items()},
         "others_under_priors": found.sensitivity,

@@ -344,8 +344,8 @@ def _check_lines(results: dict[str, Any]) -> list[str]:
         common.shown(f"residual [V], {results['residual_fraction']:.3%} of the response's sd", {"": residual}),
         common.shown("the second part's estimates less the first's [Laplace sd]", {"": repeat["shift"]}),
         f"discretisation error {error:.4%} of the response's sd, {'below' if error < allowed else 'ABOVE'} the "
-        f"{allowed:.4%} allowed (a tenth of the mean period's standard error);\ntwice the points would shift no estimate "
-        f"by more than {max(abs(s) for shifts in doubled for s in shifts.values()):.2g} standard deviations",
+        f"{allowed:.4%} allowed (a tenth of the mean period's standard error);\ntwice the points would shift no "
+        f"estimate by more than {max(abs(s) for shifts in doubled for s in shifts.values()):.2g} standard deviations",
         common.shown(f"above the drive's last line ({FREQUENCY * DRIVE_LINES:.0f} Hz)", {"": beyond}),
         f"from rest at full amplitude ({results['scheme']}, {results['samples']} points):",
         pd.DataFrame(results["from_rest"]).assign(seconds=results["seconds"]["from_rest"]).to_string(index=False),
@@ -404,9 +404,7 @@ def _estimates(choices: Mapping[str, Mapping[str, bp.MapEstimate]], truth: Mappi
             values, sds, robust = ([getattr(f, k)[name] for f in fits.values()] for k in ("theta", "sd", "robust_sd"))
             face = MAP if number == 0 else "white"
             axes.errorbar(at, values, sds, fmt="none", ecolor=LAPLACE, elinewidth=4.0, label="Laplace sd")
-            axes.errorbar(
-                at, values, robust, fmt="none", ecolor="black", elinewidth=1.0, capsize=4, label="sandwich sd"
-            )
+            axes.errorbar(at, values, robust, fmt="none", ecolor="black", elinewidth=1, capsize=4, label="sandwich sd")
             axes.plot(at, values, "o", color=MAP, mfc=face, ms=6, zorder=5, label=f"MAP, {label}")
         if truth is not None:
             axes.axhline(truth[name], color=TRUTH, lw=1.2, ls="--", label="true value")

@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 
 import bayesperiodic as bp
 from studies import common
-from studies.common import resumed
 from studies.verdicts import cases
 from studies.verdicts import outcome as verdicts_outcome
 from studies.verdicts.cases import CASES, COMPARE, FINE, IDENTIFIABILITY, PREDICT
@@ -65,7 +64,7 @@ def replicates(folder: Path, names: Sequence[str], count: int, seed: int) -> lis
         tasks += [(name, DATA, number, seed) for name in names]
         tasks += [(name, SAMPLER, number, seed) for name in names if number < MOST_SAMPLER_SEEDS]
     keys = "case", "kind", "number", "seed"
-    return resumed(folder / FILE, tasks, replicate, lambda line: tuple(line[key] for key in keys), source())
+    return common.resumed(folder / FILE, tasks, replicate, lambda line: tuple(line[key] for key in keys), source())
 
 
 def summary(lines: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
