@@ -80,26 +80,17 @@ def _problem(
 
 
 def _run(
-    name: str,
-    frequency: float,
-    inputs: dict[str, tuple[float, float]],
-    harmonics: dict[str, int],
-    samples: int,
+    name: str, frequency: float, inputs: dict[str, tuple[float, float]], harmonics: dict[str, int], samples: int,
     overcount: float = 1.0,
-) -> bp.Experiment:
+) -> bp.Experiment:  # fmt: skip
     """Return an experiment's settings, with the mean and the amplitude of each input; its outputs are never used."""
     wave = np.sin(2 * np.pi * np.arange(samples) / samples)
+    given = {channel: mean + amplitude * wave for channel, (mean, amplitude) in inputs.items()}
+    counted = {channel: round(overcount * (2 * kept + 1)) for channel, kept in harmonics.items()}
     return bp.Experiment(
-        name,
-        frequency,
-        {channel: wave for channel in harmonics},
-        {channel: mean + amplitude * wave for channel, (mean, amplitude) in inputs.items()},
-        samples=samples,
-        cycles=CYCLES,
-        harmonics=harmonics | dict.fromkeys(inputs, 1),
-        independent={channel: round(overcount * (2 * kept + 1)) for channel, kept in harmonics.items()},
-        synthetic=True,
-    )
+        name, frequency, dict.fromkeys(harmonics, wave), given, samples=samples, cycles=CYCLES,
+        harmonics=harmonics | dict.fromkeys(inputs, 1), independent=counted, synthetic=True,
+    )  # fmt: skip
 
 
 CASES: dict[str, Callable[[], bp.Problem]] = {

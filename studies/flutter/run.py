@@ -48,7 +48,7 @@ def run(options: argparse.Namespace) -> None:
     columns = ["wind_speed", "used", "frequency", "frequency_se", "cycles", "drift.pitch"]
     print(common.shown("records", results["records"], columns), *refused.values(), sep="\n")
     with watch.part("authors", "following the cycles of the authors' values from the Hopf point"):
-        results["checks"], results["authors_branch"] = _against_integration(), _hopf_and_fold()
+        results |= _authors_cycles()
         authors = questions.authors_errors(experiments, speeds)
     checked = dict(results["checks"])
     by_grid = checked.pop("stable_cycles")
@@ -107,22 +107,12 @@ def _with_known_noise(both: rig.Fitted, experiments: rig.Experiments, speeds: di
     return stated.anchored(stated.vector(both.fit.theta), {n: both.fit.solutions[n].states for n in experiments})
 
 
-def _hopf_and_fold() -> dict[str, float]:
-    along = rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS)
-    fold = along.branches[0].folds[0]
-    return {
-        "hopf_speed": along.hopf.value,
-        "hopf_frequency": along.hopf.frequency,
-        "fold_speed": fold.parameters["U"],
-        "fold_frequency": fold.frequency,
-    }
-
-
-def _against_integration() -> dict[str, Any]:
-    """Return the Hopf point and the stable cycles by both ways, and by how much they differ, by points of the grid."""
+def _authors_cycles() -> dict[str, Any]:
+    """Return the branch of the authors' values, and how it differs from eigenvalues and time integration."""
     by_grid = {points: rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS, points) for points in GRIDS}
     point, (speed, frequency) = by_grid[rig.SAMPLES].hopf, hopf()
-    return {
+    fold = by_grid[rig.SAMPLES].branches[0].folds[0]
+    checks = {
         "hopf_speed": {"continuation": point.value, "eigenvalues": speed},
         "hopf_frequency": {"continuation": point.frequency, "eigenvalues": frequency},
         "stable_cycles": {
@@ -130,6 +120,9 @@ def _against_integration() -> dict[str, Any]:
             for points, along in by_grid.items()
         },
     }
+    branch = {"hopf_speed": point.value, "hopf_frequency": point.frequency}
+    branch |= {"fold_speed": fold.parameters["U"], "fold_frequency": fold.frequency}
+    return {"checks": checks, "authors_branch": branch}
 
 
 def _differences(orbit: bp.PeriodicSolution, speed: float) -> dict[str, float]:

@@ -15,10 +15,8 @@ from studies.landing_gear.quality import FALSE_ALARM, LIMIT, MEANINGS, Unit, dev
 from studies.landing_gear.rig import GEAR, RUNS, Run
 
 CHANNELS = {
-    "displacement": (1e3, "displacement [mm]"),
-    "force": (1e-3, "force [kN]"),
-    "pressure": (1e-6, "pressure [MPa]"),
-}
+    "displacement": (1e3, "displacement [mm]"), "force": (1e-3, "force [kN]"), "pressure": (1e-6, "pressure [MPa]"),
+}  # fmt: skip
 TITLE = "SYNTHETIC data"
 NORMAL_90 = 1.6448536269514722
 SIGNS = {POSITIVE: ("#009E73", "o"), UNDETERMINED: ("#999999", "D"), NEGATIVE: ("#CC79A7", "v")}

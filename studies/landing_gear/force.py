@@ -1,11 +1,11 @@
 """The landing gear with the force given, as in eq. (9), with the noise of the measured force propagated.
 
-With the force as input its noise moves displacement and pressure together, by more than their own noise, and in a way
-that resembles heat conduction: a fit that treats the force as exact is confident of wrong signs. Here displacement and
-pressure have the covariance B S Bᵀ + J F Jᵀ, with S and F the variances of the amplitudes of outputs and force from the
-scatter of the cycles, B the harmonics kept, and J the derivatives of the steady motion by the force's amplitudes, at an
-estimate that is computed twice; up to one common factor, which is 1 if the model is adequate. (Errors in variables, to
-first order: W. A. Fuller, Measurement Error Models, Wiley, 1987.)
+The noise of the force moves displacement and pressure together, by more than their own noise and like heat conduction:
+a fit that treats the force as exact is confident of wrong signs. Here displacement and pressure have the covariance
+B S Bᵀ + J F Jᵀ, with S and F the variances of the amplitudes of outputs and force from the scatter of the cycles, B the
+harmonics kept, and J the derivatives of the steady motion by the force's amplitudes, at an estimate that is computed
+twice; up to one common factor, which is 1 if the model is adequate. (Errors in variables, to first order: W. A. Fuller,
+Measurement Error Models, Wiley, 1987.)
 
 Joint fits share theta4 and theta6; theta16 is local to each experiment. The steepness of the friction, theta10, is
 varied from 30 to 3000 s/m, solved from static equilibrium.

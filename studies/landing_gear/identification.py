@@ -87,17 +87,11 @@ def draw(
     """Return the same with draws of the posterior, the variances integrated out."""
     stated, fit = estimated.problem, estimated.fit
     before = time.perf_counter()
+    walkers = max(QUICK_WALKERS if quick else WALKERS, 2 * len(stated.names))
     posterior = bp.sample(
-        stated,
-        fit,
-        seed=seed,
-        ensembles=ENSEMBLES,
-        walkers=max(QUICK_WALKERS if quick else WALKERS, 2 * len(stated.names)),
-        max_steps=QUICK_STEPS if quick else max_steps,
-        variances="collapsed",
-        executor=None if quick else executor,
-        progress=False,
-    )
+        stated, fit, seed=seed, ensembles=ENSEMBLES, walkers=walkers, max_steps=QUICK_STEPS if quick else max_steps,
+        variances="collapsed", executor=None if quick else executor, progress=False,
+    )  # fmt: skip
     return Identified(stated, fit, posterior, time.perf_counter() - before)
 
 

@@ -10,10 +10,10 @@ Truth A is eq. (9) of de Kraker, Verbeek & van de Wouw (1997). Truth B adds effe
 
 flexure
     The displacement is measured at the actuator, and rod, fork and frame between it and the strut deform by
-    `flexibility` times the force, counted from the static load. Friction turns its sign with the motion, so that the
-    gas follows the measured displacement with a lost motion of about flexibility · 450 N, whatever the stroke. The
-    pressure lags the measured displacement, the opposite of what heat conduction does, and the more so the smaller the
-    stroke. (Internal friction of struts: Milwitzky & Cook, Analysis of landing-gear behavior, NACA Report 1154, 1953.)
+    `flexibility` times the force less the static load. Friction changes sign with the motion, so that the gas follows
+    the measured displacement with a lost motion of about flexibility · 450 N. The pressure lags, the opposite of the
+    effect of heat conduction, and the more so the smaller the stroke. (Internal friction of struts: Milwitzky & Cook,
+    Analysis of landing-gear behavior, NACA Report 1154, 1953.)
 line
     The pressure reaches its transducer through a narrow line, a `delay` later; to first order p − delay · ṗ, whose
     error is below 1e-5 of the pressure at 6 Hz. Equal at all strokes, it grows with the frequency. (Bergh & Tijdeman,

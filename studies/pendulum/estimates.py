@@ -38,10 +38,7 @@ MOST_DROPPED = 4
 
 @dataclass(frozen=True)
 class Identified:
-    """Estimates from the orbits of one recording.
-
-    `problems, fits`: By what is free.
-    """
+    """Estimates from the orbits of one recording, by what is free."""
 
     polished: bp.Orbits  # At the first estimate of m and l
     selected: bp.Orbits
@@ -120,12 +117,6 @@ def covers(fit: bp.MapEstimate, probability: float = 0.9) -> dict[str, bool]:
     return {name: bool(low <= TRUTH[name] <= high) for name, (low, high) in fit.interval(probability).items()}
 
 
-def estimate_table(fit: bp.MapEstimate, *, synthetic: bool) -> dict[str, Mapping[str, float]]:
-    """Return estimate and standard deviation of each parameter, and its relative error where the truth is known."""
-    found = {name: {"value": value, "sd": fit.sd[name]} for name, value in fit.theta.items()}
-    return {n: row | ({"relative_error": errors(fit)[n]} if synthetic else {}) for n, row in found.items()}
-
-
 NATURAL = ("m", "l", "k1", "k2", "k3")
 COMBINATIONS = {f"c{i}": f"k{i}/(m*l**2)" for i in (1, 2, 3)}
 DETERMINED = ("l", *COMBINATIONS)
@@ -135,19 +126,15 @@ QUICK_STEPS = 250
 
 @dataclass(frozen=True)
 class Ridge:
-    """Draws of all five parameters and their verdicts.
-
-    `natural, sampling`: Of Laplace with the draws, in natural values and in logarithms. `combinations`: Mean and sd of
-    the identifiable combinations, by Laplace (columns value, laplace_sd) and MCMC (mean, sd).
-    """
+    """Draws of all five parameters and their verdicts."""
 
     fit: bp.MapEstimate
     posterior: bp.Posterior
     structure: bp.Structure  # Structural identifiability, without data
     identifiability: bp.Identifiability
-    natural: bp.Comparison
-    sampling: bp.Comparison
-    combinations: pd.DataFrame
+    natural: bp.Comparison  # Laplace against MCMC in natural values
+    sampling: bp.Comparison  # The same in logarithms
+    combinations: pd.DataFrame  # By Laplace (value, laplace_sd) and MCMC (mean, sd)
 
 
 def sample(identified: Identified, seed: int, quick: bool) -> Ridge:

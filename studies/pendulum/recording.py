@@ -25,13 +25,9 @@ def simulate(periods: int, seed: int) -> bp.Recording:
     """Return a recording without noise; the seed chooses where on the attractor it starts."""
     start = np.random.default_rng(seed).uniform([-np.pi, -5.0], [np.pi, 5.0])
     whole = bp.simulate(
-        bp.models.pendulum,
-        TRUTH,
-        frequency=FREQUENCY,
-        duration=(SETTLING + periods) / FREQUENCY,
-        sampling_rate=SAMPLES * FREQUENCY,
-        start={"phi": start[0], "dphi": start[1]},
-    )
+        bp.models.pendulum, TRUTH, frequency=FREQUENCY, duration=(SETTLING + periods) / FREQUENCY,
+        sampling_rate=SAMPLES * FREQUENCY, start={"phi": start[0], "dphi": start[1]},
+    )  # fmt: skip
     # The drive's phase stays: the settling takes whole periods.
     return whole.between(SETTLING / FREQUENCY, whole.time[-1])
 

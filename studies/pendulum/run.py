@@ -129,9 +129,12 @@ def estimates(
     used = sum(orbit.points.size for orbit in identified.selected)
     table = {}
     for which, fit in identified.fits.items():
+        rows: dict[str, dict[str, float]] = {name: {"value": v, "sd": fit.sd[name]} for name, v in fit.theta.items()}
+        for name, error in pendulum_estimates.errors(fit).items() if about["synthetic"] else ():
+            rows[name]["relative_error"] = error
         table[which] = {
             "status": fit.status,
-            "parameters": pendulum_estimates.estimate_table(fit, synthetic=about["synthetic"]),
+            "parameters": rows,
             "scale": fit.noise["scale"],
             "sd_with_eigenvalues_over_without": {n: with_eigenvalues[which].sd[n] / fit.sd[n] for n in fit.theta},
         }

@@ -29,16 +29,14 @@ Expected = Mapping[str, Mapping[str, tuple[str, ...]]]
 
 @dataclass(frozen=True)
 class Case:
-    """A case with known verdicts.
-
-    `fault`: By tool, the parameters whose verdicts name the fault; empty if there is no fault.
-    """
+    """A case with known verdicts."""
 
     title: str  # The fault, in words
     truth: Mapping[str, float]  # Of every parameter, also of those that the fitted model lacks
     problem: Callable[[int], bp.Problem]  # Makes the problem of a data seed
     shown: str  # The parameter of the figure
     expected: Expected  # By tool and parameter: the verdicts that are right
+    # By tool, the parameters whose verdicts name the fault, if there is one
     fault: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     sampling: Mapping[str, Any] = field(default_factory=dict)  # Arguments of `bp.sample`
     drawless: bool = False  # Whether the verdicts do not use draws, so that replicates over data seeds do without them
@@ -47,24 +45,18 @@ class Case:
 def _driven(name: str, parameters: Mapping[str, str], force: Callable[[Any, Any], sp.Expr]) -> bp.Model:
     """Return a model whose output is a force of a measured displacement; its state has no part in it."""
     return bp.Model(
-        name,
-        states=["w"],
-        inputs=["x"],
-        parameters=dict(parameters),
-        units={"x": "m", "force": "N", "w": "m"},
-        equations=lambda s, p, u: [s.dw + s.w - u.x],
-        outputs=lambda s, p, u: {"force": force(p, u)},
-    )
+        name, states=["w"], inputs=["x"], parameters=dict(parameters), units={"x": "m", "force": "N", "w": "m"},
+        equations=lambda s, p, u: [s.dw + s.w - u.x], outputs=lambda s, p, u: {"force": force(p, u)},
+    )  # fmt: skip
 
 
 PRODUCT = _driven("product", {"a": "1", "b": "N/m"}, lambda p, u: p.a * p.b * u.x)
 SUM = _driven("sum", {"a": "N/m", "b": "N/m"}, lambda p, u: (p.a + p.b) * u.x)
 DAMPED = _driven("damped", {"k": "N/m", "c": "N s/m"}, lambda p, u: p.k * u.x + p.c * u.dx)
 RUBBING = _driven(
-    "rubbing",
-    {"k": "N/m", "c": "N s/m", "coulomb": "N"},
+    "rubbing", {"k": "N/m", "c": "N s/m", "coulomb": "N"},
     lambda p, u: p.k * u.x + p.c * u.dx + p.coulomb * sp.tanh(u.dx / 0.02),
-)
+)  # fmt: skip
 BEAM = _driven("beam", {"position": "1", "k": "N/m"}, lambda p, u: p.k * sp.sin(sp.pi * p.position) * u.x)
 
 
