@@ -41,10 +41,10 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("read", "reading the recording and folding it into its mean period"):
         recording, data = read_recording(options.data, options.seed)
         experiment = recording.fold()
-    what = "SYNTHETIC recording" if data["synthetic"] else "measured recording"
+    kind = "SYNTHETIC recording" if data["synthetic"] else "measured recording"
     harmonics = experiment.harmonics
     print(
-        f"  {what} {data['path']}: {experiment.frequency:.6f} ± {experiment.frequency_se:.1g} Hz, "
+        f"  {kind} {data['path']}: {experiment.frequency:.6f} ± {experiment.frequency_se:.1g} Hz, "
         f"{experiment.cycles} steady cycles, periodicity {experiment.periodicity:.4f}\n"
         f"  kept: {harmonics['displacement']} harmonics of the displacement, {harmonics['force']} of the force, "
         f"{experiment.independent['force']} independent values"

@@ -78,7 +78,7 @@ def bands(theta: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> dict[t
 def bifurcation(
     experiments: Experiments, speeds: Speeds, fit: bp.MapEstimate, draws: Mapping[str, np.ndarray]
 ) -> Figure:
-    """Draw amplitudes over wind speed: posterior bands of both branches, the authors' values, what was measured."""
+    """Draw amplitudes over wind speed: posterior bands of both branches, the authors' values, measurements."""
     drawn = bands(fit.theta, draws)
     best, theirs = amplitudes(RIG | fit.theta), amplitudes(RIG | AUTHORS | SENSORS)
     figure = plt.figure(figsize=(9.0, 8.0), layout="constrained")

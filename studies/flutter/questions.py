@@ -141,7 +141,7 @@ def leave_out(
 
 
 def laplace_draws(fit: bp.MapEstimate, draws: int) -> dict[str, np.ndarray]:
-    """Return draws (draws,) of each parameter from the Laplace approximation, in logarithms of what is positive.
+    """Return draws (draws,) of each parameter from the Laplace approximation, in logarithms of positive parameters.
 
     There the ridges of products, such as a stiffness and a sensor's scale, are straight.
     """

@@ -21,7 +21,7 @@ SAMPLES, SCHEME = 12, "fourier"
 # The published values of the parameters that are estimated, and of the others.
 AUTHORS = {name: reference.RIG[name] for name in ("c_h", "c_alpha", "k_alpha", "k_alpha2", "k_alpha3")}
 RIG = {name: value for name, value in reference.RIG.items() if name not in AUTHORS}
-# Near what the measured cycles give: all eight kinds of cycles exist there.
+# Near the estimate from the measured cycles; all eight kinds of cycles exist there.
 TRUE = {
     "c_h": 6.8, "c_alpha": 0.254, "k_alpha": 56.5, "k_alpha2": 684.0, "k_alpha3": 4577.0, "gain_heave": 7.16,
     "gain_pitch": 0.752, "offset_heave": 3.357, "offset_pitch": 0.7213,
@@ -126,7 +126,7 @@ def estimate(
     experiments: Experiments, speeds: Speeds, start: Mapping[str, float] = START,
     known: Mapping[str, float] | None = None, noise: Any = "circulant",
 ) -> Fitted:  # fmt: skip
-    """Return the MAP point; the frequency's error is what the last fit but one left, root mean square.
+    """Return the MAP point; the frequency error allowed is the root mean square error of the last fit but one.
 
     A model whose frequency errors exceed the standard errors must not be weighted by these. Continuation starts at the
     medians of the priors, on orbits of the correct branch, and ends at `start`.

@@ -72,7 +72,7 @@ class Gear:
         return out
 
     def integrator(self, kind: str, fineness: float, tolerance: float) -> Integrate:
-        """Return a compiled method with so many steps per cycle, or with this relative error of a step."""
+        """Return a compiled method; `fineness` is the number of steps per cycle, or the relative error of a step."""
         steps, frequency = int(fineness) if kind == FIXED else TABLE // 2, self.experiment.frequency
         inputs, points = self._table(2 * steps), min(steps, SAMPLES)
 
@@ -85,7 +85,7 @@ class Gear:
         return integrate
 
     def scipy(self, method: str, relative: float, cycles: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-        """Return SciPy's integration of so many cycles: from parameters and start to the states of the last."""
+        """Return SciPy's integration over some cycles: from parameters and start to the states of the last one."""
         inputs, frequency = self._table(TABLE), self.experiment.frequency
         times = (cycles - 1 + np.arange(SAMPLES) / SAMPLES) / frequency
 
@@ -205,7 +205,7 @@ def draws(
     """Return draws (count, names) from which time integration becomes steady, and how many were left out.
 
     At theta16 ≤ 0 the gas has no steady state that an integration could reach. Of those with every theta16 positive
-    some need more cycles than `MAX_CYCLES`. `steady` tells it of a draw (1, names).
+    some need more cycles than `MAX_CYCLES`. `steady` decides it for a draw (1, names).
     """
     names = identified.problem.names
     every = np.stack([identified.posterior.draws(name) for name in names], axis=-1)

@@ -162,7 +162,7 @@ def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
 
 
 def repaired(found: Mapping[str, Any]) -> Figure:
-    """Draw theta16 by experiment under eq. (9) and under the best model, and how each model predicts what it lacks."""
+    """Draw theta16 by experiment under eq. (9) and the best model, and the prediction errors of all models."""
     figure, (top, bottom) = plt.subplots(2, 1, figsize=(10.0, 8.5), sharex=True, layout="constrained")
     runs = list(next(iter(found["models"].values()))["scores"])
     order = [run.name for run in RUNS if run.name in runs]

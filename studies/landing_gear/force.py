@@ -165,4 +165,4 @@ def line(drive: str, found: Mapping[str, Any]) -> str:
     sds = found["posterior"]
     common = ", ".join(f"{name} {sds[name]['mean']:.6g} ± {sds[name]['sd']:.1g}" for name in ("theta4", "theta6"))
     end = "converged" if found["converged"] else found["reason"]
-    return f"  jointly, {drive} given: {common}; {found['log_posterior_calls']} log-posteriors, {end}"
+    return f"jointly, {drive} given: {common}; {found['log_posterior_calls']} log-posteriors, {end}"

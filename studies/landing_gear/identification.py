@@ -115,7 +115,7 @@ class Verdict:
     identifiability: bp.Identifiability
     misspecified: bool  # At a false-alarm rate of 1 % per experiment
     p: float  # p-value of the misfit
-    exact: Any = None  # Identified with the force taken for exact, None with the displacement given
+    exact: Any = None  # Fit that treats the force as exact, None with the displacement given
 
     @property
     def p_negative(self) -> tuple[float, float]:

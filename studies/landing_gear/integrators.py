@@ -88,7 +88,7 @@ def _controlled_steps(rates, size):
         """Integrate until steady, then through one more cycle for the states (samples, size).
 
         Return the number of cycles, 0 if it never becomes steady. `inputs` holds a cycle (points, signals), `scale`
-        (size,) what the errors are measured by.
+        (size,) the scales of the errors.
         """
         rate, trial, u = np.empty((7, size)), np.empty(size), np.empty(inputs.shape[1])
         samples, change, step, done = path.shape[0], 0.0, 1e-3, False

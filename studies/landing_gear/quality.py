@@ -68,7 +68,7 @@ def examine(kind: str, seed: int) -> Unit:
 
 
 def examine_all(references: int, each: int, seed: int) -> tuple[Unit, list[Unit]]:
-    """Return the reference, the mean of so many measurements, and so many units of each kind."""
+    """Return the reference, the mean of its measurements, and `each` units of each kind."""
     tasks = [(GOOD, REFERENCE_SEED * (seed + 1) + k) for k in range(references)]
     tasks += [(kind, FIRST_UNIT * (seed + 1) + k) for k, kind in enumerate(np.repeat(list(FAULTS), each).tolist())]
     found = list(common.each(examine, tasks, here=len(tasks) <= SERIALLY))

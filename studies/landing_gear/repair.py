@@ -27,7 +27,7 @@ MODELS: dict[str, frozenset[str]] = {
     BEST: TRUTHS["B"],
 }
 QUICK_MODELS = (PAPER, "lost motion")
-# The static load is what the flexure is counted from, not a property of the gear.
+# The static load is the reference of the flexure, not a property of the gear.
 EFFECT_PRIORS = {
     "flexibility": bp.LogNormal(5e-8, 1.0),
     "delay": bp.Normal(0.0, 1e-3),

@@ -36,7 +36,7 @@ class OfTruth:
 
     recordings: dict[str, bp.Recording]  # By experiment
     verdicts: dict[str, Verdict]  # The displacement given
-    joint: dict[str, Identified]  # All experiments, theta4 and theta6 in common, by what is given
+    joint: dict[str, Identified]  # All experiments, theta4 and theta6 in common, by the given signal
     sensitivity: dict[str, dict[str, Any]]  # The other parameters under priors, by experiment
     forced: dict[str, Verdict]  # The force given, with its noise propagated
     dropped: Dropped
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> None:
         results[truth] = _collect(runs, every[truth])
         print(_account(truth, results[truth]))
     if "A" in every:
-        with watch.part("cost", "what a log-posterior of truth A costs, against time integration until steady"):
+        with watch.part("cost", "time of a log-posterior of truth A, against time integration until steady"):
             joint = every["A"].joint.items()
             results["cost"] = {d: cost.measure(d, one, options.seed, quick=options.quick) for d, one in joint}
         print("\n".join(cost.table(drive, one) for drive, one in results["cost"].items()))
@@ -140,7 +140,7 @@ def _of_all(
     """Run the parts common to all truths, add their results, and return the figures by name."""
     drawn: dict[str, Any] = {}
     if "B" in truths:
-        with watch.part("repair", "truth B: better models, compared by what they predict of experiments held out"):
+        with watch.part("repair", "truth B: better models, compared by their predictions of held-out experiments"):
             fits = repair.repair([r.name for r in runs], options.seed, quick=options.quick)
         results["repair"] = repair.account(fits)
         print(repair.table(results["repair"]))
@@ -227,7 +227,7 @@ def _account(truth: str, results: Mapping[str, Any]) -> str:
         common.shown("other parameters under priors", results["others_under_priors"], ["mean", "sd", "p_negative"]),
         common.shown("force given", forced["experiments"], columns),
         f"pairs at one frequency that differ in sign, displacement given: {pairs}",
-        f"taking the force for exact, {wrong} would be negative (Laplace)",
+        f"with the force treated as exact, {wrong} would be negative (Laplace)",
         *(force.line(drive, one) for drive, one in results["joint"].items()),
         f"drop: true displacement within the 90 % band for {early:.0%} of the first 2.5 s and {late:.0%} of the time "
         f"until 30 s, off the median by up to {1e3 * moved['largest_error_of_the_median']:.3f} mm",
