@@ -13,7 +13,7 @@ import pickle
 import platform
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -208,3 +208,39 @@ def save_figures(folder: Path, figures: dict[str, Figure]) -> list[Path]:
 def _shrink(path: Path) -> None:
     with Image.open(path) as picture:
         picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def source_key(*files: str | None) -> str:
+    """Return a key of the package's version and of source files, which marks the results of older code as stale."""
+    text = versions()["bayesperiodic"] + "".join(sha256(Path(str(file))) for file in files)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def described(found: tuple[Path, str] | None) -> Line:
+    """Return the entry of results.json on a file from `find_data`, or on generated data."""
+    if found is None:
+        return {"path": "generated", "sha256": None, "synthetic": True}
+    return {"path": found[1], "sha256": sha256(found[0]), "synthetic": False}
+
+
+def finish(folder: Path, results: Line, watch: Stopwatch, paths: Sequence[Path] = (), *, synthetic: bool) -> None:
+    """Write results.json with the times and versions, and print the paths of figures and results."""
+    path = write_results(folder, results | {"seconds": watch.total(), "versions": versions()})
+    kind = " (synthetic data)" if synthetic else ""
+    print(f"figures{kind}: {', '.join(map(str, paths))}\nresults: {path}" if paths else f"results{kind}: {path}")
+
+
+def shared_legend(figure: Figure, columns: int, loc: Any = "outside lower center", **options: Any) -> None:
+    """Draw one legend of all labels in a figure, outside its axes."""
+    handles: dict[str, Any] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    figure.legend(handles.values(), handles, frameon=False, ncols=columns, loc=loc, **options)
+
+
+def shown(title: str, rows: Mapping[str, Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
+    """Return named rows as a table under a title, entries of nested mappings as "outer.inner"; all columns or some."""
+    table = pd.json_normalize([dict(row) for row in rows.values()]).set_axis(list(rows))
+    table = table if columns is None else table.reindex(columns=list(columns))
+    return f"{title}\n{table.to_string(float_format='{:.4g}'.format, na_rep='-')}"

@@ -17,7 +17,7 @@ from studies.benchmark.equations import table
 from studies.benchmark.kernels import Integrators, integrators, misfit
 from studies.damper import run as damper
 from studies.gear import FINE, GEAR, SAMPLES, folded, gear_at_rest, gear_problem, measured
-from studies.silverbox import data as silverbox_data
+from studies.silverbox import run as silverbox_data
 
 FORCE, DISPLACEMENT, DUFFING, DAMPER, SILVERBOX = (
     "landing gear, force given", "landing gear, displacement given", "Duffing, damping ratio 0.5 %", "damper",

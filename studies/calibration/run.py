@@ -1,11 +1,9 @@
 """Coverage of intervals: simulated campaigns of three problems, and of one with a wrong likelihood.
 
-All data are synthetic. Every replicate draws its truth from the priors, records it by time integration, and runs fold,
-MAP estimate, Laplace approximation and emcee (`bp.calibrate`). The likelihood of the second case is deliberately wrong:
-it counts a quarter more independent values than there are, as if every variance were a fifth smaller. The problems
-have the scale of the measured magneto-rheological damper, of a hardening Duffing oscillator below its resonance, and of
-eq. (9) of the landing gear with the displacement given; the noise is white, and the prior of its variance is drawn from
-too.
+All data are synthetic, with white noise. Every replicate draws its truth from the priors, records it by time
+integration, and runs fold, MAP estimate, Laplace approximation and emcee (`bp.calibrate`). The likelihood of the second
+case is deliberately wrong: it counts a quarter more independent values than there are, as if every variance were a
+fifth smaller.
 
 Replicates are saved as they end, results after each case; the same command computes missing replicates. Replicates run
 in N processes with ``--processes N``, on a Dask cluster with ``--dask ADDRESS``, or in the processes of
@@ -30,6 +28,7 @@ import numpy as np
 import bayesperiodic as bp
 from studies import common
 from studies.common import TaskPool
+from studies.gear import GEAR
 
 CYCLES = 10
 OVERCOUNT = 1.25
@@ -68,55 +67,35 @@ def landing_gear() -> bp.Problem:
         "theta6": bp.Normal(-2.3, 0.15),
         "theta16": bp.LogNormal(2.0, 0.5),
     }
-    fixed = {
-        "theta1": 80.0, "theta2": 0.0, "theta3": 8e3, "theta5": 1e6 / 293, "theta7": 0.0, "theta8": 150.0,
-        "theta9": 1e-4, "theta10": 300.0, "theta12": 0.0, "theta15": 17.0, "theta17": -293.0,
-    }  # fmt: skip
-    return bp.Problem(
-        bp.models.landing_gear("displacement"),
-        [run],
-        priors=priors,
-        fixed=fixed,
-        tied={"theta11": "-1e5*theta4"},
-        noise=bp.noise.Independent(prior=bp.LogNormal(50.0**2, 0.5)),
-        scheme="central4",
-    )
+    tied = {"theta11": "-1e5*theta4"}
+    fixed = {name: value for name, value in GEAR.items() if name not in (*priors, *tied)}
+    return _problem(bp.models.landing_gear("displacement"), run, priors, fixed, 50.0**2, tied)
 
 
-def _problem(model: bp.Model, run: bp.Experiment, priors: Any, fixed: Any, variance: float) -> bp.Problem:
+def _problem(
+    model: bp.Model, run: bp.Experiment, priors: Any, fixed: Any, variance: float, tied: Any = None
+) -> bp.Problem:
     noise = bp.noise.Independent(prior=bp.LogNormal(variance, 0.5))
-    return bp.Problem(model, [run], priors=priors, fixed=fixed, noise=noise, scheme="central4")
+    return bp.Problem(model, [run], priors=priors, fixed=fixed, tied=tied, noise=noise, scheme="central4")
 
 
 def _run(
-    name: str,
-    frequency: float,
-    inputs: dict[str, tuple[float, float]],
-    harmonics: dict[str, int],
-    samples: int,
+    name: str, frequency: float, inputs: dict[str, tuple[float, float]], harmonics: dict[str, int], samples: int,
     overcount: float = 1.0,
-) -> bp.Experiment:
+) -> bp.Experiment:  # fmt: skip
     """Return an experiment's settings, with the mean and the amplitude of each input; its outputs are never used."""
     wave = np.sin(2 * np.pi * np.arange(samples) / samples)
+    given = {channel: mean + amplitude * wave for channel, (mean, amplitude) in inputs.items()}
+    counted = {channel: round(overcount * (2 * kept + 1)) for channel, kept in harmonics.items()}
     return bp.Experiment(
-        name,
-        frequency,
-        {channel: wave for channel in harmonics},
-        {channel: mean + amplitude * wave for channel, (mean, amplitude) in inputs.items()},
-        samples=samples,
-        cycles=CYCLES,
-        harmonics=harmonics | dict.fromkeys(inputs, 1),
-        independent={channel: round(overcount * (2 * kept + 1)) for channel, kept in harmonics.items()},
-        synthetic=True,
-    )
+        name, frequency, dict.fromkeys(harmonics, wave), given, samples=samples, cycles=CYCLES,
+        harmonics=harmonics | dict.fromkeys(inputs, 1), independent=counted, synthetic=True,
+    )  # fmt: skip
 
 
 CASES: dict[str, Callable[[], bp.Problem]] = {
-    "duffing": duffing,
-    "miscounted": miscounted,
-    "damper": damper,
-    "landing_gear": landing_gear,
-}
+    "duffing": duffing, "miscounted": miscounted, "damper": damper, "landing_gear": landing_gear,
+}  # fmt: skip
 DEFAULT, QUICK = 20, 5
 STRIDE = 4
 STEPS = 250
@@ -135,7 +114,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"All data are SYNTHETIC: {count} campaigns of every case, their truths drawn from the priors.")
     results: dict[str, Any] = {}
     about = {"synthetic": True, "seed": options.seed, "replicates": count, "steps": STEPS, "overcount": OVERCOUNT}
-    with executor_of(options) as executor:
+    with _executor_of(options) as executor:
         for number, (name, case) in enumerate(CASES.items()):
             with watch.part(name, name.replace("_", " ")):
                 found = bp.calibrate(
@@ -143,7 +122,7 @@ def run(options: argparse.Namespace) -> None:
                     executor=executor, max_steps=STEPS,
                 )  # fmt: skip
             print(found)
-            results[name] = collect(found)
+            results[name] = _collect(found)
             study = about | {"cases": list(results), "seconds": watch.total(), "versions": common.versions()}
             paths = common.save_figures(options.out, {name: bp.plot.ranks(found)})
             path = common.write_results(options.out, results | {"study": study})
@@ -151,8 +130,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 @contextmanager
-def executor_of(options: argparse.Namespace) -> Iterator[Any]:
-    """Provide the executor of the replicates."""
+def _executor_of(options: argparse.Namespace) -> Iterator[Any]:
     if options.dask:
         from distributed import Client
 
@@ -167,8 +145,7 @@ def executor_of(options: argparse.Namespace) -> Iterator[Any]:
         yield options.processes
 
 
-def collect(one: bp.Calibration) -> dict[str, Any]:
-    """Return the content of results.json on one case; NaN becomes None."""
+def _collect(one: bp.Calibration) -> dict[str, Any]:
     rows = one.table.to_dict("records")
     return {
         "replicates": one.replicates,
@@ -184,7 +161,7 @@ def collect(one: bp.Calibration) -> dict[str, Any]:
     }
 
 
-ROUNDS, EACH, LOOP = 7, 6, 20_000_000
+ROUNDS, EACH, LOOP = 7, 6, 60_000_000
 EMPTY = 500
 SCALING_STEPS = 250
 
@@ -208,7 +185,7 @@ def scaling(seed: int) -> dict[str, Any]:
             )  # fmt: skip
 
         def loops(workers: int) -> None:
-            for done in [pool.submit(plain_loop, LOOP) for _ in range(workers)]:
+            for done in [pool.submit(sum, range(LOOP)) for _ in range(workers)]:
                 done.result()
 
         for workers in (1, 2):
@@ -220,15 +197,20 @@ def scaling(seed: int) -> dict[str, Any]:
                 times[f"loop {workers}"].append(_seconds(lambda w=workers: loops(w)))  # type: ignore[misc]
                 times[f"farm {workers}"].append(_seconds(lambda w=workers, n=number: farm(w, EACH, n)))  # type: ignore[misc]
         overhead = _overhead(clients[2])
-    return _account(times, overhead, problem)
-
-
-def plain_loop(count: int) -> int:
-    """Count in plain Python."""
-    total = 0
-    for k in range(count):
-        total += k
-    return total
+    gain, plain = (2.0 * np.array(times[f"{what} 1"]) / np.array(times[f"{what} 2"]) for what in ("farm", "loop"))
+    replicate = float(np.median(times["farm 1"])) / EACH
+    return {
+        "gain_of_two_workers": float(np.median(gain)),
+        "gain_of_two_plain_loops": float(np.median(plain)),
+        "ratio": float(np.median(gain) / np.median(plain)),
+        "ratios_of_rounds": (gain / plain).tolist(),
+        "seconds_a_replicate": replicate,
+        "overhead_a_task_seconds": overhead,
+        "problem_bytes": len(cloudpickle.dumps(problem)),
+        "rounds": ROUNDS,
+        "replicates_a_round_and_worker": EACH,
+        "workers_one_scheduler_feeds": int(replicate / overhead),
+    }
 
 
 def _overhead(client: Any) -> float:
@@ -251,21 +233,3 @@ def _seconds(action: Callable[[], Any]) -> float:
     before = time.perf_counter()
     action()
     return time.perf_counter() - before
-
-
-def _account(times: dict[str, list[float]], overhead: float, problem: bp.Problem) -> dict[str, Any]:
-    gains = {what: 2.0 * np.array(times[f"{what} 1"]) / np.array(times[f"{what} 2"]) for what in ("farm", "loop")}
-    ratio = gains["farm"] / gains["loop"]
-    replicate = float(np.median(times["farm 1"])) / EACH
-    return {
-        "gain_of_two_workers": float(np.median(gains["farm"])),
-        "gain_of_two_plain_loops": float(np.median(gains["loop"])),
-        "ratio": float(np.median(gains["farm"]) / np.median(gains["loop"])),
-        "ratios_of_rounds": ratio.tolist(),
-        "seconds_a_replicate": replicate,
-        "overhead_a_task_seconds": overhead,
-        "problem_bytes": len(cloudpickle.dumps(problem)),
-        "rounds": ROUNDS,
-        "replicates_a_round_and_worker": EACH,
-        "workers_one_scheduler_feeds": int(replicate / overhead),
-    }

@@ -41,10 +41,10 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("read", "reading the recording and folding it into its mean period"):
         recording, data = read_recording(options.data, options.seed)
         experiment = recording.fold()
-    what = "SYNTHETIC recording" if data["synthetic"] else "measured recording"
+    kind = "SYNTHETIC recording" if data["synthetic"] else "measured recording"
     harmonics = experiment.harmonics
     print(
-        f"  {what} {data['path']}: {experiment.frequency:.6f} ± {experiment.frequency_se:.1g} Hz, "
+        f"  {kind} {data['path']}: {experiment.frequency:.6f} ± {experiment.frequency_se:.1g} Hz, "
         f"{experiment.cycles} steady cycles, periodicity {experiment.periodicity:.4f}\n"
         f"  kept: {harmonics['displacement']} harmonics of the displacement, {harmonics['force']} of the force, "
         f"{experiment.independent['force']} independent values"
@@ -60,43 +60,39 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("map", "finding the MAP point and the Laplace covariance"):
         fit = bp.map_estimate(problem)
     with watch.part("harmonics", "repeating it with other numbers of displacement harmonics"):
-        choices = [fit_with(recording, count) for count in other_choices(harmonics["displacement"])]
+        default = harmonics["displacement"]
+        counts = max(1, round(default / 4)), min(58, 2 * default)
+        folded = [recording.fold(harmonics={"displacement": count}) for count in counts]
+        choices = [_summary(e, bp.map_estimate(bp.Problem(bp.models.dahl, [e], priors=PRIORS))) for e in folded]
     with watch.part("sample", "sampling the posterior with emcee"):
         posterior = bp.sample(problem, fit, seed=options.seed, max_steps=500 if options.quick else 20_000)
     print(f"  {posterior.reason}")
     with watch.part("figures", "drawing"):
         comparison = bp.compare(problem, fit, posterior)
-        prediction = bp.predict(problem, posterior)
         figures = {
-            "fit": bp.plot.fit(problem, fit, prediction),
+            "fit": bp.plot.fit(problem, fit, bp.predict(problem, posterior)),
             "loops": bp.plot.loops(problem, fit),
             "corner": bp.plot.corner(posterior, laplace=fit),
             "traces": bp.plot.traces(posterior),
         }
         paths = common.save_figures(options.out, figures)
 
-    choices = sorted([summary(experiment, fit), *choices], key=lambda choice: choice["harmonics"])
-    print("\n" + tables(data, experiment, fit, posterior, comparison, choices) + "\n")
-    results = collect(data, experiment, fit, posterior, comparison, choices, options.seed)
-    path = common.write_results(options.out, results | {"seconds": watch.total(), "versions": common.versions()})
-    print(f"figures{' (synthetic data)' if data['synthetic'] else ''}: {', '.join(map(str, paths))}\nresults: {path}")
+    choices = sorted([_summary(experiment, fit), *choices], key=lambda choice: choice["harmonics"])
+    results = {"data": data, "seed": options.seed} | _collect(experiment, fit, posterior, comparison, choices)
+    print("\n" + _tables(results, fit, comparison) + "\n")
+    common.finish(options.out, results, watch, paths, synthetic=data["synthetic"])
 
 
 def read_recording(given: Path | None, seed: int) -> tuple[bp.Recording, dict[str, Any]]:
     """Return the measured recording, or a generated one of the same kind, and its description."""
     found = common.find_data(given, FILE)
     if found is None:
-        return generate(seed), {"path": "generated", "sha256": None, "synthetic": True}
-    path, name = found
+        return generate(seed), common.described(found)
     recording = bp.Recording.from_csv(
-        path,
-        time="time_s",
-        inputs={"displacement": "displacement_mm"},
-        outputs={"force": "force_N"},
-        units={"displacement": ("mm", "m")},
-        name="magneto-rheological damper, 0 V",
-    )
-    return recording, {"path": name, "sha256": common.sha256(path), "synthetic": False}
+        found[0], time="time_s", inputs={"displacement": "displacement_mm"}, outputs={"force": "force_N"},
+        units={"displacement": ("mm", "m")}, name="magneto-rheological damper, 0 V",
+    )  # fmt: skip
+    return recording, common.described(found)
 
 
 def generate(seed: int) -> bp.Recording:
@@ -105,31 +101,14 @@ def generate(seed: int) -> bp.Recording:
     for harmonic, amplitude in SYNTHETIC_SHAPE.items():
         amplitudes[harmonic] = amplitude
     phase = 2j * np.pi * np.arange(64)[:, None] / 64 * np.arange(amplitudes.size)
+    displacement = (np.exp(phase) @ amplitudes).real
     return bp.simulate(
-        bp.models.dahl,
-        PUBLISHED,
-        {"displacement": (np.exp(phase) @ amplitudes).real},
-        frequency=SYNTHETIC_FREQUENCY,
-        duration=30.0,
-        sampling_rate=100.0,
-        noise=SYNTHETIC_NOISE,
-        seed=seed,
-    )
+        bp.models.dahl, PUBLISHED, {"displacement": displacement}, frequency=SYNTHETIC_FREQUENCY, duration=30.0,
+        sampling_rate=100.0, noise=SYNTHETIC_NOISE, seed=seed,
+    )  # fmt: skip
 
 
-def other_choices(default: int) -> list[int]:
-    """Return two other numbers of kept input harmonics, well below and well above the default."""
-    return [max(1, round(default / 4)), min(58, 2 * default)]
-
-
-def fit_with(recording: bp.Recording, count: int) -> dict[str, Any]:
-    """Return the estimate with another number of displacement harmonics."""
-    experiment = recording.fold(harmonics={"displacement": count})
-    return summary(experiment, bp.map_estimate(bp.Problem(bp.models.dahl, [experiment], priors=PRIORS)))
-
-
-def summary(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, Any]:
-    """Return what one choice of harmonics leads to."""
+def _summary(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, Any]:
     return {
         "harmonics": experiment.harmonics["displacement"],
         "map": fit.theta,
@@ -140,20 +119,14 @@ def summary(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, Any]:
     }
 
 
-def collect(
-    data: dict[str, Any],
+def _collect(
     experiment: bp.Experiment,
     fit: bp.MapEstimate,
     posterior: bp.Posterior,
     comparison: bp.Comparison,
     choices: list[dict[str, Any]],
-    seed: int,
 ) -> dict[str, Any]:
-    """Return the content of results.json, times and versions excepted."""
-    table = posterior.summary()
-    return {
-        "data": data,
-        "seed": seed,
+    return _summary(experiment, fit) | {
         "units": {name: bp.models.dahl.units[name] for name in fit.theta} | {"variance[force]": "N²"},
         "frequency": {"value": experiment.frequency, "se": experiment.frequency_se},
         "cycles": experiment.cycles,
@@ -161,18 +134,10 @@ def collect(
         "independent_values": experiment.independent["force"],
         "harmonics": dict(experiment.harmonics),
         "whiteness": {"p": fit.whiteness["force"].p, "lag1": fit.whiteness["force"].lag1},
-        "map": fit.theta,
-        "laplace_sd": fit.sd,
         "robust_sd": fit.robust_sd,
         "noise_split": {key: getattr(fit.noise_split["force"], key) for key in ("measurement", "model", "total")},
-        "posterior": {
-            name: {key: float(row[key]) for key in ("mean", "sd", "q05", "q50", "q95")}
-            for name, row in table.iterrows()
-        },
+        "posterior": posterior.summary()[["mean", "sd", "q05", "q50", "q95"]].astype(float).to_dict("index"),
         "comparison": comparison.table["verdict"].to_dict(),
-        "rms": fit.rms["force"],
-        "fvu": fit.fvu["force"],
-        "input_noise": fit.input_noise["force"],
         "input_harmonics": {"rule": RULE, "choices": choices},
         "converged": posterior.converged,
         "reason": posterior.reason,
@@ -185,41 +150,22 @@ def collect(
     }
 
 
-def tables(
-    data: dict[str, Any],
-    experiment: bp.Experiment,
-    fit: bp.MapEstimate,
-    posterior: bp.Posterior,
-    comparison: bp.Comparison,
-    choices: list[dict[str, Any]],
-) -> str:
-    """Return the tables to print, with their interpretation."""
-    kind = "SYNTHETIC data" if data["synthetic"] else "measured data"
-    table = comparison.table
-    rows = pd.DataFrame(
-        {
-            "unit": [bp.models.dahl.units[name] for name in table.index],
-            "MAP": table["map"],
-            "Laplace sd": table["laplace_sd"],
-            "robust sd": pd.Series(fit.robust_sd),
-            "mean": table["mean"],
-            "sd": table["sd"],
-            "5 %": table["q05"],
-            "95 %": table["q95"],
-            "skewness": table["skewness"],
-            "published": [PUBLISHED[name] or np.nan for name in table.index],
-            "Laplace is": table["verdict"],
-        },
-        index=table.index,
-    )
+def _tables(results: dict[str, Any], fit: bp.MapEstimate, comparison: bp.Comparison) -> str:
+    kind = "SYNTHETIC data" if results["data"]["synthetic"] else "measured data"
+    columns = {
+        "unit": pd.Series(results["units"]), "robust sd": pd.Series(fit.robust_sd),
+        "published": pd.Series(PUBLISHED).replace(0.0, np.nan),
+    }  # fmt: skip
+    shown = ["map", "laplace_sd", "mean", "sd", "q05", "q95", "skewness", "verdict"]
+    rows = comparison.table[shown].assign(**columns)
+    white, split = fit.whiteness["force"], fit.noise_split["force"]
     lines = [
         f"Dahl model of the damper, {kind}, SI units (the source has mm): Laplace against MCMC",
         rows.to_string(float_format="{:.4g}".format, na_rep="-"),
         f"variance of the mean period (prior 1/v): {fit.variances['force']:.3g} N² (eq. 7), posterior mean "
-        f"{posterior.draws('variance[force]').mean():.3g} N²",
+        f"{results['posterior']['variance[force]']['mean']:.3g} N²",
         f"residual {fit.rms['force']:.2f} N rms, {fit.fvu['force']:.2%} of the force's variance",
     ]
-    white, split = fit.whiteness["force"], fit.noise_split["force"]
     if white.p < 0.01:
         lines.append(
             f"The residual is not white (p = {white.p:.1g}, autocorrelation {white.lag1:.2f} from one independent "
@@ -227,25 +173,18 @@ def tables(
             "too small; the robust ones use the\nspectrum of the residual. Of its "
             f"{split.total:.2f} N, {split.measurement:.2f} N are measurement noise and {split.model:.2f} N model error."
         )
-    lines += ["", f"The same with other numbers of displacement harmonics; the rule: {RULE}."]
-    lines.append(
-        pd.DataFrame(
-            [
-                {
-                    "harmonics": c["harmonics"],
-                    "default": "*" if c["harmonics"] == experiment.harmonics["displacement"] else "",
-                }
-                | {name: f"{c['map'][name]:.4g} ± {c['laplace_sd'][name]:.2g}" for name in c["map"]}
-                | {"fvu": f"{c['fvu']:.3%}"}
-                for c in choices
-            ]
-        ).to_string(index=False)
-    )
-    rho = [c["map"]["rho"] for c in choices]
-    widest = max(c["laplace_sd"]["rho"] for c in choices)
-    lines.append(
+    choices = results["input_harmonics"]["choices"]
+    by_choice = {
+        c["harmonics"]: {name: f"{value:.4g} ± {c['laplace_sd'][name]:.2g}" for name, value in c["map"].items()}
+        | {"fvu": f"{c['fvu']:.3%}"}
+        for c in choices
+    }
+    rho, widest = [c["map"]["rho"] for c in choices], max(c["laplace_sd"]["rho"] for c in choices)
+    return "\n".join([
+        *lines, "", f"Estimates by number of displacement harmonics; the rule: {RULE}:",
+        f"{results['harmonics']['displacement']} harmonics.",
+        pd.DataFrame(by_choice).T.to_string(),
         f"rho runs from {min(rho):.3g} to {max(rho):.3g} 1/m over these choices, {np.ptp(rho) / widest:.1f} of its "
         "largest standard deviation: it depends on\nhow sharply the measured motion reverses, which the posterior does "
-        "not include."
-    )
-    return "\n".join(lines)
+        "not include.",
+    ])  # fmt: skip

@@ -7,17 +7,14 @@ identifiable.
 """
 
 import argparse
-import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from scipy.stats import binom
 
 import bayesperiodic as bp
 from studies import common
-from studies.common import resumed
 from studies.flutter import rig
 from studies.flutter.questions import FREE_SCALES, errors
 from studies.flutter.rig import TRUE, estimate
@@ -27,8 +24,6 @@ FIRST_SEED = 100_000
 STIFFNESSES = ("k_alpha2", "k_alpha3")
 LEVEL, ALARM = 0.9, 0.01
 
-Task = tuple[int]
-
 
 def run(options: argparse.Namespace) -> None:
     """Compute the campaigns missing from the file in the folder, and report on all of them."""
@@ -37,22 +32,19 @@ def run(options: argparse.Namespace) -> None:
     folder = options.out / "campaigns"
     with watch.part("campaigns", f"{options.replicates} campaigns"):
         tasks = [(FIRST_SEED * options.seed + number,) for number in range(options.replicates)]
-        lines = resumed(folder / FILE, tasks, campaign, lambda line: (line["seed"],), source())
+        lines = common.resumed(folder / FILE, tasks, campaign, lambda line: (line["seed"],), source())
     found = account(lines)
     print(table(found))
     results = {"synthetic": True, "seed": options.seed, "truth": TRUE, "account": found, "campaigns": lines}
-    path = common.write_results(folder, results | {"seconds": watch.total(), "versions": common.versions()})
-    print(f"results (synthetic data): {path}")
+    common.finish(folder, results, watch, synthetic=True)
 
 
 def source() -> str:
     """Return a key that identifies the version of the campaigns."""
-    files = [Path(__file__), Path(str(rig.__file__))]
-    text = common.versions()["bayesperiodic"] + "".join(common.sha256(path) for path in files)
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
+    return common.source_key(__file__, rig.__file__)
 
 
-def campaign(task: Task) -> dict[str, Any]:
+def campaign(task: tuple[int]) -> dict[str, Any]:
     """Return the results of one campaign."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -3,11 +3,13 @@
 from collections.abc import Mapping
 
 import numpy as np
+from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
+from studies.common import shared_legend
 from studies.flutter.questions import CHANNELS, closed, contraction, drawn_sizes, laplace_draws, sizes
-from studies.flutter.rig import AUTHORS, RIG, SENSORS, Fitted, cycles
+from studies.flutter.rig import AUTHORS, RIG, SENSORS, Experiments, Fitted, Speeds, cycles
 
 MEASURED, MODEL, THEIRS = "black", {True: "#0072B2", False: "#D55E00"}, "#999999"
 KIND = {True: "stable", False: "unstable"}
@@ -15,8 +17,8 @@ GRID, COARSE = np.linspace(13.0, 19.0, 241), np.linspace(13.0, 19.0, 41)
 
 
 def all_of(
-    experiments: Mapping[str, bp.Experiment],
-    speeds: Mapping[str, float],
+    experiments: Experiments,
+    speeds: Speeds,
     fits: Mapping[str, Fitted],
     fit: bp.MapEstimate,
     posterior: bp.Posterior | None,
@@ -31,14 +33,14 @@ def all_of(
     figures = {
         "bifurcation": bifurcation(experiments, speeds, fit, chosen),
         "portraits": portraits(experiments, speeds, fit),
-        "contraction": contractions(fits, any(e.synthetic for e in experiments.values())),
+        "contraction": contractions(fits, _kind(experiments)),
     }
     return figures if posterior is None else figures | {"corner": bp.plot.corner(posterior, laplace=fit)}
 
 
 def amplitudes(values: Mapping[str, float]) -> dict[tuple[str, bool], np.ndarray]:
     """Return the amplitude of each channel over the grid of wind speeds, by branch; NaN where there is no cycle."""
-    found = {(channel, kind): np.full(GRID.size, np.nan) for channel in ("heave", "pitch") for kind in KIND}
+    found = {(channel, kind): np.full(GRID.size, np.nan) for channel in CHANNELS for kind in KIND}
     try:
         branches = cycles(values).branches
     except ValueError:
@@ -48,7 +50,7 @@ def amplitudes(values: Mapping[str, float]) -> dict[tuple[str, bool], np.ndarray
         own = sorted((o for o in orbits if o.stable == kind), key=lambda orbit: orbit.parameters["U"])
         if len(own) > 1:
             speed = [orbit.parameters["U"] for orbit in own]
-            for channel in ("heave", "pitch"):
+            for channel in CHANNELS:
                 size = [sizes(orbit.outputs)[channel] for orbit in own]
                 found[channel, kind] = np.interp(GRID, speed, size, left=np.nan, right=np.nan)
     return found
@@ -74,18 +76,13 @@ def bands(theta: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> dict[t
 
 
 def bifurcation(
-    experiments: Mapping[str, bp.Experiment],
-    speeds: Mapping[str, float],
-    fit: bp.MapEstimate,
-    draws: Mapping[str, np.ndarray],
+    experiments: Experiments, speeds: Speeds, fit: bp.MapEstimate, draws: Mapping[str, np.ndarray]
 ) -> Figure:
-    """Draw amplitudes over wind speed: posterior bands of both branches, the authors' values, what was measured."""
-    from matplotlib import pyplot as plt
-
+    """Draw amplitudes over wind speed: posterior bands of both branches, the authors' values, measurements."""
     drawn = bands(fit.theta, draws)
     best, theirs = amplitudes(RIG | fit.theta), amplitudes(RIG | AUTHORS | SENSORS)
     figure = plt.figure(figsize=(9.0, 8.0), layout="constrained")
-    for axes, channel in zip(figure.subplots(2, 1, sharex=True), ("heave", "pitch"), strict=True):
+    for axes, channel in zip(figure.subplots(2, 1, sharex=True), CHANNELS, strict=True):
         for kind in (True, False):
             colour, style = MODEL[kind], "-" if kind else "--"
             at, low, high = drawn[channel, kind]
@@ -105,23 +102,19 @@ def bifurcation(
         axes.set_ylabel(f"amplitude of {channel} [sensor units]")
         axes.set_ylim(bottom=0.0)
     axes.set_xlabel("wind speed [m/s]")
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, ncols=3, loc="outside lower center", fontsize=9)
+    shared_legend(figure, 3, fontsize=9)
     figure.suptitle(f"Flutter rig{_kind(experiments)}: limit cycles")
     return figure
 
 
-def portraits(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float], fit: bp.MapEstimate) -> Figure:
+def portraits(experiments: Experiments, speeds: Speeds, fit: bp.MapEstimate) -> Figure:
     """Draw pitch over heave, measured and fitted, a panel per cycle."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(11.0, 6.0), layout="constrained")
     for axes, (name, e) in zip(figure.subplots(2, 4, sharex=True, sharey=True).flat, experiments.items(), strict=False):
         orbit = fit.solutions[name]
         kind = not name.startswith("unstable")
         for values, colour, label in ((e.outputs, MEASURED, "measured"), (orbit.outputs, MODEL[kind], "fitted")):
-            smooth = {c: closed(values[c]) for c in ("heave", "pitch")}
-            axes.plot(smooth["heave"], smooth["pitch"], color=colour, lw=1.4, label=f"{label}, {KIND[kind]}")
+            axes.plot(*(closed(values[c]) for c in CHANNELS), color=colour, lw=1.4, label=f"{label}, {KIND[kind]}")
         axes.set_title(f"{speeds[name]:g} m/s, {KIND[kind]}", fontsize=10)
         axes.legend(frameon=False, fontsize=7, loc="lower right")
     for axes in figure.axes[4:]:
@@ -132,10 +125,8 @@ def portraits(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, flo
     return figure
 
 
-def contractions(fits: Mapping[str, Fitted], synthetic: bool) -> Figure:
+def contractions(fits: Mapping[str, Fitted], kind_of_data: str) -> Figure:
     """Draw posterior sd over prior sd of each parameter, from the stable cycles, the unstable ones, and both."""
-    from matplotlib import pyplot as plt
-
     table = contraction(fits)
     names = list(table)
     figure = plt.figure(figsize=(8.0, 5.5), layout="constrained")
@@ -148,10 +139,10 @@ def contractions(fits: Mapping[str, Fitted], synthetic: bool) -> Figure:
     axes.set_yticks(range(len(names)), names)
     axes.invert_yaxis()
     axes.set_xlabel("Laplace sd over the prior's sd [1]")
-    figure.legend(frameon=False, ncols=4, loc="outside lower center")
-    figure.suptitle(f"Flutter rig{', synthetic data' if synthetic else ''}: information on each parameter")
+    shared_legend(figure, 4)
+    figure.suptitle(f"Flutter rig{kind_of_data}: information on each parameter")
     return figure
 
 
-def _kind(experiments: Mapping[str, bp.Experiment]) -> str:
+def _kind(experiments: Experiments) -> str:
     return ", synthetic data" if any(e.synthetic for e in experiments.values()) else ""

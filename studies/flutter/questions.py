@@ -1,24 +1,12 @@
 """Analysis of the flutter fits: gain from unstable cycles, predicted cycles, size of the misfit."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 import bayesperiodic as bp
-from studies.flutter.rig import (
-    AUTHORS,
-    PRIORS,
-    RIG,
-    SENSORS,
-    SPREADS,
-    SPRINGS,
-    START,
-    Fitted,
-    cycles,
-    estimate,
-    problem,
-)
+from studies.flutter import rig
 
 NEAR = 0.25
 FEWEST = 3
@@ -27,46 +15,49 @@ CHANNELS = ("heave", "pitch")
 CURVE = 240
 
 
-def closed(values: np.ndarray) -> np.ndarray:
+def closed(values: np.ndarray, points: int = CURVE) -> np.ndarray:
     """Return a closed curve through the samples of a cycle, by its Fourier series."""
-    curve = np.fft.irfft(np.fft.rfft(values), CURVE) * CURVE / values.size
+    curve = np.fft.irfft(np.fft.rfft(values), points) * points / values.size
     return np.append(curve, curve[0])
+
+
+def half_range(values: np.ndarray, points: int = CURVE) -> float:
+    """Return half the range of a periodic signal, between its samples too."""
+    return 0.5 * float(np.ptp(closed(values, points)))
 
 
 def sizes(outputs: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Return half the range of each channel over the cycle, in sensor units."""
-    return {channel: 0.5 * float(np.ptp(closed(outputs[channel]))) for channel in CHANNELS}
+    return {channel: half_range(outputs[channel]) for channel in CHANNELS}
 
 
-def errors(fitted: Fitted, experiments: Mapping[str, bp.Experiment]) -> dict[str, Any]:
+def _errors_of(orbit: bp.PeriodicSolution, e: bp.Experiment) -> dict[str, Any]:
+    measured = sizes(e.outputs)
+    return {
+        "amplitude_error": {c: v / measured[c] - 1.0 for c, v in sizes(orbit.outputs).items()},
+        "frequency_error": orbit.frequency / e.frequency - 1.0,
+    }
+
+
+def errors(fitted: rig.Fitted, experiments: rig.Experiments) -> dict[str, Any]:
     """Return the errors of the fitted cycles, and whether their stability is correct."""
     found = {}
     for name, e in experiments.items():
-        orbit, measured = fitted.fit.solutions[name], sizes(e.outputs)
-        found[name] = {
-            "amplitude_error": {c: v / measured[c] - 1.0 for c, v in sizes(orbit.outputs).items()},
-            "frequency_error": orbit.frequency / e.frequency - 1.0,
-            "stable": orbit.stable,
-            "as_measured": orbit.stable == (not name.startswith("unstable")),
-        }
+        orbit = fitted.fit.solutions[name]
+        as_measured = orbit.stable == (kind_of(name) == "stable")
+        found[name] = _errors_of(orbit, e) | {"stable": orbit.stable, "as_measured": as_measured}
     return found
 
 
-def authors_errors(experiments: Mapping[str, bp.Experiment], speeds: Mapping[str, float]) -> dict[str, Any]:
+def authors_errors(experiments: rig.Experiments, speeds: rig.Speeds) -> dict[str, Any]:
     """Return the same for the authors' values and sensor units; None and the reason if there is no cycle."""
-    along = cycles(RIG | AUTHORS | SENSORS)
+    along = rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS)
     found: dict[str, Any] = {}
     for name, e in experiments.items():
         try:
-            orbit = along.at(name, speeds[name])
+            found[name] = _errors_of(along.at(name, speeds[name]), e)
         except ValueError as error:
             found[name] = {"amplitude_error": None, "frequency_error": None, "why": str(error)}
-            continue
-        measured = sizes(e.outputs)
-        found[name] = {
-            "amplitude_error": {c: v / measured[c] - 1.0 for c, v in sizes(orbit.outputs).items()},
-            "frequency_error": orbit.frequency / e.frequency - 1.0,
-        }
     return found
 
 
@@ -81,41 +72,30 @@ def kind_of(name: str) -> str:
     return "unstable" if name.startswith("unstable") else "stable"
 
 
-def contraction(fits: Mapping[str, Fitted]) -> dict[str, dict[str, dict[str, float]]]:
+def contraction(fits: Mapping[str, rig.Fitted]) -> dict[str, dict[str, dict[str, float]]]:
     """Return estimate, Laplace and robust sd, and sd over the prior's sd, by parameter and data."""
     generator = np.random.default_rng(0)
-    prior = {name: float(np.std(one.sample(20_000, generator))) for name, one in PRIORS.items()}
-    gain = PRIORS["gain_pitch"].sample(20_000, generator)
-    draws = {n: PRIORS[n].sample(20_000, generator) for n in ("k_alpha2", "k_alpha3")}
+    prior = {name: float(np.std(one.sample(20_000, generator))) for name, one in rig.PRIORS.items()}
+    gain = rig.PRIORS["gain_pitch"].sample(20_000, generator)
+    draws = {n: rig.PRIORS[n].sample(20_000, generator) for n in ("k_alpha2", "k_alpha3")}
     prior["k_alpha2 at gain 1"] = float(np.std(draws["k_alpha2"] / gain))
     prior["k_alpha3 at gain 1"] = float(np.std(draws["k_alpha3"] / gain**2))
     table: dict[str, dict[str, dict[str, float]]] = {}
     for kind, fitted in fits.items():
         fit = fitted.fit
-        values, sds = dict(fit.theta), dict(fit.sd)
-        for name, (value, sd) in springs(fit).items():
-            values[name], sds[name] = value, sd
-        for name, value in values.items():
-            row = {"estimate": value, "sd": sds[name], "over_prior": sds[name] / prior[name]}
+        # The nonlinear stiffnesses in units of the pitch sensor, independent of its scale.
+        springs = fit.derive({name.replace(" ", "_"): text for name, text in rig.SPRINGS.items()})[["value", "sd"]]
+        rows = {name: (value, fit.sd[name]) for name, value in fit.theta.items()}
+        rows |= dict(zip(rig.SPRINGS, springs.itertuples(index=False, name=None), strict=True))
+        for name, (value, sd) in rows.items():
+            row = {"estimate": value, "sd": sd, "over_prior": sd / prior[name]}
             if name in fit.robust_sd:
                 row["robust_sd"] = fit.robust_sd[name]
             table.setdefault(name, {})[kind] = row
     return table
 
 
-def springs(fit: bp.MapEstimate) -> dict[str, tuple[float, float]]:
-    """Return the nonlinear stiffnesses in units of the pitch sensor, independent of the scales, with their sds."""
-    gain = fit.theta["gain_pitch"]
-    found = {}
-    for power, (name, spring) in enumerate(zip(SPRINGS, ("k_alpha2", "k_alpha3"), strict=True), 1):
-        value = fit.theta[spring] / gain**power
-        slopes = np.array([value / fit.theta[spring], -power * value / gain])
-        block = fit.covariance.loc[[spring, "gain_pitch"], [spring, "gain_pitch"]].to_numpy()
-        found[name] = value, float(np.sqrt(slopes @ block @ slopes))
-    return found
-
-
-def groups(speeds: Mapping[str, float]) -> list[list[str]]:
+def groups(speeds: rig.Speeds) -> list[list[str]]:
     """Return the names of the records by wind speed, those within a quarter of a metre per second together."""
     found: list[list[str]] = []
     for name in sorted(speeds, key=lambda name: speeds[name]):
@@ -127,38 +107,18 @@ def groups(speeds: Mapping[str, float]) -> list[list[str]]:
 
 
 def leave_out(
-    experiments: Mapping[str, bp.Experiment],
-    speeds: Mapping[str, float],
-    theta: dict[str, float],
-    left: list[str],
-    draws: int,
-) -> tuple[Fitted, dict[str, Any]]:
-    """Return the fit without some cycles, started at the estimate θ from all, and its predictions of them."""
-    kept = {name: e for name, e in experiments.items() if name not in left}
-    fitted = estimate(kept, speeds, start=START | theta)
-    return fitted, predictions(fitted, experiments, speeds, left, draws)
+    experiments: rig.Experiments, speeds: rig.Speeds, theta: dict[str, float], left: list[str], draws: int
+) -> tuple[rig.Fitted, dict[str, Any]]:
+    """Return the fit without some cycles, started at the estimate θ from all, and the errors of its predictions.
 
-
-def predictions(
-    fitted: Fitted,
-    experiments: Mapping[str, bp.Experiment],
-    speeds: Mapping[str, float],
-    left: Sequence[str],
-    draws: int,
-) -> dict[str, Any]:
-    """Return the errors of cycles that were not fitted: in per cent, in posterior sds, and with the model's error.
-
-    `fitted`: Without them. `speeds`: [m/s]. `draws`: From the Laplace approximation; there are none where the MAP point
-    itself has no such cycle.
+    Errors are relative, in sds of draws of the Laplace approximation, and in sds with the model's error. There are no
+    draws where the MAP point itself has no such cycle.
     """
-    fit, along = fitted.fit, cycles(RIG | fitted.fit.theta)
+    kept = {name: e for name, e in experiments.items() if name not in left}
+    fitted = rig.estimate(kept, speeds, start=rig.START | theta)
+    fit, along = fitted.fit, rig.cycles(rig.RIG | fitted.fit.theta)
     every = laplace_draws(fit, draws)
-    misses = [
-        v / sizes(e.outputs)[c] - 1.0
-        for e in fitted.problem.experiments
-        for c, v in sizes(fit.solutions[e.name].outputs).items()
-    ]
-    model = float(np.sqrt(np.mean(np.square(misses))))
+    model = mean_size({e.name: _errors_of(fit.solutions[e.name], e) for e in fitted.problem.experiments}) or 0.0
     found: dict[str, Any] = {}
     for name in left:
         try:
@@ -177,16 +137,16 @@ def predictions(
                 sd = float(np.std(drawn[channel][there]))
                 with_model = float(np.hypot(sd, model * size))
                 found[name][channel] |= {"posterior_sds": off / sd, "sds_with_model_error": off / with_model}
-    return found
+    return fitted, found
 
 
 def laplace_draws(fit: bp.MapEstimate, draws: int) -> dict[str, np.ndarray]:
-    """Return draws (draws,) of each parameter from the Laplace approximation, in logarithms of what is positive.
+    """Return draws (draws,) of each parameter from the Laplace approximation, in logarithms of positive parameters.
 
     There the ridges of products, such as a stiffness and a sensor's scale, are straight.
     """
     values = np.array(list(fit.theta.values()))
-    positive = np.array([name in SPREADS for name in fit.theta])
+    positive = np.array([name in rig.SPREADS for name in fit.theta])
     slopes = np.where(positive, values, 1.0)
     covariance = fit.covariance.to_numpy() / np.outer(slopes, slopes)
     changes = np.random.default_rng(0).multivariate_normal(np.zeros(values.size), covariance, size=draws)
@@ -201,7 +161,7 @@ def drawn_sizes(
     like = bp.Experiment(
         "cycle", orbit.frequency, orbit.outputs, samples=orbit.samples, frequency_se=1e-3, guess=orbit.states
     )
-    stated = problem([like], {"cycle": orbit.parameters["U"]}, frequency_error=0.0, noise="independent")
+    stated = rig.problem([like], {"cycle": orbit.parameters["U"]}, frequency_error=0.0, noise="independent")
     rows = np.stack([draws[name] for name in stated.names], axis=-1)
     outputs, there = stated.anchored(theta, {"cycle": orbit.states}).outputs(rows)
     curves = {channel: outputs["cycle"][channel] for channel in CHANNELS}

@@ -12,6 +12,7 @@ RIG = {
     "b": 0.15, "span": 1.0, "a": -0.5, "rho": 1.204, "x_alpha": 0.234, "m": 5.3, "m_T": 16.9, "I_alpha": 0.1726,
     "c_h": 15.443, "c_alpha": 0.562767, "k_h": 3529.4, "k_alpha": 54.1162, "k_alpha2": 751.6, "k_alpha3": 5006.0,
 }  # fmt: skip
+# One unit of the heave sensor is 18 cm, the pitch sensor reads rad; so the authors' code plots them.
 SENSORS = {"gain_heave": 1 / 0.18, "gain_pitch": 1.0, "offset_heave": 3.37, "offset_pitch": 0.71}
 
 
@@ -19,7 +20,7 @@ def flutter_matrices(p: Mapping[str, float]) -> tuple[np.ndarray, ...]:
     """Return mass, damping and stiffness at p["U"], written out entry by entry as they were published."""
     b, a, rho, U, pi = p["b"], p["a"], p["rho"] * p["span"], p["U"], np.pi
     c0, c1, c2, c3, c4 = 1.0, 0.165, 0.0455, 0.335, 0.3
-    C = c0 - c1 - c3
+    C, lagged = c0 - c1 - c3, c1 * c2 + c3 * c4
     mass = [
         [pi * rho * b**2 + p["m_T"], -a * pi * rho * b**3 + b * p["m"] * p["x_alpha"], 0],
         [-a * pi * rho * b**3 + b * p["m"] * p["x_alpha"], p["I_alpha"] + pi * (1 / 8 + a**2) * rho * b**4, 0],
@@ -29,22 +30,19 @@ def flutter_matrices(p: Mapping[str, float]) -> tuple[np.ndarray, ...]:
         [
             p["c_h"] + 2 * pi * rho * b * U * C,
             (1 + C * (1 - 2 * a)) * pi * rho * b**2 * U,
-            2 * pi * rho * U**2 * b * (c1 * c2 + c3 * c4),
+            2 * pi * rho * U**2 * b * lagged,
         ],
         [
             -2 * pi * (a + 0.5) * rho * b**2 * C * U,
             p["c_alpha"] + (0.5 - a) * (1 - C * (1 + 2 * a)) * pi * rho * b**3 * U,
-            -2 * pi * rho * U**2 * b**2 * (a + 0.5) * (c1 * c2 + c3 * c4),
+            -2 * pi * rho * U**2 * b**2 * (a + 0.5) * lagged,
         ],
         [-1 / b, a - 0.5, (c2 + c4) * U / b],
     ]
+    moment = p["k_alpha"] - 2 * pi * (a + 0.5) * rho * C * b**2 * U**2
     stiffness = [
         [p["k_h"], 2 * pi * rho * b * U**2 * C, 2 * pi * rho * U**3 * c2 * c4 * (c1 + c3)],
-        [
-            0,
-            p["k_alpha"] - 2 * pi * (a + 0.5) * rho * C * b**2 * U**2,
-            -2 * pi * rho * b * U**3 * (a + 0.5) * c2 * c4 * (c1 + c3),
-        ],
+        [0, moment, -2 * pi * rho * b * U**3 * (a + 0.5) * c2 * c4 * (c1 + c3)],
         [0, -U / b, c2 * c4 * U**2 / b**2],
     ]
     return tuple(np.array(matrix, dtype=float) for matrix in (mass, damping, stiffness))

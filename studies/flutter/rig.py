@@ -13,18 +13,15 @@ import numpy as np
 
 import bayesperiodic as bp
 from studies import common
+from studies.flutter import reference
+from studies.flutter.reference import SENSORS
 
 MODEL = bp.models.flutter
 SAMPLES, SCHEME = 12, "fourier"
-# As published with the data, in SI units.
-RIG = {
-    "b": 0.15, "span": 1.0, "a": -0.5, "rho": 1.204, "x_alpha": 0.234, "m": 5.3, "m_T": 16.9, "I_alpha": 0.1726,
-    "k_h": 3529.4,
-}  # fmt: skip
-AUTHORS = {"c_h": 15.443, "c_alpha": 0.562767, "k_alpha": 54.1162, "k_alpha2": 751.6, "k_alpha3": 5006.0}
-# One unit of the heave sensor is 18 cm, the pitch sensor reads rad; so the authors' code plots them.
-SENSORS = {"gain_heave": 1 / 0.18, "gain_pitch": 1.0, "offset_heave": 3.37, "offset_pitch": 0.71}
-# Near what the measured cycles give: all eight kinds of cycles exist there.
+# The published values of the parameters that are estimated, and of the others.
+AUTHORS = {name: reference.RIG[name] for name in ("c_h", "c_alpha", "k_alpha", "k_alpha2", "k_alpha3")}
+RIG = {name: value for name, value in reference.RIG.items() if name not in AUTHORS}
+# Near the estimate from the measured cycles; all eight kinds of cycles exist there.
 TRUE = {
     "c_h": 6.8, "c_alpha": 0.254, "k_alpha": 56.5, "k_alpha2": 684.0, "k_alpha3": 4577.0, "gain_heave": 7.16,
     "gain_pitch": 0.752, "offset_heave": 3.357, "offset_pitch": 0.7213,
@@ -42,6 +39,10 @@ SPRINGS = {"k_alpha2 at gain 1": "k_alpha2/gain_pitch", "k_alpha3 at gain 1": "k
 FIRST_AMPLITUDE, LONGEST_STEP = 5e-3, 1.0
 LOWEST_SPEED, HIGHEST_SPEED, SEARCHED = 8.0, 19.5, (5.0, 25.0)
 FIRST_SHARE, ROUNDS = 0.01, 2
+
+
+Experiments = Mapping[str, bp.Experiment]
+Speeds = Mapping[str, float]  # By record [m/s]
 
 
 class Fitted(NamedTuple):
@@ -63,8 +64,7 @@ class Cycles(NamedTuple):
 
         Raises ValueError: If there is none; the message names the nearest fold or endpoint, and the Hopf point.
         """
-        orbits: list[bp.PeriodicSolution] = []
-        missing = ""
+        orbits, missing = list[bp.PeriodicSolution](), ""
         for branch in self.branches:
             try:
                 orbits += bp.solutions_at(MODEL, branch, speed)
@@ -107,51 +107,44 @@ def _along(first: bp.PeriodicSolution, until: float) -> bp.Branch:
 
 
 def problem(
-    experiments: Sequence[bp.Experiment],
-    speeds: Mapping[str, float],
-    *,
-    frequency_error: float,
-    known: Mapping[str, float] | None = None,
-    noise: Any = "circulant",
-) -> bp.Problem:
+    experiments: Sequence[bp.Experiment], speeds: Speeds, *, frequency_error: float,
+    known: Mapping[str, float] | None = None, noise: Any = "circulant",
+) -> bp.Problem:  # fmt: skip
     """Return the problem of some cycles, the model's frequency allowed an error [Hz] beside the measured one's.
 
     The delay of the outputs is fixed: cycles are compared at the phase at which the fundamentals of both sensors agree
     best.
     """
-    known = dict(known or {})
+    known = known or {}
     allowed = [replace(e, frequency_se=math.hypot(e.frequency_se, frequency_error)) for e in experiments]
-    fixed: dict[str, Any] = RIG | known | {"U": {e.name: speeds[e.name] for e in experiments}, "shift": 0.0}
+    fixed: dict[str, Any] = {**RIG, **known, "U": {e.name: speeds[e.name] for e in experiments}, "shift": 0.0}
     priors = {name: prior for name, prior in PRIORS.items() if name not in known}
     return bp.Problem(MODEL, allowed, priors=priors, fixed=fixed, noise=noise, scheme=SCHEME)
 
 
 def estimate(
-    experiments: Mapping[str, bp.Experiment],
-    speeds: Mapping[str, float],
-    start: Mapping[str, float] = START,
-    known: Mapping[str, float] | None = None,
-    noise: Any = "circulant",
-) -> Fitted:
-    """Return the MAP point; the frequency's error is what the last fit but one left, root mean square.
+    experiments: Experiments, speeds: Speeds, start: Mapping[str, float] = START,
+    known: Mapping[str, float] | None = None, noise: Any = "circulant",
+) -> Fitted:  # fmt: skip
+    """Return the MAP point; the frequency error allowed is the root mean square error of the last fit but one.
 
     A model whose frequency errors exceed the standard errors must not be weighted by these. Continuation starts at the
     medians of the priors, on orbits of the correct branch, and ends at `start`.
     """
-    known = dict(known or {})
-    along = cycles(RIG | START | known)
+    known = known or {}
+    along = cycles({**RIG, **START, **known})
     guessed = [replace(e, guess=along.at(name, speeds[name]).states) for name, e in experiments.items()]
     error = FIRST_SHARE * float(np.mean([e.frequency for e in guessed]))
     point = {name: value for name, value in start.items() if name in PRIORS and name not in known}
-    for _ in range(ROUNDS):
+    measured = float(np.sqrt(np.mean([e.frequency_se**2 for e in guessed])))
+    for number in range(ROUNDS + 1):
         stated = problem(guessed, speeds, frequency_error=error, known=known, noise=noise)
-        fit = bp.map_estimate(stated, start=point, progress=False)
-        missed = [fit.solutions[e.name].frequency - e.frequency for e in guessed]
-        measured = float(np.sqrt(np.mean([e.frequency_se**2 for e in guessed])))
-        error = math.sqrt(max(float(np.mean(np.square(missed))) - measured**2, 0.0))
-        point = dict(fit.theta)
-    stated = problem(guessed, speeds, frequency_error=error, known=known, noise=noise)
-    return Fitted(stated, bp.map_estimate(stated, start=point, progress=False), error)
+        found = Fitted(stated, bp.map_estimate(stated, start=point, progress=False), error)
+        if number < ROUNDS:
+            missed = [found.fit.solutions[e.name].frequency - e.frequency for e in guessed]
+            error = math.sqrt(max(float(np.mean(np.square(missed))) - measured**2, 0.0))
+            point = dict(found.fit.theta)
+    return found
 
 
 FILE = "flutter/flutter_cbc_500hz.npz"
@@ -185,22 +178,16 @@ class Record(NamedTuple):
     speed: float
     control: dict[str, float]
 
-    @property
-    def stable(self) -> bool:
-        """Whether the cycle is stable without control, from the record's name."""
-        return not self.recording.name.startswith("unstable")
-
 
 def read_records(given: Path | None, seed: int) -> tuple[list[Record], dict[str, Any]]:
     """Return the measured records, or generated ones of the same kind, and their description."""
     found = common.find_data(given, FILE)
     if found is None:
-        return generate(seed), {"path": "generated", "sha256": None, "synthetic": True}
-    path, name = found
-    with np.load(path, allow_pickle=False) as file:
+        return generate(seed), common.described(found)
+    with np.load(found[0], allow_pickle=False) as file:
         names = [key.removesuffix(META) for key in file.files if key.endswith(META)]
         records = [_record(key, file[key].astype(float), file[key + META]) for key in names]
-    return records, {"path": name, "sha256": common.sha256(path), "synthetic": False}
+    return records, common.described(found)
 
 
 def _record(key: str, rows: np.ndarray, meta: np.ndarray) -> Record:
@@ -245,19 +232,18 @@ def _at(values: np.ndarray, phase: np.ndarray) -> np.ndarray:
     return np.real(waves @ amplitudes)
 
 
-def fold(record: Record) -> bp.Experiment:
-    """Return the mean cycle, τ = 0 where the fundamental of heave crosses its mean upwards."""
-    return record.recording.fold(SAMPLES, harmonics=HARMONICS, origin="crossing", largest_drift=LARGEST_DRIFT)
-
-
 def usable(records: list[Record]) -> tuple[dict[str, bp.Experiment], dict[str, str]]:
-    """Return the mean cycles of the records that the rule admits, and why the others are left out, both by name."""
+    """Return the mean cycles of the records that the rule admits, and why the others are left out, both by name.
+
+    τ = 0 where the fundamental of heave crosses its mean upwards.
+    """
     admitted, refused = {}, {}
-    for record in records:
+    settings: dict[str, Any] = {"harmonics": HARMONICS, "origin": "crossing", "largest_drift": LARGEST_DRIFT}
+    for recording in (record.recording for record in records):
         try:
-            admitted[record.recording.name] = fold(record)
+            admitted[recording.name] = recording.fold(SAMPLES, **settings)
         except ValueError as error:
-            refused[record.recording.name] = str(error)
+            refused[recording.name] = str(error)
     return admitted, refused
 
 

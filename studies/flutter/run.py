@@ -8,59 +8,133 @@ authors' values, by continuation, are compared with eigenvalues and with a long 
 """
 
 import argparse
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 import bayesperiodic as bp
 from studies import common
-from studies.flutter import campaigns, questions
+from studies.flutter import campaigns, questions, rig
 from studies.flutter import figures as flutter_figures
 from studies.flutter.reference import hopf, settled
-from studies.flutter.rig import (
-    ADDRESS,
-    AUTHORS,
-    LARGEST_DRIFT,
-    MODEL,
-    RIG,
-    RULE,
-    SAMPLES,
-    SENSORS,
-    SHA256,
-    TRUE,
-    Fitted,
-    Record,
-    cycles,
-    estimate,
-    problem,
-    read_records,
-    spectral_frequency,
-    usable,
-)
+
+SAMPLING: dict[str, Any] = {
+    "ensembles": 2, "walkers": 20, "max_steps": 12_000, "variances": "collapsed", "progress": False,
+}  # fmt: skip
+KINDS = ("stable", "unstable")
+# Of the comparison with time integration: wind speeds [m/s]; the study's grid, and one on which the series converged.
+SPEEDS = (15.6, 16.5, 17.3)
+STATES = ("h", "alpha", "w")
+GRIDS = (rig.SAMPLES, 2 * rig.SAMPLES)
+CURVE = 4000
 
 
-def introduction(
-    data: dict[str, Any], records: list[Record], experiments: dict[str, bp.Experiment], refused: dict[str, str]
-) -> str:
-    """Return the description of the records to print."""
-    lines = [f"  {'SYNTHETIC records' if data['synthetic'] else 'measured records'} {data['path']}; {RULE}"]
-    for record in records:
-        name = record.recording.name
-        if name in experiments:
-            e = experiments[name]
-            lines.append(
-                f"  {name:17s} {record.speed:5.1f} m/s  {e.frequency:.5f} Hz ± {e.frequency_se / e.frequency:.4%}  "
-                f"{e.cycles} cycles, drift of pitch {e.drift['pitch']:+.1%}"
-            )
-    lines += [f"  left out: {why}" for why in refused.values()]
+def run(options: argparse.Namespace) -> None:
+    """Run the study, or the campaigns that count coverage."""
+    if options.replicates:
+        campaigns.run(options)
+        return
+    watch, draws = common.Stopwatch(), 20 if options.quick else 200
+    with watch.part("read", "reading the records and folding them without an input"):
+        records, data = rig.read_records(options.data, options.seed)
+        experiments, refused = rig.usable(records)
+        speeds = {r.recording.name: r.speed for r in records if r.recording.name in experiments}
+    print(f"  {'SYNTHETIC records' if data['synthetic'] else 'measured records'} {data['path']}; {rig.RULE}")
     if data["synthetic"]:
-        lines.append(f"  the measured file was not found; it is at {ADDRESS}, sha256 {SHA256}; true values {TRUE}")
-    return "\n".join(lines)
+        print(f"  the measured file was not found; it is at {rig.ADDRESS}, sha256 {rig.SHA256}; true values {rig.TRUE}")
+    results = {"data": data, "seed": options.seed, "quick": options.quick, "rule": rig.RULE, "refused": refused}
+    results["records"] = _of_records(records, experiments)
+    columns = ["wind_speed", "used", "frequency", "frequency_se", "cycles", "drift.pitch"]
+    print(common.shown("records", results["records"], columns), *refused.values(), sep="\n")
+    with watch.part("authors", "following the cycles of the authors' values from the Hopf point"):
+        results |= _authors_cycles()
+        authors = questions.authors_errors(experiments, speeds)
+    checked = dict(results["checks"])
+    by_grid = checked.pop("stable_cycles")
+    cycles = {f"{grid}, {at}": row for grid, rows in by_grid.items() for at, row in rows.items()}
+    print(common.shown("Hopf point of the authors' values", checked))
+    print(common.shown("relative difference of stable cycles from time integration", cycles), flush=True)
+    with watch.part("map", "estimating from all cycles"):
+        both = rig.estimate(experiments, speeds)
+    with watch.part("parts", "estimating from stable or unstable cycles alone, and with wind speeds left out"):
+        fits, results["predictions"] = _parts(experiments, speeds, both, options.quick, draws)
+    with watch.part("structure", "structural identifiability"):
+        known = (*rig.RIG, "U", "c_h", "c_alpha")
+        structure = bp.structure(rig.MODEL, fixed=[name for name in rig.MODEL.parameters if name in known])
+    with watch.part("known noise", "estimating with the noise's shape known"):
+        stated = _with_known_noise(both, experiments, speeds)
+        fit = bp.map_estimate(stated, start=both.fit.theta, progress=False)
+    posterior = verdict = compared = None
+    if not options.quick:
+        with watch.part("sample", "sampling the posterior"):
+            posterior = bp.sample(stated, fit, seed=options.seed, **SAMPLING)
+        with watch.part("verdicts", "identifiability, and Laplace against MCMC"):
+            verdict = bp.identifiability(stated, fit, posterior, profile=False, candidates=[])
+            compared = bp.compare(stated, fit, posterior)
+    with watch.part("figures", "drawing"):
+        figures = flutter_figures.all_of(experiments, speeds, fits, fit, posterior, draws)
+        paths = common.save_figures(options.out, figures)
+
+    results |= _of_fits(fits, experiments, authors) | {
+        "structure": {"text": str(structure), "free_scales": questions.FREE_SCALES},
+        "verdicts": verdict and verdict.table["verdict"].to_dict(),
+        "posterior": posterior and compared and _of_draws(posterior, fit, compared),
+    }
+    print("\n".join(["", _tables(results), str(structure), *(str(one) for one in (verdict, compared) if one), ""]))
+    common.finish(options.out, results, watch, paths, synthetic=data["synthetic"])
 
 
-def of_records(records: list[Record], experiments: dict[str, bp.Experiment], refused: dict[str, str]) -> dict[str, Any]:
-    """Return the description of each record, and why it is used or not."""
+def _parts(
+    experiments: rig.Experiments, speeds: dict[str, float], both: rig.Fitted, quick: bool, draws: int
+) -> tuple[dict[str, rig.Fitted], dict[str, Any]]:
+    """Return the fits by kind of cycle, and how cycles that were not fitted are predicted: by speed and by kind."""
+    kinds = {kind: [name for name in experiments if questions.kind_of(name) != kind] for kind in KINDS}
+    left_out = {f"{other} from {kind}": kinds[kind] for kind, other in zip(KINDS, KINDS[::-1], strict=True)}
+    for group in questions.groups(speeds)[: 1 if quick else None]:
+        label = " and ".join(sorted({f"{speeds[name]:g}" for name in group}))
+        left_out[f"without {label} m/s"] = group
+    tasks = [(experiments, speeds, dict(both.fit.theta), names, draws) for names in left_out.values()]
+    found = dict(zip(left_out, common.each(questions.leave_out, tasks), strict=True))
+    fits = dict(zip(KINDS, (fitted for fitted, _ in found.values()), strict=False)) | {"both": both}
+    return fits, {label: predicted for label, (_, predicted) in found.items()}
+
+
+def _with_known_noise(both: rig.Fitted, experiments: rig.Experiments, speeds: dict[str, float]) -> bp.Problem:
+    """Return the problem whose noise has the shape found at the MAP point; the variances stay free."""
+    shape = {name: value for name, value in both.fit.noise.items() if not name.startswith("variance")}
+    stated = rig.problem(both.problem.experiments, speeds, frequency_error=both.frequency_error, known=shape)
+    return stated.anchored(stated.vector(both.fit.theta), {n: both.fit.solutions[n].states for n in experiments})
+
+
+def _authors_cycles() -> dict[str, Any]:
+    """Return the branch of the authors' values, and how it differs from eigenvalues and time integration."""
+    by_grid = {points: rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS, points) for points in GRIDS}
+    point, (speed, frequency) = by_grid[rig.SAMPLES].hopf, hopf()
+    fold = by_grid[rig.SAMPLES].branches[0].folds[0]
+    checks = {
+        "hopf_speed": {"continuation": point.value, "eigenvalues": speed},
+        "hopf_frequency": {"continuation": point.frequency, "eigenvalues": frequency},
+        "stable_cycles": {
+            f"{points} points": {f"{at:g} m/s": _differences(along.at("stable", at), at) for at in SPEEDS}
+            for points, along in by_grid.items()
+        },
+    }
+    branch = {"hopf_speed": point.value, "hopf_frequency": point.frequency}
+    branch |= {"fold_speed": fold.parameters["U"], "fold_frequency": fold.frequency}
+    return {"checks": checks, "authors_branch": branch}
+
+
+def _differences(orbit: bp.PeriodicSolution, speed: float) -> dict[str, float]:
+    """Return the relative differences of the frequency and of each state's amplitude from a time integration's."""
+    frequency, states = settled(speed)
+    return {"frequency": float(orbit.frequency / frequency) - 1.0} | {
+        name: questions.half_range(orbit.states[name], CURVE) / questions.half_range(own, CURVE) - 1.0
+        for name, own in zip(STATES, states, strict=True)
+    }
+
+
+def _of_records(records: list[rig.Record], experiments: rig.Experiments) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for record in records:
         name = record.recording.name
@@ -70,29 +144,27 @@ def of_records(records: list[Record], experiments: dict[str, bp.Experiment], ref
             found[name] |= {
                 "frequency": e.frequency,
                 "frequency_se": e.frequency_se,
-                "spectral_frequency": spectral_frequency(record, e),
+                "spectral_frequency": rig.spectral_frequency(record, e),
                 "cycles": e.cycles,
                 "periodicity": e.periodicity,
                 "drift": dict(e.drift),
-                "largest_drift": LARGEST_DRIFT,
+                "largest_drift": rig.LARGEST_DRIFT,
                 "scatter_of_one_cycle": dict(e.scatter),
                 "amplitude": questions.sizes(e.outputs),
             }
-    return {"rule": RULE, "refused": refused, "records": found}
+    return found
 
 
-def of_fits(fits: dict[str, Fitted], experiments: dict[str, bp.Experiment], authors: dict[str, Any]) -> dict[str, Any]:
-    """Return the results of the fits."""
-    both = fits["both"]
-    fit, found = both.fit, questions.errors(both, experiments)
+def _of_fits(fits: dict[str, rig.Fitted], experiments: rig.Experiments, authors: dict[str, Any]) -> dict[str, Any]:
+    fit, found = fits["both"].fit, questions.errors(fits["both"], experiments)
     return {
-        "units": {name: MODEL.units[name] for name in fit.theta},
+        "units": {name: rig.MODEL.units[name] for name in fit.theta},
         "map": fit.theta,
         "sd": fit.sd,
         "robust_sd": fit.robust_sd,
         "status": fit.status,
         "noise": fit.noise,
-        "frequency_error_allowed": both.frequency_error,
+        "frequency_error_allowed": fits["both"].frequency_error,
         "undetermined": list(fit.undetermined),
         "doubling_shift": fit.doubling_shift,
         "misfit": {
@@ -111,261 +183,38 @@ def of_fits(fits: dict[str, Fitted], experiments: dict[str, bp.Experiment], auth
     }
 
 
-def of_posterior(
-    structure: bp.Structure,
-    fit: bp.MapEstimate,
-    posterior: bp.Posterior | None,
-    verdict: bp.Identifiability | None,
-    compared: bp.Comparison | None,
-) -> dict[str, Any]:
-    """Return the structural identifiability, and the results of the draws."""
-    return {
-        "structure": {"text": str(structure), "free_scales": questions.FREE_SCALES},
-        "verdicts": verdict and verdict.table["verdict"].to_dict(),
-        "posterior": posterior and compared and draws_of(posterior, fit, compared),
-    }
-
-
-def draws_of(posterior: bp.Posterior, fit: bp.MapEstimate, compared: bp.Comparison) -> dict[str, Any]:
-    """Return the results of the draws and of the Laplace approximation."""
-    names = list(fit.theta)
+def _of_draws(posterior: bp.Posterior, fit: bp.MapEstimate, compared: bp.Comparison) -> dict[str, Any]:
+    draws = {name: posterior.draws(name) for name in fit.theta}
+    # On a ridge along which their ratio stays the correlation is 1.
+    logarithms = [np.log(draws[name].ravel()) for name in ("k_alpha2", "gain_pitch")]
     return {
         "converged": posterior.converged,
         "reason": posterior.reason,
         "failures": posterior.failures,
-        "mean": {n: float(posterior.draws(n).mean()) for n in names},
-        "sd": {n: float(posterior.draws(n).std()) for n in names},
-        "laplace_sd": {n: fit.sd[n] for n in names},
-        "correlation_of_logarithms": _correlation(posterior, "k_alpha2", "gain_pitch"),
+        "mean": {n: float(values.mean()) for n, values in draws.items()},
+        "sd": {n: float(values.std()) for n, values in draws.items()},
+        "laplace_sd": dict(fit.sd),
+        "correlation_of_logarithms": float(np.corrcoef(logarithms)[0, 1]),
         "laplace_verdicts": compared.table["verdict"].to_dict(),
     }
 
 
-def _correlation(posterior: bp.Posterior, one: str, other: str) -> float:
-    """Return the correlation of two parameters' logarithms: that of a ridge on which their ratio stays is 1."""
-    return float(np.corrcoef(*(np.log(posterior.draws(name).ravel()) for name in (one, other)))[0, 1])
-
-
-def tables(results: dict[str, Any]) -> str:
-    """Return the tables to print, with their interpretation."""
+def _tables(results: dict[str, Any]) -> str:
     kind = "SYNTHETIC data" if results["data"]["synthetic"] else "measured data"
-    lines = [f"Flutter rig, {kind}: errors of amplitudes (heave, pitch) and of the frequency", ""]
-    for name, one in results["errors"].items():
-        theirs = results["authors_errors"][name]
-        lines.append(
-            f"  {name:17s} fitted {_per_cent(one)}    authors' values "
-            + (_per_cent(theirs) if theirs["amplitude_error"] else "no cycle")
-        )
-    misfit = results["misfit"]
-    lines.append(
-        f"  rms of the amplitudes' errors {results['errors_rms']:.1%}; the authors' "
-        f"{results['authors_errors_rms_where_a_cycle_exists']:.1%} where they have a cycle"
-    )
-    for channel, error in misfit["model_error"].items():
-        lines.append(
-            f"  {channel}: model error {error:.3g}, measurement noise {misfit['measurement_noise'][channel]:.3g} "
-            f"(sensor units), whitened residual p = {misfit['whiteness'][channel]:.2g}"
-        )
-    lines += ["", "sd over the prior's sd by data (stable, unstable, both)"]
-    for name, by in results["contraction"].items():
-        lines.append(f"  {name:20s}" + "  ".join(f"{by[k]['estimate']:10.5g} ({by[k]['over_prior']:.3f})" for k in by))
-    lines += ["", "cycles that were not fitted: error, in posterior sds, in sds with the model's error"]
-    for case, found in results["predictions"].items():
-        for name, one in found.items():
-            errors = [_missed(c, one[c]) for c in ("heave", "pitch") if c in one]
-            lines.append(f"  {case:22s} {name:17s} " + (", ".join(errors) or "no cycle"))
-    return "\n".join(lines)
-
-
-def _missed(channel: str, one: dict[str, float]) -> str:
-    if "posterior_sds" not in one:
-        return f"{channel} {one['error']:+.1%} (few draws have the cycle)"
-    return f"{channel} {one['error']:+.1%} ({one['posterior_sds']:+.1f}, {one['sds_with_model_error']:+.1f})"
-
-
-def _per_cent(one: dict[str, Any]) -> str:
-    size = one["amplitude_error"]
-    return f"{size['heave']:+6.1%} {size['pitch']:+6.1%} {one['frequency_error']:+6.2%}"
-
-
-SPEEDS = (15.6, 16.5, 17.3)
-STATES = ("h", "alpha", "w")
-# The study's grid, and one on which the series has converged.
-GRIDS = (SAMPLES, 2 * SAMPLES)
-CURVE = 4000
-
-
-def account() -> dict[str, Any]:
-    """Return the Hopf point and the stable cycles by both ways, and by how much they differ, by points of the grid."""
-    by_grid = {points: cycles(RIG | AUTHORS | SENSORS, points) for points in GRIDS}
-    point, (speed, frequency) = by_grid[SAMPLES].hopf, hopf()
-    return {
-        "hopf_speed": {"continuation": point.value, "eigenvalues": speed},
-        "hopf_frequency": {"continuation": point.frequency, "eigenvalues": frequency},
-        "stable_cycles": {
-            f"{points} points": {f"{at:g} m/s": _differences(along.at("stable", at), at) for at in SPEEDS}
-            for points, along in by_grid.items()
-        },
-    }
-
-
-def _differences(orbit: bp.PeriodicSolution, speed: float) -> dict[str, float]:
-    """Return the relative differences of the frequency and of each state's amplitude from a time integration's."""
-    frequency, states = settled(speed)
-    return {"frequency": float(orbit.frequency / frequency) - 1.0} | {
-        name: half_range(orbit.states[name]) / half_range(own) - 1.0 for name, own in zip(STATES, states, strict=True)
-    }
-
-
-def half_range(values: np.ndarray) -> float:
-    """Return half the range of a periodic signal, between its samples too, by its Fourier series."""
-    return 0.5 * float(np.ptp(np.fft.irfft(np.fft.rfft(values), CURVE))) * CURVE / values.size
-
-
-def line(found: Mapping[str, Any]) -> str:
-    """Return the text to print."""
-    speed, frequency = found["hopf_speed"], found["hopf_frequency"]
-    off = {
-        points: max(abs(one[name]) for one in by_speed.values() for name in STATES)
-        for points, by_speed in found["stable_cycles"].items()
-    }
-    differences = ", ".join(f"{most:.1e} with {points}" for points, most in off.items())
-    return (
-        f"  the authors' values: Hopf point {speed['continuation']:.4f} m/s, {frequency['continuation']:.5f} Hz "
-        f"(eigenvalues {speed['eigenvalues']:.4f}, {frequency['eigenvalues']:.5f}); amplitudes of stable cycles off a "
-        f"time integration's by at most {differences}"
-    )
-
-
-SAMPLING: dict[str, Any] = {
-    "ensembles": 2,
-    "walkers": 20,
-    "max_steps": 12_000,
-    "variances": "collapsed",
-    "progress": False,
-}
-KINDS = ("stable", "unstable")
-
-
-class Answers(NamedTuple):
-    """Results of the fits to the cycles."""
-
-    checks: dict[str, Any]
-    authors: dict[str, Any]
-    authors_branch: dict[str, float]
-    fits: dict[str, Fitted]
-    left_out: dict[str, Any]
-    structure: bp.Structure
-
-
-class Sampled(NamedTuple):
-    """The estimate with the noise's shape known, and the posterior, None in a quick run."""
-
-    fit: bp.MapEstimate
-    posterior: bp.Posterior | None = None
-    verdict: bp.Identifiability | None = None
-    compared: bp.Comparison | None = None
-
-
-def run(options: argparse.Namespace) -> None:
-    """Run the study, or the campaigns that count coverage."""
-    if options.replicates:
-        campaigns.run(options)
-        return
-    watch = common.Stopwatch()
-    with watch.part("read", "reading the records and folding them without an input"):
-        records, data = read_records(options.data, options.seed)
-        experiments, refused = usable(records)
-        speeds = {r.recording.name: r.speed for r in records if r.recording.name in experiments}
-    print(introduction(data, records, experiments, refused))
-    found = answers(watch, experiments, speeds, options.quick)
-    sampled = sample(watch, found.fits["both"], experiments, speeds, options)
-    with watch.part("figures", "drawing"):
-        draws = 20 if options.quick else 200
-        figures = flutter_figures.all_of(experiments, speeds, found.fits, sampled.fit, sampled.posterior, draws)
-        paths = common.save_figures(options.out, figures)
-
-    results = {"data": data, "seed": options.seed, "quick": options.quick}
-    results |= of_records(records, experiments, refused)
-    results |= of_fits(found.fits, experiments, found.authors)
-    results |= {"checks": found.checks, "authors_branch": found.authors_branch, "predictions": found.left_out}
-    results |= of_posterior(found.structure, sampled.fit, *sampled[1:])
-    results |= {"seconds": watch.total(), "versions": common.versions()}
-    print("\n" + tables(results) + f"\n{found.structure}\n{sampled.verdict or ''}")
-    print(f"{sampled.compared or ''}\n")
-    path = common.write_results(options.out, results)
-    print(f"figures{' (synthetic data)' if data['synthetic'] else ''}: {', '.join(map(str, paths))}\nresults: {path}")
-
-
-def answers(
-    watch: common.Stopwatch, experiments: dict[str, bp.Experiment], speeds: dict[str, float], quick: bool
-) -> Answers:
-    """Return the results of the fits: authors' values, all cycles, subsets, and predictions of the cycles left out."""
-    with watch.part("authors", "following the cycles of the authors' values from the Hopf point"):
-        checks = account()
-        print(line(checks), flush=True)
-        authors = questions.authors_errors(experiments, speeds)
-        branch = hopf_and_fold()
-    with watch.part("map", "estimating from all cycles"):
-        both = estimate(experiments, speeds)
-    with watch.part("parts", "estimating from stable or unstable cycles alone, and with wind speeds left out"):
-        fits, left = parts(experiments, speeds, both, quick)
-    with watch.part("structure", "asking what the equations leave open"):
-        structure = bp.structure(MODEL, fixed=[n for n in MODEL.parameters if n in RIG or n in ("U", "c_h", "c_alpha")])
-    return Answers(checks, authors, branch, fits, left, structure)
-
-
-def sample(
-    watch: common.Stopwatch,
-    both: Fitted,
-    experiments: dict[str, bp.Experiment],
-    speeds: dict[str, float],
-    options: argparse.Namespace,
-) -> Sampled:
-    """Return the estimate from all cycles with the noise's shape known and, unless the run is quick, the posterior."""
-    with watch.part("known noise", "estimating with the noise's shape known"):
-        stated = with_known_noise(both, experiments, speeds)
-        fit = bp.map_estimate(stated, start=both.fit.theta, progress=False)
-    if options.quick:
-        return Sampled(fit)
-    with watch.part("sample", "sampling the posterior"):
-        posterior = bp.sample(stated, fit, seed=options.seed, **SAMPLING)
-    with watch.part("verdicts", "asking what the data determine, and where Laplace and the draws differ"):
-        verdict = bp.identifiability(stated, fit, posterior, profile=False, candidates=[])
-        return Sampled(fit, posterior, verdict, bp.compare(stated, fit, posterior))
-
-
-def hopf_and_fold() -> dict[str, float]:
-    """Return where the authors' values have their Hopf point and their fold."""
-    along = cycles(RIG | AUTHORS | SENSORS)
-    fold = along.branches[0].folds[0]
-    return {
-        "hopf_speed": along.hopf.value,
-        "hopf_frequency": along.hopf.frequency,
-        "fold_speed": fold.parameters["U"],
-        "fold_frequency": fold.frequency,
-    }
-
-
-def parts(
-    experiments: dict[str, bp.Experiment], speeds: dict[str, float], both: Fitted, quick: bool
-) -> tuple[dict[str, Fitted], dict[str, Any]]:
-    """Return the fits by kind of cycle, and how cycles that were not fitted are predicted: by speed and by kind."""
-    kinds = {kind: [name for name in experiments if questions.kind_of(name) != kind] for kind in KINDS}
-    left_out = {f"{other} from {kind}": kinds[kind] for kind, other in zip(KINDS, KINDS[::-1], strict=True)}
-    for group in questions.groups(speeds)[: 1 if quick else None]:
-        label = " and ".join(sorted({f"{speeds[name]:g}" for name in group}))
-        left_out[f"without {label} m/s"] = group
-    draws, theta = 20 if quick else 200, dict(both.fit.theta)
-    tasks = [(experiments, speeds, theta, names, draws) for names in left_out.values()]
-    found = dict(zip(left_out, common.each(questions.leave_out, tasks), strict=True))
-    fits = dict(zip(KINDS, (fitted for fitted, _ in found.values()), strict=False)) | {"both": both}
-    return fits, {label: predicted for label, (_, predicted) in found.items()}
-
-
-def with_known_noise(both: Fitted, experiments: dict[str, bp.Experiment], speeds: dict[str, float]) -> bp.Problem:
-    """Return the problem whose noise has the shape found at the MAP point; the variances stay free."""
-    shape = {name: value for name, value in both.fit.noise.items() if not name.startswith("variance")}
-    guessed = list(both.problem.experiments)
-    stated = problem(guessed, speeds, frequency_error=both.frequency_error, known=shape)
-    return stated.anchored(stated.vector(both.fit.theta), {n: both.fit.solutions[n].states for n in experiments})
+    columns = [*(f"amplitude_error.{channel}" for channel in questions.CHANNELS), "frequency_error"]
+    missed = [f"{c}.{k}" for c in questions.CHANNELS for k in ("error", "posterior_sds", "sds_with_model_error")]
+    gained = [f"{kind}.{key}" for kind in (*KINDS, "both") for key in ("estimate", "over_prior")]
+    return "\n".join([
+        f"Flutter rig, {kind}",
+        common.shown("relative errors of the fitted cycles", results["errors"], columns),
+        common.shown("relative errors of the authors' values, - without a cycle", results["authors_errors"], columns),
+        f"rms of the amplitudes' errors {results['errors_rms']:.1%}; the authors' "
+        f"{results['authors_errors_rms_where_a_cycle_exists']:.1%} where they have a cycle",
+        "misfit by channel (sensor units; whiteness: p of the whitened residual)",
+        pd.DataFrame(results["misfit"]).to_string(float_format="{:.3g}".format),
+        common.shown("estimate, and sd over the prior's sd, by data", results["contraction"], gained),
+        *(
+            common.shown(f"cycles that were not fitted, {case}: relative error, in sds; - without a cycle", one, missed)
+            for case, one in results["predictions"].items()
+        ),
+    ])  # fmt: skip

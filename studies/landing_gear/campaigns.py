@@ -4,7 +4,6 @@ Every campaign has its own noise. Each experiment is sampled briefly (two ensemb
 steps), which is enough for intervals and signs; intervals of the Laplace approximation are counted too.
 """
 
-import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,11 +14,9 @@ from scipy.stats import binom
 
 import bayesperiodic as bp
 from studies import common
-from studies.common import resumed
-from studies.landing_gear import identification, rig, verdicts
-from studies.landing_gear.identification import DISPLACEMENT, PRIORS, Identified, estimate, fold
+from studies.landing_gear import identification, rig
+from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, PRIORS, fold
 from studies.landing_gear.rig import GEAR, RUNS, TRUTHS, Run, measure
-from studies.landing_gear.verdicts import CONDUCTION, NEGATIVE, judge
 
 FILE = "campaigns.jsonl"
 FIRST_SEED = 100_000
@@ -33,15 +30,12 @@ Task = tuple[str, int]
 def campaigns(folder: Path, count: int, seed: int, truth: str = "A") -> list[dict[str, Any]]:
     """Compute the campaigns missing from the file in the folder, and return all of them."""
     tasks: list[Task] = [(truth, FIRST_SEED * seed + number) for number in range(count)]
-    return resumed(folder / FILE, tasks, campaign, lambda line: (line["truth"], line["seed"]), source())
+    return common.resumed(folder / FILE, tasks, campaign, lambda line: (line["truth"], line["seed"]), source())
 
 
 def source() -> str:
     """Return a key that identifies the version of the campaigns."""
-    modules = (identification, rig, verdicts)
-    files = [Path(__file__), *(Path(str(module.__file__)) for module in modules)]
-    text = common.versions()["bayesperiodic"] + "".join(common.sha256(path) for path in files)
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
+    return common.source_key(__file__, identification.__file__, rig.__file__)
 
 
 def campaign(task: Task) -> dict[str, Any]:
@@ -54,15 +48,15 @@ def campaign(task: Task) -> dict[str, Any]:
 
 
 def _examine(run: Run, truth: str, seed: int) -> dict[str, Any]:
-    fitted = estimate([fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)], DISPLACEMENT)
+    fitted = identification.estimate([fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)], DISPLACEMENT)
     stated, fit = fitted.problem, fitted.fit
     posterior = bp.sample(stated, fit, seed=seed, **SAMPLING)
-    verdict = judge(Identified(stated, fit, posterior, 0.0))
-    drawn = {name: np.quantile(posterior.draws(name), [0.5 - LEVEL / 2, 0.5 + LEVEL / 2]) for name in stated.names}
-    laplace = fit.interval(LEVEL)
+    verdict = identification.judge(identification.Identified(stated, fit, posterior))
+    ends = [0.5 - LEVEL / 2, 0.5 + LEVEL / 2]
+    mcmc = {name: np.quantile(posterior.draws(name), ends) for name in stated.names}
     return {
-        "mcmc_covers": {name: bool(low < GEAR[name] < high) for name, (low, high) in drawn.items()},
-        "laplace_covers": {name: bool(laplace[name][0] < GEAR[name] < laplace[name][1]) for name in stated.names},
+        "mcmc_covers": {name: bool(low < GEAR[name] < high) for name, (low, high) in mcmc.items()},
+        "laplace_covers": {name: bool(low < GEAR[name] < high) for name, (low, high) in fit.interval(LEVEL).items()},
         "sd": {name: float(posterior.draws(name).std()) for name in stated.names},
         "sign": verdict.sign,
         "misspecified": verdict.misspecified,
@@ -79,43 +73,36 @@ def account(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     every = [one for line in lines for one in line["experiments"].values()]
     tail = 0.5 * FAMILY / len(PRIORS)
     low, high = (float(binom.ppf(p, len(every), LEVEL)) for p in (tail, 1.0 - tail))
-    covered = {
-        kind: {name: sum(one[f"{kind}_covers"][name] for one in every) for name in PRIORS}
-        for kind in ("mcmc", "laplace")
-    }
+    by_run = {run.name: [line["experiments"][run.name] for line in lines] for run in RUNS}
     return {
         "campaigns": len(lines),
         "experiments": len(every),
         "band": [low, high],
-        "covered": covered,
-        "covered_by_experiment": {
-            run.name: {
-                name: sum(line["experiments"][run.name]["mcmc_covers"][name] for line in lines) for name in PRIORS
-            }
-            for run in RUNS
-        },
+        "covered": {kind: _covered(every, kind) for kind in ("mcmc", "laplace")},
+        "covered_by_experiment": {run: _covered(own, "mcmc") for run, own in by_run.items()},
         "median_sd_by_experiment": {
-            run.name: {
-                name: float(np.median([line["experiments"][run.name]["sd"][name] for line in lines])) for name in PRIORS
-            }
-            for run in RUNS
+            run: {name: float(np.median([one["sd"][name] for one in own])) for name in PRIORS}
+            for run, own in by_run.items()
         },
-        "called_negative": sum(one["sign"] == NEGATIVE for one in every),
+        "called_negative": sum(one["sign"] == identification.NEGATIVE for one in every),
         "called_misspecified": sum(one["misspecified"] for one in every),
         "map_not_converged": sum(not one["map_converged"] for one in every),
         "stop_rule_passed": sum(one["stop_rule"] for one in every),
     }
 
 
+def _covered(every: Sequence[Mapping[str, Any]], kind: str) -> dict[str, int]:
+    return {name: sum(one[f"{kind}_covers"][name] for one in every) for name in PRIORS}
+
+
 def table(found: Mapping[str, Any]) -> str:
     """Return the counts as text."""
     low, high = found["band"]
-    lines = [f"  {found['campaigns']} campaigns, {found['experiments']} posteriors; 90 % intervals that cover:"]
-    for kind, counts in found["covered"].items():
-        listed = ", ".join(f"{name} {count}" for name, count in counts.items())
-        lines.append(f"    {kind:8s}{listed} (band {low:.0f} … {high:.0f})")
-    lines.append(
-        f"    {CONDUCTION} called negative {found['called_negative']} times, the model misspecified "
-        f"{found['called_misspecified']} times; {found['map_not_converged']} estimates not converged"
+    title = (
+        f"{found['campaigns']} campaigns, {found['experiments']} posteriors; 90 % intervals with the truth (band "
+        f"{low:.0f} … {high:.0f})"
     )
-    return "\n".join(lines)
+    return (
+        f"{common.shown(title, found['covered'])}\n{CONDUCTION} called negative {found['called_negative']} times, the "
+        f"model misspecified {found['called_misspecified']} times; {found['map_not_converged']} estimates not converged"
+    )

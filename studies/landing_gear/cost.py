@@ -1,33 +1,29 @@
 """Time of a log-posterior of the landing gear: the periodic solver against time integration until steady.
 
 All fourteen experiments at draws of their joint posterior, interleaved in one run. The periodic solver is timed with
-the whole log-posterior, the others with the integration alone, at the accuracy of the periodic solver or better. This
-accuracy depends on the scheme: each direction is measured with the study's scheme, the smoother one also with the
-finer scheme.
+the whole log-posterior, by scheme; the compiled methods of `studies.landing_gear.integrators`, and SciPy's LSODA and
+Radau on the same compiled right-hand side, with the integration alone. For each experiment the largest steps and
+loosest tolerances are chosen with which the outputs of all draws are as accurate as those of the periodic solver,
+compared with the finest integration.
 """
 
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
+from studies import common
+from studies.benchmark.equations import table as input_table
 from studies.benchmark.kernels import MAX_CYCLES
-from studies.landing_gear.contenders import (
-    COMPILED,
-    SCIPY,
-    Contender,
-    Gear,
-    choose,
-    choose_scipy,
-    error,
-)
-from studies.landing_gear.identification import DISPLACEMENT, FORCE, SAMPLES, Identified, problem
-from studies.landing_gear.integrators import NAMES
-from studies.landing_gear.verdicts import CONDUCTION
+from studies.gear import gear_at_rest
+from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, FORCE, SAMPLES, Identified, problem
+from studies.landing_gear.integrators import NAMES, methods
 from studies.timing import Action, interleaved, spread
 
 DRAWS, QUICK_DRAWS = 10, 2
@@ -39,6 +35,150 @@ STATIC, ESTIMATE = "from static equilibrium", "from the steady state at the esti
 WARM, BATCHED, COLD = "warm", "batched", "cold"
 # Of SciPy's integrators.
 TIMED_CYCLES = 3
+FIXED, CONTROLLED, LSODA, RADAU = "Runge-Kutta", "Dormand-Prince", "LSODA", "Radau"
+COMPILED, SCIPY = (FIXED, CONTROLLED), (LSODA, RADAU)
+STEPS = (16, 20, 25, 32, 40, 50, 80, 100, 160, 200, 400, 800, 1600, 3200, 6400, 12_800, 25_600)
+RELATIVE = tuple(10.0**-k for k in range(3, 12))
+# Of the gas temperature [K].
+TOLERANCES = tuple(10.0**-k for k in range(10))
+FINEST = 1e-11, 1e-9
+# Points of a cycle between which inputs are interpolated, and scales of the errors: [m], [m/s].
+TABLE = 16_384
+SCALE = (0.1, 0.1)
+
+# From parameters and start to the states of a cycle (samples, size) and the number of cycles integrated, 0 for never.
+Integrate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]
+
+
+@dataclass(frozen=True)
+class Gear:
+    """One experiment in the form of the integrators."""
+
+    drive: str
+    experiment: bp.Experiment
+    parameters: np.ndarray  # (draws, parameters): In the order of `integrators.NAMES`
+    estimate: np.ndarray  # (parameters,): The MAP estimate
+
+    def still(self, parameters: np.ndarray) -> np.ndarray:
+        """Return static equilibrium under the mean input, the gas as warm as the wall."""
+        return gear_at_rest(self.experiment, dict(zip(NAMES, parameters, strict=True)))
+
+    def outputs(self, parameters: np.ndarray, path: np.ndarray) -> np.ndarray:
+        """Return the outputs (SAMPLES, 2) that belong to states (points, size) over a cycle."""
+        if len(path) != SAMPLES:
+            path = np.fft.irfft(np.fft.rfft(path, axis=0) * (SAMPLES / len(path)), SAMPLES, axis=0)
+        out = np.empty((SAMPLES, 2))
+        self._methods.outputs(parameters, self._inputs, np.ascontiguousarray(path), out)
+        return out
+
+    def integrator(self, kind: str, fineness: float, tolerance: float) -> Integrate:
+        """Return a compiled method; `fineness` is the number of steps per cycle, or the relative error of a step."""
+        steps, frequency = int(fineness) if kind == FIXED else TABLE // 2, self.experiment.frequency
+        inputs, points = self._table(2 * steps), min(steps, SAMPLES)
+
+        def integrate(parameters: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, int]:
+            path, given = np.empty((points, start.size)), (parameters, inputs, frequency, start.copy())
+            if kind == FIXED:
+                return path, self._methods.fixed(*given, tolerance, path)
+            return path, self._methods.controlled(*given, self._scale(parameters), fineness, tolerance, path)
+
+        return integrate
+
+    def scipy(self, method: str, relative: float, cycles: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """Return SciPy's integration over some cycles: from parameters and start to the states of the last one."""
+        inputs, frequency = self._table(TABLE), self.experiment.frequency
+        times = (cycles - 1 + np.arange(SAMPLES) / SAMPLES) / frequency
+
+        def integrate(parameters: np.ndarray, start: np.ndarray) -> np.ndarray:
+            solved = solve_ivp(  # type: ignore[call-overload]
+                self._methods.rates_in_time, (0.0, cycles / frequency), start, method, times, rtol=relative,
+                atol=relative * self._scale(parameters), args=(parameters, inputs, 1.0 / frequency),
+            )  # fmt: skip
+            return solved.y.T if solved.success else np.full((SAMPLES, start.size), np.nan)
+
+        return integrate
+
+    @cached_property
+    def exact(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Steady state at the start of a cycle, and outputs of a cycle, of every draw, by the finest integration."""
+        integrate, found = self.integrator(CONTROLLED, *FINEST), []
+        for parameters in self.parameters:
+            path, cycles = integrate(parameters, self.still(parameters))
+            if not cycles:
+                raise RuntimeError(f"{self.experiment.name}: the time integration does not become steady.")
+            found.append((path[0], self.outputs(parameters, path)))
+        return found
+
+    @property
+    def steady(self) -> bool:
+        """Whether the finest integration becomes steady at every draw."""
+        integrate = self.integrator(CONTROLLED, *FINEST)
+        return all(integrate(parameters, self.still(parameters))[1] for parameters in self.parameters)
+
+    @property
+    def _methods(self) -> Any:
+        return methods(self.drive)
+
+    @cached_property
+    def _inputs(self) -> np.ndarray:
+        return self._table(SAMPLES)
+
+    def _table(self, points: int) -> np.ndarray:
+        return input_table(self.experiment, [self.drive], points)
+
+    def _scale(self, parameters: np.ndarray) -> np.ndarray:
+        return np.array([-parameters[14]] if self.drive == DISPLACEMENT else [*SCALE, -parameters[14]])
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method with the settings that an experiment needs."""
+
+    integrate: Integrate
+    fineness: float  # Steps a cycle, or relative error of a step
+    tolerance: float  # Of the steady temperature [K]
+    error: float  # The largest of any draw's outputs, of their range
+    cycles: float  # The mean that it takes from static equilibrium
+
+
+def error(outputs: np.ndarray, exact: np.ndarray) -> float:
+    """Return the largest error of outputs (samples, channels), of their range."""
+    return float(np.max(np.abs(outputs - exact).max(axis=0) / np.ptp(exact, axis=0)))
+
+
+def choose(gear: Gear, kind: str, allowed: float) -> Contender:
+    """Return a compiled method with the cheapest settings that are no less accurate than allowed."""
+    for fineness in STEPS if kind == FIXED else RELATIVE:
+        if _judge(gear, gear.integrator(kind, fineness, TOLERANCES[-1]))[0] > allowed:
+            continue
+        for tolerance in TOLERANCES:
+            integrate = gear.integrator(kind, fineness, tolerance)
+            worst, cycles = _judge(gear, integrate)
+            if worst <= allowed:
+                return Contender(integrate, fineness, tolerance, worst, cycles)
+    raise RuntimeError(f"{gear.experiment.name}: {kind} does not become as accurate as {allowed:.1e}.")
+
+
+def _judge(gear: Gear, integrate: Integrate) -> tuple[float, float]:
+    """Return the largest error of all draws, and how many cycles they take in the mean."""
+    worst, count = 0.0, []
+    for parameters, (_, exact) in zip(gear.parameters, gear.exact, strict=True):
+        path, cycles = integrate(parameters, gear.still(parameters))
+        worst = max(worst, error(gear.outputs(parameters, path), exact)) if cycles else np.inf
+        if worst == np.inf:
+            break
+        count.append(cycles)
+    return worst, float(np.mean(count)) if count else 0.0
+
+
+def choose_scipy(gear: Gear, method: str, allowed: float) -> float | None:
+    """Return the loosest relative tolerance with which a cycle from the first draw's steady state is right, or None."""
+    parameters, (steady, exact) = gear.parameters[0], gear.exact[0]
+    for relative in RELATIVE:
+        path = gear.scipy(method, relative, 1)(parameters, steady)
+        if error(gear.outputs(parameters, path), exact) <= allowed:
+            return relative
+    return None
 
 
 def measure(drive: str, identified: Identified, seed: int, *, quick: bool) -> dict[str, Any]:
@@ -55,37 +195,8 @@ def measure(drive: str, identified: Identified, seed: int, *, quick: bool) -> di
         "left_out": left_out,
         "cores": os.cpu_count(),
         "samples": SAMPLES,
-        "schemes": {scheme: _by_scheme(drive, scheme, identified, theta, gears, quick) for scheme in SCHEMES[drive]},
+        "schemes": {scheme: _by_scheme(scheme, identified, theta, gears, quick) for scheme in SCHEMES[drive]},
     }
-
-
-def _by_scheme(
-    drive: str, scheme: str, identified: Identified, theta: np.ndarray, gears: Sequence[Gear], quick: bool
-) -> dict[str, Any]:
-    """Return the times of the other methods at the accuracy of one scheme of the periodic solver."""
-    stated, fit = identified.problem, identified.fit
-    if scheme != stated.scheme:
-        stated = problem(stated.experiments, drive, scheme=scheme)
-    warm = stated.anchored(fit.theta)
-    own = _own_errors(warm, theta, gears)
-    chosen = [{k: choose(gear, k, allowed) for k in COMPILED} for gear, allowed in zip(gears, own, strict=True)]
-    noise = np.array(list(fit.noise.values()))
-    times = interleaved(_actions(warm, scheme, noise, theta, gears, chosen), QUICK_REPEATS if quick else REPEATS)
-    scipy = {method: _scipy(gears, own, chosen, method) for method in SCIPY}
-    return {
-        "milliseconds": {name: spread(1e3 * values) for name, values in times.items()},
-        "scipy_milliseconds": {method: seconds and 1e3 * seconds for method, seconds in scipy.items()},
-        "ratios": _ratios(times, scipy),
-        "experiments": {
-            gear.experiment.name: {"error": allowed}
-            | {kind: _settings(contender) for kind, contender in by_kind.items()}
-            for gear, allowed, by_kind in zip(gears, own, chosen, strict=True)
-        },
-    }
-
-
-def _settings(found: Contender) -> dict[str, float]:
-    return {name: getattr(found, name) for name in ("fineness", "tolerance", "error", "cycles")}
 
 
 def draws(
@@ -94,13 +205,10 @@ def draws(
     """Return draws (count, names) from which time integration becomes steady, and how many were left out.
 
     At theta16 ≤ 0 the gas has no steady state that an integration could reach. Of those with every theta16 positive
-    some need more cycles than `MAX_CYCLES`.
-
-    `steady`: Of a draw (1, names).
+    some need more cycles than `MAX_CYCLES`. `steady` decides it for a draw (1, names).
     """
-    posterior, names = identified.posterior, identified.problem.names
-    assert posterior is not None
-    every = np.stack([posterior.draws(name) for name in names], axis=-1)
+    names = identified.problem.names
+    every = np.stack([identified.posterior.draws(name) for name in names], axis=-1)
     able = (every[:, [name.startswith(CONDUCTION) for name in names]] > 0.0).all(axis=1)
     found: list[np.ndarray] = []
     tried = 0
@@ -120,6 +228,32 @@ def _gear(drive: str, experiment: bp.Experiment, identified: Identified, theta: 
     estimate = stated.vector(identified.fit.theta)
     values = np.ascontiguousarray(stated.parameters(np.vstack([theta, estimate]), experiment.name)[:, order])
     return Gear(drive, experiment, values[:-1], values[-1])
+
+
+def _by_scheme(
+    scheme: str, identified: Identified, theta: np.ndarray, gears: Sequence[Gear], quick: bool
+) -> dict[str, Any]:
+    """Return the times of the other methods at the accuracy of one scheme of the periodic solver."""
+    stated, fit = identified.problem, identified.fit
+    if scheme != stated.scheme:
+        stated = problem(stated.experiments, gears[0].drive, scheme=scheme)
+    warm = stated.anchored(fit.theta)
+    own = _own_errors(warm, theta, gears)
+    chosen = [{k: choose(gear, k, allowed) for k in COMPILED} for gear, allowed in zip(gears, own, strict=True)]
+    noise = np.array(list(fit.noise.values()))
+    times = interleaved(_actions(warm, scheme, noise, theta, gears, chosen), QUICK_REPEATS if quick else REPEATS)
+    scipy = {method: _scipy(gears, own, chosen, method) for method in SCIPY}
+    settings = "fineness", "tolerance", "error", "cycles"
+    return {
+        "milliseconds": {name: spread(1e3 * values) for name, values in times.items()},
+        "scipy_milliseconds": {method: seconds and 1e3 * seconds for method, seconds in scipy.items()},
+        "ratios": _ratios(times, scipy),
+        "experiments": {
+            gear.experiment.name: {"error": allowed}
+            | {kind: {name: getattr(one, name) for name in settings} for kind, one in by_kind.items()}
+            for gear, allowed, by_kind in zip(gears, own, chosen, strict=True)
+        },
+    }
 
 
 def _own_errors(warm: bp.Problem, theta: np.ndarray, gears: Sequence[Gear]) -> list[float]:
@@ -142,25 +276,30 @@ def _actions(
     gears: Sequence[Gear],
     chosen: Sequence[Mapping[str, Contender]],
 ) -> dict[str, Action]:
-    """Return what is timed, and of how many log-posteriors each call takes the time."""
+    """Return the timed actions, with the number of log-posteriors of each call."""
     many = np.resize(theta, (WALKERS, theta.shape[1]))
+
+    def cold(gear: Gear) -> bp.PeriodicSolution:
+        values, e = dict(zip(NAMES, gear.parameters[0], strict=True)), gear.experiment
+        model = bp.models.landing_gear(gear.drive)
+        return bp.solve_periodic(model, values, e.inputs, frequency=e.frequency, samples=SAMPLES, scheme=scheme)
+
+    def steady(gear: Gear, contender: Contender) -> np.ndarray:
+        # Static equilibrium if theta16 ≤ 0 at the estimate, without a steady state.
+        path, cycles = contender.integrate(gear.estimate, gear.still(gear.estimate))
+        return path[0] if cycles else gear.still(gear.estimate)
+
     actions: dict[str, Action] = {
         WARM: Action(lambda: [warm.log_posterior(one, noise) for one in theta], len(theta)),
         BATCHED: Action(lambda: warm.log_posterior(many, noise), WALKERS),
-        COLD: Action(lambda: [_cold(gear, scheme) for gear in gears]),
+        COLD: Action(lambda: [cold(gear) for gear in gears]),
     }
     for kind in COMPILED:
         contenders = [by_kind[kind] for by_kind in chosen]
-        known = [_steady(*one) for one in zip(gears, contenders, strict=True)]
+        known = [steady(*one) for one in zip(gears, contenders, strict=True)]
         actions[f"{kind} {STATIC}"] = Action(partial(_integrate, gears, contenders, None), len(theta))
         actions[f"{kind} {ESTIMATE}"] = Action(partial(_integrate, gears, contenders, known), len(theta))
     return actions
-
-
-def _steady(gear: Gear, contender: Contender) -> np.ndarray:
-    """Return the steady state at the estimate, or static equilibrium where its theta16 ≤ 0 leaves it none."""
-    path, cycles = contender.integrate(gear.estimate, gear.still(gear.estimate))
-    return path[0] if cycles else gear.still(gear.estimate)
 
 
 def _integrate(gears: Sequence[Gear], contenders: Sequence[Contender], starts: Sequence[np.ndarray] | None) -> None:
@@ -169,55 +308,39 @@ def _integrate(gears: Sequence[Gear], contenders: Sequence[Contender], starts: S
             contender.integrate(parameters, gear.still(parameters) if starts is None else starts[i])
 
 
-def _cold(gear: Gear, scheme: str) -> bp.PeriodicSolution:
-    """Solve from static equilibrium."""
-    return bp.solve_periodic(
-        bp.models.landing_gear(gear.drive),
-        dict(zip(NAMES, gear.parameters[0], strict=True)),
-        gear.experiment.inputs,
-        frequency=gear.experiment.frequency,
-        samples=SAMPLES,
-        scheme=scheme,
-    )
-
-
 def _scipy(
     gears: Sequence[Gear], own: Sequence[float], chosen: Sequence[Mapping[str, Contender]], method: str
 ) -> float | None:
-    """Return the seconds of one integration of all until steady, None where no tolerance is accurate enough."""
+    """Return the seconds of one integration of all until steady, None where no tolerance is accurate enough.
+
+    A few cycles are timed; all the others cost the same.
+    """
     relative = [choose_scipy(gear, method, allowed) for gear, allowed in zip(gears, own, strict=True)]
     total = 0.0
     for gear, tolerance, by_kind in zip(gears, relative, chosen, strict=True):
         if tolerance is None:
             return None
-        cycles = min(contender.cycles for contender in by_kind.values())
-        total += _few_cycles(gear, method, tolerance) * cycles / TIMED_CYCLES
+        integrate, parameters = gear.scipy(method, tolerance, TIMED_CYCLES), gear.parameters[0]
+        start, times = gear.still(parameters), []
+        for _ in range(2):
+            before = time.perf_counter()
+            integrate(parameters, start)
+            times.append(time.perf_counter() - before)
+        total += min(times) * min(contender.cycles for contender in by_kind.values()) / TIMED_CYCLES
     return total
-
-
-def _few_cycles(gear: Gear, method: str, relative: float) -> float:
-    """Return the seconds of `TIMED_CYCLES`; all the others cost the same."""
-    integrate, parameters = gear.scipy(method, relative, TIMED_CYCLES), gear.parameters[0]
-    start, times = gear.still(parameters), []
-    for _ in range(2):
-        before = time.perf_counter()
-        integrate(parameters, start)
-        times.append(time.perf_counter() - before)
-    return min(times)
 
 
 def _ratios(times: Mapping[str, np.ndarray], scipy: Mapping[str, float | None]) -> dict[str, Any]:
     """Return the time ratios of integration to the periodic solver, by the faster compiled method in each repeat."""
     quickest = {start: np.min([times[f"{kind} {start}"] for kind in COMPILED], axis=0) for start in (STATIC, ESTIMATE)}
     found = {f"compiled {start} / {WARM}": values / times[WARM] for start, values in quickest.items()}
-    found |= {f"compiled {STATIC} / {BATCHED}": quickest[STATIC] / times[BATCHED]}
-    found |= {f"compiled {STATIC} / {COLD}": quickest[STATIC] / times[COLD]}
+    found |= {f"compiled {STATIC} / {own}": quickest[STATIC] / times[own] for own in (BATCHED, COLD)}
     found |= {f"{method} {STATIC} / {WARM}": seconds / times[WARM] for method, seconds in scipy.items() if seconds}
     return {name: spread(values) for name, values in found.items()}
 
 
 def table(drive: str, found: Mapping[str, Any]) -> str:
-    """Return the text to print."""
+    """Return the times to print."""
     left_out = found["left_out"]
     lines = [
         f"  {drive} given: {left_out['not_positive']} of {left_out['draws']} draws excluded without a steady state, "
@@ -225,12 +348,10 @@ def table(drive: str, found: Mapping[str, Any]) -> str:
     ]
     for scheme, one in found["schemes"].items():
         worst = max(entry["error"] for entry in one["experiments"].values())
-        lines.append(
-            f"    {scheme}, error at most {worst:.0e} of the range: {one['milliseconds'][WARM]['median']:.2f} ms a "
-            "log-posterior of all experiments"
+        title = (
+            f"{scheme}, error at most {worst:.0e} of the range: {one['milliseconds'][WARM]['median']:.2f} ms a "
+            "log-posterior of all experiments, and ratios of times"
         )
-        for name, ratio in one["ratios"].items():
-            lines.append(f"      {name}: {ratio['median']:.1f} ({ratio['least']:.1f} … {ratio['largest']:.1f})")
-        for method, milliseconds in one["scipy_milliseconds"].items():
-            lines += [] if milliseconds else [f"      {method}: not as accurate at any tolerance"]
+        inaccurate = [f"{m}: not as accurate at any tolerance" for m, ms in one["scipy_milliseconds"].items() if not ms]
+        lines += [common.shown(title, one["ratios"]), *inaccurate]
     return "\n".join(lines)

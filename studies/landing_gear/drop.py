@@ -16,8 +16,8 @@ import numpy as np
 import sympy as sp
 
 import bayesperiodic as bp
-from studies.landing_gear.identification import DISPLACEMENT, ENSEMBLES, Identified, draw, estimate, fold
-from studies.landing_gear.rig import parameters
+from studies.landing_gear.identification import Identified
+from studies.landing_gear.rig import Strut, heat_balance, parameters, strut
 
 FRAME, HEIGHT, WIDTH = 2.02, 1.16, 0.58
 MASS, GRAVITY, HELD = 690.0, 9.81, 0.02
@@ -31,56 +31,43 @@ CHANNELS = ("displacement", "force", "pressure")
 class Dropped:
     """One truth's drop test."""
 
-    identified: Identified  # All shaker experiments with theta4, theta6 and theta16 in common
     true: bp.Recording  # Without noise
     band: Any  # Posterior prediction
+
+
+def _compression(psi: Any) -> sp.Expr:
+    """Return the gear's compression [m] at an angle of the frame."""
+    reach = sp.sqrt((FRAME * sp.cos(psi) - FRAME - WIDTH) ** 2 + (HEIGHT - FRAME * sp.sin(psi)) ** 2)
+    return float(np.hypot(WIDTH, HEIGHT)) - reach
 
 
 @cache
 def drop_model(effects: frozenset[str]) -> bp.Model:
     """Return frame and gear; states: psi, the frame's angle below the horizontal [rad], and T, of the gas [K]."""
-    names = (*parameters(effects), "mass")
 
-    def compression(s: Any) -> sp.Expr:
-        end = FRAME * sp.cos(s.psi), HEIGHT - FRAME * sp.sin(s.psi)
-        reach = sp.sqrt((end[0] - FRAME - WIDTH) ** 2 + end[1] ** 2)
-        return float(np.hypot(WIDTH, HEIGHT)) - reach
-
-    def gear(s: Any, p: Any) -> dict[str, sp.Expr]:
-        q = compression(s)
+    def gear(s: Any, p: Any) -> tuple[sp.Expr, Strut]:
+        q = _compression(s.psi)
         lever = sp.diff(q, s.psi)
-        v = lever * s.dpsi
-        acceleration = sp.diff(lever, s.psi) * s.dpsi**2 + lever * s.ddpsi
-        gas = p.theta5 * s.T / (1 + p.theta6 * q + p.theta7 * s.T)
-        friction = (p.theta8 + p.theta9 * gas) * sp.atan(p.theta10 * v)
-        force = p.theta1 * (acceleration + p.theta2) + p.theta3 * v * abs(v) + p.theta4 * gas + friction + p.theta11
-        return {"q": q, "v": v, "lever": lever, "gas": gas, "friction": friction, "force": force}
+        return lever, strut(p, q, lever * s.dpsi, sp.diff(lever, s.psi) * s.dpsi**2 + lever * s.ddpsi, s.T)
 
     def equations(s: Any, p: Any, u: Any) -> list[sp.Expr]:
-        at = gear(s, p)
-        conduction = p.theta16 * (1 + p.theta6 * at["q"]) * (s.T + p.theta17)
-        if "convection" in effects:
-            conduction *= 1 + abs(at["v"]) / p.convection_speed
-        heat = p.theta15 * s.dT + conduction - (p.theta4 * at["gas"] + p.theta11) * at["v"]
-        if "friction_heat" in effects:
-            heat -= p.heat_share * at["friction"] * at["v"]
+        lever, at = gear(s, p)
         weight = p.mass * GRAVITY * FRAME * sp.cos(s.psi)
-        return [p.mass * FRAME**2 * s.ddpsi - weight + at["force"] * at["lever"], heat]
+        return [p.mass * FRAME**2 * s.ddpsi - weight + at.force * lever, heat_balance(effects, s, p, at)]
 
     def outputs(s: Any, p: Any, u: Any) -> dict[str, sp.Expr]:
-        at = gear(s, p)
-        displacement, pressure = at["q"] + p.theta12, at["gas"]
+        _, at = gear(s, p)
+        displacement, pressure = at.q + p.theta12, at.pressure
         if "flexure" in effects:
-            displacement += p.flexibility * (at["force"] - p.static_load)
+            displacement += p.flexibility * (at.force - p.static_load)
         if "line" in effects:
-            rate = sp.diff(pressure, s.T) * s.dT + sp.diff(pressure, s.psi) * s.dpsi
-            pressure = pressure - p.delay * rate
-        return {"displacement": displacement, "force": at["force"], "pressure": pressure}
+            pressure -= p.delay * (sp.diff(pressure, s.T) * s.dT + sp.diff(pressure, s.psi) * s.dpsi)
+        return {"displacement": displacement, "force": at.force, "pressure": pressure}
 
     return bp.Model(
         "_".join(["landing_gear_drop", *sorted(effects)]),
         states=["psi", "T"],
-        parameters=names,
+        parameters=(*parameters(effects), "mass"),
         units={"psi": "rad", "T": "K", "displacement": "m", "force": "N", "pressure": "Pa"},
         equations=equations,
         outputs=outputs,
@@ -88,37 +75,21 @@ def drop_model(effects: frozenset[str]) -> bp.Model:
     )
 
 
-def held_angle() -> float:
-    """Return the frame's angle [rad] at which the gear is compressed by `HELD`."""
-    psi = sp.Symbol("psi")
-    reach = sp.sqrt((FRAME * sp.cos(psi) - FRAME - WIDTH) ** 2 + (HEIGHT - FRAME * sp.sin(psi)) ** 2)
-    return float(sp.nsolve(float(np.hypot(WIDTH, HEIGHT)) - HELD - reach, psi, 0.01))
-
-
 def drop(values: Mapping[str, float], effects: Iterable[str] = (), duration: float = LONG) -> bp.Recording:
     """Return the drop of a gear with these parameters, from rest at room temperature, without noise."""
+    psi = sp.Symbol("psi")
+    held = float(sp.nsolve(_compression(psi) - HELD, psi, 0.01))
     return bp.simulate(
-        drop_model(frozenset(effects)),
-        {**values, "mass": MASS},
-        frequency=1.0,
-        duration=duration,
-        sampling_rate=SAMPLING,
-        start={"psi": held_angle(), "T": -values["theta17"]},
-    )
-
-
-def identify(recordings: Iterable[bp.Recording], seed: int, *, quick: bool) -> Identified:
-    """Return the joint fit of all shaker experiments to the gear that is dropped."""
-    experiments = [fold(recording, DISPLACEMENT) for recording in recordings]
-    return draw(estimate(experiments, DISPLACEMENT, one_conduction=True), seed, quick=quick, executor=ENSEMBLES)
+        drop_model(frozenset(effects)), {**values, "mass": MASS}, frequency=1.0, duration=duration,
+        sampling_rate=SAMPLING, start={"psi": held, "T": -values["theta17"]},
+    )  # fmt: skip
 
 
 def predict(identified: Identified, effects: Iterable[str], draws: int) -> Dropped:
-    """Return the true drop under the effects of a truth, and its posterior prediction."""
-    assert identified.posterior is not None
+    """Return the true drop under the effects of a truth, and its prediction from a joint fit with one theta16."""
     name = identified.problem.experiments[0].name
     found = bp.predict(identified.problem, identified.posterior, draws=draws, run=drop, experiment=name)
-    return Dropped(identified, drop(parameters(effects), effects), found.transient)
+    return Dropped(drop(parameters(effects), effects), found.transient)
 
 
 def account(dropped: Dropped) -> dict[str, Any]:

@@ -4,77 +4,97 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
+from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
+from studies.common import shared_legend
 from studies.landing_gear.drop import SHORT, Dropped
-from studies.landing_gear.identification import Identified
+from studies.landing_gear.identification import CONDUCTION, NEGATIVE, POSITIVE, UNDETERMINED, Identified, Verdict
 from studies.landing_gear.quality import FALSE_ALARM, LIMIT, MEANINGS, Unit, deviations
 from studies.landing_gear.rig import GEAR, RUNS, Run
-from studies.landing_gear.verdicts import CONDUCTION, NEGATIVE, POSITIVE, UNDETERMINED, Verdict
 
 CHANNELS = {
-    "displacement": (1e3, "displacement [mm]"),
-    "force": (1e-3, "force [kN]"),
-    "pressure": (1e-6, "pressure [MPa]"),
-}
+    "displacement": (1e3, "displacement [mm]"), "force": (1e-3, "force [kN]"), "pressure": (1e-6, "pressure [MPa]"),
+}  # fmt: skip
 TITLE = "SYNTHETIC data"
 NORMAL_90 = 1.6448536269514722
 SIGNS = {POSITIVE: ("#009E73", "o"), UNDETERMINED: ("#999999", "D"), NEGATIVE: ("#CC79A7", "v")}
 # The scale of theta16 is linear up to here, logarithmic beyond [W/K].
 LINEAR_TO, TICKS = 3.0, (-100, -50, -20, -10, -5, -3, -2, -1, 0, 1, 2, 3, 5, 10, 20)
+STYLES: dict[str, dict[str, Any]] = {
+    "eq. (9)": {"color": "#0072B2", "lw": 3.0}, "pressure line": {"color": "#E69F00", "ls": "--"},
+    "lost motion": {"color": "#CC79A7"}, "all four": {"color": "#009E73"},
+}  # fmt: skip
 TRUTH_NAMES = {"A": "truth A: eq. (9) holds", "B": "truth B: lost motion, line lag, convection, friction heat"}
 
 
-def histories(recordings: Mapping[str, bp.Recording], identified: Mapping[str, Identified]) -> Figure:
-    """Draw recorded and fitted displacement, force and pressure of one experiment, one column per truth."""
-    from matplotlib import pyplot as plt
-
-    figure = plt.figure(figsize=(5.0 * len(recordings) + 1.0, 8.5), layout="constrained")
-    grid = figure.subplots(4, len(recordings), sharex=True, squeeze=False, sharey="row")
-    for column, (truth, recording) in zip(grid.T, recordings.items(), strict=True):
-        _histories(column, recording, identified[truth])
-        column[0].set_title(TRUTH_NAMES[truth], fontsize=10)
-    for axes, label in zip(grid[:, 0], (*(label for _, label in CHANNELS.values()), "residual force [N]"), strict=True):
+def _columns(truths: Mapping[str, Any], height: float, last: str, **options: Any) -> tuple[Figure, np.ndarray]:
+    """Return a figure with a column per truth: displacement, force, pressure, and a last row."""
+    figure = plt.figure(figsize=(5.0 * len(truths) + 1.0, height), layout="constrained")
+    grid = figure.subplots(4, len(truths), squeeze=False, sharey="row", **options)
+    for axes, truth in zip(grid[0], truths, strict=True):
+        axes.set_title(TRUTH_NAMES[truth], fontsize=10)
+    for axes, label in zip(grid[:, 0], (*(label for _, label in CHANNELS.values()), last), strict=True):
         axes.set_ylabel(label)
-    figure.legend(*grid[1, 0].get_legend_handles_labels(), frameon=False, ncols=2, loc="outside lower center")
-    experiment = next(iter(recordings.values())).name.replace(" Hz ", " Hz, ±")
-    figure.suptitle(f"Landing gear at {experiment}, {TITLE}")
+    return figure, grid
+
+
+def histories(shown: Mapping[str, tuple[bp.Recording, Identified]]) -> Figure:
+    """Draw recorded and fitted displacement, force and pressure of one experiment, one column per truth."""
+    figure, grid = _columns(shown, 8.5, "residual force [N]", sharex=True)
+    for column, (recording, identified) in zip(grid.T, shown.values(), strict=True):
+        (experiment,), fit = identified.problem.experiments, identified.fit
+        residuals = fit.residuals[experiment.name]
+        until = 2.0 / experiment.frequency
+        kept = recording.time <= until
+        time = np.arange(2 * experiment.samples) / (experiment.samples * experiment.frequency)
+        signals = {**recording.inputs, **recording.outputs}
+        for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
+            colours, recorded = bp.plot.COLOURS, scale * signals[channel][kept]
+            axes.plot(recording.time[kept], recorded, ".", ms=2, color=colours["measured"], label="recorded")
+            if channel in residuals:
+                fitted = experiment.outputs[channel] - residuals[channel]
+                axes.plot(time, scale * np.tile(fitted, 2), color=bp.plot.COLOURS["map"], lw=1.4, label="MAP")
+        column[3].plot(time, np.tile(residuals["force"], 2), color=bp.plot.COLOURS["map"], lw=1.0)
+        column[3].axhline(0.0, color="black", lw=0.6)
+        column[3].set_xlabel("time [s]")
+    shared_legend(figure, 2)
+    name = next(iter(shown.values()))[0].name.replace(" Hz ", " Hz, ±")
+    figure.suptitle(f"Landing gear at {name}, {TITLE}")
     return figure
-
-
-def _histories(column: np.ndarray, recording: bp.Recording, identified: Identified) -> None:
-    (experiment,), fit = identified.problem.experiments, identified.fit
-    residuals = fit.residuals[experiment.name]
-    until = 2.0 / experiment.frequency
-    kept = recording.time <= until
-    time = np.arange(2 * experiment.samples) / (experiment.samples * experiment.frequency)
-    signals = {**recording.inputs, **recording.outputs}
-    for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
-        colours, recorded = bp.plot.COLOURS, scale * signals[channel][kept]
-        axes.plot(recording.time[kept], recorded, ".", ms=2, color=colours["measured"], label="recorded")
-        if channel in residuals:
-            fitted = experiment.outputs[channel] - residuals[channel]
-            axes.plot(time, scale * np.tile(fitted, 2), color=bp.plot.COLOURS["map"], lw=1.4, label="MAP")
-    column[3].plot(time, np.tile(residuals["force"], 2), color=bp.plot.COLOURS["map"], lw=1.0)
-    column[3].axhline(0.0, color="black", lw=0.6)
-    column[3].set_xlabel("time [s]")
 
 
 def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict]], drive: str) -> Figure:
     """Draw theta16 by experiment: 90 % intervals of draws and of the Laplace approximation, and the sign verdict."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(11.0, 4.2 * len(verdicts) + 1.0), layout="constrained")
     grid = figure.subplots(len(verdicts), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (truth, by_run) in zip(grid, verdicts.items(), strict=True):
-        _conductions(axes, [by_run[run.name] for run in runs])
+        judged = [by_run[run.name] for run in runs]
+        at = np.arange(len(judged))
+        low, high = np.array([np.quantile(v.identified.posterior.draws(CONDUCTION), [0.05, 0.95]) for v in judged]).T
+        laplace = np.array([v.identified.fit.interval(0.9)[CONDUCTION] for v in judged]).T
+        axes.vlines(at - 0.1, low, high, color=bp.plot.COLOURS["mcmc"], lw=5, label="draws, 90 %")
+        axes.vlines(at + 0.1, *laplace, color=bp.plot.COLOURS["laplace"], lw=2, label="Laplace, 90 %")
+        axes.axhline(GEAR[CONDUCTION], color="black", lw=0.9, ls="--", label="true value 2 W/K")
+        axes.axhline(0.0, color="black", lw=0.6)
+        for sign, (colour, marker) in SIGNS.items():
+            axes.plot([], [], marker, color=colour, label=f"sign: {sign}")
+            for i in (i for i, v in enumerate(judged) if v.sign == sign):
+                face = "white" if judged[i].misspecified else colour
+                value = judged[i].identified.fit.theta[CONDUCTION]
+                axes.plot(i, value, marker, color=colour, mfc=face, ms=8, mew=1.8, zorder=5)
+        axes.set_yscale("symlog", linthresh=LINEAR_TO, linscale=1.5)
+        axes.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS])
+        axes.minorticks_off()
+        ends = np.concatenate([low, high, *laplace, [-0.5, GEAR[CONDUCTION] + 0.5]])
+        axes.set_ylim(1.2 * ends.min(), 1.2 * ends.max())
+        axes.set_ylabel("theta16 [W/K]")
+        axes.set_xlim(-0.6, len(judged) - 0.4)
         axes.set_title(TRUTH_NAMES[truth], fontsize=11)
     names = [f"{run.frequency:g} Hz\n±{1e3 * run.stroke:g} mm" for run in runs]
     grid[-1].set_xticks(range(len(runs)), names, fontsize=9)
-    handles, labels = grid[0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, ncols=4, loc="outside lower center", fontsize=9)
+    shared_legend(figure, 4, fontsize=9)
     figure.suptitle(
         f"Heat conduction theta16 by experiment, {drive} given, SYNTHETIC data\n"
         "(filled: model adequate, open: misspecified)"
@@ -82,89 +102,37 @@ def conductions(runs: Sequence[Run], verdicts: Mapping[str, Mapping[str, Verdict
     return figure
 
 
-def _conductions(axes: Axes, verdicts: Sequence[Verdict]) -> None:
-    at = np.arange(len(verdicts))
-    low, high = np.array([_interval(v) for v in verdicts]).T
-    laplace = np.array([v.identified.fit.interval(0.9)[CONDUCTION] for v in verdicts]).T
-    axes.vlines(at - 0.1, low, high, color=bp.plot.COLOURS["mcmc"], lw=5, label="draws, 90 %")
-    axes.vlines(at + 0.1, *laplace, color=bp.plot.COLOURS["laplace"], lw=2, label="Laplace, 90 %")
-    axes.axhline(GEAR[CONDUCTION], color="black", lw=0.9, ls="--", label="true value 2 W/K")
-    axes.axhline(0.0, color="black", lw=0.6)
-    for sign, (colour, marker) in SIGNS.items():
-        axes.plot([], [], marker, color=colour, label=f"sign: {sign}")
-        for i in (i for i, v in enumerate(verdicts) if v.sign == sign):
-            face = "white" if verdicts[i].misspecified else colour
-            value = verdicts[i].identified.fit.theta[CONDUCTION]
-            axes.plot(i, value, marker, color=colour, mfc=face, ms=8, mew=1.8, zorder=5)
-    axes.set_yscale("symlog", linthresh=LINEAR_TO, linscale=1.5)
-    axes.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS])
-    axes.set_yticks([], minor=True)
-    ends = np.concatenate([low, high, *laplace, [-0.5, GEAR[CONDUCTION] + 0.5]])
-    axes.set_ylim(1.2 * ends.min(), 1.2 * ends.max())
-    axes.set_ylabel("theta16 [W/K]")
-    axes.set_xlim(-0.6, len(verdicts) - 0.4)
-
-
-def _interval(verdict: Verdict) -> tuple[float, float]:
-    posterior = verdict.identified.posterior
-    assert posterior is not None
-    low, high = np.quantile(posterior.draws(CONDUCTION), [0.05, 0.95])
-    return float(low), float(high)
-
-
 def drops(dropped: Mapping[str, Dropped]) -> Figure:
     """Draw the drop test, a column per truth: the first 2.5 s, and by how much the displacement is off over 30 s."""
-    from matplotlib import pyplot as plt
-
-    figure = plt.figure(figsize=(5.0 * len(dropped) + 1.0, 9.0), layout="constrained")
-    grid = figure.subplots(4, len(dropped), squeeze=False, sharey="row")
-    for column, (truth, found) in zip(grid.T, dropped.items(), strict=True):
-        _drop(column, found)
-        column[0].set_title(TRUTH_NAMES[truth], fontsize=10)
-    rows = (*(label for _, label in CHANNELS.values()), "displacement minus\npredicted median [mm]")
-    for axes, label in zip(grid[:, 0], rows, strict=True):
-        axes.set_ylabel(label)
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, ncols=3, loc="outside lower center")
+    figure, grid = _columns(dropped, 9.0, "displacement minus\npredicted median [mm]")
+    for column, found in zip(grid.T, dropped.values(), strict=True):
+        time, band, colours = found.true.time, found.band, bp.plot.COLOURS
+        early = time <= SHORT
+        for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
+            true, low, median, high = (
+                scale * signals[channel][early] for signals in (found.true.outputs, band.low, band.median, band.high)
+            )
+            axes.plot(time[early], true, color=colours["measured"], lw=2.6, label="true")
+            axes.plot(time[early], median, "--", color=colours["mcmc"], lw=1.4, label="posterior median")
+            axes.fill_between(time[early], low, high, color=colours["mcmc"], alpha=0.3, lw=0, label="90 % band")
+            axes.tick_params(labelbottom=channel == "pressure")
+        column[2].set_xlabel("time [s]")
+        median = band.median["displacement"]
+        low, high = 1e3 * (band.low["displacement"] - median), 1e3 * (band.high["displacement"] - median)
+        column[3].fill_between(time, low, high, color=colours["mcmc"], alpha=0.3, lw=0)
+        column[3].plot(time, 1e3 * (found.true.outputs["displacement"] - median), color=colours["measured"], lw=1.2)
+        column[3].axhline(0.0, color=colours["mcmc"], ls="--", lw=1.0)
+        column[3].set_xlabel("time [s], until the gas has cooled")
+    shared_legend(figure, 3)
     figure.suptitle(f"Drop test, predicted from the shaker's experiments, {TITLE}")
     return figure
 
 
-def _drop(column: np.ndarray, found: Dropped) -> None:
-    time, band, colours = found.true.time, found.band, bp.plot.COLOURS
-    early = time <= SHORT
-    for axes, (channel, (scale, _)) in zip(column, CHANNELS.items(), strict=False):
-        low, high = scale * band.low[channel][early], scale * band.high[channel][early]
-        axes.plot(
-            time[early], scale * found.true.outputs[channel][early], color=colours["measured"], lw=2.6, label="true"
-        )
-        axes.plot(
-            time[early],
-            scale * band.median[channel][early],
-            "--",
-            color=colours["mcmc"],
-            lw=1.4,
-            label="posterior median",
-        )
-        axes.fill_between(time[early], low, high, color=colours["mcmc"], alpha=0.3, lw=0, label="90 % band")
-        axes.tick_params(labelbottom=channel == "pressure")
-    column[2].set_xlabel("time [s]")
-    median = band.median["displacement"]
-    low, high = 1e3 * (band.low["displacement"] - median), 1e3 * (band.high["displacement"] - median)
-    column[3].fill_between(time, low, high, color=colours["mcmc"], alpha=0.3, lw=0)
-    column[3].plot(time, 1e3 * (found.true.outputs["displacement"] - median), color=colours["measured"], lw=1.2)
-    column[3].axhline(0.0, color=colours["mcmc"], ls="--", lw=1.0)
-    column[3].set_xlabel("time [s], until the gas has cooled")
-
-
 def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
     """Draw the quality-control chart: every unit's deviation from the reference, a row per parameter."""
-    from matplotlib import pyplot as plt
-
     figure, grid = plt.subplots(len(MEANINGS), 1, figsize=(9.0, 9.5), sharex=True, layout="constrained")
     number = np.arange(1, len(units) + 1)
     every = [deviations(reference, unit) for unit in units]
-    kinds = list(dict.fromkeys(unit.kind for unit in units))
     for axes, (name, meaning) in zip(grid, MEANINGS.items(), strict=True):
         z = np.array([deviation[name] for deviation in every])
         out = np.abs(z) > LIMIT
@@ -177,7 +145,7 @@ def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
         axes.set_ylim(-2.0 * max(10.0, np.abs(z).max()), 2.0 * max(10.0, np.abs(z).max()))
         axes.minorticks_off()
         axes.set_ylabel(f"{meaning}\n{name}", fontsize=9)
-    for k, kind in enumerate(kinds):
+    for k, kind in enumerate(dict.fromkeys(unit.kind for unit in units)):
         members = np.flatnonzero([unit.kind == kind for unit in units])
         grid[0].text(
             number[members].mean(), 1.04, kind, ha="center", va="bottom", transform=grid[0].get_xaxis_transform()
@@ -185,8 +153,7 @@ def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
         for axes in grid if k else ():
             axes.axvline(number[members[0]] - 0.5, color="black", lw=0.6)
     grid[-1].set_xlabel("unit")
-    handles = {label: h for axes in grid for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles, frameon=False, ncols=2, loc="outside lower center")
+    shared_legend(figure, 2)
     figure.suptitle(
         "Deviation from the reference gear, in common standard deviations [1], SYNTHETIC data\n"
         f"(grey: ±{LIMIT:.2f}, a false alarm in {FALSE_ALARM:.0%} of good units)"
@@ -195,16 +162,8 @@ def quality(reference: Unit, units: Sequence[Unit]) -> Figure:
 
 
 def repaired(found: Mapping[str, Any]) -> Figure:
-    """Draw theta16 by experiment under eq. (9) and under the best model, and how each model predicts what it lacks."""
-    from matplotlib import pyplot as plt
-
+    """Draw theta16 by experiment under eq. (9) and the best model, and the prediction errors of all models."""
     figure, (top, bottom) = plt.subplots(2, 1, figsize=(10.0, 8.5), sharex=True, layout="constrained")
-    styles: dict[str, dict[str, Any]] = {
-        "eq. (9)": {"color": "#0072B2", "lw": 3.0},
-        "pressure line": {"color": "#E69F00", "ls": "--"},
-        "lost motion": {"color": "#CC79A7"},
-        "all four": {"color": "#009E73"},
-    }
     runs = list(next(iter(found["models"].values()))["scores"])
     order = [run.name for run in RUNS if run.name in runs]
     place = np.arange(len(order))
@@ -212,7 +171,7 @@ def repaired(found: Mapping[str, Any]) -> Figure:
         values = np.array([one["estimates"][f"{CONDUCTION}[{name}]"] for name in order])
         top.errorbar(
             place + 0.12 * (2 * k - 1), values[:, 0], NORMAL_90 * values[:, 1], fmt="o", ms=4, capsize=2,
-            color=styles[model]["color"], label=model,
+            color=STYLES[model]["color"], label=model,
         )  # fmt: skip
     top.axhline(GEAR[CONDUCTION], color="black", lw=0.8, ls=":", label="truth")
     top.axhline(0.0, color="black", lw=0.8)
@@ -225,7 +184,7 @@ def repaired(found: Mapping[str, Any]) -> Figure:
     top.legend(frameon=False)
     for model, one in found["models"].items():
         errors = [one["errors_held_out"][name]["force"] for name in order]
-        bottom.plot(place, errors, "o", ms=4, **{"lw": 1.0, "ls": "-"} | styles[model], label=model)
+        bottom.plot(place, errors, "o", ms=4, **{"lw": 1.0, "ls": "-"} | STYLES[model], label=model)
     bottom.axhline(found["noise_of_the_mean"]["force"], color="black", lw=0.8, ls=":", label="noise of the mean period")
     bottom.set_yscale("log")
     bottom.set_ylabel("rms error of the force [N]\nin experiments held out")
@@ -236,33 +195,14 @@ def repaired(found: Mapping[str, Any]) -> Figure:
 
 
 def loops(identified: Mapping[str, Sequence[Identified]]) -> Figure:
-    """Draw mean period and fit of some experiments of each truth, the residual below, the displacement being given."""
-    from matplotlib import pyplot as plt
-
-    shown = [(truth, one) for truth, several in identified.items() for one in several]
-    figure = plt.figure(figsize=(3.6 * len(shown), 6.8), layout="constrained")
-    grid = figure.subplots(2, len(shown), squeeze=False, sharex="col")
-    for (above, below), (truth, one) in zip(grid.T, shown, strict=True):
-        _loop(above, below, one)
-        name = one.problem.experiments[0].name.replace(" Hz ", " Hz, ±")
-        above.set_title(f"{TRUTH_NAMES[truth].replace(': ', ':' + chr(10))}\n{name}", fontsize=9)
-    grid[0, 0].set_ylabel("force [kN]")
-    grid[1, 0].set_ylabel("residual force [N]")
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), frameon=False, ncols=2, loc="outside lower center")
+    """Draw the friction loops of some experiments, a row per truth, the displacement being given."""
+    most = max(map(len, identified.values()))
+    figure = plt.figure(figsize=(7.0 * most, 3.6 * len(identified) + 0.4), layout="constrained")
+    parts = figure.subfigures(len(identified), most, squeeze=False)
+    for row, (truth, several) in zip(parts, identified.items(), strict=True):
+        for part, one in zip(row, several, strict=True):
+            bp.plot.loops(one.problem, one.fit, output="force", figure=part)
+            name = one.problem.experiments[0].name.replace(" Hz ", " Hz, ±")
+            part.suptitle(f"{TRUTH_NAMES[truth]}\n{name}", fontsize=9)
     figure.suptitle(f"Friction loops of the landing gear, displacement given, {TITLE}")
     return figure
-
-
-def _loop(above: Axes, below: Axes, identified: Identified) -> None:
-    (experiment,), colours = identified.problem.experiments, bp.plot.COLOURS
-    residual = identified.fit.residuals[experiment.name]["force"]
-    x, force = 1e3 * _closed(experiment.inputs["displacement"]), _closed(experiment.outputs["force"])
-    above.plot(x, 1e-3 * force, color=colours["measured"], lw=1.8, label="recorded, mean period")
-    above.plot(x, 1e-3 * (force - _closed(residual)), "--", color=colours["map"], lw=1.2, label="MAP")
-    below.plot(x, _closed(residual), color=colours["measured"], lw=0.9)
-    below.axhline(0.0, color="black", lw=0.6)
-    below.set_xlabel("displacement [mm]")
-
-
-def _closed(values: np.ndarray) -> np.ndarray:
-    return np.append(values, values[0])

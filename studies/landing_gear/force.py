@@ -1,11 +1,11 @@
 """The landing gear with the force given, as in eq. (9), with the noise of the measured force propagated.
 
-With the force as input its noise moves displacement and pressure together, by more than their own noise, and in a way
-that resembles heat conduction: a fit that treats the force as exact is confident of wrong signs. Here displacement and
-pressure have the covariance B S Bᵀ + J F Jᵀ, with S and F the variances of the amplitudes of outputs and force from the
-scatter of the cycles, B the harmonics kept, and J the derivatives of the steady motion by the force's amplitudes, at an
-estimate that is computed twice; up to one common factor, which is 1 if the model is adequate. (Errors in variables, to
-first order: W. A. Fuller, Measurement Error Models, Wiley, 1987.)
+The noise of the force moves displacement and pressure together, by more than their own noise and like heat conduction:
+a fit that treats the force as exact is confident of wrong signs. Here displacement and pressure have the covariance
+B S Bᵀ + J F Jᵀ, with S and F the variances of the amplitudes of outputs and force from the scatter of the cycles, B the
+harmonics kept, and J the derivatives of the steady motion by the force's amplitudes, at an estimate that is computed
+twice; up to one common factor, which is 1 if the model is adequate. (Errors in variables, to first order: W. A. Fuller,
+Measurement Error Models, Wiley, 1987.)
 
 Joint fits share theta4 and theta6; theta16 is local to each experiment. The steepness of the friction, theta10, is
 varied from 30 to 3000 s/m, solved from static equilibrium.
@@ -13,7 +13,7 @@ varied from 30 to 3000 s/m, solved from static equilibrium.
 
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,53 +21,35 @@ import numpy as np
 from scipy.stats import chi2
 
 import bayesperiodic as bp
-from studies.landing_gear.identification import (
-    DISPLACEMENT,
-    DRIVES,
-    ENSEMBLES,
-    FIXED,
-    FORCE,
-    KEPT,
-    PRIORS,
-    SAMPLES,
-    TIED,
-    Identified,
-    draw,
-    estimate,
-    fold,
-)
-from studies.landing_gear.rig import GEAR, HARMONICS, MEAN_COMPRESSION, Run
-from studies.landing_gear.verdicts import CONDUCTION, FALSE_ALARM, Verdict, laplace
+from studies.landing_gear import identification
+from studies.landing_gear.identification import DISPLACEMENT, FORCE, KEPT, SAMPLES, Identified, Verdict, estimate, fold
+from studies.landing_gear.rig import GEAR, Run, imposed
 
 SLOPES = (30.0, 100.0, 300.0, 1000.0, 3000.0)
 
 
 def solve(run: Run, slope: float, drive: str) -> tuple[bp.PeriodicSolution, bool]:
     """Return the gear's motion in an experiment, and whether the solver warned that the grid is too coarse."""
-    gear = GEAR | {"theta10": slope}
-    phase = np.exp(2j * np.pi * np.outer(np.arange(SAMPLES) / SAMPLES, list(HARMONICS)))
-    moved = MEAN_COMPRESSION + run.stroke * (phase @ list(HARMONICS.values())).real
-    found, warned = _solve(run, gear, DISPLACEMENT, moved)
-    if drive == FORCE:
-        amplitudes = np.fft.rfft(found.outputs["force"])
-        amplitudes[KEPT[FORCE]["force"] + 1 :] = 0.0
-        found, warned = _solve(run, gear, FORCE, np.fft.irfft(amplitudes, SAMPLES))
-    return found, warned
 
+    def moved(drive: str, signal: np.ndarray) -> tuple[bp.PeriodicSolution, bool]:
+        model, gear = bp.models.landing_gear(drive), GEAR | {"theta10": slope}
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            found = bp.solve_periodic(model, gear, {drive: signal}, frequency=run.frequency, samples=SAMPLES)
+        return found, any("steps of the grid" in str(warning.message) for warning in caught)
 
-def _solve(run: Run, gear: Mapping[str, float], drive: str, signal: np.ndarray) -> tuple[bp.PeriodicSolution, bool]:
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        found = bp.solve_periodic(
-            bp.models.landing_gear(drive), gear, {drive: signal}, frequency=run.frequency, samples=SAMPLES
-        )
-    return found, any("steps of the grid" in str(warning.message) for warning in caught)
+    found, warned = moved(DISPLACEMENT, imposed(run, SAMPLES))
+    if drive == DISPLACEMENT:
+        return found, warned
+    amplitudes = np.fft.rfft(found.outputs["force"])
+    amplitudes[KEPT[FORCE]["force"] + 1 :] = 0.0
+    return moved(FORCE, np.fft.irfft(amplitudes, SAMPLES))
 
 
 def slope_account(runs: Sequence[Run]) -> dict[str, Any]:
     """Return by direction and slope how the solves of all experiments ended, and how many warned."""
     result: dict[str, Any] = {}
-    for drive in DRIVES:
+    for drive in identification.DRIVES:
         result[drive] = {}
         for slope in SLOPES:
             every = [solve(run, slope, drive) for run in runs]
@@ -78,13 +60,11 @@ def slope_account(runs: Sequence[Run]) -> dict[str, Any]:
 
 def slope_line(found: Mapping[str, Any]) -> str:
     """Return the text to print."""
-    every = [one for by_slope in found.values() for one in by_slope.values()]
-    total = sum(sum(one["status"].values()) for one in every)
-    converged = sum(one["status"].get("converged", 0) for one in every)
+    statuses = sum((Counter(one["status"]) for by_slope in found.values() for one in by_slope.values()), Counter())
     warned = ", ".join(f"{one['warned']} at {slope} s/m" for slope, one in found[FORCE].items() if one["warned"])
     return (
-        f"  friction slope 30 to 3000 s/m: {converged} of {total} solves converged on {SAMPLES} points; force given, "
-        f"the solver warned that this is too coarse for {warned or 'none'}"
+        f"  friction slope 30 to 3000 s/m: {statuses['converged']} of {statuses.total()} solves converged on {SAMPLES} "
+        f"points; force given, the solver warned that this is too coarse for {warned or 'none'}"
     )
 
 
@@ -95,60 +75,44 @@ POINTS = 80
 STEP = 3.0
 # The covariance is computed at a fit that treats the force as exact, then again at the resulting fit.
 ROUNDS = 2
-SCHEME = "central4"
+# Noise "independent": one factor of the covariances.
+SETTINGS: dict[str, Any] = {"noise": "independent", "scheme": "central4"}
 
 
-def judge(recording: bp.Recording, seed: int, quick: bool) -> tuple[Identified, Verdict]:
-    """Return the fit that treats the force as exact, and the verdict with the noise of the force propagated."""
+def judge(recording: bp.Recording, seed: int, quick: bool) -> Verdict:
+    """Return the verdict with the noise of the force propagated, and the fit that treats the force as exact."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The noise of the measured inputs")
         exact = found = estimate([fold(recording, FORCE)], FORCE)
         for _ in range(ROUNDS):
-            found = _fitted(with_noise_of_the_input(exact.problem.experiments[0], found.fit.theta))
-    identified = draw(found, seed, quick=quick)
-    stated, fit = identified.problem, identified.fit
-    identifiability = bp.identifiability(stated, fit, identified.posterior, profile=False, candidates=[])
-    p = misfit(stated, fit)
-    return exact, Verdict(identified, identifiability, p < FALSE_ALARM, p)
-
-
-def _fitted(experiment: bp.Experiment) -> Identified:
-    stated = bp.Problem(
-        bp.models.landing_gear(FORCE), [experiment], priors=PRIORS, fixed=FIXED, tied=TIED, scheme=SCHEME
-    )
-    return Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0)
-
-
-def misfit(stated: bp.Problem, fit: bp.MapEstimate) -> float:
-    """Return the p-value of residuals as large as these, if the covariance is right: χ² of n − l values, eq. (7)."""
-    free = stated.counted - len(stated.names)
-    return float(chi2.sf(fit.noise["scale"] * free, free))
+            experiment = with_noise_of_the_input(exact.problem.experiments[0], found.fit.theta)
+            found = estimate([experiment], FORCE, **SETTINGS)
+    identified = identification.draw(found, seed, quick=quick)
+    # p-value of residuals as large as these, if the covariance is right: χ² of n − l values, eq. (7).
+    free = identified.problem.counted - len(identified.problem.names)
+    p = float(chi2.sf(identified.fit.noise["scale"] * free, free))
+    return Verdict(identified, identification.identifiability(identified), p < identification.FALSE_ALARM, p, exact)
 
 
 def with_noise_of_the_input(experiment: bp.Experiment, theta: Mapping[str, float]) -> bp.Experiment:
     """Return the experiment at points over the period, with the covariance at θ of all that was measured."""
-    model = bp.models.landing_gear(FORCE)
-    parameters = FIXED | dict(theta) | {"theta11": -1e5 * theta["theta4"]}
+    model, force = bp.models.landing_gear(FORCE), experiment.inputs[FORCE]
+    parameters = identification.FIXED | dict(theta) | {"theta11": -1e5 * theta["theta4"]}
     at = np.arange(SAMPLES) % (SAMPLES // POINTS) == 0
 
-    def moved(force: np.ndarray, guess: str | Mapping[str, np.ndarray]) -> bp.PeriodicSolution:
+    def moved(change: np.ndarray | float, guess: str | Mapping[str, np.ndarray]) -> bp.PeriodicSolution:
         return bp.solve_periodic(
-            model,
-            parameters,
-            {FORCE: force},
-            frequency=experiment.frequency,
-            samples=SAMPLES,
-            scheme=SCHEME,
-            guess=guess,
-        )
+            model, parameters, {FORCE: force + change}, frequency=experiment.frequency, samples=SAMPLES,
+            scheme=SETTINGS["scheme"], guess=guess,
+        )  # fmt: skip
 
     columns = []
     with warnings.catch_warnings():
-        # Of a grid that is coarse for the friction: the fit says so once.
+        # The fit itself warns of a grid that is coarse for the friction.
         warnings.filterwarnings("ignore", "The transition of a smooth sign")
-        centre = moved(experiment.inputs[FORCE], "static")
+        centre = moved(0.0, "static")
         for wave in amplitudes(experiment, FORCE).T:
-            ends = [moved(experiment.inputs[FORCE] + sign * STEP * wave, centre.states) for sign in (1.0, -1.0)]
+            ends = [moved(sign * STEP * wave, centre.states) for sign in (1.0, -1.0)]
             up, down = ([experiment.project(c, end.outputs[c])[at] for c in model.outputs] for end in ends)
             columns.append((np.stack(up, axis=-1) - np.stack(down, axis=-1)).ravel() / (2.0 * STEP))
     response = np.stack(columns, axis=-1)
@@ -165,20 +129,13 @@ def amplitudes(experiment: bp.Experiment, channel: str) -> np.ndarray:
     The scatter of the cycles is pooled over the harmonics, for the noise is white.
     """
     harmonics = KEPT[FORCE][channel]
-    variance = experiment.amplitude_variance[channel]
-    sd = np.sqrt(0.5 * np.mean(variance[1 : harmonics + 1]))
+    sd = np.sqrt(0.5 * np.mean(experiment.amplitude_variance[channel][1 : harmonics + 1]))
     phase = 2 * np.pi * np.outer(np.arange(SAMPLES) / SAMPLES, np.arange(1, harmonics + 1))
     return sd * np.hstack([np.full((SAMPLES, 1), np.sqrt(0.5)), np.cos(phase), np.sin(phase)])
 
 
 # With the force given a log-posterior costs more, and the draws are fewer than the stop rule asks for.
 STEPS_WITH_FORCE = 1000
-
-
-def given_displacement(recordings: Iterable[bp.Recording], seed: int, *, quick: bool) -> Identified:
-    """Return estimate and draws with the displacement given."""
-    found = estimate([fold(recording, DISPLACEMENT) for recording in recordings], DISPLACEMENT)
-    return draw(found, seed, quick=quick, executor=ENSEMBLES)
 
 
 def given_force(forced: Mapping[str, Verdict], seed: int, *, quick: bool) -> Identified | None:
@@ -189,39 +146,17 @@ def given_force(forced: Mapping[str, Verdict], seed: int, *, quick: bool) -> Ide
     experiments = [verdict.identified.problem.experiments[0] for verdict in forced.values()]
     if len(experiments) < 2:
         return None
-    stated = bp.Problem(
-        bp.models.landing_gear(FORCE),
-        experiments,
-        priors=PRIORS,
-        fixed=FIXED,
-        tied=TIED,
-        local=[CONDUCTION],
-        scheme=SCHEME,
-    )
-    found = Identified(stated, bp.map_estimate(stated, progress=False), None, 0.0)
-    return draw(found, seed, quick=quick, max_steps=STEPS_WITH_FORCE, executor=ENSEMBLES)
+    found = estimate(experiments, FORCE, **SETTINGS)
+    return identification.draw(found, seed, quick=quick, max_steps=STEPS_WITH_FORCE, executor=identification.ENSEMBLES)
 
 
 def account(identified: Identified) -> dict[str, Any]:
-    """Return the entries of results.json."""
+    """Return the entries of results.json on a joint fit."""
     posterior = identified.posterior
-    assert posterior is not None
-    table = posterior.summary()
-    return laplace(identified) | {
-        "posterior": {
-            name: {key: float(table[key][name]) for key in ("mean", "sd", "q05", "q50", "q95", "ess", "rhat")}
-            for name in identified.problem.names
-        },
-        "p_negative": {
-            name: float((posterior.draws(name) < 0.0).mean())
-            for name in identified.problem.names
-            if name.startswith(CONDUCTION)
-        },
-        "converged": posterior.converged,
+    local = [name for name in identified.problem.names if name.startswith(identification.CONDUCTION)]
+    return identification.drawn(identified, "ess", "rhat") | {
+        "p_negative": {name: float((posterior.draws(name) < 0.0).mean()) for name in local},
         "reason": posterior.reason,
-        "log_posterior_calls": posterior.log_posterior_calls,
-        "failures": posterior.failures,
-        "seconds": identified.seconds,
     }
 
 
@@ -229,7 +164,5 @@ def line(drive: str, found: Mapping[str, Any]) -> str:
     """Return the text to print."""
     sds = found["posterior"]
     common = ", ".join(f"{name} {sds[name]['mean']:.6g} ± {sds[name]['sd']:.1g}" for name in ("theta4", "theta6"))
-    drawn = found["reason"]
-    if found["converged"]:
-        drawn = "converged"
-    return f"  jointly, {drive} given: {common}; {found['log_posterior_calls']} log-posteriors, {drawn}"
+    end = "converged" if found["converged"] else found["reason"]
+    return f"jointly, {drive} given: {common}; {found['log_posterior_calls']} log-posteriors, {end}"

@@ -10,9 +10,10 @@ compression q [m] and velocity [m/s] if the force is given. Parameters are in th
 """
 
 from functools import cache
-from typing import Any, NamedTuple
+from types import SimpleNamespace
 
 import numpy as np
+from scipy.integrate import RK45
 
 import bayesperiodic as bp
 from studies.benchmark.equations import NUMBA, FirstOrder
@@ -21,19 +22,8 @@ from studies.gear import GEAR
 
 NAMES = tuple(GEAR)
 # Nodes, stage weights and the difference of the two results of Dormand and Prince.
-NODES = np.array([0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0])
-STAGES = np.array(
-    [
-        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0],
-        [3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0],
-        [44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0],
-        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0],
-        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0],
-        [35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
-    ]
-)
-DIFFERENCE = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
+NODES, DIFFERENCE = np.append(RK45.C, 1.0), RK45.E
+STAGES = np.vstack([np.pad(RK45.A, ((0, 0), (0, 1))), RK45.B])
 
 
 @compiled
@@ -98,7 +88,7 @@ def _controlled_steps(rates, size):
         """Integrate until steady, then through one more cycle for the states (samples, size).
 
         Return the number of cycles, 0 if it never becomes steady. `inputs` holds a cycle (points, signals), `scale`
-        (size,) what the errors are measured by.
+        (size,) the scales of the errors.
         """
         rate, trial, u = np.empty((7, size)), np.empty(size), np.empty(inputs.shape[1])
         samples, change, step, done = path.shape[0], 0.0, 1e-3, False
@@ -145,20 +135,15 @@ def _controlled_steps(rates, size):
     return integrate
 
 
-class Methods(NamedTuple):
-    """Compiled functions for one direction."""
-
-    fixed: Any
-    controlled: Any
-    outputs: Any  # (p, u, states, out)
-    rates_in_time: Any  # (t, y, p, u, period)
-
-
 @cache
-def methods(drive: str) -> Methods:
-    """Return the compiled functions for the displacement or the force given."""
+def methods(drive: str) -> SimpleNamespace:
+    """Return the compiled functions fixed, controlled, outputs and rates_in_time of one direction."""
     model = bp.models.landing_gear(drive)
     first, generic = FirstOrder(model, ()), integrators(model, NAMES[:1])
     rates = compiled(first.function(NUMBA, first.rates))
-    steps = _fixed_steps(rates, first.size), _controlled_steps(rates, first.size)
-    return Methods(*steps, generic.outputs, generic.rates_in_time)
+    return SimpleNamespace(
+        fixed=_fixed_steps(rates, first.size),
+        controlled=_controlled_steps(rates, first.size),
+        outputs=generic.outputs,
+        rates_in_time=generic.rates_in_time,
+    )

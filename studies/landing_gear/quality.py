@@ -1,10 +1,9 @@
 """Quality control as the paper proposes it: whether a new gear equals the reference, and which parameter differs.
 
-SYNTHETIC units under three experiments each. Good ones have the reference's parameters; faulty ones have too little
-gas, worn friction, or less oil, so that the gas fills a larger volume. A parameter is called "different" if it deviates
-from the reference by more than their combined standard deviations allow, at a false-alarm rate of 1 % per unit over all
-parameters. The reference is measured several times to reduce its own error. The area theta4 is machined and known; the
-gas's heat capacity theta15 is proportional to its amount, theta5/theta6.
+SYNTHETIC units under three experiments each, good or with too little gas, worn friction, or less oil. A parameter is
+called "different" if it deviates from the reference, which is measured several times, by more than their combined
+standard deviations allow, at a false-alarm rate of 1 % per unit over all parameters. The area theta4 is machined and
+known; the gas's heat capacity theta15 is proportional to its amount, theta5/theta6.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,8 +15,8 @@ from scipy.stats import binom, norm
 
 import bayesperiodic as bp
 from studies import common
-from studies.landing_gear.identification import DISPLACEMENT, fold
-from studies.landing_gear.rig import GEAR, RUNS, SAME, Changed, measure
+from studies.landing_gear.identification import DISPLACEMENT, estimate, fold
+from studies.landing_gear.rig import GEAR, RUNS, Changed, measure
 
 CAMPAIGN = ("0.2 Hz 80 mm", "1 Hz 36 mm", "4 Hz 8 mm")
 PRIORS = {
@@ -35,20 +34,14 @@ MEANINGS = {
 }  # fmt: skip
 GOOD = "good"
 LOST_GAS, WORN, LOST_OIL = 0.02, 0.2, 0.01
-FAULTS: dict[str, Changed] = {
-    GOOD: SAME,
-    "low gas charge": frozenset(
-        {"theta5": (1 - LOST_GAS) * GEAR["theta5"], "theta15": (1 - LOST_GAS) * GEAR["theta15"]}.items()
-    ),
-    "worn friction": frozenset({"theta8": (1 - WORN) * GEAR["theta8"]}.items()),
+CHANGES: dict[str, dict[str, float]] = {
+    GOOD: {},
+    "low gas charge": {name: (1 - LOST_GAS) * GEAR[name] for name in ("theta5", "theta15")},
+    "worn friction": {"theta8": (1 - WORN) * GEAR["theta8"]},
     # The same gas in a volume larger by the oil that left.
-    "leaking oil": frozenset(
-        {"theta5": GEAR["theta5"] / (1 + LOST_OIL), "theta6": GEAR["theta6"] / (1 + LOST_OIL)}.items()
-    ),
+    "leaking oil": {name: GEAR[name] / (1 + LOST_OIL) for name in ("theta5", "theta6")},
 }
-TOUCHED = {
-    GOOD: set[str](), "low gas charge": {"theta5"}, "worn friction": {"theta8"}, "leaking oil": {"theta5", "theta6"},
-}  # fmt: skip
+FAULTS: dict[str, Changed] = {kind: frozenset(changes.items()) for kind, changes in CHANGES.items()}
 FALSE_ALARM = 0.01
 LIMIT = float(norm.isf(0.5 * FALSE_ALARM / len(PRIORS)))
 POWER = 0.9
@@ -68,37 +61,21 @@ class Unit:
 
 
 def examine(kind: str, seed: int) -> Unit:
-    """Return the estimate of one unit of a kind."""
-    fit = bp.map_estimate(problem(kind, seed), progress=False)
+    """Return the estimate of one unit of a kind; seeds differ in the noise of the instruments."""
+    experiments = [fold(measure(run, (), seed, FAULTS[kind]), DISPLACEMENT) for run in RUNS if run.name in CAMPAIGN]
+    fit = estimate(experiments, DISPLACEMENT, one_conduction=True, priors=PRIORS, fixed=FIXED, tied=TIED).fit
     return Unit(kind, dict(fit.theta), dict(fit.sd), fit.converged)
 
 
-def problem(kind: str, seed: int) -> bp.Problem:
-    """Return the problem of one unit; seeds differ in the noise of the instruments."""
-    runs = [run for run in RUNS if run.name in CAMPAIGN]
-    return bp.Problem(
-        bp.models.landing_gear(DISPLACEMENT),
-        [fold(measure(run, (), seed, FAULTS[kind]), DISPLACEMENT) for run in runs],
-        priors=PRIORS,
-        fixed=FIXED,
-        tied=TIED,
-        noise=bp.noise.Independent(per="experiment"),
-    )
-
-
 def examine_all(references: int, each: int, seed: int) -> tuple[Unit, list[Unit]]:
-    """Return the reference, measured so many times, and so many units of each kind."""
+    """Return the reference, the mean of its measurements, and `each` units of each kind."""
     tasks = [(GOOD, REFERENCE_SEED * (seed + 1) + k) for k in range(references)]
     tasks += [(kind, FIRST_UNIT * (seed + 1) + k) for k, kind in enumerate(np.repeat(list(FAULTS), each).tolist())]
     found = list(common.each(examine, tasks, here=len(tasks) <= SERIALLY))
-    return _together(found[:references]), found[references:]
-
-
-def _together(units: Sequence[Unit]) -> Unit:
-    """Return the mean of repeated measurements of one gear."""
+    units = found[:references]
     theta = {name: float(np.mean([unit.theta[name] for unit in units])) for name in PRIORS}
-    sd = {name: float(np.sqrt(np.mean([unit.sd[name] ** 2 for unit in units]) / len(units))) for name in PRIORS}
-    return Unit(GOOD, theta, sd, all(unit.converged for unit in units))
+    sd = {name: float(np.sqrt(np.mean([unit.sd[name] ** 2 for unit in units]) / references)) for name in PRIORS}
+    return Unit(GOOD, theta, sd, all(unit.converged for unit in units)), found[references:]
 
 
 def deviations(reference: Unit, unit: Unit) -> dict[str, float]:
@@ -120,14 +97,13 @@ def account(reference: Unit, units: Sequence[Unit]) -> dict[str, Any]:
         },
         "kinds": {},
     }
-    for kind in FAULTS:
+    for kind in CHANGES:
         every = [deviations(reference, unit) for unit in units if unit.kind == kind]
         different = {name: sum(abs(z[name]) > LIMIT for z in every) for name in PRIORS}
-        touched = TOUCHED[kind]
         flagged = sum(any(abs(v) > LIMIT for v in z.values()) for z in every)
-        right = sum(all((abs(z[n]) > LIMIT) == (n in touched) for n in PRIORS) for z in every)
+        right = sum(all((abs(z[n]) > LIMIT) == (n in CHANGES[kind]) for n in PRIORS) for z in every)
         found["kinds"][kind] = {
-            "changed": {name: value / GEAR[name] - 1.0 for name, value in FAULTS[kind]},
+            "changed": {name: value / GEAR[name] - 1.0 for name, value in CHANGES[kind].items()},
             "units": len(every),
             "not_converged": sum(not unit.converged for unit in units if unit.kind == kind),
             "called_different": different,
@@ -146,11 +122,7 @@ def _rate(wrong: int, count: int) -> dict[str, Any]:
 
 
 def table(found: Mapping[str, Any]) -> str:
-    """Return the counts as lines to print."""
-    lines = [f"  quality control: units that differ by more than {found['limit']:.2f} standard deviations, in"]
-    names = "".join(f"{MEANINGS[name]:>17s}" for name in PRIORS)
-    lines.append(f"  {'kind of unit':16s}{'units':>6s}{'any':>5s}{names}")
-    for kind, one in found["kinds"].items():
-        counts = "".join(f"{count:17d}" for count in one["called_different"].values())
-        lines.append(f"  {kind:16s}{one['units']:6d}{one['units_with_any']:5d}{counts}")
-    return "\n".join(lines)
+    """Return the counts to print."""
+    title = f"quality control: units that differ by more than {found['limit']:.2f} standard deviations, by kind of unit"
+    different = [f"called_different.{name}" for name in PRIORS]
+    return common.shown(title, found["kinds"], ["units", "units_with_any", *different])

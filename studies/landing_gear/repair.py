@@ -8,15 +8,15 @@ scatter over experiments gives the standard error of the mean difference.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
 
 import bayesperiodic as bp
-from studies.common import each
-from studies.landing_gear.identification import DISPLACEMENT, FIXED, KEPT, PRIORS, TIED, fold
+from studies import common
+from studies.landing_gear import identification
+from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, fold
 from studies.landing_gear.rig import NOISE, RECORDED, RUNS, STRENGTHS, TRUTHS, damper, measure
 
 PAPER, BEST = "eq. (9)", "all four"
@@ -27,7 +27,7 @@ MODELS: dict[str, frozenset[str]] = {
     BEST: TRUTHS["B"],
 }
 QUICK_MODELS = (PAPER, "lost motion")
-# The static load is what the flexure is counted from, not a property of the gear.
+# The static load is the reference of the flexure, not a property of the gear.
 EFFECT_PRIORS = {
     "flexibility": bp.LogNormal(5e-8, 1.0),
     "delay": bp.Normal(0.0, 1e-3),
@@ -37,25 +37,18 @@ EFFECT_PRIORS = {
 KNOWN = {"static_load": STRENGTHS["flexure"]["static_load"]}
 FOLDS, QUICK_FOLDS = 4, 2
 SCHEME = "central4"
-CONDUCTION = "theta16"
 
 
-@dataclass(frozen=True)
-class Task:
-    """One fit.
-
-    `runs, held_out`: Names of experiments; without any held out, theta16 is each experiment's own.
-    """
+class Task(NamedTuple):
+    """One fit."""
 
     model: str
-    runs: tuple[str, ...]
-    held_out: tuple[str, ...]
-    truth: str
+    runs: tuple[str, ...]  # Names of experiments
+    held_out: tuple[str, ...]  # Without any, theta16 is local to each experiment
     seed: int
 
 
-@dataclass(frozen=True)
-class Fitted:
+class Fitted(NamedTuple):
     """Results of a fit."""
 
     task: Task
@@ -66,7 +59,7 @@ class Fitted:
     errors: dict[str, dict[str, float]]  # Root mean square prediction error, by experiment and channel
 
 
-def repair(names: Sequence[str], truth: str, seed: int, *, quick: bool) -> list[Fitted]:
+def repair(names: Sequence[str], seed: int, *, quick: bool) -> list[Fitted]:
     """Return the fits of all models without each fold of the experiments, and of the first and last with all."""
     folds = QUICK_FOLDS if quick else FOLDS
     models = QUICK_MODELS if quick else tuple(MODELS)
@@ -74,12 +67,12 @@ def repair(names: Sequence[str], truth: str, seed: int, *, quick: bool) -> list[
     for k in range(folds):
         held_out = tuple(names[k::folds])
         rest = tuple(name for name in names if name not in held_out)
-        tasks += [Task(model, rest, held_out, truth, seed) for model in models]
+        tasks += [Task(model, rest, held_out, seed) for model in models]
     if quick:
         return [fit(task) for task in tasks]
     # The longest first.
-    tasks = [Task(model, tuple(names), (), truth, seed) for model in (BEST, PAPER)] + tasks[::-1]
-    return list(each(fit, [(task,) for task in tasks]))
+    tasks = [Task(model, tuple(names), (), seed) for model in (BEST, PAPER)] + tasks[::-1]
+    return list(common.each(fit, [(task,) for task in tasks]))
 
 
 def fit(task: Task) -> Fitted:
@@ -94,15 +87,14 @@ def fit(task: Task) -> Fitted:
 def problem(task: Task, names: Sequence[str]) -> bp.Problem:
     """Return the problem of some experiments under a model."""
     model = damper(MODELS[task.model])
-    recordings = [measure(run, TRUTHS[task.truth], task.seed) for run in RUNS if run.name in names]
-    return bp.Problem(
-        model,
+    recordings = [measure(run, TRUTHS["B"], task.seed) for run in RUNS if run.name in names]
+    return identification.problem(
         [fold(recording, DISPLACEMENT) for recording in recordings],
-        priors=PRIORS | {name: prior for name, prior in EFFECT_PRIORS.items() if name in model.parameters},
-        fixed=FIXED | {name: value for name, value in KNOWN.items() if name in model.parameters},
-        tied=TIED,
-        local=[] if task.held_out else [CONDUCTION],
-        noise=bp.noise.Independent(per="experiment"),
+        DISPLACEMENT,
+        one_conduction=bool(task.held_out),
+        model=model,
+        priors=identification.PRIORS | {n: prior for n, prior in EFFECT_PRIORS.items() if n in model.parameters},
+        fixed=identification.FIXED | {name: value for name, value in KNOWN.items() if name in model.parameters},
         scheme=SCHEME,
     )
 
@@ -124,15 +116,16 @@ def score(one: bp.Problem, theta: Mapping[str, float]) -> tuple[float, dict[str,
 
 def account(fits: Sequence[Fitted]) -> dict[str, Any]:
     """Return the entries of results.json: scores by model, differences from eq. (9), theta16 with all experiments."""
-    kept = {channel: 2 * KEPT[DISPLACEMENT][channel] + 1 for channel in ("force", "pressure")}
-    noise = {channel: NOISE[channel] * float(np.sqrt(count / RECORDED)) for channel, count in kept.items()}
+    noise = {
+        c: NOISE[c] * float(np.sqrt((2 * identification.KEPT[DISPLACEMENT][c] + 1) / RECORDED))
+        for c in ("force", "pressure")
+    }
     found: dict[str, Any] = {"noise_of_the_mean": noise, "models": {}, "theta16": {}}
-    of_paper = _scores(fits, PAPER)
-    done = {one.task.model for one in fits}
-    for model in (name for name in MODELS if name in done):
-        held_out = [one for one in fits if one.task.model == model and one.task.held_out]
-        scores = _scores(fits, model)
-        gain = np.array([scores[name] - of_paper[name] for name in of_paper])
+    by_model = {model: [one for one in fits if one.task.model == model] for model in MODELS}
+    every = {m: {name: v for one in own for name, v in one.scores.items()} for m, own in by_model.items() if own}
+    for model, scores in every.items():
+        held_out = [one for one in by_model[model] if one.task.held_out]
+        gain = np.array([scores[name] - value for name, value in every[PAPER].items()])
         errors = {name: by_channel for one in held_out for name, by_channel in one.errors.items()}
         found["models"][model] = {
             "effects": sorted(MODELS[model]),
@@ -141,15 +134,11 @@ def account(fits: Sequence[Fitted]) -> dict[str, Any]:
             "gain_over_eq_9": [float(gain.mean()), float(gain.std(ddof=1) / np.sqrt(gain.size))],
             "errors_held_out": errors,
             "experiments_predicted_better": int(np.sum(gain > 0.0)),
-            "rms_error": {
-                channel: float(np.sqrt(np.mean([e[channel] ** 2 for e in errors.values()])))
-                for channel in next(iter(errors.values()))
-            },
+            "rms_error": {c: float(np.sqrt(np.mean([e[c] ** 2 for e in errors.values()]))) for c in noise},
         }
-    for one in sorted(fits, key=lambda one: list(MODELS).index(one.task.model)):
-        if not one.task.held_out:
+        for one in (one for one in by_model[model] if not one.task.held_out):
             names = [name for name in one.theta if name.startswith(CONDUCTION)]
-            found["theta16"][one.task.model] = {
+            found["theta16"][model] = {
                 "status": one.status,
                 "estimates": {name: [one.theta[name], one.sd[name]] for name in names},
                 "p_negative_laplace": {name: float(ndtr(-one.theta[name] / one.sd[name])) for name in names},
@@ -158,23 +147,16 @@ def account(fits: Sequence[Fitted]) -> dict[str, Any]:
     return found
 
 
-def _scores(fits: Sequence[Fitted], model: str) -> dict[str, float]:
-    return {name: value for one in fits if one.task.model == model for name, value in one.scores.items()}
-
-
 def table(found: Mapping[str, Any]) -> str:
-    """Return the comparison as lines to print."""
-    lines = [f"  {'model':16s}gain over eq. (9) an experiment   better in   rms error held out: force, pressure"]
+    """Return the comparison to print."""
+    rows = {}
     for model, one in found["models"].items():
         gain, error = one["gain_over_eq_9"]
-        rms = one["rms_error"]
-        lines.append(
-            f"  {model:16s}{gain:17.1f} ± {error:<10.1f}{one['experiments_predicted_better']:11d}"
-            f"{rms['force']:25.1f} N {1e-3 * rms['pressure']:8.2f} kPa"
-        )
+        rows[model] = one["rms_error"] | {
+            "gain": gain, "its error": error, "better in": one["experiments_predicted_better"]
+        }  # fmt: skip
+    lines = [common.shown("rms error held out, mean gain over eq. (9) of the score of an experiment", rows)]
     for model, one in found["theta16"].items():
-        negative = sum(p > 0.99 for p in one["p_negative_laplace"].values())
-        lines.append(
-            f"  {model}: theta16 negative with P > 99 % in {negative} of {len(one['p_negative_laplace'])} experiments"
-        )
+        chances = one["p_negative_laplace"].values()
+        lines.append(f"  {model}: theta16 negative with P > 99 % in {sum(p > 0.99 for p in chances)} of {len(chances)}")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""The rig of the landing gear study: fourteen experiments with an imposed displacement, and what is recorded.
+"""The rig of the landing gear study: two dampers, fourteen experiments with an imposed displacement, recordings.
 
 Everything is SYNTHETIC. A servo-hydraulic actuator moves the axle about a mean compression of 0.12 m. Its oil supply
 limits the speed to 0.25 m/s (2.9 kW at the largest force), 2π · frequency · half stroke, so that large strokes are slow
@@ -6,21 +6,18 @@ and fast ones small. The motion is a sine with the harmonics of a servo valve, 0
 are displacement, force on the axle and gas pressure over 40 cycles at 353.275 samples per cycle, with independent
 normal noise: of full scale (0.2 m, 20 kN, 2.5 MPa) 0.02 % for the displacement, 0.3 % for force and pressure.
 
-The two dampers behind the synthetic measurements of the landing gear study: eq. (9), and one with more physics.
-
 Truth A is eq. (9) of de Kraker, Verbeek & van de Wouw (1997). Truth B adds effects that it lacks, one switch each:
 
 flexure
-    The displacement is measured at the actuator, and rod, fork and frame between it and the strut give way by
-    `flexibility` times the force, counted from the static load. Friction turns its sign with the motion, so that the
-    gas follows the measured displacement with a lost motion of about flexibility · 450 N, whatever the stroke. The
-    pressure lags the measured displacement, the opposite of what heat conduction does, and the more so the smaller the
-    stroke. (Internal friction of struts: Milwitzky & Cook, Analysis of landing-gear behavior, NACA Report 1154, 1953.)
+    The displacement is measured at the actuator, and rod, fork and frame between it and the strut deform by
+    `flexibility` times the force less the static load. Friction changes sign with the motion, so that the gas follows
+    the measured displacement with a lost motion of about flexibility · 450 N. The pressure lags, the opposite of the
+    effect of heat conduction, and the more so the smaller the stroke. (Internal friction of struts: Milwitzky & Cook,
+    Analysis of landing-gear behavior, NACA Report 1154, 1953.)
 line
-    The pressure reaches its transducer through a narrow line, a `delay` later; taken to first order, p − delay · ṗ,
-    whose error is below 1e-5 of the pressure at 6 Hz. The same at every stroke, it grows with the frequency. (Bergh &
-    Tijdeman, Theoretical and experimental results for the dynamic response of pressure measuring systems, NLR-TR F.238,
-    1965.)
+    The pressure reaches its transducer through a narrow line, a `delay` later; to first order p − delay · ṗ, whose
+    error is below 1e-5 of the pressure at 6 Hz. Equal at all strokes, it grows with the frequency. (Bergh & Tijdeman,
+    Theoretical and experimental results for the dynamic response of pressure measuring systems, NLR-TR F.238, 1965.)
 convection
     The wall takes more heat from moving gas: theta16 is multiplied by 1 + |q̇|/`convection_speed`. (Newton's law with a
     constant coefficient fails in a periodically compressed gas: Hartig, Depp, Rexer & Pelz, arXiv:2012.06526, 2020.)
@@ -32,7 +29,7 @@ import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import sympy as sp
@@ -47,14 +44,43 @@ STRENGTHS = {
     "friction_heat": {"heat_share": 0.02},
 }
 TRUTHS = {"A": frozenset[str](), "B": frozenset(STRENGTHS)}
-
-_UNITS = {"flexibility": "m/N", "static_load": "N", "delay": "s", "convection_speed": "m/s", "heat_share": "1"}
-_UNITS |= {name: unit for name, unit in bp.models.landing_gear("force").units.items() if name not in _UNITS}
+UNITS = bp.models.landing_gear("force").units | {
+    "flexibility": "m/N", "static_load": "N", "delay": "s", "convection_speed": "m/s", "heat_share": "1",
+    "temperature": "K", "compression": "m",
+}  # fmt: skip
 
 
 def parameters(effects: Iterable[str]) -> dict[str, float]:
     """Return every parameter of the damper with these effects."""
     return GEAR | {name: value for effect in sorted(effects) for name, value in STRENGTHS[effect].items()}
+
+
+class Strut(NamedTuple):
+    """Eq. (9) at a compression, in the symbols of a model: velocity, gas pressure, friction and axial force."""
+
+    q: sp.Expr
+    v: sp.Expr
+    pressure: sp.Expr
+    friction: sp.Expr
+    force: sp.Expr
+
+
+def strut(p: Any, q: Any, v: Any, acceleration: Any, temperature: Any) -> Strut:
+    """Return pressure, friction and force for a motion of the strut."""
+    pressure = p.theta5 * temperature / (1 + p.theta6 * q + p.theta7 * temperature)
+    friction = (p.theta8 + p.theta9 * pressure) * sp.atan(p.theta10 * v)
+    oil = p.theta3 * v * abs(v)
+    inertia = p.theta1 * (acceleration + p.theta2)
+    return Strut(q, v, pressure, friction, inertia + oil + p.theta4 * pressure + friction + p.theta11)
+
+
+def heat_balance(effects: frozenset[str], s: Any, p: Any, at: Strut) -> sp.Expr:
+    """Return the energy balance of the gas."""
+    conduction = p.theta16 * (1 + p.theta6 * at.q) * (s.T + p.theta17)
+    if "convection" in effects:
+        conduction *= 1 + abs(at.v) / p.convection_speed
+    heat = p.theta15 * s.dT + conduction - (p.theta4 * at.pressure + p.theta11) * at.v
+    return heat - p.heat_share * at.friction * at.v if "friction_heat" in effects else heat
 
 
 @cache
@@ -64,50 +90,38 @@ def damper(effects: frozenset[str]) -> bp.Model:
     States are the gas temperature T [K] and, with "flexure", the compression q [m]; outputs force, pressure and, unseen
     by any instrument, temperature and compression.
     """
-    flexure, names = "flexure" in effects, parameters(effects)
+    flexure = "flexure" in effects
+
+    def at(s: Any, p: Any, u: Any) -> Strut:
+        given = u.displacement - p.theta12, u.ddisplacement, u.dddisplacement
+        return strut(p, *((s.q, s.dq, s.ddq) if flexure else given), s.T)
 
     def equations(s: Any, p: Any, u: Any) -> list[sp.Expr]:
-        at = _At(effects, s, p, u)
-        conduction = p.theta16 * (1 + p.theta6 * at.q) * (s.T + p.theta17)
-        if "convection" in effects:
-            conduction *= 1 + abs(at.v) / p.convection_speed
-        heat = p.theta15 * s.dT + conduction - (p.theta4 * at.pressure + p.theta11) * at.v
-        if "friction_heat" in effects:
-            heat -= p.heat_share * at.friction * at.v
+        here = at(s, p, u)
+        heat = heat_balance(effects, s, p, here)
         if not flexure:
             return [heat]
-        return [u.displacement - p.theta12 - at.q - p.flexibility * (at.force - p.static_load), heat]
+        return [u.displacement - p.theta12 - here.q - p.flexibility * (here.force - p.static_load), heat]
 
     def outputs(s: Any, p: Any, u: Any) -> dict[str, sp.Expr]:
-        at = _At(effects, s, p, u)
-        rate = at.pressure.diff(s.T) * s.dT + at.pressure.diff(s.q if flexure else u.displacement) * at.v
-        measured = at.pressure - p.delay * rate if "line" in effects else at.pressure
-        return {"force": at.force, "pressure": measured, "temperature": s.T, "compression": at.q}
+        here = at(s, p, u)
+        rate = here.pressure.diff(s.T) * s.dT + here.pressure.diff(s.q if flexure else u.displacement) * here.v
+        measured = here.pressure - p.delay * rate if "line" in effects else here.pressure
+        return {"force": here.force, "pressure": measured, "temperature": s.T, "compression": here.q}
 
-    states, channels = [*(["q"] if flexure else []), "T"], ("displacement", "force", "pressure")
+    states = ("q", "T") if flexure else ("T",)
     return bp.Model(
         "_".join(["landing_gear_truth", *sorted(effects)]),
         states=states,
         inputs=["displacement"],
-        parameters={name: _UNITS[name] for name in names},
-        units={name: _UNITS[name] for name in (*states, *channels)} | {"temperature": "K", "compression": "m"},
+        parameters={name: UNITS[name] for name in parameters(effects)},
+        units={
+            name: UNITS[name] for name in (*states, "displacement", "force", "pressure", "temperature", "compression")
+        },
         equations=equations,
         outputs=outputs,
-        description="A landing gear damper with effects that eq. (9) lacks, see `studies.landing_gear.truth`.",
+        description="A landing gear damper with effects that eq. (9) lacks, see `studies.landing_gear.rig`.",
     )
-
-
-class _At:
-    """Motion, gas pressure, friction and force of eq. (9) in the symbols of a model."""
-
-    def __init__(self, effects: frozenset[str], s: Any, p: Any, u: Any):
-        given = u.displacement - p.theta12, u.ddisplacement, u.dddisplacement
-        self.q, self.v, acceleration = (s.q, s.dq, s.ddq) if "flexure" in effects else given
-        self.pressure = p.theta5 * s.T / (1 + p.theta6 * self.q + p.theta7 * s.T)
-        self.friction = (p.theta8 + p.theta9 * self.pressure) * sp.atan(p.theta10 * self.v)
-        oil = p.theta3 * self.v * abs(self.v)
-        inertia = p.theta1 * (acceleration + p.theta2)
-        self.force = inertia + oil + p.theta4 * self.pressure + self.friction + p.theta11
 
 
 MEAN_COMPRESSION = 0.12
@@ -127,14 +141,14 @@ SAME: Changed = frozenset()
 
 @dataclass(frozen=True)
 class Run:
-    """One experiment of the rig."""
+    """One experiment of the rig: frequency [Hz] and half stroke, the displacement's amplitude [m]."""
 
-    frequency: float  # [Hz]
-    stroke: float  # Half of it, the displacement's amplitude [m]
+    frequency: float
+    stroke: float
 
     @property
     def name(self) -> str:
-        """What it is called in tables, figures and parameters."""
+        """Name in tables, figures and parameters."""
         return f"{self.frequency:g} Hz {1e3 * self.stroke:g} mm"
 
     @property
@@ -152,19 +166,20 @@ RUNS = tuple(
 )  # fmt: skip
 
 
+def imposed(run: Run, samples: int) -> np.ndarray:
+    """Return the displacement [m] over a cycle."""
+    phase = 2j * np.pi * np.arange(samples)[:, None] / samples * list(HARMONICS)
+    return MEAN_COMPRESSION + run.stroke * (np.exp(phase) @ list(HARMONICS.values())).real
+
+
 def measure(run: Run, effects: Iterable[str], seed: int, changed: Changed = SAME) -> bp.Recording:
-    """Return what the instruments record in one experiment, of a gear with some parameters changed."""
+    """Return the recording of one experiment with noise, of a gear with some parameters changed."""
     clean = steady(run, frozenset(effects), changed)
     generator = np.random.default_rng([zlib.crc32(run.name.encode()), seed])
     signals = {**clean.inputs, **clean.outputs}
     noisy = {name: signals[name] + NOISE[name] * generator.standard_normal(RECORDED) for name in NOISE}
-    return bp.Recording(
-        clean.time,
-        {name: noisy[name] for name in ("force", "pressure")},
-        {"displacement": noisy["displacement"]},
-        name=run.name,
-        synthetic=True,
-    )
+    given = {"displacement": noisy.pop("displacement")}
+    return bp.Recording(clean.time, noisy, given, name=run.name, synthetic=True)
 
 
 @cache
@@ -176,13 +191,9 @@ def steady(run: Run, effects: frozenset[str], changed: Changed = SAME) -> bp.Rec
     """
     cycle = integrate_steady(run, effects, RECORDED, changed)
     phase = np.arange(RECORDED) * CYCLES % RECORDED
-    return bp.Recording(
-        np.arange(RECORDED) * CYCLES / (RECORDED * run.frequency),
-        {name: values[phase] for name, values in cycle.outputs.items()},
-        {name: values[phase] for name, values in cycle.inputs.items()},
-        name=run.name,
-        synthetic=True,
-    )
+    time = np.arange(RECORDED) * CYCLES / (RECORDED * run.frequency)
+    outputs, inputs = ({n: v[phase] for n, v in signals.items()} for signals in (cycle.outputs, cycle.inputs))
+    return bp.Recording(time, outputs, inputs, name=run.name, synthetic=True)
 
 
 def integrate_steady(run: Run, effects: frozenset[str], samples: int, changed: Changed = SAME) -> bp.Recording:
@@ -195,9 +206,16 @@ def integrate_steady(run: Run, effects: frozenset[str], samples: int, changed: C
     start = {"T": -values["theta17"]}
     if "flexure" in effects:
         start["q"] = MEAN_COMPRESSION + run.stroke
+
+    def integrate(cycles: int, samples: int) -> bp.Recording:
+        return bp.simulate(
+            damper(effects), values, {"displacement": imposed(run, 16)}, frequency=run.frequency,
+            duration=(cycles + 0.5 / samples) / run.frequency, sampling_rate=samples * run.frequency, start=start,
+        )  # fmt: skip
+
     stretch = int(np.ceil(STRETCH * run.frequency))
     for _ in range(ROUNDS):
-        found = _integrate(run, effects, values, start, 3 * stretch, 1).outputs
+        found = integrate(3 * stretch, 1).outputs
         first, second, third = found["temperature"][stretch::stretch]
         bend = first - 2 * second + third
         limit = third - (third - second) ** 2 / bend if bend else third
@@ -206,24 +224,7 @@ def integrate_steady(run: Run, effects: frozenset[str], samples: int, changed: C
         if "flexure" in effects:
             start["q"] = found["compression"][-1]
         if settled:
-            # What is wrong with the starting speed dies out within milliseconds.
-            two = _integrate(run, effects, values, start, 2, samples)
+            # The error of the starting speed decays within milliseconds.
+            two = integrate(2, samples)
             return two.between(two.time[samples], two.time[2 * samples - 1])
     raise RuntimeError(f"{run.name}: the gas temperature has not settled.")
-
-
-def _integrate(
-    run: Run, effects: frozenset[str], values: dict[str, float], start: dict[str, float], cycles: int, samples: int
-) -> bp.Recording:
-    """Return so many cycles with so many samples each."""
-    phase = 2j * np.pi * np.arange(16)[:, None] / 16 * list(HARMONICS)
-    shape = (np.exp(phase) @ list(HARMONICS.values())).real
-    return bp.simulate(
-        damper(effects),
-        values,
-        {"displacement": MEAN_COMPRESSION + run.stroke * shape},
-        frequency=run.frequency,
-        duration=(cycles + 0.5 / samples) / run.frequency,
-        sampling_rate=samples * run.frequency,
-        start=start,
-    )

@@ -7,21 +7,18 @@ eq. (9) lacks (truth B). The study examines whether a negative theta16 is due to
 
 import argparse
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import bayesperiodic as bp
 from studies import common
 from studies.landing_gear import campaigns, cost, drop, force, identification, quality, repair, rig
 from studies.landing_gear import figures as landing_gear_figures
-from studies.landing_gear import results as landing_gear_results
-from studies.landing_gear import verdicts as landing_gear_verdicts
-from studies.landing_gear.identification import DISPLACEMENT, FORCE, PRIORS, Identified, draw, estimate, fold
-from studies.landing_gear.results import OfTruth
-from studies.landing_gear.rig import RUNS, TRUTHS, Run, measure
-from studies.landing_gear.verdicts import Verdict, judge
+from studies.landing_gear.drop import Dropped
+from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, FORCE, PRIORS, Identified, Verdict
+from studies.landing_gear.rig import FULL_SCALE, GEAR, NOISE_SHARE, RUNS, SPEED_LIMIT, STRENGTHS, TRUTHS, Run, measure
 
 # Folder for the results of each truth until the study ends.
 PARTS = "parts"
@@ -30,16 +27,34 @@ QUICK = tuple(run for run in RUNS if run.name in (FIGURE_1, SMALL))
 DROPS, QUICK_DROPS = 200, 20
 # Measurements of the reference, units of each kind.
 UNITS, QUICK_UNITS = (10, 60), (1, 1)
+LARGE_STROKE, TOLERANCE = 0.06, 0.25
+
+
+@dataclass(frozen=True)
+class OfTruth:
+    """Results of one truth."""
+
+    recordings: dict[str, bp.Recording]  # By experiment
+    verdicts: dict[str, Verdict]  # The displacement given
+    joint: dict[str, Identified]  # All experiments, theta4 and theta6 in common, by the given signal
+    sensitivity: dict[str, dict[str, Any]]  # The other parameters under priors, by experiment
+    forced: dict[str, Verdict]  # The force given, with its noise propagated
+    dropped: Dropped
 
 
 def run(options: argparse.Namespace) -> None:
     """Run the study, or with ``--replicates`` campaigns of truth A alone."""
     if options.replicates < 0:
         raise ValueError(f"--replicates: must be at least 0, got {options.replicates}.")
-    if options.replicates:
-        _campaigns(options)
-        return
     watch, runs = common.Stopwatch(), QUICK if options.quick else RUNS
+    if options.replicates:
+        with watch.part("campaigns", f"{options.replicates} SYNTHETIC campaigns of truth A"):
+            lines = campaigns.campaigns(options.out / "campaigns", options.replicates, options.seed)
+        found = campaigns.account(lines)
+        print(campaigns.table(found))
+        found |= {"synthetic": True, "seed": options.seed}
+        common.finish(options.out / "campaigns", found, watch, synthetic=True)
+        return
     truths = [options.truth] if options.truth else list(TRUTHS)
     print("All data are SYNTHETIC: a simulated rig, see studies/landing_gear/rig.py.")
     every: dict[str, OfTruth] = {}
@@ -48,26 +63,34 @@ def run(options: argparse.Namespace) -> None:
         path, source = options.out / PARTS / f"{truth}.pkl", _source(options, truth)
         every[truth], seconds = common.remembered(path, source, partial(_of_truth, truth, runs, options))
         watch.seconds |= seconds
-        results[truth] = landing_gear_results.collect(runs, every[truth])
-        print(landing_gear_results.account(truth, results[truth]))
+        results[truth] = _collect(runs, every[truth])
+        print(_account(truth, results[truth]))
     if "A" in every:
-        results["cost"] = _cost(every["A"].joint, options, watch)
+        with watch.part("cost", "time of a log-posterior of truth A, against time integration until steady"):
+            joint = every["A"].joint.items()
+            results["cost"] = {d: cost.measure(d, one, options.seed, quick=options.quick) for d, one in joint}
+        print("\n".join(cost.table(drive, one) for drive, one in results["cost"].items()))
     drawn = _of_all(runs, truths, options, watch, results)
     with watch.part("figures", "drawing"):
-        paths = common.save_figures(options.out, drawn | figures(runs, every, options.quick))
-    results |= {"rig": landing_gear_results.rig()}
-    results |= {"study": {"synthetic": True, "seed": options.seed, "quick": options.quick}}
-    results |= {"seconds": watch.total(), "versions": common.versions()}
-    path = common.write_results(options.out, results)
+        paths = common.save_figures(options.out, drawn | _figures(runs, every, options.quick))
+    results["rig"] = {
+        "experiments": {r.name: {"frequency": r.frequency, "half_stroke": r.stroke, "speed": r.speed} for r in RUNS},
+        "speed_limit": SPEED_LIMIT,
+        "full_scale": FULL_SCALE,
+        "noise_share_of_full_scale": NOISE_SHARE,
+        "truth": GEAR,
+        "effects_of_truth_B": STRENGTHS,
+        "priors": {name: repr(prior) for name, prior in PRIORS.items()},
+    }
+    results["study"] = {"synthetic": True, "seed": options.seed, "quick": options.quick}
+    common.finish(options.out, results, watch, paths, synthetic=True)
     shutil.rmtree(options.out / PARTS, ignore_errors=True)
-    print(f"figures (synthetic data): {', '.join(map(str, paths))}\nresults: {path}")
 
 
 def _source(options: argparse.Namespace, truth: str) -> str:
-    """Return a key that identifies version and settings of kept posteriors."""
-    modules = drop, force, identification, landing_gear_results, rig, landing_gear_verdicts
-    files = [common.sha256(Path(str(module.__file__))) for module in modules]
-    return " ".join([common.versions()["bayesperiodic"], truth, str(options.seed), str(options.quick), *files])
+    """Return a key that identifies version and settings of stored results."""
+    key = common.source_key(*(module.__file__ for module in (drop, force, identification, rig)), __file__)
+    return f"{key} {truth} {options.seed} {options.quick}"
 
 
 def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace) -> tuple[OfTruth, dict[str, float]]:
@@ -76,28 +99,34 @@ def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace) -> t
     with watch.part(f"rig {truth}", f"truth {truth}: simulating and recording {len(runs)} experiments"):
         recordings = {r.name: measure(r, TRUTHS[truth], seed) for r in runs}
     with watch.part(f"posteriors {truth}", f"truth {truth}: displacement given, one posterior an experiment"):
-        verdicts = _with_displacement_given(recordings, seed, quick)
+        verdicts = _judged(identification.judge_recording, recordings, options)
     with watch.part(f"joint {truth}", f"truth {truth}: all experiments at once, theta4 and theta6 in common"):
-        joint = {DISPLACEMENT: force.given_displacement(recordings.values(), seed, quick=quick)}
+        joint = {DISPLACEMENT: identification.jointly(recordings.values(), seed, quick=quick)}
     with watch.part(f"sensitivity {truth}", f"truth {truth}: the other parameters under priors"):
-        varied = [r for r in runs if r.name == SMALL] if quick else runs
-        sensitivity = landing_gear_verdicts.examine_all(varied, truth, seed, quick=quick)
+        tasks = [(r, truth, seed, quick) for r in runs if r.name == SMALL or not quick]
+        free = common.each(identification.with_others_free, tasks, here=quick)
+        sensitivity = dict(zip([task[0].name for task in tasks], free, strict=True))
     with watch.part(f"force {truth}", f"truth {truth}: force given, one posterior an experiment"):
         given = {name: recording for name, recording in recordings.items() if name == SMALL or not quick}
-        exact, forced = _with_force_given(given, seed, quick)
+        forced = _judged(force.judge, given, options)
     with watch.part(f"force joint {truth}", f"truth {truth}: force given, all experiments at once"):
         together = force.given_force(forced, seed, quick=quick)
         joint |= {FORCE: together} if together else {}
     with watch.part(f"drop {truth}", f"truth {truth}: the drop test, predicted from all experiments"):
-        gear = drop.identify(recordings.values(), seed, quick=quick)
+        gear = identification.jointly(recordings.values(), seed, quick=quick, one_conduction=True)
         dropped = drop.predict(gear, TRUTHS[truth], QUICK_DROPS if quick else DROPS)
-    return OfTruth(recordings, verdicts, joint, sensitivity, exact, forced, dropped), watch.seconds
+    return OfTruth(recordings, verdicts, joint, sensitivity, forced, dropped), watch.seconds
 
 
-def _cost(joint: Mapping[str, Identified], options: argparse.Namespace, watch: common.Stopwatch) -> dict[str, Any]:
-    with watch.part("cost", "what a log-posterior of truth A costs, against time integration until steady"):
-        found = {drive: cost.measure(drive, one, options.seed, quick=options.quick) for drive, one in joint.items()}
-    print("\n".join(cost.table(drive, one) for drive, one in found.items()))
+def _judged(
+    work: Callable[..., Verdict], recordings: Mapping[str, bp.Recording], options: argparse.Namespace
+) -> dict[str, Verdict]:
+    """Return the verdict on every experiment, and print each as it comes."""
+    found = {}
+    tasks = [(recording, options.seed, options.quick) for recording in recordings.values()]
+    for name, verdict in zip(recordings, common.each(work, tasks, here=options.quick), strict=True):
+        found[name] = verdict
+        print(identification.line(name, verdict), flush=True)
     return found
 
 
@@ -111,8 +140,8 @@ def _of_all(
     """Run the parts common to all truths, add their results, and return the figures by name."""
     drawn: dict[str, Any] = {}
     if "B" in truths:
-        with watch.part("repair", "truth B: better models, compared by what they predict of experiments held out"):
-            fits = repair.repair([r.name for r in runs], "B", options.seed, quick=options.quick)
+        with watch.part("repair", "truth B: better models, compared by their predictions of held-out experiments"):
+            fits = repair.repair([r.name for r in runs], options.seed, quick=options.quick)
         results["repair"] = repair.account(fits)
         print(repair.table(results["repair"]))
         drawn["repair"] = landing_gear_figures.repaired(results["repair"])
@@ -127,62 +156,80 @@ def _of_all(
     return drawn
 
 
-def _campaigns(options: argparse.Namespace) -> None:
-    watch, folder = common.Stopwatch(), options.out / "campaigns"
-    with watch.part("campaigns", f"{options.replicates} SYNTHETIC campaigns of truth A"):
-        lines = campaigns.campaigns(folder, options.replicates, options.seed)
-    found = campaigns.account(lines)
-    print(campaigns.table(found))
-    found |= {"synthetic": True, "seed": options.seed, "seconds": watch.total(), "versions": common.versions()}
-    print(f"results: {common.write_results(folder, found)}")
-
-
-def _with_displacement_given(recordings: Mapping[str, bp.Recording], seed: int, quick: bool) -> dict[str, Verdict]:
-    verdicts = {}
-    tasks = [(recording, seed, quick) for recording in recordings.values()]
-    for name, verdict in zip(recordings, common.each(_verdict, tasks, here=quick), strict=True):
-        verdicts[name] = verdict
-        print(landing_gear_verdicts.line(name, verdict), flush=True)
-    return verdicts
-
-
-def _verdict(recording: bp.Recording, seed: int, quick: bool) -> Verdict:
-    return judge(draw(estimate([fold(recording, DISPLACEMENT)], DISPLACEMENT), seed, quick=quick))
-
-
-def _with_force_given(
-    recordings: Mapping[str, bp.Recording], seed: int, quick: bool
-) -> tuple[dict[str, Identified], dict[str, Verdict]]:
-    exact, verdicts = {}, {}
-    tasks = [(recording, seed, quick) for recording in recordings.values()]
-    for name, found in zip(recordings, common.each(force.judge, tasks, here=quick), strict=True):
-        exact[name], verdicts[name] = found
-        print(landing_gear_verdicts.line(name, verdicts[name]), flush=True)
-    return exact, verdicts
-
-
-def figures(runs: Sequence[Run], every: Mapping[str, OfTruth], quick: bool) -> dict[str, Any]:
-    """Return the figures of all truths by name."""
-    shown = {truth: found.recordings[FIGURE_1] for truth, found in every.items()}
+def _figures(runs: Sequence[Run], every: Mapping[str, OfTruth], quick: bool) -> dict[str, Any]:
     verdicts = {truth: found.verdicts for truth, found in every.items()}
     forced = {truth: found.forced for truth, found in every.items()}
+    with_force = [run for run in runs if run.name in next(iter(forced.values()))]
     drawn = {
-        "histories": landing_gear_figures.histories(shown, {t: verdicts[t][FIGURE_1].identified for t in shown}),
+        "histories": landing_gear_figures.histories({
+            truth: (found.recordings[FIGURE_1], found.verdicts[FIGURE_1].identified) for truth, found in every.items()
+        }),
         "theta16": landing_gear_figures.conductions(runs, verdicts, DISPLACEMENT),
-        "theta16_force": landing_gear_figures.conductions(
-            [run for run in runs if run.name in next(iter(forced.values()))], forced, FORCE
-        ),
+        "theta16_force": landing_gear_figures.conductions(with_force, forced, FORCE),
         "drop": landing_gear_figures.drops({truth: found.dropped for truth, found in every.items()}),
-    }
+    }  # fmt: skip
     chosen = {"large": FIGURE_1 if quick else LARGE, "small": SMALL}
     drawn["loops"] = landing_gear_figures.loops(
         {truth: [by_run[name].identified for name in chosen.values()] for truth, by_run in verdicts.items()}
     )
     for stroke, name in chosen.items():
-        for truth in verdicts:
-            identified = verdicts[truth][name].identified
-            assert identified.posterior is not None
-            drawn[f"corner_{stroke}_{truth}"] = bp.plot.corner(
-                identified.posterior, laplace=identified.fit, names=list(PRIORS)
-            )
+        for truth, by_run in verdicts.items():
+            one = by_run[name].identified
+            corner = bp.plot.corner(one.posterior, laplace=one.fit, names=list(PRIORS))
+            drawn[f"corner_{stroke}_{truth}"] = corner
     return drawn
+
+
+def _collect(runs: Sequence[Run], found: OfTruth) -> dict[str, Any]:
+    theta16 = {name: v.identified.fit.theta[CONDUCTION] for name, v in found.verdicts.items()}
+    chances = {name: v.p_negative[0] for name, v in found.verdicts.items()}
+    pairs = [(a.name, b.name) for a in runs for b in runs if a.frequency == b.frequency and a.stroke > b.stroke]
+    exact = {name: identification.laplace(verdict.exact) for name, verdict in found.forced.items()}
+    return _posteriors(found.verdicts) | {
+        "joint": {drive: force.account(joint) for drive, joint in found.joint.items()},
+        "others_under_priors": found.sensitivity,
+        "force_given": _posteriors(found.forced) | {"force_taken_for_exact": exact},
+        "drop": drop.account(found.dropped),
+        "surely_negative": [name for name, chance in chances.items() if chance > 0.99],
+        "large_strokes_within_a_quarter": all(
+            abs(theta16[r.name] / GEAR[CONDUCTION] - 1.0) < TOLERANCE for r in runs if r.stroke >= LARGE_STROKE
+        ),
+        # Experiments at one frequency whose theta16 differ in sign.
+        "opposite_pairs": [
+            {"pair": list(pair), "theta16": [theta16[n] for n in pair], "p_negative": [chances[n] for n in pair]}
+            for pair in pairs
+            if theta16[pair[0]] * theta16[pair[1]] < 0.0
+        ],
+    }
+
+
+def _posteriors(verdicts: Mapping[str, Verdict]) -> dict[str, Any]:
+    posteriors = [v.identified.posterior for v in verdicts.values()]
+    return {
+        "experiments": {name: identification.account(v) for name, v in verdicts.items()},
+        "signs": {s: [n for n, v in verdicts.items() if v.sign == s] for s in identification.SIGNS},
+        "misspecified": [name for name, v in verdicts.items() if v.misspecified],
+        "posteriors_converged": sum(posterior.converged for posterior in posteriors),
+        "seconds": sum(v.identified.seconds for v in verdicts.values()),
+        "log_posterior_calls": sum(posterior.log_posterior_calls for posterior in posteriors),
+    }
+
+
+def _account(truth: str, results: Mapping[str, Any]) -> str:
+    forced, moved = results["force_given"], results["drop"]["displacement"]
+    wrong = sum(e["p_negative_laplace"][CONDUCTION] > 0.975 for e in forced["force_taken_for_exact"].values())
+    early, late = moved["share_within_the_band"].values()
+    pairs = "; ".join(" against ".join(p["pair"]) for p in results["opposite_pairs"]) or "none"
+    columns = [*(f"posterior.{CONDUCTION}.{key}" for key in ("mean", "sd")), "p_negative", "sign", "misspecified"]
+    columns += ["converged", "log_posterior_calls", "seconds"]
+    lines = [
+        common.shown(f"truth {truth}, displacement given", results["experiments"], columns),
+        common.shown("other parameters under priors", results["others_under_priors"], ["mean", "sd", "p_negative"]),
+        common.shown("force given", forced["experiments"], columns),
+        f"pairs at one frequency that differ in sign, displacement given: {pairs}",
+        f"with the force treated as exact, {wrong} would be negative (Laplace)",
+        *(force.line(drive, one) for drive, one in results["joint"].items()),
+        f"drop: true displacement within the 90 % band for {early:.0%} of the first 2.5 s and {late:.0%} of the time "
+        f"until 30 s, off the median by up to {1e3 * moved['largest_error_of_the_median']:.3f} mm",
+    ]
+    return "\n".join(lines)

@@ -36,9 +36,8 @@ def run(options: argparse.Namespace) -> None:
         held = judge(panels[2], options.seed, 500 if options.quick else 12_000)
     paths = common.save_figures(options.out, {"overview": figure})
     results = {"folds_hz": folds, "orbits": found, "posterior": held, "seed": options.seed, "quick": options.quick}
-    path = common.write_results(options.out, results | {"seconds": watch.total(), "versions": common.versions()})
     print(f"  folds at {folds} Hz; orbits by period {found}; {held}")
-    print(f"figures (synthetic data): {', '.join(map(str, paths))}\nresults: {path}")
+    common.finish(options.out, results, watch, paths, synthetic=True)
 
 
 def follow(ax: Axes) -> list[float]:
@@ -78,7 +77,12 @@ def judge(ax: Axes, seed: int, steps: int) -> dict[str, str | bool]:
     ax.plot(*ellipses(fit), color=bp.plot.COLOURS["laplace"], ls="--")
     ax.plot(case.truth[MASS], case.truth[AIR], "x", ms=9, mew=2.5, color="black")
     ax.set(xlabel="mass m [kg]", ylabel="air resistance k3 [N m s²]", title="identifiability: only the ratio")
-    ax.legend(handles=_handles(), loc="lower right", fontsize=8, framealpha=0.95)
+    handles = [
+        plt.Line2D([], [], marker=".", ls="", color=bp.plot.COLOURS["mcmc"], label="MCMC"),
+        plt.Line2D([], [], ls="--", color=bp.plot.COLOURS["laplace"], label="Laplace, 50 and 90 %"),
+        plt.Line2D([], [], marker="x", ls="", ms=8, mew=2.5, color="black", label="truth (synthetic data)"),
+    ]
+    ax.legend(handles=handles, loc="lower right", fontsize=8, framealpha=0.95)
     verdicts = bp.identifiability(problem, fit, posterior, profile=False).verdicts
     return {MASS: verdicts[MASS], AIR: verdicts[AIR], "converged": posterior.converged}
 
@@ -92,11 +96,3 @@ def ellipses(fit: bp.MapEstimate) -> tuple[np.ndarray, np.ndarray]:
     radii = np.sqrt(-2.0 * np.log1p(-np.array(PROBABILITIES)))
     wave = factor @ np.concatenate([radius * circle for radius in radii], axis=1)
     return fit.theta[MASS] + wave[0], fit.theta[AIR] + wave[1]
-
-
-def _handles() -> list[plt.Line2D]:
-    return [
-        plt.Line2D([], [], marker=".", ls="", color=bp.plot.COLOURS["mcmc"], label="MCMC"),
-        plt.Line2D([], [], ls="--", color=bp.plot.COLOURS["laplace"], label="Laplace, 50 and 90 %"),
-        plt.Line2D([], [], marker="x", ls="", ms=8, mew=2.5, color="black", label="truth (synthetic data)"),
-    ]

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 import bayesperiodic as bp
@@ -39,10 +38,7 @@ MOST_DROPPED = 4
 
 @dataclass(frozen=True)
 class Identified:
-    """Estimates from the orbits of one recording.
-
-    `problems, fits`: By what is free.
-    """
+    """Estimates from the orbits of one recording, by what is free."""
 
     polished: bp.Orbits  # At the first estimate of m and l
     selected: bp.Orbits
@@ -53,7 +49,8 @@ class Identified:
 
 def identify(orbits: bp.Orbits, *, which: Sequence[str] = tuple(FREE)) -> Identified:
     """Estimate m and l from measured orbits and the paper's start, polish all orbits there, select, estimate again."""
-    first, lost = _first_estimate([orbit for orbit in orbits if not orbit.equilibrium and _moderate(orbit)])
+    moderate = [orbit for orbit in orbits if abs(orbit.eigenvalues[0]) < LARGEST and orbit.quality >= 1e-3]
+    first, lost = _first_estimate([orbit for orbit in moderate if not orbit.equilibrium])
     values = TRUTH | first.theta
     doubt = {name: 3.0 * first.sd[name] for name in first.theta}
     polished = bp.polish_orbits(bp.models.pendulum, orbits, values, parameter_sd=doubt, samples=SAMPLES, scheme=SCHEME)
@@ -63,10 +60,9 @@ def identify(orbits: bp.Orbits, *, which: Sequence[str] = tuple(FREE)) -> Identi
     return Identified(polished, selected, problems, fits, tuple(lost))
 
 
-def with_eigenvalues(selected: bp.Orbits, free: Sequence[str]) -> tuple[bp.Problem, bp.MapEstimate]:
-    """Return problem and estimate with the unstable eigenvalues that were estimated in the objective."""
-    problem = problem_of([o.experiment(samples=SAMPLES, multipliers=True) for o in selected], free)
-    return problem, _fit(problem)
+def with_eigenvalues(selected: bp.Orbits, free: Sequence[str]) -> bp.MapEstimate:
+    """Return the estimate with the unstable eigenvalues that were estimated in the objective."""
+    return _fit(problem_of([o.experiment(samples=SAMPLES, multipliers=True) for o in selected], free))
 
 
 def problem_of(experiments: Sequence[bp.Experiment], free: Sequence[str]) -> bp.Problem:
@@ -91,15 +87,8 @@ def _short(orbits: bp.Orbits) -> bp.Orbits:
 
 
 def _fit(problem: bp.Problem) -> bp.MapEstimate:
-    return bp.map_estimate(problem, start={n: _start(n) for n in problem.names}, progress=False)
-
-
-def _start(name: str) -> float:
-    return START[name] if name in START else float(PRIORS[name].quantile(0.5))
-
-
-def _moderate(orbit: bp.Orbit) -> bool:
-    return bool(abs(orbit.eigenvalues[0]) < LARGEST and orbit.quality >= 1e-3)
+    start = {name: float(prior.quantile(0.5)) for name, prior in PRIORS.items()} | START
+    return bp.map_estimate(problem, start={name: start[name] for name in problem.names}, progress=False)
 
 
 def _first_estimate(orbits: Sequence[bp.Orbit]) -> tuple[bp.MapEstimate, list[tuple[str, str]]]:
@@ -128,12 +117,6 @@ def covers(fit: bp.MapEstimate, probability: float = 0.9) -> dict[str, bool]:
     return {name: bool(low <= TRUTH[name] <= high) for name, (low, high) in fit.interval(probability).items()}
 
 
-def estimate_table(fit: bp.MapEstimate, *, synthetic: bool) -> dict[str, Mapping[str, float]]:
-    """Return estimate and standard deviation of each parameter, and its relative error where the truth is known."""
-    found = {name: {"value": value, "sd": fit.sd[name]} for name, value in fit.theta.items()}
-    return {n: row | ({"relative_error": errors(fit)[n]} if synthetic else {}) for n, row in found.items()}
-
-
 NATURAL = ("m", "l", "k1", "k2", "k3")
 COMBINATIONS = {f"c{i}": f"k{i}/(m*l**2)" for i in (1, 2, 3)}
 DETERMINED = ("l", *COMBINATIONS)
@@ -143,20 +126,15 @@ QUICK_STEPS = 250
 
 @dataclass(frozen=True)
 class Ridge:
-    """Draws of all five parameters and their verdicts.
+    """Draws of all five parameters and their verdicts."""
 
-    `natural, sampling`: Of Laplace with the draws, in natural values and in logarithms. `combinations`: Mean and sd of
-    the identifiable combinations, by Laplace (columns value, laplace_sd) and MCMC (mean, sd).
-    """
-
-    problem: bp.Problem
     fit: bp.MapEstimate
     posterior: bp.Posterior
     structure: bp.Structure  # Structural identifiability, without data
     identifiability: bp.Identifiability
-    natural: bp.Comparison
-    sampling: bp.Comparison
-    combinations: pd.DataFrame
+    natural: bp.Comparison  # Laplace against MCMC in natural values
+    sampling: bp.Comparison  # The same in logarithms
+    combinations: pd.DataFrame  # By Laplace (value, laplace_sd) and MCMC (mean, sd)
 
 
 def sample(identified: Identified, seed: int, quick: bool) -> Ridge:
@@ -164,12 +142,10 @@ def sample(identified: Identified, seed: int, quick: bool) -> Ridge:
     problem, fit = identified.problems[ALL], identified.fits[ALL]
     settings: dict[str, Any] = {"max_steps": QUICK_STEPS} if quick else {}
     posterior = bp.sample(problem, fit, seed=seed, ensembles=2, variances="collapsed", progress=False, **settings)
-    laplace, draws = fit.derive(COMBINATIONS), posterior.derive(COMBINATIONS)
-    table = laplace.rename(columns={"sd": "laplace_sd"}).join(draws[["mean", "sd"]])
-    l_draws = posterior.draws("l")
-    table.loc["l"] = [fit.theta["l"], fit.sd["l"], l_draws.mean(), l_draws.std()]
+    table = fit.derive(COMBINATIONS).rename(columns={"sd": "laplace_sd"})
+    table = table.join(posterior.derive(COMBINATIONS)[["mean", "sd"]])
+    table.loc["l"] = [fit.theta["l"], fit.sd["l"], posterior.draws("l").mean(), posterior.draws("l").std()]
     return Ridge(
-        problem,
         fit,
         posterior,
         bp.structure(bp.models.pendulum, fixed=list(KNOWN)),
@@ -180,16 +156,10 @@ def sample(identified: Identified, seed: int, quick: bool) -> Ridge:
     )
 
 
-def combination_draws(posterior: bp.Posterior) -> dict[str, np.ndarray]:
-    """Return the draws of the identifiable combinations."""
-    mass, length, *torques = (posterior.draws(name) for name in NATURAL)
-    return {"l": length} | {f"c{i}": torque / (mass * length**2) for i, torque in enumerate(torques, 1)}
-
-
-def truths() -> dict[str, float]:
-    """Return the true values of the identifiable combinations."""
-    inertia = TRUTH["m"] * TRUTH["l"] ** 2
-    return {"l": TRUTH["l"]} | {f"c{i}": TRUTH[f"k{i}"] / inertia for i in (1, 2, 3)}
+def combinations(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the identifiable combinations of values or draws of the parameters."""
+    inertia = values["m"] * values["l"] ** 2
+    return {"l": values["l"]} | {f"c{i}": values[f"k{i}"] / inertia for i in (1, 2, 3)}
 
 
 def collect(ridge: Ridge) -> dict[str, Any]:
@@ -214,9 +184,7 @@ def collect(ridge: Ridge) -> dict[str, Any]:
             }
             for name in NATURAL
         },
-        "combinations": {
-            str(name): {str(k): float(v) for k, v in row.items()} for name, row in ridge.combinations.iterrows()
-        },
+        "combinations": ridge.combinations.astype(float).to_dict("index"),
         "joint": {c: str(r.joint["verdict"]) for c, r in (("natural", ridge.natural), ("logarithms", ridge.sampling))},
         "recommendation": str(ridge.natural.joint["recommendation"]),
     }

@@ -4,20 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
-from studies.pendulum.estimates import (
-    DETERMINED,
-    DETERMINED_UNITS,
-    NATURAL,
-    PAPER_ERRORS,
-    Identified,
-    Ridge,
-    combination_draws,
-    truths,
-)
+from studies.pendulum import estimates
 from studies.pendulum.recording import TRUTH, UNITS
 
 BINS, SHOWN = 45, (0.001, 0.999)
@@ -27,13 +19,13 @@ SYNTHETIC = "synthetic data"
 
 
 def figures(
-    section: bp.PoincareSection, found: Identified, ridge: Ridge, table: Mapping[str, Any]
+    section: bp.PoincareSection, found: estimates.Identified, ridge: estimates.Ridge, table: Mapping[str, Any]
 ) -> dict[str, Figure]:
     """Return every figure of a run."""
     drawn = {
         "section": bp.plot.section(section, found.polished, units=UNITS),
         "orbits": bp.plot.orbits(found.selected, units=UNITS),
-        "corner": bp.plot.corner(ridge.posterior, laplace=ridge.fit, names=NATURAL),
+        "corner": bp.plot.corner(ridge.posterior, laplace=ridge.fit, names=estimates.NATURAL),
         "ridge": marginals(ridge, truth=section.synthetic),
     }
     if section.synthetic:
@@ -44,22 +36,21 @@ def figures(
     return drawn
 
 
-def marginals(ridge: Ridge, *, truth: bool) -> Figure:
+def marginals(ridge: estimates.Ridge, *, truth: bool) -> Figure:
     """Draw Laplace and MCMC of the parameters above, and of the combinations that the data determine below."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(11.0, 5.4), layout="constrained")
     grid = figure.subplots(2, 5)
-    for axes, name in zip(grid[0], NATURAL, strict=True):
+    for axes, name in zip(grid[0], estimates.NATURAL, strict=True):
         unit = bp.models.pendulum.units[name]
         _marginal(axes, ridge.posterior.draws(name), ridge.fit.theta[name], ridge.fit.sd[name], TRUTH[name], truth)
         axes.set_xlabel(f"{name} [{unit}]")
-    draws = combination_draws(ridge.posterior)
-    for axes, name in zip(grid[1], DETERMINED, strict=False):
+    draws = estimates.combinations({name: ridge.posterior.draws(name) for name in estimates.NATURAL})
+    truths = estimates.combinations(TRUTH)
+    for axes, name in zip(grid[1], estimates.DETERMINED, strict=False):
         value, sd = (float(ridge.combinations[column].loc[name]) for column in ("value", "laplace_sd"))
-        _marginal(axes, draws[name], value, sd, truths()[name], truth)
+        _marginal(axes, draws[name], value, sd, truths[name], truth)
         text = name if name == "l" else f"{name} = k{name[1]}/(m l²)"
-        axes.set_xlabel(f"{text} [{DETERMINED_UNITS[name]}]")
+        axes.set_xlabel(f"{text} [{estimates.DETERMINED_UNITS[name]}]")
     handles, labels = grid[0, 0].get_legend_handles_labels()
     grid[1, 4].set_axis_off()
     grid[1, 4].legend(handles, labels, loc="center", frameon=False)
@@ -86,8 +77,6 @@ def _marginal(axes: Axes, draws: np.ndarray, mean: float, sd: float, true: float
 
 def eigenvalues(table: Mapping[str, Any]) -> Figure:
     """Draw the median error of the unstable eigenvalue over the period, by noise and method, and the orbits found."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(3.4 * len(table) + 0.8, 5.6), layout="constrained")
     above, below = figure.subplots(2, len(table), sharex=True, sharey="row", squeeze=False)
     for top, bottom, (noise, methods) in zip(above, below, table.items(), strict=True):
@@ -110,13 +99,11 @@ def eigenvalues(table: Mapping[str, Any]) -> Figure:
 
 def errors(lines: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw the errors of m, l and k3 over noise seeds, beside the paper's."""
-    from matplotlib import pyplot as plt
-
     noises = sorted({line["noise"] for line in lines})
     figure = plt.figure(figsize=(7.6, 4.2), layout="constrained")
     axes = figure.add_subplot()
     for number, noise in enumerate(noises):
-        for place, name in enumerate(PAPER_ERRORS):
+        for place, name in enumerate(estimates.PAPER_ERRORS):
             values = [100 * abs(x["errors"][name]) for x in lines if x["noise"] == noise and name in x["errors"]]
             box = axes.boxplot([values], positions=[place + 0.28 * (number - 0.5 * (len(noises) - 1))], widths=0.2,
                                whis=(5, 95), patch_artist=True, manage_ticks=False, medianprops={"color": "black"},
@@ -124,11 +111,11 @@ def errors(lines: Sequence[Mapping[str, Any]]) -> Figure:
             box["boxes"][0].set(facecolor=("#56B4E9", "#E69F00")[number % 2], hatch=("", "///")[number % 2])
             if place == 0:
                 box["boxes"][0].set_label(f"noise {noise:.1%} of the attractor")
-    for place, error in enumerate(PAPER_ERRORS.values()):
+    for place, error in enumerate(estimates.PAPER_ERRORS.values()):
         label = "the paper's table 1" if place == 0 else None
         axes.plot([place - 0.4, place + 0.4], [100 * error] * 2, color="black", lw=2.0, label=label)
     axes.set_yscale("log")
-    axes.set_xticks(range(len(PAPER_ERRORS)), [f"{name}" for name in PAPER_ERRORS])
+    axes.set_xticks(range(len(estimates.PAPER_ERRORS)), [f"{name}" for name in estimates.PAPER_ERRORS])
     axes.set_xlabel("parameter")
     axes.set_ylabel("error [%]")
     figure.legend(loc="outside lower center", ncols=3, frameon=False)

@@ -4,21 +4,22 @@ The shooting reference of `studies.shooting` is independent of the package.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.stats import binom
 
 import bayesperiodic as bp
 from studies import shooting
-from studies.pendulum.recording import ANGLES, COORDINATES, FREQUENCY, OMEGA, TRUTH
+from studies.pendulum.recording import COORDINATES, OMEGA, TRUTH
 from studies.shooting import TURN
 
 TOLERANCE, ACCURACY = 1e-12, 1e-9
 
 
 class Shot(NamedTuple):
-    """Orbit that shooting converges to from given points."""
+    """Orbit to which shooting converges from given points."""
 
     points: np.ndarray  # (period, 2): φ in (−π, π] and φ̇ at tau = 0, 1, …
     winding: int
@@ -88,44 +89,36 @@ class Reference:
     off: float  # By how much the polished orbit's section points differ [rad, 5 rad/s]
 
 
-def references(polished: bp.Orbits) -> tuple[list[Reference], list[str]]:
-    """Return the orbits that shooting from polished orbits converges to, and the names of unconfirmed ones.
+def true_orbits(orbits: bp.Orbits) -> tuple[bp.Orbits, list[Reference], list[str]]:
+    """Return polished orbits, those to which shooting from them converges, and the names of unconfirmed ones.
 
     Of a pair of symmetric partners one is integrated and the other mirrored.
     """
+    polished = bp.polish_orbits(bp.models.pendulum, orbits, TRUTH, samples=SAMPLES)
     found: dict[int, Reference] = {}
     refuted = []
     for number, orbit in enumerate(polished):
-        points = model_points(orbit)
+        assert orbit.solution is not None
+        points = np.stack([orbit.solution.outputs[c][:: orbit.solution.samples] for c in COORDINATES], axis=-1)
         if orbit.partner is not None and orbit.partner in found:
             one = found[orbit.partner]
-            mirrored = min(
-                (np.roll(-one.points, shift, axis=0) for shift in range(one.period)),
-                key=lambda candidate: distance(candidate, points),
-            )
-            mirror = Reference(one.period, -one.winding, mirrored, one.multipliers, one.equilibrium, 0.0)
-            found[number] = _measured_against(mirror, points)
+            found[number] = _nearest(replace(one, winding=-one.winding, points=-one.points), points)
             continue
         shot = shoot(TRUTH, OMEGA, points)
-        reference = Reference(orbit.period, shot.winding, shot.points, shot.multipliers, orbit.equilibrium, 0.0)
-        reference = _measured_against(reference, points)
-        if shot.converged and shot.prime == orbit.period and shot.winding == orbit.winding and reference.off < 1e-3:
-            found[number] = reference
+        off = distance(shot.points, points)
+        if shot.converged and shot.prime == orbit.period and shot.winding == orbit.winding and off < 1e-3:
+            equilibrium = orbit.equilibrium
+            found[number] = Reference(orbit.period, shot.winding, shot.points, shot.multipliers, equilibrium, off)
         else:
             refuted.append(orbit.name)
-    return list(found.values()), refuted
+    return polished, list(found.values()), refuted
 
 
-def _measured_against(reference: Reference, points: np.ndarray) -> Reference:
-    r = reference
-    off = distance(r.points, points)
-    return Reference(r.period, r.winding, r.points, r.multipliers, r.equilibrium, off)
-
-
-def model_points(orbit: bp.Orbit) -> np.ndarray:
-    """Return the section points (period, 2) of the polished orbit."""
-    assert orbit.solution is not None
-    return np.stack([orbit.solution.outputs[c][:: orbit.solution.samples] for c in COORDINATES], axis=-1)
+def _nearest(truth: Reference, points: np.ndarray) -> Reference:
+    """Return the same orbit with the first point for which it is nearest to the points."""
+    shifted = [np.roll(truth.points, shift, axis=0) for shift in range(truth.period)]
+    offs = [distance(candidate, points) for candidate in shifted]
+    return replace(truth, points=shifted[int(np.argmin(offs))], off=min(offs))
 
 
 def classes(orbits: bp.Orbits) -> dict[int, int]:
@@ -139,31 +132,27 @@ def classes(orbits: bp.Orbits) -> dict[int, int]:
 
 def matched(orbit: bp.Orbit, truths: Sequence[Reference]) -> Reference | None:
     """Return the true orbit of a candidate, with the same first point; None if there is none."""
-    best, nearest = None, MATCHED
-    for truth in truths:
-        if truth.period != orbit.period or (orbit.winding is not None and truth.winding != orbit.winding):
-            continue
-        for shift in range(truth.period):
-            points = np.roll(truth.points, shift, axis=0)
-            off = distance(points, orbit.points)
-            if off < nearest:
-                nearest = off
-                best = Reference(truth.period, truth.winding, points, truth.multipliers, truth.equilibrium, off)
-    return best
+    candidates = [
+        _nearest(truth, orbit.points)
+        for truth in truths
+        if truth.period == orbit.period and orbit.winding in (None, truth.winding)
+    ]
+    best = min(candidates, key=lambda truth: truth.off, default=None)
+    return best if best is not None and best.off < MATCHED else None
 
 
 def eigenvalue_table(orbits: bp.Orbits, truths: Sequence[Reference]) -> list[dict[str, Any]]:
     """Return by period: candidates, true orbits among them, and the errors of the unstable eigenvalue."""
     rows = []
     for period in KNOWN_CLASSES:
-        members = [orbit for orbit in orbits if orbit.period == period]
-        pairs = [(o, t) for o in members if (t := matched(o, truths)) is not None and not t.equilibrium]
+        members = [(orbit, matched(orbit, truths)) for orbit in orbits if orbit.period == period]
+        pairs = [(o, t) for o, t in members if t is not None and not t.equilibrium]
         errors = np.array([abs(o.eigenvalues[0] / t.multipliers[0] - 1.0) for o, t in pairs])
         rows.append(
             {
                 "period": period,
                 "candidates": len(members),
-                "orbits": sum(matched(o, truths) is not None for o in members),
+                "orbits": sum(t is not None for _, t in members),
                 "estimated": sum(bool(np.isfinite(o.eigenvalue_sd[0])) for o, _ in pairs),
                 "median_relative_error": float(np.median(errors)) if errors.size else None,
             }
@@ -182,21 +171,14 @@ def pulls(orbits: bp.Orbits, truths: Sequence[Reference], largest: float) -> dic
         if np.isfinite(sd):
             found["eigenvalue"].append(float(np.log(abs(orbit.eigenvalues[0] / truth.multipliers[0])) / sd))
         off = orbit.points - truth.points
-        off[:, 0] = (off[:, 0] + np.pi) % (2 * np.pi) - np.pi
+        off[:, 0] = (off[:, 0] + np.pi) % TURN - np.pi
         found["point"] += list(off.ravel() / np.sqrt(np.diag(orbit.covariance)))
     return found
 
 
 def covered(pulls: Sequence[float]) -> dict[str, float]:
     """Return how many 90 % error bars cover, of how many, and the two-sided 99 % binomial band."""
-    from scipy.stats import binom
-
     count = len(pulls)
     low, high = binom.interval(0.99, count, 0.9) if count else (0.0, 0.0)
-    inside = int(np.sum(np.abs(pulls) <= TWO_SIDED_90)) if count else 0
+    inside = int(np.sum(np.abs(pulls) <= TWO_SIDED_90))
     return {"bars": count, "cover": inside, "band_low": float(low), "band_high": float(high)}
-
-
-def points_only(section: bp.PoincareSection) -> bp.PoincareSection:
-    """Return the same section sampled once per drive period."""
-    return bp.PoincareSection.from_points(section.points, COORDINATES, frequency=FREQUENCY, angles=ANGLES)

@@ -25,13 +25,9 @@ def simulate(periods: int, seed: int) -> bp.Recording:
     """Return a recording without noise; the seed chooses where on the attractor it starts."""
     start = np.random.default_rng(seed).uniform([-np.pi, -5.0], [np.pi, 5.0])
     whole = bp.simulate(
-        bp.models.pendulum,
-        TRUTH,
-        frequency=FREQUENCY,
-        duration=(SETTLING + periods) / FREQUENCY,
-        sampling_rate=SAMPLES * FREQUENCY,
-        start={"phi": start[0], "dphi": start[1]},
-    )
+        bp.models.pendulum, TRUTH, frequency=FREQUENCY, duration=(SETTLING + periods) / FREQUENCY,
+        sampling_rate=SAMPLES * FREQUENCY, start={"phi": start[0], "dphi": start[1]},
+    )  # fmt: skip
     # The drive's phase stays: the settling takes whole periods.
     return whole.between(SETTLING / FREQUENCY, whole.time[-1])
 
@@ -52,16 +48,13 @@ def get(data: Path | None, quick: bool, seed: int) -> tuple[bp.Recording, dict[s
     A file has the columns time [s], angle [rad] and rate [rad/s], of a pendulum driven at ω = 9.09 rad/s, whose pivot
     moves by a = 0.11 m; k1, k2 and k3 have the values of `TRUTH` where they are fixed.
     """
-    about: dict[str, Any] = {"path": "generated", "sha256": None, "synthetic": True}
+    found = common.find_data(data, "") if data else None
     if data is None:
         recording = simulate(QUICK_PERIODS if quick else PERIODS, seed)
     else:
-        if not data.is_file():
-            raise FileNotFoundError(f"--data: must be an existing file, got {str(data)!r}.")
         recording = bp.Recording.from_csv(data, time="time", outputs={name: name for name in COORDINATES})
-        about = {"path": str(data), "sha256": common.sha256(data), "synthetic": False}
     size = {"values": sum(v.size for v in recording.outputs.values())}
-    return recording, about | size | {"drive_periods": int(np.ptp(recording.time) * FREQUENCY)}
+    return recording, common.described(found) | size | {"drive_periods": int(np.ptp(recording.time) * FREQUENCY)}
 
 
 def section_of(recording: bp.Recording) -> bp.PoincareSection:

@@ -7,55 +7,47 @@ recordings.
 """
 
 import argparse
-import multiprocessing
-import os
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from typing import Any
+import time
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
 
 import bayesperiodic as bp
 from studies import common
 from studies.pendulum import estimates as pendulum_estimates
 from studies.pendulum import figures as pendulum_figures
-from studies.pendulum import orbits, replicates
+from studies.pendulum import orbits
 from studies.pendulum import recording as pendulum_recording
-from studies.pendulum.estimates import PAPER_ERRORS, START_ERRORS, Identified
+from studies.pendulum.estimates import ALL, FREE, LARGEST, LONGEST_USED, PAPER_ERRORS, START_ERRORS, Identified
 from studies.pendulum.recording import section_of, with_noise
 
 
-@dataclass(frozen=True)
-class Found:
-    """Orbits found in one section.
-
-    `chained, boxes`: By the default method and by the paper's recipe.
-    """
+class Found(NamedTuple):
+    """Orbits found in one section."""
 
     section: bp.PoincareSection
-    chained: bp.Orbits
-    boxes: bp.Orbits
+    chained: bp.Orbits  # By the default method
+    boxes: bp.Orbits  # By the paper's recipe
 
 
 def search(recording: bp.Recording, noises: Sequence[float], seed: int, periods: Sequence[int]) -> dict[float, Found]:
     """Return the orbits found with each noise level added to the recording, as a fraction of the attractor's size."""
-    tasks = [(recording, noise, seed, tuple(periods)) for noise in dict.fromkeys(noises)]
-    if len(tasks) == 1:
-        return {noises[0]: _found(tasks[0])}
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(os.cpu_count() or 1, len(tasks)), mp_context=context) as pool:
-        # The noisiest takes longest.
-        found = dict(zip([t[1] for t in reversed(tasks)], pool.map(_found, reversed(tasks)), strict=True))
+    # The noisiest takes longest, and comes first.
+    levels = list(dict.fromkeys(noises))[::-1]
+    tasks = [(recording, noise, seed, tuple(periods)) for noise in levels]
+    found = dict(zip(levels, common.each(_found, tasks, here=len(tasks) == 1), strict=True))
     return {noise: found[noise] for noise in noises}
 
 
-def _found(task: tuple[bp.Recording, float, int, tuple[int, ...]]) -> Found:
-    recording, noise, seed, periods = task
+def _found(recording: bp.Recording, noise: float, seed: int, periods: tuple[int, ...]) -> Found:
     section = section_of(with_noise(recording, noise, seed) if noise > 0.0 else recording)
-    every = {method: bp.find_orbits(section, periods=periods, method=method) for method in ("chained", "boxes")}
-    return Found(section, every["chained"], every["boxes"])
+    return Found(section, *(bp.find_orbits(section, periods=periods, method=m) for m in orbits.METHODS))
 
 
 NOISE_LEVELS = (0.0, 0.001, 0.01)
+TABLE_NOISE = (0.001, 0.01)
 PERIODS, QUICK_PERIODS = range(1, 6), range(1, 4)
 
 
@@ -67,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
             f"{options.noise}."
         )
     if options.replicates:
-        replicates.run(options)
+        _replicates(options)
         return
     watch = common.Stopwatch()
     with watch.part("recording", "the recording"):
@@ -81,16 +73,15 @@ def run(options: argparse.Namespace) -> None:
     results: dict[str, Any] = {"recording": about, "noise": noise, "seed": options.seed, "quick": options.quick}
     if about["synthetic"]:
         with watch.part("reference", "the same orbits by shooting"):
-            results |= against_shooting(found)
-        print(orbit_account(results))
+            results |= _against_shooting(found)
+        print(_orbit_account(results))
     with watch.part("estimates", "m and l, k3, and all five, from the paper's start"):
         identified = pendulum_estimates.identify(found[noise].chained)
         eigenvalue_fits = {
-            which: pendulum_estimates.with_eigenvalues(identified.selected, names)[1]
-            for which, names in pendulum_estimates.FREE.items()
+            which: pendulum_estimates.with_eigenvalues(identified.selected, names) for which, names in FREE.items()
         }
     results |= estimates(about, found[noise], identified, eigenvalue_fits)
-    print(estimate_account(results))
+    print(_estimate_account(results))
     with watch.part("ridge", "sampling the posterior of all five with emcee"):
         ridge = pendulum_estimates.sample(identified, options.seed, options.quick)
     results["all_five"] = pendulum_estimates.collect(ridge)
@@ -99,16 +90,13 @@ def run(options: argparse.Namespace) -> None:
         table = results.get("eigenvalues", {})
         figures = pendulum_figures.figures(found[noise].section, identified, ridge, table)
         paths = common.save_figures(options.out, figures)
-    results |= {"seconds": watch.total(), "versions": common.versions()}
-    path = common.write_results(options.out, results)
-    print(f"figures{' (synthetic data)' if about['synthetic'] else ''}: {', '.join(map(str, paths))}\nresults: {path}")
+    common.finish(options.out, results, watch, paths, synthetic=about["synthetic"])
 
 
-def against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
+def _against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
     """Return the orbits found without noise, compared with shooting, and the multipliers by noise level and method."""
     clean = found[0.0].chained
-    polished = bp.polish_orbits(bp.models.pendulum, clean, pendulum_recording.TRUTH, samples=orbits.SAMPLES)
-    truths, refuted = orbits.references(polished)
+    polished, truths, refuted = orbits.true_orbits(clean)
     return {
         "found_without_noise": {
             "candidates": len(clean),
@@ -122,16 +110,12 @@ def against_shooting(found: Mapping[float, Found]) -> dict[str, Any]:
             "largest_difference_from_shooting": max(truth.off for truth in truths),
         },
         "eigenvalues": {
-            f"{noise:g}": {
-                "chained": orbits.eigenvalue_table(one.chained, truths),
-                "boxes": orbits.eigenvalue_table(one.boxes, truths),
-            }
+            f"{noise:g}": {m: orbits.eigenvalue_table(getattr(one, m), truths) for m in orbits.METHODS}
             for noise, one in found.items()
         },
         "error_bars": {
             f"{noise:g}": {
-                kind: orbits.covered(values)
-                for kind, values in orbits.pulls(one.chained, truths, pendulum_estimates.LARGEST).items()
+                kind: orbits.covered(values) for kind, values in orbits.pulls(one.chained, truths, LARGEST).items()
             }
             for noise, one in found.items()
         },
@@ -145,9 +129,12 @@ def estimates(
     used = sum(orbit.points.size for orbit in identified.selected)
     table = {}
     for which, fit in identified.fits.items():
+        rows: dict[str, dict[str, float]] = {name: {"value": v, "sd": fit.sd[name]} for name, v in fit.theta.items()}
+        for name, error in pendulum_estimates.errors(fit).items() if about["synthetic"] else ():
+            rows[name]["relative_error"] = error
         table[which] = {
             "status": fit.status,
-            "parameters": pendulum_estimates.estimate_table(fit, synthetic=about["synthetic"]),
+            "parameters": rows,
             "scale": fit.noise["scale"],
             "sd_with_eigenvalues_over_without": {n: with_eigenvalues[which].sd[n] / fit.sd[n] for n in fit.theta},
         }
@@ -164,37 +151,144 @@ def estimates(
     }
 
 
-def orbit_account(results: Mapping[str, Any]) -> str:
-    """Return the comparison of found and true orbits as text."""
+def _orbit_account(results: Mapping[str, Any]) -> str:
     clean = results["found_without_noise"]
-    lines = [
+    rows = {
+        f"noise {float(noise):.1%}, {method}, period {row['period']}": row
+        for noise, methods in results["eigenvalues"].items()
+        for method, every in methods.items()
+        for row in every
+    }
+    return "\n".join([
         f"  without noise {clean['polished']} orbits of {clean['candidates']} candidates; classes by period "
         f"{clean['classes']}, wanted {clean['classes_wanted']}",
         f"  largest difference from shooting {clean['largest_difference_from_shooting']:.1e} rad, not confirmed: "
         f"{clean['not_confirmed_by_shooting'] or 'none'}",
-        "  unstable eigenvalue, median relative error (orbits/candidates) by period",
-    ]
-    for noise, methods in results["eigenvalues"].items():
-        for method, rows in methods.items():
-            cells = [
-                f"{'–' if r['median_relative_error'] is None else format(r['median_relative_error'], '.2%'):>7s} "
-                f"({r['orbits']}/{r['candidates']})"
-                for r in rows
-            ]
-            lines.append(f"    noise {float(noise):.1%} {method:8s} " + "  ".join(cells))
-    return "\n".join(lines)
+        common.shown("unstable eigenvalues", rows, ["candidates", "orbits", "median_relative_error"]),
+    ])  # fmt: skip
 
 
-def estimate_account(results: Mapping[str, Any]) -> str:
-    """Return the estimates as a table to print."""
+def _estimate_account(results: Mapping[str, Any]) -> str:
     reduction = results["data_reduction"]
-    lines = [
-        f"  {len(results['selected'])} orbits selected of {results['polished']}: of "
-        f"{reduction['numbers_in_the_recording']} numbers in the recording {reduction['numbers_used']} are used"
-    ]
-    for which, row in results["estimates"].items():
-        for name, one in row["parameters"].items():
-            error = f", error {one['relative_error']:+.3%}" if "relative_error" in one else ""
-            paper = f" (paper {PAPER_ERRORS[name]:.1%})" if which != "all five" and name in PAPER_ERRORS else ""
-            lines.append(f"    {which:9s} {name:2s} = {one['value']:.6g} ± {one['sd']:.2g}{error}{paper}")
+    rows = {
+        f"{which}: {name}": {**one, "paper": PAPER_ERRORS.get(name) if which != ALL else None}
+        for which, found in results["estimates"].items()
+        for name, one in found["parameters"].items()
+    }
+    return common.shown(
+        f"{len(results['selected'])} orbits selected of {results['polished']}: of "
+        f"{reduction['numbers_in_the_recording']} numbers in the recording {reduction['numbers_used']} are used",
+        rows,
+    )
+
+
+def _replicates(options: argparse.Namespace) -> None:
+    """Compute table 1 of the paper over many recordings: errors, coverage, failures, and multipliers as data."""
+    watch = common.Stopwatch()
+    print("All data are SYNTHETIC: simulated from the stated truth, with noise.")
+    with watch.part("truths", "the true orbits, by shooting"):
+        section = section_of(pendulum_recording.simulate(pendulum_recording.PERIODS, options.seed))
+        _, truths, _ = orbits.true_orbits(bp.find_orbits(section, periods=range(1, LONGEST_USED + 1)))
+    lines: list[dict[str, Any]] = []
+    with watch.part("replicates", f"{options.replicates} recordings at {len(TABLE_NOISE)} noise levels"):
+        tasks = [(options.seed + 1 + number, truths) for number in range(options.replicates)]
+        for number, found in enumerate(common.each(_replicate, tasks), 1):
+            lines += found
+            print(f"  {number} of {len(tasks)}", flush=True)
+    lines.sort(key=lambda line: (line["noise"], line["seed"]))
+    table = {f"{noise:g}": _summary([line for line in lines if line["noise"] == noise]) for noise in TABLE_NOISE}
+    print(_account(table))
+    folder = options.out / "table"
+    paths = common.save_figures(folder, {"errors": pendulum_figures.errors(lines)})
+    results = {"synthetic": True, "seed": options.seed, "drive_periods": pendulum_recording.PERIODS, "table": table}
+    results |= {"replicates": lines, "start_errors": START_ERRORS, "paper_errors": PAPER_ERRORS}
+    common.finish(folder, results, watch, paths, synthetic=True)
+
+
+def _replicate(seed: int, truths: Sequence[orbits.Reference]) -> list[dict[str, Any]]:
+    """Return the results of one recording, whose start and noise the seed determines, at every noise level."""
+    recording, lines = pendulum_recording.simulate(pendulum_recording.PERIODS, seed), []
+    for noise in TABLE_NOISE:
+        line: dict[str, Any] = {"seed": seed, "noise": noise, "errors": {}}
+        start = time.perf_counter()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                line |= _one(with_noise(recording, noise, seed), truths)
+            except (ValueError, RuntimeError) as error:
+                line["failure"] = f"{type(error).__name__}: {error}"
+        lines.append(line | {"seconds": round(time.perf_counter() - start, 2)})
+    return lines
+
+
+def _one(recording: bp.Recording, truths: Sequence[orbits.Reference]) -> dict[str, Any]:
+    """Return errors, sds and coverage of one recording."""
+    found_orbits = bp.find_orbits(section_of(recording), periods=range(1, LONGEST_USED + 1))
+    found = pendulum_estimates.identify(found_orbits, which=("m and l", "k3"))
+    every = (
+        list(found.fits.values()),
+        [pendulum_estimates.with_eigenvalues(found.selected, FREE[n]) for n in found.fits],
+    )
+    line: dict[str, Any] = {
+        "orbits": len(found_orbits),
+        "selected": len(found.selected),
+        "lost": [list(pair) for pair in found.lost],
+        "not_orbits": sum(orbits.matched(orbit, truths) is None for orbit in found.selected),
+        "pulls": orbits.pulls(found_orbits, truths, np.inf),
+        "converged": all(fit.converged for fits in every for fit in fits),
+    }
+    for key, fits in zip(("", "eigenvalue_"), every, strict=True):
+        line[f"{key}errors"] = {n: e for fit in fits for n, e in pendulum_estimates.errors(fit).items()}
+        line[f"{key}sd"] = {n: fit.sd[n] / fit.theta[n] for fit in fits for n in fit.theta}
+        line[f"{key}covers"] = {n: c for fit in fits for n, c in pendulum_estimates.covers(fit).items()}
+    line["scale"] = found.fits["m and l"].noise["scale"]
+    return line
+
+
+def _summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return medians, 90 % ranges and coverage over the recordings of one noise level."""
+    whole = [line for line in lines if "failure" not in line]
+    found: dict[str, Any] = {
+        "recordings": len(lines),
+        "failures": [line["failure"] for line in lines if "failure" in line],
+        "lost_orbits": sum(len(line["lost"]) for line in whole),
+        "selected_that_are_no_orbits": sum(line["not_orbits"] for line in whole),
+        "selected_median": float(np.median([line["selected"] for line in whole])),
+        "seconds_each": float(np.mean([line["seconds"] for line in lines])),
+    }
+    for name, paper in PAPER_ERRORS.items():
+        size = np.abs([line["errors"][name] for line in whole])
+        found[name] = {
+            "median_error": float(np.median(size)),
+            "range_90": [float(q) for q in np.quantile(size, [0.05, 0.95])],
+            "paper": paper,
+            "covered": _covering(line["covers"][name] for line in whole),
+            "covered_with_eigenvalues": _covering(line["eigenvalue_covers"][name] for line in whole),
+            "sd_with_eigenvalues_over_without": float(
+                np.median([line["eigenvalue_sd"][name] / line["sd"][name] for line in whole])
+            ),
+        }
+    for kind in ("eigenvalue", "point"):
+        found[f"{kind}_bars"] = orbits.covered([p for line in whole for p in line["pulls"][kind]])
+    return found
+
+
+def _covering(intervals: Iterable[bool]) -> dict[str, float]:
+    return orbits.covered([0.0 if covers else np.inf for covers in intervals])
+
+
+def _account(table: dict[str, Any]) -> str:
+    columns = ["median_error", "paper", "covered.cover", "covered.bars", "covered.band_low", "covered.band_high"]
+    columns += ["covered_with_eigenvalues.cover", "sd_with_eigenvalues_over_without"]
+    lines = []
+    for noise, found in table.items():
+        bars = found["eigenvalue_bars"]
+        rows = {name: found[name] for name in PAPER_ERRORS}
+        title = f"noise {float(noise):.1%}: relative errors, coverage of 90 % intervals"
+        lines.append(common.shown(title, rows, columns))
+        lines.append(
+            f"failures {len(found['failures'])}, orbits lost {found['lost_orbits']}, selected but not true "
+            f"{found['selected_that_are_no_orbits']}; eigenvalue error bars {bars['cover']} of {bars['bars']} "
+            f"(band {bars['band_low']:.0f} … {bars['band_high']:.0f}); {found['seconds_each']:.1f} s each"
+        )
     return "\n".join(lines)

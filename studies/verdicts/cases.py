@@ -29,16 +29,14 @@ Expected = Mapping[str, Mapping[str, tuple[str, ...]]]
 
 @dataclass(frozen=True)
 class Case:
-    """A case with known verdicts.
-
-    `fault`: By tool, the parameters whose verdicts name the fault; empty if there is no fault.
-    """
+    """A case with known verdicts."""
 
     title: str  # The fault, in words
     truth: Mapping[str, float]  # Of every parameter, also of those that the fitted model lacks
     problem: Callable[[int], bp.Problem]  # Makes the problem of a data seed
     shown: str  # The parameter of the figure
     expected: Expected  # By tool and parameter: the verdicts that are right
+    # By tool, the parameters whose verdicts name the fault, if there is one
     fault: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     sampling: Mapping[str, Any] = field(default_factory=dict)  # Arguments of `bp.sample`
     drawless: bool = False  # Whether the verdicts do not use draws, so that replicates over data seeds do without them
@@ -47,24 +45,18 @@ class Case:
 def _driven(name: str, parameters: Mapping[str, str], force: Callable[[Any, Any], sp.Expr]) -> bp.Model:
     """Return a model whose output is a force of a measured displacement; its state has no part in it."""
     return bp.Model(
-        name,
-        states=["w"],
-        inputs=["x"],
-        parameters=dict(parameters),
-        units={"x": "m", "force": "N", "w": "m"},
-        equations=lambda s, p, u: [s.dw + s.w - u.x],
-        outputs=lambda s, p, u: {"force": force(p, u)},
-    )
+        name, states=["w"], inputs=["x"], parameters=dict(parameters), units={"x": "m", "force": "N", "w": "m"},
+        equations=lambda s, p, u: [s.dw + s.w - u.x], outputs=lambda s, p, u: {"force": force(p, u)},
+    )  # fmt: skip
 
 
 PRODUCT = _driven("product", {"a": "1", "b": "N/m"}, lambda p, u: p.a * p.b * u.x)
 SUM = _driven("sum", {"a": "N/m", "b": "N/m"}, lambda p, u: (p.a + p.b) * u.x)
 DAMPED = _driven("damped", {"k": "N/m", "c": "N s/m"}, lambda p, u: p.k * u.x + p.c * u.dx)
 RUBBING = _driven(
-    "rubbing",
-    {"k": "N/m", "c": "N s/m", "coulomb": "N"},
+    "rubbing", {"k": "N/m", "c": "N s/m", "coulomb": "N"},
     lambda p, u: p.k * u.x + p.c * u.dx + p.coulomb * sp.tanh(u.dx / 0.02),
-)
+)  # fmt: skip
 BEAM = _driven("beam", {"position": "1", "k": "N/m"}, lambda p, u: p.k * sp.sin(sp.pi * p.position) * u.x)
 
 
@@ -72,39 +64,34 @@ def _generator(model: bp.Model, data_seed: int) -> np.random.Generator:
     return np.random.default_rng([zlib.crc32(model.name.encode()), data_seed])
 
 
-def _measured(
-    model: bp.Model, truth: Mapping[str, float], data_seed: int, *, frequency: float, noise: float, samples: int = 40
-) -> bp.Experiment:
-    """Return a synthetic run under a sine of 10 mm, white noise of this sd [N] on every sample of the force."""
-    displacement = STROKE * np.sin(2 * np.pi * np.arange(samples) / samples)
-    exact = bp.solve_periodic(
-        model, dict(truth), {"x": displacement}, frequency=frequency, samples=samples, scheme="central4"
-    )
-    force = exact.outputs["force"] + noise * _generator(model, data_seed).standard_normal(samples)
-    return bp.Experiment("run", frequency, {"force": force}, {"x": displacement}, samples=samples, synthetic=True)
-
-
 def _expected(**tools: Mapping[str, str]) -> dict[str, dict[str, tuple[str, ...]]]:
-    return {tool: {name: (verdict,) for name, verdict in verdicts.items()} for tool, verdicts in tools.items()}
+    """Return one right verdict by tool and parameter; the prediction is adequate if not stated otherwise."""
+    stated = {**tools, PREDICT: tools.get(PREDICT, {"all": ADEQUATE})}
+    return {tool: {name: (verdict,) for name, verdict in verdicts.items()} for tool, verdicts in stated.items()}
 
 
 QUICKLY = {"ensembles": 2, "walkers": 32, "variances": "collapsed", "max_steps": 6000}
 
 
 def _one_run(
-    title: str, shown: str, model: bp.Model, truth: Mapping[str, float], priors: Mapping[str, Any],
-    expected: Mapping[str, Mapping[str, tuple[str, ...]]], fault: Mapping[str, tuple[str, ...]], *,
-    fitted: bp.Model | None = None, frequency: float = 2.0, noise: float = 1.0, samples: int = 40,
-    delay: bool = False, fixed: Mapping[str, float] | None = None, sampling: Mapping[str, Any] | None = None,
+    title: str, shown: str, model: bp.Model, truth: Mapping[str, float], priors: Mapping[str, Any], expected: Expected,
+    fault: Mapping[str, tuple[str, ...]], *, fitted: bp.Model | None = None, frequency: float = 2.0,
+    noise: float = 1.0, samples: int = 40, fixed: Mapping[str, float] | None = None, start: str = "laplace",
 ) -> Case:  # fmt: skip
-    """Return a case with one synthetic run of a model, fitted with the same model or another one."""
+    """Return a case with one synthetic run of a model, fitted with the same model or another one.
+
+    The displacement is a sine of 10 mm, every sample of the force has white noise of this sd [N].
+    """
+    values = {name: truth[name] for name in model.parameters}
 
     def problem(data_seed: int) -> bp.Problem:
-        run = _measured(model, truth, data_seed, frequency=frequency, noise=noise, samples=samples)
+        x = {"x": STROKE * np.sin(2 * np.pi * np.arange(samples) / samples)}
+        exact = bp.solve_periodic(model, values, x, frequency=frequency, samples=samples, scheme="central4")
+        force = exact.outputs["force"] + noise * _generator(model, data_seed).standard_normal(samples)
+        run = bp.Experiment("run", frequency, {"force": force}, x, samples=samples, synthetic=True)
         return bp.Problem(fitted or model, [run], priors=priors, fixed=fixed or {})
 
-    known = {**truth, "shift[run]": 0.0} if delay else truth
-    return Case(title, known, problem, shown, expected, fault, {**QUICKLY, **(sampling or {})})
+    return Case(title, truth, problem, shown, expected, fault, {**QUICKLY, "start": start})
 
 
 STIFFNESS = bp.Normal(8e3, 4e3)
@@ -115,10 +102,7 @@ def product_ridge() -> Case:
     return _one_run(
         "only the product of a and b is identifiable", "a", PRODUCT, {"a": 1.0, "b": 1e4},
         {"a": bp.LogNormal(1.0, 0.7), "b": bp.LogNormal(1e4, 0.7)},
-        _expected(
-            identifiability={"a": COMBINATION, "b": COMBINATION}, compare={"a": SHAPE, "b": SHAPE},
-            predict={"all": ADEQUATE},
-        ),
+        _expected(identifiability={"a": COMBINATION, "b": COMBINATION}, compare={"a": SHAPE, "b": SHAPE}),
         {IDENTIFIABILITY: ("a", "b")}, noise=4.0,
     )  # fmt: skip
 
@@ -130,7 +114,6 @@ def sum_ridge() -> Case:
         {"a": bp.Normal(5e3, 2e3), "b": bp.Normal(5e3, 2e3)},
         _expected(
             identifiability={"a": COMBINATION, "b": COMBINATION}, compare={"a": FINE, "b": FINE}, joint={"all": FINE},
-            predict={"all": ADEQUATE},
         ),
         {IDENTIFIABILITY: ("a", "b")}, noise=4.0,
     )  # fmt: skip
@@ -144,15 +127,14 @@ ROTATION = 13.0 / (2 * np.pi)
 @cache
 def _rotations(samples: int = 100) -> tuple[bp.PeriodicSolution, ...]:
     """Return locked rotations of the pendulum, one turn a forcing period, at two frequencies."""
-    tau, found = np.arange(samples) / samples, []
-    for frequency in (ROTATION, 1.15 * ROTATION):
-        found.append(
-            bp.solve_periodic(
-                bp.models.pendulum, PENDULUM_TRUTH | PENDULUM_FIXED, frequency=frequency, samples=samples,
-                scheme="central4", winding=1, guess={"phi": 2 * np.pi * tau - 0.57},
-            )
-        )  # fmt: skip
-    return tuple(found)
+    guess = {"phi": 2 * np.pi * (np.arange(samples) / samples) - 0.57}
+    return tuple(
+        bp.solve_periodic(
+            bp.models.pendulum, PENDULUM_TRUTH | PENDULUM_FIXED, frequency=frequency, samples=samples,
+            scheme="central4", winding=1, guess=guess,
+        )
+        for frequency in (ROTATION, 1.15 * ROTATION)
+    )  # fmt: skip
 
 
 def scaling_symmetry() -> Case:
@@ -164,33 +146,21 @@ def scaling_symmetry() -> Case:
             if not true.converged:
                 raise RuntimeError(f"rotation {number}: no periodic solution ({true.status}).")
             size = true.samples
-            outputs = {
-                "angle": np.mod(true.outputs["angle"] + 0.01 * generator.standard_normal(size) + np.pi, 2 * np.pi)
-                - np.pi,
-                "rate": true.outputs["rate"] + 0.1 * generator.standard_normal(size),
-            }
-            runs.append(
-                bp.Experiment(
-                    f"rotation {number}", true.frequency, outputs, samples=size, winding=1, guess=true.states,
-                    synthetic=True,
-                )
-            )  # fmt: skip
+            angle = true.outputs["angle"] + 0.01 * generator.standard_normal(size)
+            rate = true.outputs["rate"] + 0.1 * generator.standard_normal(size)
+            outputs = {"angle": np.mod(angle + np.pi, 2 * np.pi) - np.pi, "rate": rate}
+            settings: dict[str, Any] = {"winding": 1, "guess": true.states, "synthetic": True}
+            runs.append(bp.Experiment(f"rotation {number}", true.frequency, outputs, samples=size, **settings))
         priors = {name: bp.LogNormal(value, 0.5) for name, value in PENDULUM_TRUTH.items()}
         return bp.Problem(bp.models.pendulum, runs, priors=priors, fixed=PENDULUM_FIXED, scheme="central4")
 
     return Case(
-        "pendulum: m, k1, k2, k3 may all grow by one factor",
-        PENDULUM_TRUTH,
-        problem,
-        "m",
-        _expected(
-            identifiability={name: COMBINATION for name in ("m", "k1", "k2", "k3")} | {"l": DETERMINED},
-            predict={"all": ADEQUATE},
-        ),
+        "pendulum: m, k1, k2, k3 may all grow by one factor", PENDULUM_TRUTH, problem, "m",
+        _expected(identifiability={name: COMBINATION for name in ("m", "k1", "k2", "k3")} | {"l": DETERMINED}),
         {IDENTIFIABILITY: ("m", "k1", "k2", "k3")},
         {"ensembles": 2, "variances": "collapsed", "max_steps": 12_000},
         drawless=True,
-    )
+    )  # fmt: skip
 
 
 def linear() -> Case:
@@ -201,7 +171,6 @@ def linear() -> Case:
         {"k": STIFFNESS, "c": bp.Normal(50.0, 50.0), "coulomb": bp.Normal(10.0, 20.0)},
         _expected(
             identifiability=dict.fromkeys(truth, DETERMINED), compare=dict.fromkeys(truth, FINE), joint={"all": FINE},
-            predict={"all": ADEQUATE},
         ),
         {},
     )  # fmt: skip
@@ -210,13 +179,10 @@ def linear() -> Case:
 def sign_undetermined() -> Case:
     """Return a small damping and a recording delay, known to 1 ms, that acts as ±10 N s/m."""
     return _one_run(
-        "a delay of the recording may be the damping", "c", DAMPED, {"k": 1e4, "c": 3.0},
+        "a delay of the recording may be the damping", "c", DAMPED, {"k": 1e4, "c": 3.0, "shift[run]": 0.0},
         {"k": STIFFNESS, "c": bp.Normal(0.0, 100.0), "shift": bp.Normal(0.0, 1e-3)},
-        _expected(
-            identifiability={"k": DETERMINED, "c": SIGN}, compare=dict.fromkeys(("k", "c", "shift[run]"), FINE),
-            predict={"all": ADEQUATE},
-        ),
-        {IDENTIFIABILITY: ("c",)}, delay=True,
+        _expected(identifiability={"k": DETERMINED, "c": SIGN}, compare=dict.fromkeys(("k", "c", "shift[run]"), FINE)),
+        {IDENTIFIABILITY: ("c",)},
     )  # fmt: skip
 
 
@@ -227,7 +193,6 @@ def prior_dominated() -> Case:
         {"k": STIFFNESS, "c": bp.Normal(20.0, 3.0)},
         _expected(
             identifiability={"k": DETERMINED, "c": PRIOR_ONLY}, compare={"k": FINE, "c": FINE}, joint={"all": FINE},
-            predict={"all": ADEQUATE},
         ),
         {IDENTIFIABILITY: ("c",)}, frequency=0.5,
     )  # fmt: skip
@@ -238,8 +203,7 @@ def truncated() -> Case:
     return _one_run(
         "the prior excludes the true value", "c", DAMPED, {"k": 1e4, "c": 24.5},
         {"k": STIFFNESS, "c": bp.Uniform(0.0, 20.0)},
-        _expected(identifiability={"k": DETERMINED, "c": PRIOR_ONLY}, predict={"all": ADEQUATE})
-        | {COMPARE: {"k": (FINE,), "c": (SHAPE, WIDE)}},
+        _expected(identifiability={"k": DETERMINED, "c": PRIOR_ONLY}) | {COMPARE: {"k": (FINE,), "c": (SHAPE, WIDE)}},
         {IDENTIFIABILITY: ("c",), COMPARE: ("c",)},
     )  # fmt: skip
 
@@ -250,8 +214,8 @@ def two_modes() -> Case:
     return _one_run(
         "two positions on the beam fit equally well", "position", BEAM, truth,
         {"position": bp.TruncatedNormal(0.4, 0.3, 0.0, 1.0)},
-        _expected(compare={"position": MODE}, joint={"all": MODE}, predict={"all": ADEQUATE}),
-        {COMPARE: ("position",)}, noise=4.0, fixed={"k": truth["k"]}, sampling={"start": "prior"},
+        _expected(compare={"position": MODE}, joint={"all": MODE}),
+        {COMPARE: ("position",)}, noise=4.0, fixed={"k": truth["k"]}, start="prior",
     )  # fmt: skip
 
 

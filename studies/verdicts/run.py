@@ -5,9 +5,7 @@ with up to 20 seeds. Each replicate is saved in replicates.jsonl as it ends, and
 """
 
 import argparse
-import hashlib
 import textwrap
-import time
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -15,29 +13,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import bayesperiodic as bp
 from studies import common
-from studies.common import resumed
 from studies.verdicts import cases
 from studies.verdicts import outcome as verdicts_outcome
 from studies.verdicts.cases import CASES, COMPARE, FINE, IDENTIFIABILITY, PREDICT
-from studies.verdicts.outcome import Outcome, examine, numbers
+from studies.verdicts.outcome import Outcome, examine
 
 DATA, SAMPLER = "data", "sampler"
 MOST_SAMPLER_SEEDS = 20
 ALWAYS_SAMPLED = 50
+# The data seed of the gallery itself, and of the replicates with other sampler seeds, is this times the seed.
 STRIDE = 1000
 FILE = "replicates.jsonl"
 
 Task = tuple[str, str, int, int]
-
-
-def first_seed(seed: int) -> int:
-    """Return the data seed of the gallery itself, and of the replicates with other sampler seeds."""
-    return STRIDE * seed
 
 
 def replicate(task: Task) -> dict[str, Any]:
@@ -47,30 +41,20 @@ def replicate(task: Task) -> dict[str, Any]:
     """
     name, kind, number, seed = task
     found: dict[str, Any] = {"case": name, "kind": kind, "number": number, "seed": seed, "source": source()}
-    data = first_seed(seed) + (number if kind == DATA else 0)
+    data = STRIDE * seed + (number if kind == DATA else 0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            if kind == DATA and number >= ALWAYS_SAMPLED and set(CASES[name]().fault) == {IDENTIFIABILITY}:
-                return found | _before_sampling(name, data).line()
-            return found | examine(name, data, first_seed(seed) + number, drawless=kind == DATA).line()
+            case = CASES[name]()
+            enough = case.drawless or (number >= ALWAYS_SAMPLED and set(case.fault) == {IDENTIFIABILITY})
+            return found | examine(name, data, STRIDE * seed + number, drawless=kind == DATA and enough).line()
         except (RuntimeError, ValueError) as error:
             return found | {"error": f"{type(error).__name__}: {error}"}
 
 
-def _before_sampling(name: str, data_seed: int) -> Outcome:
-    """Return the verdicts on the data of one seed from the estimate alone."""
-    start, case = time.perf_counter(), CASES[name]()
-    problem = case.problem(data_seed)
-    fit = bp.map_estimate(problem, progress=False)
-    return Outcome(case, problem, fit, bp.identifiability(problem, fit), None, time.perf_counter() - start)
-
-
 def source() -> str:
     """Return a key that identifies version and cases of the replicates."""
-    files = [Path(str(module.__file__)) for module in (cases, verdicts_outcome)]
-    text = common.versions()["bayesperiodic"] + "".join(common.sha256(path) for path in files)
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
+    return common.source_key(cases.__file__, verdicts_outcome.__file__)
 
 
 def replicates(folder: Path, names: Sequence[str], count: int, seed: int) -> list[dict[str, Any]]:
@@ -79,11 +63,8 @@ def replicates(folder: Path, names: Sequence[str], count: int, seed: int) -> lis
     for number in range(count):
         tasks += [(name, DATA, number, seed) for name in names]
         tasks += [(name, SAMPLER, number, seed) for name in names if number < MOST_SAMPLER_SEEDS]
-    return resumed(folder / FILE, tasks, replicate, _task, source())
-
-
-def _task(line: Mapping[str, Any]) -> Task:
-    return line["case"], line["kind"], line["number"], line["seed"]
+    keys = "case", "kind", "number", "seed"
+    return common.resumed(folder / FILE, tasks, replicate, lambda line: tuple(line[key] for key in keys), source())
 
 
 def summary(lines: Sequence[Mapping[str, Any]], outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
@@ -126,16 +107,13 @@ def _flips(lines: Sequence[Mapping[str, Any]], outcome: Outcome) -> dict[str, li
 
 def account_of_replicates(found: Mapping[str, Any]) -> str:
     """Return the counts as a table to print."""
-    lines = [f"  {'case':18s} {'kind':8s} replicates sampled right named warned converged  s each"]
-    for name, kinds in found.items():
-        for kind, c in kinds.items():
-            lines.append(
-                f"  {name:18s} {kind:8s} {c['replicates']:10d} {c['sampled']:7d} {c['right']:5d} {c['named']:5d} "
-                f"{c['warned']:6d} {c['converged']:9d}  {c['seconds_each']}"
-            )
-            lines += [f"      {number} times {what}" for what, number in c["wrong"].items()]
-            lines += [f"      flips: {what}: {', '.join(v)}" for what, v in c.get("verdicts_that_flip", {}).items()]
-            lines += [f"      {error}" for error in c["errors"]]
+    every = {f"{name}, {kind}": counts for name, kinds in found.items() for kind, counts in kinds.items()}
+    columns = ["replicates", "sampled", "right", "named", "warned", "converged", "seconds_each"]
+    lines = [common.shown("replicates by case, with other data or other seeds of the sampler", every, columns)]
+    for name, c in every.items():
+        lines += [f"{name}: {number} times {what}" for what, number in c["wrong"].items()]
+        lines += [f"{name}: flips: {what}: {', '.join(v)}" for what, v in c.get("verdicts_that_flip", {}).items()]
+        lines += [f"{name}: {error}" for error in c["errors"]]
     return "\n".join(lines)
 
 
@@ -144,35 +122,31 @@ RIDGES = {"product_ridge": None, "sum_ridge": None, "scaling_symmetry": ["m", "k
 WIDTH = 72
 
 
-def figures(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
-    """Return the gallery, and a corner of every ridge."""
-    found = {"gallery": gallery(outcomes)}
+def _figures(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
+    found = {"gallery": _gallery(outcomes)}
     for name, names in RIDGES.items():
         if name in outcomes:
             outcome = outcomes[name]
             shown = list(outcome.problem.names) if names is None else names
-            found[name] = bp.plot.corner(outcome.drawn.posterior, laplace=outcome.fit, names=shown)
+            found[name] = bp.plot.corner(outcome.posterior, laplace=outcome.fit, names=shown)
     return found
 
 
-def gallery(outcomes: Mapping[str, Outcome]) -> Figure:
+def _gallery(outcomes: Mapping[str, Outcome]) -> Figure:
     """Draw for every case the marginal of one parameter and its verdicts."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(11.0, 1.55 * len(outcomes) + 0.7), layout="constrained")
     grid = figure.subplots(len(outcomes), 2, squeeze=False, width_ratios=[1.0, 1.35])
     for (left, right), outcome in zip(grid, outcomes.values(), strict=True):
         _marginal(left, outcome)
         _words(right, outcome)
-    handles = {label: h for row in grid for h, label in zip(*row[0].get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside upper left", ncols=3, frameon=False)
+    common.shared_legend(figure, 3, loc="outside upper left")
     figure.suptitle("synthetic data", x=0.99, ha="right", fontsize="medium")
     return figure
 
 
 def _marginal(axes: Axes, outcome: Outcome) -> None:
     name, colours = outcome.case.shown, bp.plot.COLOURS
-    draws = outcome.drawn.posterior.draws(name)
+    draws = outcome.posterior.draws(name)
     density, edges = np.histogram(draws, BINS, tuple(np.quantile(draws, SHOWN)), density=True)
     axes.stairs(density, edges, color=colours["mcmc"], fill=True, label="MCMC")
     mean, sd, truth = outcome.fit.theta[name], outcome.fit.sd[name], outcome.case.truth[name]
@@ -203,9 +177,8 @@ def _words(axes: Axes, outcome: Outcome) -> None:
         PREDICT: verdicts[PREDICT]["all"],
     }
     for place, (tool, text) in zip((0.66, 0.40, 0.14), rows.items(), strict=True):
-        bold = tool in case.fault
         axes.text(0.0, place, tool, va="center", fontsize=10, color="#555555")
-        weight = "bold" if bold else "normal"
+        weight = "bold" if tool in case.fault else "normal"
         axes.text(0.19, place, textwrap.fill(text, WIDTH), va="center", fontsize=9, weight=weight)
     mark = "as expected" if not outcome.wrong else "NOT AS EXPECTED"
     axes.text(1.0, 0.14, mark, va="center", ha="right", fontsize=10, style="italic")
@@ -231,11 +204,11 @@ def run(options: argparse.Namespace) -> None:
     outcomes: dict[str, Outcome] = {}
     for name in QUICK if options.quick else CASES:
         with watch.part(name, name.replace("_", " ")):
-            outcomes[name] = examine(name, first_seed(options.seed), options.seed)
-        print(account(outcomes[name]))
+            outcomes[name] = examine(name, STRIDE * options.seed, options.seed)
+        print(_account(outcomes[name]))
     with watch.part("figures", "drawing"):
-        paths = common.save_figures(options.out, figures(outcomes))
-    results: dict[str, Any] = {name: collect(outcome) for name, outcome in outcomes.items()}
+        paths = common.save_figures(options.out, _figures(outcomes))
+    results: dict[str, Any] = {name: _collect(outcome) for name, outcome in outcomes.items()}
     if options.replicates:
         with watch.part("replicates", f"{options.replicates} replicates of every case"):
             lines = replicates(options.out, tuple(outcomes), options.replicates, options.seed)
@@ -247,9 +220,9 @@ def run(options: argparse.Namespace) -> None:
     print(f"figures (synthetic data): {', '.join(map(str, paths))}\nresults: {path}")
 
 
-def collect(outcome: Outcome) -> dict[str, Any]:
-    """Return the content of results.json on one case."""
-    case, posterior, joint = outcome.case, outcome.drawn.posterior, outcome.drawn.comparison.joint
+def _collect(outcome: Outcome) -> dict[str, Any]:
+    case, posterior, joint = outcome.case, outcome.posterior, outcome.comparison.joint
+    p_values = outcome.prediction.table.select_dtypes("number")
     return {
         "fault": case.title,
         "truth": dict(case.truth),
@@ -264,16 +237,15 @@ def collect(outcome: Outcome) -> dict[str, Any]:
         "effective_sample_size": min(posterior.ess.values()),
         "map": outcome.fit.theta,
         "laplace_sd": {n: sd if sd < float("inf") else None for n, sd in outcome.fit.sd.items()},
-        "numbers": numbers(outcome),
+        "numbers": outcome.numbers,
         "remedy": {n: text for n, text in outcome.identifiability.table["remedy"].items() if text},
         "recommendation": str(joint["recommendation"]) if joint["verdict"] != FINE else "",
-        "p_values": outcome.p_values,
+        "p_values": {str(row): values.dropna().to_dict() for row, values in p_values.iterrows()},
     }
 
 
-def account(outcome: Outcome) -> str:
-    """Return the text to print on a case."""
+def _account(outcome: Outcome) -> str:
     verdicts = [f"{tool}: {', '.join(f'{n} {v}' for n, v in rows.items())}" for tool, rows in outcome.verdicts.items()]
     verdict = f"WRONG ({outcome.wrong})" if outcome.wrong else "right"
-    lines = [f"  fault: {outcome.case.title}; every verdict {verdict}; {outcome.drawn.posterior.reason}", *verdicts]
+    lines = [f"  fault: {outcome.case.title}; every verdict {verdict}; {outcome.posterior.reason}", *verdicts]
     return "\n    ".join(lines)

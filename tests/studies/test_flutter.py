@@ -17,7 +17,7 @@ from studies.flutter.reference import hopf
 
 REAL = common.find_data(None, rig.FILE)
 real_data = pytest.mark.skipif(
-    REAL is None, reason="the measured file is not to be had here, see studies/flutter/data.py"
+    REAL is None, reason="the measured file is not to be had here, see studies/flutter/rig.py"
 )
 FOUR = ("stable_v15_6", "stable_v17_3", "unstable_v14_9", "unstable_v16_5")
 
@@ -44,7 +44,7 @@ def test_hopf_point_agrees_with_the_eigenvalues_and_a_speed_without_a_cycle_rais
 
 def test_half_range_is_that_of_the_interpolated_signal():
     tau = (np.arange(12) + 0.3) / 12
-    assert flutter.half_range(0.2 + np.cos(2 * np.pi * tau)) == pytest.approx(1.0, rel=1e-6)
+    assert questions.half_range(0.2 + np.cos(2 * np.pi * tau), flutter.CURVE) == pytest.approx(1.0, rel=1e-6)
 
 
 @pytest.mark.slow

@@ -8,12 +8,11 @@ import pytest
 import bayesperiodic as bp
 from studies import common
 from studies.__main__ import main
-from studies.silverbox import checks, data
 from studies.silverbox import run as silverbox
 
-REAL = common.find_data(None, data.FILE)
+REAL = common.find_data(None, silverbox.FILE)
 real_data = pytest.mark.skipif(
-    REAL is None, reason="the measured file is not to be had here, see studies/silverbox/data.py"
+    REAL is None, reason="the measured file is not to be had here, see studies/silverbox/run.py"
 )
 NAMES = ("c", "k1", "k2", "k3", "g", "u0")
 
@@ -26,16 +25,16 @@ def run(folder, *arguments):
 @pytest.fixture(scope="module")
 def steady_period():
     """Return a period of drive and response, integrated once."""
-    return data.steady_period()
+    return silverbox.steady_period()
 
 
 @pytest.fixture(scope="module")
 def quick(steady_period, tmp_path_factory):
-    """Return the folder, the results and the printed account of a quick run on synthetic data."""
+    """Return the folder, the results and the printed account of a quick run on synthetic silverbox."""
     folder = tmp_path_factory.mktemp("silverbox")
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
         patch.setattr(common, "find_data", lambda *_: None)
-        patch.setattr(data, "steady_period", lambda: steady_period)
+        patch.setattr(silverbox, "steady_period", lambda: steady_period)
         results = run(folder, "--quick")
     return folder, results, printed.getvalue()
 
@@ -52,11 +51,11 @@ def has_the_promised_keys(results):
 
 def test_synthetic_data_are_labelled_and_the_truth_is_recovered(quick):
     folder, results, printed = quick
-    assert "SYNTHETIC" in printed and data.SHA256 in printed and "nonlinearbenchmark.org" in printed
+    assert "SYNTHETIC" in printed and silverbox.SHA256 in printed and "nonlinearbenchmark.org" in printed
     assert results["data"] == {"path": "generated", "sha256": None, "synthetic": True}
     assert has_the_promised_keys(results)
     for noise in silverbox.NOISES:
-        for name, true in data.TRUE.items():
+        for name, true in silverbox.TRUE.items():
             assert abs(results["estimates"][noise][name] - true) < 5 * results["sd"][noise][name], (noise, name)
     assert sorted(path.name for path in folder.glob("*.png")) == ["estimates.png", "spectrum.png"]
 
@@ -79,19 +78,19 @@ def test_another_start_leads_to_the_same_estimates_and_stalls_are_overcome(quick
 
 
 def test_same_seed_same_recording_and_another_second_part(monkeypatch, steady_period):
-    monkeypatch.setattr(data, "steady_period", lambda: steady_period)
-    (first, second), (again, _) = (data.generate(seed) for seed in (1, 1))
+    monkeypatch.setattr(silverbox, "steady_period", lambda: steady_period)
+    (first, second), (again, _) = (silverbox.generate(seed) for seed in (1, 1))
     assert first.synthetic and np.array_equal(first.outputs["response"], again.outputs["response"])
     assert not np.array_equal(first.inputs["drive"], second.inputs["drive"])
 
 
 def test_error_found_by_doubling_is_that_against_time_integration(steady_period):
     drive, response = steady_period
-    time = np.arange(3 * drive.size) / data.SAMPLING_RATE
+    time = np.arange(3 * drive.size) / silverbox.SAMPLING_RATE
     recording = bp.Recording.from_arrays(time, {"response": np.tile(response, 3)}, {"drive": np.tile(drive, 3)})
-    experiment = data.fold(recording, 4096, response=335)
-    grid = checks.discretisation(recording, experiment, data.TRUE)
-    solution = data.solve(data.TRUE, experiment)
+    experiment = silverbox.fold(recording, 4096, response=335)
+    grid = silverbox.discretisation(recording, experiment, silverbox.TRUE)
+    solution = silverbox.solve(silverbox.TRUE, experiment)
     true = np.sqrt(np.mean((solution.outputs["response"][::4] - response) ** 2)) / response.std()
     assert grid.fraction == pytest.approx(true, rel=0.15)
     assert grid.difference.size == 4096
@@ -102,7 +101,7 @@ def test_error_found_by_doubling_is_that_against_time_integration(steady_period)
 def test_the_measured_silverbox(tmp_path, capsys):
     results = run(tmp_path)
     printed = capsys.readouterr().out
-    assert results["data"]["sha256"] == data.SHA256 and not results["data"]["synthetic"]
+    assert results["data"]["sha256"] == silverbox.SHA256 and not results["data"]["synthetic"]
     assert has_the_promised_keys(results)
     assert results["cycles"] == 9 and results["input_harmonics"] == 335
     assert results["residual_fraction"] <= 0.007
@@ -126,11 +125,11 @@ def test_estimates_of_the_measured_silverbox_by_an_independent_route():
     import numba
     from scipy.optimize import least_squares
 
-    (recording, _), _ = data.read_steady_parts(None, 1)
-    experiment = data.fold(recording, silverbox.SAMPLES)
-    fit = bp.map_estimate(data.problem(experiment))
+    (recording, _), _ = silverbox.read_steady_parts(None, 1)
+    experiment = silverbox.fold(recording, silverbox.SAMPLES)
+    fit = bp.map_estimate(silverbox.problem(experiment))
     drive, response = (
-        np.reshape(signal, (data.PERIODS, -1)).mean(axis=0)
+        np.reshape(signal, (silverbox.PERIODS, -1)).mean(axis=0)
         for signal in (recording.inputs["drive"], recording.outputs["response"])
     )
     lines = np.fft.rfft(drive)
@@ -138,12 +137,12 @@ def test_estimates_of_the_measured_silverbox_by_an_independent_route():
     points = 16_384
     fine = np.fft.irfft(lines, 2 * points) * (2 * points / drive.size)
     kept = experiment.harmonics["response"] + 1
-    h = 1.0 / (data.FREQUENCY * points)
+    h = 1.0 / (silverbox.FREQUENCY * points)
 
     @numba.njit
     def march(c, k1, k2, k3, g, u0):
         y, v, path = 0.0, 0.0, np.empty(points)
-        w = data.W0
+        w = silverbox.W0
         for step in range(2 * points):
             i = step % points
             path[i] = y

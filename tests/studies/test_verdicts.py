@@ -83,7 +83,7 @@ def test_replicates_are_saved_one_by_one_and_resumed(tmp_path, monkeypatch):
 def test_counts_report_wrong_and_changed_verdicts(quick):
     folder, results, _ = quick
     outcome = examine("scaling_symmetry", 0, 0, drawless=True)
-    assert outcome.sampled is None and not outcome.wrong and outcome.named
+    assert outcome.posterior is None and not outcome.wrong and outcome.named
     line = {"case": "scaling_symmetry", "kind": "data", "number": 0, "seed": 1} | outcome.line()
     other = line | {
         "kind": "sampler", "right": False, "named": False,
