@@ -1,24 +1,169 @@
-"""Figures of posterior draws: corner plot, marginals and traces, with the Laplace approximation."""
+"""Figures of estimates: fitted periods, loops, and posterior draws with the Laplace approximation."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, FigureBase
+from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 from scipy.stats import norm
 
-from bayesperiodic import _checks
+from bayesperiodic import _checks, _fourier
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.diagnostics.predictive import Prediction
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, caveats_of, unit_of, wrapped_label
+from bayesperiodic.plot import style
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, LAPLACE, axis_label, caveats_of, chosen, draws_label
+from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
 
-LEVELS = (0.5, 0.9)
+MEASURED: dict[str, Any] = {"color": COLOURS["measured"], "marker": "o"}
+FITTED: dict[str, Any] = {"color": COLOURS["map"], "ls": "--", "marker": "x"}
+BAND: dict[str, Any] = {"color": COLOURS["mcmc"], "alpha": 0.45}
+LEVELS, LEVELS_TEXT = (0.5, 0.9), "50% and 90%"
 FEWEST_BINS, MOST_BINS = 35, 200
+BINS, SHOWN = 40, (0.0005, 0.9995)
 # Range of the powers of ten of ticks without an offset or a common factor.
 WHOLE = (-5, 10)
+MOST_STEPS = 300
+
+
+def fit(
+    problem: Problem,
+    estimate: MapEstimate,
+    prediction: Prediction | None = None,
+    *,
+    experiments: Sequence[str] | None = None,
+    figure: Figure | None = None,
+) -> Figure:
+    """Draw each measured mean period with the fitted one, a predictive band and the residual below.
+
+    Parameters
+    ----------
+    problem : Problem
+    estimate : MapEstimate
+    prediction : Prediction, optional
+    experiments : sequence of str, optional
+        By default all.
+    figure : Figure, optional
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ValueError
+        For an unknown name.
+
+    Examples
+    --------
+    >>> figure = bp.plot.fit(problem, fit)
+    >>> [axes.get_ylabel() for axes in figure.axes]
+    ['displacement [m]', 'residual [m]']
+    """
+    runs = chosen(experiments, tuple(e.name for e in problem.experiments), "experiments")
+    shown = [(e, channel) for e in problem.experiments if e.name in runs for channel in e.outputs]
+    figure = figure or plt.figure(figsize=(7.0, 4.6 * len(shown)), layout="constrained")
+    grid = figure.add_gridspec(2 * len(shown), 1, height_ratios=[3, 1] * len(shown))
+    for row, (e, channel) in enumerate(shown):
+        top = figure.add_subplot(grid[2 * row])
+        below = figure.add_subplot(grid[2 * row + 1], sharex=top)
+        residual = estimate.residuals[e.name][channel]
+        predicted = e.outputs[channel] - residual
+        if prediction is not None:
+            low, high = prediction.low[e.name][channel], prediction.high[e.name][channel]
+            _band(top, e, low, high, f"{prediction.probability:.0%} predictive band")
+            _band(below, e, low - predicted, high - predicted, "_")
+        _curve(top, e, e.time, e.outputs[channel], lw=1.6, label=_measured(problem, e.cycles), **MEASURED)
+        _curve(top, e, e.time, predicted, lw=1.2, label="MAP", **FITTED)
+        _curve(below, e, e.time, residual, lw=1.0, **MEASURED)
+        below.axhline(0.0, lw=1.0, color=COLOURS["map"], ls="--")
+        unit = problem.model.units.get(channel, "")
+        top.set(ylabel=axis_label(channel, unit), title=axis_label(e.name))
+        below.set(ylabel=axis_label("residual", unit), xlabel="time in the period [s]")
+        top.tick_params(labelbottom=False)
+        top.legend(frameon=False)
+    return figure
+
+
+def _curve(axes: Axes, e: Experiment, x: np.ndarray, y: np.ndarray, closed: bool = False, **look: Any) -> None:
+    """Draw a curve without markers, or points without a line for masked data."""
+    if e.mask is None:
+        at = np.arange(x.size + closed) % x.size
+        axes.plot(x[at], y[at], **look | {"marker": None})
+    else:
+        axes.plot(x[e.mask], y[e.mask], **look | {"ls": "none"})
+
+
+def _band(axes: Axes, e: Experiment, low: np.ndarray, high: np.ndarray, label: str) -> None:
+    if e.mask is None:
+        axes.fill_between(e.time, low, high, lw=0, label=label, **BAND)
+    else:
+        axes.vlines(e.time[e.mask], low[e.mask], high[e.mask], lw=8, label=label, **BAND)
+
+
+def loops(
+    problem: Problem,
+    estimate: MapEstimate,
+    *,
+    output: str | None = None,
+    input: str | None = None,
+    figure: Figure | None = None,
+) -> Figure:
+    """Draw an output against an input and against the rate of the input, measured and fitted, for every experiment.
+
+    Parameters
+    ----------
+    problem : Problem
+    estimate : MapEstimate
+    output, input : str, optional
+        By default the first of each.
+    figure : Figure, optional
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ValueError
+        For an unknown name, or a model without inputs.
+
+    Examples
+    --------
+    >>> figure = bp.plot.loops(problem, fit)
+    >>> [axes.get_xlabel() for axes in figure.axes]
+    ['force [N]', 'rate of force [N/s]']
+    """
+    output = problem.channels[0] if output is None else output
+    _checks.one_of("output", output, problem.channels)
+    input = next(iter(problem.model.inputs), "") if input is None else input
+    _checks.one_of("input", input, problem.model.inputs)
+    figure = figure or plt.figure(figsize=(9.0, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    for number, e in enumerate(problem.experiments):
+        measured = e.outputs[output]
+        predicted = measured - estimate.residuals[e.name][output]
+        amplitudes = _fourier.coefficients(e.inputs[input])
+        rate = _fourier.on_grid(_fourier.derivative(amplitudes, e.frequency / e.periods), measured.size)
+        labels = (_measured(problem, e.cycles), "MAP") if number == 0 else (None, None)
+        for axes, across in ((left, e.inputs[input]), (right, rate)):
+            _curve(axes, e, across, measured, closed=True, lw=1.6, label=labels[0], **MEASURED)
+            _curve(axes, e, across, predicted, closed=True, lw=1.2, label=labels[1], **FITTED)
+    unit = problem.model.units.get(input, "")
+    left.set(xlabel=axis_label(input, unit), ylabel=axis_label(output, problem.model.units.get(output, "")))
+    right.set_xlabel(axis_label(f"rate of {input}", f"{unit}/s" if unit else ""))
+    left.legend(frameon=False)
+    return figure
+
+
+def _measured(problem: Problem, cycles: int) -> str:
+    synthetic = any(e.synthetic for e in problem.experiments)
+    return f"{'synthetic' if synthetic else 'measured'}, mean of {cycles} cycles"
 
 
 def corner(
@@ -61,8 +206,7 @@ def corner(
 
     names = chosen(names, posterior.names)
     draws = np.stack([posterior.draws(name) for name in names], axis=-1)
-    span = [tuple(np.quantile(draws[:, i], [0.0005, 0.9995])) for i in range(len(names))]
-    titles = [wrapped_label(name, unit_of(posterior, name)) for name in names]
+    titles = [draws_label(posterior, name) for name in names]
     bins = _bins(draws)
     margin = 0.9 + 0.17 * max(title.count("\n") for title in titles)
     size = 1.75 * len(names) + margin + 0.2
@@ -70,7 +214,7 @@ def corner(
         draws,
         labels=titles,
         levels=LEVELS,
-        range=span,
+        range=[tuple(ends) for ends in np.quantile(draws, SHOWN, axis=0).T],
         bins=bins,
         hist_bin_factor=FEWEST_BINS / bins,
         smooth=1.0,
@@ -84,10 +228,13 @@ def corner(
         fig=figure or plt.figure(figsize=(size, size)),
     )
     _write_out_ticks(figure)
+    handles = [plt.Line2D([], [], color=COLOURS["mcmc"], lw=4, label=f"MCMC, {LEVELS_TEXT}")]
     if laplace is not None:
-        mean, covariance = normal_approximation(names, laplace)
-        _laplace_on_corner(np.array(figure.axes).reshape(len(names), len(names)), mean, covariance)
-    _corner_legend(figure, posterior, laplace is not None, min(14, 4 * max(len(names), 2)))
+        _laplace_on_corner(np.array(figure.axes).reshape(len(names), -1), *_normal_approximation(names, laplace))
+        handles.append(plt.Line2D([], [], label=f"Laplace, {LEVELS_TEXT}", **LAPLACE))
+    font = min(14, 4 * max(len(names), 2))
+    place: dict[str, Any] = {"loc": "upper right", "bbox_to_anchor": (0.97, 0.97), "frameon": False}
+    figure.legend(handles=handles, fontsize=font, title=caveats_of(posterior) or None, title_fontsize=font, **place)
     width, height = figure.get_size_inches()
     top = 0.98 if len(names) > 1 else 0.75
     figure.subplots_adjust(left=margin / width, bottom=margin / height, right=0.98, top=top)
@@ -117,44 +264,16 @@ def _write_out_ticks(figure: Figure) -> None:
             axis.get_offset_text().set_visible(False)
 
 
-def _corner_legend(figure: Figure, posterior: Posterior, laplace: bool, fontsize: int) -> None:
-    handles = [plt.Line2D([], [], color=COLOURS["mcmc"], lw=4, label=f"MCMC, {_levels()}")]
-    if laplace:
-        handles.append(plt.Line2D([], [], color=COLOURS["laplace"], lw=1.6, ls="--", label=f"Laplace, {_levels()}"))
-    figure.legend(
-        handles=handles,
-        loc="upper right",
-        bbox_to_anchor=(0.97, 0.97),
-        frameon=False,
-        fontsize=fontsize,
-        title=caveats_of(posterior) or None,
-        title_fontsize=fontsize,
-    )
-
-
-def chosen(names: Sequence[str] | None, every: tuple[str, ...], argument: str = "names") -> tuple[str, ...]:
-    """Return the validated names to draw, by default all."""
-    if names is None:
-        return every
-    if isinstance(names, str) or not len(names):
-        raise ValueError(f"{argument}: must be a sequence of names, such as [{every[0]!r}], got {names!r}.")
-    for name in names:
-        _checks.one_of(argument, name, every)
-    if len(set(names)) < len(names):
-        raise ValueError(f"{argument}: must be different names, got {list(names)}.")
-    return tuple(names)
-
-
-def normal_approximation(names: tuple[str, ...], fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
+def _normal_approximation(names: tuple[str, ...], fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean (names,) and covariance (names, names) in natural values; NaN if undefined."""
     _checks.contains("laplace", [*fit.theta, *fit.noise], names, "give an estimate of the same problem")
     theta, noise = [n for n in names if n in fit.theta], [n for n in names if n not in fit.theta]
-    mean = np.array([fit.theta[n] if n in fit.theta else fit.joint_mode.get(n, np.nan) for n in names])
+    mean = pd.Series(fit.joint_mode | fit.theta, dtype=float).reindex([*names])
     covariance = pd.DataFrame(0.0, index=[*names], columns=[*names])
     covariance.loc[theta, theta] = fit.covariance.loc[theta, theta]
-    modes = [fit.joint_mode.get(n, np.nan) for n in noise]
-    covariance.loc[noise, noise] = fit.joint_covariance.reindex(noise, columns=noise) * np.outer(modes, modes)
-    return mean, covariance.to_numpy()
+    scale = np.outer(mean[noise], mean[noise])
+    covariance.loc[noise, noise] = fit.joint_covariance.reindex(noise, columns=noise) * scale
+    return mean.to_numpy(), covariance.to_numpy()
 
 
 def _laplace_on_corner(axes: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
@@ -164,7 +283,7 @@ def _laplace_on_corner(axes: np.ndarray, mean: np.ndarray, covariance: np.ndarra
         left, right = axes[i, i].get_xlim()
         x = np.linspace(left, right, 200)
         density = norm.pdf(x, mean[i], np.sqrt(variances[i]))
-        axes[i, i].plot(x, density, color=COLOURS["laplace"], lw=1.6, ls="--")
+        axes[i, i].plot(x, density, **LAPLACE)
         axes[i, i].set_ylim(0.0, 1.1 * max(density.max(), axes[i, i].get_ylim()[1] / 1.1))
         for j in drawn[drawn < i]:
             sds = np.sqrt(variances[[j, i]])
@@ -182,13 +301,6 @@ def _ellipses(axes: Axes, centre: np.ndarray, sds: np.ndarray, correlation: floa
         axes.plot(x, y, color=COLOURS["laplace"], lw=1.4, ls="--", zorder=5)
 
 
-def _levels() -> str:
-    return " and ".join(f"{level:.0%}" for level in LEVELS)
-
-
-ACROSS, BINS, SHOWN = 4, 40, (0.0005, 0.9995)
-
-
 def marginals(
     posterior: Posterior,
     *,
@@ -204,9 +316,8 @@ def marginals(
     laplace : MapEstimate, optional
         For noise parameters see `corner`.
     names : sequence of str, optional
-        Full names such as "k", "theta16[run 7]" and "variance[force]"; by default all.
+        See `corner`.
     figure : Figure, optional
-        An empty figure to draw into.
 
     Returns
     -------
@@ -226,49 +337,20 @@ def marginals(
     names = chosen(names, posterior.names)
     mean, sd = np.full((2, len(names)), np.nan)
     if laplace is not None:
-        mean, covariance = normal_approximation(names, laplace)
+        mean, covariance = _normal_approximation(names, laplace)
         sd = np.sqrt(np.diag(covariance))
-    columns, rows = panel_grid(len(names))
+    columns, rows = style.panel_grid(len(names))
     figure = figure or plt.figure(figsize=(2.4 * columns + 0.4, 2.3 * rows + 0.6), layout="constrained")
-    shown = panels(figure, len(names))
-    for i, (axes, name) in enumerate(zip(shown, names, strict=True)):
+    panels = style.panels(figure, len(names))
+    for i, (axes, name) in enumerate(zip(panels, names, strict=True)):
         draws = posterior.draws(name)
         density, edges = np.histogram(draws, BINS, tuple(np.quantile(draws, SHOWN)), density=True)
-        draw_marginal(axes, edges, density, float(mean[i]), float(sd[i]))
-        axes.set_xlabel(wrapped_label(name, unit_of(posterior, name)))
-    figure.legend(*shown[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
+        style.draw_marginal(axes, edges, density, float(mean[i]), float(sd[i]))
+        axes.set_xlabel(draws_label(posterior, name))
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
     if text := caveats_of(posterior):
         figure.suptitle(text, x=0.99, ha="right", fontsize="medium")
     return figure
-
-
-def panel_grid(count: int, across: int = ACROSS) -> tuple[int, int]:
-    """Return the numbers of columns and rows of so many panels."""
-    columns = min(count, across)
-    return columns, -(-count // columns)
-
-
-def panels(figure: FigureBase, count: int, across: int = ACROSS, sharey: bool = False) -> list[Axes]:
-    """Create so many panels in a grid."""
-    columns, rows = panel_grid(count, across)
-    grid = figure.subplots(rows, columns, sharey=sharey, squeeze=False).ravel()
-    for axes in grid[count:]:
-        axes.remove()
-    return list(grid[:count])
-
-
-def draw_marginal(axes: Axes, edges: np.ndarray, density: np.ndarray, mean: float, sd: float) -> None:
-    """Draw a histogram of draws, and a normal density if its sd is finite."""
-    axes.stairs(density, edges, color=COLOURS["mcmc"], alpha=0.45, fill=True)
-    axes.stairs(density, edges, color=COLOURS["mcmc"], lw=1.4, label="MCMC")
-    if np.isfinite(sd) and sd > 0.0:
-        width, reach = edges[-1] - edges[0], 3.0 * sd
-        x = np.linspace(max(mean - reach, edges[0] - 0.5 * width), min(mean + reach, edges[-1] + 0.5 * width), 300)
-        axes.plot(x, norm.pdf(x, mean, sd), color=COLOURS["laplace"], lw=1.6, ls="--", label="Laplace")
-    axes.set_ylim(bottom=0.0)
-    axes.set_yticks([])
-    axes.locator_params(axis="x", nbins=4)
-    axes.spines[["left", "right", "top"]].set_visible(False)
 
 
 def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = None) -> Figure:
@@ -297,19 +379,17 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
     ['c', 'k', 'variance[displacement]']
     """
     _checks.integer("walkers", walkers, 1)
-    names = posterior.names
-    group = posterior.data["posterior"]
+    names, group = posterior.names, posterior.data["posterior"]
     chains, steps = group.sizes["chain"], group.sizes["draw"]
     ensemble = group["ensemble"].to_numpy()
+    shown = np.arange(0, steps, max(1, steps // MOST_STEPS))
     figure = figure or plt.figure(figsize=(8.0, 1.25 * len(names) + 0.6), layout="constrained")
     rows = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
     for axes, name in zip(rows, names, strict=True):
-        paths = posterior.draws(name).reshape(chains, steps)
+        paths = posterior.draws(name).reshape(chains, steps)[:, shown]
         for e in np.unique(ensemble):
-            shown = paths[ensemble == e][:walkers, :: max(1, steps // 300)]
-            across = np.arange(shown.shape[1]) * max(1, steps // 300)
-            axes.plot(across, shown.T, color=ENSEMBLES[e % len(ENSEMBLES)], lw=0.4, alpha=0.6)
-        axes.set_ylabel(wrapped_label(name, unit_of(posterior, name)), fontsize=8)
+            axes.plot(shown, paths[ensemble == e][:walkers].T, color=ENSEMBLES[e % len(ENSEMBLES)], lw=0.4, alpha=0.6)
+        axes.set_ylabel(draws_label(posterior, name), fontsize=8)
         axes.annotate(
             f"tau {posterior.tau[name]:.0f} steps, R-hat {posterior.rhat[name]:.3f}",
             (0.995, 0.97),
