@@ -9,15 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import ndtri
 
-from bayesperiodic.diagnostics.calibration import (
-    Calibration,
-    bin_count,
-    binomial_band,
-    coverage,
-    ecdf_band,
-    evaluation_points,
-)
-from bayesperiodic.diagnostics.campaigns import METHODS
+from bayesperiodic.diagnostics import calibration as uniformity
+from bayesperiodic.diagnostics.calibration import METHODS, Calibration
 from bayesperiodic.diagnostics.comparison import Comparison
 from bayesperiodic.diagnostics.verdicts import END_SHIFT, ERRORS, FINE, LEVELS
 from bayesperiodic.estimation.profile import CLOSED, Profile
@@ -69,11 +62,11 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
             values = calibration.positions[method][name]
             values = np.sort(values[np.isfinite(values)])
             _histogram(row[0], values, method, f"{LABELS[method]}: {verdicts[method, name]}")
-            points, size, banded = evaluation_points(), values.size, method == METHODS[0] and values.size
+            points, size, banded = uniformity.evaluation_points(), values.size, method == METHODS[0] and values.size
             steps = np.searchsorted(values, points, side="right") / max(size, 1)
-            _deviation(row[1], steps, ecdf_band(size, LEVEL) if banded else None, method)
-            covered = np.array([coverage(values, level) for level in points])
-            _deviation(row[2], covered, binomial_band(size, points, 1.0 - LEVEL) if banded else None, method)
+            _deviation(row[1], steps, uniformity.ecdf_band(size, LEVEL) if banded else None, method)
+            covered = np.array([uniformity.coverage(values, level) for level in points])
+            _deviation(row[2], covered, uniformity.binomial_band(size, points, 1.0 - LEVEL) if banded else None, method)
         row[0].set(ylim=(0.0, HEADROOM * row[0].get_ylim()[1]), ylabel=wrapped_label(name, ""))
         row[0].legend(frameon=False, fontsize="small", loc="upper center")
     for top, bottom, title, label in zip(grid[0], grid[-1], TITLES, ACROSS, strict=True):
@@ -84,11 +77,11 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
 
 
 def _histogram(axes: Axes, values: np.ndarray, method: str, label: str) -> None:
-    bins = bin_count(values.size)
+    bins = uniformity.bin_count(values.size)
     counts, edges = np.histogram(values, bins, (0.0, 1.0))
     expected = max(values.size, 1) / bins
     if method == METHODS[0] and values.size:
-        low, high = binomial_band(values.size, np.array(1.0 / bins), 1.0 - LEVEL)
+        low, high = uniformity.binomial_band(values.size, np.array(1.0 / bins), 1.0 - LEVEL)
         axes.axhspan(float(low) * bins, float(high) * bins, **BAND)
     axes.stairs(counts / expected, edges, color=COLOURS[method], ls=LINES[method], lw=1.6, label=label)
     axes.set_xlim(0.0, 1.0)
@@ -96,7 +89,7 @@ def _histogram(axes: Axes, values: np.ndarray, method: str, label: str) -> None:
 
 def _deviation(axes: Axes, values: np.ndarray, band: tuple[np.ndarray, np.ndarray] | None, method: str) -> None:
     """Draw a function of the evaluation points minus the points themselves, with its band."""
-    points = evaluation_points()
+    points = uniformity.evaluation_points()
     if band is not None:
         axes.fill_between(points, band[0] - points, band[1] - points, **BAND)
     axes.plot(points, values - points, color=COLOURS[method], ls=LINES[method], lw=1.4)
