@@ -138,14 +138,10 @@ class Calibration(Result):
         Number of failed replicates by reason: "no steady state" (of the simulated truth), "fold failed", "no estimate",
         "estimate not converged" (excluded for Laplace), "no draws", "draws not usable" (fewer than 20 independent ones,
         or R-hat above 1.1; excluded for MCMC).
-    replicates : int
-        Total number.
-    stop_rule : int
-        Number of chains that passed the stop rule of `sample`.
-    draws : float
-        Median number of independent draws per rank.
-    failed_solves : float
-        Mean fraction of proposals whose periodic solve failed.
+    replicates, stop_rule : int
+        Total number, and number of chains that passed the stop rule of `sample`.
+    draws, failed_solves : float
+        Median number of independent draws per rank, and mean fraction of proposals whose periodic solve failed.
     synthetic : bool
         Always True.
 
@@ -219,8 +215,8 @@ def calibrate(
         other executors, repeat the call with the same folder.
     ensembles, walkers, max_steps
         Arguments of `sample` in each replicate. Short chains suffice, because ranks use draws five autocorrelation
-        times apart. Too few walkers bias the result: with eight in four dimensions this time was underestimated, and
-        the dispersion of exact ranks was 5 to 10 % too large.
+        times apart. Too few walkers bias the result: with eight in four dimensions, the dispersion of exact ranks was 5
+        to 10 % too large.
     progress : bool
 
     Returns
@@ -261,7 +257,7 @@ def calibrate(
         replicate,
         lambda line: line["number"],
         source,
-        shared=Campaign(problem, seed, source, ensembles, walkers, max_steps),
+        shared=Campaign(problem, seed, source, {"ensembles": ensembles, "walkers": walkers, "max_steps": max_steps}),
         executor=executor,
         progress=progress,
     )
@@ -270,16 +266,13 @@ def calibrate(
 
 def summary(lines: Sequence[dict[str, Any]], names: Sequence[str]) -> Calibration:
     """Summarise the results of all replicates for these quantities."""
-    positions = {
-        method: {name: np.array([line[method][name] for line in lines if method in line]) for name in names}
-        for method in METHODS
-    }
+    found = {method: [line[method] for line in lines if method in line] for method in METHODS}
+    positions = {m: {name: np.array([line[name] for line in own]) for name in names} for m, own in found.items()}
     failures = Counter(line["status"] for line in lines if line["status"] != DONE)
     if unconverged := sum("map" in line and LAPLACE not in line for line in lines):
         failures["estimate not converged"] = unconverged
-    tables = [_table(method, positions[method]) for method in METHODS]
     return Calibration(
-        table=pd.concat(tables, ignore_index=True),
+        table=pd.concat([_table(*item) for item in positions.items()], ignore_index=True),
         positions=positions,
         failures=dict(sorted(failures.items())),
         replicates=len(lines),
@@ -322,9 +315,7 @@ class Campaign:
     problem: Problem
     seed: int
     source: str
-    ensembles: int
-    walkers: int | None
-    max_steps: int
+    sampler: dict[str, Any]
 
 
 def check_supported(problem: Problem) -> None:
@@ -344,17 +335,17 @@ def check_supported(problem: Problem) -> None:
         raise ValueError(f"problem: must have a forced model, got the autonomous {problem.model.name!r}.")
     for e in problem.experiments:
         turns = [e.winding] if isinstance(e.winding, int) else [*e.winding.values()]
-        for what, found in (
-            ("a mask", e.mask is not None),
-            ("multipliers", e.multipliers is not None),
-            (f"periods = {e.periods}", e.periods > 1),
-            ("a winding number", any(turns)),
-            ("a delay (shift)", problem.parameter_maps[e.name].delayed),
-        ):
-            if found:
-                raise ValueError(
-                    f"problem: experiments must have whole histories of one forcing period, got {e.name!r} with {what}."
-                )
+        excluded = {
+            "a mask": e.mask is not None,
+            "multipliers": e.multipliers is not None,
+            f"periods = {e.periods}": e.periods > 1,
+            "a winding number": any(turns),
+            "a delay (shift)": problem.parameter_maps[e.name].delayed,
+        }
+        if what := next((what for what, found in excluded.items() if found), ""):
+            raise ValueError(
+                f"problem: experiments must have whole histories of one forcing period, got {e.name!r} with {what}."
+            )
 
 
 def replicate(campaign: Campaign, number: int) -> dict[str, Any]:
@@ -366,7 +357,9 @@ def replicate(campaign: Campaign, number: int) -> dict[str, Any]:
     truths, noise, chain, ties = (np.random.default_rng(seed) for seed in seeds)
     problem = campaign.problem
     theta = dict(zip(problem.names, problem.joint_prior.sample(1, truths)[0].tolist(), strict=True))
-    variances = _drawn_variances(problem, truths)
+    prior = problem.noise.prior
+    drawn = {name: float(as_prior("prior", prior).sample(1, truths)[0]) for name in problem.free_noise}
+    variances = problem.likelihood.fixed | drawn
     line: dict[str, Any] = {"source": campaign.source, "number": number, "theta": theta}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -378,12 +371,6 @@ def replicate(campaign: Campaign, number: int) -> dict[str, Any]:
             return line | {"status": "fold failed", "error": str(error)}
         truth = theta | _folded_variances(problem, variances, [fraction for _, fraction in measured])
         return line | {"truth": truth} | _ranks(campaign, [again for again, _ in measured], truth, chain, ties)
-
-
-def _drawn_variances(problem: Problem, generator: np.random.Generator) -> dict[str, float]:
-    """Return all variances, drawn from the prior or fixed."""
-    drawn = {n: float(as_prior("prior", problem.noise.prior).sample(1, generator)[0]) for n in problem.free_noise}
-    return problem.likelihood.fixed | drawn
 
 
 def _variance_name(problem: Problem, channel: str, experiment: str) -> str:
@@ -402,11 +389,9 @@ def _measured(
 
     The variance of the samples is that of the folded mean times the samples per independent value of that mean.
     """
-    vector = problem.vector(theta)
-    values = dict(zip(problem.model.parameters, problem.parameters(vector[None], e.name)[0].tolist(), strict=True))
-    cycle = steady_cycle(
-        problem.model, values, e.inputs, frequency=e.frequency, samples=e.samples, start=_first_state(problem, e)
-    )
+    model, (row,) = problem.model, problem.parameters(problem.vector(theta)[None], e.name).tolist()
+    values, start = dict(zip(model.parameters, row, strict=True)), _first_state(problem, e)
+    cycle = steady_cycle(model, values, e.inputs, frequency=e.frequency, samples=e.samples, start=start)
     limit, cycles = _fourier.highest_harmonic(e.samples), max(e.cycles, FEWEST_CYCLES)
     size = cycles * e.samples
     kept = {channel: e.harmonics.get(channel, limit) for channel in (*e.inputs, *e.outputs)}
@@ -458,16 +443,13 @@ def _ranks(
     if fit.converged:
         found[LAPLACE] = _laplace_cdf(fit, truth)
     try:
-        posterior = sample(
-            problem, fit, seed=int(chain.integers(2**32)), ensembles=campaign.ensembles, walkers=campaign.walkers,
-            max_steps=campaign.max_steps, progress=False,
-        )  # fmt: skip
+        posterior = sample(problem, fit, seed=int(chain.integers(2**32)), progress=False, **campaign.sampler)
     except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
         return found | {"status": "no draws", "error": str(error)}
-    found |= {"stop_rule": posterior.converged, "rhat": max(posterior.rhat.values())}
-    found["failed"] = sum(posterior.failures.values())
+    rhat, failed = max(posterior.rhat.values()), sum(posterior.failures.values())
+    found |= {"stop_rule": posterior.converged, "rhat": rhat, "failed": failed}
     draws = independent_draws(posterior)
-    if not found["rhat"] <= LARGEST_RHAT or draws is None:
+    if not rhat <= LARGEST_RHAT or draws is None:
         return found | {"status": "draws not usable"}
     found["draws"] = len(next(iter(draws.values())))
     return found | {"status": DONE, MCMC: {name: position(draws[name], value, ties) for name, value in truth.items()}}

@@ -14,23 +14,8 @@ from scipy.stats import skew
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic.diagnostics.verdicts import (
-    FINE,
-    LEVELS,
-    MODE,
-    NARROW,
-    SHAPE,
-    UNCONVERGED,
-    USABLE_K,
-    WIDE,
-    Sample,
-    ellipsoid_radii,
-    joint_verdict,
-    marginal_verdict,
-    normal_draws,
-    radii,
-    wasserstein_distance,
-)
+from bayesperiodic.diagnostics import verdicts
+from bayesperiodic.diagnostics.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, USABLE_K, WIDE, Sample
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.density import COLLAPSED, NATURAL, LogPosterior, SamplingCoordinates
 from bayesperiodic.posterior.labels import unit
@@ -278,7 +263,7 @@ def importance_k(problem: Problem, fit: MapEstimate, coordinates: str) -> tuple[
     mean, covariance = _proposal(density, fit, natural)
     if not np.isfinite(covariance).all():
         return np.nan, np.nan, np.nan
-    points, log_proposal = normal_draws(mean, covariance, PROPOSALS, np.random.default_rng(SEED))
+    points, log_proposal = verdicts.normal_draws(mean, covariance, PROPOSALS, np.random.default_rng(SEED))
     log_weights = density.evaluate(points, threads=None).log_prob - log_proposal
     k, top = convergence.pareto_k(log_weights), log_weights.max()
     weights = np.exp(log_weights - top) if np.isfinite(top) else np.ones(1)
@@ -298,12 +283,8 @@ def _proposal(density: LogPosterior, fit: MapEstimate, natural: bool) -> tuple[n
             return mean, covariance
     if natural:
         own, noise = slice(len(names)), slice(len(names), None)
-        mean[own] = density.problem.vector(fit.theta)
-        covariance[own, own], covariance[own, noise], covariance[noise, own] = (
-            fit.covariance.loc[names, names],
-            0.0,
-            0.0,
-        )
+        mean[own], covariance[own, own] = density.problem.vector(fit.theta), fit.covariance.loc[names, names]
+        covariance[own, noise], covariance[noise, own] = 0.0, 0.0
     return mean, covariance
 
 
@@ -332,7 +313,7 @@ class Scores:
         """Return the fractions of draws inside ellipsoids of given probabilities, and their errors, (2, levels)."""
         if not self.laplace.determined:
             return np.full((2, levels.size), np.nan)
-        limits = ellipsoid_radii(levels, self.laplace.mean.size)
+        limits = verdicts.ellipsoid_radii(levels, self.laplace.mean.size)
         return np.array([self.distances.below(limit, level) for limit, level in zip(limits, levels, strict=True)]).T
 
 
@@ -343,19 +324,18 @@ def _scores(
     ensemble = posterior.data["posterior"]["ensemble"].to_numpy()
     samples = {name: Sample.of(points[:, i], ensemble, posterior.ess[name]) for i, name in enumerate(laplace.names)}
     sampled = partial(Sample.of, ensemble=ensemble, size=min(posterior.ess[name] for name in laplace.names))
-    verdicts = {
-        name: marginal_verdict(
-            samples[name], float(laplace.mean[i]), float(laplace.sds[i]), laplace.supports[i], posterior.converged
-        )
-        for i, name in enumerate(laplace.names)
+    normals = zip(samples.items(), laplace.mean.tolist(), laplace.sds.tolist(), laplace.supports, strict=True)
+    marginal = {
+        name: verdicts.marginal_verdict(draws, mean, sd, support, posterior.converged)
+        for (name, draws), mean, sd, support in normals
     }
     unknown = np.full(len(points), np.nan)
-    distances = radii(points, laplace.mean, laplace.covariance) if laplace.determined else unknown
+    distances = verdicts.radii(points, laplace.mean, laplace.covariance) if laplace.determined else unknown
     *k, efficiency = importance_k(problem, fit, coordinates)
     tail = NO_TAIL if efficiency > EVEN else (k[0], k[1])
-    joint = joint_verdict(points, laplace.mean, laplace.covariance, sampled, tail, posterior.converged)
-    joint = _consistent(joint, set(verdicts.values()))
-    return Scores(laplace, samples, sampled(distances), verdicts, (k[0], k[1]), efficiency, joint)
+    joint = verdicts.joint_verdict(points, laplace.mean, laplace.covariance, sampled, tail, posterior.converged)
+    joint = _consistent(joint, set(marginal.values()))
+    return Scores(laplace, samples, sampled(distances), marginal, (k[0], k[1]), efficiency, joint)
 
 
 def _consistent(joint: str, rows: set[str]) -> str:
@@ -382,7 +362,7 @@ def _row(sample: Sample, mean: float, sd: float) -> dict[str, float]:
         end = mean + z * sd if z else mean
         found |= {f"laplace_{label}": end, label: value}
         found |= {f"{label}_difference": (value - end) / own, f"{label}_difference_mcse": error / own}
-    found["wasserstein"], found["wasserstein_mcse"] = wasserstein_distance(sample, mean, sd)
+    found["wasserstein"], found["wasserstein_mcse"] = verdicts.wasserstein_distance(sample, mean, sd)
     return found
 
 

@@ -62,22 +62,16 @@ class Information:
         """The directions, in columns (names, directions), in the coordinates."""
         return self._relative[1] * self.prior_sd[:, None]
 
-    @property
+    @cached_property
     def spectrum(self) -> np.ndarray:
         """Eigenvalues of the information, descending, in units of the logarithm or of the prior sd if signed."""
-        return self._scaled_eigenvalues[::-1]
+        values = hessian_eigh(self.matrix, np.where(self.logarithmic, 1.0, self.prior_sd))[0][::-1]
+        return np.where(values > SMALLEST * values[0], values, 0.0)
 
     @property
     def condition(self) -> float:
         """Ratio of the largest to the smallest of these."""
-        values = self._scaled_eigenvalues
-        return float(values[-1] / values[0]) if values[0] > 0.0 else np.inf
-
-    @cached_property
-    def _scaled_eigenvalues(self) -> np.ndarray:
-        scale = np.where(self.logarithmic, 1.0, self.prior_sd)
-        values, _, _ = hessian_eigh(self.matrix, scale)
-        return np.where(values > SMALLEST * values[-1], values, 0.0)
+        return float(self.spectrum[0] / self.spectrum[-1]) if self.spectrum[-1] > 0.0 else np.inf
 
     @property
     def alone(self) -> np.ndarray:
@@ -150,18 +144,16 @@ def rank_candidates(
     the one found from that of the run as the initial guess. Candidates without an orbit have NaN. Columns: run,
     frequency, scale, gain and one per parameter; the most informative first.
     """
-    runs = {e.name: e for e in problem.experiments}
-    scale = information.prior_sd
-    before = information.matrix * np.outer(scale, scale) + np.eye(scale.size)
+    runs, unit = {e.name: e for e in problem.experiments}, np.outer(information.prior_sd, information.prior_sd)
+    before = information.matrix * unit + np.eye(len(unit))
     now, rows = np.sqrt(np.diag(np.linalg.inv(before))), []
     for candidate in candidates:
         _checks.one_of("candidates", candidate.run, runs)
-        added = _added(problem, fit, information, runs[candidate.run], candidate)
-        after = before + added * np.outer(scale, scale)
+        after = before + _added(problem, fit, information, runs[candidate.run], candidate) * unit
         row: dict[str, object] = {**candidate._asdict(), "gain": np.nan}
         if np.isfinite(after).all():
             row["gain"] = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1])
-            row |= dict(zip(problem.names, np.sqrt(np.diag(np.linalg.inv(after))) / now, strict=True))
+            row |= zip(problem.names, np.sqrt(np.diag(np.linalg.inv(after))) / now, strict=True)
         rows.append(row)
     table = pd.DataFrame(rows, columns=[*Candidate._fields, "gain", *problem.names])
     return table.sort_values("gain", ascending=False, na_position="last", ignore_index=True)
@@ -171,8 +163,7 @@ def _added(
     problem: Problem, fit: MapEstimate, information: Information, run: Experiment, candidate: Candidate
 ) -> np.ndarray:
     """Return the information of a candidate in the coordinates of `information`; NaN without an orbit."""
-    theta = problem.vector(fit.theta)
-    parameter_map = problem.parameter_maps[run.name]
+    theta, parameter_map = problem.vector(fit.theta), problem.parameter_maps[run.name]
     values = parameter_map.values(theta[None])[0]
     inputs = {name: u.mean() + candidate.scale * (u - u.mean()) for name, u in run.inputs.items()}
     with warnings.catch_warnings():
@@ -192,13 +183,11 @@ def _added(
     if not solution.converged:
         return np.full((theta.size, theta.size), np.nan)
     slopes = parameter_map.slopes(theta)[:-1] * np.where(information.logarithmic, information.theta, 1.0)
-    noise = np.array([[fit.noise[name] for name in problem.noise_names]])
-    variances = problem.likelihood.value_variances(noise)
+    variances = problem.likelihood.value_variances(problem.noise_values(fit.noise)[None])
     total = np.zeros((theta.size, theta.size))
     for channel in run.outputs:
         if (run.name, channel) in variances:
-            by_parameter = np.stack([solution.sensitivities[channel][n] for n in problem.model.parameters])
-            changes = slopes.T @ by_parameter
+            changes = slopes.T @ np.stack([solution.sensitivities[channel][n] for n in problem.model.parameters])
             weight = run.independent[channel] / changes.shape[1] / float(variances[run.name, channel][0])
             total += weight * changes @ changes.T
     return total

@@ -4,7 +4,7 @@ import base64
 import importlib.metadata
 import io
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -362,58 +362,49 @@ def residuals(given: ReportInputs) -> Rows:
     return rows
 
 
+def _formatted(table: pd.DataFrame, **columns: tuple[str, Callable[[Any], Any]]) -> Rows:
+    """Return columns of a table, each with its title and format; `label` is the index."""
+    rows = table.rename_axis("label").reset_index().to_dict("records")
+    return [{title: form(row[name]) for name, (title, form) in columns.items()} for row in rows]
+
+
 def verdicts(given: ReportInputs) -> Rows:
     """Return the table of the identifiability of each parameter."""
-    return [
-        {
-            "Parameter": code(str(name)),
-            "Verdict": badge(row["verdict"]),
-            "Evidence": row["evidence"],
-            "Recommendation": row["remedy"] or html.NOTHING,
-        }
-        for name, row in given.identifiability.table.iterrows()
-    ]
+    return _formatted(
+        given.identifiability.table,
+        label=("Parameter", code),
+        verdict=("Verdict", badge),
+        evidence=("Evidence", str),
+        remedy=("Recommendation", lambda text: text or html.NOTHING),
+    )
 
 
 def laplace(found: Comparison) -> Rows:
     """Return the table of the comparison of Laplace with MCMC."""
-    two = html.Rounding(0, 2)
-    columns = {"Shift": "shift", "Ratio of sds": "sd_ratio", "Skewness": "skewness", "Distance": "wasserstein"}
-    return [
-        {
-            "Coordinate": code(row["coordinate"]),
-            "Verdict": badge(row["verdict"]),
-            **{t: html.Number(f"{two.text(row[c])} ± {two.text(row[f'{c}_mcse'])}") for t, c in columns.items()},
-            "Recommendation": row["recommendation"],
-        }
-        for _, row in found.table.iterrows()
-    ]
+    titles = {"shift": "Shift", "sd_ratio": "Ratio of sds", "skewness": "Skewness", "wasserstein": "Distance"}
+    columns: dict[str, Any] = {"coordinate": ("Coordinate", code), "verdict": ("Verdict", badge)}
+    columns |= {column: (title, html.Number) for column, title in titles.items()}
+    two = html.Rounding(0, 2).text
+    pairs = {c: found.table[c].map(two) + " ± " + found.table[f"{c}_mcse"].map(two) for c in titles}
+    return _formatted(found.table.assign(**pairs), **columns, recommendation=("Recommendation", str))
 
 
 def adequacy(found: Prediction) -> Rows:
     """Return the table of the tests of the model."""
-    return [
-        {
-            "Experiment and channel": str(label),
-            "Verdict": badge(row["verdict"]),
-            **{f"p-values: {test}": html.p_value(row[test]) for test in TESTS},
-            "Fraction of model error": html.percent(row["model_error_share"]),
-        }
-        for label, row in found.table.iterrows()
-    ]
+    columns: dict[str, Any] = {"label": ("Experiment and channel", str), "verdict": ("Verdict", badge)}
+    columns |= {test: (f"p-values: {test}", html.p_value) for test in TESTS}
+    return _formatted(found.table, **columns, model_error_share=("Fraction of model error", html.percent))
 
 
 def sampling(given: ReportInputs) -> Rows:
     """Return the table of the convergence of the draws."""
-    return [
-        {
-            "Quantity": code(str(name)),
-            "Effective sample size": html.Number(f"{row['ess']:.0f}"),
-            "Autocorrelation time [steps]": number(row["tau"], 3),
-            "R-hat between ensembles": html.Number(f"{row['rhat']:.4f}"),
-        }
-        for name, row in given.summary.iterrows()
-    ]
+    return _formatted(
+        given.summary,
+        label=("Quantity", code),
+        ess=("Effective sample size", lambda size: html.Number(f"{size:.0f}")),
+        tau=("Autocorrelation time [steps]", number),
+        rhat=("R-hat between ensembles", lambda rhat: html.Number(f"{rhat:.4f}")),
+    )
 
 
 def settings(given: ReportInputs) -> Rows:

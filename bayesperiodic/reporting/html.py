@@ -62,14 +62,7 @@ SMALLEST, LARGEST = 1e-2, 1e6
 
 
 def number(value: float, digits: int = 3) -> Number:
-    """Format a number with a count of significant digits and a raised power of ten.
-
-    Examples
-    --------
-    >>> from bayesperiodic.reporting.html import number
-    >>> number(-0.5), number(1.2345e-9), number(float("nan"))
-    ('−0.5', '1.23×10⁻⁹', '–')
-    """
+    """Format a number with a count of significant digits and a raised power of ten."""
     if isnan(value):
         return Number(NOTHING)
     if isinf(value):
@@ -98,31 +91,14 @@ def counted(count: int, what: str) -> str:
 
 
 def unit(text: str) -> str:
-    """Format a unit with raised powers, without line breaks.
-
-    Examples
-    --------
-    >>> from bayesperiodic.reporting.html import unit
-    >>> unit("m/s^2"), unit("")
-    ('m/s²', '–')
-    """
+    """Format a unit with raised powers, without line breaks."""
     raised = re.sub(r"\^(-?\d+)", lambda found: found[1].translate(RAISED), text).replace(" ", "\u00a0")
     return raised or NOTHING
 
 
 @dataclass(frozen=True)
 class Rounding:
-    """Common rounding of the values of one quantity: a power of ten and a number of decimals.
-
-    Examples
-    --------
-    >>> from bayesperiodic.reporting.html import Rounding
-    >>> rounding = Rounding.of(768.123, 4.5678)
-    >>> rounding.text(768.123), rounding.text(-4.5678), Rounding.of(5e-3, 2e-6).text(5e-3)
-    ('768.12', '−4.57', '5.00000×10⁻³')
-    >>> Rounding(-3, 1).interval(4e-3, 5.1e-3), Rounding(0, 1).interval(-1.0, 2.0)
-    ('(4.0 … 5.1)×10⁻³', '−1.0 … 2.0')
-    """
+    """Common rounding of the values of one quantity: a power of ten and a number of decimals."""
 
     exponent: int
     decimals: int

@@ -97,7 +97,7 @@ def test_the_variance_is_that_of_the_folded_mean():
 
 
 def test_a_variance_with_a_proper_prior_is_ranked_too():
-    line = replicate(Campaign(linear(known=False), 1, "source", 2, 8, 250), 0)
+    line = replicate(Campaign(linear(known=False), 1, "source", {"ensembles": 2, "walkers": 8, "max_steps": 250}), 0)
     assert line["status"] == "done" and set(line["mcmc"]) == set(line["laplace"]) == {*PRIORS, "variance[force]"}
     assert line["truth"]["variance[force]"] > 0 and line["number"] == 0 and line["map"] == "converged"
 

@@ -92,3 +92,13 @@ def test_rounding_loses_less_than_a_hundredth_of_a_standard_deviation(value, sd)
         mantissa, _, power = rounding.text(x).replace("−", "-").partition("×10")
         power = power.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
         assert float(mantissa) * 10.0 ** int(power or 0) == pytest.approx(x, abs=0.0051 * sd + 1e-15 * abs(x))
+
+
+def test_numbers_units_and_intervals_have_raised_powers():
+    assert [html.number(x) for x in (-0.5, 1.2345e-9, float("nan"))] == ["−0.5", "1.23×10⁻⁹", "–"]
+    assert [html.unit(text) for text in ("m/s^2", "")] == ["m/s²", "–"]
+    rounding = html.Rounding.of(768.123, 4.5678)
+    assert [rounding.text(768.123), rounding.text(-4.5678)] == ["768.12", "−4.57"]
+    assert html.Rounding.of(5e-3, 2e-6).text(5e-3) == "5.00000×10⁻³"
+    assert html.Rounding(-3, 1).interval(4e-3, 5.1e-3) == "(4.0 … 5.1)×10⁻³"
+    assert html.Rounding(0, 1).interval(-1.0, 2.0) == "−1.0 … 2.0"
