@@ -195,7 +195,7 @@ class _Whitened:
         each = zip(self.groups, names, strict=True)
         self.known = frozenset(group for group, own in each if set(own) <= set(likelihood.fixed))
         white = zip(*(likelihood.whitened(part, noise) for part in (here.residuals, here.changes)), strict=True)
-        self.parts = [(*_kept(block, *both), _labels(block)) for block, both in zip(self.blocks, white, strict=True)]
+        self.parts = [_used(block, *both) for block, both in zip(self.blocks, white, strict=True)]
 
     def spectral_tests(self, index: int) -> tuple[float, float, float]:
         """Return p of whiteness and of the harmonic content of a block, and the strongest harmonic."""
@@ -215,35 +215,25 @@ def _testable(r: np.ndarray, j: np.ndarray) -> bool:
     return bool(np.isfinite(r).all() and np.isfinite(j).all())
 
 
-def _kept(block: Block, *parts: np.ndarray) -> list[np.ndarray]:
-    """Return the components (…, kept) used in the tests; points as cosine components along the period."""
+def _used(block: Block, *parts: np.ndarray) -> list[np.ndarray]:
+    """Return the components (…, used) for the tests, points as cosine components along the period, and harmonics."""
+    harmonic = block.harmonic if block.kind == SPECTRAL else (np.arange(block.size) + 1) // 2
+    number = min(block.size, int(np.rint(block.count))) if block.kind in (SPECTRAL, POINTS) else block.size
+    order = np.sort(np.argsort(harmonic, kind="stable")[:number])
     if block.kind == POINTS:
         parts = tuple(dct(part, norm="ortho", axis=-1) for part in parts)
-    return [part[..., _order(block)] for part in parts]
-
-
-def _labels(block: Block) -> np.ndarray:
-    """Return the harmonics (kept,) of the components used in the tests."""
-    return _harmonic(block)[_order(block)]
-
-
-def _order(block: Block) -> np.ndarray:
-    number = min(block.size, int(np.rint(block.count))) if block.kind in (SPECTRAL, POINTS) else block.size
-    return np.sort(np.argsort(_harmonic(block), kind="stable")[:number])
-
-
-def _harmonic(block: Block) -> np.ndarray:
-    return block.harmonic if block.kind == SPECTRAL else (np.arange(block.size) + 1) // 2
+    return [part[..., order] for part in (*parts, harmonic)]
 
 
 def _size(problem: Problem, here: Linearisation, index: int, white: _Whitened) -> tuple[float, float]:
     """Return p of a residual larger than the measured or known noise, and the fraction of model error."""
     block = white.blocks[index]
-    r, j = (np.sqrt(block.weight) * part for part in _kept(block, here.residuals[index], here.changes[index]))
+    r, j, harmonic = _used(block, here.residuals[index], here.changes[index])
+    r, j = np.sqrt(block.weight) * r, np.sqrt(block.weight) * j
     if not _testable(r, j) or not (block.measured > 0.0 or white.groups[index] in white.known):
         return NOT_TESTED, NOT_TESTED
     if block.measured > 0.0:
-        unexplained, measured = Unexplained(r, j, _labels(block)), block.measured
+        unexplained, measured = Unexplained(r, j, harmonic), block.measured
         e = next(e for e in problem.experiments if e.name == block.experiment)
         # Unequal variances reduce the degrees of freedom of a sum of squares.
         evenness = _evenness(e, block)

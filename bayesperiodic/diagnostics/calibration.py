@@ -147,8 +147,6 @@ class Calibration(Result):
 
     Examples
     --------
-    Two replicates are too few for a verdict; a thousand reveal miscalibrations of a few per cent:
-
     >>> calibration.positions["laplace"]["k"].shape, calibration.replicates, calibration.table["method"].tolist()
     ((2,), 2, ['mcmc', 'laplace'])
     """
@@ -189,7 +187,7 @@ def calibrate(
     max_steps: int = 500,
     progress: bool = True,
 ) -> Calibration:
-    """Test the calibration of the posterior by simulation-based calibration [1]_.
+    """Test the calibration of the posterior by simulation-based calibration (Talts et al., arXiv:1804.06788, 2018).
 
     Each replicate draws θ and the variances from the prior, integrates the model in time to its steady state, records
     as many cycles as the experiment has (at least three) with as many samples per cycle as its grid, adds white noise,
@@ -229,11 +227,6 @@ def calibrate(
         For an improper prior, or a problem whose recordings cannot be simulated; if the folder is in use.
     RuntimeError
         If the workers of the executor died; finished replicates are in the folder.
-
-    References
-    ----------
-    .. [1] S. Talts, M. Betancourt, D. Simpson, A. Vehtari, A. Gelman, Validating Bayesian inference algorithms with
-       simulation-based calibration, arXiv:1804.06788, 2018.
 
     Examples
     --------

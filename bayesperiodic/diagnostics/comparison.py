@@ -137,10 +137,11 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     have not converged, unless every ensemble by itself shows another mode.
 
     The joint verdict rests on the fraction of draws inside the Laplace ellipsoids and on the Pareto k̂ of the importance
-    weights of 8000 draws from Laplace ([1]_; above 0.7 the proposal is unusable; modes that Laplace does not reach
-    remain undetected). k̂ describes only the tail of the weights and is ignored if they are even (efficiency above
-    98 %). In natural coordinates, k̂ is that of the density with the variances integrated out where that is possible in
-    closed form.
+    weights of 8000 draws from Laplace (Vehtari, Simpson, Gelman, Yao, Gabry, Pareto smoothed importance sampling, J.
+    Mach. Learn. Res. 25 (2024) 1-58; above 0.7 the proposal is unusable; modes that Laplace does not reach remain
+    undetected). k̂ describes only the tail of the weights and is ignored if they are even (efficiency above 98 %). In
+    natural coordinates, k̂ is that of the density with the variances integrated out where that is possible in closed
+    form.
 
     Parameters
     ----------
@@ -162,11 +163,6 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
         For unknown coordinates, a posterior of another problem, or sampling coordinates without a joint Laplace
         approximation.
 
-    References
-    ----------
-    .. [1] A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry, Pareto smoothed importance sampling, Journal of Machine
-       Learning Research 25 (2024) 1-58.
-
     Examples
     --------
     >>> bp.compare(problem, fit, posterior, coordinates="sampling").table["coordinate"].tolist()
@@ -175,16 +171,14 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     _checks.one_of("coordinates", coordinates, COORDINATES)
     every = (*problem.names, *problem.free_noise)
     _checks.contains("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
-    both = {kind: _approximation(problem, fit, kind) for kind in COORDINATES}
-    laplace = both[coordinates]
-    if laplace is None:
+    scored = _scores(problem, fit, posterior, coordinates)
+    if scored is None:
         raise ValueError(
             "coordinates: must be 'natural' for an estimate without a joint Laplace approximation, got 'sampling'. The "
             f"density has no maximum with finite curvature ({'; '.join(fit.undetermined) or fit.status})."
         )
-    scored = _scores(problem, fit, posterior, laplace, coordinates)
-    other = both[SAMPLING] if coordinates == NATURAL and posterior.converged and not scored.fine else None
-    cured = None if other is None else _scores(problem, fit, posterior, other, SAMPLING)
+    doubtful = coordinates == NATURAL and posterior.converged and not scored.fine
+    cured = _scores(problem, fit, posterior, SAMPLING) if doubtful else None
     group, draws = posterior.data["posterior"].to_dataset(), {n: s.whole for n, s in scored.samples.items()}
     shares, errors = scored.inside(PROBABILITIES)
     histograms = {name: np.histogram(x, BINS, tuple(np.quantile(x, SHOWN))) for name, x in draws.items()}
@@ -317,9 +311,11 @@ class Scores:
         return np.array([self.distances.below(limit, level) for limit, level in zip(limits, levels, strict=True)]).T
 
 
-def _scores(
-    problem: Problem, fit: MapEstimate, posterior: Posterior, laplace: Approximation, coordinates: str
-) -> Scores:
+def _scores(problem: Problem, fit: MapEstimate, posterior: Posterior, coordinates: str) -> Scores | None:
+    """Return the scores of the Laplace approximation; None if there is none."""
+    laplace = _approximation(problem, fit, coordinates)
+    if laplace is None:
+        return None
     points = laplace.points(posterior)
     ensemble = posterior.data["posterior"]["ensemble"].to_numpy()
     samples = {name: Sample.of(points[:, i], ensemble, posterior.ess[name]) for i, name in enumerate(laplace.names)}

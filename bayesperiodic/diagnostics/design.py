@@ -44,7 +44,11 @@ class Information:
         changes = problem.likelihood.whitened(here.changes, problem.noise_values(fit.noise))
         slopes = np.where(logs, theta, 1.0)
         design = np.concatenate(changes, axis=1) * slopes[:, None]
-        return cls(problem.names, theta, logs, design @ design.T, prior_sds(problem, logs))
+        ends = [
+            marginal.quantile(np.array([1.0 - ONE_SD, ONE_SD])) for marginal in problem.joint_prior.marginals.values()
+        ]
+        widths = [np.log(high / low) if log else high - low for (low, high), log in zip(ends, logs, strict=True)]
+        return cls(problem.names, theta, logs, design @ design.T, 0.5 * np.array(widths))
 
     @cached_property
     def _relative(self) -> tuple[np.ndarray, np.ndarray]:
@@ -97,18 +101,9 @@ class Information:
         with np.errstate(invalid="ignore"):
             return self.together / self.alone
 
-    def coordinate(self, name: str, values: np.ndarray) -> np.ndarray:
-        """Return values of a parameter in its coordinate."""
-        return np.log(values) if self.logarithmic[self.names.index(name)] else values
-
-
-def prior_sds(problem: Problem, logs: np.ndarray) -> np.ndarray:
-    """Return half the central 68 % interval of each prior in its coordinate."""
-    result = np.empty(len(problem.names))
-    for i, name in enumerate(problem.names):
-        low, high = problem.joint_prior.marginals[name].quantile(np.array([1.0 - ONE_SD, ONE_SD]))
-        result[i] = 0.5 * (np.log(high / low) if logs[i] else high - low)
-    return result
+    def coordinates(self, values: np.ndarray) -> np.ndarray:
+        """Return the coordinates of values (draws, names)."""
+        return np.where(self.logarithmic, np.log(np.where(self.logarithmic, values, 1.0)), values)
 
 
 FACTORS = (0.5, 1.0, 2.0)

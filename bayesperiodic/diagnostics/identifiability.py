@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 import pandas as pd
 import sympy as sp
-from scipy.special import ndtr
+from scipy.special import ndtr, softmax
 
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
@@ -83,12 +83,9 @@ def power_scaling(problem: Problem, posterior: Posterior) -> dict[str, tuple[flo
 
 
 def _sensitivity(values: np.ndarray, log_density: np.ndarray) -> float:
-    distances = []
-    for power in (POWER - 1.0, 1.0 / POWER - 1.0):
-        logarithm = power * (log_density - log_density.max())
-        weights = np.exp(logarithm - logarithm.max())
-        distances.append(cumulative_jensen_shannon(values, weights / weights.sum()))
-    return float(np.mean(distances) / np.log2(POWER))
+    powers = np.array([[POWER - 1.0], [1.0 / POWER - 1.0]])
+    weights = softmax(powers * (log_density - log_density.max()), axis=1)
+    return float(np.mean([cumulative_jensen_shannon(values, w) for w in weights]) / np.log2(POWER))
 
 
 def cumulative_jensen_shannon(values: np.ndarray, weights: np.ndarray) -> float:
@@ -158,24 +155,15 @@ class Identifiability(Result):
         Candidates for a further experiment, the most informative first: expected gain in nats, and the remaining
         fraction of each parameter's sd.
     structure : Structure
-        Structural identifiability of the free parameters from the measured channels.
+        Of the free parameters, from the measured channels.
     converged : bool
         False if there are draws that have not converged.
 
     Examples
     --------
-    If the mass is free too, a weak motion at one frequency determines k − m·ω² and little more:
-
-    >>> weak = {"force": 0.3 * force["force"]}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, weak, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.03}, seed=1).fold(32, harmonics=3)
-    >>> priors = {"m": bp.LogNormal(1, 0.5), "c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)}
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors=priors, scheme="fourier", fixed={"k3": 0.5})
-    >>> found = bp.identifiability(problem, bp.map_estimate(problem, progress=False), profile=False)
-    >>> found.verdicts
-    {'m': 'only in combination', 'c': 'determined', 'k': 'determined'}
-    >>> found.table.loc["m", "remedy"]
-    'fix one of m, k'
+    >>> found = bp.identifiability(problem, fit, profile=False)
+    >>> found.verdicts, found.directions["parameters"].tolist()
+    ({'c': 'determined', 'k': 'determined'}, ['c', 'k'])
     """
 
     table: pd.DataFrame
@@ -194,11 +182,10 @@ class Identifiability(Result):
     def __repr__(self) -> str:
         lines = ["Identifiability of the parameters"]
         for name, row in self.table.iterrows():
-            remedy = f"\n    Recommendation: {row['remedy']}." if row["remedy"] else ""
-            lines.append(f"{name}: {row['verdict']}; {row['evidence']}.{remedy}")
+            lines.append(f"{name}: {row['verdict']}; {row['evidence']}.")
+            lines += [f"    Recommendation: {row['remedy']}."] if row["remedy"] else []
         lines.append(f"The condition number of the Fisher information is {self.condition:.3g}.")
-        if not self.converged:
-            lines.append("The draws have NOT CONVERGED; these results are provisional.")
+        lines += [] if self.converged else ["The draws have NOT CONVERGED; these results are provisional."]
         return "\n".join(lines)
 
 
@@ -218,8 +205,8 @@ def identifiability(
 
     1. "sign undetermined": the size of a signed parameter is determined, but both signs have a probability above 2.5 %
        (by more than three Monte Carlo errors).
-    2. "only with the prior": the profile ([1]_) ends at the support of the prior on one side, although the parameter is
-       not collinear with others.
+    2. "only with the prior": the profile (Raue et al., Bioinformatics 25 (2009) 1923-1929) ends at the support of the
+       prior on one side, although the parameter is not collinear with others.
     3. "not determined": with all other parameters known, the data have less than 1 % of the information of the prior.
     4. "only in combination": a structural symmetry of the equations contains the parameter, see `structure`.
     5. "determined": with the other parameters unknown, the data alone leave less than a third of the prior sd.
@@ -244,12 +231,6 @@ def identifiability(
     ------
     ValueError
         For an estimate of another problem, or a candidate of an unknown run.
-
-    References
-    ----------
-    .. [1] A. Raue, C. Kreutz, T. Maiwald, J. Bachmann, M. Schilling, U. Klingmüller, J. Timmer, Structural and
-       practical identifiability analysis of partially observed dynamical models by exploiting the profile likelihood,
-       Bioinformatics 25 (2009) 1923-1929.
 
     Examples
     --------
@@ -282,7 +263,8 @@ def identifiability(
     table[["prior_sensitivity", "likelihood_sensitivity"]] = np.array(sensitivities)
     rows = table.to_dict("index")
     for name, row in zip(problem.names, rows.values(), strict=True):
-        row["verdict"] = _verdict(row, _size_known(problem, fit, posterior, name))
+        signed = np.isfinite(row["p_negative"])
+        row["verdict"] = _verdict(row, signed and _size_known(problem, fit, posterior, name))
         both = row["verdict"] == SIGN and abs(fit.theta[name]) > 2.0 * fit.sd[name]
         row["evidence"] = _evidence(row)
         row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments, structure)
@@ -313,28 +295,23 @@ def _widths(
         variances = np.diag(fit.joint_covariance.loc[labels, labels])
         return np.sqrt(variances) / information.prior_sd, np.zeros(len(labels))
     prior = problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))
-    widths, errors = np.empty((2, len(problem.names)))
-    for i, name in enumerate(problem.names):
-        values = information.coordinate(name, posterior.draws(name))
-        widths[i] = _half_width(values) / _half_width(information.coordinate(name, prior[:, i]))
-        # The standard error of half the central 68 % interval of a normal sample is 1.1 times that of its sd.
-        errors[i] = 2.0 * widths[i] ** 2 * 1.1 / np.sqrt(2.0 * posterior.ess[name])
-    return widths, errors
+    draws = np.stack([posterior.draws(name) for name in problem.names], axis=-1)
+    widths = _half_width(information.coordinates(draws)) / _half_width(information.coordinates(prior))
+    # The standard error of half the central 68 % interval of a normal sample is 1.1 times that of its sd.
+    size = np.array([posterior.ess[name] for name in problem.names])
+    return widths, 2.0 * widths**2 * 1.1 / np.sqrt(2.0 * size)
 
 
-def _half_width(values: np.ndarray) -> float:
-    low, high = np.quantile(values, [ndtr(-1.0), ndtr(1.0)])
-    return float(0.5 * (high - low))
-
-
-def _is_signed(problem: Problem, name: str) -> bool:
-    low, high = problem.joint_prior.supports[name]
-    return low < 0.0 < high
+def _half_width(values: np.ndarray) -> np.ndarray:
+    """Return half the central 68 % interval of values (draws, …)."""
+    low, high = np.quantile(values, [ndtr(-1.0), ndtr(1.0)], axis=0)
+    return 0.5 * (high - low)
 
 
 def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, name: str) -> tuple[float, float]:
     """Return the probability that a parameter is negative, and its Monte Carlo error; NaN if it cannot be."""
-    if not _is_signed(problem, name):
+    low, high = problem.joint_prior.supports[name]
+    if not low < 0.0 < high:
         return np.nan, np.nan
     if posterior is None:
         return float(ndtr(-fit.theta[name] / fit.sd[name])), 0.0
@@ -345,16 +322,14 @@ def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, n
 
 
 def _size_known(problem: Problem, fit: MapEstimate, posterior: Posterior | None, name: str) -> bool:
-    """Return whether the data at least halve the width of the absolute value of a signed parameter."""
-    if not _is_signed(problem, name):
-        return False
+    """Return whether the data at least halve the width of the absolute value of a parameter."""
     column = problem.names.index(name)
     prior = np.abs(problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))[:, column])
     if posterior is None:
         values = fit.theta[name] + fit.sd[name] * np.random.default_rng(1).standard_normal(PRIOR_DRAWS)
     else:
         values = posterior.draws(name)
-    return _half_width(np.abs(values)) < 0.5 * _half_width(prior)
+    return bool(_half_width(np.abs(values)) < 0.5 * _half_width(prior))
 
 
 def _verdict(row: dict, size_known: bool) -> str:
@@ -373,8 +348,8 @@ def _verdict(row: dict, size_known: bool) -> str:
 
 
 def _evidence(row: dict) -> str:
-    error = f" ± {row['contraction_mcse']:.2g}" if row["contraction_mcse"] else ""
-    text = f"contraction {row['contraction']:.3g}{error}"
+    text = f"contraction {row['contraction']:.3g}"
+    text += f" ± {row['contraction_mcse']:.2g}" if row["contraction_mcse"] else ""
     if row["collinearity"] >= COLLINEAR:
         factor = "infinitely" if not row["collinearity"] < 1e6 else f"{row['collinearity']:.3g} times"
         text += f", the other parameters widen it {factor}"

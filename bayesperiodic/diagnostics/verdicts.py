@@ -72,8 +72,8 @@ def wasserstein(x: np.ndarray, mean: float, sd: float) -> np.ndarray:
 def wasserstein_distance(sample: Sample, mean: float, sd: float) -> tuple[float, float]:
     """Return the Wasserstein distance from a normal distribution in sds of the draws, and its Monte Carlo error.
 
-    The estimate is biased upwards: draws of the normal distribution itself have a distance of 1.3/√ESS sds. The error
-    is the root of the sum of squares of the spread between batches and of this bias.
+    Draws of the normal distribution itself have a distance of 1.3/√ESS sds. The error is the root of the sum of squares
+    of the spread between batches and of this bias.
     """
     if not np.isfinite(sd):
         return np.inf, np.nan
@@ -186,8 +186,7 @@ def marginal_verdict(sample: Sample, mean: float, sd: float, support: tuple[floa
 
 
 def _unconverged(sample: Sample, mean: float) -> str:
-    every = all(has_other_mode(ensemble, mean) for ensemble in sample.by_ensemble())
-    return MODE if every else UNCONVERGED
+    return MODE if all(has_other_mode(ensemble, mean) for ensemble in sample.by_ensemble()) else UNCONVERGED
 
 
 def _end(sample: Sample, mean: float, sd: float, own: float) -> str:

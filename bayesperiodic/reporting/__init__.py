@@ -43,7 +43,7 @@ def report(
     posterior : Posterior or None
         Without draws the report has no MCMC results, no comparison and no test of the model.
     path : path
-        Path of the file, such as "report.html".
+        Of the file, such as "report.html".
     title : str, optional
         By default the model's name.
     comparison : Comparison, optional
@@ -53,7 +53,7 @@ def report(
     Returns
     -------
     Path
-        Path of the file.
+        Of the file.
 
     Raises
     ------

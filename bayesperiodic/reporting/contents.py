@@ -113,21 +113,9 @@ class ReportInputs:
         return {name: ratio for name, ratio in ratios.items() if self.coloured and LARGE_RATIO < ratio < np.inf}
 
     @property
-    def underestimated_sds(self) -> list[str]:
-        """A warning if standard deviations are too small because a residual is not white."""
-        if not (ratios := self.robust_ratios):
-            return []
-        worst = max(ratios, key=lambda name: ratios[name])
-        return [
-            f"The residual of {', '.join(self.coloured)} is not white, so the standard deviations and intervals of "
-            f"{', '.join(ratios)} are too small; the robust ones are up to {number(ratios[worst], 2)} times as "
-            f"large ({worst})."
-        ]
-
-    @property
     def warnings(self) -> list[str]:
-        """All warnings on the estimate."""
-        return [*estimation_warnings(self.problem, self.fit), *self.underestimated_sds]
+        """Warnings of the estimate."""
+        return estimation_warnings(self.problem, self.fit)
 
     def unit(self, name: str) -> str:
         """Return the formatted unit of a parameter, a channel or a noise parameter, by its full name."""
