@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.random import Generator
 from scipy import stats
 from scipy.special import ndtr, ndtri, stdtr
 
@@ -372,11 +373,7 @@ def _variance_name(problem: Problem, channel: str, experiment: str) -> str:
 
 
 def _measured(
-    problem: Problem,
-    e: Experiment,
-    theta: dict[str, float],
-    variances: dict[str, float],
-    generator: np.random.Generator,
+    problem: Problem, e: Experiment, theta: dict[str, float], variances: dict[str, float], generator: Generator
 ) -> tuple[Experiment, float]:
     """Return a simulated repetition of an experiment, and the fraction of its cycles that the fold used.
 
@@ -420,11 +417,7 @@ def _folded_variances(problem: Problem, variances: dict[str, float], used: list[
 
 
 def _ranks(
-    campaign: Campaign,
-    experiments: list[Experiment],
-    truth: dict[str, float],
-    chain: np.random.Generator,
-    ties: np.random.Generator,
+    campaign: Campaign, experiments: list[Experiment], truth: dict[str, float], chain: Generator, ties: Generator
 ) -> dict[str, Any]:
     """Return the ranks of the truth in the Laplace approximation and among the draws."""
     problem = campaign.problem.with_experiments(experiments)
@@ -460,7 +453,7 @@ def independent_draws(posterior: Posterior) -> dict[str, np.ndarray] | None:
     return {name: posterior.draws(name).reshape(chains, steps)[:, kept].ravel() for name in posterior.names}
 
 
-def position(draws: np.ndarray, truth: float, generator: np.random.Generator) -> float:
+def position(draws: np.ndarray, truth: float, generator: Generator) -> float:
     """Return the randomised normalised rank of the truth, uniform on (0, 1) if draws and truth are exchangeable."""
     rank = np.sum(draws < truth) + generator.integers(np.sum(draws == truth) + 1)
     return float((rank + generator.uniform()) / (draws.size + 1))

@@ -158,8 +158,11 @@ def _branch_handles(branches: Sequence[Branch], labels: Sequence[str] | None) ->
 MOST_POINTS = 20_000
 PERIOD_MARKERS = "osD^vP*X"
 COLUMNS = 6
-MEASURED_CYCLE: dict[str, Any] = {"color": COLOURS["measured"], "lw": 2.2, "alpha": 0.45}
-MODEL_CYCLE: dict[str, Any] = {"color": COLOURS["map"], "lw": 1.0}
+MEASURED, MODEL = "closest measured cycle", "orbit of the model"
+CYCLES: dict[str, dict[str, Any]] = {
+    MEASURED: {"color": COLOURS["measured"], "lw": 2.2, "alpha": 0.45},
+    MODEL: {"color": COLOURS["map"], "lw": 1.0},
+}
 POINTS: dict[str, Any] = {"color": ENSEMBLES[1], "marker": "o", "ls": "", "mec": "black", "mew": 0.6}
 
 
@@ -215,10 +218,7 @@ def section(
 
 
 def orbits(
-    orbits: Orbits | Sequence[Orbit],
-    *,
-    units: Mapping[str, str] | None = None,
-    figure: Figure | None = None,
+    orbits: Orbits | Sequence[Orbit], *, units: Mapping[str, str] | None = None, figure: Figure | None = None
 ) -> Figure:
     """Draw the phase portrait of each orbit: measured cycle, polished orbit of the model, and section points.
 
@@ -260,30 +260,30 @@ def orbits(
     across, up = _coordinate_labels(orbits[0], units)
     figure.supxlabel(across, fontsize="medium")
     figure.supylabel(up, fontsize="medium")
-    figure.legend(handles=_handles(orbits), loc="outside upper center", ncols=3, frameon=False, fontsize="small")
+    drawn = {label for orbit in orbits for label in _cycles(orbit)}
+    looks = {"section points": POINTS} | {label: look for label, look in CYCLES.items() if label in drawn}
+    handles = [plt.Line2D([], [], label=label, **look) for label, look in looks.items()]
+    figure.legend(handles=handles, loc="outside upper center", ncols=3, frameon=False, fontsize="small")
     return figure
 
 
 def _portrait(ax: Axes, orbit: Orbit) -> None:
-    for signals, style in _cycles(orbit):
+    for label, signals in _cycles(orbit).items():
         x, y = (np.angle(np.exp(1j * signals[c])) if c in orbit.angles else signals[c] for c in orbit.coordinates)
         # Angles jump at ±π.
         jump = np.flatnonzero(np.abs(np.diff(x)) > np.pi) + 1 if orbit.angles else np.empty(0, dtype=int)
-        ax.plot(np.insert(x, jump, np.nan), np.insert(y, jump, np.nan), **style)
+        ax.plot(np.insert(x, jump, np.nan), np.insert(y, jump, np.nan), **CYCLES[label])
     ax.plot(*orbit.points.T, ms=4.5, zorder=4, **POINTS)
     turns = "" if orbit.winding is None else f", winding {orbit.winding}"
     ax.set_title(f"period {orbit.period}{turns}\n$\\mu$ = {_multiplier(orbit)}", fontsize="x-small")
     ax.tick_params(labelsize="x-small")
 
 
-def _cycles(orbit: Orbit) -> list[tuple[Mapping[str, np.ndarray], dict]]:
-    """Return the measured cycle and that of the model, closed, with their styles."""
-    found: list[tuple[Mapping[str, np.ndarray], dict]] = []
-    if orbit.cycle is not None:
-        found.append((orbit.cycle, MEASURED_CYCLE))
+def _cycles(orbit: Orbit) -> dict[str, Mapping[str, np.ndarray]]:
+    """Return the measured cycle and that of the model, closed, by their labels."""
+    found = {} if orbit.cycle is None else {MEASURED: orbit.cycle}
     if orbit.solution is not None:
-        closed = {c: np.append(v, v[0]) for c, v in orbit.solution.outputs.items() if c in orbit.coordinates}
-        found.append((closed, MODEL_CYCLE))
+        found[MODEL] = {c: np.append(v, v[0]) for c, v in orbit.solution.outputs.items() if c in orbit.coordinates}
     return found
 
 
@@ -292,15 +292,6 @@ def _multiplier(orbit: Orbit) -> str:
     if abs(value.imag) > 0.0:
         return f"{value:.3g}"
     return f"{value.real:.4g} ± {sd:.2g}" if np.isfinite(sd) else f"{value.real:.3g}, not estimated"
-
-
-def _handles(orbits: Orbits | Sequence[Orbit]) -> list[plt.Line2D]:
-    handles = [plt.Line2D([], [], label="section points", **POINTS)]
-    if any(orbit.cycle is not None for orbit in orbits):
-        handles.append(plt.Line2D([], [], label="closest measured cycle", **MEASURED_CYCLE))
-    if any(orbit.solution is not None for orbit in orbits):
-        handles.append(plt.Line2D([], [], label="orbit of the model", **MODEL_CYCLE))
-    return handles
 
 
 def _coordinate_labels(plane: PoincareSection | Orbit, units: Mapping[str, str] | None) -> list[str]:

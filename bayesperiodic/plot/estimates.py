@@ -28,7 +28,7 @@ FEWEST_BINS, MOST_BINS = 35, 200
 BINS, SHOWN = 40, (0.0005, 0.9995)
 # Range of the powers of ten of ticks without an offset or a common factor.
 WHOLE = (-5, 10)
-MOST_STEPS = 300
+MOST_STEPS, BOX = 300, {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1.5}
 
 
 def fit(
@@ -390,15 +390,9 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
         for e in np.unique(ensemble):
             axes.plot(shown, paths[ensemble == e][:walkers].T, color=ENSEMBLES[e % len(ENSEMBLES)], lw=0.4, alpha=0.6)
         axes.set_ylabel(draws_label(posterior, name), fontsize=8)
-        axes.annotate(
-            f"tau {posterior.tau[name]:.0f} steps, R-hat {posterior.rhat[name]:.3f}",
-            (0.995, 0.97),
-            xycoords="axes fraction",
-            ha="right",
-            va="top",
-            fontsize=7,
-            bbox={"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 1.5},
-        )
+        text = f"tau {posterior.tau[name]:.0f} steps, R-hat {posterior.rhat[name]:.3f}"
+        place: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top"}
+        axes.annotate(text, (0.995, 0.97), fontsize=7, bbox=BOX, **place)
     rows[-1].set_xlabel("step after burn-in (one colour per ensemble)")
     if text := caveats_of(posterior):
         figure.suptitle(text)

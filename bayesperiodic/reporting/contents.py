@@ -113,7 +113,7 @@ class ReportInputs:
         return {name: ratio for name, ratio in ratios.items() if self.coloured and LARGE_RATIO < ratio < np.inf}
 
     @property
-    def warnings(self) -> list[str]:
+    def warnings(self) -> Iterator[str]:
         """Warnings of the estimate."""
         return estimation_warnings(self.problem, self.fit)
 
