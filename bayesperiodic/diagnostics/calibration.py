@@ -210,8 +210,7 @@ def calibrate(
     folder : path, optional
         Each replicate is appended to ``replicates.jsonl`` there; a repeated call computes only the missing ones.
     executor : None, int, Dask Client, or executor with the interface of concurrent.futures
-        None computes serially. Replicates of a lost Dask worker are repeated by others; after the loss of workers of
-        other executors, repeat the call with the same folder.
+        None computes serially. After the loss of workers, except of Dask, repeat the call with the same folder.
     ensembles, walkers, max_steps
         Arguments of `sample` in each replicate. Short chains suffice, because ranks use draws five autocorrelation
         times apart. Too few walkers bias the result: with eight in four dimensions, the dispersion of exact ranks was 5

@@ -1,7 +1,7 @@
 """Posterior predictions of periods and transients, and tests of the model."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import compress, islice
 
@@ -122,7 +122,13 @@ def _transient(problem: Problem, theta: np.ndarray, run: Run, experiment: str | 
             raise ValueError(f"run: must return a Recording, got a {type(recording).__name__}.")
         if not signals:
             time, signals = recording.time, {output: [] for output in recording.outputs}
-        _check_same(recording, time, signals)
+        _checks.same_names("run: outputs of the recordings", recording.outputs, signals)
+        other = recording.time
+        if other.size != time.size or not np.allclose(other, time, rtol=1e-9, atol=0.0):
+            raise ValueError(
+                f"run: all recordings must have the same times, got {time.size} and {other.size} samples, from "
+                f"{time[0]:g} to {time[-1]:g} s and from {other[0]:g} to {other[-1]:g} s."
+            )
         for output, values in recording.outputs.items():
             signals[output].append(values)
     if not signals:
@@ -146,16 +152,6 @@ def _experiment_of(problem: Problem, experiment: str | None) -> str:
                 f"differ in {parameter!r}."
             )
     return names[0]
-
-
-def _check_same(recording: Recording, time: np.ndarray, outputs: Mapping[str, list[np.ndarray]]) -> None:
-    _checks.same_names("run: outputs of the recordings", recording.outputs, outputs)
-    other = recording.time
-    if other.size != time.size or not np.allclose(other, time, rtol=1e-9, atol=0.0):
-        raise ValueError(
-            f"run: all recordings must have the same times, got {time.size} and {other.size} samples, from "
-            f"{time[0]:g} to {time[-1]:g} s and from {other[0]:g} to {other[-1]:g} s."
-        )
 
 
 REJECTIONS = {

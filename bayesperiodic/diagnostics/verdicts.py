@@ -230,8 +230,7 @@ def joint_verdict(
     its radius is increased by 15 % (which corresponds to a shift of the end of a 90 % interval by a quarter of a sd);
     too many accordingly. The approximation is then "too narrow" or "too wide" if a normal distribution with the mean
     and covariance of the draws is fine and correcting the mean alone is not sufficient; otherwise, and where the Pareto
-    k̂ (given with its error) exceeds 0.7 by its error, it has the "wrong shape". `sampled` makes a Sample of values
-    (draws,).
+    k̂ exceeds 0.7 by its error, it has the "wrong shape". `sampled` makes a Sample of values (draws,).
     """
     own_mean, own_covariance = points.mean(axis=0), np.atleast_2d(np.cov(points.T))
     scale = np.sqrt(np.diag(own_covariance))
