@@ -51,7 +51,7 @@ from .posterior.priors import StudentT as StudentT
 from .posterior.priors import TruncatedNormal as TruncatedNormal
 from .posterior.priors import Uniform as Uniform
 from .posterior.problem import Problem as Problem
-from .reporting.build import report as report
+from .reporting import report as report
 from .sampling.posterior import Posterior as Posterior
 from .sampling.sample import sample as sample
 from .simulation import simulate as simulate

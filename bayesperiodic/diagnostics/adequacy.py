@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,23 +22,10 @@ NOT_TESTED = float("nan")
 
 
 class Unexplained:
-    """Whitened residual components, projected orthogonally to the changes under the parameters.
+    """Whitened residual components (size,), projected orthogonally to their derivatives (parameters, size).
 
-    Parameters
-    ----------
-    components : array (size,)
-        Independent with equal variances under the model.
-    changes : array (parameters, size)
-        Their derivatives with respect to the parameters; rows may be dependent or zero.
-    harmonic : int array (size,)
-        Harmonic of each component.
-
-    Attributes
-    ----------
-    square : float
-        Sum of squares.
-    freedom : int
-        Its degrees of freedom.
+    The components are independent with equal variances under the model; derivatives may be dependent or zero. `square`
+    is the sum of squares, `freedom` the number of its degrees of freedom.
     """
 
     def __init__(self, components: np.ndarray, changes: np.ndarray, harmonic: np.ndarray):
@@ -84,8 +72,9 @@ class Unexplained:
         tested = (freedom > 0) & (rest > 0)
         if not tested.any():
             return NOT_TESTED, NOT_TESTED
-        p = np.ones(len(sets))
-        p[tested] = _f_test(square[tested], freedom[tested], (self.square - square)[tested], rest[tested])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = square / freedom / (np.maximum(self.square - square, 0.0) / rest)
+        p = np.where(tested, stats.f.sf(np.nan_to_num(ratio, nan=0.0, posinf=np.inf), freedom, rest), 1.0)
         _, _, power, size = self._sums
         return min(1.0, float(p.min() * tested.sum())), float(self.harmonics[np.argmax(power / size)])
 
@@ -109,19 +98,10 @@ def excess(variance: float, freedom: float, known: float, known_freedom: float) 
 
 
 def consistency(parts: Sequence[tuple[np.ndarray, np.ndarray, str]], known: frozenset[str]) -> float:
-    """Return p of Chow's test of common parameters against separate ones.
+    """Return p of the test of common parameters against separate ones by Chow, Econometrica 28 (1960) 591-605.
 
-    Parameters
-    ----------
-    parts : sequence of (array (size,), array (parameters, size), str)
-        Whitened components of each block, their derivatives, and the group of blocks with a common variance.
-    known : set of str
-        Groups whose whitened variance is known to be 1.
-
-    References
-    ----------
-    G. C. Chow, Tests of equality between sets of coefficients in two linear regressions, Econometrica 28 (1960)
-    591-605.
+    Each block has whitened components (size,), their derivatives (parameters, size), and the group of blocks with which
+    it has a common variance; the whitened variance of `known` groups is 1.
     """
     own = [Unexplained(r, j, np.zeros(r.size, dtype=int)) for r, j, _ in parts]
     scale, freedoms = dict.fromkeys(known, 1.0), [np.inf]
@@ -142,25 +122,12 @@ def consistency(parts: Sequence[tuple[np.ndarray, np.ndarray, str]], known: froz
 
 
 def holm(p: np.ndarray) -> np.ndarray:
-    """Return p-values adjusted by Holm's method; NaN is not counted.
-
-    References
-    ----------
-    S. Holm, A simple sequentially rejective multiple test procedure, Scandinavian Journal of Statistics 6 (1979) 65-70.
-    """
+    """Return p-values adjusted by the method of Holm, Scand. J. Statist. 6 (1979) 65-70; NaN is not counted."""
+    count = np.count_nonzero(~np.isnan(p))
+    order = np.argsort(p, kind="stable")[:count]
     adjusted = np.full(p.shape, np.nan)
-    tested = np.flatnonzero(~np.isnan(p))
-    order = tested[np.argsort(p[tested], kind="stable")]
-    steps = p[order] * np.arange(order.size, 0, -1)
-    adjusted[order] = np.minimum(1.0, np.maximum.accumulate(steps)) if order.size else steps
+    adjusted[order] = np.minimum(1.0, np.maximum.accumulate(p[order] * np.arange(count, 0, -1)))
     return adjusted
-
-
-def _f_test(square: np.ndarray, freedom: np.ndarray, other: np.ndarray, other_freedom: np.ndarray) -> np.ndarray:
-    """Return p of the one-sided F tests of mean squares."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = square / freedom / (np.maximum(other, 0.0) / other_freedom)
-    return np.asarray(stats.f.sf(np.nan_to_num(ratio, nan=0.0, posinf=np.inf), freedom, other_freedom))
 
 
 LEVEL = 0.01
@@ -175,49 +142,42 @@ def adequacy(
 ) -> pd.DataFrame:
     """Return the table of `Prediction`: the p-values of all tests and the verdicts.
 
-    Parameters
-    ----------
-    problem : Problem
-    here : Linearisation
-        At a draw near the best fit.
-    noise : array (draws, noise_names)
-        Draws of the noise parameters.
-    replicates : mapping of (str, str) to array (draws, points)
-        Of the data, by experiment and channel; NaN outside the mask and for failed solves.
+    The linearisation is that at a draw near the best fit. Noise parameters are draws (draws, noise_names), replicates
+    of the data (draws, points) by experiment and channel, NaN outside the mask and for failed solves.
     """
-    likelihood = problem.likelihood
     shapes = np.median(noise, axis=0)[None] if problem.noise.flat else noise[:: max(1, len(noise) // SHAPES)]
-    rows: dict[str, dict[str, float | str]] = {}
+    rows: dict[str, dict[str, Any]] = {}
     white = [_Whitened(problem, here, shape) for shape in shapes]
-    for i, block in enumerate(likelihood.blocks):
+    for i, block in enumerate(problem.likelihood.blocks):
         if block.kind == KNOWN:
             continue
-        row: dict[str, float | str] = {"experiment": block.experiment, "channel": block.channel}
         # The spectrum of correlated noise is known from draws only: the p of the realised residual is their mean.
-        found = [w.spectral_tests(i) for w in white]
-        whiteness, harmonics, harmonic = np.array(found).T
-        row |= {"whiteness": float(whiteness.mean()), "harmonics": float(harmonics.mean()), "harmonic": harmonic[0]}
-        row |= _size(problem, here, block, i, white[0])
-        row["amplitude"] = _amplitude(problem, block, replicates)
-        rows[f"{block.experiment} {block.channel}"] = row
-    common = float(np.mean([w.consistency() for w in white]))
-    rows[ALL] = {"experiment": ALL, "channel": ALL, "consistency": common}
+        whiteness, harmonics, harmonic = np.array([w.spectral_tests(i) for w in white]).T
+        size, share = _size(problem, here, i, white[0])
+        rows[f"{block.experiment} {block.channel}"] = {
+            "experiment": block.experiment,
+            "channel": block.channel,
+            "whiteness": whiteness.mean(),
+            "harmonics": harmonics.mean(),
+            "harmonic": harmonic[0],
+            "size": size,
+            "model_error_share": share,
+            "amplitude": _amplitude(problem, block, replicates),
+        }
+    rows[ALL] = {"experiment": ALL, "channel": ALL, "consistency": np.mean([w.consistency() for w in white])}
     columns = ["experiment", "channel", *TESTS, "harmonic", "model_error_share"]
-    return _judged(pd.DataFrame.from_dict(rows, orient="index", columns=columns))
-
-
-def adjusted_p(table: pd.DataFrame) -> np.ndarray:
-    """Return the p-values (rows, tests) of a table, adjusted for their total number."""
-    return holm(table[[*TESTS]].to_numpy(dtype=float).ravel()).reshape(len(table), -1)
-
-
-def _judged(table: pd.DataFrame) -> pd.DataFrame:
+    table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
     adjusted = adjusted_p(table)
     smallest = np.min(np.where(np.isnan(adjusted), np.inf, adjusted), axis=1)
     smallest[-1] = min(smallest)
     table["p"] = np.where(np.isinf(smallest), np.nan, smallest)
     table["verdict"] = np.select([np.isinf(smallest), smallest < LEVEL], [UNTESTED, MISSPECIFIED], ADEQUATE)
     return table
+
+
+def adjusted_p(table: pd.DataFrame) -> np.ndarray:
+    """Return the p-values (rows, tests) of a table, adjusted for their total number."""
+    return holm(table[[*TESTS]].to_numpy(dtype=float).ravel()).reshape(len(table), -1)
 
 
 class _Whitened:
@@ -232,15 +192,10 @@ class _Whitened:
         self.blocks = likelihood.blocks
         names = [problem.noise.parameter_names(block) for block in self.blocks]
         self.groups = [own[0] if own else KNOWN for own in names]
-        self.known = frozenset(
-            g for g, own in zip(self.groups, names, strict=True) if set(own) <= set(likelihood.fixed)
-        )
-        residuals = likelihood.whitened(here.residuals, noise)
-        changes = likelihood.whitened(here.changes, noise)
-        self.parts = [
-            (kept(block, r), kept(block, j), labels(block))
-            for block, r, j in zip(self.blocks, residuals, changes, strict=True)
-        ]
+        each = zip(self.groups, names, strict=True)
+        self.known = frozenset(group for group, own in each if set(own) <= set(likelihood.fixed))
+        white = zip(*(likelihood.whitened(part, noise) for part in (here.residuals, here.changes)), strict=True)
+        self.parts = [_used(block, *both) for block, both in zip(self.blocks, white, strict=True)]
 
     def spectral_tests(self, index: int) -> tuple[float, float, float]:
         """Return p of whiteness and of the harmonic content of a block, and the strongest harmonic."""
@@ -260,54 +215,36 @@ def _testable(r: np.ndarray, j: np.ndarray) -> bool:
     return bool(np.isfinite(r).all() and np.isfinite(j).all())
 
 
-def kept(block: Block, components: np.ndarray) -> np.ndarray:
-    """Return the components (…, kept) used in the tests; points as cosine components along the period."""
-    if block.kind == POINTS:
-        components = dct(components, norm="ortho", axis=-1)
-    return components[..., _order(block)]
-
-
-def labels(block: Block) -> np.ndarray:
-    """Return the harmonics (kept,) of the components used in the tests."""
-    return _harmonic(block)[_order(block)]
-
-
-def _order(block: Block) -> np.ndarray:
+def _used(block: Block, *parts: np.ndarray) -> list[np.ndarray]:
+    """Return the components (…, used) for the tests, points as cosine components along the period, and harmonics."""
+    harmonic = block.harmonic if block.kind == SPECTRAL else (np.arange(block.size) + 1) // 2
     number = min(block.size, int(np.rint(block.count))) if block.kind in (SPECTRAL, POINTS) else block.size
-    return np.sort(np.argsort(_harmonic(block), kind="stable")[:number])
+    order = np.sort(np.argsort(harmonic, kind="stable")[:number])
+    if block.kind == POINTS:
+        parts = tuple(dct(part, norm="ortho", axis=-1) for part in parts)
+    return [part[..., order] for part in (*parts, harmonic)]
 
 
-def _harmonic(block: Block) -> np.ndarray:
-    if block.kind == SPECTRAL:
-        return block.harmonic
-    return (np.arange(block.size) + 1) // 2
-
-
-def _size(problem: Problem, here: Linearisation, block: Block, index: int, white: _Whitened) -> dict[str, float | str]:
+def _size(problem: Problem, here: Linearisation, index: int, white: _Whitened) -> tuple[float, float]:
     """Return p of a residual larger than the measured or known noise, and the fraction of model error."""
-    nothing: dict[str, float | str] = {"size": NOT_TESTED, "model_error_share": NOT_TESTED}
-    r, j = (np.sqrt(block.weight) * kept(block, part[index]) for part in (here.residuals, here.changes))
-    if not _testable(r, j):
-        return nothing
-    if not block.measured > 0.0:
-        if white.groups[index] not in white.known:
-            return nothing
-        unexplained, measured = Unexplained(*white.parts[index]), 1.0
-        freedom, behind = float(unexplained.freedom), np.inf
-    else:
-        unexplained, measured = Unexplained(r, j, labels(block)), block.measured
+    block = white.blocks[index]
+    r, j, harmonic = _used(block, here.residuals[index], here.changes[index])
+    r, j = np.sqrt(block.weight) * r, np.sqrt(block.weight) * j
+    if not _testable(r, j) or not (block.measured > 0.0 or white.groups[index] in white.known):
+        return NOT_TESTED, NOT_TESTED
+    if block.measured > 0.0:
+        unexplained, measured = Unexplained(r, j, harmonic), block.measured
         e = next(e for e in problem.experiments if e.name == block.experiment)
         # Unequal variances reduce the degrees of freedom of a sum of squares.
         evenness = _evenness(e, block)
-        freedom = unexplained.freedom * evenness
         behind = (e.cycles - 1) * block.count * evenness if e.cycles > 1 else np.inf
+    else:
+        unexplained, measured, evenness, behind = Unexplained(*white.parts[index]), 1.0, 1.0, np.inf
     if not unexplained.freedom:
-        return nothing
+        return NOT_TESTED, NOT_TESTED
     variance = unexplained.square / unexplained.freedom
-    return {
-        "size": excess(variance, freedom, measured, behind),
-        "model_error_share": max(0.0, 1.0 - measured / variance) if variance > 0.0 else 0.0,
-    }
+    share = max(0.0, 1.0 - measured / variance) if variance > 0.0 else 0.0
+    return excess(variance, unexplained.freedom * evenness, measured, behind), share
 
 
 def _evenness(experiment: Experiment, block: Block) -> float:

@@ -1,36 +1,37 @@
-"""Simulation-based calibration: coverage of the intervals, and tests of uniformity."""
+"""Simulation-based calibration: replicates, coverage of the intervals, and tests of uniformity."""
 
 import hashlib
 import importlib.metadata
+import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.random import Generator
 from scipy import stats
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri, stdtr
 
-from bayesperiodic import _checks
+from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic._parallel import checkpointed_tasks
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.data.recording import Recording
 from bayesperiodic.diagnostics.adequacy import holm
-from bayesperiodic.diagnostics.campaigns import (
-    DONE,
-    LAPLACE,
-    MCMC,
-    METHODS,
-    SPACING,
-    Campaign,
-    check_supported,
-    replicate,
-)
+from bayesperiodic.estimation.map_estimate import map_estimate
+from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.posterior.joint_priors import as_prior
+from bayesperiodic.posterior.noise import EXPERIMENT, VARIANCE, Independent
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.checkpoint import fingerprint
+from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.sampling.sample import sample
+from bayesperiodic.simulation import NotSettled, steady_cycle
 
 POINTS, SIMULATED, SIMULATION_SEED = 100, 20_000, 0
 FEWEST_IN_BIN, MOST_BINS = 20, 20
@@ -48,9 +49,8 @@ def dispersion_test(values: np.ndarray) -> tuple[float, float]:
     If variances are a fifth too small its expectation is 1.25; with 1000 values the power against this alternative at
     a level of 1 % is 99.7 %, that of `ecdf_test` 76 %, of Kolmogorov's test 20 %.
     """
-    square = float(np.sum(normal_scores(values) ** 2))
-    low, high = stats.chi2.cdf(square, values.size), stats.chi2.sf(square, values.size)
-    return square / values.size, float(min(1.0, 2.0 * min(low, high)))
+    square, null = float(np.sum(normal_scores(values) ** 2)), stats.chi2(values.size)
+    return square / values.size, float(min(1.0, 2.0 * min(null.cdf(square), null.sf(square))))
 
 
 def chi_square_test(values: np.ndarray) -> float:
@@ -67,14 +67,10 @@ def bin_count(size: int) -> int:
 
 
 def ecdf_test(values: np.ndarray) -> float:
-    """Return p of the empirical distribution function's smallest pointwise binomial tail ([1]_, section 3).
+    """Return p of the smallest pointwise binomial tail of the empirical distribution function.
 
-    The null distribution is simulated once for every number of values, with a fixed seed.
-
-    References
-    ----------
-    .. [1] T. Säilynoja, P.-C. Bürkner, A. Vehtari, Graphical test for discrete uniformity and its applications in
-       goodness-of-fit evaluation and multiple sample comparison, Statistics and Computing 32 (2022) 32.
+    This is the test of Säilynoja, Bürkner and Vehtari, Statistics and Computing 32 (2022) 32, section 3. The null
+    distribution is simulated once for every number of values, with a fixed seed.
     """
     table, null = _null(values.size)
     counts = np.searchsorted(np.sort(values), evaluation_points(), side="right")
@@ -84,9 +80,7 @@ def ecdf_test(values: np.ndarray) -> float:
 
 def ecdf_band(size: int, level: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the simultaneous band of the empirical distribution function of `size` values, at `evaluation_points`."""
-    tail = float(np.quantile(_null(size)[1], 1.0 - level))
-    points = evaluation_points()
-    return binomial_band(size, points, tail)
+    return binomial_band(size, evaluation_points(), float(np.quantile(_null(size)[1], 1.0 - level)))
 
 
 def binomial_band(size: int, probabilities: np.ndarray, tail: float) -> tuple[np.ndarray, np.ndarray]:
@@ -110,6 +104,13 @@ def _null(size: int) -> tuple[np.ndarray, np.ndarray]:
     return table, table[drawn, np.arange(POINTS - 1)].min(axis=1)
 
 
+MCMC, LAPLACE = "mcmc", "laplace"
+METHODS = (MCMC, LAPLACE)
+DONE, NO_STEADY_STATE = "done", "no steady state"
+FEWEST_CYCLES = 3
+# Steps between draws taken as independent, in autocorrelation times (which short chains underestimate), the least
+# number of these draws, and the largest R-hat.
+SPACING, FEWEST_DRAWS, LARGEST_RHAT = 5.0, 20, 1.1
 FILE = "replicates.jsonl"
 LEVELS = (0.5, 0.8, 0.9, 0.95)
 FALSE_ALARMS = 0.01
@@ -129,8 +130,7 @@ class Calibration(Result):
         normal scores, above 1 if intervals are too narrow; shift, their mean; p of the dispersion test, the ECDF test
         and the χ² test of the histogram, each adjusted by Holm's method for the quantities of the method; coverage of
         the central 50, 80, 90 and 95 % intervals; verdict: "calibrated", "too narrow", "too wide", "not uniform", or
-        "too few replicates" below 20. The probability that a calibrated method gets another verdict for any quantity is
-        at most 1 % per test.
+        "too few replicates" below 20. The probability of a false verdict for any quantity is at most 1 % per test.
     positions : dict of str to dict of str to array (replicates,)
         By method and quantity, between 0 and 1, uniformly distributed if calibrated: for "mcmc" the randomised
         normalised rank of the truth among independent draws; for "laplace" the distribution function at the truth.
@@ -139,27 +139,17 @@ class Calibration(Result):
         Number of failed replicates by reason: "no steady state" (of the simulated truth), "fold failed", "no estimate",
         "estimate not converged" (excluded for Laplace), "no draws", "draws not usable" (fewer than 20 independent ones,
         or R-hat above 1.1; excluded for MCMC).
-    replicates : int
-        Total number.
-    stop_rule : int
-        Number of chains that passed the stop rule of `sample`.
-    draws : float
-        Median number of independent draws per rank.
-    failed_solves : float
-        Mean fraction of proposals whose periodic solve failed.
+    replicates, stop_rule : int
+        Total number, and number of chains that passed the stop rule of `sample`.
+    draws, failed_solves : float
+        Median number of independent draws per rank, and mean fraction of proposals whose periodic solve failed.
     synthetic : bool
         Always True.
 
     Examples
     --------
-    Two replicates are too few for a verdict; a thousand reveal miscalibrations of a few per cent:
-
-    >>> calibration.positions["laplace"]["k"].shape, calibration.replicates, calibration.synthetic
-    ((2,), 2, True)
-    >>> calibration.table[["quantity", "method", "replicates"]]
-      quantity   method  replicates
-    0        k     mcmc           2
-    1        k  laplace           2
+    >>> calibration.positions["laplace"]["k"].shape, calibration.replicates, calibration.table["method"].tolist()
+    ((2,), 2, ['mcmc', 'laplace'])
     """
 
     table: pd.DataFrame
@@ -198,7 +188,7 @@ def calibrate(
     max_steps: int = 500,
     progress: bool = True,
 ) -> Calibration:
-    """Test the calibration of the posterior by simulation-based calibration [1]_.
+    """Test the calibration of the posterior by simulation-based calibration (Talts et al., arXiv:1804.06788, 2018).
 
     Each replicate draws θ and the variances from the prior, integrates the model in time to its steady state, records
     as many cycles as the experiment has (at least three) with as many samples per cycle as its grid, adds white noise,
@@ -220,12 +210,11 @@ def calibrate(
     folder : path, optional
         Each replicate is appended to ``replicates.jsonl`` there; a repeated call computes only the missing ones.
     executor : None, int, Dask Client, or executor with the interface of concurrent.futures
-        None computes serially. Replicates of a lost Dask worker are repeated by others; after the loss of workers of
-        other executors, repeat the call with the same folder.
+        None computes serially. After the loss of workers, except of Dask, repeat the call with the same folder.
     ensembles, walkers, max_steps
         Arguments of `sample` in each replicate. Short chains suffice, because ranks use draws five autocorrelation
-        times apart. Too few walkers bias the result: with eight in four dimensions this time was underestimated, and
-        the dispersion of exact ranks was 5 to 10 % too large.
+        times apart. Too few walkers bias the result: with eight in four dimensions, the dispersion of exact ranks was 5
+        to 10 % too large.
     progress : bool
 
     Returns
@@ -239,20 +228,11 @@ def calibrate(
     RuntimeError
         If the workers of the executor died; finished replicates are in the folder.
 
-    References
-    ----------
-    .. [1] S. Talts, M. Betancourt, D. Simpson, A. Vehtari, A. Gelman, Validating Bayesian inference algorithms with
-       simulation-based calibration, arXiv:1804.06788, 2018.
-
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = np.cos(2 * np.pi * np.arange(32) / 32)
-    >>> run = bp.Experiment("run", 0.1, {"displacement": force}, {"force": force}, samples=32, cycles=4,
-    ...                     harmonics={"displacement": 5, "force": 5})
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"k": bp.LogNormal(1, 0.1)}, scheme="fourier",
-    ...                      fixed={"m": 1, "c": 0.2, "k3": 0.5, "variance[displacement]": 1e-4})
-    >>> found = bp.calibrate(problem, replicates=2, seed=1, max_steps=250, progress=False)
+    >>> known = bp.Problem(bp.models.duffing, [run], priors={"k": bp.LogNormal(1, 0.1)}, scheme="fourier",
+    ...                    fixed={"m": 1, "c": 0.2, "k3": 0.5, "variance[displacement]": 1e-4})
+    >>> found = bp.calibrate(known, replicates=2, seed=1, max_steps=250, progress=False)
     >>> found.failures, found.names, found.table["verdict"].tolist()
     ({}, ('k',), ['too few replicates', 'too few replicates'])
     """
@@ -260,17 +240,17 @@ def calibrate(
     _checks.integer("seed", seed, 0)
     check_supported(problem)
     settings = (
-        f"{fingerprint(problem)}, seed {seed}, {ensembles} x {walkers} walkers, {max_steps} steps, {SPACING} apart"
+        f"{importlib.metadata.version('bayesperiodic')}, {fingerprint(problem)}, seed {seed}, {ensembles} x {walkers} "
+        f"walkers, {max_steps} steps, {SPACING} apart"
     )
-    source = hashlib.sha256(f"{importlib.metadata.version('bayesperiodic')}, {settings}".encode()).hexdigest()[:16]
-    campaign = Campaign(problem, seed, source, ensembles, walkers, max_steps)
+    source = hashlib.sha256(settings.encode()).hexdigest()[:16]
     lines = checkpointed_tasks(
         None if folder is None else Path(folder) / FILE,
         range(replicates),
         replicate,
         lambda line: line["number"],
         source,
-        shared=campaign,
+        shared=Campaign(problem, seed, source, {"ensembles": ensembles, "walkers": walkers, "max_steps": max_steps}),
         executor=executor,
         progress=progress,
     )
@@ -279,16 +259,13 @@ def calibrate(
 
 def summary(lines: Sequence[dict[str, Any]], names: Sequence[str]) -> Calibration:
     """Summarise the results of all replicates for these quantities."""
-    positions = {
-        method: {name: np.array([line[method][name] for line in lines if method in line]) for name in names}
-        for method in METHODS
-    }
+    found = {method: [line[method] for line in lines if method in line] for method in METHODS}
+    positions = {m: {name: np.array([line[name] for line in own]) for name in names} for m, own in found.items()}
     failures = Counter(line["status"] for line in lines if line["status"] != DONE)
     if unconverged := sum("map" in line and LAPLACE not in line for line in lines):
         failures["estimate not converged"] = unconverged
-    tables = [_table(method, positions[method]) for method in METHODS]
     return Calibration(
-        table=pd.concat(tables, ignore_index=True),
+        table=pd.concat([_table(*item) for item in positions.items()], ignore_index=True),
         positions=positions,
         failures=dict(sorted(failures.items())),
         replicates=len(lines),
@@ -308,12 +285,14 @@ def _table(method: str, positions: dict[str, np.ndarray]) -> pd.DataFrame:
             row["dispersion"], row["p_dispersion"] = dispersion_test(finite)
             row["shift"] = float(normal_scores(finite).mean())
             row["p_ecdf"], row["p_chi_square"] = ecdf_test(finite), chi_square_test(finite)
-        row |= {f"coverage_{100 * level:.0f}": coverage(finite, level) for level in LEVELS}
-        rows.append(row)
+        rows.append(row | {f"coverage_{100 * level:.0f}": coverage(finite, level) for level in LEVELS})
     table = pd.DataFrame(rows)
     for test in TESTS:
         table[test] = holm(table[test].to_numpy(dtype=float))
-    table["verdict"] = [_verdict(row) for row in table.to_dict("records")]
+    rejected = table[[*TESTS]] < FALSE_ALARMS
+    off = np.where(table["dispersion"] > 1.0, NARROW, WIDE)
+    cases = [table["replicates"] < FEWEST, rejected["p_dispersion"], rejected.any(axis=1)]
+    table["verdict"] = np.select(cases, [FEW, off, SHAPE], CALIBRATED)
     return table
 
 
@@ -322,9 +301,175 @@ def coverage(positions: np.ndarray, level: float) -> float:
     return float(np.mean(np.abs(positions - 0.5) <= 0.5 * level)) if positions.size else np.nan
 
 
-def _verdict(row: Mapping[Any, Any]) -> str:
-    if row["replicates"] < FEWEST:
-        return FEW
-    if row["p_dispersion"] < FALSE_ALARMS:
-        return NARROW if row["dispersion"] > 1.0 else WIDE
-    return SHAPE if min(row["p_ecdf"], row["p_chi_square"]) < FALSE_ALARMS else CALIBRATED
+@dataclass(frozen=True)
+class Campaign:
+    """Settings of all replicates."""
+
+    problem: Problem
+    seed: int
+    source: str
+    sampler: dict[str, Any]
+
+
+def check_supported(problem: Problem) -> None:
+    """Raise a ValueError for an improper prior, or a problem whose recordings cannot be simulated."""
+    noise = problem.noise
+    if not isinstance(noise, Independent):
+        raise ValueError(
+            f"problem: must have the noise model noise.Independent, got {noise.name!r}. Recordings are simulated with "
+            "independent errors: give noise.Independent(prior=…)."
+        )
+    if problem.free_noise and not noise.proper:
+        raise ValueError(
+            f"problem: must have proper priors, got the {noise.prior_text} of {problem.free_noise[0]!r}. Give "
+            "noise.Independent(prior=bp.InverseGamma(…)) or another proper prior, or fix the variance."
+        )
+    if problem.model.autonomous:
+        raise ValueError(f"problem: must have a forced model, got the autonomous {problem.model.name!r}.")
+    for e in problem.experiments:
+        turns = [e.winding] if isinstance(e.winding, int) else [*e.winding.values()]
+        excluded = {
+            "a mask": e.mask is not None,
+            "multipliers": e.multipliers is not None,
+            f"periods = {e.periods}": e.periods > 1,
+            "a winding number": any(turns),
+            "a delay (shift)": problem.parameter_maps[e.name].delayed,
+        }
+        if what := next((what for what, found in excluded.items() if found), ""):
+            raise ValueError(
+                f"problem: experiments must have whole histories of one forcing period, got {e.name!r} with {what}."
+            )
+
+
+def replicate(campaign: Campaign, number: int) -> dict[str, Any]:
+    """Return one replicate as a JSON object: its status, its truth, and the rank of the truth in each estimate.
+
+    A replicate depends on the seed of the campaign and on its number only.
+    """
+    seeds = np.random.SeedSequence([campaign.seed, number]).spawn(4)
+    truths, noise, chain, ties = (np.random.default_rng(seed) for seed in seeds)
+    problem = campaign.problem
+    theta = dict(zip(problem.names, problem.joint_prior.sample(1, truths)[0].tolist(), strict=True))
+    prior = problem.noise.prior
+    drawn = {name: float(as_prior("prior", prior).sample(1, truths)[0]) for name in problem.free_noise}
+    variances = problem.likelihood.fixed | drawn
+    line: dict[str, Any] = {"source": campaign.source, "number": number, "theta": theta}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            measured = [_measured(problem, e, theta, variances, noise) for e in problem.experiments]
+        except NotSettled:
+            return line | {"status": NO_STEADY_STATE}
+        except ValueError as error:
+            return line | {"status": "fold failed", "error": str(error)}
+        truth = theta | _folded_variances(problem, variances, [fraction for _, fraction in measured])
+        return line | {"truth": truth} | _ranks(campaign, [again for again, _ in measured], truth, chain, ties)
+
+
+def _variance_name(problem: Problem, channel: str, experiment: str) -> str:
+    inside = f"{channel}, {experiment}" if problem.noise.per == EXPERIMENT else channel
+    return f"{VARIANCE}[{inside}]"
+
+
+def _measured(
+    problem: Problem, e: Experiment, theta: dict[str, float], variances: dict[str, float], generator: Generator
+) -> tuple[Experiment, float]:
+    """Return a simulated repetition of an experiment, and the fraction of its cycles that the fold used.
+
+    The variance of the samples is that of the folded mean times the samples per independent value of that mean.
+    """
+    model, (row,) = problem.model, problem.parameters(problem.vector(theta)[None], e.name).tolist()
+    values, start = dict(zip(model.parameters, row, strict=True)), _first_state(problem, e)
+    cycle = steady_cycle(model, values, e.inputs, frequency=e.frequency, samples=e.samples, start=start)
+    limit, cycles = _fourier.highest_harmonic(e.samples), max(e.cycles, FEWEST_CYCLES)
+    size = cycles * e.samples
+    kept = {channel: e.harmonics.get(channel, limit) for channel in (*e.inputs, *e.outputs)}
+    inputs, outputs = {channel: np.tile(signal, cycles) for channel, signal in e.inputs.items()}, {}
+    for channel in e.outputs:
+        mean_variance = variances[_variance_name(problem, channel, e.name)]
+        sd = np.sqrt(mean_variance * size / (2 * kept[channel] + 1))
+        outputs[channel] = np.tile(cycle[channel], cycles) + sd * generator.standard_normal(size)
+    time = np.arange(size) / (e.samples * e.frequency)
+    recording = Recording(time, outputs, inputs, name=e.name, synthetic=True)
+    again = recording.fold(e.samples, frequency=e.frequency, harmonics=kept)
+    return replace(again, independent=e.independent, guess=e.guess), again.cycles / cycles
+
+
+def _first_state(problem: Problem, e: Experiment) -> dict[str, float]:
+    """Return the states and rates at τ = 0 of the guess of an experiment; empty without a guess."""
+    found = {}
+    for state, values in e.guess.items():
+        found[state] = float(values[0])
+        if problem.model.orders[state] == 2:
+            rate = _fourier.derivative(_fourier.coefficients(values), e.frequency)
+            found[f"d{state}"] = float(_fourier.on_grid(rate, values.size)[0])
+    return found
+
+
+def _folded_variances(problem: Problem, variances: dict[str, float], used: list[float]) -> dict[str, float]:
+    """Return the free variances of the folded means, which are larger if the fold left out cycles."""
+    fractions: dict[str, list[float]] = {name: [] for name in (*problem.likelihood.fixed, *problem.free_noise)}
+    for e, fraction in zip(problem.experiments, used, strict=True):
+        for channel in e.outputs:
+            fractions[_variance_name(problem, channel, e.name)].append(fraction)
+    return {name: variances[name] / float(np.mean(fractions[name])) for name in problem.free_noise}
+
+
+def _ranks(
+    campaign: Campaign, experiments: list[Experiment], truth: dict[str, float], chain: Generator, ties: Generator
+) -> dict[str, Any]:
+    """Return the ranks of the truth in the Laplace approximation and among the draws."""
+    problem = campaign.problem.with_experiments(experiments)
+    try:
+        fit = map_estimate(problem, progress=False)
+    except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
+        return {"status": "no estimate", "error": str(error)}
+    found: dict[str, Any] = {"map": fit.status, "stop_rule": False}
+    if fit.converged:
+        found[LAPLACE] = _laplace_cdf(fit, truth)
+    try:
+        posterior = sample(problem, fit, seed=int(chain.integers(2**32)), progress=False, **campaign.sampler)
+    except (ValueError, RuntimeError, np.linalg.LinAlgError) as error:
+        return found | {"status": "no draws", "error": str(error)}
+    rhat, failed = max(posterior.rhat.values()), sum(posterior.failures.values())
+    found |= {"stop_rule": posterior.converged, "rhat": rhat, "failed": failed}
+    draws = independent_draws(posterior)
+    if not rhat <= LARGEST_RHAT or draws is None:
+        return found | {"status": "draws not usable"}
+    found["draws"] = len(next(iter(draws.values())))
+    return found | {"status": DONE, MCMC: {name: position(draws[name], value, ties) for name, value in truth.items()}}
+
+
+def independent_draws(posterior: Posterior) -> dict[str, np.ndarray] | None:
+    """Return draws of every quantity at steps five autocorrelation times apart; None for fewer than 20."""
+    tau, group = max(posterior.tau.values()), posterior.data["posterior"]
+    if not np.isfinite(tau):
+        return None
+    chains, steps = group.sizes["chain"], group.sizes["draw"]
+    kept = np.arange(steps - 1, -1, -int(np.ceil(SPACING * tau)))
+    if chains * kept.size < FEWEST_DRAWS:
+        return None
+    return {name: posterior.draws(name).reshape(chains, steps)[:, kept].ravel() for name in posterior.names}
+
+
+def position(draws: np.ndarray, truth: float, generator: Generator) -> float:
+    """Return the randomised normalised rank of the truth, uniform on (0, 1) if draws and truth are exchangeable."""
+    rank = np.sum(draws < truth) + generator.integers(np.sum(draws == truth) + 1)
+    return float((rank + generator.uniform()) / (draws.size + 1))
+
+
+def _laplace_cdf(fit: MapEstimate, truth: dict[str, float]) -> dict[str, float]:
+    """Return the distribution functions of the Laplace approximation at the truth.
+
+    Student's t of `MapEstimate.interval` for parameters, the joint approximation of the logarithm for variances.
+    """
+    found = {}
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for name, value in truth.items():
+            if name in fit.theta:
+                distance = (value - fit.theta[name]) / fit.sd[name]
+                found[name] = float(stdtr(min(fit.degrees_of_freedom, 1e9), distance))
+            else:
+                sd = np.sqrt(fit.joint_covariance[name].to_dict()[name])
+                found[name] = float(ndtr(np.log(value / fit.joint_mode[name]) / sd))
+    return found

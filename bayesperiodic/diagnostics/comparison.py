@@ -1,8 +1,11 @@
 """Comparison of the Laplace approximation with MCMC, per parameter and jointly."""
 
 import html
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import zip_longest
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,23 +14,8 @@ from scipy.stats import skew
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic.diagnostics.verdicts import (
-    FINE,
-    LEVELS,
-    MODE,
-    NARROW,
-    SHAPE,
-    UNCONVERGED,
-    USABLE_K,
-    WIDE,
-    Sample,
-    ellipsoid_radii,
-    joint_verdict,
-    marginal_verdict,
-    normal_draws,
-    radii,
-    wasserstein_distance,
-)
+from bayesperiodic.diagnostics import verdicts
+from bayesperiodic.diagnostics.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, USABLE_K, WIDE, Sample
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.density import COLLAPSED, NATURAL, LogPosterior, SamplingCoordinates
 from bayesperiodic.posterior.labels import unit
@@ -62,8 +50,7 @@ class Comparison(Result):
         One row per parameter. The other columns refer to coordinate ("k" or "ln k"): map and laplace_sd, mean and sd of
         the draws; shift (mean − map in posterior sds), sd_ratio (Laplace over posterior), skewness; laplace_q05, q05
         and q05_difference ((draws − Laplace) in posterior sds), likewise for 50 and 95 %; wasserstein, the distance
-        between the draws and the Laplace approximation in posterior sds, whose error includes its upward bias; verdict
-        and recommendation.
+        from Laplace in posterior sds, whose error includes its upward bias; verdict and recommendation.
     joint : dict
         dimension; share_50, share_90 and share_95, the fractions of draws inside the Laplace ellipsoids; pareto_k, the
         k̂ of Laplace as an importance proposal, with the error of the tail fit; efficiency, the effective fraction of
@@ -71,15 +58,14 @@ class Comparison(Result):
     coordinates : str
         "natural" or "sampling".
     probabilities : array (probabilities,)
-        Probabilities of the quantiles and of the ellipsoids.
     quantiles : dict of str to array (probabilities,)
-        Quantiles of the draws.
+        Of the draws.
     edges, densities : dict of str to array (bins + 1,) and (bins,)
         Histograms of the central 99.9 % of the draws.
     shares, shares_mcse : array (probabilities,)
         Fractions of draws inside the Laplace ellipsoids of these probabilities.
     units : dict of str to str
-        Units of the natural values.
+        Of the natural values.
     synthetic, converged : bool
         Whether the data are synthetic, and whether the draws have converged.
 
@@ -106,42 +92,31 @@ class Comparison(Result):
     converged: bool
 
     def __repr__(self) -> str:
-        joint = f"{self._ellipsoids} Joint verdict: {self.joint['verdict']}; {self.joint['recommendation']}."
-        return f"{self._title}\n{self._short.to_string()}\n{joint}"
+        title, short, joint = self._parts(str, str)
+        return f"{title}\n{short.to_string()}\n{joint}"
 
     def _repr_html_(self) -> str:
-        short = self._short.map(html.escape).assign(verdict=self._short["verdict"].map(_coloured))
-        short.index = short.index.map(html.escape)
+        title, short, joint = self._parts(html.escape, _coloured)
         with pd.option_context("display.max_colwidth", None):
-            table = short.to_html(escape=False, border=0)
-        verdict = f"{_coloured(str(self.joint['verdict']))}; {html.escape(str(self.joint['recommendation']))}"
-        title, ellipsoids = html.escape(self._title), html.escape(self._ellipsoids)
-        return f"<p>{title}</p>{table}<p>{ellipsoids} Joint verdict: {verdict}.</p>"
+            return f"<p>{title}</p>{short.to_html(escape=False, border=0)}<p>{joint}</p>"
 
-    @property
-    def _title(self) -> str:
+    def _parts(self, text: Callable[[str], str], mark: Callable[[str], str]) -> tuple[str, pd.DataFrame, str]:
+        """Return the title, the main columns of the table and a sentence, with texts and verdicts formatted."""
+        table, joint = self.table, self.joint
+        columns: dict[str, Any] = {c: table[c].map("{:.5g}".format) for c in ("map", "mean")}
+        columns |= {c: table[c].map("{:.3g}".format) for c in ("laplace_sd", "sd")}
+        for c in ("shift", "sd_ratio", "skewness", "wasserstein"):
+            columns[c] = table[c].map("{:.2f}".format) + table[f"{c}_mcse"].map(" ± {:.2f}".format)
+        columns |= {"verdict": table["verdict"].map(mark), "recommendation": table["recommendation"].map(text)}
         data = ", synthetic data" if self.synthetic else ""
-        return f"Laplace against MCMC in {self.coordinates} coordinates{data} (± Monte Carlo error)"
-
-    @property
-    def _short(self) -> pd.DataFrame:
-        """The main columns of the table as text, values with their errors."""
-        table = self.table
-        columns: dict[str, list[str]] = {c: [f"{v:.5g}" for v in table[c]] for c in ("map", "mean")}
-        columns |= {c: [f"{v:.3g}" for v in table[c]] for c in ("laplace_sd", "sd")}
-        for column in ("shift", "sd_ratio", "skewness", "wasserstein"):
-            pairs = zip(table[column], table[f"{column}_mcse"], strict=True)
-            columns[column] = [f"{value:.2f} ± {error:.2f}" for value, error in pairs]
-        columns |= {c: table[c].tolist() for c in ("verdict", "recommendation")}
-        return pd.DataFrame(columns, index=table["coordinate"].tolist())
-
-    @property
-    def _ellipsoids(self) -> str:
         keys = [f"share_{100 * level:.0f}" for level in LEVELS]
-        inside = ", ".join(f"{self.joint[key]:.1%} ± {self.joint[f'{key}_mcse']:.1%}" for key in keys)
-        k, error = self.joint["pareto_k"], self.joint["pareto_k_mcse"]
+        inside = ", ".join(f"{joint[key]:.1%} ± {joint[f'{key}_mcse']:.1%}" for key in keys)
         return (
-            f"The 50, 90 and 95% Laplace ellipsoids contain {inside} of the draws; Pareto k̂ is {k:.2f} ± {error:.2f}."
+            f"Laplace against MCMC in {self.coordinates} coordinates{data} (± Monte Carlo error)",
+            pd.DataFrame(columns).set_axis(table["coordinate"].map(text).tolist()),
+            f"The 50, 90 and 95% Laplace ellipsoids contain {inside} of the draws; Pareto k̂ is {joint['pareto_k']:.2f} "
+            f"± {joint['pareto_k_mcse']:.2f}. Joint verdict: {mark(str(joint['verdict']))}; "
+            f"{text(str(joint['recommendation']))}.",
         )
 
 
@@ -162,10 +137,11 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     have not converged, unless every ensemble by itself shows another mode.
 
     The joint verdict rests on the fraction of draws inside the Laplace ellipsoids and on the Pareto k̂ of the importance
-    weights of 8000 draws from Laplace ([1]_; above 0.7 the proposal is unusable; modes that Laplace does not reach
-    remain undetected). k̂ describes only the tail of the weights and is ignored if they are even (efficiency above
-    98 %). In natural coordinates, k̂ is that of the density with the variances integrated out where that is possible in
-    closed form.
+    weights of 8000 draws from Laplace (Vehtari, Simpson, Gelman, Yao, Gabry, Pareto smoothed importance sampling, J.
+    Mach. Learn. Res. 25 (2024) 1-58; above 0.7 the proposal is unusable; modes that Laplace does not reach remain
+    undetected). k̂ describes only the tail of the weights and is ignored if they are even (efficiency above 98 %). In
+    natural coordinates, k̂ is that of the density with the variances integrated out where that is possible in closed
+    form.
 
     Parameters
     ----------
@@ -187,44 +163,36 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
         For unknown coordinates, a posterior of another problem, or sampling coordinates without a joint Laplace
         approximation.
 
-    References
-    ----------
-    .. [1] A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry, Pareto smoothed importance sampling, Journal of Machine
-       Learning Research 25 (2024) 1-58.
-
     Examples
     --------
-    >>> scorecard = bp.compare(problem, fit, posterior, coordinates="sampling")
-    >>> scorecard.table["coordinate"].tolist()
+    >>> bp.compare(problem, fit, posterior, coordinates="sampling").table["coordinate"].tolist()
     ['ln c', 'ln k', 'ln variance[displacement]']
     """
     _checks.one_of("coordinates", coordinates, COORDINATES)
     every = (*problem.names, *problem.free_noise)
     _checks.contains("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
-    both = {kind: approximation(problem, fit, kind) for kind in COORDINATES}
-    laplace = both[coordinates]
-    if laplace is None:
+    scored = _scores(problem, fit, posterior, coordinates)
+    if scored is None:
         raise ValueError(
             "coordinates: must be 'natural' for an estimate without a joint Laplace approximation, got 'sampling'. The "
             f"density has no maximum with finite curvature ({'; '.join(fit.undetermined) or fit.status})."
         )
-    scored = scores(problem, fit, posterior, laplace, coordinates)
-    other = both[SAMPLING] if coordinates == NATURAL and posterior.converged and not scored.fine else None
-    cured = None if other is None else scores(problem, fit, posterior, other, SAMPLING)
-    group, names = posterior.data["posterior"].to_dataset(), laplace.names
+    doubtful = coordinates == NATURAL and posterior.converged and not scored.fine
+    cured = _scores(problem, fit, posterior, SAMPLING) if doubtful else None
+    group, draws = posterior.data["posterior"].to_dataset(), {n: s.whole for n, s in scored.samples.items()}
     shares, errors = scored.inside(PROBABILITIES)
-    histograms = {name: _histogram(scored.samples[name].whole) for name in names}
+    histograms = {name: np.histogram(x, BINS, tuple(np.quantile(x, SHOWN))) for name, x in draws.items()}
     return Comparison(
         table=_table(scored, cured),
         joint=_joint(scored, cured),
         coordinates=coordinates,
         probabilities=PROBABILITIES,
-        quantiles={name: np.quantile(scored.samples[name].whole, PROBABILITIES) for name in names},
+        quantiles={name: np.quantile(x, PROBABILITIES) for name, x in draws.items()},
         edges={name: edges for name, (_, edges) in histograms.items()},
-        densities={name: density for name, (density, _) in histograms.items()},
+        densities={n: counts / (draws[n].size * np.diff(edges)) for n, (counts, edges) in histograms.items()},
         shares=shares,
         shares_mcse=errors,
-        units={name: unit(group, name) for name in names},
+        units={name: unit(group, name) for name in draws},
         synthetic=bool(posterior.data.attrs.get("synthetic")),
         converged=posterior.converged,
     )
@@ -246,32 +214,32 @@ class Approximation:
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def coordinates(self) -> tuple[str, ...]:
-        """Names of the coordinates, such as "ln k"."""
-        return tuple(f"ln {n}" if log else n for n, log in zip(self.names, self.logarithmic, strict=True))
+    def determined(self) -> bool:
+        """True if all covariances are finite."""
+        return bool(np.isfinite(self.covariance).all())
 
     def points(self, posterior: Posterior) -> np.ndarray:
         """Return all draws in these coordinates, (draws, names)."""
-        columns = [posterior.draws(name) for name in self.names]
-        return np.stack([np.log(x) if log else x for x, log in zip(columns, self.logarithmic, strict=True)], axis=-1)
+        points = np.stack([posterior.draws(name) for name in self.names], axis=-1)
+        points[:, self.logarithmic] = np.log(points[:, self.logarithmic])
+        return points
 
 
-def approximation(problem: Problem, fit: MapEstimate, coordinates: str) -> Approximation | None:
+def _approximation(problem: Problem, fit: MapEstimate, coordinates: str) -> Approximation | None:
     """Return the Laplace approximation in "natural" or "sampling" coordinates; None if there is none."""
-    every = tuple(problem.joint_prior.supports.values())
+    names, supports = [*problem.names], tuple(problem.joint_prior.supports.values())
     if coordinates == NATURAL:
-        names, covariance = [*problem.names], fit.covariance.loc[[*problem.names], [*problem.names]].to_numpy()
-        plain = np.zeros(len(names), dtype=bool)
-        return Approximation(problem.names, plain, problem.vector(fit.theta), covariance, every)
+        plain, covariance = np.zeros(len(names), dtype=bool), fit.covariance.loc[names, names].to_numpy()
+        return Approximation(problem.names, plain, problem.vector(fit.theta), covariance, supports)
     density = SamplingCoordinates(problem)
     try:
         mean, covariance = laplace_approximation(density, fit)
     except ValueError:
         return None
     logarithmic = np.concatenate([density.logarithmic, np.ones(len(density.free), dtype=bool)])
-    supports = [*every, *[(0.0, np.inf)] * len(density.free)]
+    # The logarithms of positive parameters and of noise parameters, which come last, are unbounded.
     whole = (-np.inf, np.inf)
-    own = tuple(whole if log else support for support, log in zip(supports, logarithmic, strict=True))
+    own = tuple(whole if log else end for end, log in zip_longest(supports, logarithmic))
     return Approximation(density.labels, logarithmic, mean, covariance, own)
 
 
@@ -289,7 +257,7 @@ def importance_k(problem: Problem, fit: MapEstimate, coordinates: str) -> tuple[
     mean, covariance = _proposal(density, fit, natural)
     if not np.isfinite(covariance).all():
         return np.nan, np.nan, np.nan
-    points, log_proposal = normal_draws(mean, covariance, PROPOSALS, np.random.default_rng(SEED))
+    points, log_proposal = verdicts.normal_draws(mean, covariance, PROPOSALS, np.random.default_rng(SEED))
     log_weights = density.evaluate(points, threads=None).log_prob - log_proposal
     k, top = convergence.pareto_k(log_weights), log_weights.max()
     weights = np.exp(log_weights - top) if np.isfinite(top) else np.ones(1)
@@ -300,19 +268,18 @@ def importance_k(problem: Problem, fit: MapEstimate, coordinates: str) -> tuple[
 
 def _proposal(density: LogPosterior, fit: MapEstimate, natural: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and covariance in the coordinates of a density; NaN if there are none."""
-    names = [*density.problem.names]
-    try:
-        without_noise = natural and not density.free
-        mean, covariance = (np.empty(0), np.empty((0, 0))) if without_noise else laplace_approximation(density, fit)
-    except ValueError:
-        return np.full(density.dimension, np.nan), np.full((density.dimension,) * 2, np.nan)
-    if not natural:
-        return mean, covariance
-    noise, count = slice(len(names), None), len(names)
-    whole = np.zeros((density.dimension,) * 2)
-    whole[:count, :count] = fit.covariance.loc[names, names]
-    whole[count:, count:] = covariance[noise, noise]
-    return np.concatenate([density.problem.vector(fit.theta), mean[noise]]), whole
+    names, size = [*density.problem.names], density.dimension
+    mean, covariance = np.full(size, np.nan), np.full((size, size), np.nan)
+    if density.free or not natural:
+        try:
+            mean, covariance = laplace_approximation(density, fit)
+        except ValueError:
+            return mean, covariance
+    if natural:
+        own, noise = slice(len(names)), slice(len(names), None)
+        mean[own], covariance[own, own] = density.problem.vector(fit.theta), fit.covariance.loc[names, names]
+        covariance[own, noise], covariance[noise, own] = 0.0, 0.0
+    return mean, covariance
 
 
 @dataclass(frozen=True)
@@ -332,44 +299,39 @@ class Scores:
     joint: str
 
     @property
-    def usable_as_proposal(self) -> bool:
-        """False if the importance weights have a relevant heavy tail."""
-        return self.efficiency > EVEN or not self.pareto_k[0] > USABLE_K
-
-    @property
     def fine(self) -> bool:
         """True if every verdict is "fine"."""
         return {self.joint, *self.verdicts.values()} == {FINE}
 
     def inside(self, levels: np.ndarray) -> np.ndarray:
         """Return the fractions of draws inside ellipsoids of given probabilities, and their errors, (2, levels)."""
-        if not np.isfinite(self.laplace.covariance).all():
+        if not self.laplace.determined:
             return np.full((2, levels.size), np.nan)
-        limits = ellipsoid_radii(levels, self.laplace.mean.size)
+        limits = verdicts.ellipsoid_radii(levels, self.laplace.mean.size)
         return np.array([self.distances.below(limit, level) for limit, level in zip(limits, levels, strict=True)]).T
 
 
-def scores(
-    problem: Problem, fit: MapEstimate, posterior: Posterior, laplace: Approximation, coordinates: str
-) -> Scores:
-    """Return the scores of a Laplace approximation."""
+def _scores(problem: Problem, fit: MapEstimate, posterior: Posterior, coordinates: str) -> Scores | None:
+    """Return the scores of the Laplace approximation; None if there is none."""
+    laplace = _approximation(problem, fit, coordinates)
+    if laplace is None:
+        return None
     points = laplace.points(posterior)
     ensemble = posterior.data["posterior"]["ensemble"].to_numpy()
     samples = {name: Sample.of(points[:, i], ensemble, posterior.ess[name]) for i, name in enumerate(laplace.names)}
     sampled = partial(Sample.of, ensemble=ensemble, size=min(posterior.ess[name] for name in laplace.names))
-    verdicts = {
-        name: marginal_verdict(
-            samples[name], float(laplace.mean[i]), float(laplace.sds[i]), laplace.supports[i], posterior.converged
-        )
-        for i, name in enumerate(laplace.names)
+    normals = zip(samples.items(), laplace.mean.tolist(), laplace.sds.tolist(), laplace.supports, strict=True)
+    marginal = {
+        name: verdicts.marginal_verdict(draws, mean, sd, support, posterior.converged)
+        for (name, draws), mean, sd, support in normals
     }
-    finite = np.isfinite(laplace.covariance).all()
-    distances = radii(points, laplace.mean, laplace.covariance) if finite else np.full(len(points), np.nan)
+    unknown = np.full(len(points), np.nan)
+    distances = verdicts.radii(points, laplace.mean, laplace.covariance) if laplace.determined else unknown
     *k, efficiency = importance_k(problem, fit, coordinates)
     tail = NO_TAIL if efficiency > EVEN else (k[0], k[1])
-    joint = joint_verdict(points, laplace.mean, laplace.covariance, sampled, tail, posterior.converged)
-    joint = _consistent(joint, set(verdicts.values()))
-    return Scores(laplace, samples, sampled(distances), verdicts, (k[0], k[1]), efficiency, joint)
+    joint = verdicts.joint_verdict(points, laplace.mean, laplace.covariance, sampled, tail, posterior.converged)
+    joint = _consistent(joint, set(marginal.values()))
+    return Scores(laplace, samples, sampled(distances), marginal, (k[0], k[1]), efficiency, joint)
 
 
 def _consistent(joint: str, rows: set[str]) -> str:
@@ -383,7 +345,7 @@ def _consistent(joint: str, rows: set[str]) -> str:
     return joint
 
 
-def row(sample: Sample, mean: float, sd: float) -> dict[str, float]:
+def _row(sample: Sample, mean: float, sd: float) -> dict[str, float]:
     """Return the statistics of one quantity and their Monte Carlo errors, see `Comparison.table`."""
     own_mean, mean_error = sample.estimate(lambda x: x.mean(axis=-1))
     own, spread = sample.estimate(lambda x: np.std(x, axis=-1, ddof=1))
@@ -396,27 +358,8 @@ def row(sample: Sample, mean: float, sd: float) -> dict[str, float]:
         end = mean + z * sd if z else mean
         found |= {f"laplace_{label}": end, label: value}
         found |= {f"{label}_difference": (value - end) / own, f"{label}_difference_mcse": error / own}
-    found["wasserstein"], found["wasserstein_mcse"] = wasserstein_distance(sample, mean, sd)
+    found["wasserstein"], found["wasserstein_mcse"] = verdicts.wasserstein_distance(sample, mean, sd)
     return found
-
-
-def joint_row(scored: Scores) -> dict[str, float]:
-    """Return the joint statistics, see `Comparison.joint`."""
-    found: dict[str, float] = {"dimension": scored.laplace.mean.size}
-    for level, inside, error in zip(LEVELS, *scored.inside(np.array(LEVELS)), strict=True):
-        key = f"share_{100 * level:.0f}"
-        found |= {key: float(inside), f"{key}_mcse": float(error)}
-    return found | {
-        "pareto_k": scored.pareto_k[0],
-        "pareto_k_mcse": scored.pareto_k[1],
-        "efficiency": scored.efficiency,
-    }
-
-
-def _histogram(draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    low, high = np.quantile(draws, SHOWN)
-    counts, edges = np.histogram(draws, BINS, (low, high))
-    return counts / (draws.size * np.diff(edges)), edges
 
 
 def _table(scored: Scores, cured: Scores | None) -> pd.DataFrame:
@@ -426,8 +369,8 @@ def _table(scored: Scores, cured: Scores | None) -> pd.DataFrame:
         cure = cured is not None and cured.verdicts[name] == FINE
         logarithm = cured is not None and bool(cured.laplace.logarithmic[i])
         rows[name] = {
-            "coordinate": laplace.coordinates[i],
-            **row(scored.samples[name], float(laplace.mean[i]), sd),
+            "coordinate": f"ln {name}" if laplace.logarithmic[i] else name,
+            **_row(scored.samples[name], float(laplace.mean[i]), sd),
             "verdict": verdict,
             "recommendation": _recommendation(verdict, cure, logarithm, bool(np.isfinite(sd))),
         }
@@ -435,14 +378,19 @@ def _table(scored: Scores, cured: Scores | None) -> pd.DataFrame:
 
 
 def _joint(scored: Scores, cured: Scores | None) -> dict[str, float | str]:
+    found: dict[str, float | str] = {"dimension": scored.laplace.mean.size}
+    for level, inside, error in zip(LEVELS, *scored.inside(np.array(LEVELS)), strict=True):
+        key = f"share_{100 * level:.0f}"
+        found |= {key: float(inside), f"{key}_mcse": float(error)}
+    found |= zip(("pareto_k", "pareto_k_mcse", "efficiency"), (*scored.pareto_k, scored.efficiency), strict=True)
     logarithm = cured is not None and bool(cured.laplace.logarithmic[: scored.laplace.mean.size].any())
-    finite = bool(np.isfinite(scored.laplace.covariance).all())
-    advice = _recommendation(scored.joint, cured is not None and cured.fine, logarithm, finite)
+    advice = _recommendation(scored.joint, cured is not None and cured.fine, logarithm, scored.laplace.determined)
     if scored.joint == FINE:
         others = [name for name, verdict in scored.verdicts.items() if verdict != FINE]
         advice += f", except for {', '.join(others)}" if others else ""
-        advice += ", not as an importance proposal" if not scored.usable_as_proposal else ""
-    return joint_row(scored) | {"verdict": scored.joint, "recommendation": advice}
+        heavy_tail = not scored.efficiency > EVEN and scored.pareto_k[0] > USABLE_K
+        advice += ", not as an importance proposal" if heavy_tail else ""
+    return found | {"verdict": scored.joint, "recommendation": advice}
 
 
 def _recommendation(verdict: str, cure: bool, logarithm: bool, determined: bool) -> str:

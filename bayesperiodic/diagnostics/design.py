@@ -44,7 +44,11 @@ class Information:
         changes = problem.likelihood.whitened(here.changes, problem.noise_values(fit.noise))
         slopes = np.where(logs, theta, 1.0)
         design = np.concatenate(changes, axis=1) * slopes[:, None]
-        return cls(problem.names, theta, logs, design @ design.T, prior_sds(problem, logs))
+        ends = [
+            marginal.quantile(np.array([1.0 - ONE_SD, ONE_SD])) for marginal in problem.joint_prior.marginals.values()
+        ]
+        widths = [np.log(high / low) if log else high - low for (low, high), log in zip(ends, logs, strict=True)]
+        return cls(problem.names, theta, logs, design @ design.T, 0.5 * np.array(widths))
 
     @cached_property
     def _relative(self) -> tuple[np.ndarray, np.ndarray]:
@@ -62,22 +66,16 @@ class Information:
         """The directions, in columns (names, directions), in the coordinates."""
         return self._relative[1] * self.prior_sd[:, None]
 
-    @property
+    @cached_property
     def spectrum(self) -> np.ndarray:
         """Eigenvalues of the information, descending, in units of the logarithm or of the prior sd if signed."""
-        return self._scaled_eigenvalues[::-1]
+        values = hessian_eigh(self.matrix, np.where(self.logarithmic, 1.0, self.prior_sd))[0][::-1]
+        return np.where(values > SMALLEST * values[0], values, 0.0)
 
     @property
     def condition(self) -> float:
         """Ratio of the largest to the smallest of these."""
-        values = self._scaled_eigenvalues
-        return float(values[-1] / values[0]) if values[0] > 0.0 else np.inf
-
-    @cached_property
-    def _scaled_eigenvalues(self) -> np.ndarray:
-        scale = np.where(self.logarithmic, 1.0, self.prior_sd)
-        values, _, _ = hessian_eigh(self.matrix, scale)
-        return np.where(values > SMALLEST * values[-1], values, 0.0)
+        return float(self.spectrum[0] / self.spectrum[-1]) if self.spectrum[-1] > 0.0 else np.inf
 
     @property
     def alone(self) -> np.ndarray:
@@ -103,18 +101,9 @@ class Information:
         with np.errstate(invalid="ignore"):
             return self.together / self.alone
 
-    def coordinate(self, name: str, values: np.ndarray) -> np.ndarray:
-        """Return values of a parameter in its coordinate."""
-        return np.log(values) if self.logarithmic[self.names.index(name)] else values
-
-
-def prior_sds(problem: Problem, logs: np.ndarray) -> np.ndarray:
-    """Return half the central 68 % interval of each prior in its coordinate."""
-    result = np.empty(len(problem.names))
-    for i, name in enumerate(problem.names):
-        low, high = problem.joint_prior.marginals[name].quantile(np.array([1.0 - ONE_SD, ONE_SD]))
-        result[i] = 0.5 * (np.log(high / low) if logs[i] else high - low)
-    return result
+    def coordinates(self, values: np.ndarray) -> np.ndarray:
+        """Return the coordinates of values (draws, names)."""
+        return np.where(self.logarithmic, np.log(np.where(self.logarithmic, values, 1.0)), values)
 
 
 FACTORS = (0.5, 1.0, 2.0)
@@ -150,18 +139,16 @@ def rank_candidates(
     the one found from that of the run as the initial guess. Candidates without an orbit have NaN. Columns: run,
     frequency, scale, gain and one per parameter; the most informative first.
     """
-    runs = {e.name: e for e in problem.experiments}
-    scale = information.prior_sd
-    before = information.matrix * np.outer(scale, scale) + np.eye(scale.size)
+    runs, unit = {e.name: e for e in problem.experiments}, np.outer(information.prior_sd, information.prior_sd)
+    before = information.matrix * unit + np.eye(len(unit))
     now, rows = np.sqrt(np.diag(np.linalg.inv(before))), []
     for candidate in candidates:
         _checks.one_of("candidates", candidate.run, runs)
-        added = _added(problem, fit, information, runs[candidate.run], candidate)
-        after = before + added * np.outer(scale, scale)
+        after = before + _added(problem, fit, information, runs[candidate.run], candidate) * unit
         row: dict[str, object] = {**candidate._asdict(), "gain": np.nan}
         if np.isfinite(after).all():
             row["gain"] = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1])
-            row |= dict(zip(problem.names, np.sqrt(np.diag(np.linalg.inv(after))) / now, strict=True))
+            row |= zip(problem.names, np.sqrt(np.diag(np.linalg.inv(after))) / now, strict=True)
         rows.append(row)
     table = pd.DataFrame(rows, columns=[*Candidate._fields, "gain", *problem.names])
     return table.sort_values("gain", ascending=False, na_position="last", ignore_index=True)
@@ -171,8 +158,7 @@ def _added(
     problem: Problem, fit: MapEstimate, information: Information, run: Experiment, candidate: Candidate
 ) -> np.ndarray:
     """Return the information of a candidate in the coordinates of `information`; NaN without an orbit."""
-    theta = problem.vector(fit.theta)
-    parameter_map = problem.parameter_maps[run.name]
+    theta, parameter_map = problem.vector(fit.theta), problem.parameter_maps[run.name]
     values = parameter_map.values(theta[None])[0]
     inputs = {name: u.mean() + candidate.scale * (u - u.mean()) for name, u in run.inputs.items()}
     with warnings.catch_warnings():
@@ -192,13 +178,11 @@ def _added(
     if not solution.converged:
         return np.full((theta.size, theta.size), np.nan)
     slopes = parameter_map.slopes(theta)[:-1] * np.where(information.logarithmic, information.theta, 1.0)
-    noise = np.array([[fit.noise[name] for name in problem.noise_names]])
-    variances = problem.likelihood.value_variances(noise)
+    variances = problem.likelihood.value_variances(problem.noise_values(fit.noise)[None])
     total = np.zeros((theta.size, theta.size))
     for channel in run.outputs:
         if (run.name, channel) in variances:
-            by_parameter = np.stack([solution.sensitivities[channel][n] for n in problem.model.parameters])
-            changes = slopes.T @ by_parameter
+            changes = slopes.T @ np.stack([solution.sensitivities[channel][n] for n in problem.model.parameters])
             weight = run.independent[channel] / changes.shape[1] / float(variances[run.name, channel][0])
             total += weight * changes @ changes.T
     return total

@@ -7,11 +7,12 @@ from functools import lru_cache
 import numpy as np
 import pandas as pd
 import sympy as sp
-from scipy.special import ndtr
+from scipy.special import ndtr, softmax
 
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics.design import Candidate, Information, default_candidates, rank_candidates
+from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
 from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
@@ -31,11 +32,9 @@ def structure_of(problem: Problem) -> Structure:
     local parameter counts as one.
     """
     free = {name for name in problem.names if "[" not in name} | set(local_names(problem.names))
-    fixed = {name: set(values.values()) for name, values in problem.fixed.items() if name not in free}
-    parameters = set(problem.model.parameters)
-    zeros = tuple(sorted(name for name, values in fixed.items() if values == {0.0} and name in parameters))
-    known = tuple(name for name in problem.model.parameters if name in fixed)
-    tied = tuple((name, text) for name, text in problem.tied.items() if name in parameters)
+    known = tuple(name for name in problem.model.parameters if name in problem.fixed and name not in free)
+    zeros = tuple(sorted(name for name in known if set(problem.fixed[name].values()) == {0.0}))
+    tied = tuple((name, text) for name, text in problem.tied.items() if name in problem.model.parameters)
     return _structure(problem.model, problem.channels, known, zeros, tied)
 
 
@@ -62,29 +61,21 @@ MOST_DRAWS = 20_000
 
 
 def power_scaling(problem: Problem, posterior: Posterior) -> dict[str, tuple[float, float]]:
-    """Return the sensitivity of each parameter's posterior to power-scaling of the prior and of the likelihood ([1]_).
+    """Return the sensitivity of each parameter's posterior to power-scaling of the prior and of the likelihood.
 
     The draws are weighted by the prior of θ, or the likelihood, to the powers 0.25 and −0.2. The sensitivity is the
     cumulative Jensen-Shannon distance between the weighted and the unweighted distribution per doubling of the weight,
-    averaged over the two powers. A value above 0.05 is noticeable: for a normal distribution, it is a shift of the mean
-    by a sixth of its standard deviation. If both are large, prior and likelihood are in conflict; if only the first is,
-    the data are uninformative. The two series of ArviZ that the package supports scale this diagnostic differently.
-
-    References
-    ----------
-    .. [1] N. Kallioinen, T. Paananen, P.-C. Bürkner, A. Vehtari, Detecting and diagnosing prior and likelihood
-       sensitivity with power-scaling, Statistics and Computing 34 (2024) 57.
+    averaged over the two powers (Kallioinen et al., Statistics and Computing 34 (2024) 57). A value above 0.05 is
+    noticeable: for a normal distribution, it is a shift of the mean by a sixth of its standard deviation. If both are
+    large, prior and likelihood are in conflict; if only the first is, the data are uninformative. The two series of
+    ArviZ that the package supports scale this diagnostic differently.
     """
-    step = max(1, posterior.draws(problem.names[0]).size // MOST_DRAWS)
-    theta = np.stack([posterior.draws(name)[::step] for name in problem.names], axis=-1)
-    lp = posterior.data["sample_stats"]["lp"].transpose("chain", "draw").to_numpy().ravel()[::step]
+    lp = posterior.data["sample_stats"]["lp"].transpose("chain", "draw").to_numpy().ravel()
+    thinned = slice(None, None, max(1, lp.size // MOST_DRAWS))
+    theta, noise = draws_of(problem, posterior, thinned)
     prior = np.asarray(problem.log_prior(theta))
-    logs = problem.logarithmic
-    free = np.empty((len(theta), len(problem.free_noise)))
-    for i, name in enumerate(problem.free_noise):
-        free[:, i] = posterior.draws(name)[::step]
-    noise = problem.likelihood.complete(free)
-    likelihood = lp - prior - problem.likelihood.log_prior(noise) - np.log(theta[:, logs]).sum(axis=1)
+    jacobian = np.log(theta[:, problem.logarithmic]).sum(axis=1)
+    likelihood = lp[thinned] - prior - problem.likelihood.log_prior(noise) - jacobian
     return {
         name: (_sensitivity(theta[:, i], prior), _sensitivity(theta[:, i], likelihood))
         for i, name in enumerate(problem.names)
@@ -92,36 +83,31 @@ def power_scaling(problem: Problem, posterior: Posterior) -> dict[str, tuple[flo
 
 
 def _sensitivity(values: np.ndarray, log_density: np.ndarray) -> float:
-    distances = []
-    for power in (POWER - 1.0, 1.0 / POWER - 1.0):
-        logarithm = power * (log_density - log_density.max())
-        weights = np.exp(logarithm - logarithm.max())
-        distances.append(cumulative_jensen_shannon(values, weights / weights.sum()))
-    return float(np.mean(distances) / np.log2(POWER))
+    powers = np.array([[POWER - 1.0], [1.0 / POWER - 1.0]])
+    weights = softmax(powers * (log_density - log_density.max()), axis=1)
+    return float(np.mean([cumulative_jensen_shannon(values, w) for w in weights]) / np.log2(POWER))
 
 
 def cumulative_jensen_shannon(values: np.ndarray, weights: np.ndarray) -> float:
     """Return the normalised cumulative Jensen-Shannon distance, 0 to 1, between unweighted and weighted draws.
 
-    It is the larger one of the distances in the two directions of the axis.
-
-    References
-    ----------
-    H.-V. Nguyen, J. Vreeken, Non-parametric Jensen-Shannon divergence, ECML PKDD 2015, 173-189.
+    It is the larger one of the distances in the two directions of the axis (Nguyen and Vreeken, Non-parametric
+    Jensen-Shannon divergence, ECML PKDD 2015, 173-189).
     """
     order = np.argsort(values, kind="stable")
-    x, plain, weighted = values[order], np.full(values.size, 1.0 / values.size), weights[order]
-    return max(_one_sided(x, plain, weighted), _one_sided(-x[::-1], plain, weighted[::-1]))
+    x, weighted = values[order], weights[order]
+    return max(_one_sided(x, weighted), _one_sided(-x[::-1], weighted[::-1]))
 
 
-def _one_sided(x: np.ndarray, plain: np.ndarray, weighted: np.ndarray) -> float:
+def _one_sided(x: np.ndarray, weighted: np.ndarray) -> float:
     widths = np.diff(x)
-    p, q = np.cumsum(plain)[:-1], np.cumsum(weighted)[:-1]
+    p, q = np.cumsum(np.full(x.size, 1.0 / x.size))[:-1], np.cumsum(weighted)[:-1]
     total = np.sum((p + q) * widths)
     if total <= 0.0:
         return 0.0
     middle = 0.5 * (p + q)
 
+    # The linear terms of the two parts cancel; with them, rounding errors do not hide small distances.
     def against(own: np.ndarray, other: np.ndarray) -> float:
         with np.errstate(divide="ignore", invalid="ignore"):
             terms = np.where(own > 0.0, own * np.log2(own / middle), 0.0)
@@ -135,6 +121,7 @@ COMBINATION, SIGN, NOTHING = "only in combination", "sign undetermined", "not de
 # Standard deviations left by the data alone, in prior sds: the largest one of determined parameters (a contraction of
 # 0.9), and the smallest one of undetermined parameters (1 % of the information of the prior).
 DETERMINED_SD, UNINFORMED_SD = 1.0 / 3.0, 10.0
+UNDETERMINED_GAIN = 1.0 / DETERMINED_SD**2
 COLLINEAR = 5.0
 SIGN_PROBABILITY = 0.975
 MONTE_CARLO_ERRORS = 3.0
@@ -150,14 +137,13 @@ class Identifiability(Result):
     Attributes
     ----------
     table : DataFrame
-        One row per parameter. ``verdict``: "determined", "only with the prior", "only in combination", "sign
-        undetermined" or "not determined". ``contraction``: 1 − (posterior sd / prior sd)², of the logarithm of positive
-        parameters, with its Monte Carlo error ``contraction_mcse``. ``alone`` and ``together``: the sd left by the data
-        alone, in prior sds, if the other parameters are known and if they are unknown; ``collinearity``: their ratio.
-        ``profile``: its shape. ``structural``: the parameters of a structural symmetry that contains it, if any.
-        ``p_negative`` and ``p_negative_mcse``: probability of a value below zero; NaN for positive parameters.
-        ``prior_sensitivity`` and ``likelihood_sensitivity``: distance per doubling of the prior or the likelihood
-        (power-scaling). ``evidence`` and ``remedy``: summary and recommendation.
+        One row per parameter. ``verdict``: see `identifiability`. ``contraction``: 1 − (posterior sd / prior sd)², of
+        the logarithm of positive parameters, with its Monte Carlo error ``contraction_mcse``. ``alone`` and
+        ``together``: the sd left by the data alone, in prior sds, if the other parameters are known and if they are
+        unknown; ``collinearity``: their ratio. ``profile``: its shape. ``structural``: the parameters of a structural
+        symmetry that contains it, if any. ``p_negative`` and ``p_negative_mcse``: probability of a value below zero;
+        NaN for positive parameters. ``prior_sensitivity`` and ``likelihood_sensitivity``: distance per doubling of the
+        prior or the likelihood (power-scaling). ``evidence`` and ``remedy``: summary and recommendation.
     directions : DataFrame
         One row per direction in parameter space, in ascending order of information: information of the data over that
         of the prior, contraction, the direction in words, its parameters, and combinations invariant along it.
@@ -170,24 +156,15 @@ class Identifiability(Result):
         Candidates for a further experiment, the most informative first: expected gain in nats, and the remaining
         fraction of each parameter's sd.
     structure : Structure
-        Structural identifiability of the free parameters from the measured channels.
+        Of the free parameters, from the measured channels.
     converged : bool
         False if there are draws that have not converged.
 
     Examples
     --------
-    If the mass is free too, a weak motion at one frequency determines k − m·ω² and little more:
-
-    >>> force = {"force": 0.3 * np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.03}, seed=1).fold(32, harmonics=3)
-    >>> priors = {"m": bp.LogNormal(1, 0.5), "c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)}
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors=priors, scheme="fourier", fixed={"k3": 0.5})
-    >>> found = bp.identifiability(problem, bp.map_estimate(problem, progress=False), profile=False)
-    >>> found.verdicts
-    {'m': 'only in combination', 'c': 'determined', 'k': 'determined'}
-    >>> found.table.loc["m", "remedy"]
-    'fix one of m, k'
+    >>> found = bp.identifiability(problem, fit, profile=False)
+    >>> found.verdicts, found.directions["parameters"].tolist()
+    ({'c': 'determined', 'k': 'determined'}, ['c', 'k'])
     """
 
     table: pd.DataFrame
@@ -206,11 +183,10 @@ class Identifiability(Result):
     def __repr__(self) -> str:
         lines = ["Identifiability of the parameters"]
         for name, row in self.table.iterrows():
-            remedy = f"\n    Recommendation: {row['remedy']}." if row["remedy"] else ""
-            lines.append(f"{name}: {row['verdict']}; {row['evidence']}.{remedy}")
+            lines.append(f"{name}: {row['verdict']}; {row['evidence']}.")
+            lines += [f"    Recommendation: {row['remedy']}."] if row["remedy"] else []
         lines.append(f"The condition number of the Fisher information is {self.condition:.3g}.")
-        if not self.converged:
-            lines.append("The draws have NOT CONVERGED; these results are provisional.")
+        lines += [] if self.converged else ["The draws have NOT CONVERGED; these results are provisional."]
         return "\n".join(lines)
 
 
@@ -230,8 +206,8 @@ def identifiability(
 
     1. "sign undetermined": the size of a signed parameter is determined, but both signs have a probability above 2.5 %
        (by more than three Monte Carlo errors).
-    2. "only with the prior": the profile ([1]_) ends at the support of the prior on one side, although the parameter is
-       not collinear with others.
+    2. "only with the prior": the profile (Raue et al., Bioinformatics 25 (2009) 1923-1929) ends at the support of the
+       prior on one side, although the parameter is not collinear with others.
     3. "not determined": with all other parameters known, the data have less than 1 % of the information of the prior.
     4. "only in combination": a structural symmetry of the equations contains the parameter, see `structure`.
     5. "determined": with the other parameters unknown, the data alone leave less than a third of the prior sd.
@@ -257,57 +233,58 @@ def identifiability(
     ValueError
         For an estimate of another problem, or a candidate of an unknown run.
 
-    References
-    ----------
-    .. [1] A. Raue, C. Kreutz, T. Maiwald, J. Bachmann, M. Schilling, U. Klingmüller, J. Timmer, Structural and
-       practical identifiability analysis of partially observed dynamical models by exploiting the profile likelihood,
-       Bioinformatics 25 (2009) 1923-1929.
-
     Examples
     --------
     >>> bp.identifiability(problem, fit, profile=False).verdicts
     {'c': 'determined', 'k': 'determined'}
     """
-    information = Information.of(problem, fit)
-    profiles = profile_of(problem, fit) if profile is True else (profile or None)
-    widths, errors = _widths(problem, fit, posterior, information)
+    information, structure = Information.of(problem, fit), structure_of(problem)
+    shapes = profile_of(problem, fit).shape if profile is True else profile.shape if profile else {}
     options = default_candidates(problem) if candidates is None else [Candidate(*c) for c in candidates]
-    experiments = rank_candidates(problem, fit, information, options)
-    directions = _directions(information)
-    scaling = power_scaling(problem, posterior) if posterior is not None else {}
-    structure, rows = structure_of(problem), {}
-    for i, name in enumerate(problem.names):
-        together = np.sqrt(1.0 / max(1.0 / widths[i] ** 2 - 1.0, 1e-12)) if posterior else information.together[i]
-        row: dict[str, object] = {
-            "contraction": 1.0 - widths[i] ** 2,
-            "contraction_mcse": errors[i],
-            "alone": information.alone[i],
-            "together": together,
-            "collinearity": information.collinearity[i],
-            "profile": profiles.shape[name] if profiles and name in profiles.names else "",
-            "structural": ", ".join(_partners(structure, name)),
-        }
-        negative, error = _negative(problem, fit, posterior, name)
-        row |= {"p_negative": negative, "p_negative_mcse": error}
-        row |= dict(zip(("prior_sensitivity", "likelihood_sensitivity"), scaling.get(name, (np.nan,) * 2), strict=True))
-        row["verdict"] = _verdict(row, _size_known(problem, fit, posterior, name))
-        row["evidence"] = _evidence(row)
+    experiments, directions = rank_candidates(problem, fit, information, options), _directions(information)
+    widths, errors = _widths(problem, fit, posterior, information)
+    left = information.together if posterior is None else np.sqrt(1.0 / np.maximum(1.0 / widths**2 - 1.0, 1e-12))
+    table = pd.DataFrame(
+        {
+            "verdict": "",
+            "contraction": 1.0 - widths**2,
+            "contraction_mcse": errors,
+            "alone": information.alone,
+            "together": left,
+            "collinearity": information.collinearity,
+            "profile": [shapes.get(name, "") for name in problem.names],
+            "structural": [_partners(structure, name) for name in problem.names],
+        },
+        index=[*problem.names],
+    )
+    signs = [_negative(problem, fit, posterior, name) for name in problem.names]
+    table[["p_negative", "p_negative_mcse"]] = np.array(signs)
+    scaling = {} if posterior is None else power_scaling(problem, posterior)
+    sensitivities = [scaling.get(name, (np.nan, np.nan)) for name in problem.names]
+    table[["prior_sensitivity", "likelihood_sensitivity"]] = np.array(sensitivities)
+    rows = table.to_dict("index")
+    for name, row in zip(problem.names, rows.values(), strict=True):
+        signed = np.isfinite(row["p_negative"])
+        row["verdict"] = _verdict(row, signed and _size_known(problem, fit, posterior, name))
         both = row["verdict"] == SIGN and abs(fit.theta[name]) > 2.0 * fit.sd[name]
+        row["evidence"] = _evidence(row)
         row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments, structure)
-        rows[name] = row
-    table = pd.DataFrame.from_dict(rows, orient="index")
-    table = table[["verdict", *(c for c in table.columns if c != "verdict")]]
-    converged = posterior is None or posterior.converged
     return Identifiability(
-        table, directions, information.spectrum, information.condition, experiments, structure, converged
+        pd.DataFrame.from_dict(rows, orient="index"),
+        directions,
+        information.spectrum,
+        information.condition,
+        experiments,
+        structure,
+        converged=posterior is None or posterior.converged,
     )
 
 
-def _partners(structure: Structure, name: str) -> list[str]:
+def _partners(structure: Structure, name: str) -> str:
     """Return the parameters of the structural symmetries that contain one, itself included."""
     plain = name.partition("[")[0]
     found = [p for symmetry in structure.symmetries if plain in symmetry.parameters for p in symmetry.parameters]
-    return list(dict.fromkeys(found))
+    return ", ".join(dict.fromkeys(found))
 
 
 def _widths(
@@ -319,28 +296,23 @@ def _widths(
         variances = np.diag(fit.joint_covariance.loc[labels, labels])
         return np.sqrt(variances) / information.prior_sd, np.zeros(len(labels))
     prior = problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))
-    widths, errors = np.empty((2, len(problem.names)))
-    for i, name in enumerate(problem.names):
-        values = information.coordinate(name, posterior.draws(name))
-        widths[i] = _half_width(values) / _half_width(information.coordinate(name, prior[:, i]))
-        # The standard error of half the central 68 % interval of a normal sample is 1.1 times that of its sd.
-        errors[i] = 2.0 * widths[i] ** 2 * 1.1 / np.sqrt(2.0 * posterior.ess[name])
-    return widths, errors
+    draws = np.stack([posterior.draws(name) for name in problem.names], axis=-1)
+    widths = _half_width(information.coordinates(draws)) / _half_width(information.coordinates(prior))
+    # The standard error of half the central 68 % interval of a normal sample is 1.1 times that of its sd.
+    size = np.array([posterior.ess[name] for name in problem.names])
+    return widths, 2.0 * widths**2 * 1.1 / np.sqrt(2.0 * size)
 
 
-def _half_width(values: np.ndarray) -> float:
-    low, high = np.quantile(values, [ndtr(-1.0), ndtr(1.0)])
-    return float(0.5 * (high - low))
-
-
-def _is_signed(problem: Problem, name: str) -> bool:
-    low, high = problem.joint_prior.supports[name]
-    return low < 0.0 < high
+def _half_width(values: np.ndarray) -> np.ndarray:
+    """Return half the central 68 % interval of values (draws, …)."""
+    low, high = np.quantile(values, [ndtr(-1.0), ndtr(1.0)], axis=0)
+    return 0.5 * (high - low)
 
 
 def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, name: str) -> tuple[float, float]:
     """Return the probability that a parameter is negative, and its Monte Carlo error; NaN if it cannot be."""
-    if not _is_signed(problem, name):
+    low, high = problem.joint_prior.supports[name]
+    if not low < 0.0 < high:
         return np.nan, np.nan
     if posterior is None:
         return float(ndtr(-fit.theta[name] / fit.sd[name])), 0.0
@@ -351,15 +323,14 @@ def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, n
 
 
 def _size_known(problem: Problem, fit: MapEstimate, posterior: Posterior | None, name: str) -> bool:
-    """Return whether the data at least halve the width of the absolute value of a signed parameter."""
-    if not _is_signed(problem, name):
-        return False
+    """Return whether the data at least halve the width of the absolute value of a parameter."""
     column = problem.names.index(name)
     prior = np.abs(problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))[:, column])
     if posterior is None:
-        normal = np.random.default_rng(1).standard_normal(PRIOR_DRAWS)
-        return _half_width(np.abs(fit.theta[name] + fit.sd[name] * normal)) < 0.5 * _half_width(prior)
-    return _half_width(np.abs(posterior.draws(name))) < 0.5 * _half_width(prior)
+        values = fit.theta[name] + fit.sd[name] * np.random.default_rng(1).standard_normal(PRIOR_DRAWS)
+    else:
+        values = posterior.draws(name)
+    return bool(_half_width(np.abs(values)) < 0.5 * _half_width(prior))
 
 
 def _verdict(row: dict, size_known: bool) -> str:
@@ -378,8 +349,8 @@ def _verdict(row: dict, size_known: bool) -> str:
 
 
 def _evidence(row: dict) -> str:
-    error = f" ± {row['contraction_mcse']:.2g}" if row["contraction_mcse"] else ""
-    text = f"contraction {row['contraction']:.3g}{error}"
+    text = f"contraction {row['contraction']:.3g}"
+    text += f" ± {row['contraction_mcse']:.2g}" if row["contraction_mcse"] else ""
     if row["collinearity"] >= COLLINEAR:
         factor = "infinitely" if not row["collinearity"] < 1e6 else f"{row['collinearity']:.3g} times"
         text += f", the other parameters widen it {factor}"
@@ -400,25 +371,21 @@ def _evidence(row: dict) -> str:
 def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame, structure: Structure) -> str:
     if row["verdict"] == DETERMINED:
         return ""
-    if row["verdict"] == COMBINATION and row["structural"]:
-        return f"fix one of {row['structural']}, or report {', '.join(structure.combinations)}".removesuffix(
-            ", or report "
-        )
     if row["verdict"] == COMBINATION:
-        own = directions[directions["parameters"].str.split(", ").apply(lambda members: name in members)]
-        own = own[own["gain"] < 1.0 / DETERMINED_SD**2]
-        if len(own):
-            best = own.iloc[0]
-            combos = f", or report {best['combinations']}" if best["combinations"] else ""
-            return f"fix one of {best['parameters']}{combos}"
-    if len(experiments) and name in experiments:
-        ranked = experiments.dropna(subset=[name]).sort_values(name)
-        if len(ranked) and ranked.iloc[0][name] < 0.9:
-            best = ranked.iloc[0]
-            return (
-                f"measure {best['run']} at {best['frequency']:.3g} Hz with {best['scale']:.3g} times its amplitude: "
-                f"this would leave {best[name]:.0%} of the sd"
-            )
+        own = directions[[name in members.split(", ") for members in directions["parameters"]]]
+        own = own[own["gain"] < UNDETERMINED_GAIN]
+        members, combos = row["structural"], ", ".join(structure.combinations)
+        if not members and len(own):
+            members, combos = own.iloc[0][["parameters", "combinations"]]
+        if members:
+            return f"fix one of {members}" + (f", or report {combos}" if combos else "")
+    ranked = experiments.dropna(subset=[name]).sort_values(name)
+    if len(ranked) and ranked.iloc[0][name] < 0.9:
+        best = ranked.iloc[0]
+        return (
+            f"measure {best['run']} at {best['frequency']:.3g} Hz with {best['scale']:.3g} times its amplitude: "
+            f"this would leave {best[name]:.0%} of the sd"
+        )
     return "report it with its prior, or fix it; no candidate experiment would reduce its sd by 10 %"
 
 
@@ -432,19 +399,18 @@ def _directions(information: Information) -> pd.DataFrame:
     shown = vectors.copy()
     if uninformed.sum() > 1:
         shown[uninformed] = reduced(vectors[uninformed])
-    rows = []
-    for gain, vector in zip(gains, shown, strict=True):
-        natural = np.where(np.abs(vector) > 0.05 * np.abs(vector).max(), vector, 0.0)
-        members = [name for name, part in zip(information.names, natural, strict=True) if part]
-        rows.append(
-            {
-                "gain": gain,
-                "contraction": gain / (1.0 + gain),
-                "direction": in_words(vector, information.names, information.logarithmic),
-                "parameters": ", ".join(members),
-                "combinations": ", ".join(combinations(vector, information.names, information.logarithmic))
-                if gain < 1.0 / DETERMINED_SD**2
-                else "",
-            }
-        )
-    return pd.DataFrame(rows)
+    names, logarithmic = information.names, information.logarithmic
+    members = np.abs(shown) > 0.05 * np.abs(shown).max(axis=1, keepdims=True)
+    invariant = [
+        combinations(v, names, logarithmic) if low else ()
+        for v, low in zip(shown, gains < UNDETERMINED_GAIN, strict=True)
+    ]
+    return pd.DataFrame(
+        {
+            "gain": gains,
+            "contraction": gains / (1.0 + gains),
+            "direction": [in_words(vector, names, logarithmic) for vector in shown],
+            "parameters": [", ".join(np.array(names)[own]) for own in members],
+            "combinations": [", ".join(own) for own in invariant],
+        }
+    )

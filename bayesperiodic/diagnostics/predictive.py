@@ -1,8 +1,9 @@
 """Posterior predictions of periods and transients, and tests of the model."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import compress, islice
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,7 @@ from tqdm import tqdm
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.diagnostics.adequacy import ALL, LEVEL, TESTS, UNTESTED, adequacy, adjusted_p
 from bayesperiodic.periodic import arclength
@@ -47,16 +49,16 @@ def bands(
     """Return the bands of outputs (draws, points) and residual variances (draws,) at the draws that converged."""
     count = converged.size
     scores = ndtri((np.arange(NOISE_LEVELS) + 0.5) / NOISE_LEVELS)
-    found: list[dict[str, dict[str, np.ndarray]]] = [{}, {}, {}]
+    found: list[dict[str, dict[str, np.ndarray]]] = [{e.name: {} for e in problem.experiments} for _ in QUANTILES]
     for e in problem.experiments:
         for channel in e.outputs:
             variance = variances.get((e.name, channel), np.zeros(count))
             expected = e.project(channel, outputs[e.name][channel])
             noise = np.sqrt(variance)[:, None, None] * scores[:, None]
             values = (expected[:, None] + noise)[converged].reshape(-1, expected.shape[1])
-            for band, q in zip(found, QUANTILES, strict=True):
-                level = np.median(expected[converged], axis=0) if q == 0.5 else np.quantile(values, q, axis=0)
-                band.setdefault(e.name, {})[channel] = level
+            levels = np.median(expected[converged], axis=0), *np.quantile(values, QUANTILES[1:], axis=0)
+            for band, level in zip(found, levels, strict=True):
+                band[e.name][channel] = level
     median, low, high = found
     return Bands(median, low, high, PROBABILITY, count, int(count - converged.sum()))
 
@@ -76,21 +78,11 @@ Run = Callable[[dict[str, float]], Recording]
 
 @dataclass(frozen=True)
 class Transient(Result):
-    """Predictive bands of a transient recording.
+    """Predictive bands of a transient recording, over time (samples,) [s].
 
-    Attributes
-    ----------
-    time : array (samples,)
-        [s].
-    median, low, high : dict of str to array (samples,)
-        By output: pointwise median and central 90 % band of the signals, for the uncertainty of the parameters alone,
-        without measurement noise unless `run` adds it.
-    probability : float
-        Probability of the band.
-    draws : int
-        Number of runs, one per draw.
-    failures : dict of str to int
-        Number of failed runs by reason; they are excluded.
+    By output, the pointwise median (samples,) and the central 90 % band of the signals for the uncertainty of the
+    parameters alone, without measurement noise unless `run` adds it. There is one run per draw; failed ones are
+    excluded, and counted by reason.
     """
 
     time: np.ndarray
@@ -115,15 +107,12 @@ class Transient(Result):
         )
 
 
-def transient(problem: Problem, theta: np.ndarray, run: Run, experiment: str | None) -> Transient:
+def _transient(problem: Problem, theta: np.ndarray, run: Run, experiment: str | None) -> Transient:
     """Return the bands of the recordings that `run` returns at draws θ (draws, names)."""
-    name = _experiment_of(problem, experiment)
-    names, time = problem.model.parameters, np.empty(0)
-    signals: dict[str, list[np.ndarray]] = {}
-    failures: Counter[str] = Counter()
-    for row in problem.parameters(theta, name):
+    time, signals, failures = np.empty(0), dict[str, list[np.ndarray]](), Counter[str]()
+    for row in problem.parameters(theta, _experiment_of(problem, experiment)):
         try:
-            recording = run(dict(zip(names, row.tolist(), strict=True)))
+            recording = run(dict(zip(problem.model.parameters, row.tolist(), strict=True)))
         # Raised by integrators that fail, and by recordings of values that are not finite.
         except (RuntimeError, ArithmeticError, ValueError) as error:
             failures[f"{type(error).__name__}: {error}"] += 1
@@ -133,7 +122,13 @@ def transient(problem: Problem, theta: np.ndarray, run: Run, experiment: str | N
             raise ValueError(f"run: must return a Recording, got a {type(recording).__name__}.")
         if not signals:
             time, signals = recording.time, {output: [] for output in recording.outputs}
-        _check_same(recording, time, signals)
+        _checks.same_names("run: outputs of the recordings", recording.outputs, signals)
+        other = recording.time
+        if other.size != time.size or not np.allclose(other, time, rtol=1e-9, atol=0.0):
+            raise ValueError(
+                f"run: all recordings must have the same times, got {time.size} and {other.size} samples, from "
+                f"{time[0]:g} to {time[-1]:g} s and from {other[0]:g} to {other[-1]:g} s."
+            )
         for output, values in recording.outputs.items():
             signals[output].append(values)
     if not signals:
@@ -149,24 +144,14 @@ def _experiment_of(problem: Problem, experiment: str | None) -> str:
     if experiment is not None:
         _checks.one_of("experiment", experiment, names)
         return experiment
-    maps = [problem.parameter_maps[name] for name in names]
     for parameter in problem.model.parameters:
-        sources = {(m.columns.get(parameter), m.fixed.get(parameter)) for m in maps}
-        if len(sources) > 1:
+        maps = problem.parameter_maps.values()
+        if len({(m.columns.get(parameter), m.fixed.get(parameter)) for m in maps}) > 1:
             raise ValueError(
                 f"experiment: must be one of {', '.join(map(repr, names))} with `run`, got None. The experiments "
                 f"differ in {parameter!r}."
             )
     return names[0]
-
-
-def _check_same(recording: Recording, time: np.ndarray, outputs: Mapping[str, list[np.ndarray]]) -> None:
-    _checks.same_names("run: outputs of the recordings", recording.outputs, outputs)
-    if recording.time.size != time.size or not np.allclose(recording.time, time, rtol=1e-9, atol=0.0):
-        raise ValueError(
-            f"run: all recordings must have the same times, got {time.size} and {recording.time.size} samples, from "
-            f"{time[0]:g} to {time[-1]:g} s and from {recording.time[0]:g} to {recording.time[-1]:g} s."
-        )
 
 
 REJECTIONS = {
@@ -192,7 +177,7 @@ class Prediction(Bands):
         the kept harmonics, including the residual variance, assumed normal at each point. Section values with a
         covariance of their own have the band of the model alone.
     probability : float
-        Probability of the band.
+        Of the band.
     draws, failed : int
         Number of draws, and of those without a periodic solution.
     table : DataFrame
@@ -214,8 +199,6 @@ class Prediction(Bands):
     >>> found = bp.predict(problem, posterior, draws=50)
     >>> found.verdict, found.failed, found.median["synthetic duffing"]["displacement"].shape
     ('adequate', 0, (32,))
-    >>> bool(found.table.loc["all", "p"] > 0.01)
-    True
     """
 
     table: pd.DataFrame
@@ -232,49 +215,40 @@ class Prediction(Bands):
         """Rejections in words, by row of the table."""
         found = {}
         for (label, row), small in zip(self.table.iterrows(), adjusted_p(self.table) < LEVEL, strict=True):
-            reasons = [
-                f"{REJECTIONS[test]} (p = {row[test]:.2g})"
-                for test, rejected in zip(TESTS, small, strict=True)
-                if rejected
-            ]
-            if reasons:
+            if reasons := [f"{REJECTIONS[test]} (p = {row[test]:.2g})" for test in compress(TESTS, small)]:
                 error = row["model_error_share"]
                 text = "" if np.isnan(error) else f"; {error:.1%} of the residual variance is model error"
                 found[str(label)] = f"{', '.join(reasons)}{text}"
         return found
 
     def __repr__(self) -> str:
+        verdict = f"The model is {self.verdict} (overall false alarm rate {LEVEL:.0%})."
         lines = [
             f"Tests of the model from {self.draws} draws, {self.failed} without a periodic solution",
             self.table.to_string(float_format="{:.2g}".format, na_rep="-"),
-            "There are too few values to test the model."
-            if self.verdict == UNTESTED
-            else f"The model is {self.verdict} (overall false alarm rate {LEVEL:.0%}).",
+            "There are too few values to test the model." if self.verdict == UNTESTED else verdict,
             *(f"{label}: {text}." for label, text in self.findings.items()),
+            self.note,
+            repr(self.transient) if self.transient else "",
         ]
-        return "\n".join([*lines, *filter(None, [self.note]), *([repr(self.transient)] if self.transient else [])])
+        return "\n".join(filter(None, lines))
 
 
 @in_one_thread
 def predict(
-    problem: Problem,
-    posterior: Posterior,
-    *,
-    draws: int = 200,
-    run: Run | None = None,
-    experiment: str | None = None,
+    problem: Problem, posterior: Posterior, *, draws: int = 200, run: Run | None = None, experiment: str | None = None
 ) -> Prediction:
     """Predict the mean period of every experiment, and test the model against the measured one.
 
     The tests use the residual at the draw with the highest density, projected orthogonally to its changes under the
     parameters of that experiment and channel, so that their null distributions are known. They are exact for models
     linear in the parameters, for any prior, and independent of the identifiability of the parameters. The amplitude is
-    compared with replicates [1]_ whose parameters were fitted to the data: its p is conservative [2]_.
+    compared with replicates whose parameters were fitted to the data (Gelman, Meng, Stern, Statistica Sinica 6 (1996)
+    733-807): its p is conservative (Meng, Annals of Statistics 22 (1994) 1142-1160).
 
     The noise model determines which misfit is detectable. With unknown variance, misfit of any size is taken as noise,
-    and only its shape along the period or the scatter of the measured cycles reveals it. Circulant noise also absorbs
-    correlated misfit; then only the scatter reveals it. The tests do not detect a wrong prior, except that of the
-    amplitude.
+    and only its shape along the period or the scatter of the measured cycles reveals it; circulant noise also absorbs
+    correlated misfit. Only the test of the amplitude can detect a wrong prior.
 
     Parameters
     ----------
@@ -284,8 +258,8 @@ def predict(
         Equally spaced posterior draws, at least 20.
     run : callable, optional
         Returns the recording of a transient for a mapping of all parameters of the model, such as
-        ``lambda p: bp.simulate(model, p, inputs, frequency=1.0, duration=30.0, sampling_rate=100.0)``. Called once per
-        draw; all recordings must have the same times and outputs.
+        ``lambda p: bp.simulate(model, p, inputs, frequency=1.0, duration=30.0, sampling_rate=100.0)``, once per draw;
+        all recordings must have the same times and outputs.
     experiment : str, optional
         The experiment whose parameters `run` gets; required if experiments differ in some.
 
@@ -300,12 +274,6 @@ def predict(
         `run`, or recordings that differ in their times or outputs.
     RuntimeError
         If no draw or not the one with the highest density has a periodic solution, or if all runs fail.
-
-    References
-    ----------
-    .. [1] A. Gelman, X.-L. Meng, H. Stern, Posterior predictive assessment of model fitness via realized discrepancies,
-       Statistica Sinica 6 (1996) 733-807.
-    .. [2] X.-L. Meng, Posterior predictive p-values, Annals of Statistics 22 (1994) 1142-1160.
 
     Examples
     --------
@@ -324,30 +292,28 @@ def predict(
     lp = posterior.data["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()
     points, noise = draws_of(problem, posterior, np.linspace(0, lp.size - 1, count).astype(int))
     peak = draws_of(problem, posterior, [int(np.argmax(lp))])[0][0]
-    runs = [e.name for e in problem.experiments]
-    anchored = problem.anchored(peak, posterior.guesses(runs, problem.model.states)).density()
+    guesses = posterior.guesses([*problem.observations], problem.model.states)
+    anchored = problem.anchored(peak, guesses).density()
     solved = anchored.simulator.solve(points)
     converged = solved.status == CONVERGED
     if not converged.any():
         raise RuntimeError("posterior: none of its draws has a periodic solution. Give draws of this problem.")
     outputs = {name: o.predicted(solved.response(name)) for name, o in problem.observations.items()}
     predicted = bands(problem, outputs, converged, problem.likelihood.value_variances(noise))
-    components = problem.likelihood.simulate(noise, np.random.default_rng(posterior.seed))
+    components = iter(problem.likelihood.simulate(noise, np.random.default_rng(posterior.seed)))
     replicates = {}
-    for e in problem.experiments:
-        observation = problem.observations[e.name]
-        own, components = components[: len(observation.blocks)], components[len(observation.blocks) :]
-        for channel, values in observation.replicates(solved.response(e.name), own).items():
-            replicates[e.name, channel] = values[converged]
+    for name, observation in problem.observations.items():
+        own = list(islice(components, len(observation.blocks)))
+        for channel, values in observation.replicates(solved.response(name), own).items():
+            replicates[name, channel] = values[converged]
     here = anchored.linearise(peak)
     if not here.converged:
         raise RuntimeError(
             "posterior: its draw of highest density has no periodic solution. Give draws of this problem."
         )
     table = adequacy(problem, here, noise, replicates)
-    recorded = None if run is None else transient(problem, points, run, experiment)
-    given = {f.name: getattr(predicted, f.name) for f in fields(predicted)}
-    return Prediction(**given, table=table, transient=recorded, note=_note(problem, posterior, table))
+    recorded = None if run is None else _transient(problem, points, run, experiment)
+    return Prediction(**vars(predicted), table=table, transient=recorded, note=_note(problem, posterior, table))
 
 
 def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:
@@ -393,19 +359,9 @@ class PriorPredictive(Result):
 
     Examples
     --------
-    With a wide prior of k near resonance, one draw in 25 belongs to another branch:
-
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.2, duration=200,
-    ...                   sampling_rate=8, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 1.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
     >>> expected = bp.prior_predictive(problem, draws=50, progress=False)
-    >>> expected.table.loc["all", ["converged", "other orbit", "no orbit"]].to_dict()
-    {'converged': 0.96, 'other orbit': 0.04, 'no orbit': 0.0}
-    >>> list(expected.causes)
-    ['other orbit (stalled): the branch folds back to another orbit at the same parameters']
-    >>> expected.outputs.low["synthetic duffing"]["displacement"].shape
-    (32,)
+    >>> expected.table.loc["all", ["converged", "other orbit", "no orbit"]].to_dict(), expected.causes
+    ({'converged': 1.0, 'other orbit': 0.0, 'no orbit': 0.0}, {})
     """
 
     table: pd.DataFrame
@@ -451,8 +407,6 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
 
     Examples
     --------
-    Priors that contain the measured period:
-
     >>> expected = bp.prior_predictive(problem, draws=50, progress=False)
     >>> float(expected.table.loc["synthetic duffing", "inside"])
     1.0
@@ -460,11 +414,9 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     count = _checks.integer("draws", draws, 20)
     theta = problem.joint_prior.sample(count, np.random.default_rng(_checks.integer("seed", seed, 0)))
     density, runs = problem.density(), [e.name for e in problem.experiments]
-    solved = density.simulator.solve(theta)
-    verdicts, causes = {}, Counter[str]()
+    solved, causes = density.simulator.solve(theta), Counter[str]()
+    verdicts = {name: np.full(count, STATUSES[CONVERGED], dtype=object) for name in runs}
     failed = [(name, i) for name in runs for i in np.flatnonzero(solved.statuses(name) != CONVERGED)]
-    for name in runs:
-        verdicts[name] = np.full(count, STATUSES[CONVERGED], dtype=object)
     for name, i in tqdm(failed, desc="failed solves", disable=not (progress and failed)):
         verdicts[name][i], why = ENDS[density.simulator.path_outcome(theta[i], name)]
         causes[f"{verdicts[name][i]} ({STATUSES[solved.statuses(name)[i]]}): {why}"] += 1
@@ -478,16 +430,14 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     order = [STATUSES[CONVERGED], OTHER, NO_ORBIT, FAILED]
     worst = np.max([[order.index(v) for v in row] for row in verdicts.values()], axis=0)
     verdicts["all"] = np.array(order, dtype=object)[worst]
-    rows = {name: {what: float(np.mean(row == what)) for what in order} for name, row in verdicts.items()}
-    table = pd.DataFrame.from_dict(rows, orient="index")
-    table["inside"] = [*(_inside(problem, prediction, e) for e in range(len(problem.experiments))), np.nan]
+    shares = {what: [np.mean(row == what) for row in verdicts.values()] for what in order}
+    inside = [*(_inside(e, prediction) for e in problem.experiments), np.nan]
     fractions = {cause: number / (count * len(runs)) for cause, number in causes.most_common()}
-    return PriorPredictive(table, fractions, prediction, count)
+    return PriorPredictive(pd.DataFrame(shares | {"inside": inside}, [*verdicts]), fractions, prediction, count)
 
 
-def _inside(problem: Problem, prediction: Bands, index: int) -> float:
+def _inside(e: Experiment, prediction: Bands) -> float:
     """Return the fraction of the measured values within the band."""
-    e = problem.experiments[index]
     within = [
         (values >= prediction.low[e.name][channel]) & (values <= prediction.high[e.name][channel])
         for channel, values in e.outputs.items()

@@ -17,19 +17,11 @@ WASSERSTEIN_FLOOR = float(np.sqrt(2 / np.pi) * quad(lambda z: np.sqrt(ndtr(z) * 
 
 @dataclass(frozen=True)
 class Sample:
-    """Draws of one quantity, as a whole and in batches.
+    """Draws (draws,) of one quantity, as a whole and in batches (batches, size), with the effective sample size.
 
     The Monte Carlo error of a statistic is the standard deviation of its values in the batches over √batches. A batch
     is an eighth of the steps of one independent ensemble, several autocorrelation times where the sampler converged.
-
-    Attributes
-    ----------
-    whole : array (draws,)
-    batches : array (batches, size)
-        Those of one ensemble after the other.
-    size : float
-        Effective sample size.
-    ensembles : int
+    The batches of one ensemble follow those of the other.
     """
 
     whole: np.ndarray
@@ -80,8 +72,8 @@ def wasserstein(x: np.ndarray, mean: float, sd: float) -> np.ndarray:
 def wasserstein_distance(sample: Sample, mean: float, sd: float) -> tuple[float, float]:
     """Return the Wasserstein distance from a normal distribution in sds of the draws, and its Monte Carlo error.
 
-    The estimate is biased upwards: draws of the normal distribution itself have a distance of 1.3/√ESS sds. The error
-    is the root of the sum of squares of the spread between batches and of this bias.
+    Draws of the normal distribution itself have a distance of 1.3/√ESS sds. The error is the root of the sum of squares
+    of the spread between batches and of this bias.
     """
     if not np.isfinite(sd):
         return np.inf, np.nan
@@ -194,8 +186,7 @@ def marginal_verdict(sample: Sample, mean: float, sd: float, support: tuple[floa
 
 
 def _unconverged(sample: Sample, mean: float) -> str:
-    every = all(has_other_mode(ensemble, mean) for ensemble in sample.by_ensemble())
-    return MODE if every else UNCONVERGED
+    return MODE if all(has_other_mode(ensemble, mean) for ensemble in sample.by_ensemble()) else UNCONVERGED
 
 
 def _end(sample: Sample, mean: float, sd: float, own: float) -> str:
@@ -239,21 +230,13 @@ def joint_verdict(
     its radius is increased by 15 % (which corresponds to a shift of the end of a 90 % interval by a quarter of a sd);
     too many accordingly. The approximation is then "too narrow" or "too wide" if a normal distribution with the mean
     and covariance of the draws is fine and correcting the mean alone is not sufficient; otherwise, and where the Pareto
-    k̂ exceeds 0.7 by its error, it has the "wrong shape".
-
-    Parameters
-    ----------
-    points : array (draws, dimension)
-    mean, covariance : array (dimension,), (dimension, dimension)
-    sampled : callable
-        Constructor of a Sample from values (draws,).
-    pareto_k : tuple of float
-        With its error.
-    converged : bool
-        See `marginal_verdict`.
+    k̂ exceeds 0.7 by its error, it has the "wrong shape". `sampled` makes a Sample of values (draws,).
     """
     own_mean, own_covariance = points.mean(axis=0), np.atleast_2d(np.cov(points.T))
-    direction = _widest(own_covariance)
+    scale = np.sqrt(np.diag(own_covariance))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    # The direction of largest spread, in units of the sds.
+    direction = covariance_eigh(own_covariance, scale)[1][:, -1] / scale
     along = sampled(points @ direction)
     if not converged:
         return _unconverged(along, float(mean @ direction))
@@ -279,16 +262,7 @@ def _ellipsoids(distances: Sample, dimension: int) -> str:
     found = set()
     for level, radius in zip(LEVELS, ellipsoid_radii(np.array(LEVELS), dimension), strict=True):
         larger, error = distances.below(SCALE * radius, level)
-        if larger < level - ERRORS * error:
-            found.add(NARROW)
+        found |= {NARROW} if larger < level - ERRORS * error else set()
         smaller, error = distances.below(radius / SCALE, level)
-        if smaller > level + ERRORS * error:
-            found.add(WIDE)
+        found |= {WIDE} if smaller > level + ERRORS * error else set()
     return found.pop() if len(found) == 1 else SHAPE if found else FINE
-
-
-def _widest(covariance: np.ndarray) -> np.ndarray:
-    """Return the direction of largest spread of the draws, in units of their sds."""
-    scale = np.sqrt(np.diag(covariance))
-    scale = np.where(scale > 0.0, scale, 1.0)
-    return covariance_eigh(covariance, scale)[1][:, -1] / scale

@@ -1,9 +1,11 @@
-"""Figures of data, estimates, posteriors, branches and orbits; every function returns the matplotlib Figure."""
+"""Figures of data, estimates, posteriors, branches and orbits.
+
+Every function returns the matplotlib Figure; an empty one to draw into can be given as `figure`.
+"""
 
 from bayesperiodic.plot.branches import branch, orbits, section
-from bayesperiodic.plot.data import fit, loops
 from bayesperiodic.plot.diagnostics import comparison, profile, ranks
-from bayesperiodic.plot.posterior import corner, marginals, traces
+from bayesperiodic.plot.estimates import corner, fit, loops, marginals, traces
 from bayesperiodic.plot.style import COLOURS
 
 __all__ = [

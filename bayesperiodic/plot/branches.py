@@ -1,6 +1,7 @@
 """Figures of branches of periodic solutions, Poincaré sections and orbits."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import cycle, pairwise
 from typing import Any, cast
 
 import matplotlib.pyplot as plt
@@ -49,9 +50,8 @@ def branch(
     angular : bool
         Show frequencies as angular frequencies in rad/s.
     figure : Figure, optional
-        An empty figure to draw into.
     ax : Axes, optional
-        Axes to draw into, instead.
+        To draw into, instead of a figure.
 
     Returns
     -------
@@ -83,8 +83,7 @@ def branch(
     if ax is None:
         ax = (figure or plt.figure(figsize=(7.0, 4.6), layout="constrained")).add_subplot()
     factor = 2 * np.pi if angular and branch.vary == "frequency" else 1.0
-    for number, b in enumerate(branches):
-        colour = ENSEMBLES[number % len(ENSEMBLES)]
+    for b, colour in zip(branches, cycle(ENSEMBLES), strict=False):
         across, up = factor * b.values, _measures(b, measure, output)
         for stable, part in _runs(b):
             ax.plot(across[part], up[part], color=colour, lw=1.6, ls="-" if stable else "--", zorder=2 + stable)
@@ -92,9 +91,8 @@ def branch(
             at = np.array([k == kind for k in b.kinds])
             every = np.repeat(across[at], up.shape[1])
             ax.plot(every, up[at].ravel(), marker, color=colour, mfc="white", ms=6, mew=1.4, ls="none", zorder=4)
-    ax.set_xlabel(
-        "angular frequency [rad/s]" if factor != 1.0 else axis_label(branch.vary, branch.units.get(branch.vary, ""))
-    )
+    varied = axis_label(branch.vary, branch.units.get(branch.vary, ""))
+    ax.set_xlabel("angular frequency [rad/s]" if factor != 1.0 else varied)
     ax.set_ylabel(_measure_label(measure, output, branch.units.get(output, "") if unit is None else unit))
     ax.legend(handles=_branch_handles(branches, labels), frameon=False)
     return cast(Figure, ax.figure)
@@ -130,12 +128,9 @@ def _turns(solution: PeriodicSolution, output: str) -> np.ndarray:
 def _runs(branch: Branch) -> list[tuple[bool, slice]]:
     """Return the stable and unstable parts of the branch; folds and period doublings belong to both neighbours."""
     plain = [None if kind else solution.stable for solution, kind in zip(branch, branch.kinds, strict=True)]
-    between = [True in pair and False not in pair for pair in zip(plain[:-1], plain[1:], strict=True)]
-    starts = [i for i in range(len(between)) if i == 0 or between[i] != between[i - 1]]
-    return [
-        (between[first], slice(first, last + 1))
-        for first, last in zip(starts, [*starts[1:], len(between)], strict=True)
-    ]
+    between = [True in pair and False not in pair for pair in pairwise(plain)]
+    starts = [0, *(np.flatnonzero(np.diff(between)) + 1), len(between)]
+    return [(between[first], slice(first, last + 1)) for first, last in pairwise(starts) if first < last]
 
 
 def _measure_label(measure: str | Callable, output: str, unit: str) -> str:
@@ -147,23 +142,28 @@ def _measure_label(measure: str | Callable, output: str, unit: str) -> str:
 
 
 def _branch_handles(branches: Sequence[Branch], labels: Sequence[str] | None) -> list[plt.Line2D]:
-    handles = [
-        plt.Line2D([], [], color=ENSEMBLES[number % len(ENSEMBLES)], lw=1.6, label=label)
-        for number, label in enumerate(labels or [])
+    looks: list[dict[str, Any]] = [
+        {"color": colour, "lw": 1.6, "label": label}
+        for colour, label in zip(cycle(ENSEMBLES), labels or [], strict=False)
     ]
-    for stable, style in ((True, "-"), (False, "--")):
+    for stable, style, name in ((True, "-", "stable"), (False, "--", "unstable")):
         if any(stable == verdict for b in branches for verdict, _ in _runs(b)):
-            name = "stable" if stable else "unstable"
-            handles.append(plt.Line2D([], [], color="black", lw=1.6, ls=style, label=name))
+            looks.append({"color": "black", "lw": 1.6, "ls": style, "label": name})
     for kind, marker in MARKERS.items():
         if any(kind in b.kinds for b in branches):
-            handles.append(plt.Line2D([], [], color="black", marker=marker, mfc="white", mew=1.4, ls="", label=kind))
-    return handles
+            looks.append({"color": "black", "marker": marker, "mfc": "white", "mew": 1.4, "ls": "", "label": kind})
+    return [plt.Line2D([], [], **look) for look in looks]
 
 
 MOST_POINTS = 20_000
 PERIOD_MARKERS = "osD^vP*X"
 COLUMNS = 6
+MEASURED, MODEL = "closest measured cycle", "orbit of the model"
+CYCLES: dict[str, dict[str, Any]] = {
+    MEASURED: {"color": COLOURS["measured"], "lw": 2.2, "alpha": 0.45},
+    MODEL: {"color": COLOURS["map"], "lw": 1.0},
+}
+POINTS: dict[str, Any] = {"color": ENSEMBLES[1], "marker": "o", "ls": "", "mec": "black", "mew": 0.6}
 
 
 def section(
@@ -184,9 +184,8 @@ def section(
     units : mapping of str to str, optional
         Units of the coordinates; angles are in rad.
     figure : Figure, optional
-        An empty figure to draw into.
     ax : Axes, optional
-        Axes to draw into, instead.
+        To draw into, instead of a figure.
 
     Returns
     -------
@@ -204,27 +203,22 @@ def section(
     name = "section" if every == 1 else f"section, one point in {every}"
     ax.plot(*shown.T, ",", color="0.65", rasterized=True, zorder=1)
     handles = [plt.Line2D([], [], marker=".", ls="", color="0.65", label=f"{name} ({len(shown)})")]
-    for rank, period in enumerate(sorted({orbit.period for orbit in orbits})):
+    periods = sorted({orbit.period for orbit in orbits})
+    for period, marker, colour in zip(periods, cycle(PERIOD_MARKERS), cycle(ENSEMBLES), strict=False):
         members = [orbit for orbit in orbits if orbit.period == period]
-        marker, colour = PERIOD_MARKERS[rank % len(PERIOD_MARKERS)], ENSEMBLES[rank % len(ENSEMBLES)]
-        style: dict[str, Any] = {"marker": marker, "color": colour, "ls": "", "ms": 5}
         points = np.concatenate([orbit.points for orbit in members])
-        ax.plot(*points.T, mec="black", mew=0.5, zorder=3, **style)
+        look: dict[str, Any] = {"marker": marker, "color": colour, "ls": "", "ms": 5, "mec": "black", "mew": 0.5}
+        ax.plot(*points.T, zorder=3, **look)
         noun = "orbit" if len(members) == 1 else "orbits"
-        handles.append(
-            plt.Line2D([], [], mec="black", mew=0.5, label=f"period {period}: {len(members)} {noun}", **style)
-        )
-    ax.set_xlabel(_name(section.coordinates[0], section.angles, units))
-    ax.set_ylabel(_name(section.coordinates[1], section.angles, units))
+        handles.append(plt.Line2D([], [], label=f"period {period}: {len(members)} {noun}", **look))
+    across, up = _coordinate_labels(section, units)
+    ax.set(xlabel=across, ylabel=up)
     ax.legend(handles=handles, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0), markerscale=1.3)
     return cast(Figure, ax.figure)
 
 
 def orbits(
-    orbits: Orbits | Sequence[Orbit],
-    *,
-    units: Mapping[str, str] | None = None,
-    figure: Figure | None = None,
+    orbits: Orbits | Sequence[Orbit], *, units: Mapping[str, str] | None = None, figure: Figure | None = None
 ) -> Figure:
     """Draw the phase portrait of each orbit: measured cycle, polished orbit of the model, and section points.
 
@@ -233,9 +227,8 @@ def orbits(
     orbits : Orbits or sequence of Orbit
         At least one.
     units : mapping of str to str, optional
-        Units of the coordinates; angles are in rad.
+        See `section`.
     figure : Figure, optional
-        An empty figure to draw into.
 
     Returns
     -------
@@ -258,40 +251,39 @@ def orbits(
     rows = -(-len(orbits) // columns)
     figure = figure or plt.figure(figsize=(1.9 * columns + 0.6, 1.85 * rows + 0.7), layout="constrained")
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    for orbit, ax in zip(orbits, axes.flat, strict=False):
+    for number, (orbit, ax) in enumerate(zip(orbits, axes.flat, strict=False)):
         _portrait(ax, orbit)
-    for ax in axes.flat[len(orbits) :]:
-        ax.set_axis_off()
-    for number, ax in enumerate(axes.flat[: len(orbits)]):
         # The last panel of a column may be above an empty one.
         ax.tick_params(labelbottom=number + columns >= len(orbits))
-    first = orbits[0]
-    figure.supxlabel(_name(first.coordinates[0], first.angles, units), fontsize="medium")
-    figure.supylabel(_name(first.coordinates[1], first.angles, units), fontsize="medium")
-    figure.legend(handles=_handles(orbits), loc="outside upper center", ncols=3, frameon=False, fontsize="small")
+    for ax in axes.flat[len(orbits) :]:
+        ax.set_axis_off()
+    across, up = _coordinate_labels(orbits[0], units)
+    figure.supxlabel(across, fontsize="medium")
+    figure.supylabel(up, fontsize="medium")
+    drawn = {label for orbit in orbits for label in _cycles(orbit)}
+    looks = {"section points": POINTS} | {label: look for label, look in CYCLES.items() if label in drawn}
+    handles = [plt.Line2D([], [], label=label, **look) for label, look in looks.items()]
+    figure.legend(handles=handles, loc="outside upper center", ncols=3, frameon=False, fontsize="small")
     return figure
 
 
 def _portrait(ax: Axes, orbit: Orbit) -> None:
-    for signals, style in _cycles(orbit):
+    for label, signals in _cycles(orbit).items():
         x, y = (np.angle(np.exp(1j * signals[c])) if c in orbit.angles else signals[c] for c in orbit.coordinates)
         # Angles jump at ±π.
         jump = np.flatnonzero(np.abs(np.diff(x)) > np.pi) + 1 if orbit.angles else np.empty(0, dtype=int)
-        ax.plot(np.insert(x, jump, np.nan), np.insert(y, jump, np.nan), **style)
-    ax.plot(*orbit.points.T, "o", color=ENSEMBLES[1], mec="black", mew=0.6, ms=4.5, zorder=4)
+        ax.plot(np.insert(x, jump, np.nan), np.insert(y, jump, np.nan), **CYCLES[label])
+    ax.plot(*orbit.points.T, ms=4.5, zorder=4, **POINTS)
     turns = "" if orbit.winding is None else f", winding {orbit.winding}"
     ax.set_title(f"period {orbit.period}{turns}\n$\\mu$ = {_multiplier(orbit)}", fontsize="x-small")
     ax.tick_params(labelsize="x-small")
 
 
-def _cycles(orbit: Orbit) -> list[tuple[Mapping[str, np.ndarray], dict]]:
-    """Return the measured cycle and that of the model, closed, with their styles."""
-    found: list[tuple[Mapping[str, np.ndarray], dict]] = []
-    if orbit.cycle is not None:
-        found.append((orbit.cycle, {"color": COLOURS["measured"], "lw": 2.2, "alpha": 0.45}))
+def _cycles(orbit: Orbit) -> dict[str, Mapping[str, np.ndarray]]:
+    """Return the measured cycle and that of the model, closed, by their labels."""
+    found = {} if orbit.cycle is None else {MEASURED: orbit.cycle}
     if orbit.solution is not None:
-        closed = {c: np.append(v, v[0]) for c, v in orbit.solution.outputs.items() if c in orbit.coordinates}
-        found.append((closed, {"color": COLOURS["map"], "lw": 1.0}))
+        found[MODEL] = {c: np.append(v, v[0]) for c, v in orbit.solution.outputs.items() if c in orbit.coordinates}
     return found
 
 
@@ -302,17 +294,6 @@ def _multiplier(orbit: Orbit) -> str:
     return f"{value.real:.4g} ± {sd:.2g}" if np.isfinite(sd) else f"{value.real:.3g}, not estimated"
 
 
-def _handles(orbits: Orbits | Sequence[Orbit]) -> list[plt.Line2D]:
-    handles = [plt.Line2D([], [], marker="o", ls="", color=ENSEMBLES[1], mec="black", mew=0.6, label="section points")]
-    if any(orbit.cycle is not None for orbit in orbits):
-        handles.append(
-            plt.Line2D([], [], color=COLOURS["measured"], lw=2.2, alpha=0.45, label="closest measured cycle")
-        )
-    if any(orbit.solution is not None for orbit in orbits):
-        handles.append(plt.Line2D([], [], color=COLOURS["map"], lw=1.0, label="orbit of the model"))
-    return handles
-
-
-def _name(coordinate: str, angles: Sequence[str], units: Mapping[str, str] | None) -> str:
-    known = dict.fromkeys(angles, "rad") | dict(units or {})
-    return axis_label(coordinate, known.get(coordinate, ""))
+def _coordinate_labels(plane: PoincareSection | Orbit, units: Mapping[str, str] | None) -> list[str]:
+    known = dict.fromkeys(plane.angles, "rad") | dict(units or {})
+    return [axis_label(coordinate, known.get(coordinate, "")) for coordinate in plane.coordinates]

@@ -9,29 +9,23 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import ndtri
 
-from bayesperiodic.diagnostics.calibration import (
-    Calibration,
-    bin_count,
-    binomial_band,
-    coverage,
-    ecdf_band,
-    evaluation_points,
-)
-from bayesperiodic.diagnostics.campaigns import METHODS
+from bayesperiodic.diagnostics import calibration as uniformity
+from bayesperiodic.diagnostics.calibration import METHODS, Calibration
 from bayesperiodic.diagnostics.comparison import Comparison
 from bayesperiodic.diagnostics.verdicts import END_SHIFT, ERRORS, FINE, LEVELS
 from bayesperiodic.estimation.profile import CLOSED, Profile
-from bayesperiodic.plot.posterior import chosen, draw_marginal, panel_grid, panels
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label, caveats, wrapped_label
+from bayesperiodic.plot import style
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, LAPLACE, axis_label, chosen, wrapped_label
 
 LEVEL = 0.99
 # Factor on the height of the histogram axes, for the legend.
 HEADROOM = 1.45
-COLUMNS = {
-    "count per bin / expected": "position of the truth in the posterior",
-    "distribution function − diagonal": "position of the truth in the posterior",
-    "coverage − probability": "probability of the interval",
-}
+TITLES = "count per bin / expected", "distribution function − diagonal", "coverage − probability"
+ACROSS = (
+    "position of the truth in the posterior",
+    "position of the truth in the posterior",
+    "probability of the interval",
+)
 LABELS = {"mcmc": "MCMC", "laplace": "Laplace"}
 LINES = {"mcmc": "-", "laplace": "--"}
 BAND: dict[str, Any] = {"color": "grey", "alpha": 0.25, "lw": 0}
@@ -48,7 +42,7 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
     ----------
     calibration : Calibration
     figure : Figure, optional
-        An empty figure with a constrained layout to draw into.
+        With a constrained layout.
 
     Returns
     -------
@@ -68,15 +62,14 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
             values = calibration.positions[method][name]
             values = np.sort(values[np.isfinite(values)])
             _histogram(row[0], values, method, f"{LABELS[method]}: {verdicts[method, name]}")
-            points, size, banded = evaluation_points(), values.size, method == METHODS[0] and values.size
+            points, size, banded = uniformity.evaluation_points(), values.size, method == METHODS[0] and values.size
             steps = np.searchsorted(values, points, side="right") / max(size, 1)
-            _deviation(row[1], steps, ecdf_band(size, LEVEL) if banded else None, method)
-            covered = np.array([coverage(values, level) for level in points])
-            _deviation(row[2], covered, binomial_band(size, points, 1.0 - LEVEL) if banded else None, method)
-        row[0].set_ylim(0.0, HEADROOM * row[0].get_ylim()[1])
-        row[0].set_ylabel(wrapped_label(name, ""))
+            _deviation(row[1], steps, uniformity.ecdf_band(size, LEVEL) if banded else None, method)
+            covered = np.array([uniformity.coverage(values, level) for level in points])
+            _deviation(row[2], covered, uniformity.binomial_band(size, points, 1.0 - LEVEL) if banded else None, method)
+        row[0].set(ylim=(0.0, HEADROOM * row[0].get_ylim()[1]), ylabel=wrapped_label(name, ""))
         row[0].legend(frameon=False, fontsize="small", loc="upper center")
-    for top, bottom, (title, label) in zip(grid[0], grid[-1], COLUMNS.items(), strict=True):
+    for top, bottom, title, label in zip(grid[0], grid[-1], TITLES, ACROSS, strict=True):
         top.set_title(title, fontsize="medium")
         bottom.set_xlabel(label)
     figure.suptitle(f"{calibration.replicates} synthetic campaigns; bands of 99 %", fontsize="medium")
@@ -84,11 +77,11 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
 
 
 def _histogram(axes: Axes, values: np.ndarray, method: str, label: str) -> None:
-    bins = bin_count(values.size)
+    bins = uniformity.bin_count(values.size)
     counts, edges = np.histogram(values, bins, (0.0, 1.0))
     expected = max(values.size, 1) / bins
     if method == METHODS[0] and values.size:
-        low, high = binomial_band(values.size, np.array(1.0 / bins), 1.0 - LEVEL)
+        low, high = uniformity.binomial_band(values.size, np.array(1.0 / bins), 1.0 - LEVEL)
         axes.axhspan(float(low) * bins, float(high) * bins, **BAND)
     axes.stairs(counts / expected, edges, color=COLOURS[method], ls=LINES[method], lw=1.6, label=label)
     axes.set_xlim(0.0, 1.0)
@@ -96,7 +89,7 @@ def _histogram(axes: Axes, values: np.ndarray, method: str, label: str) -> None:
 
 def _deviation(axes: Axes, values: np.ndarray, band: tuple[np.ndarray, np.ndarray] | None, method: str) -> None:
     """Draw a function of the evaluation points minus the points themselves, with its band."""
-    points = evaluation_points()
+    points = uniformity.evaluation_points()
     if band is not None:
         axes.fill_between(points, band[0] - points, band[1] - points, **BAND)
     axes.plot(points, values - points, color=COLOURS[method], ls=LINES[method], lw=1.4)
@@ -121,7 +114,7 @@ def comparison(comparison: Comparison, *, names: Sequence[str] | None = None, fi
     names : sequence of str, optional
         By default all.
     figure : Figure, optional
-        An empty figure with a constrained layout to draw into.
+        With a constrained layout.
 
     Returns
     -------
@@ -139,18 +132,17 @@ def comparison(comparison: Comparison, *, names: Sequence[str] | None = None, fi
     ['c', 'k', 'Laplace quantile − MAP [posterior sd]', 'probability of the Laplace ellipsoid']
     """
     names = chosen(names, tuple(comparison.table.index))
-    columns, rows = panel_grid(len(names))
-    size = max(2.4 * columns, 8.4), 2.5 * rows + 4.6
-    figure = figure or plt.figure(figsize=size, layout="constrained")
+    columns, rows = style.panel_grid(len(names))
+    figure = figure or plt.figure(figsize=(max(2.4 * columns, 8.4), 2.5 * rows + 4.6), layout="constrained")
     top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[2.5 * rows + 0.4, 4.2])[:, 0]
-    marginals = panels(top, len(names))
+    marginals = style.panels(top, len(names))
     for axes, name in zip(marginals, names, strict=True):
         about = comparison.table.loc[name].to_dict()
-        draw_marginal(axes, comparison.edges[name], comparison.densities[name], about["map"], about["laplace_sd"])
+        style.draw_marginal(axes, comparison.edges[name], comparison.densities[name], about["map"], about["laplace_sd"])
         axes.set_title(about["verdict"], fontsize="medium")
         axes.set_xlabel(_coordinate_label(comparison, name))
     top.legend(*marginals[0].get_legend_handles_labels(), loc="outside upper left", ncols=2, frameon=False)
-    if text := caveats(comparison.synthetic, comparison.converged):
+    if text := style.caveats(comparison.synthetic, comparison.converged):
         top.suptitle(text, x=0.99, ha="right", fontsize="medium")
     left, right = below.subplots(1, 2)
     _quantiles(left, comparison, names)
@@ -172,42 +164,32 @@ def _quantiles(axes: Axes, comparison: Comparison, names: Sequence[str]) -> None
     reach = np.array([-LIMIT, LIMIT])
     axes.fill_between(reach, reach - END_SHIFT, reach + END_SHIFT, **BAND)
     unnamed = "fine" if set(table["verdict"]) == {FINE} or len(wrong) == sum(table["verdict"] != FINE) else "others"
+    plain: dict[str, Any] = {"color": "black", "lw": 0.8, "label": unnamed}
+    looks = {
+        name: {"color": colour, "ls": dashes, "lw": 2.0, "label": axis_label(f"{name}: {table.loc[name, 'verdict']}")}
+        for name, (colour, dashes) in zip(wrong, LOOKS, strict=False)
+    }
     for name in [*table.index.difference(wrong, sort=False), *wrong]:
         line = table.loc[name]
-        if not np.isfinite(line["laplace_sd"]):
-            continue
-        across = ndtri(comparison.probabilities) * line["laplace_sd"] / line["sd"]
-        up = (comparison.quantiles[name] - line["map"]) / line["sd"]
-        if name in wrong:
-            colour, style = LOOKS[int(np.flatnonzero(wrong == name)[0])]
-            axes.plot(across, up, color=colour, ls=style, lw=2.0, label=axis_label(f"{name}: {line['verdict']}", ""))
-        else:
-            axes.plot(across, up, color="black", lw=0.8, label=unnamed)
-    axes.set_xlim(-LIMIT, LIMIT)
-    axes.set_ylim(-LIMIT, LIMIT)
-    axes.set_aspect("equal")
-    axes.set_xlabel("Laplace quantile − MAP [posterior sd]")
-    axes.set_ylabel("MCMC quantile − MAP [posterior sd]")
+        if np.isfinite(line["laplace_sd"]):
+            across = ndtri(comparison.probabilities) * line["laplace_sd"] / line["sd"]
+            axes.plot(across, (comparison.quantiles[name] - line["map"]) / line["sd"], **looks.get(name, plain))
+    labels = {"xlabel": "Laplace quantile − MAP [posterior sd]", "ylabel": "MCMC quantile − MAP [posterior sd]"}
+    axes.set(xlim=(-LIMIT, LIMIT), ylim=(-LIMIT, LIMIT), aspect="equal", **labels)
     handles = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
     axes.legend(handles.values(), handles.keys(), frameon=False, fontsize="small", loc="upper left")
 
 
 def _interval_coverage(axes: Axes, comparison: Comparison) -> None:
-    across, shares, errors = comparison.probabilities, comparison.shares, comparison.shares_mcse
+    across, shares, errors = comparison.probabilities, comparison.shares, ERRORS * comparison.shares_mcse
     axes.plot([0.0, 1.0], [0.0, 1.0], color=COLOURS["laplace"], lw=1.4, ls="--", label="Laplace")
-    axes.fill_between(
-        across, shares - ERRORS * errors, shares + ERRORS * errors, color=COLOURS["mcmc"], alpha=0.45, lw=0
-    )
+    axes.fill_between(across, shares - errors, shares + errors, color=COLOURS["mcmc"], alpha=0.45, lw=0)
     axes.plot(across, shares, color=COLOURS["mcmc"], lw=1.8, label="MCMC")
     axes.plot(LEVELS, np.interp(LEVELS, across, shares), "o", color=COLOURS["mcmc"], ms=6)
-    axes.set_xlim(0.0, 1.0)
-    axes.set_ylim(0.0, 1.0)
-    axes.set_aspect("equal")
-    axes.set_xlabel("probability of the Laplace ellipsoid")
-    axes.set_ylabel("fraction of the draws inside")
-    axes.set_title(
-        rf"jointly: {comparison.joint['verdict']}, $\hat{{k}}$ = {comparison.joint['pareto_k']:.2f}", fontsize="medium"
-    )
+    labels = {"xlabel": "probability of the Laplace ellipsoid", "ylabel": "fraction of the draws inside"}
+    axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0), aspect="equal", **labels)
+    verdict, k = comparison.joint["verdict"], comparison.joint["pareto_k"]
+    axes.set_title(rf"jointly: {verdict}, $\hat{{k}}$ = {k:.2f}", fontsize="medium")
     axes.legend(frameon=False, fontsize="small", loc="upper left")
 
 
@@ -228,7 +210,6 @@ def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Fig
     names : sequence of str, optional
         By default all.
     figure : Figure, optional
-        An empty figure to draw into.
 
     Returns
     -------
@@ -246,9 +227,9 @@ def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Fig
     ('k [N/m]', 'relative log-density')
     """
     shown = chosen(names, profile.names)
-    columns, rows = panel_grid(len(shown), PROFILES_ACROSS)
+    columns, rows = style.panel_grid(len(shown), PROFILES_ACROSS)
     figure = figure or plt.figure(figsize=(3.0 * columns + 0.8, 2.7 * rows + 0.6), layout="constrained")
-    for number, axes in enumerate(panels(figure, len(shown), PROFILES_ACROSS, sharey=True)):
+    for number, axes in enumerate(style.panels(figure, len(shown), PROFILES_ACROSS, sharey=True)):
         _profile_panel(axes, profile, shown[number])
         if number % columns == 0:
             axes.set_ylabel("relative log-density")
@@ -268,30 +249,30 @@ def _profile_panel(axes: Axes, profile: Profile, name: str) -> None:
     if np.isfinite(sd):
         x = np.geomspace(values[0], values[-1], 400) if wide else _laplace_range(profile, name)
         parabola = -profile.improvement - 0.5 * ((x - at) / sd) ** 2
-        axes.plot(x, parabola, color=COLOURS["laplace"], lw=1.6, ls="--", zorder=1.5, label=laplace)
+        axes.plot(x, parabola, zorder=1.5, label=laplace, **LAPLACE)
     if not found.all():
         low = np.full(np.sum(~found), 0.97 * bottom)
         axes.plot(values[~found], low, "x", color=COLOURS["measured"], ms=5, label=failed)
     axes.axhline(AT_90, color="grey", lw=0.8, ls=":", zorder=1)
-    axes.annotate(
-        "90%", (1, AT_90), (-3, 1), ("axes fraction", "data"), "offset points", color="grey", ha="right", va="bottom"
-    )
+    places = ("axes fraction", "data"), "offset points"
+    axes.annotate("90%", (1, AT_90), (-3, 1), *places, color="grey", ha="right", va="bottom")
     if profile.shape[name] != CLOSED:
         axes.annotate(profile.shape[name], (0.5, 0.03), xycoords="axes fraction", ha="center", va="bottom")
     if wide:
         axes.set_xscale("log")
     else:
         axes.locator_params(axis="x", nbins=3)
-    axes.set_ylim(bottom, 0.35)
-    axes.set_xlabel(axis_label(name, profile.units[name]))
+    axes.set(ylim=(bottom, 0.35), xlabel=axis_label(name, profile.units[name]))
 
 
 def _laplace_range(profile: Profile, name: str) -> np.ndarray:
     """Return values within three standard deviations, limited by the support and half the drawn range beyond it."""
-    values, reach, (low, high) = profile.values[name], 3.0 * profile.sd[name], profile.limits[name]
-    margin = 0.5 * np.ptp(values)
-    return np.linspace(
-        min(values[0], max(low, values[0] - margin, profile.map[name] - reach)),
-        max(values[-1], min(high, values[-1] + margin, profile.map[name] + reach)),
-        400,
+    values, at, reach, (low, high) = (
+        profile.values[name],
+        profile.map[name],
+        3.0 * profile.sd[name],
+        profile.limits[name],
     )
+    margin = 0.5 * np.ptp(values)
+    start = min(values[0], max(low, values[0] - margin, at - reach))
+    return np.linspace(start, max(values[-1], min(high, values[-1] + margin, at + reach)), 400)

@@ -1,14 +1,23 @@
-"""Colours and labels of all figures; each colour has one meaning everywhere."""
+"""Colours, labels and panels of all figures; each colour has one meaning everywhere."""
 
 import textwrap
+from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import FigureBase
+from scipy.stats import norm
+
+from bayesperiodic import _checks
 from bayesperiodic.posterior import labels
 from bayesperiodic.sampling.posterior import Posterior
 
 #: Colours of measurements, of the MAP estimate, of the Laplace approximation and of MCMC, in all figures.
 COLOURS = {"measured": "#000000", "map": "#0072B2", "laplace": "#D55E00", "mcmc": "#56B4E9"}
 ENSEMBLES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
-LABEL_LENGTH = 24
+LAPLACE: dict[str, Any] = {"color": COLOURS["laplace"], "lw": 1.6, "ls": "--"}
+LABEL_LENGTH, ACROSS = 24, 4
 
 
 def caveats_of(posterior: Posterior) -> str:
@@ -21,9 +30,9 @@ def caveats(synthetic: bool, converged: bool) -> str:
     return ", ".join((["synthetic data"] if synthetic else []) + ([] if converged else ["NOT CONVERGED"]))
 
 
-def unit_of(posterior: Posterior, name: str) -> str:
-    """Return the unit of a quantity by its full name; "" without one."""
-    return labels.unit(posterior.data["posterior"].to_dataset(), name)
+def draws_label(posterior: Posterior, name: str) -> str:
+    """Return the label of a quantity by its full name."""
+    return wrapped_label(name, labels.unit(posterior.data["posterior"].to_dataset(), name))
 
 
 def wrapped_label(name: str, unit: str) -> str:
@@ -31,7 +40,49 @@ def wrapped_label(name: str, unit: str) -> str:
     return axis_label(textwrap.fill(name, LABEL_LENGTH), unit).replace(" [", "\n[")
 
 
-def axis_label(name: str, unit: str) -> str:
+def axis_label(name: str, unit: str = "") -> str:
     """Return a name with its unit, escaped for matplotlib."""
     text = f"{name} [{unit}]" if unit else name
     return text.replace("$", r"\$")
+
+
+def chosen(names: Sequence[str] | None, every: tuple[str, ...], argument: str = "names") -> tuple[str, ...]:
+    """Return the validated names to draw, by default all."""
+    if names is None:
+        return every
+    if isinstance(names, str) or not len(names):
+        raise ValueError(f"{argument}: must be a sequence of names, such as [{every[0]!r}], got {names!r}.")
+    for name in names:
+        _checks.one_of(argument, name, every)
+    if len(set(names)) < len(names):
+        raise ValueError(f"{argument}: must be different names, got {list(names)}.")
+    return tuple(names)
+
+
+def panel_grid(count: int, across: int = ACROSS) -> tuple[int, int]:
+    """Return the numbers of columns and rows of so many panels."""
+    columns = min(count, across)
+    return columns, -(-count // columns)
+
+
+def panels(figure: FigureBase, count: int, across: int = ACROSS, sharey: bool = False) -> list[Axes]:
+    """Create so many panels in a grid."""
+    columns, rows = panel_grid(count, across)
+    grid = figure.subplots(rows, columns, sharey=sharey, squeeze=False).ravel()
+    for axes in grid[count:]:
+        axes.remove()
+    return list(grid[:count])
+
+
+def draw_marginal(axes: Axes, edges: np.ndarray, density: np.ndarray, mean: float, sd: float) -> None:
+    """Draw a histogram of draws, and a normal density if its sd is finite."""
+    axes.stairs(density, edges, color=COLOURS["mcmc"], alpha=0.45, fill=True)
+    axes.stairs(density, edges, color=COLOURS["mcmc"], lw=1.4, label="MCMC")
+    if np.isfinite(sd) and sd > 0.0:
+        width, reach = edges[-1] - edges[0], 3.0 * sd
+        x = np.linspace(max(mean - reach, edges[0] - 0.5 * width), min(mean + reach, edges[-1] + 0.5 * width), 300)
+        axes.plot(x, norm.pdf(x, mean, sd), label="Laplace", **LAPLACE)
+    axes.set_ylim(bottom=0.0)
+    axes.set_yticks([])
+    axes.locator_params(axis="x", nbins=4)
+    axes.spines[["left", "right", "top"]].set_visible(False)

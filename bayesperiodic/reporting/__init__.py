@@ -1,1 +1,84 @@
-"""The report: one self-contained HTML page about a fit, for people who do not run Python."""
+"""The report of an identification: one self-contained HTML page, for readers who do not run Python."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+from bayesperiodic import plot
+from bayesperiodic._io import in_folder, written_whole
+from bayesperiodic.diagnostics.adequacy import LEVEL
+from bayesperiodic.diagnostics.comparison import Comparison
+from bayesperiodic.diagnostics.identifiability import Identifiability
+from bayesperiodic.diagnostics.predictive import Prediction
+from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.reporting import contents, html
+from bayesperiodic.sampling.posterior import Posterior
+
+
+def report(
+    problem: Problem,
+    fit: MapEstimate,
+    posterior: Posterior | None,
+    path: str | Path,
+    *,
+    title: str | None = None,
+    comparison: Comparison | None = None,
+    identifiability: Identifiability | None = None,
+    prediction: Prediction | None = None,
+) -> Path:
+    """Write an HTML report of an identification.
+
+    The report contains the data, the model with its equations, the estimates (MAP, Laplace and MCMC side by side), the
+    residual, the verdicts, the diagnostics of the sampler, and settings, seed and versions, with figures. It is a
+    single accessible file without scripts or external resources: figures are embedded SVG images, equations MathML. All
+    text is escaped. An existing file is replaced only by a complete one.
+
+    Diagnostics that are not given are computed in a few seconds, except the profiles of `identifiability`, which solve
+    anew for every parameter: to include them, give ``identifiability=bp.identifiability(problem, fit, posterior)``.
+
+    Parameters
+    ----------
+    problem : Problem
+    fit : MapEstimate
+    posterior : Posterior or None
+        Without draws the report has no MCMC results, no comparison and no test of the model.
+    path : path
+        Of the file, such as "report.html".
+    title : str, optional
+        By default the model's name.
+    comparison : Comparison, optional
+    identifiability : Identifiability, optional
+    prediction : Prediction, optional
+
+    Returns
+    -------
+    Path
+        Of the file.
+
+    Raises
+    ------
+    ValueError
+        If the fit, the posterior or a diagnosis is of another problem.
+    FileNotFoundError
+        If the folder of `path` does not exist.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     page = bp.report(problem, fit, None, f"{folder}/report.html").read_text(encoding="utf-8")
+    >>> page[:15], "<script" in page
+    ('<!DOCTYPE html>', False)
+    """
+    target = in_folder(path)
+    text = html.page(
+        title=title or problem.model.name,
+        given=contents.ReportInputs.of(problem, fit, posterior, identifiability, comparison, prediction),
+        content=contents,
+        plot=plot,
+        level=LEVEL,
+        written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+    )
+    with written_whole(target) as draft:
+        draft.write_text(text, encoding="utf-8")
+    return target

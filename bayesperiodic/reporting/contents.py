@@ -1,44 +1,146 @@
-"""Tables and figures of the report."""
+"""Inputs, tables and images of the report; the texts around them are in the template."""
 
 import base64
 import importlib.metadata
 import io
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
-from bayesperiodic import plot
-from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.diagnostics.adequacy import ADEQUATE, LEVEL, MISSPECIFIED, TESTS, UNTESTED
-from bayesperiodic.diagnostics.comparison import Comparison
-from bayesperiodic.diagnostics.identifiability import DETERMINED, NOTHING
-from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction
+from bayesperiodic import _checks
+from bayesperiodic.diagnostics.adequacy import ADEQUATE, MISSPECIFIED, TESTS, UNTESTED
+from bayesperiodic.diagnostics.comparison import Comparison, compare
+from bayesperiodic.diagnostics.identifiability import DETERMINED, NOTHING, Identifiability, identifiability
+from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction, predict
 from bayesperiodic.diagnostics.verdicts import FINE, MODE, UNCONVERGED
+from bayesperiodic.estimation.map_estimate import estimation_warnings
+from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.periodic.schemes import find_scheme
+from bayesperiodic.posterior import labels
 from bayesperiodic.posterior.parameters import SHIFT
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.reporting import html
-from bayesperiodic.reporting.inputs import ReportInputs, symbol
+from bayesperiodic.reporting.html import Rows, code, number
 from bayesperiodic.sampling.checkpoint import fingerprint
 from bayesperiodic.sampling.posterior import Posterior
 
-LONGEST = 120
+# Level of the whiteness test, and the ratio of robust to Laplace sd above which the report warns.
+NOT_WHITE, LARGE_RATIO = 0.01, 1.5
+LONGEST, MOST_PANELS = 120, 7
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "xarray", "matplotlib")
-MOST_PANELS = 7
-TONES = {
-    FINE: html.GOOD,
-    DETERMINED: html.GOOD,
-    ADEQUATE: html.GOOD,
-    MISSPECIFIED: html.BAD,
-    MODE: html.BAD,
-    UNCONVERGED: html.BAD,
-    NOTHING: html.BAD,
-    UNTESTED: html.NEUTRAL,
-}
+TONES = dict.fromkeys((FINE, DETERMINED, ADEQUATE), html.GOOD) | {UNTESTED: html.NEUTRAL}
+TONES |= dict.fromkeys((MISSPECIFIED, MODE, UNCONVERGED, NOTHING), html.BAD)
+
+
+@dataclass(frozen=True)
+class ReportInputs:
+    """A problem, its estimate, and the draws and diagnostics that the report shows; those that are missing are None.
+
+    `no_prediction` is the reason why there is no prediction although there are draws, "" otherwise.
+    """
+
+    problem: Problem
+    fit: MapEstimate
+    posterior: Posterior | None
+    identifiability: Identifiability
+    comparison: Comparison | None
+    prediction: Prediction | None
+    no_prediction: str
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        fit: MapEstimate,
+        posterior: Posterior | None,
+        found: Identifiability | None,
+        comparison: Comparison | None,
+        prediction: Prediction | None,
+    ) -> "ReportInputs":
+        """Check that all inputs belong to one problem, and compute the diagnostics that are not given."""
+        runs, no_prediction = [e.name for e in problem.experiments], ""
+        _checks.same_names("fit", fit.theta, problem.names)
+        _checks.same_names("fit", fit.residuals, runs)
+        if posterior is not None:
+            _check_data(posterior, problem)
+            comparison = compare(problem, fit, posterior) if comparison is None else comparison
+            try:
+                prediction = predict(problem, posterior) if prediction is None else prediction
+            except RuntimeError as error:
+                no_prediction = str(error)
+        found = identifiability(problem, fit, posterior, profile=False) if found is None else found
+        _checks.same_names("identifiability", dict.fromkeys(found.table.index), problem.names)
+        if comparison is not None:
+            remedy = "give the one of this problem, compare(problem, fit, posterior)"
+            _checks.contains("comparison", comparison.table.index, problem.names, remedy)
+        if prediction is not None:
+            _checks.same_names("prediction", prediction.median, runs)
+        return cls(problem, fit, posterior, found, comparison, prediction, no_prediction)
+
+    @property
+    def synthetic(self) -> bool:
+        """Whether any of the data were simulated."""
+        return any(e.synthetic for e in self.problem.experiments)
+
+    @property
+    def clocks(self) -> set[str]:
+        """The time symbols, of "tau" and "frequency", that the model contains."""
+        model = self.problem.model
+        used = set().union(*(e.free_symbols for e in (*model.equations, *model.output_expressions)))
+        return {name for name in ("tau", "frequency") if model.time_symbols[name] in used}
+
+    @cached_property
+    def summary(self) -> pd.DataFrame:
+        """Mean, sd, interval and diagnostics of the draws by name; empty without draws."""
+        return pd.DataFrame() if self.posterior is None else self.posterior.summary()
+
+    @property
+    def coloured(self) -> list[str]:
+        """The channels whose residual is not white."""
+        return [channel for channel, white in self.fit.whiteness.items() if white.p < NOT_WHITE]
+
+    @property
+    def robust_ratios(self) -> dict[str, float]:
+        """Robust over Laplace standard deviation where it exceeds 1.5 although some residual is not white."""
+        ratios = {name: self.fit.robust_sd[name] / sd for name, sd in self.fit.sd.items() if sd > 0.0}
+        return {name: ratio for name, ratio in ratios.items() if self.coloured and LARGE_RATIO < ratio < np.inf}
+
+    @property
+    def warnings(self) -> Iterator[str]:
+        """Warnings of the estimate."""
+        return estimation_warnings(self.problem, self.fit)
+
+    def unit(self, name: str) -> str:
+        """Return the formatted unit of a parameter, a channel or a noise parameter, by its full name."""
+        units, (plain, _, place) = self.problem.model.units, name.partition("[")
+        if plain == SHIFT:
+            return "s"
+        if name in self.problem.noise_names:
+            channel = units.get(place.rstrip("]").partition(",")[0], "")
+            return html.unit(labels.squared(channel) if plain == "variance" and channel else "")
+        return html.unit(units.get(plain, ""))
+
+
+def _check_data(posterior: Posterior, problem: Problem) -> None:
+    """Raise a ValueError unless the draws are of the problem's parameters and were made from its data."""
+    data = posterior.data["observed_data"]
+    measured = {f"{e.name} {channel}": values for e in problem.experiments for channel, values in e.outputs.items()}
+    if (
+        set(posterior.names) != {*problem.names, *problem.free_noise}
+        or set(data.data_vars) != set(measured)
+        or not all(np.array_equal(data[name].to_numpy(), values) for name, values in measured.items())
+    ):
+        raise ValueError(
+            "posterior: must be of the parameters and data of `problem`, got draws of other parameters or data. Give "
+            "sample(problem, fit)."
+        )
 
 
 def badge(verdict: str) -> html.Badge:
@@ -51,6 +153,11 @@ def other_than(good: str, verdicts: Mapping[Any, str]) -> list[str]:
     return [f"{name}: {verdict}" for name, verdict in verdicts.items() if verdict != good]
 
 
+def rms(values: np.ndarray) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def embedded(drawing: Figure, name: str) -> str:
     """Return a figure as a data URL of an SVG image, reproducibly, and close it."""
     buffer = io.BytesIO()
@@ -60,59 +167,68 @@ def embedded(drawing: Figure, name: str) -> str:
     return f"data:image/svg+xml;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 
-def experiments(given: ReportInputs) -> html.Table:
+def most_correlated(posterior: Posterior) -> tuple[list[str], str]:
+    """Return the names of the most correlated quantities, and a sentence on the strongest correlation."""
+    names = posterior.names
+    correlations = np.atleast_2d(np.corrcoef(np.stack([posterior.draws(name) for name in names])))
+    np.fill_diagonal(correlations, 0.0)
+    correlations = np.nan_to_num(correlations)
+    kept = np.sort(np.argsort(-np.abs(correlations).max(axis=0), kind="stable")[:MOST_PANELS])
+    strongest = ""
+    if len(names) > 1:
+        i, j = sorted(np.unravel_index(np.argmax(np.abs(correlations)), correlations.shape))
+        value = number(float(correlations[i, j]), 2)
+        strongest = f" The strongest correlation is {value}, between {names[i]} and {names[j]}."
+    return [names[i] for i in kept], strongest
+
+
+def experiments(given: ReportInputs) -> Rows:
     """Return the table of the experiments."""
-    rows = [
+    return [
         {
             "Experiment": e.name,
             "Data": "synthetic" if e.synthetic else "measured",
-            "Frequency [Hz]": html.number(e.frequency, 7),
-            "Standard error [Hz]": html.number(e.frequency_se, 2) if e.frequency_se else html.NOTHING,
+            "Frequency [Hz]": number(e.frequency, 7),
+            "Standard error [Hz]": number(e.frequency_se, 2) if e.frequency_se else html.NOTHING,
             "Cycles": html.Number(e.cycles),
             "Forcing periods per response": html.Number(e.periods),
             "Points per period": html.Number(e.samples),
-            "Periodicity": html.number(e.periodicity, 5),
+            "Periodicity": number(e.periodicity, 5),
         }
         for e in given.problem.experiments
     ]
-    caption = "Experiments. The periodicity is the fraction of the variance that the mean period explains."
-    return html.Table("table-experiments", caption, rows)
 
 
-def channels(given: ReportInputs) -> html.Table:
+def channels(given: ReportInputs) -> Rows:
     """Return the table of the channels."""
-    rows = [
-        _channel(given, e, channel, kind)
-        for e in given.problem.experiments
-        for kind, channels in (("input", e.inputs), ("output", e.outputs))
-        for channel in channels
-    ]
-    caption = "Channels: prescribed (inputs) and compared with the model (outputs)."
-    return html.Table("table-channels", caption, rows)
+    rows: list[dict[str, str]] = []
+    for e in given.problem.experiments:
+        masked = "output" if e.mask is None else f"output, at {np.sum(e.mask)} points"
+        outputs = e.outputs if e.mask is None else {channel: values[e.mask] for channel, values in e.outputs.items()}
+        every = [("input", *item) for item in e.inputs.items()] + [(masked, *item) for item in outputs.items()]
+        rows += [
+            {
+                "Channel": code(channel),
+                "Experiment": e.name,
+                "Kind": kind,
+                "Unit": given.unit(channel),
+                "Minimum": number(float(values.min()), 4),
+                "Maximum": number(float(values.max()), 4),
+                "Harmonics kept": html.Number(e.harmonics.get(channel, "all")),
+                "Independent values": html.Number(e.independent.get(channel, html.NOTHING)),
+                "Standard deviation of one cycle": number(e.scatter.get(channel, np.nan)),
+            }
+            for kind, channel, values in every
+        ]
+    return rows
 
 
-def _channel(given: ReportInputs, e: Experiment, channel: str, kind: str) -> dict[str, str]:
-    values = (e.inputs if kind == "input" else e.outputs)[channel]
-    measured = values if e.mask is None or kind == "input" else values[e.mask]
-    return {
-        "Channel": html.code(channel),
-        "Experiment": e.name,
-        "Kind": kind if e.mask is None or kind == "input" else f"{kind}, at {measured.size} points",
-        "Unit": given.unit(channel),
-        "Minimum": html.number(float(measured.min()), 4),
-        "Maximum": html.number(float(measured.max()), 4),
-        "Harmonics kept": html.Number(e.harmonics.get(channel, "all")),
-        "Independent values": html.Number(e.independent.get(channel, html.NOTHING)),
-        "Standard deviation of one cycle": html.number(e.scatter.get(channel, np.nan)),
-    }
-
-
-def parameters(given: ReportInputs) -> html.Table:
+def parameters(given: ReportInputs) -> Rows:
     """Return the table of all parameters."""
-    rows = [
+    return [
         {
-            "Parameter": html.code(name),
-            "Symbol": symbol(name.partition("[")[0]),
+            "Parameter": code(name),
+            "Symbol": html.symbol(plain),
             "Unit": given.unit(name),
             "Role": role,
             "Prior, value or expression": known,
@@ -120,7 +236,6 @@ def parameters(given: ReportInputs) -> html.Table:
         for plain in (*given.problem.model.parameters, SHIFT)
         for name, role, known in _roles(given.problem, plain)
     ]
-    return html.Table("table-parameters", "Parameters with their priors, fixed values or expressions.", rows)
 
 
 def _roles(problem: Problem, plain: str) -> Iterator[tuple[str, str, str]]:
@@ -137,51 +252,48 @@ def _roles(problem: Problem, plain: str) -> Iterator[tuple[str, str, str]]:
     if len(by_run) == len(problem.experiments) and len(set(by_run.values())) == 1:
         by_run = {"": next(iter(by_run.values()))}
     for run, value in by_run.items():
-        yield (f"{plain}[{run}]" if run else plain), "fixed", str(html.number(value, 6))
+        yield (f"{plain}[{run}]" if run else plain), "fixed", str(number(value, 6))
 
 
-def summary(given: ReportInputs) -> html.Table:
+def summary(given: ReportInputs) -> Rows:
     """Return the summary table of the free parameters."""
-    fit, intervals, rows = given.fit, given.fit.interval(PROBABILITY), []
-    robust = fit.interval(PROBABILITY, robust=True) if given.robust_ratios else {}
+    robust = given.fit.interval(PROBABILITY, robust=True) if given.robust_ratios else {}
     laplace = {} if given.comparison is None else dict(given.comparison.table["verdict"])
-    for name, value in fit.theta.items():
-        rounding = html.Rounding.of(value, fit.sd[name])
-        drawn = _mcmc_cells(given, name, rounding)
-        row: dict[str, str | html.Badge] = {
-            "Parameter": html.code(name),
-            "Unit": given.unit(name),
-            "MAP": rounding.text(value),
-            "90 % interval": drawn["MCMC: 90 % interval"] if drawn else rounding.interval(*intervals[name]),
+    rows = []
+    for full, (name, rounding) in zip(estimates(given), _roundings(given.fit).items(), strict=True):
+        row = {
+            **{title: full[title] for title in ("Parameter", "Unit", "MAP")},
+            "90 % interval": full.get("MCMC: 90 % interval", full["Laplace: 90 % interval"]),
         }
         row |= {"Robust 90 % interval": rounding.interval(*robust[name])} if robust else {}
         row |= {"Identifiability": badge(given.identifiability.verdicts[name])}
         row |= {"Laplace approximation": badge(laplace[name])} if laplace else {}
         rows.append(row)
-    source = "the Laplace approximation (Student’s t)" if given.posterior is None else "MCMC"
-    return html.Table("table-summary", f"Free parameters; 90 % intervals from {source}.", rows)
+    return rows
 
 
-def estimates(given: ReportInputs) -> html.Table:
+def _roundings(fit: MapEstimate) -> dict[str, html.Rounding]:
+    return {name: html.Rounding.of(value, fit.sd[name]) for name, value in fit.theta.items()}
+
+
+def estimates(given: ReportInputs) -> Rows:
     """Return the table of the estimates of the free parameters."""
-    fit, intervals, rows = given.fit, given.fit.interval(PROBABILITY), []
-    for name, value in fit.theta.items():
-        rounding = html.Rounding.of(value, fit.sd[name])
-        rows.append(
-            {
-                "Parameter": html.code(name),
-                "Unit": given.unit(name),
-                "MAP": rounding.text(value),
-                "Laplace: sd": rounding.sd(fit.sd[name]),
-                "Laplace: 90 % interval": rounding.interval(*intervals[name]),
-                "Laplace: robust sd": rounding.sd(fit.robust_sd[name]),
-                **_mcmc_cells(given, name, rounding),
-            }
-        )
-    return html.Table("table-estimates", "Estimates of the free parameters.", rows)
+    fit, intervals = given.fit, given.fit.interval(PROBABILITY)
+    return [
+        {
+            "Parameter": code(name),
+            "Unit": given.unit(name),
+            "MAP": rounding.text(fit.theta[name]),
+            "Laplace: sd": rounding.sd(fit.sd[name]),
+            "Laplace: 90 % interval": rounding.interval(*intervals[name]),
+            "Laplace: robust sd": rounding.sd(fit.robust_sd[name]),
+            **_mcmc_cells(given, name, rounding),
+        }
+        for name, rounding in _roundings(fit).items()
+    ]
 
 
-def noise(given: ReportInputs) -> html.Table:
+def noise(given: ReportInputs) -> Rows:
     """Return the table of the estimates of the noise parameters."""
     fit, rows = given.fit, []
     variances = dict(zip(fit.joint_covariance.index, np.diag(fit.joint_covariance), strict=True))
@@ -193,199 +305,97 @@ def noise(given: ReportInputs) -> html.Table:
         independent = fit.independent.get(channel, fit.independent.get(name, np.nan))
         rows.append(
             {
-                "Noise parameter": html.code(name),
+                "Noise parameter": code(name),
                 "Unit": given.unit(name),
-                "Independent values": html.number(independent, 6),
-                "Estimate (eq. 7)": rounding.text(value) if free else html.Number(f"{html.number(value, 6)} (known)"),
+                "Independent values": number(independent, 6),
+                "Estimate (eq. 7)": rounding.text(value) if free else html.Number(f"{number(value, 6)} (known)"),
                 "Laplace: relative sd": html.percent(relative),
                 **_mcmc_cells(given, name, rounding),
             }
         )
-    return html.Table("table-noise", "Estimates of the noise parameters.", rows)
+    return rows
 
 
-def _mcmc_cells(given: ReportInputs, name: str, rounding: html.Rounding) -> dict[str, str]:
+def _mcmc_cells(given: ReportInputs, name: str, rounding: html.Rounding) -> dict[str, html.Number]:
     """Return mean, standard deviation and 90 % interval of the draws; no columns without draws."""
     if given.posterior is None:
         return {}
-    titles = ("MCMC: mean", "MCMC: sd", "MCMC: 90 % interval")
-    if name not in given.summary.index:
-        return dict.fromkeys(titles, html.Number(html.NOTHING))
-    mean, sd, low, high = map(float, given.summary.loc[[name], ["mean", "sd", "q05", "q95"]].to_numpy()[0])
-    return dict(zip(titles, (rounding.text(mean), rounding.sd(sd), rounding.interval(low, high)), strict=True))
+    mean, sd, low, high = given.summary.reindex([name])[["mean", "sd", "q05", "q95"]].to_numpy(dtype=float)[0]
+    return {
+        "MCMC: mean": rounding.text(mean),
+        "MCMC: sd": rounding.sd(sd),
+        "MCMC: 90 % interval": rounding.interval(low, high),
+    }
 
 
-def corner(given: ReportInputs, posterior: Posterior) -> html.Figure:
-    """Return the corner plot of the most correlated quantities."""
-    names = posterior.names
-    correlations = np.atleast_2d(np.corrcoef(np.stack([posterior.draws(name) for name in names])))
-    np.fill_diagonal(correlations, 0.0)
-    correlations = np.nan_to_num(correlations)
-    kept = np.sort(np.argsort(-np.abs(correlations).max(axis=0), kind="stable")[:MOST_PANELS])
-    shown = [names[i] for i in kept]
-    selection = "" if len(shown) == len(names) else f" Shown are the {len(shown)} most correlated of {len(names)}."
-    strongest = ""
-    if len(names) > 1:
-        i, j = sorted(np.unravel_index(np.argmax(np.abs(correlations)), correlations.shape))
-        value = html.number(float(correlations[i, j]), 2)
-        strongest = f" The strongest correlation is {value}, between {names[i]} and {names[j]}."
-    return html.Figure(
-        "figure-corner",
-        embedded(plot.corner(posterior, laplace=given.fit, names=shown), "corner"),
-        f"Matrix of plots: marginal distributions of {', '.join(shown)} on the diagonal, contours of their pairs below "
-        f"it, from the draws and from the Laplace approximation.{strongest}",
-        "Posterior distribution of parameters and noise parameters: draws (MCMC) and Laplace approximation, with the "
-        f"regions of 50 and 90 % probability.{strongest}{selection}",
-        wide=True,
-    )
-
-
-def residuals(given: ReportInputs) -> html.Table:
+def residuals(given: ReportInputs) -> Rows:
     """Return the table of the residuals."""
     fit, rows = given.fit, []
-    for channel, rms in fit.rms.items():
+    for channel, value in fit.rms.items():
         split, white = fit.noise_split.get(channel), fit.whiteness[channel]
         noise, error = (np.nan, np.nan) if split is None else (split.measurement, split.model)
         rows.append(
             {
-                "Channel": html.code(channel),
+                "Channel": code(channel),
                 "Unit": given.unit(channel),
-                "rms of the residual": html.number(rms),
+                "rms of the residual": number(value),
                 "Unexplained variance": html.percent(fit.fvu[channel]),
-                "Measurement noise": html.number(noise),
-                "Model error": html.number(np.nan if np.isnan(noise) else error),
-                "Input noise": html.number(fit.input_noise.get(channel, np.nan)),
+                "Measurement noise": number(noise),
+                "Model error": number(np.nan if np.isnan(noise) else error),
+                "Input noise": number(fit.input_noise.get(channel, np.nan)),
                 "Whiteness p": html.p_value(white.p),
-                "Autocorrelation": html.number(white.lag1, 2),
+                "Autocorrelation": number(white.lag1, 2),
             }
         )
-    caption = "Residual of each channel, measured minus MAP; standard deviations in the unit of the channel."
-    return html.Table("table-residuals", caption, rows)
+    return rows
 
 
-def fits(given: ReportInputs) -> Iterator[html.Figure]:
-    """Yield a figure of the fit for every experiment, and that of the loops."""
-    problem, fit, prediction = given.problem, given.fit, given.prediction
-    for place, e in enumerate(problem.experiments):
-        channels = ", ".join(f"{channel} [{given.unit(channel)}]" for channel in e.outputs)
-        band = f", the {prediction.probability:.0%} predictive band of the draws" if prediction else ""
-        residual = ", ".join(
-            f"{html.number(float(np.sqrt(np.mean(fit.residuals[e.name][channel] ** 2))))} {given.unit(channel)}"
-            for channel in e.outputs
-        )
-        yield html.Figure(
-            f"figure-fit-{place + 1}",
-            embedded(plot.fit(problem, fit, prediction, experiments=[e.name]), f"fit {place}"),
-            f"Line plot over one period of experiment {e.name}: measured {channels}, the MAP fit on top{band}, and the "
-            f"residual below; its root mean square is {residual}.",
-            f"{e.name}: one period of {', '.join(e.outputs)}, measured and fitted, and the residual.",
-        )
-    if problem.model.inputs:
-        axes = f"{problem.channels[0]} against {problem.model.inputs[0]}, and against its rate"
-        yield html.Figure(
-            "figure-loops",
-            embedded(plot.loops(problem, fit), "loops"),
-            f"Closed curves of {axes}, measured and fitted, for {len(problem.experiments)} experiments.",
-            f"Measured and fitted: {axes}.",
-            wide=True,
-        )
+def _formatted(table: pd.DataFrame, **columns: tuple[str, Callable[[Any], Any]]) -> Rows:
+    """Return columns of a table, each with its title and format; `label` is the index."""
+    rows = table.rename_axis("label").reset_index().to_dict("records")
+    return [{title: form(row[name]) for name, (title, form) in columns.items()} for row in rows]
 
 
-def verdicts(given: ReportInputs) -> html.Table:
+def verdicts(given: ReportInputs) -> Rows:
     """Return the table of the identifiability of each parameter."""
-    rows = [
-        {
-            "Parameter": html.code(str(name)),
-            "Verdict": badge(row["verdict"]),
-            "Evidence": row["evidence"],
-            "Recommendation": row["remedy"] or html.NOTHING,
-        }
-        for name, row in given.identifiability.table.iterrows()
-    ]
-    return html.Table("table-identifiability", "Identifiability of each parameter: data against prior.", rows)
+    return _formatted(
+        given.identifiability.table,
+        label=("Parameter", code),
+        verdict=("Verdict", badge),
+        evidence=("Evidence", str),
+        remedy=("Recommendation", lambda text: text or html.NOTHING),
+    )
 
 
-def laplace(found: Comparison) -> html.Table:
+def laplace(found: Comparison) -> Rows:
     """Return the table of the comparison of Laplace with MCMC."""
-    two = html.Rounding(0, 2)
-    columns = {"Shift": "shift", "Ratio of sds": "sd_ratio", "Skewness": "skewness", "Distance": "wasserstein"}
-    rows = [
-        {
-            "Coordinate": html.code(row["coordinate"]),
-            "Verdict": badge(row["verdict"]),
-            **{t: html.Number(f"{two.text(row[c])} ± {two.text(row[f'{c}_mcse'])}") for t, c in columns.items()},
-            "Recommendation": row["recommendation"],
-        }
-        for _, row in found.table.iterrows()
-    ]
-    caption = (
-        f"Laplace against MCMC in {found.coordinates} coordinates (± Monte Carlo error). Shift: mean of the draws "
-        "minus MAP, in standard deviations of the draws. Ratio: Laplace sd over sd of the draws. Distance: Wasserstein "
-        "distance in standard deviations of the draws."
-    )
-    return html.Table("table-laplace", caption, rows)
+    titles = {"shift": "Shift", "sd_ratio": "Ratio of sds", "skewness": "Skewness", "wasserstein": "Distance"}
+    columns: dict[str, Any] = {"coordinate": ("Coordinate", code), "verdict": ("Verdict", badge)}
+    columns |= {column: (title, html.Number) for column, title in titles.items()}
+    two = html.Rounding(0, 2).text
+    pairs = {c: found.table[c].map(two) + " ± " + found.table[f"{c}_mcse"].map(two) for c in titles}
+    return _formatted(found.table.assign(**pairs), **columns, recommendation=("Recommendation", str))
 
 
-def comparison(found: Comparison) -> html.Figure:
-    """Return the figure of the comparison of Laplace with MCMC."""
-    verdicts = ", ".join(f"{name} {verdict}" for name, verdict in found.table["verdict"].items())
-    return html.Figure(
-        "figure-comparison",
-        embedded(plot.comparison(found), "comparison"),
-        "Marginal distributions of the draws with the Laplace approximation on top, their quantiles against each "
-        f"other, and the fraction of draws in Laplace ellipsoids. Verdicts: {verdicts}; jointly "
-        f"{found.joint['verdict']}.",
-        "The Laplace approximation against the draws: marginal distributions, quantiles (grey: tolerance) and "
-        "ellipsoids.",
-        wide=True,
-    )
-
-
-def adequacy(found: Prediction) -> html.Table:
+def adequacy(found: Prediction) -> Rows:
     """Return the table of the tests of the model."""
-    rows: list[html.Row] = [
-        {
-            "Experiment and channel": str(label),
-            "Verdict": badge(row["verdict"]),
-            **{f"p-values: {test}": html.p_value(row[test]) for test in TESTS},
-            "Fraction of model error": html.percent(row["model_error_share"]),
-        }
-        for label, row in found.table.iterrows()
-    ]
-    caption = (
-        "Tests of the model. Verdicts use p-values adjusted for all tests of the table (Holm), with a false alarm rate "
-        f"of {html.percent(LEVEL)}; the last column is the fraction of the residual variance beyond the measured noise."
-    )
-    return html.Table("table-adequacy", caption, rows)
+    columns: dict[str, Any] = {"label": ("Experiment and channel", str), "verdict": ("Verdict", badge)}
+    columns |= {test: (f"p-values: {test}", html.p_value) for test in TESTS}
+    return _formatted(found.table, **columns, model_error_share=("Fraction of model error", html.percent))
 
 
-def sampling(given: ReportInputs) -> html.Table:
+def sampling(given: ReportInputs) -> Rows:
     """Return the table of the convergence of the draws."""
-    rows = [
-        {
-            "Quantity": html.code(str(name)),
-            "Effective sample size": html.Number(f"{row['ess']:.0f}"),
-            "Autocorrelation time [steps]": html.number(row["tau"], 3),
-            "R-hat between ensembles": html.Number(f"{row['rhat']:.4f}"),
-        }
-        for name, row in given.summary.iterrows()
-    ]
-    return html.Table("table-sampling", "Convergence of the draws, in sampling coordinates.", rows)
-
-
-def traces(given: ReportInputs, posterior: Posterior) -> html.Figure:
-    """Return the figure of the traces."""
-    return html.Figure(
-        "figure-traces",
-        embedded(plot.traces(posterior, walkers=2), "traces"),
-        f"Traces of some walkers of each ensemble for {', '.join(posterior.names)}; the largest R-hat is "
-        f"{given.summary['rhat'].max():.4f}.",
-        "Traces of some walkers; each colour is an independent ensemble.",
-        wide=True,
+    return _formatted(
+        given.summary,
+        label=("Quantity", code),
+        ess=("Effective sample size", lambda size: html.Number(f"{size:.0f}")),
+        tau=("Autocorrelation time [steps]", number),
+        rhat=("R-hat between ensembles", lambda rhat: html.Number(f"{rhat:.4f}")),
     )
 
 
-def settings(given: ReportInputs) -> html.Table:
+def settings(given: ReportInputs) -> Rows:
     """Return the table of the settings."""
     problem, fit, posterior = given.problem, given.fit, given.posterior
     shifts = {name: abs(shift) for name, shift in fit.doubling_shift.items() if np.isfinite(shift)}
@@ -397,9 +407,9 @@ def settings(given: ReportInputs) -> html.Table:
         "Noise model": repr(problem.noise),
         "Search for the MAP": f"{fit.status}, {steps}, {starts}",
         "Largest shift of an estimate with twice as many points": (
-            f"{html.number(shifts[worst], 2)} sd ({worst})" if worst else "not known"
+            f"{number(shifts[worst], 2)} sd ({worst})" if worst else "not known"
         ),
-        "Degrees of freedom": html.number(fit.degrees_of_freedom, 5),
+        "Degrees of freedom": number(fit.degrees_of_freedom, 5),
     }
     if posterior is not None:
         group, attributes = posterior.data["posterior"], posterior.data.attrs
@@ -411,12 +421,10 @@ def settings(given: ReportInputs) -> html.Table:
             "Draws": f"{count} ensembles, {chains // count} chains each, {draws} draws per chain",
             "Drawn with": ", ".join(programs),
         }
-    rows = [{"Setting": name, "Value": html.code(value)} for name, value in values.items()]
-    return html.Table("table-settings", "Settings.", rows)
+    return [{"Setting": name, "Value": code(value)} for name, value in values.items()]
 
 
-def versions() -> html.Table:
+def versions() -> Rows:
     """Return the table of the versions of Python and of the packages."""
     values = {"Python": platform.python_version()} | {name: importlib.metadata.version(name) for name in PACKAGES}
-    rows = [{"Program": name, "Version": html.code(value)} for name, value in values.items()]
-    return html.Table("table-versions", "Versions in use when this page was written.", rows)
+    return [{"Program": name, "Version": code(value)} for name, value in values.items()]

@@ -1,4 +1,4 @@
-"""Tables, figures and badges of the page, the formatting of numbers and units, and the template engine."""
+"""Formatting of numbers, units, names and equations, and the template engine."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -8,8 +8,13 @@ from itertools import groupby
 from math import floor, isfinite, isinf, isnan, log10
 from typing import Any
 
+import sympy as sp
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from sympy.printing.mathml import MathMLPresentationPrinter
+from sympy.printing.pretty.pretty_symbology import greek_unicode
+
+from bayesperiodic.models.model import Model
 
 GOOD, CAUTION, BAD, NEUTRAL = "good", "caution", "bad", "neutral"
 # A badge shows its tone by a sign as well as by a colour.
@@ -28,42 +33,22 @@ class Number(str):
     """A formatted number; columns that hold one are aligned to the right."""
 
 
-Row = Mapping[str, str | Markup | Badge]
+Rows = Sequence[Mapping[str, str | Badge]]
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table: rows as mappings from column titles to cells, where the first cell heads the row.
+def columns(rows: Rows) -> list[tuple[str, bool]]:
+    """Return the title of each column, without its common head, and whether it holds numbers.
 
     A title such as "Laplace: sd" places the column "sd" under the common head "Laplace".
     """
-
-    id: str
-    caption: str
-    rows: Sequence[Row]
-
-    @property
-    def columns(self) -> list[tuple[str, bool]]:
-        """The title of each column, and whether it holds numbers."""
-        titles = self.rows[0] if self.rows else ()
-        return [(t.rpartition(": ")[2], any(isinstance(row[t], Number) for row in self.rows)) for t in titles]
-
-    @property
-    def groups(self) -> list[tuple[str, int]]:
-        """The common heads with the number of columns below each; empty without any."""
-        heads = [title.rpartition(": ")[0] for title in (self.rows[0] if self.rows else ())]
-        return [(head, len(list(columns))) for head, columns in groupby(heads)] if any(heads) else []
+    titles = rows[0] if rows else ()
+    return [(title.rpartition(": ")[2], any(isinstance(row[title], Number) for row in rows)) for title in titles]
 
 
-@dataclass(frozen=True)
-class Figure:
-    """An image within the page, with a description for screen readers."""
-
-    id: str
-    source: str
-    alt: str
-    caption: str
-    wide: bool = False
+def heads(rows: Rows) -> list[tuple[str, int]]:
+    """Return the common heads with the number of columns below each; empty without any."""
+    found = [title.rpartition(": ")[0] for title in (rows[0] if rows else ())]
+    return [(head, len(list(columns))) for head, columns in groupby(found)] if any(found) else []
 
 
 def code(name: str) -> Markup:
@@ -77,14 +62,7 @@ SMALLEST, LARGEST = 1e-2, 1e6
 
 
 def number(value: float, digits: int = 3) -> Number:
-    """Format a number with a count of significant digits and a raised power of ten.
-
-    Examples
-    --------
-    >>> from bayesperiodic.reporting.html import number
-    >>> number(-0.5), number(1.2345e-9), number(float("nan"))
-    ('−0.5', '1.23×10⁻⁹', '–')
-    """
+    """Format a number with a count of significant digits and a raised power of ten."""
     if isnan(value):
         return Number(NOTHING)
     if isinf(value):
@@ -113,31 +91,14 @@ def counted(count: int, what: str) -> str:
 
 
 def unit(text: str) -> str:
-    """Format a unit with raised powers, without line breaks.
-
-    Examples
-    --------
-    >>> from bayesperiodic.reporting.html import unit
-    >>> unit("m/s^2"), unit("")
-    ('m/s²', '–')
-    """
+    """Format a unit with raised powers, without line breaks."""
     raised = re.sub(r"\^(-?\d+)", lambda found: found[1].translate(RAISED), text).replace(" ", "\u00a0")
     return raised or NOTHING
 
 
 @dataclass(frozen=True)
 class Rounding:
-    """Common rounding of the values of one quantity: a power of ten and a number of decimals.
-
-    Examples
-    --------
-    >>> from bayesperiodic.reporting.html import Rounding
-    >>> rounding = Rounding.of(768.123, 4.5678)
-    >>> rounding.text(768.123), rounding.text(-4.5678), Rounding.of(5e-3, 2e-6).text(5e-3)
-    ('768.12', '−4.57', '5.00000×10⁻³')
-    >>> Rounding(-3, 1).interval(4e-3, 5.1e-3), Rounding(0, 1).interval(-1.0, 2.0)
-    ('(4.0 … 5.1)×10⁻³', '−1.0 … 2.0')
-    """
+    """Common rounding of the values of one quantity: a power of ten and a number of decimals."""
 
     exponent: int
     decimals: int
@@ -172,6 +133,115 @@ class Rounding:
         return Number(f"({ends}){_power_of_ten(self.exponent)}" if self.exponent else ends)
 
 
+DOTS = ("", "˙", "¨")
+# Space between factors, because some of them are words.
+AS_READ = {
+    "<mo>-</mo>": "<mo>−</mo>",
+    "<mo>&InvisibleTimes;</mo>": '<mo lspace="0.08em" rspace="0.08em">\u2062</mo>',
+    "&ExponentialE;": "e",
+    "&pi;": "π",
+}
+TAGS = {
+    "sign": "sgn", "Max": "max", "Min": "min", "log": "ln",
+    "StrictGreaterThan": "&gt;", "StrictLessThan": "&lt;", "GreaterThan": "≥", "LessThan": "≤", "Unequality": "≠",
+}  # fmt: skip
+
+
+def equations(model: Model) -> list[Markup]:
+    """Return the equations of motion, one per state, with the terms that contain no state on the right-hand side."""
+    printer, states = _Printer(_names(model)), model.state_symbols.values()
+    sides = [equation.as_independent(*states, as_Add=True) for equation in model.equations]
+    return [printer.equation(left, -right) for right, left in sides]
+
+
+def outputs(model: Model) -> list[Markup]:
+    """Return the output equations, one per channel."""
+    printer = _Printer(_names(model))
+    each = zip(model.outputs, model.output_expressions, strict=True)
+    return [printer.equation(sp.Symbol(name), expression) for name, expression in each]
+
+
+def symbol(name: str) -> Markup:
+    """Typeset a name: Greek letters, and digits and the parts after underscores as subscripts."""
+    return Markup(f"<math>{_Printer({}).text(sp.Symbol(name))}</math>")
+
+
+def _names(model: Model) -> dict[sp.Symbol, tuple[str, int]]:
+    """Return the name and the order of the derivative of each symbol."""
+    found = {model.time_symbols["tau"]: ("tau", 0), model.time_symbols["frequency"]: ("f", 0)}
+    found |= {symbol: (name, 0) for name, symbol in model.parameter_symbols.items()}
+    for names, symbols in ((model.states, model.state_symbols), (model.inputs, model.input_symbols)):
+        found |= {symbols["d" * order + name]: (name, order) for name in names for order in range(3)}
+    return found
+
+
+class _Printer(MathMLPresentationPrinter):
+    """Printer of symbols by their names, with dots for time derivatives."""
+
+    def __init__(self, names: dict[sp.Symbol, tuple[str, int]]):
+        super().__init__()
+        self._names = names
+
+    def equation(self, *sides: sp.Expr) -> Markup:
+        """Return a displayed equation."""
+        return Markup(f'<math display="block">{"<mo>=</mo>".join(map(self.text, sides))}</math>')
+
+    def text(self, expression: sp.Expr) -> str:
+        """Return an expression as text, with entities replaced by characters."""
+        text = self._print(expression).toxml()
+        for printed, wanted in AS_READ.items():
+            text = text.replace(printed, wanted)
+        return text
+
+    def node(self, tag: str, *children: Any) -> Any:
+        """Create an element with text or elements in it."""
+        made = self.dom.createElement(tag)
+        for child in children:
+            made.appendChild(self.dom.createTextNode(child) if isinstance(child, str) else child)
+        return made
+
+    def mathml_tag(self, e: Any) -> str:
+        """Return the tag or name of a function, or the sign of a relation."""
+        return TAGS.get(type(e).__name__) or super().mathml_tag(e)
+
+    def _print_Symbol(self, sym: sp.Symbol, style: str = "plain") -> Any:
+        name, order = self._names.get(sym, (sym.name, 0))
+        pieces = re.findall(r"\d+|[^\d_]+", name)
+        base, *below = (greek_unicode.get(piece, piece) for piece in pieces)
+        line = self.node("mi", base)
+        if order:
+            line = self.node("mover", line, self.node("mo", DOTS[order]))
+            line.setAttribute("accent", "true")
+        if not below:
+            return line
+        marks = [self.node("mn" if piece.isdigit() else "mi", piece) for piece in below]
+        return self.node("msub", line, marks[0] if len(marks) == 1 else self.node("mrow", *marks))
+
+    def _print_Float(self, expr: sp.Float) -> Any:
+        mantissa, _, exponent = f"{float(expr):.12g}".partition("e")
+        if not exponent:
+            return self.node("mn", mantissa)
+        power = self.node("msup", self.node("mn", "10"), self.node("mn", str(int(exponent)).replace("-", "−")))
+        return self.node("mrow", self.node("mn", mantissa), self.node("mo", "×"), power)
+
+    def _print_Piecewise(self, expr: sp.Piecewise) -> Any:
+        rows = []
+        for value, condition in expr.args:
+            when = [self.node("mtext", "if\u00a0"), self._print(condition)]
+            if condition is sp.true:
+                when = [self.node("mtext", "otherwise")]
+            rows.append(self.node("mtr", self.node("mtd", self._print(value)), self.node("mtd", *when)))
+        return self.node("mrow", self.node("mo", "{"), self.node("mtable", *rows))
+
+    def _as_ordered_terms(self, expr: sp.Expr, order: Any = None) -> list[sp.Expr]:
+        """Sort terms by their highest derivative, negative ones last."""
+        terms = super()._as_ordered_terms(expr, order)
+        return sorted(terms, key=lambda term: (-self._height(term), term.could_extract_minus_sign()))
+
+    def _height(self, term: sp.Expr) -> int:
+        return max((self._names.get(s, ("", 0))[1] for s in term.free_symbols), default=0)
+
+
 @cache
 def _environment() -> Environment:
     made = Environment(
@@ -182,7 +252,8 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     made.tests["badge"] = lambda value: isinstance(value, Badge)
-    made.globals |= {"signs": SIGNS, "Badge": Badge}
+    made.globals |= {"signs": SIGNS, "Badge": Badge, "columns": columns, "heads": heads}
+    made.globals |= {"equations": equations, "outputs": outputs}
     made.filters |= {"number": number, "percent": percent, "counted": counted}
     return made
 

@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 import bayesperiodic as bp
 from bayesperiodic import _parallel as parallel
-from bayesperiodic.diagnostics import campaigns
-from bayesperiodic.diagnostics.calibration import FILE, summary
-from bayesperiodic.diagnostics.campaigns import Campaign, check_supported, position, replicate
+from bayesperiodic.diagnostics import calibration
+from bayesperiodic.diagnostics.calibration import FILE, Campaign, check_supported, position, replicate, summary
 from tests.known import LINEAR, RUNAWAY, grid, linear_regressors
 from tests.problems import cycle_run
 
@@ -51,7 +50,7 @@ def without_draws(monkeypatch):
     def fails(*_, **__):
         raise RuntimeError("no draws")
 
-    monkeypatch.setattr(campaigns, "sample", fails)
+    monkeypatch.setattr(calibration, "sample", fails)
 
 
 @pytest.mark.slow
@@ -91,14 +90,14 @@ def test_the_variance_is_that_of_the_folded_mean():
     clean = e.project("force", linear_regressors(0.05, 2.0, grid(32)) @ [900.0, 40.0, 25.0])
     squares = []
     for _ in range(200):
-        again, used = campaigns._measured(problem, e, theta, variances, generator)
+        again, used = calibration._measured(problem, e, theta, variances, generator)
         assert again.independent == {"force": 21} and again.synthetic and again.cycles == round(4 * used)
         squares.append(21 * np.mean((again.outputs["force"] - clean) ** 2) / (KNOWN_VARIANCE / used))
     assert np.mean(squares) / 21 == pytest.approx(1.0, abs=5 * np.sqrt(2 / (200 * 21)))
 
 
 def test_a_variance_with_a_proper_prior_is_ranked_too():
-    line = replicate(Campaign(linear(known=False), 1, "source", 2, 8, 250), 0)
+    line = replicate(Campaign(linear(known=False), 1, "source", {"ensembles": 2, "walkers": 8, "max_steps": 250}), 0)
     assert line["status"] == "done" and set(line["mcmc"]) == set(line["laplace"]) == {*PRIORS, "variance[force]"}
     assert line["truth"]["variance[force]"] > 0 and line["number"] == 0 and line["map"] == "converged"
 

@@ -200,6 +200,21 @@ def test_power_scaling_distinguishes_prior_from_likelihood(linear):
     assert table.loc["a", "likelihood_sensitivity"] > 0.05 > table.loc["a", "prior_sensitivity"]
 
 
+def test_weak_motion_at_one_frequency_determines_stiffness_and_mass_only_in_combination():
+    """If the mass is free too, it determines k − m·ω² and little more."""
+    force, truth = {"force": 0.3 * np.cos(2 * np.pi * grid(32))}, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}
+    noise = {"displacement": 0.03}
+    recording = bp.simulate(
+        bp.models.duffing, truth, force, frequency=0.1, duration=400, sampling_rate=4, noise=noise, seed=1
+    )
+    priors = {"m": bp.LogNormal(1, 0.5), "c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)}
+    weak = recording.fold(32, harmonics=3)
+    problem = bp.Problem(bp.models.duffing, [weak], priors=priors, scheme="fourier", fixed={"k3": 0.5})
+    found = bp.identifiability(problem, bp.map_estimate(problem, **QUIET), profile=False)
+    assert found.verdicts == {"m": "only in combination", "c": "determined", "k": "determined"}
+    assert found.table.loc["m", "remedy"] == "fix one of m, k"
+
+
 def test_result_is_saved_and_loaded(linear, tmp_path):
     found = bp.identifiability(*linear, profile=False)
     found.save(tmp_path / "verdict.h5")

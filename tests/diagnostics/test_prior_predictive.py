@@ -77,6 +77,23 @@ def test_well_behaved_prior_gives_no_warnings():
     assert "failed solves" not in repr(found)
 
 
+def test_orbits_on_another_branch_are_distinguished_from_missing_ones():
+    """With a wide prior of k near resonance, two of 50 draws belong to another branch."""
+    force, truth = {"force": np.cos(2 * np.pi * grid(32))}, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}
+    noise = {"displacement": 0.01}
+    recording = bp.simulate(
+        bp.models.duffing, truth, force, frequency=0.2, duration=200, sampling_rate=8, noise=noise, seed=1
+    )
+    priors = {"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 1.5)}
+    fixed = {"m": 1, "k3": 0.5}
+    problem = bp.Problem(bp.models.duffing, [recording.fold(32)], priors=priors, fixed=fixed, scheme="fourier")
+    found = bp.prior_predictive(problem, draws=50, progress=False)
+    assert found.table.loc["all", ["converged", "other orbit", "no orbit"]].tolist() == [0.96, 0.04, 0.0]
+    assert list(found.causes) == [
+        "other orbit (stalled): the branch folds back to another orbit at the same parameters"
+    ]
+
+
 def test_error_names_the_bad_argument_or_the_prior_without_orbits():
     with pytest.raises(ValueError, match="draws: must be .*got 5"):
         bp.prior_predictive(saddle_node(bp.Normal(1.0, 1.0)), draws=5)

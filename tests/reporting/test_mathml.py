@@ -5,7 +5,7 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
-from bayesperiodic.reporting import html, inputs
+from bayesperiodic.reporting import html
 
 
 def shown(markup: str) -> str:
@@ -22,7 +22,7 @@ def equations(*expressions):
         equations=lambda s, p, u: [s.ddx - u.force],
         outputs=lambda s, p, u: {f"y{i}": e(s, p, u) for i, e in enumerate(expressions)},
     )
-    return [shown(row).partition("=")[2] for row in inputs.outputs(model)]
+    return [shown(row).partition("=")[2] for row in html.outputs(model)]
 
 
 @pytest.mark.parametrize(
@@ -38,23 +38,23 @@ def equations(*expressions):
     ],
 )
 def test_names_are_typeset_with_greek_letters_and_subscripts(name, written):
-    assert inputs.symbol(name) == f"<math>{written}</math>"
+    assert html.symbol(name) == f"<math>{written}</math>"
 
 
 def test_derivatives_are_dots_over_the_letter_alone():
-    (row,) = inputs.equations(bp.models.duffing)
+    (row,) = html.equations(bp.models.duffing)
     assert shown(row) == "mx¨+cx˙+kx+k3x3=force"
     assert '<mover accent="true"><mi>x</mi><mo>¨</mo></mover>' in row
     assert (
         '<msub><mover accent="true"><mi>x</mi><mo>¨</mo></mover><mn>1</mn></msub>'
-        in inputs.equations(bp.models.chain(2))[0]
+        in html.equations(bp.models.chain(2))[0]
     )
 
 
 def test_terms_without_states_are_on_the_right_hand_side():
-    assert shown(inputs.equations(bp.models.silverbox)[0]).endswith("=gdrive+u0")
-    assert shown(inputs.equations(bp.models.van_der_pol)[0]) == "x¨−μωx˙(1−x2)+ω2x=0"
-    assert shown(inputs.equations(bp.models.landing_gear())[0]).endswith("=force−θ11")
+    assert shown(html.equations(bp.models.silverbox)[0]).endswith("=gdrive+u0")
+    assert shown(html.equations(bp.models.van_der_pol)[0]) == "x¨−μωx˙(1−x2)+ω2x=0"
+    assert shown(html.equations(bp.models.landing_gear())[0]).endswith("=force−θ11")
 
 
 def test_functions_and_numbers_print_as_they_are_read():
@@ -74,12 +74,12 @@ def test_functions_and_numbers_print_as_they_are_read():
 
 @pytest.mark.parametrize("model", [bp.models.pendulum, bp.models.landing_gear(), bp.models.flutter, bp.models.dahl])
 def test_every_model_gives_sound_markup_that_names_all_its_parameters(model):
-    rows = [*inputs.equations(model), *inputs.outputs(model)]
+    rows = [*html.equations(model), *html.outputs(model)]
     assert not re.search(r"p_|s_d|u_|NaN|&\w+;", "".join(rows).replace("&lt;", "").replace("&gt;", ""))
     whole = "".join(rows)
     used = set().union(*(e.free_symbols for e in (*model.equations, *model.output_expressions)))
     for name, symbol in model.parameter_symbols.items():
-        inner = inputs.symbol(name).removeprefix("<math>").removesuffix("</math>")
+        inner = html.symbol(name).removeprefix("<math>").removesuffix("</math>")
         assert (inner in whole) == (symbol in used)
 
 
@@ -92,3 +92,13 @@ def test_rounding_loses_less_than_a_hundredth_of_a_standard_deviation(value, sd)
         mantissa, _, power = rounding.text(x).replace("−", "-").partition("×10")
         power = power.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
         assert float(mantissa) * 10.0 ** int(power or 0) == pytest.approx(x, abs=0.0051 * sd + 1e-15 * abs(x))
+
+
+def test_numbers_units_and_intervals_have_raised_powers():
+    assert [html.number(x) for x in (-0.5, 1.2345e-9, float("nan"))] == ["−0.5", "1.23×10⁻⁹", "–"]
+    assert [html.unit(text) for text in ("m/s^2", "")] == ["m/s²", "–"]
+    rounding = html.Rounding.of(768.123, 4.5678)
+    assert [rounding.text(768.123), rounding.text(-4.5678)] == ["768.12", "−4.57"]
+    assert html.Rounding.of(5e-3, 2e-6).text(5e-3) == "5.00000×10⁻³"
+    assert html.Rounding(-3, 1).interval(4e-3, 5.1e-3) == "(4.0 … 5.1)×10⁻³"
+    assert html.Rounding(0, 1).interval(-1.0, 2.0) == "−1.0 … 2.0"

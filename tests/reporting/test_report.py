@@ -70,7 +70,7 @@ def test_given_verdicts_are_not_recomputed(solved, scored, tmp_path, monkeypatch
     problem, fit, posterior = solved
     found, predicted = bp.identifiability(problem, fit, profile=False), bp.predict(problem, posterior, draws=20)
     for name in ("compare", "identifiability", "predict"):
-        monkeypatch.setattr(f"bayesperiodic.reporting.inputs.{name}", None)
+        monkeypatch.setattr(f"bayesperiodic.reporting.contents.{name}", None)
     given = {"comparison": replace(scored, coordinates="sampling"), "identifiability": found, "prediction": predicted}
     written = Page(bp.report(problem, fit, posterior, tmp_path / "r.html", **given).read_text(encoding="utf-8"))
     assert "Laplace against MCMC in sampling coordinates" in written.text
@@ -88,7 +88,7 @@ def test_failed_prediction_is_reported(solved, scored, tmp_path, monkeypatch):
     def fail(*_):
         raise RuntimeError("posterior: none of its draws has a periodic solution.")
 
-    monkeypatch.setattr("bayesperiodic.reporting.inputs.predict", fail)
+    monkeypatch.setattr("bayesperiodic.reporting.contents.predict", fail)
     written = Page(bp.report(*solved, tmp_path / "r.html", comparison=scored).read_text(encoding="utf-8"))
     assert written.text.count("none of its draws has a periodic solution") == 2
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from bayesperiodic.diagnostics.campaigns import check_supported
+from bayesperiodic.diagnostics.calibration import check_supported
 from studies.__main__ import main
 from studies.calibration import run as calibration
 from studies.calibration.run import OVERCOUNT
