@@ -1,15 +1,20 @@
-"""Models: differential and output equations in symbolic form."""
+"""Models: differential and output equations in symbolic form, and their time integration."""
 
 from collections.abc import Callable, Iterable, Mapping
-from functools import cached_property
+from functools import cache, cached_property
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
+from bayesperiodic.models.cache import load
 from bayesperiodic.models.code_generation import GridFunction, Kernels, SymbolicModel, VjpKernels
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
+DERIVATIVES = ("", "d", "dd")
 
 
 class Names:
@@ -99,9 +104,8 @@ class Model:
         self.states = _checks.identifiers("states", states, RESERVED)
         self.inputs = _checks.identifiers("inputs", inputs, (*RESERVED, *self.states))
         self.parameters = _checks.identifiers("parameters", parameters, RESERVED)
-        for argument, names in (("states", self.states), ("inputs", self.inputs)):
-            _check_derivative_names(argument, names)
-            _checks.identifiers(argument, [d + n for d in ("", "d", "dd") for n in names], RESERVED)
+        for argument, space, names in (("states", "s", self.states), ("inputs", "u", self.inputs)):
+            _check_derivative_names(argument, space, names)
         if not self.states:
             raise ValueError("states: must have at least one name, got none.")
 
@@ -153,9 +157,8 @@ class Model:
         return given
 
     def _order(self, state: str) -> int:
-        appearing = set().union(*(e.free_symbols for e in self.equations))
-        for order, prefix in ((2, "dd"), (1, "d")):
-            if self.state_symbols[prefix + state] in appearing:
+        for order in (2, 1):
+            if self.state_symbols[DERIVATIVES[order] + state] in _symbols(self.equations):
                 return order
         raise ValueError(
             f"states: must have a derivative in an equation, got {state!r} without one; eliminate it, or add its "
@@ -166,7 +169,7 @@ class Model:
     def autonomous(self) -> bool:
         """True if the equations contain neither inputs nor τ, so that the period is unknown."""
         forcing = {*self.input_symbols.values(), self.time_symbols["tau"]}
-        return not any(e.free_symbols & forcing for e in self.equations)
+        return not _symbols(self.equations) & forcing
 
     @cached_property
     def smooth_signs(self) -> tuple[sp.Expr, ...]:
@@ -211,7 +214,7 @@ class Model:
         return self.symbolic.jacobian_change()
 
     def vjp_kernels(self, moving: tuple[int, ...]) -> VjpKernels:
-        """Return the compiled vector-Jacobian products that gradients need.
+        """Return the compiled vector-Jacobian products of a gradient.
 
         Parameters
         ----------
@@ -232,13 +235,9 @@ class Model:
 
     def input_derivatives(self) -> dict[str, int]:
         """Return the order of the highest time derivative of every input that the model uses."""
-        used = set().union(*(e.free_symbols for e in (*self.equations, *self.output_expressions)))
+        used = _symbols((*self.equations, *self.output_expressions))
         return {
-            name: max(
-                order
-                for order, prefix in enumerate(("", "d", "dd"))
-                if order == 0 or self.input_symbols[prefix + name] in used
-            )
+            name: max(order for order in range(3) if not order or self.input_symbols[DERIVATIVES[order] + name] in used)
             for name in self.inputs
         }
 
@@ -269,8 +268,11 @@ class Model:
         )
 
 
-def _check_derivative_names(argument: str, names: tuple[str, ...]) -> None:
-    space = "s" if argument == "states" else "u"
+def _symbols(expressions: Iterable[sp.Expr]) -> set[sp.Symbol]:
+    return set().union(*(e.free_symbols for e in expressions))
+
+
+def _check_derivative_names(argument: str, space: str, names: tuple[str, ...]) -> None:
     for name in names:
         for derivative in (f"d{name}", f"dd{name}"):
             if derivative in names:
@@ -278,10 +280,58 @@ def _check_derivative_names(argument: str, names: tuple[str, ...]) -> None:
                     f"{argument}: must not contain derivatives, got {derivative!r} and {name!r}; leave {derivative!r} "
                     f"out and write {space}.{derivative}."
                 )
+    _checks.identifiers(argument, [d + n for d in DERIVATIVES for n in names], RESERVED)
 
 
-def _with_derivatives(prefix: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]:
-    return {d + n: sp.Symbol(f"{prefix}_{d}_{n}", real=True) for d in ("", "d", "dd") for n in names}
+def _with_derivatives(space: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]:
+    return {d + n: sp.Symbol(f"{space}_{d}_{n}", real=True) for d in DERIVATIVES for n in names}
+
+
+@cache
+def integration_kernels() -> ModuleType:
+    """Return the compiled functions of time integration."""
+    return load(Path(__file__).with_name("_kernels").joinpath("integrate.py").read_text(encoding="utf-8"))
+
+
+def integrate(
+    model: Model,
+    start: np.ndarray,
+    inputs: np.ndarray,
+    parameters: np.ndarray,
+    *,
+    frequency: float,
+    samples: int,
+    steps: int,
+    kept: int,
+) -> np.ndarray | None:
+    """Integrate by the classical fourth-order Runge-Kutta method; None if the states overflow.
+
+    Parameters
+    ----------
+    model : Model
+    start : array (size,)
+        The states, then the rates of the second-order ones, at tau = 0.
+    inputs : array (2·samples·periods, 3·inputs)
+        u, u̇, ü at half steps over one response period, which is repeated.
+    parameters : array (parameters,)
+    frequency : float
+        Forcing frequency [Hz].
+    samples : int
+        Steps per forcing period.
+    steps, kept : int
+        Steps to take, and how many of the last are returned.
+
+    Returns
+    -------
+    array (kept, size)
+        The states before each of the last steps.
+    """
+    orders = np.array(list(model.orders.values()))
+    path = np.empty((kept, orders.sum()))
+    start, inputs = np.array(start, dtype=float), np.ascontiguousarray(inputs)
+    function = model.kernels.residual_jacobian
+    runge_kutta = integration_kernels().runge_kutta
+    return path if runge_kutta(function, start, inputs, samples, parameters, frequency, orders, steps, path) else None
 
 
 def smooth_sign(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
@@ -296,8 +346,7 @@ def smooth_sign(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
 
     Returns
     -------
-    sympy expression
-        Dimensionless.
+    sympy expression, dimensionless
 
     Raises
     ------
@@ -328,8 +377,7 @@ def smooth_abs(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
 
     Returns
     -------
-    sympy expression
-        In the unit of `x`.
+    sympy expression, in the unit of `x`
 
     Raises
     ------

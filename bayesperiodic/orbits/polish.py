@@ -8,8 +8,7 @@ import numpy as np
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic.models.integrate import integrate
-from bayesperiodic.models.model import Model
+from bayesperiodic.models.model import Model, integrate
 from bayesperiodic.orbits.cycles import shift_between
 from bayesperiodic.orbits.orbit import TURN, Orbit, Orbits, counted_turns, resampled_cycle
 from bayesperiodic.orbits.section import wrapped
