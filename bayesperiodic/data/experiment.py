@@ -137,8 +137,9 @@ class Experiment(Result):
                 _checks.one_of(argument, key, (*self.inputs, *self.outputs))
         measured = points if self.mask is None else int(self.mask.sum())
         counts = {key: min(measured, 2 * self.harmonics.get(key, points) + 1) for key in self.outputs}
-        _checks.same_names("independent", counts | dict(self.independent), self.outputs)
-        object.__setattr__(self, "independent", counts | dict(self.independent))
+        counts |= self.independent
+        _checks.same_names("independent", counts, self.outputs)
+        object.__setattr__(self, "independent", counts)
         self._check_multipliers()
         self._check_covariance(measured * len(self.outputs))
 
@@ -175,9 +176,9 @@ class Experiment(Result):
         matrix = np.asarray(self.covariance, dtype=float)
         size = values if self.multiplier_sd is not None else values + logarithms
         if matrix.shape != (size, size):
+            further = f" and {logarithms} multipliers" if size > values else ""
             raise ValueError(
-                f"covariance: must have shape {(size, size)}, for {values} measured values"
-                f"{f' and {logarithms} multipliers' if size > values else ''}, got {matrix.shape}."
+                f"covariance: must have shape {(size, size)}, for {values} values{further}, got {matrix.shape}."
             )
         if bad := np.count_nonzero(~np.isfinite(matrix)):
             raise ValueError(f"covariance: must be finite and symmetric, got {bad} entries that are not finite.")
@@ -237,21 +238,18 @@ class Experiment(Result):
         ({'x': 3}, [5.0, 3.536, 0.0])
         """
         samples = _checks.integer("samples", samples, 4)
-        signals: dict[str, dict[str, np.ndarray]] = {"outputs": {}, "inputs": {}}
-        highest: dict[str, int] = {}
-        for kind, channels in (("outputs", outputs), ("inputs", inputs or {})):
-            for channel, values in channels.items():
-                amplitudes = _amplitudes(f"{kind}[{channel!r}]", values, samples)
-                signals[kind][channel] = _fourier.on_grid(amplitudes, samples)
-                highest[channel] = amplitudes.size - 1
+        measured, driven = (
+            {channel: _amplitudes(f"{kind}[{channel!r}]", values, samples) for channel, values in given.items()}
+            for kind, given in (("outputs", outputs), ("inputs", inputs or {}))
+        )
         return cls(
             name,
             frequency,
-            signals["outputs"],
-            signals["inputs"],
+            {channel: _fourier.on_grid(amplitudes, samples) for channel, amplitudes in measured.items()},
+            {channel: _fourier.on_grid(amplitudes, samples) for channel, amplitudes in driven.items()},
             samples=samples,
-            harmonics={channel: highest[channel] for channel in outputs},
-            independent={channel: 2 * highest[channel] + 1 for channel in outputs},
+            harmonics={channel: amplitudes.size - 1 for channel, amplitudes in measured.items()},
+            independent={channel: 2 * amplitudes.size - 1 for channel, amplitudes in measured.items()},
         )
 
     @property
@@ -271,15 +269,12 @@ class Experiment(Result):
         ----------
         channel : str
         values : array (…, samples·periods)
-            In the channel's unit.
 
         Returns
         -------
         array (…, samples·periods)
         """
-        if channel not in self.harmonics:
-            return values
-        return _fourier.project(values, self.harmonics[channel])
+        return _fourier.project(values, self.harmonics[channel]) if channel in self.harmonics else values
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
@@ -20,25 +21,13 @@ CROSSING = "crossing"
 
 @dataclass(frozen=True)
 class Signals:
-    """Channels sampled at the same times.
+    """Channels sampled at the same times."""
 
-    Attributes
-    ----------
-    name : str
-        Of the recording, for messages.
-    time : array (samples,)
-    channels : tuple of str
-        Inputs first.
-    values : array (channels, samples)
-    inputs : int
-        Number of inputs.
-    """
-
-    name: str
-    time: np.ndarray
-    channels: tuple[str, ...]
-    values: np.ndarray
-    inputs: int
+    name: str  # of the recording, for messages
+    time: np.ndarray  # (samples,)
+    channels: tuple[str, ...]  # inputs first
+    values: np.ndarray  # (channels, samples)
+    inputs: int  # number of inputs
 
     def __post_init__(self) -> None:
         for i, (channel, values) in enumerate(zip(self.channels, self.values, strict=True)):
@@ -57,37 +46,24 @@ class Signals:
 
 @dataclass(frozen=True)
 class HarmonicFit:
-    """A Fourier series fitted to several channels.
+    """A Fourier series fitted to several channels."""
 
-    Attributes
-    ----------
-    frequency : float
-        Fundamental frequency [Hz].
-    amplitudes : array (channels, harmonics + 1), complex
-        As in `_fourier`, with phases relative to time 0.
-    residuals : array (channels, samples)
-    """
-
-    frequency: float
-    amplitudes: np.ndarray
-    residuals: np.ndarray
-
-    @property
-    def degrees_of_freedom(self) -> int:
-        """Samples less fitted coefficients, at least 1."""
-        return max(self.residuals.shape[1] - (2 * self.amplitudes.shape[1] - 1), 1)
+    frequency: float  # fundamental frequency [Hz]
+    amplitudes: np.ndarray  # complex, as in `_fourier`, with phases relative to time 0, (channels, harmonics + 1)
+    residuals: np.ndarray  # (channels, samples)
 
     @property
     def variances(self) -> np.ndarray:
         """Residual variance of each channel, (channels,)."""
-        return np.sum(self.residuals**2, axis=1) / self.degrees_of_freedom
+        degrees_of_freedom = max(self.residuals.shape[1] - (2 * self.amplitudes.shape[1] - 1), 1)
+        return np.sum(self.residuals**2, axis=1) / degrees_of_freedom
 
 
 def fit_harmonics(time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int) -> HarmonicFit:
     """Fit harmonics 0 … `harmonics` of `frequency` to channels (channels, samples) by least squares.
 
-    The matrix of the normal equations of the exponentials exp(2πi h f t), h = −H … H, is Hermitian Toeplitz, and well
-    conditioned if the samples resolve the highest harmonic.
+    The normal matrix of exp(2πi h f t), h = −H … H, is Hermitian Toeplitz, and well conditioned if the samples resolve
+    the highest harmonic.
     """
     turn = np.exp(-2j * np.pi * frequency * time)
     power = np.ones_like(turn)
@@ -195,53 +171,24 @@ def _largest_equivalent(time: np.ndarray, channels: np.ndarray, frequency: float
     return frequency
 
 
-@dataclass(frozen=True)
-class CycleScatter:
-    """Differences between the cycles of one channel and their mean, by harmonic.
+class CycleScatter(NamedTuple):
+    """Variances of one channel's complex amplitudes, (harmonics + 1,) each."""
 
-    Attributes
-    ----------
-    one_cycle : array (harmonics + 1,)
-        Variance E|c − c̄|² of one cycle's complex amplitude.
-    mean : array (harmonics + 1,)
-        Variance of the mean's complex amplitude, corrected for correlation between successive cycles.
-    """
-
-    one_cycle: np.ndarray
-    mean: np.ndarray
+    one_cycle: np.ndarray  # E|c − c̄|² of one cycle
+    mean: np.ndarray  # of the mean, corrected for correlation between successive cycles
 
 
 @dataclass(frozen=True)
 class MeanPeriod:
-    """Mean period of steady signals.
+    """Mean period of steady signals; see `Experiment` for the meaning of most fields."""
 
-    Attributes
-    ----------
-    frequency, frequency_se : float
-        Fundamental frequency and its standard error [Hz].
-    amplitudes : dict of str to array (harmonics + 1,), complex
-        Harmonics that each channel keeps, phases relative to the origin.
-    sd : dict of str to float
-        Standard deviation of one cycle about the mean, within the kept harmonics.
-    amplitude_variance : dict of str to array (harmonics + 1,)
-        Variance of the mean's amplitudes.
-    cycles, samples : int
-        Numbers of cycles and samples used.
-    periodicity : float
-        Fraction of the variance that the mean period explains, of the channel with the smallest one.
-    drift : dict of str to float
-        Relative growth of each channel's fundamental over the signals.
-    origin : float
-        Time [s] at which τ = 0.
-    """
-
-    frequency: float
-    frequency_se: float
-    amplitudes: dict[str, np.ndarray]
-    sd: dict[str, float]
+    frequency: float  # fundamental frequency [Hz]
+    frequency_se: float  # its standard error [Hz]
+    amplitudes: dict[str, np.ndarray]  # complex, those that each channel keeps, phases relative to the origin
+    scatter: dict[str, float]
     amplitude_variance: dict[str, np.ndarray]
     cycles: int
-    samples: int
+    samples: int  # number of measured samples used
     periodicity: float
     drift: dict[str, float]
     origin: float
@@ -250,7 +197,6 @@ class MeanPeriod:
 def mean_period(
     signals: Signals,
     points: int,
-    *,
     frequency: float | None,
     periods: int,
     harmonics: int | Mapping[str, int] | None,
@@ -288,7 +234,7 @@ def mean_period(
         frequency=fit.frequency,
         frequency_se=fundamental_se,
         amplitudes={channel: amplitudes[i, own] for i, (channel, own) in enumerate(used.items())},
-        sd={c: float(np.sqrt(_power(scatter[i].one_cycle[own]))) for i, (c, own) in enumerate(used.items())},
+        scatter={c: float(np.sqrt(_power(scatter[i].one_cycle[own]))) for i, (c, own) in enumerate(used.items())},
         amplitude_variance={channel: scatter[i].mean[own] for i, (channel, own) in enumerate(used.items())},
         cycles=cycles,
         samples=steady.time.size,

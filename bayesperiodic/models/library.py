@@ -1,6 +1,7 @@
 """Library of models; ``help(bayesperiodic.models.pendulum)`` shows the equations and the source of one."""
 
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import sympy as sp
@@ -63,9 +64,7 @@ dahl = Model(
 def _pendulum(s: Any, p: Any, u: Any) -> list[sp.Expr]:
     inertia, omega = p.m * p.l**2, 2 * sp.pi * s.frequency
     friction = p.k1 * smooth_sign(s.dphi, p.v0) + p.k2 * s.dphi + p.k3 * s.dphi * abs(s.dphi)
-    return [
-        s.ddphi + friction / inertia + (p.g + p.a * omega**2 * sp.cos(2 * sp.pi * s.tau)) / p.l * sp.sin(s.phi),
-    ]
+    return [s.ddphi + friction / inertia + (p.g + p.a * omega**2 * sp.cos(2 * sp.pi * s.tau)) / p.l * sp.sin(s.phi)]
 
 
 pendulum = Model(
@@ -156,22 +155,10 @@ van_der_pol = Model(
 )
 
 _GEAR_UNITS = {
-    "theta1": "kg",
-    "theta2": "m/s^2",
-    "theta3": "N s^2/m^2",
-    "theta4": "m^2",
-    "theta5": "Pa/K",
-    "theta6": "1/m",
-    "theta7": "1/K",
-    "theta8": "N",
-    "theta9": "m^2",
-    "theta10": "s/m",
-    "theta11": "N",
-    "theta12": "m",
-    "theta15": "J/K",
-    "theta16": "W/K",
-    "theta17": "K",
-}
+    "theta1": "kg", "theta2": "m/s^2", "theta3": "N s^2/m^2", "theta4": "m^2", "theta5": "Pa/K", "theta6": "1/m",
+    "theta7": "1/K", "theta8": "N", "theta9": "m^2", "theta10": "s/m", "theta11": "N", "theta12": "m",
+    "theta15": "J/K", "theta16": "W/K", "theta17": "K",
+}  # fmt: skip
 _GEAR_CHANNELS = {"displacement": "m", "force": "N", "pressure": "Pa", "q": "m", "T": "K"}
 
 
@@ -231,28 +218,26 @@ def landing_gear(drive: str = "force") -> Model:
 def _landing_gear(drive: str) -> Model:
     forced = drive == "force"
 
-    def motion(s: Any, p: Any, u: Any) -> tuple[sp.Expr, sp.Expr, sp.Expr]:
-        return (s.q, s.dq, s.ddq) if forced else (u.displacement - p.theta12, u.ddisplacement, u.dddisplacement)
-
-    def pressure(s: Any, p: Any, u: Any) -> sp.Expr:
-        q, _, _ = motion(s, p, u)
-        return p.theta5 * s.T / (1 + p.theta6 * q + p.theta7 * s.T)
-
-    def force(s: Any, p: Any, u: Any) -> sp.Expr:
-        _, v, a = motion(s, p, u)
-        gas = pressure(s, p, u)
+    def terms(s: Any, p: Any, u: Any) -> tuple[sp.Expr, sp.Expr, sp.Expr]:
+        """Return pressure, force and the energy balance."""
+        q, v, a = (s.q, s.dq, s.ddq) if forced else (u.displacement - p.theta12, u.ddisplacement, u.dddisplacement)
+        gas = p.theta5 * s.T / (1 + p.theta6 * q + p.theta7 * s.T)
         friction = (p.theta8 + p.theta9 * gas) * sp.atan(p.theta10 * v)
-        return p.theta1 * (a + p.theta2) + p.theta3 * v * abs(v) + p.theta4 * gas + friction + p.theta11
+        force = p.theta1 * (a + p.theta2) + p.theta3 * v * abs(v) + p.theta4 * gas + friction + p.theta11
+        conduction = p.theta16 * (1 + p.theta6 * q) * (s.T + p.theta17)
+        return gas, force, p.theta15 * s.dT + conduction - (p.theta4 * gas + p.theta11) * v
 
     def equations(s: Any, p: Any, u: Any) -> list[sp.Expr]:
-        q, v, _ = motion(s, p, u)
-        conduction = p.theta16 * (1 + p.theta6 * q) * (s.T + p.theta17)
-        energy = p.theta15 * s.dT + conduction - (p.theta4 * pressure(s, p, u) + p.theta11) * v
-        return [force(s, p, u) - u.force, energy] if forced else [energy]
+        _, force, energy = terms(s, p, u)
+        return [force - u.force, energy] if forced else [energy]
 
     def outputs(s: Any, p: Any, u: Any) -> dict[str, sp.Expr]:
-        measured = {"displacement": s.q + p.theta12} if forced else {"force": force(s, p, u)}
-        return measured | {"pressure": pressure(s, p, u)}
+        pressure, force, _ = terms(s, p, u)
+        return (
+            {"displacement": s.q + p.theta12, "pressure": pressure}
+            if forced
+            else {"force": force, "pressure": pressure}
+        )
 
     names = ["q", "T", "force", "displacement", "pressure"] if forced else ["T", "displacement", "force", "pressure"]
     return Model(
@@ -316,10 +301,8 @@ def _chain(masses: int) -> Model:
     def equations(s: Any, p: Any, u: Any) -> list[sp.Expr]:
         x = [sp.S.Zero, *(getattr(s, name) for name in states)]
         v = [sp.S.Zero, *(getattr(s, f"d{name}") for name in states)]
-        pull = [
-            p.c * (v[i] - v[i - 1]) + p.k * (x[i] - x[i - 1]) + p.k3 * (x[i] - x[i - 1]) ** 3
-            for i in range(1, masses + 1)
-        ]
+        elongation, rate = ([b - a for a, b in pairwise(values)] for values in (x, v))
+        pull = [p.c * de + p.k * e + p.k3 * e**3 for e, de in zip(elongation, rate, strict=True)]
         pull.append(u.force)
         return [p.m * getattr(s, f"dd{name}") + pull[i] - pull[i + 1] for i, name in enumerate(states)]
 
@@ -377,30 +360,16 @@ def _flutter(s: Any, p: Any, u: Any) -> list[sp.Expr]:
     return [heave, pitch, wake]
 
 
+_FLUTTER_UNITS = {
+    "U": "m/s", "b": "m", "a": "1", "span": "m", "rho": "kg/m^3", "x_alpha": "1", "m": "kg", "m_T": "kg",
+    "I_alpha": "kg m^2", "c_h": "N s/m", "c_alpha": "N m s", "k_h": "N/m", "k_alpha": "N m", "k_alpha2": "N m",
+    "k_alpha3": "N m", "gain_heave": "1/m", "gain_pitch": "1", "offset_heave": "1", "offset_pitch": "1",
+}  # fmt: skip
+
 flutter = Model(
     "flutter",
     states=["h", "alpha", "w"],
-    parameters={
-        "U": "m/s",
-        "b": "m",
-        "a": "1",
-        "span": "m",
-        "rho": "kg/m^3",
-        "x_alpha": "1",
-        "m": "kg",
-        "m_T": "kg",
-        "I_alpha": "kg m^2",
-        "c_h": "N s/m",
-        "c_alpha": "N m s",
-        "k_h": "N/m",
-        "k_alpha": "N m",
-        "k_alpha2": "N m",
-        "k_alpha3": "N m",
-        "gain_heave": "1/m",
-        "gain_pitch": "1",
-        "offset_heave": "1",
-        "offset_pitch": "1",
-    },
+    parameters=_FLUTTER_UNITS,
     units={"h": "m", "alpha": "rad", "w": "s", "heave": "1", "pitch": "1"},
     equations=_flutter,
     outputs=lambda s, p, u: {

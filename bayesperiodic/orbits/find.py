@@ -61,8 +61,8 @@ def find_orbits(
     product of the derivatives along the chain. Covariances are sandwich estimates over runs of consecutive points and
     include the estimated bias.
 
-    "boxes": the method of [1]_ as a baseline: boxes of 1 % of the attractor, recurrence to the same or an adjacent box,
-    and one linear fit of the map over the whole period. Noise and curvature bias its eigenvalues.
+    "boxes": the method of [1]_ as a baseline: recurrence to the same or an adjacent box of the section, and one linear
+    fit of the map over the whole period. Noise and curvature bias its eigenvalues.
 
     Parameters
     ----------
@@ -145,8 +145,7 @@ def _scaled(section: PoincareSection, neighbours: int) -> _ScaledSection:
     maps = ReturnMap(points[:-1], section.increments / size, turn, section.winds, noise)
     check_chaos(maps, points)
     if section.noise is None:
-        noise = estimate_noise(maps, neighbours)
-        maps = ReturnMap(points[:-1], section.increments / size, turn, section.winds, noise)
+        maps.noise = estimate_noise(maps, neighbours)
     return _ScaledSection(points, size, maps)
 
 

@@ -17,7 +17,7 @@ from bayesperiodic.periodic.solution import PeriodicSolution
 if TYPE_CHECKING:
     import pandas as pd
 
-# A harmonic is significant above this multiple of the median amplitude of the spectrum's upper half.
+# The last significant harmonic exceeds this multiple of the median amplitude of the spectrum's upper half.
 NOISE_FLOOR = 5.0
 # Largest bias of an eigenvalue that is used as data, in standard deviations.
 MOST_BIAS = 0.5
@@ -45,13 +45,11 @@ class Orbit(Result):
     period : int
         Prime period in forcing periods.
     winding : int or None
-        Turns of the angle per response period; None if the section does not determine it, 0 if no coordinate is an
-        angle.
+        Turns of the angle per response period, 0 without an angle; None if the section does not determine it.
     points : array (period, 2)
         Section values at tau = 0, 1, …, angles in (−π, π].
     joint_covariance : array (2·period + 2, 2·period + 2)
-        Of the points, point by point, and of log|eigenvalue|, largest first; NaN for eigenvalues that are not
-        estimated.
+        Of the points, point by point, and of log|eigenvalue|, largest first; NaN where not estimated.
     eigenvalues : array (2,)
         Of the linearised return map over the period, largest modulus first, real or complex.
     eigenvalue_bias : array (2,)
@@ -137,8 +135,8 @@ class Orbit(Result):
             Grid points per forcing period.
         multipliers : bool
             Compare the unstable eigenvalues too, as log|μ| with fixed sign and with their covariance with the points.
-            One that is complex, not estimated, or whose bias exceeds half its standard deviation is left out, and so is
-            every smaller one.
+            One that is complex, not estimated, or whose bias exceeds half its standard deviation is left out, and so
+            are all smaller ones.
         whole : bool
             Compare all samples of the measured cycle instead, with a variance per channel. The measured cycle is a
             close return and does not close exactly; the gap counts as noise.
@@ -223,12 +221,11 @@ class Orbits(Result):
 
     @property
     def table(self) -> pd.DataFrame:
-        """One row per orbit, followed by the rejected candidates with the reason.
+        """One row per orbit, followed by the rejected candidates with the reason in the column `rejected`.
 
-        Columns: name, period, winding (missing if unknown), returns, quality, multiplier and contraction (the two
-        eigenvalues), their standard deviations (NaN: not estimated), `estimated` (whether that of the multiplier is),
-        modulus of the multiplier, largest standard deviation of a point in the first and in the second coordinate,
-        the partner's name, equilibrium, rejected (the reason, empty for accepted orbits).
+        `winding` is missing if unknown; `multiplier` and `contraction` are the two eigenvalues, whose standard
+        deviations are NaN if not estimated; `sd_first` and `sd_second` are the largest standard deviations of a point
+        in the two coordinates.
         """
         import pandas as pd
 
@@ -260,15 +257,13 @@ def counted_turns(orbit: Orbit) -> int | None:
     """Return the winding number counted in the section or in its measured cycle; None if neither determines it."""
     if orbit.winding is not None or orbit.cycle is None:
         return orbit.winding
-    turns = [round(float(_end(orbit.cycle[name]) - orbit.cycle[name][0]) / TURN) for name in orbit.angles]
-    return int(turns[0]) if turns else 0
+    return sum(round(float(_end(orbit.cycle[name]) - orbit.cycle[name][0]) / TURN) for name in orbit.angles)
 
 
 def resampled_cycle(orbit: Orbit, winding: int, samples: int) -> np.ndarray:
     """Return the measured cycle (samples·period, 2) on another grid, closed, with its significant harmonics only.
 
-    The gap between its end and its start is distributed over the cycle. Harmonics above the last one that exceeds five
-    times the median amplitude of the upper half of the spectrum are removed.
+    The gap between its end and its start is distributed over the cycle.
     """
     assert orbit.cycle is not None
     tau, columns = np.arange(samples * orbit.period) / samples, []
@@ -293,7 +288,6 @@ def _on_grid(values: np.ndarray, points: int) -> np.ndarray:
 
 
 def _measured_cycle(orbit: Orbit, samples: int) -> Mapping[str, np.ndarray]:
-    """Return the measured cycle, whose samples are grid points."""
     if orbit.cycle is None:
         raise ValueError(f"whole: must be False, got True; {orbit.name!r} has no measured cycle.")
     measured = len(orbit.cycle[orbit.coordinates[0]]) // orbit.period

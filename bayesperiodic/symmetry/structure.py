@@ -9,7 +9,7 @@ import sympy as sp
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic.models.model import Model
-from bayesperiodic.symmetry.determining import Generator, determining_equations, generators_of
+from bayesperiodic.symmetry.determining import Generator, System, determining_equations, generators_of, system_of
 from bayesperiodic.symmetry.invariants import (
     Directions,
     Flow,
@@ -19,7 +19,6 @@ from bayesperiodic.symmetry.invariants import (
     flow_of,
     verified,
 )
-from bayesperiodic.symmetry.system import System, system_of
 
 
 @dataclass(frozen=True)
@@ -181,14 +180,7 @@ def _listed(names: Sequence[str], conjunction: str) -> str:
 
 
 def written(expression: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
-    """Return an expression as text such as "k1/(m*l**2)".
-
-    Parameters
-    ----------
-    expression : expression
-    names : dict
-        Symbol -> name, in the order of factors and terms.
-    """
+    """Return an expression as text such as "k1/(m*l**2)", with factors and terms in the order of the names."""
     order = {symbol: place for place, symbol in enumerate(names)}
     number, rest = sp.factor_terms(expression).as_coeff_Mul()
     negative = number.is_negative
@@ -308,14 +300,15 @@ def structure(
     whole = system_of(model, measured)
     system = whole.given(known, {whole.parameters[name]: sp.S.Zero for name in zeros})
     for name in zeros:
-        if any(e.has(sp.zoo, sp.nan, sp.oo) for e in (*system.equations, *system.outputs.values())):
+        if any(e.has(sp.zoo, sp.nan, sp.oo) for e in system.expressions):
             raise ValueError(f"fixed: must not be zero if the equations divide by it, got {name} = 0.")
     return analyse_structure(model.name, system, known)
 
 
 def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Structure:
     """Return the structure of a symbolic system, whose parameters may have been replaced by expressions."""
-    system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if n in whole.appearing})
+    used = whole.used
+    system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if s in used})
     names = {s: n for n, s in (whole.parameters | whole.known).items()}
     kinds, generators, flows = _symmetries(system)
     directions = directions_of(system, generators)
@@ -351,7 +344,7 @@ def _symmetries(system: System) -> tuple[list[str], list[Generator], list[Flow |
 
 
 def _kind(generator: Generator) -> str:
-    if generator.weights:
+    if generator.scaling:
         return "scaling"
     constant = any(move.is_number for move in (*generator.parameters.values(), *generator.states.values()))
     return "shift" if constant else "other"

@@ -7,8 +7,8 @@ import sympy as sp
 from bayesperiodic._expressions import parse
 from bayesperiodic.symmetry import determining
 from bayesperiodic.symmetry.determining import Algebra
+from bayesperiodic.symmetry.invariants import differentiated, series
 from bayesperiodic.symmetry.structure import written
-from bayesperiodic.symmetry.system import differentiated, series
 
 x, y, a, b = sp.symbols("x y a b", real=True)
 
