@@ -25,10 +25,8 @@ class Experiment(Result):
         Forcing frequency [Hz].
     outputs, inputs : mapping of str to array (samples·periods,)
         Values on the grid, end point excluded.
-    samples : int
-        Grid points per forcing period.
-    periods : int
-        Forcing periods per response period.
+    samples, periods : int
+        Grid points per forcing period, and forcing periods per response period.
     winding : int or mapping of str to int
         Turns of an angle per response period.
     scatter : mapping of str to float, optional
@@ -59,10 +57,9 @@ class Experiment(Result):
     covariance : array (values, values) or (values + multipliers, values + multipliers), optional
         Covariance of the outputs at the points of the mask, point by point and in the order of `outputs` within a
         point, up to one unknown factor ("scale"). It may have further rows for the logarithms of ``multipliers``.
-    multipliers : array (multipliers,), optional
-        Measured Floquet multipliers, real and signed, largest modulus first; they are compared as log|μ|.
-    multiplier_sd : array (multipliers,), optional
-        Standard deviations of log|μ|, if ``covariance`` has no rows for them.
+    multipliers, multiplier_sd : array (multipliers,), optional
+        Measured Floquet multipliers, real and signed, largest modulus first, which are compared as log|μ|, and the
+        standard deviations of log|μ|, if ``covariance`` has no rows for them.
     guess : mapping of str to array (samples·periods,), optional
         States of the model, including turns of angles, from which the first periodic solve starts; by default the
         equilibrium. An unstable orbit needs a guess.
@@ -206,7 +203,7 @@ class Experiment(Result):
         *,
         samples: int = 800,
     ) -> "Experiment":
-        """Make an experiment from harmonic amplitudes instead of time histories.
+        """Make an experiment from harmonic amplitudes.
 
         Parameters
         ----------
@@ -227,8 +224,8 @@ class Experiment(Result):
         Raises
         ------
         ValueError
-            For amplitudes that are not a finite vector, a mean that is not real, too few samples for the highest
-            harmonic, and as for `Experiment`.
+            As for `Experiment`, and for amplitudes that are not a finite vector, a mean that is not real, too few
+            samples for the highest harmonic.
 
         Examples
         --------

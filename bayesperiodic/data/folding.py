@@ -89,8 +89,7 @@ def refine_frequency(
 
     Gauss-Newton iteration for the fundamental, with the amplitudes projected out and every channel weighted by its
     residual variance. The standard error is robust to correlation within a cycle, because the scores are summed over
-    each cycle before they are squared; it is at least that for independent samples. The slope contains the largest
-    harmonic and those whose squared amplitude is ten times its noise; noise in the others would count as information.
+    each cycle before they are squared; it is at least that for independent samples.
     """
     for _ in range(iterations):
         fit, slope, weights = _linearised(time, channels, frequency, harmonics)
@@ -113,6 +112,7 @@ def _linearised(
     fit = fit_harmonics(time, channels, frequency, harmonics)
     noise = 4.0 * fit.variances[:, None] / time.size
     power = np.abs(fit.amplitudes) ** 2
+    # The slope contains the largest and the significant harmonics; noise in the others would count as information.
     largest = power[:, 1:].max(axis=1, keepdims=True)
     clear = np.where((power > SIGNIFICANT_POWER * noise) | (power == largest), fit.amplitudes, 0.0)
     rate = _fourier.derivative(clear, 1.0)
@@ -125,8 +125,7 @@ def _linearised(
 def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
     """Estimate the fundamental frequency [Hz] from the autocorrelation; None if it has no positive peak.
 
-    The lag is the smallest one whose peak reaches 90 % of the highest. A multiple of its frequency is preferred if it
-    explains the signals equally well.
+    The lag is the smallest one whose peak reaches 90 % of the highest.
     """
     samples = time.size
     step = (time[-1] - time[0]) / (samples - 1)
@@ -154,6 +153,7 @@ def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
 
 
 def _largest_equivalent(time: np.ndarray, channels: np.ndarray, frequency: float) -> float:
+    """Return the largest multiple of a frequency that explains the signals equally well."""
     last = time >= time[-1] - 6.0 / frequency
     time, channels = time[last], channels[:, last]
     nyquist = 0.5 * (time.size - 1) / np.ptp(time)
@@ -204,7 +204,9 @@ def mean_period(
     largest_drift: float | None,
 ) -> MeanPeriod:
     """Estimate the mean period of the steady part of signals; see `Recording.fold`."""
-    start = _checked_origin(origin)
+    if isinstance(origin, str) and origin != CROSSING:
+        raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
+    start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
     signals = replace(signals, time=signals.time - start)
     fundamental = _first_guess(signals, frequency, periods)
     if frequency is None:
@@ -221,13 +223,13 @@ def mean_period(
     periodicity = _periodicity(steady, fit)
     cycles = round(np.ptp(steady.time) * fit.frequency)
     scatter = [_cycle_scatter(steady.time, fit, channel, cycles) for channel in range(len(signals.channels))]
-    kept = {
-        channel: _last_significant(fit.amplitudes[i], scatter[i].mean, cycles)
-        for i, channel in enumerate(signals.channels)
-    } | _chosen(harmonics, signals.channels, limit)
+    significant = [_last_significant(a, own.mean, cycles) for a, own in zip(fit.amplitudes, scatter, strict=True)]
+    kept = dict(zip(signals.channels, significant, strict=True)) | _chosen(harmonics, signals.channels, limit)
     amplitudes = fit.amplitudes
     if origin == CROSSING:
-        start = _crossing(amplitudes[signals.inputs, 1], fit.frequency)
+        # The first time ≥ 0 at which the fundamental of the first output crosses zero upwards.
+        phase = np.angle(amplitudes[signals.inputs, 1]) / (2 * np.pi)
+        start = float((-0.25 - phase) % 1.0 / fit.frequency)
         amplitudes = amplitudes * np.exp(2j * np.pi * fit.frequency * start * np.arange(amplitudes.shape[1]))
     used = {channel: slice(kept[channel] + 1) for channel in signals.channels}
     return MeanPeriod(
@@ -244,18 +246,11 @@ def mean_period(
     )
 
 
-def _checked_origin(origin: float | str) -> float:
-    """Return the time of τ = 0 [s]; 0 if a crossing defines it later."""
-    if origin == CROSSING:
-        return 0.0
-    if isinstance(origin, str):
-        raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
-    return _checks.finite_number("origin", origin)
-
-
 def _first_guess(signals: Signals, frequency: float | None, periods: int) -> float:
+    remedy = "give the forcing frequency"
     if frequency is not None:
         fundamental: float | None = _checks.positive("frequency", frequency) / periods
+        remedy = f"check frequency = {frequency!r} Hz and periods = {periods}"
     elif signals.inputs:
         guess = guess_frequency(signals.time, signals.values[: signals.inputs])
         fundamental = guess / periods if guess else None
@@ -263,11 +258,9 @@ def _first_guess(signals: Signals, frequency: float | None, periods: int) -> flo
         fundamental = guess_frequency(signals.time, signals.values)
     if fundamental is None or _cycles(signals.time, fundamental) < MINIMUM_CYCLES:
         found = "no period" if fundamental is None else f"{_cycles(signals.time, fundamental):.2f} cycles"
-        remedy = f"check frequency = {frequency!r} Hz and periods = {periods}"
         raise ValueError(
             f"recording: must have at least {MINIMUM_CYCLES} cycles, got {found} in {signals.name!r} of "
-            f"{np.ptp(signals.time):g} s; record longer, or "
-            f"{'give the forcing frequency' if frequency is None else remedy}."
+            f"{np.ptp(signals.time):g} s; record longer, or {remedy}."
         )
     return fundamental
 
@@ -302,10 +295,9 @@ def _resolved(time: np.ndarray, fundamental: float, points: int) -> int:
 
 
 def _cycles_apart(signals: Signals, fundamental: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cycle of each sample, counted back from the end, and the amplitudes of the whole cycles.
+    """Return the cycle of each sample, counted back from the end, and the amplitudes of the whole cycles, last first.
 
-    The amplitudes (cycles, channels, harmonics + 1) are relative to each channel's standard deviation; the last cycle
-    comes first.
+    The amplitudes (cycles, channels, harmonics + 1) are relative to each channel's standard deviation.
     """
     time, values = signals.time, signals.values
     period = 1.0 / fundamental
@@ -334,11 +326,6 @@ def _refuse_drift(name: str, drift: Mapping[str, float], largest: float | None) 
             f"{drift[worst]:+.1%}, more than largest_drift = {largest:.1%}; leave it out, or select a steady part with "
             "`between`."
         )
-
-
-def _crossing(amplitude: complex, frequency: float) -> float:
-    """Return the first time ≥ 0 at which the signal Re a·exp(2πi f t) crosses zero upwards."""
-    return float((-0.25 - np.angle(amplitude) / (2 * np.pi)) % 1.0 / frequency)
 
 
 def _steady_part(cycle: np.ndarray, shape: np.ndarray) -> np.ndarray:

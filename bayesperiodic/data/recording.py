@@ -149,7 +149,7 @@ class Recording(Result):
     ------
     ValueError
         For fewer than two samples, samples that are NaN or infinite, different lengths, a time that does not increase,
-        no output, names that are not identifiers or are repeated.
+        no output, names that are repeated or not identifiers.
 
     Examples
     --------
@@ -217,14 +217,7 @@ class Recording(Result):
         Raises
         ------
         ValueError
-            For samples that are NaN or infinite, different lengths, or a time that does not increase.
-
-        Examples
-        --------
-        >>> import numpy as np, bayesperiodic as bp
-        >>> t = np.arange(1000) / 100
-        >>> bp.Recording.from_arrays(t, {"angle": np.sin(2 * np.pi * 1.3 * t)}).sampling_rate
-        100.0
+            As for `Recording`.
         """
         measured = _checks.mapping("outputs", outputs, "{'force': values}")
         given = _checks.mapping("inputs", {} if inputs is None else inputs, "{'force': values}")
@@ -267,8 +260,8 @@ class Recording(Result):
         FileNotFoundError
             If there is no such file.
         ValueError
-            For a missing column, a cell that is not a number, NaN or infinite samples, a time that does not increase,
-            both or neither of ``time`` and ``sampling_rate``, an unknown unit.
+            As for `Recording`, and for a missing column, a cell that is not a number, both or neither of ``time`` and
+            ``sampling_rate``, an unknown unit.
 
         Examples
         --------
@@ -354,9 +347,9 @@ class Recording(Result):
         units: Units | None,
         name: str | None,
     ) -> "Recording":
-        inputs, units = {} if inputs is None else inputs, units or {}
-        _checks.mapping("outputs", outputs, "{'force': 'the column of the force'}")
-        _checks.mapping("inputs", inputs, "{'force': 'the column of the force'}")
+        example = "{'force': 'the column of the force'}"
+        _checks.mapping("outputs", outputs, example)
+        inputs, units = _checks.mapping("inputs", {} if inputs is None else inputs, example), units or {}
         if (time is None) == (sampling_rate is None):
             raise ValueError(f"time: must be given or sampling_rate, and not both, got {time!r} and {sampling_rate!r}.")
         for key in units:
@@ -368,13 +361,12 @@ class Recording(Result):
             values = _checks.finite_vector(f"{key} (column {column!r} of {Path(path).name})", columns[column])
             return convert(key, values, units[key]) if key in units else values
 
-        signals = {key: channel(key, column) for key, column in (*outputs.items(), *inputs.items())}
+        measured, given = ({key: channel(key, name) for key, name in kind.items()} for kind in (outputs, inputs))
         if time:
             seconds = channel("time", time)
         else:
-            samples = next(iter(signals.values())).size if signals else 0
+            samples = next((values.size for values in (measured | given).values()), 0)
             seconds = np.arange(samples) / _checks.positive("sampling_rate", sampling_rate)
-        measured, given = ({key: signals[key] for key in kind} for kind in (outputs, inputs))
         return cls(seconds, measured, given, name or Path(path).stem)
 
     def between(self, start: float, stop: float) -> "Recording":
@@ -435,8 +427,7 @@ class Recording(Result):
             Time [s] at which τ = 0. "crossing", for autonomous systems, whose phase is arbitrary: the first time >= 0
             at which the fundamental of the first output crosses zero upwards.
         largest_drift : float, optional
-            Limit of the relative change of a channel's fundamental over the recording, by linear regression on the
-            amplitudes of the cycles. By default there is no limit.
+            Limit of the relative change of a channel's fundamental over the recording, by linear regression.
         name : str, optional
             By default the recording's name.
 
@@ -455,8 +446,6 @@ class Recording(Result):
         --------
         The displacement of an oscillator with noise of 0.1 mm; forcing and sampling rate are incommensurate:
 
-        >>> import numpy as np, bayesperiodic as bp
-        >>> force = {"force": np.cos(2 * np.pi * np.arange(64) / 64)}
         >>> recording = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1,
         ...                         duration=400, sampling_rate=9.7, noise={"displacement": 1e-4}, seed=1)
         >>> run = recording.fold(samples=64, harmonics={"displacement": 9}, name="run 1")

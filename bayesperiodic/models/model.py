@@ -1,6 +1,7 @@
 """Models: differential and output equations in symbolic form, and their time integration."""
 
 from collections.abc import Callable, Iterable, Mapping
+from copy import copy
 from functools import cache, cached_property
 from pathlib import Path
 from types import ModuleType
@@ -21,8 +22,7 @@ class Names:
     """Symbols as attributes, such as ``s.dx`` and ``p.k3``."""
 
     def __init__(self, kind: str, symbols: Mapping[str, sp.Symbol]):
-        self._kind = kind
-        self._symbols = dict(symbols)
+        self._kind, self._symbols = kind, dict(symbols)
 
     def __getattr__(self, name: str) -> sp.Symbol:
         if name.startswith("_"):
@@ -182,8 +182,7 @@ class Model:
         """Return the model with an additional last parameter that multiplies the arguments of all smooth signs."""
         sharpness = sp.Symbol("p_sharpness_of_signs", real=True)
         softer = {sign: sign.func(sharpness * sign.args[0]) for sign in self.smooth_signs}
-        other = object.__new__(Model)
-        other.__dict__.update(self.__getstate__())
+        other = copy(self)
         other.equations = tuple(e.xreplace(softer) for e in self.equations)
         other.parameters = (*self.parameters, "sharpness_of_signs")
         other.parameter_symbols = {**self.parameter_symbols, "sharpness_of_signs": sharpness}
@@ -225,13 +224,10 @@ class Model:
         -------
         VjpKernels
         """
-        if moving not in self._vjp_kernels:
-            self._vjp_kernels[moving] = self.symbolic.vjp_kernels(moving)
-        return self._vjp_kernels[moving]
-
-    @cached_property
-    def _vjp_kernels(self) -> dict[tuple[int, ...], VjpKernels]:
-        return {}
+        known = self.__dict__.setdefault("_vjp_kernels", {})
+        if moving not in known:
+            known[moving] = self.symbolic.vjp_kernels(moving)
+        return known[moving]
 
     def input_derivatives(self) -> dict[str, int]:
         """Return the order of the highest time derivative of every input that the model uses."""
@@ -306,25 +302,9 @@ def integrate(
 ) -> np.ndarray | None:
     """Integrate by the classical fourth-order Runge-Kutta method; None if the states overflow.
 
-    Parameters
-    ----------
-    model : Model
-    start : array (size,)
-        The states, then the rates of the second-order ones, at tau = 0.
-    inputs : array (2·samples·periods, 3·inputs)
-        u, u̇, ü at half steps over one response period, which is repeated.
-    parameters : array (parameters,)
-    frequency : float
-        Forcing frequency [Hz].
-    samples : int
-        Steps per forcing period.
-    steps, kept : int
-        Steps to take, and how many of the last are returned.
-
-    Returns
-    -------
-    array (kept, size)
-        The states before each of the last steps.
+    `start` (size,) contains the states and then the rates of the second-order ones at tau = 0; `inputs`
+    (2·samples·periods, 3·inputs) u, u̇, ü at half steps over one response period, which is repeated. There are `samples`
+    steps per forcing period. The result (kept, size) contains `start`'s variables before each of the last steps.
     """
     orders = np.array(list(model.orders.values()))
     path = np.empty((kept, orders.sum()))

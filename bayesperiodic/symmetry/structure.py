@@ -25,32 +25,17 @@ from bayesperiodic.symmetry.invariants import (
 class Symmetry:
     """Transformation of parameters, and of states that are not measured, that leaves all measured outputs unchanged.
 
-    Attributes
-    ----------
-    kind : {"scaling", "shift", "other"}
-        "shift" adds a constant to a parameter or a state, and may also transform others.
-    parameters : tuple of str
-        The parameters that change. Fixing any one of them removes the symmetry.
-    generator : dict of str to str
-        Parameter or state -> its infinitesimal change.
-    transformation : dict of str to str
-        Parameter or state -> its image under the finite transformation with the group parameter `amount`, confirmed by
-        exact substitution in the equations. Empty if no closed form was found.
-    amount : str
-        Name of the group parameter: a factor > 0 for scalings, otherwise a number that is 0 for the identity.
-    factor : tuple of tuple of str
-        The matrix by which the transformation multiplies the equations.
-    no_help : tuple of str
-        Parameters that enter the same combinations, but do not remove the symmetry if they are fixed.
+    Its kind is "scaling", "shift" (which adds a constant to a parameter or a state, and may also transform others) or
+    "other". The finite transformation is confirmed by exact substitution in the equations.
     """
 
     kind: str
-    parameters: tuple[str, ...]
-    generator: dict[str, str]
-    transformation: dict[str, str]
-    amount: str
-    factor: tuple[tuple[str, ...], ...]
-    no_help: tuple[str, ...]
+    parameters: tuple[str, ...]  # those that change; fixing any one of them removes the symmetry
+    generator: dict[str, str]  # infinitesimal changes by parameter or state
+    transformation: dict[str, str]  # images by parameter or state; empty if no closed form was found
+    amount: str  # name of the group parameter: a factor > 0 for scalings, otherwise a number, 0 for the identity
+    factor: tuple[tuple[str, ...], ...]  # matrix by which the transformation multiplies the equations
+    no_help: tuple[str, ...]  # parameters in the same combinations that do not remove the symmetry if they are fixed
 
     def __repr__(self) -> str:
         if self.transformation:
@@ -75,7 +60,7 @@ class Structure(Result):
         One row per unknown parameter. verdict: "determined", "only in combination", "not determined" (in no combination
         either) or "does not appear"; enters: the combinations that contain it (for a determined parameter, the
         coefficients without undetermined ones); fix: numbers, from 1, of the symmetries that fixing it removes;
-        partners: other parameters, of which any one determines it if known.
+        partners: other parameters, any one of which determines it if known.
     combinations : tuple of str
         Independent identifiable combinations of the parameters that are not determined; expressions for `derive`. With
         `unexplained` directions they are confirmed at random values only.
@@ -237,14 +222,16 @@ def structure(
 
     The analysis assumes unlimited data without noise, arbitrary inputs, frequencies and motions, and generic parameter
     values. A parameter that is not determined here cannot be determined by any experiment; the converse depends on the
-    data.
+    data. "Determined" means locally: discrete ambiguities, such as the common sign of two factors, are not searched
+    for.
 
-    Two methods are combined. The first finds transformations of parameters and states that map solutions to solutions
-    and leave outputs, inputs and time unchanged: Lie symmetries [1]_ [2]_, affine in states and inputs. They satisfy
+    Two methods are combined. The first finds Lie symmetries [1]_ [2]_, affine in states and inputs: transformations of
+    parameters and states that map solutions to solutions and leave outputs, inputs and time unchanged. They satisfy
     linear equations, which are solved exactly over the rational functions of the parameters; a finite transformation
     is accepted only if substitution in the symbolic equations confirms it. The second computes the rank of exact
     sensitivities of the outputs' Taylor coefficients at random values, which bounds the number of symmetries of any
     kind [3]_. If the rank and the number of symmetries add up to the number of parameters, the result is complete.
+    Sensitivities do not detect the dependence of a discontinuity on a parameter; no rank is returned in this case.
 
     Parameters
     ----------
@@ -262,12 +249,6 @@ def structure(
     ------
     ValueError
         For an unknown output or parameter, no output, or a value of zero that the equations divide by.
-
-    Notes
-    -----
-    "Determined" means locally: discrete ambiguities, such as the common sign of two factors, are not searched for.
-    Sensitivities do not detect the dependence of a discontinuity on a parameter (unlike that of a kink), and no rank is
-    returned in this case.
 
     References
     ----------
@@ -310,7 +291,9 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
     used = whole.used
     system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if s in used})
     names = {s: n for n, s in (whole.parameters | whole.known).items()}
-    kinds, generators, flows = _symmetries(system)
+    symmetries = generators_of(determining_equations(system)) if system.parameters else []
+    flows = [verified(system, flow) if (flow := flow_of(symmetry)) else None for symmetry in symmetries]
+    generators = [flow.generator if flow else symmetry for symmetry, flow in zip(symmetries, flows, strict=True)]
     directions = directions_of(system, generators)
     coefficients = coefficients_of(system)
     found = combinations_of(system, generators, [f for f in flows if f], directions, coefficients)
@@ -322,24 +305,13 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
         table=_table(whole, system, generators, directions, coefficients, combinations, names),
         combinations=tuple(combinations.values()),
         symmetries=tuple(
-            _symmetry(system, kind, generator, flow, combinations, names)
-            for kind, generator, flow in zip(kinds, generators, flows, strict=True)
+            _symmetry(system, _kind(symmetry), generator, flow, combinations, names)
+            for symmetry, generator, flow in zip(symmetries, generators, flows, strict=True)
         ),
         to_fix=directions.smallest_set(),
         rank=len(system.parameters) - len(directions.rows) if directions.points or not system.parameters else None,
         points=directions.points,
         unexplained=directions.unexplained,
-    )
-
-
-def _symmetries(system: System) -> tuple[list[str], list[Generator], list[Flow | None]]:
-    """Return the kinds of the symmetries, their generators and, if there are closed forms, their flows."""
-    found = generators_of(determining_equations(system)) if system.parameters else []
-    flows = [verified(system, flow) if (flow := flow_of(g)) else None for g in found]
-    return (
-        [_kind(g) for g in found],
-        [flow.generator if flow else g for g, flow in zip(found, flows, strict=True)],
-        flows,
     )
 
 
@@ -395,22 +367,21 @@ def _symmetry(
     symbols = system.parameters | {s: system.symbols[s] for s in generator.states}
     moves = generator.parameters | generator.states
     shared = [c.free_symbols for c in combinations if c.free_symbols & {symbols[n] for n in generator.parameters}]
-    texts = {**names, **{system.symbols[s]: s for s in (*system.symbols,)}}
+    others = {n: s for n, s in system.parameters.items() if n not in generator.parameters}
+    texts = {**names, **{symbol: name for name, symbol in system.symbols.items()}}
     amount = ""
+    rows: list[list[sp.Expr]] = []
     if flow is not None:
         wanted = ("t", "scale", "scale_factor") if flow.amount.is_positive else ("delta", "shift_by", "amount")
         amount = next(n for n in wanted if n not in texts.values())
         texts[flow.amount] = amount
+        rows = flow.factor.tolist() if flow.factor else []
     return Symmetry(
         kind=kind,
         parameters=tuple(generator.parameters),
         generator={n: written(move, texts) for n, move in moves.items()},
         transformation={n: written(flow.images[symbols[n]], texts) for n in moves} if flow else {},
         amount=amount,
-        factor=tuple(tuple(written(e, texts) for e in flow.factor.row(i)) for i in range(flow.factor.rows))
-        if flow and flow.factor
-        else (),
-        no_help=tuple(
-            n for n, s in system.parameters.items() if n not in generator.parameters and any(s in c for c in shared)
-        ),
+        factor=tuple(tuple(written(e, texts) for e in row) for row in rows),
+        no_help=tuple(n for n, s in others.items() if any(s in c for c in shared)),
     )
