@@ -109,17 +109,11 @@ class Kernels:
     output_rates: bool  # whether the outputs depend on q̇ or q̈
 
     def evaluate(
-        self,
-        name: str,
-        states: np.ndarray,
-        inputs: np.ndarray,
-        parameters: np.ndarray,
-        tau: np.ndarray,
-        frequency: float,
+        self, name: str, states: np.ndarray, inputs: np.ndarray, theta: np.ndarray, tau: np.ndarray, frequency: float
     ) -> np.ndarray:
         """Return one of the functions on a grid, (points, columns)."""
         out = np.empty((tau.size, self.columns(name)))
-        getattr(self, name)(states, inputs, parameters, tau, frequency, out)
+        getattr(self, name)(states, inputs, theta, tau, frequency, out)
         return out
 
     def columns(self, name: str) -> int:
@@ -202,10 +196,10 @@ class SymbolicModel:
         return _module([_function(name, needed, arguments) for name, needed in expressions.items()])
 
     def jacobian_change(self) -> GridFunction:
-        """Return the compiled directional derivative of ∂g/∂(q, q̇, q̈).
+        """Return the compiled directional derivative of ∂g/∂(q, q̇, q̈), row by row (states × 3·states).
 
         It is a function of states (q, q̇, q̈ and their changes), inputs (u, u̇, ü and their changes) and parameters (θ,
-        its change and that of the frequency); columns row by row (states × 3·states).
+        its change and that of the frequency).
         """
         return _grid_functions(self.jacobian_change_source(), ("jacobian_change",))["jacobian_change"]
 
@@ -245,13 +239,12 @@ class SymbolicModel:
         self, states: tuple[sp.Symbol, ...], inputs: tuple[sp.Symbol, ...], parameters: tuple[sp.Symbol, ...]
     ) -> dict[sp.Symbol, str]:
         """Return the Python expression of every symbol in a grid function."""
-        return {
-            **{symbol: f"flat_states[{len(states)}*i + {column}]" for column, symbol in enumerate(states)},
-            **{symbol: f"flat_inputs[{len(inputs)}*i + {column}]" for column, symbol in enumerate(inputs)},
-            **{symbol: f"parameters[{index}]" for index, symbol in enumerate(parameters)},
-            self.tau: "tau[i]",
-            self.frequency: "frequency",
-        }
+        return (
+            {symbol: f"flat_states[{len(states)}*i + {column}]" for column, symbol in enumerate(states)}
+            | {symbol: f"flat_inputs[{len(inputs)}*i + {column}]" for column, symbol in enumerate(inputs)}
+            | {symbol: f"parameters[{index}]" for index, symbol in enumerate(parameters)}
+            | {self.tau: "tau[i]", self.frequency: "frequency"}
+        )
 
 
 def _grid_functions(source: str, names: Sequence[str]) -> dict[str, GridFunction]:

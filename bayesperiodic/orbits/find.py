@@ -98,7 +98,6 @@ def find_orbits(
     --------
     The Hénon map has one orbit of period 1 and one of period 2 on its attractor:
 
-    >>> import numpy as np, bayesperiodic as bp
     >>> x = np.zeros((2000, 2))
     >>> for k in range(1999):
     ...     x[k + 1] = 1 - 1.4 * x[k, 0] ** 2 + x[k, 1], 0.3 * x[k, 0]
@@ -163,27 +162,23 @@ def _search_count(maps: ReturnMap, neighbours: int) -> int:
 def _chained(scaled: _ScaledSection, atlas: Atlas, period: int, neighbours: int) -> list[tuple[Candidate, Estimate]]:
     maps = scaled.maps
     found: list[tuple[Candidate, Estimate]] = []
+
+    def same(one: Estimate, other: Estimate) -> bool:
+        distance, _ = shift_between(one.points, other.points, maps.wrap)
+        return distance < max(1e-3, 2.0 * max(_largest_sd(one), _largest_sd(other)))
+
     for candidate in candidates(maps, atlas, scaled.points, period):
         estimate = refine(maps, candidate.points, neighbours)
-        if estimate is None or not _acceptable(maps, estimate):
+        if estimate is None or not (sd := _largest_sd(estimate)) < LARGEST_SD:
             continue
-        if not any(_same(maps, estimate, other) for _, other in found):
+        repeats = has_shorter_period(estimate.points, maps.wrap, max(2e-3, 3.0 * sd))
+        if not repeats and not any(same(estimate, other) for _, other in found):
             found.append((candidate, estimate))
     return found
 
 
 def _largest_sd(estimate: Estimate) -> float:
     return float(np.sqrt(np.diag(estimate.covariance)[: estimate.points.size].max()))
-
-
-def _acceptable(maps: ReturnMap, estimate: Estimate) -> bool:
-    sd = _largest_sd(estimate)
-    return sd < LARGEST_SD and not has_shorter_period(estimate.points, maps.wrap, max(2e-3, 3.0 * sd))
-
-
-def _same(maps: ReturnMap, one: Estimate, other: Estimate) -> bool:
-    distance, _ = shift_between(one.points, other.points, maps.wrap)
-    return distance < max(1e-3, 2.0 * max(_largest_sd(one), _largest_sd(other)))
 
 
 def _orbit(

@@ -36,10 +36,8 @@ class Orbit(Result):
     ----------
     name : str
         Unique among the orbits of a section, such as ``"period 3, winding 1, orbit 2"``.
-    coordinates : tuple of str
-        The section's two coordinates, which are outputs of the model.
-    angles : tuple of str
-        The coordinates that are angles.
+    coordinates, angles : tuple of str
+        The section's two coordinates, which are outputs of the model, and those of them that are angles.
     frequency : float
         Of the forcing [Hz].
     period : int
@@ -50,10 +48,9 @@ class Orbit(Result):
         Section values at tau = 0, 1, …, angles in (−π, π].
     joint_covariance : array (2·period + 2, 2·period + 2)
         Of the points, point by point, and of log|eigenvalue|, largest first; NaN where not estimated.
-    eigenvalues : array (2,)
-        Of the linearised return map over the period, largest modulus first, real or complex.
-    eigenvalue_bias : array (2,)
-        Estimated bias of log|eigenvalue|, which is not subtracted.
+    eigenvalues, eigenvalue_bias : array (2,)
+        Of the linearised return map over the period, largest modulus first, real or complex, and the estimated bias of
+        log|eigenvalue|, which is not subtracted.
     returns : int
         Number of measured close returns.
     quality : float
@@ -74,7 +71,6 @@ class Orbit(Result):
     The fixed point of the Hénon map (section as in `find_orbits`) is x = (√6.09 − 0.7)/2.8; its multipliers are the
     roots of μ² + 2.8 x μ = 0.3:
 
-    >>> import bayesperiodic as bp
     >>> orbit = bp.find_orbits(henon_section, periods=[1])[0]
     >>> orbit.points.round(4).tolist(), orbit.eigenvalues.round(3).tolist()
     ([[0.6314, 0.1894]], [-1.924, 0.156])
@@ -204,7 +200,6 @@ class Orbits(Result):
     --------
     Two orbits of the Hénon map (section as in `find_orbits`):
 
-    >>> import bayesperiodic as bp
     >>> orbits = bp.find_orbits(henon_section, periods=[1, 2])
     >>> len(orbits), orbits[1].name, orbits.rejected
     (2, 'period 2, winding 0, orbit 1', ())
@@ -329,13 +324,10 @@ def _with_multipliers(orbit: Orbit, experiment: Experiment) -> Experiment:
     unstable = np.abs(orbit.eigenvalues) > 1.0
     kept, omitted = np.flatnonzero(unstable & known), np.flatnonzero(unstable & ~known)
     if omitted.size:
-        complex_pair = np.iscomplex(orbit.eigenvalues[omitted[0]])
-        why = "complex" if complex_pair else "not estimated, or its bias exceeds half its standard deviation"
-        warnings.warn(
-            f"The eigenvalue {orbit.eigenvalues[omitted[0]]:.4g} of {orbit.name!r} is left out: it is {why}.",
-            UserWarning,
-            stacklevel=3,
-        )
+        value = orbit.eigenvalues[omitted[0]]
+        why = "complex" if np.iscomplex(value) else "not estimated, or its bias exceeds half its standard deviation"
+        text = f"The eigenvalue {value:.4g} of {orbit.name!r} is left out: it is {why}."
+        warnings.warn(text, UserWarning, stacklevel=3)
         # Multipliers are compared in the order of their moduli, so none below an omitted one can be used.
         kept = kept[kept < omitted[0]]
     if not kept.size:

@@ -58,17 +58,11 @@ def polish_orbits(
         A forced one, whose states (and rates, if there is no measured cycle) follow from the section's coordinates.
     orbits : Orbits, or sequence of Orbit
         From `find_orbits`; those rejected before stay rejected.
-    parameters : mapping of str to float
-        A value for every parameter.
-    inputs : mapping of str to array (samples,), optional
-        Every input over one forcing period.
+    parameters, inputs, samples, scheme
+        As for `solve_periodic`; inputs over one forcing period.
     parameter_sd : mapping of str to float, optional
         Standard deviations of uncertain parameters. They widen the accepted distances by their effect on the section
         points, to first order.
-    samples : int
-        Grid points per forcing period.
-    scheme : str or Scheme
-        See `solve_periodic`.
     tolerance : float
         Additional standard error of every measured coordinate, as a fraction of the range of all measured values, of a
         turn for an angle.
@@ -82,16 +76,13 @@ def polish_orbits(
     Raises
     ------
     ValueError
-        For an autonomous model, unknown names, coordinates that do not determine the model's states, and arguments that
-        `solve_periodic` does not accept.
+        As for `solve_periodic`, and for an autonomous model or coordinates that do not determine the model's states.
 
     Examples
     --------
     `pendulum_orbits`: the orbits of period 1 in 2,000 forcing periods of the pendulum in `PoincareSection`'s example.
-    Newton's method on the return map of the integrated model gives the multiplier −1.7059 for the orbit with winding
-    number 1:
+    Newton's method on the return map of the integrated model gives the multiplier −1.7059:
 
-    >>> import bayesperiodic as bp
     >>> polished = bp.polish_orbits(bp.models.pendulum, pendulum_orbits, pendulum_parameters, samples=200)
     >>> [turning] = [orbit for orbit in polished if orbit.winding == 1 and orbit.eigenvalues[0].real < 0]
     >>> print(f"{turning.solution.multipliers[0].real:.3f}")
@@ -171,13 +162,13 @@ class _Polisher:
 
     def polish(self, orbit: Orbit) -> tuple[Orbit, str]:
         """Return the orbit with its solution and an empty reason, or unchanged with the reason for its rejection."""
-        reasons = []
+        first = ""
         for winding, states in self._starts(orbit):
             found, reason = self._solve(orbit, winding, states)
             if not reason:
                 return found, ""
-            reasons.append(reason)
-        return orbit, reasons[0] if reasons else "the model's states diverge from its section points"
+            first = first or reason
+        return orbit, first or "the model's states diverge from its section points"
 
     def shift(self, one: Orbit, other: Orbit, sign: int = 1) -> int | None:
         """Return the cyclic shift under which two polished orbits, one of them times `sign`, coincide; None if none."""
@@ -288,8 +279,7 @@ class _Polisher:
         equations = self._equations(orbit, 0)
         if orbit.cycle is not None:
             assert winding is not None
-            values = resampled_cycle(orbit, winding, self.samples)
-            phases = self._phases(orbit, equations, values, equations.grid.tau, equations.inputs)
+            phases = self._phases(orbit, equations, resampled_cycle(orbit, winding, self.samples))
             yield winding, phases[:, : equations.count]
         for turns, states in self._integrated(orbit, equations):
             if winding is None or turns == winding:
@@ -302,8 +292,7 @@ class _Polisher:
         meet. Several winding numbers are possible; they follow in the order of the corrections they need.
         """
         samples, periods, count = self.samples, orbit.period, equations.count
-        tau = np.arange(periods, dtype=float)
-        starts = self._phases(orbit, equations, orbit.points, tau, equations.inputs[::samples], rates=True)
+        starts = self._phases(orbit, equations, orbit.points, rates=True)
         half = _fourier.on_grid(_fourier.coefficients(equations.inputs[:samples].T), 2 * samples).T
         grid = {"samples": samples, "steps": samples + 1, "kept": samples + 1}
         paths = [integrate(self.model, s, half, self.theta, frequency=equations.frequency, **grid) for s in starts]
@@ -324,23 +313,17 @@ class _Polisher:
             yield int(sum(turns)), _connected(np.stack(segments), missed, whole)
 
     def _phases(
-        self,
-        orbit: Orbit,
-        equations: PeriodicEquations,
-        values: np.ndarray,
-        tau: np.ndarray,
-        inputs: np.ndarray,
-        rates: bool = False,
+        self, orbit: Orbit, equations: PeriodicEquations, values: np.ndarray, rates: bool = False
     ) -> np.ndarray:
         """Return the states, then the rates of the second-order ones, (points, size), from the section's coordinates.
 
-        The rates are valid only if they are requested.
+        The values of the coordinates are at whole tau if rates are needed; else on the grid, and the rates are invalid.
         """
-        model, count = self.model, equations.count
+        model, count, every = self.model, equations.count, self.samples if rates else 1
+        tau, here = np.ascontiguousarray(equations.grid.tau[::every]), np.ascontiguousarray(equations.inputs[::every])
         columns = [model.outputs.index(name) for name in orbit.coordinates]
         second = [i for i, state in enumerate(model.states) if model.orders[state] == 2]
         places = [*range(count), *(count + i for i in second)]
-        here = np.ascontiguousarray(inputs)
 
         def outputs(phase: np.ndarray) -> np.ndarray:
             states = np.zeros((tau.size, 3 * count))
@@ -414,7 +397,7 @@ def select_orbits(
     orbits : Orbits
         From `polish_orbits`.
     parameters : iterable of str
-        The parameters to be estimated.
+        Those to be estimated.
     model : Model, optional
         If given, unstable eigenvalues are included, as in ``orbit.experiment(multipliers=True)``.
     largest_multiplier : float
@@ -436,9 +419,8 @@ def select_orbits(
 
     Examples
     --------
-    With the orbits of `polish_orbits`' example; the pendulum at rest does not depend on the parameters:
+    The pendulum at rest does not depend on the parameters:
 
-    >>> import bayesperiodic as bp
     >>> polished = bp.polish_orbits(bp.models.pendulum, pendulum_orbits, pendulum_parameters, samples=200)
     >>> best = bp.select_orbits(polished, ["m", "l"])
     >>> 0 < len(best) < len(polished), "a state of rest" in [reason for _, reason in best.rejected]

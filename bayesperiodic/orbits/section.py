@@ -29,9 +29,8 @@ class PoincareSection(Result):
     ----------
     points : array (count, 2)
         Angles in (−π, π].
-    coordinates : tuple of str
-    angles : tuple of str
-        The coordinates that are angles, one at most.
+    coordinates, angles : tuple of str
+        The two coordinates, and those of them that are angles, one at most.
     frequency : float
         Forcing frequency [Hz]; for crossings of a plane, returns per second.
     increments : array (count − 1, 2)
@@ -53,10 +52,8 @@ class PoincareSection(Result):
     --------
     The driven pendulum in chaotic motion, once a forcing period:
 
-    >>> import bayesperiodic as bp
-    >>> theta = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
-    >>> recording = bp.simulate(bp.models.pendulum, theta, frequency=1.4467, duration=200, sampling_rate=60,
-    ...                         start={"phi": 1})
+    >>> recording = bp.simulate(bp.models.pendulum, pendulum_parameters, frequency=1.4467, duration=200,
+    ...                         sampling_rate=60, start={"phi": 1})
     >>> section = bp.PoincareSection.from_recording(recording, ("angle", "rate"), frequency=1.4467, angles=["angle"])
     >>> section
     PoincareSection(290 points of angle, rate at 1.4467 Hz from a recording of 12001 samples)
@@ -120,9 +117,10 @@ class PoincareSection(Result):
         signals = _signals(recording, names, angle_names)
         time = recording.time
         if recording.sampling_rate < FEWEST_SAMPLES * frequency:
+            found = f"{recording.sampling_rate / frequency:.3g}"
             raise ValueError(
-                f"recording: must have at least {FEWEST_SAMPLES} samples a period, got "
-                f"{recording.sampling_rate / frequency:.3g}. For samples taken once a period, use from_points."
+                f"recording: must have at least {FEWEST_SAMPLES} samples a period, got {found}. For samples taken once "
+                "a period, use from_points."
             )
         first = int(np.ceil((time[0] - origin) * frequency - 1e-9))
         last = int(np.floor((time[-1] - origin) * frequency + 1e-9))
@@ -250,12 +248,8 @@ class PoincareSection(Result):
 
         Parameters
         ----------
-        index : int
-            Position of the first point.
-        period : int
-            Number of returns.
-        samples : int
-            Per return.
+        index, period, samples : int
+            Position of the first point, number of returns, samples per return.
 
         Returns
         -------
@@ -274,10 +268,8 @@ class PoincareSection(Result):
 
     def __repr__(self) -> str:
         source = "points alone" if self.signals is None else f"a recording of {len(self.signals)} samples"
-        return (
-            f"PoincareSection({len(self.points)} points of {', '.join(self.coordinates)} at {self.frequency:.6g} Hz "
-            f"from {source})"
-        )
+        names = ", ".join(self.coordinates)
+        return f"PoincareSection({len(self.points)} points of {names} at {self.frequency:.6g} Hz from {source})"
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:

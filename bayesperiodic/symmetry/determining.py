@@ -158,7 +158,7 @@ def _rank(matrix: np.ndarray) -> int:
     return len(_reduced(matrix)[1])
 
 
-def _nullspace(matrix: np.ndarray) -> np.ndarray:
+def nullspace(matrix: np.ndarray) -> np.ndarray:
     """Return vectors (nullity, columns) that span the null space modulo the prime."""
     rows, pivots = _reduced(matrix)
     columns = matrix.shape[1]
@@ -236,13 +236,9 @@ class Algebra:
         self.field = field(self.generators or [sp.Dummy("one")], sp.QQ, "lex")[0]
         self._divisors = [self.field.from_expr(r).numer for r in self._relations]
 
-    def element(self, expression: sp.Expr) -> Any:
-        """Return the field element of an expression whose functions occur in the given expressions."""
-        return self.field.from_expr(self._replaced(expression))
-
     def numerators(self, expressions: Sequence[sp.Expr]) -> list[Any]:
-        """Return polynomials proportional to the expressions, reduced by the relations."""
-        elements = [self.element(e) for e in expressions]
+        """Return polynomials proportional to expressions of known functions, reduced by the relations."""
+        elements = [self.field.from_expr(self._replaced(e)) for e in expressions]
         common = reduce(lambda a, b: a.lcm(b), (e.denom for e in elements))
         found = [e.numer * common.exquo(e.denom) for e in elements]
         return [n.rem(self._divisors) for n in found] if self._divisors else found
@@ -488,15 +484,16 @@ class Generator:
 
 def generators_of(equations: Determining) -> list[Generator]:
     """Return a maximal set of symmetries of the parameters that are independent at generic values."""
-    scalings = _scalings(equations)
-    moves = _moves_of_parameters(equations, scalings)
-    count, parameters = len(equations.terms), equations.parameters
-    vectors = _nullspace(equations.matrix)[:, :count]
+    terms, parameters, scalings = equations.terms, equations.parameters, _scalings(equations)
+    values = dict(zip(equations.unknowns, equations.point, strict=True))
+    rows = [[scaling.get(k, 0) * values[terms[k].own] % PRIME for k in parameters] for scaling in scalings]
+    moves = np.array(rows, dtype=np.int64).reshape(len(scalings), len(parameters))
+    vectors = nullspace(equations.matrix)[:, : len(terms)]
     wanted = _rank(vectors[:, parameters])
-    chosen = [_generator(equations, {k: equations.terms[k].own * w for k, w in s.items()}, s) for s in scalings]
+    chosen = [_generator(equations, {k: terms[k].own * w for k, w in s.items()}, s) for s in scalings]
     for support in _circuits(vectors, equations.weights) if len(chosen) < wanted else []:
-        rest = [k for k in range(count) if k not in support]
-        (move,) = _nullspace(vectors[:, rest].T) if rest else np.ones((1, len(vectors)), dtype=np.int64)
+        rest = [k for k in range(len(terms)) if k not in support]
+        (move,) = nullspace(vectors[:, rest].T) if rest else np.ones((1, len(vectors)), dtype=np.int64)
         row = (move[:, None] * vectors[:, parameters] % PRIME).sum(axis=0) % PRIME
         if _rank(np.vstack([moves, row])) > len(moves):
             moves = np.vstack([moves, row])
@@ -531,14 +528,6 @@ def _scalings(equations: Determining) -> list[dict[int, int]]:
             taken = np.vstack([taken, vector[parameters]])
             found.append({k: int(w) for k, w in zip(columns, vector, strict=False) if w})
     return found
-
-
-def _moves_of_parameters(equations: Determining, scalings: list[dict[int, int]]) -> np.ndarray:
-    """Return the changes of the parameters by the scalings, modulo the prime at the point of the matrix."""
-    values = dict(zip(equations.unknowns, equations.point, strict=True))
-    parameters = equations.parameters
-    rows = [[s.get(k, 0) * values[equations.terms[k].own] % PRIME for k in parameters] for s in scalings]
-    return np.array(rows, dtype=np.int64).reshape(len(scalings), len(parameters))
 
 
 def _generator(

@@ -86,7 +86,7 @@ def test_null_spaces_modulo_the_prime_are_exact():
     matrix = random.integers(-9, 9, (4, 7)) @ random.integers(-9, 9, (7, 9))
     vectors = determining.nullspace(matrix)
     assert len(vectors) == 9 - np.linalg.matrix_rank(matrix)
-    assert not determining.product(matrix % determining.PRIME, vectors.T).any()
+    assert not (matrix.astype(object) @ vectors.T.astype(object) % determining.PRIME).any()
 
 
 def test_circuits_of_a_plane_are_the_vectors_with_a_zero():
