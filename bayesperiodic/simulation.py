@@ -80,7 +80,6 @@ def simulate(
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
     >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0}, {"force": np.ones(8)},
     ...                   frequency=0.2, duration=100, sampling_rate=10)
     >>> round(float(run.outputs["displacement"][-1]), 3)
@@ -258,8 +257,7 @@ def steady_cycle(
 
     Five cycles are integrated from the start. Then Newton's method solves for the state that is repeated after one
     cycle, which avoids long integrations of slow transients, such as thermal ones. Only a stable cycle is accepted;
-    otherwise this is repeated, at most twelve times in total. If there is no stable cycle or the integration fails, a
-    `NotSettled` is raised.
+    otherwise this is repeated, up to twelve times. Without a stable cycle, `NotSettled` is raised.
     """
     system = _FirstOrder(model, parameters, inputs, frequency)
     try:

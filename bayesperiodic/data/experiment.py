@@ -75,7 +75,6 @@ class Experiment(Result):
     --------
     A force measured over 20 cycles, with five harmonics kept:
 
-    >>> import numpy as np, bayesperiodic as bp
     >>> tau = np.arange(64) / 64
     >>> force, stroke = 30.0 * np.sin(2 * np.pi * tau), 0.01 * np.cos(2 * np.pi * tau)
     >>> run = bp.Experiment("run 1", 2.0, {"force": force}, {"stroke": stroke}, samples=64,
@@ -229,7 +228,6 @@ class Experiment(Result):
 
         Examples
         --------
-        >>> import bayesperiodic as bp
         >>> run = bp.Experiment.from_harmonics("run", 2.0, {"x": [0.1, 0.02 - 0.01j]}, {"force": [0, 5]}, samples=8)
         >>> run.independent, run.inputs["force"].round(3)[:3].tolist()
         ({'x': 3}, [5.0, 3.536, 0.0])

@@ -1,8 +1,8 @@
 """Estimation of the mean steady period of sampled signals, and of its uncertainty."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
@@ -171,39 +171,17 @@ def _largest_equivalent(time: np.ndarray, channels: np.ndarray, frequency: float
     return frequency
 
 
-class CycleScatter(NamedTuple):
-    """Variances of one channel's complex amplitudes, (harmonics + 1,) each."""
-
-    one_cycle: np.ndarray  # E|c − c̄|² of one cycle
-    mean: np.ndarray  # of the mean, corrected for correlation between successive cycles
-
-
-@dataclass(frozen=True)
-class MeanPeriod:
-    """Mean period of steady signals; see `Experiment` for the meaning of most fields."""
-
-    frequency: float  # fundamental frequency [Hz]
-    frequency_se: float  # its standard error [Hz]
-    amplitudes: dict[str, np.ndarray]  # complex, those that each channel keeps, phases relative to the origin
-    scatter: dict[str, float]
-    amplitude_variance: dict[str, np.ndarray]
-    cycles: int
-    samples: int  # number of measured samples used
-    periodicity: float
-    drift: dict[str, float]
-    origin: float
-
-
-def mean_period(
+def fold_signals(
     signals: Signals,
-    points: int,
-    frequency: float | None,
+    samples: int,
     periods: int,
+    frequency: float | None,
     harmonics: int | Mapping[str, int] | None,
     origin: float | str,
     largest_drift: float | None,
-) -> MeanPeriod:
-    """Estimate the mean period of the steady part of signals; see `Recording.fold`."""
+) -> dict[str, Any]:
+    """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`."""
+    points = samples * periods
     if isinstance(origin, str) and origin != CROSSING:
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
@@ -222,8 +200,8 @@ def mean_period(
         fit, fundamental_se = fit_harmonics(steady.time, steady.values, fundamental, limit), 0.0
     periodicity = _periodicity(steady, fit)
     cycles = round(np.ptp(steady.time) * fit.frequency)
-    scatter = [_cycle_scatter(steady.time, fit, channel, cycles) for channel in range(len(signals.channels))]
-    significant = [_last_significant(a, own.mean, cycles) for a, own in zip(fit.amplitudes, scatter, strict=True)]
+    one_cycle, mean = zip(*(_cycle_scatter(steady.time, fit, own, cycles) for own in fit.residuals), strict=True)
+    significant = [_last_significant(a, variance, cycles) for a, variance in zip(fit.amplitudes, mean, strict=True)]
     kept = dict(zip(signals.channels, significant, strict=True)) | _chosen(harmonics, signals.channels, limit)
     amplitudes = fit.amplitudes
     if origin == CROSSING:
@@ -231,19 +209,29 @@ def mean_period(
         phase = np.angle(amplitudes[signals.inputs, 1]) / (2 * np.pi)
         start = float((-0.25 - phase) % 1.0 / fit.frequency)
         amplitudes = amplitudes * np.exp(2j * np.pi * fit.frequency * start * np.arange(amplitudes.shape[1]))
-    used = {channel: slice(kept[channel] + 1) for channel in signals.channels}
-    return MeanPeriod(
-        frequency=fit.frequency,
-        frequency_se=fundamental_se,
-        amplitudes={channel: amplitudes[i, own] for i, (channel, own) in enumerate(used.items())},
-        scatter={c: float(np.sqrt(_power(scatter[i].one_cycle[own]))) for i, (c, own) in enumerate(used.items())},
-        amplitude_variance={channel: scatter[i].mean[own] for i, (channel, own) in enumerate(used.items())},
-        cycles=cycles,
-        samples=steady.time.size,
-        periodicity=periodicity,
-        drift=drift,
-        origin=start,
-    )
+    used = [slice(kept[channel] + 1) for channel in signals.channels]
+
+    def by_channel(values: Iterable[Any]) -> dict[str, Any]:
+        return dict(zip(signals.channels, values, strict=True))
+
+    folded = by_channel(_fourier.on_grid(a[own], points) for a, own in zip(amplitudes, used, strict=True))
+    inputs, outputs = signals.channels[: signals.inputs], signals.channels[signals.inputs :]
+    return {
+        "frequency": fit.frequency * periods,
+        "frequency_se": fundamental_se * periods,
+        "outputs": {channel: folded[channel] for channel in outputs},
+        "inputs": {channel: folded[channel] for channel in inputs},
+        "samples": samples,
+        "periods": periods,
+        "cycles": cycles,
+        "scatter": by_channel(float(np.sqrt(_power(v[own]))) for v, own in zip(one_cycle, used, strict=True)),
+        "independent": {channel: min(2 * kept[channel] + 1, steady.time.size) for channel in outputs},
+        "harmonics": kept,
+        "amplitude_variance": by_channel(v[own] for v, own in zip(mean, used, strict=True)),
+        "periodicity": periodicity,
+        "drift": drift,
+        "origin": start,
+    }
 
 
 def _first_guess(signals: Signals, frequency: float | None, periods: int) -> float:
@@ -353,20 +341,27 @@ def _periodicity(signals: Signals, fit: HarmonicFit) -> float:
     return float(explained[worst])
 
 
-def _cycle_scatter(time: np.ndarray, fit: HarmonicFit, channel: int, cycles: int) -> CycleScatter:
+def _cycle_scatter(
+    time: np.ndarray, fit: HarmonicFit, residuals: np.ndarray, cycles: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the variances of one cycle's complex amplitudes and of the mean's, (harmonics + 1,) each.
+
+    The latter are corrected for correlation between successive cycles.
+    """
     count = fit.amplitudes.shape[1]
     cycle = np.minimum(((time - time[0]) * fit.frequency).astype(int), cycles - 1)
     size = np.bincount(cycle, minlength=cycles)
     turn, power = np.exp(-2j * np.pi * fit.frequency * time), np.ones(time.size, dtype=complex)
     deviation = np.empty((cycles, count), dtype=complex)
     for h in range(count):
-        wave = fit.residuals[channel] * power
+        wave = residuals * power
         total = np.bincount(cycle, wave.real, cycles) + 1j * np.bincount(cycle, wave.imag, cycles)
         deviation[:, h] = total / size * (1.0 if h == 0 else 2.0)
         power *= turn
-    one_cycle = np.sum(np.abs(deviation) ** 2, axis=0) / (cycles - 1)
+    squared = np.sum(np.abs(deviation) ** 2, axis=0)
+    one_cycle = squared / (cycles - 1)
     follow = np.sum((deviation[1:] * np.conj(deviation[:-1])).real, axis=0)
-    return CycleScatter(one_cycle, one_cycle / cycles * _inflation(follow, np.sum(np.abs(deviation) ** 2, axis=0)))
+    return one_cycle, one_cycle / cycles * _inflation(follow, squared)
 
 
 def _inflation(follow: np.ndarray, total: np.ndarray) -> np.ndarray:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from bayesperiodic import _checks, _fourier
+from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.data.folding import Signals, mean_period
+from bayesperiodic.data.folding import Signals, fold_signals
 
 
 def read_csv(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
@@ -153,7 +153,6 @@ class Recording(Result):
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
     >>> t = np.arange(0, 60, 0.01)
     >>> recording = bp.Recording.from_arrays(t, {"angle": np.sin(2 * np.pi * 1.3 * t)}, name="swing")
     >>> recording.between(10, 50)
@@ -265,7 +264,7 @@ class Recording(Result):
 
         Examples
         --------
-        >>> import pathlib, tempfile, numpy as np, pandas as pd, bayesperiodic as bp
+        >>> import pathlib, tempfile, numpy as np, pandas as pd
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
         >>> t = np.arange(500) / 50
         >>> pd.DataFrame({"t": t, "x_mm": 25 * np.sin(2 * np.pi * t)}).to_csv(path, index=False)
@@ -452,31 +451,11 @@ class Recording(Result):
         >>> print(f"{run.frequency:.4f} Hz, {run.independent['displacement']} independent values")
         0.1000 Hz, 19 independent values
         """
-        periods = _checks.integer("periods", periods, 1)
-        points = _checks.integer("samples", samples, 4) * periods
+        periods, samples = _checks.integer("periods", periods, 1), _checks.integer("samples", samples, 4)
         channels = self.inputs | self.outputs
         signals = Signals(self.name, self.time, tuple(channels), np.stack([*channels.values()]), len(self.inputs))
-        mean = mean_period(signals, points, frequency, periods, harmonics, origin, largest_drift)
-        folded = {channel: _fourier.on_grid(amplitudes, points) for channel, amplitudes in mean.amplitudes.items()}
-        kept = {channel: amplitudes.size - 1 for channel, amplitudes in mean.amplitudes.items()}
-        return Experiment(
-            name or self.name,
-            mean.frequency * periods,
-            {channel: folded[channel] for channel in self.outputs},
-            {channel: folded[channel] for channel in self.inputs},
-            samples=samples,
-            periods=periods,
-            scatter=mean.scatter,
-            cycles=mean.cycles,
-            independent={channel: min(2 * kept[channel] + 1, mean.samples) for channel in self.outputs},
-            frequency_se=mean.frequency_se * periods,
-            harmonics=kept,
-            amplitude_variance=mean.amplitude_variance,
-            periodicity=mean.periodicity,
-            drift=mean.drift,
-            origin=mean.origin,
-            synthetic=self.synthetic,
-        )
+        folded = fold_signals(signals, samples, periods, frequency, harmonics, origin, largest_drift)
+        return Experiment(name or self.name, synthetic=self.synthetic, **folded)
 
     def __repr__(self) -> str:
         kind = "synthetic recording" if self.synthetic else "recording"

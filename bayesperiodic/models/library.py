@@ -20,12 +20,11 @@ duffing = Model(
     description="""A mass on a damper and a hardening or softening spring: m ẍ + c ẋ + k x + k3 x³ = force.
 
     The cubic term is the first nonlinear term of any smooth symmetric restoring force (G. Duffing, Erzwungene
-    Schwingungen bei veränderlicher Eigenfrequenz, Vieweg, 1918). For first experiments, and for structures near a
-    resonance, which have up to three periodic solutions at one frequency.
+    Schwingungen bei veränderlicher Eigenfrequenz, Vieweg, 1918). For structures near a resonance, which have up to
+    three periodic solutions at one frequency.
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
     >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": np.ones(8)},
     ...                   frequency=0.2, duration=100, sampling_rate=10)
     """,
@@ -51,7 +50,6 @@ dahl = Model(
     With an amplitude of 10 mm, 50 times 1/rho, friction slides most of the time and dissipates almost the
     4·Kw·10 mm = 2 J per period of ideal Coulomb friction:
 
-    >>> import numpy as np, bayesperiodic as bp
     >>> x = 0.01 * np.cos(2 * np.pi * np.arange(800) / 800)
     >>> theta = {"Kx": 0, "K": 0, "F0": 0, "Kw": 50.0, "rho": 5e3}
     >>> solution = bp.solve_periodic(bp.models.dahl, theta, {"displacement": x}, frequency=1.0)
@@ -99,7 +97,6 @@ pendulum = Model(
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> theta = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
     >>> run = bp.simulate(bp.models.pendulum, theta, frequency=1.4467, duration=7, sampling_rate=100, start={"phi": 1})
     """,
@@ -120,12 +117,10 @@ silverbox = Model(
     The usual model of the Silverbox, an electronic circuit that is equivalent to a mass on a hardening spring
     (T. Wigren, J. Schoukens, Three free data sets for development and benchmarking in nonlinear system identification,
     European Control Conference, 2013). k2 and u0 represent offsets of the measured signals. w0 is a time scale and not
-    identifiable: twice w0 with c/2 and a quarter of the other parameters gives the same response; fix it. The response
-    has no offset parameter, because other values of k1, k2 and u0 have the same effect.
+    identifiable: twice w0 with c/2 and a quarter of the other parameters gives the same response; fix it.
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
     >>> theta = {"w0": 408.4, "c": 0.1, "k1": 1.1, "k2": 0, "k3": 4.4, "g": 1.1, "u0": 0}
     >>> run = bp.simulate(bp.models.silverbox, theta, {"drive": 0.1 * np.cos(2 * np.pi * np.arange(16) / 16)},
     ...                   frequency=60, duration=0.5, sampling_rate=600)
@@ -143,12 +138,10 @@ van_der_pol = Model(
 
     Van der Pol's equation (Philosophical Magazine 2, 1926, 978-992) with time scaled by omega. The damping is negative
     for ``|x|`` < 1 and positive for ``|x|`` > 1, so that every motion except rest converges to one limit cycle, with
-    amplitude about 2 and, for small mu, period (2π/omega)(1 + mu²/16 + …). The displacement is relative to the one at
-    which the damping vanishes. For autonomous systems, whose frequency is unknown and whose phase is arbitrary.
+    amplitude about 2 and, for small mu, period (2π/omega)(1 + mu²/16 + …).
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.models.van_der_pol.autonomous
     True
     """,
@@ -185,13 +178,13 @@ def landing_gear(drive: str = "force") -> Model:
     ----------
     drive : {"force", "displacement"}
         "force": states q and T, input force, outputs displacement and pressure; for a gear under a prescribed load.
-        "displacement": state T, input displacement, which determines q and its derivatives, outputs force and pressure;
-        for a test rig with prescribed motion, such as the paper's, and faster to solve.
+        "displacement": state T, input displacement, outputs force and pressure; for a test rig with prescribed motion,
+        such as the paper's, and faster to solve.
 
     Returns
     -------
     Model
-        The same object for the same drive. If theta4 is free and theta11 represents the ambient pressure, tie them.
+        If theta4 is free and theta11 represents the ambient pressure, tie them.
 
     Raises
     ------
@@ -206,7 +199,6 @@ def landing_gear(drive: str = "force") -> Model:
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.models.landing_gear("displacement").outputs
     ('force', 'pressure')
     """
@@ -266,8 +258,7 @@ def chain(masses: int) -> Model:
         m \ddot x_i + R(e_i, \dot e_i) - R(e_{i+1}, \dot e_{i+1}) = 0,
         \qquad R(e, \dot e) = c \dot e + k e + k_3 e^3,
 
-    with the force in place of −R after the last mass. One mass is the Duffing oscillator. For several modes with few
-    parameters: internal resonances, identifiability from one channel, cost as a function of the number of states.
+    with the force in place of −R after the last mass. One mass is the Duffing oscillator.
 
     Parameters
     ----------
@@ -277,8 +268,7 @@ def chain(masses: int) -> Model:
     Returns
     -------
     Model
-        States x1, x2, …; input force; parameters m, c, k, k3; output displacement, that of the last mass. The same
-        object for the same number.
+        States x1, x2, …; input force; parameters m, c, k, k3; output displacement, that of the last mass.
 
     Raises
     ------
@@ -287,7 +277,6 @@ def chain(masses: int) -> Model:
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.models.chain(3).states
     ('x1', 'x2', 'x3')
     """
@@ -385,15 +374,14 @@ flutter = Model(
     0) = 0. The air (density rho, wing of length span) adds mass, damping and stiffness; the lift increases with the
     wind speed U and depends on past motion through the wake, by Jones's approximation of Wagner's function. The spring
     in pitch hardens, so that limit cycles exist below the speed at which the equilibrium loses its stability: an
-    unstable one inside a stable one.
-    The wing has mass m and inertia I_alpha about its pitch axis, which is a·b behind the middle of the chord and
-    x_alpha·b ahead of the centre of mass; the total heaving mass is m_T. The springs and dampers are k_h, c_h in heave
-    and k_alpha, k_alpha2, k_alpha3, c_alpha in pitch. The sensors are linear: heave = offset_heave + gain_heave h,
-    pitch = offset_pitch + gain_pitch α. For self-excited systems whose unstable cycles are also measured.
+    unstable one inside a stable one. The wing has mass m and inertia I_alpha about its pitch axis, which is a·b behind
+    the middle of the chord and x_alpha·b ahead of the centre of mass; the total heaving mass is m_T. The springs and
+    dampers are k_h, c_h in heave and k_alpha, k_alpha2, k_alpha3, c_alpha in pitch. The sensors are linear: heave =
+    offset_heave + gain_heave h, pitch = offset_pitch + gain_pitch α. For self-excited systems whose unstable cycles are
+    also measured.
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> rig = {"b": 0.15, "span": 1, "a": -0.5, "rho": 1.204, "x_alpha": 0.234, "m": 5.3, "m_T": 16.9,
     ...     "I_alpha": 0.1726, "c_h": 15.443, "c_alpha": 0.562767, "k_h": 3529.4, "k_alpha": 54.1162, "k_alpha2": 751.6,
     ...     "k_alpha3": 5006, "gain_heave": 1, "gain_pitch": 1, "offset_heave": 0, "offset_pitch": 0}

@@ -77,7 +77,6 @@ class Model:
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> model = bp.Model("spring", states=["x"], inputs=["force"], parameters={"m": "kg", "k": "N/m"},
     ...     equations=lambda s, p, u: [p.m * s.ddx + p.k * s.x - u.force],
     ...     outputs=lambda s, p, u: {"displacement": s.x})
@@ -337,7 +336,7 @@ def smooth_sign(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
     --------
     Coulomb friction of 20 N with a transition within about ±1 mm/s:
 
-    >>> import sympy as sp, bayesperiodic as bp
+    >>> import sympy as sp
     >>> v = sp.Symbol("v")
     >>> friction = 20 * bp.smooth_sign(v, 1e-3)
     >>> [round(float(friction.subs(v, speed)), 2) for speed in (-1e-3, 0, 1e-3, 1e-2)]
@@ -366,7 +365,7 @@ def smooth_abs(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
 
     Examples
     --------
-    >>> import sympy as sp, bayesperiodic as bp
+    >>> import sympy as sp
     >>> v = sp.Symbol("v")
     >>> [round(float(bp.smooth_abs(v, 0.1).subs(v, speed)), 3) for speed in (0, 0.1, 1, -10)]
     [0.0, 0.041, 0.905, 9.9]

@@ -10,15 +10,8 @@ from scipy.stats import chi2
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic.orbits.cycles import (
-    Candidate,
-    Estimate,
-    box_orbits,
-    candidates,
-    has_shorter_period,
-    refine,
-    shift_between,
-)
+from bayesperiodic.orbits import cycles
+from bayesperiodic.orbits.cycles import Candidate, Estimate
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.return_map import REACH, Atlas, ReturnMap, check_chaos, estimate_noise
 from bayesperiodic.orbits.section import PoincareSection, wrapped
@@ -111,13 +104,13 @@ def find_orbits(
     box = _checks.positive("box", box)
     scaled = _scaled(section, neighbours)
     if method == "boxes":
-        found = [pair for p in wanted for pair in box_orbits(scaled.maps, scaled.points, p, neighbours, box)]
+        found = [pair for p in wanted for pair in cycles.box_orbits(scaled.maps, scaled.points, p, neighbours, box)]
     else:
         atlas = Atlas(scaled.maps, _search_count(scaled.maps, neighbours))
         found = [pair for p in wanted for pair in _chained(scaled, atlas, p, neighbours)]
     quality_count = _search_count(scaled.maps, FEWEST_NEIGHBOURS)
     orbits = [_orbit(section, scaled, *pair, _quality(scaled, *pair, quality_count)) for pair in found]
-    return Orbits(tuple(_named(_with_partners(orbits, scaled))), values=section.values, method=method)
+    return Orbits(_finished(orbits, scaled), values=section.values, method=method)
 
 
 def _periods(periods: Iterable[int], count: int) -> list[int]:
@@ -164,14 +157,14 @@ def _chained(scaled: _ScaledSection, atlas: Atlas, period: int, neighbours: int)
     found: list[tuple[Candidate, Estimate]] = []
 
     def same(one: Estimate, other: Estimate) -> bool:
-        distance, _ = shift_between(one.points, other.points, maps.wrap)
+        distance, _ = cycles.shift_between(one.points, other.points, maps.wrap)
         return distance < max(1e-3, 2.0 * max(_largest_sd(one), _largest_sd(other)))
 
-    for candidate in candidates(maps, atlas, scaled.points, period):
-        estimate = refine(maps, candidate.points, neighbours)
+    for candidate in cycles.candidates(maps, atlas, scaled.points, period):
+        estimate = cycles.refine(maps, candidate.points, neighbours)
         if estimate is None or not (sd := _largest_sd(estimate)) < LARGEST_SD:
             continue
-        repeats = has_shorter_period(estimate.points, maps.wrap, max(2e-3, 3.0 * sd))
+        repeats = cycles.has_shorter_period(estimate.points, maps.wrap, max(2e-3, 3.0 * sd))
         if not repeats and not any(same(estimate, other) for _, other in found):
             found.append((candidate, estimate))
     return found
@@ -199,11 +192,11 @@ def _orbit(
         if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
-    for k, name in enumerate(section.coordinates):
-        if name in section.angles:
-            points[:, k] = wrapped(points[:, k])
-            if cycle is not None:
-                cycle[name] += 2.0 * np.pi * np.round((points[0, k] - cycle[name][0]) / (2.0 * np.pi))
+    for k in np.flatnonzero(scaled.maps.angle):
+        points[:, k] = wrapped(points[:, k])
+        if cycle is not None:
+            values = cycle[section.coordinates[k]]
+            values += 2.0 * np.pi * np.round((points[0, k] - values[0]) / (2.0 * np.pi))
     return Orbit(
         name="",
         coordinates=section.coordinates,
@@ -248,30 +241,25 @@ def _quality(scaled: _ScaledSection, candidate: Candidate, estimate: Estimate, n
     return float(chi2.sf(statistic, 2 * period))
 
 
-def _with_partners(orbits: list[Orbit], scaled: _ScaledSection) -> list[Orbit]:
-    """Return the orbits with the positions of their mirror images under the change of all signs."""
+def _finished(orbits: list[Orbit], scaled: _ScaledSection) -> tuple[Orbit, ...]:
+    """Return the orbits with names, and with the positions of their mirror images under the change of all signs."""
     result: list[Orbit] = []
+    counts: Counter[tuple[int, int | None]] = Counter()
     for orbit in orbits:
         partner, closest = None, np.inf
         for k, other in enumerate(orbits):
             if other.period != orbit.period:
                 continue
-            distance, _ = shift_between(orbit.points / scaled.size, -other.points / scaled.size, scaled.maps.wrap)
+            distance, _ = cycles.shift_between(
+                orbit.points / scaled.size, -other.points / scaled.size, scaled.maps.wrap
+            )
             sd = np.sqrt([np.diag(o.covariance).reshape(-1, 2).max(0) / scaled.size**2 for o in (orbit, other)]).max()
             if distance < max(2e-3, 4.0 * sd) and distance < closest:
                 partner, closest = k, distance
         # Without a measured cycle, a symmetric fixed point is taken for a state of rest.
         rest = orbit.equilibrium or (orbit.cycle is None and orbit.period == 1 and partner == len(result))
-        result.append(replace(orbit, partner=partner, equilibrium=rest))
-    return result
-
-
-def _named(orbits: list[Orbit]) -> list[Orbit]:
-    counts: Counter[tuple[int, int | None]] = Counter()
-    result = []
-    for orbit in orbits:
-        key = (orbit.period, orbit.winding)
-        counts[key] += 1
+        counts[orbit.period, orbit.winding] += 1
         winding = "" if orbit.winding is None else f", winding {orbit.winding}"
-        result.append(replace(orbit, name=f"period {orbit.period}{winding}, orbit {counts[key]}"))
-    return result
+        name = f"period {orbit.period}{winding}, orbit {counts[orbit.period, orbit.winding]}"
+        result.append(replace(orbit, name=name, partner=partner, equilibrium=rest))
+    return tuple(result)

@@ -10,14 +10,8 @@ import numpy as np
 import sympy as sp
 from sympy.polys.matrices import DomainMatrix
 
-from bayesperiodic.symmetry.determining import (
-    Algebra,
-    Generator,
-    System,
-    integer_circuits,
-    integer_rows,
-    lie_derivative,
-)
+from bayesperiodic.symmetry import determining
+from bayesperiodic.symmetry.determining import Algebra, Generator, System, lie_derivative
 
 # Sensitivities: complex step, number of random parameter values, Newton steps, relative size of zero singular values.
 STEP, VALUES, NEWTON_STEPS, ZERO = 1e-30, 4, 30, 1e-9
@@ -463,11 +457,11 @@ def _others(
     null = [list(v) for v in weights.nullspace()] if scalings else sp.eye(len(left)).tolist()
     if not null:
         return []
-    vectors = integer_rows(DomainMatrix.from_Matrix(sp.Matrix(null)).convert_to(sp.QQ))
+    vectors = determining.integer_rows(DomainMatrix.from_Matrix(sp.Matrix(null)).convert_to(sp.QQ))
     symbols = [system.parameters[n] for n in left]
     products = [
         sp.Mul(*(moved.get(s, s) ** int(power) for s, power in zip(symbols, vector, strict=True)))
-        for vector in integer_circuits(vectors, np.ones(len(left), dtype=np.int64))
+        for vector in determining.integer_circuits(vectors, np.ones(len(left), dtype=np.int64))
     ]
     return [sp.factor(sp.cancel(p)) for p in products]
 

@@ -9,16 +9,9 @@ import sympy as sp
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic.models.model import Model
+from bayesperiodic.symmetry import invariants
 from bayesperiodic.symmetry.determining import Generator, System, determining_equations, generators_of, system_of
-from bayesperiodic.symmetry.invariants import (
-    Directions,
-    Flow,
-    coefficients_of,
-    combinations_of,
-    directions_of,
-    flow_of,
-    verified,
-)
+from bayesperiodic.symmetry.invariants import Directions, Flow
 
 
 @dataclass(frozen=True)
@@ -78,7 +71,6 @@ class Structure(Result):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> found = bp.structure(bp.models.duffing, fixed=["k"])
     >>> found.complete, found.table["verdict"].to_dict()
     (True, {'m': 'determined', 'c': 'determined', 'k3': 'determined'})
@@ -261,7 +253,6 @@ def structure(
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> found = bp.structure(bp.models.pendulum, fixed=["a", "g", "v0"])
     >>> found.combinations
     ('k1/(m*l**2)', 'k2/(m*l**2)', 'k3/(m*l**2)')
@@ -292,11 +283,13 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
     system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if s in used})
     names = {s: n for n, s in (whole.parameters | whole.known).items()}
     symmetries = generators_of(determining_equations(system)) if system.parameters else []
-    flows = [verified(system, flow) if (flow := flow_of(symmetry)) else None for symmetry in symmetries]
+    flows = [
+        invariants.verified(system, flow) if (flow := invariants.flow_of(symmetry)) else None for symmetry in symmetries
+    ]
     generators = [flow.generator if flow else symmetry for symmetry, flow in zip(symmetries, flows, strict=True)]
-    directions = directions_of(system, generators)
-    coefficients = coefficients_of(system)
-    found = combinations_of(system, generators, [f for f in flows if f], directions, coefficients)
+    directions = invariants.directions_of(system, generators)
+    coefficients = invariants.coefficients_of(system)
+    found = invariants.combinations_of(system, generators, [f for f in flows if f], directions, coefficients)
     combinations = {c: written(c, names).removeprefix("-") for c in found}
     return Structure(
         model=name,
