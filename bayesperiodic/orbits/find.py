@@ -192,11 +192,11 @@ def _orbit(
         if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
-    for k in np.flatnonzero(scaled.maps.angle):
-        points[:, k] = wrapped(points[:, k])
+    for column in np.flatnonzero(scaled.maps.angle):
+        points[:, column] = wrapped(points[:, column])
         if cycle is not None:
-            values = cycle[section.coordinates[k]]
-            values += 2.0 * np.pi * np.round((points[0, k] - values[0]) / (2.0 * np.pi))
+            values = cycle[section.coordinates[column]]
+            values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
     return Orbit(
         name="",
         coordinates=section.coordinates,
