@@ -171,7 +171,7 @@ class SymbolicModel:
         """Return the compiled residual, Jacobian, outputs and derivatives."""
         rates = set(self.states[len(self.equations) :])
         return Kernels(
-            **_grid_functions(self.kernel_source(), FUNCTIONS),
+            **dict(zip(FUNCTIONS, grid_functions(self.kernel_source(), FUNCTIONS), strict=True)),
             states=len(self.equations),
             inputs=len(self.inputs) // 3,
             parameters=len(self.parameters),
@@ -195,16 +195,12 @@ class SymbolicModel:
         arguments = self._arguments(q, u, theta)
         return _module([_function(name, needed, arguments) for name, needed in expressions.items()])
 
-    def jacobian_change(self) -> GridFunction:
-        """Return the compiled directional derivative of ∂g/∂(q, q̇, q̈), row by row (states × 3·states).
+    def jacobian_change_source(self) -> str:
+        """Return the module of the directional derivative of ∂g/∂(q, q̇, q̈), row by row (states × 3·states), as text.
 
         It is a function of states (q, q̇, q̈ and their changes), inputs (u, u̇, ü and their changes) and parameters (θ,
         its change and that of the frequency).
         """
-        return _grid_functions(self.jacobian_change_source(), ("jacobian_change",))["jacobian_change"]
-
-    def jacobian_change_source(self) -> str:
-        """Return the module of `jacobian_change` as text."""
         moving = (*self.states, *self.inputs, *self.parameters, self.frequency)
         change = {symbol: sp.Symbol(f"c_{symbol.name}", real=True) for symbol in moving}
         q, u, theta = ((*own, *map(change.get, own)) for own in (self.states, self.inputs, self.parameters))
@@ -215,12 +211,8 @@ class SymbolicModel:
         ]
         return _module([_function("jacobian_change", changes, arguments)])
 
-    def vjp_kernels(self, moving: tuple[int, ...]) -> VjpKernels:
-        """Return the compiled vector-Jacobian products with respect to the parameters of these indices."""
-        return VjpKernels(**_grid_functions(self.vjp_source(moving), ("outputs_vjp", "equations_vjp")))
-
     def vjp_source(self, moving: tuple[int, ...]) -> str:
-        """Return the module of `vjp_kernels` as text."""
+        """Return the module of `VjpKernels`, with respect to the parameters of these indices, as text."""
         by = tuple(self.parameters[i] for i in moving)
 
         def function(name: str, letter: str, rows: tuple[sp.Expr, ...], columns: tuple[sp.Symbol, ...]) -> str:
@@ -247,9 +239,10 @@ class SymbolicModel:
         )
 
 
-def _grid_functions(source: str, names: Sequence[str]) -> dict[str, GridFunction]:
+def grid_functions(source: str, names: Sequence[str]) -> list[GridFunction]:
+    """Return functions of a generated module, compiled or from the cache."""
     module = load(source)
-    return {name: GridFunction(getattr(module, name)) for name in names}
+    return [GridFunction(getattr(module, name)) for name in names]
 
 
 def _jacobian(rows: Sequence[sp.Expr], columns: Sequence[sp.Symbol]) -> list[sp.Expr]:

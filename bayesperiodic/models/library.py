@@ -158,10 +158,10 @@ _GEAR_CHANNELS = {"displacement": "m", "force": "N", "pressure": "Pa", "q": "m",
 def landing_gear(drive: str = "force") -> Model:
     r"""Return the model of a nose landing gear damper, driven by a force or by a displacement.
 
-    The equations are eq. (9) of [1]_. q is the compression and T the absolute temperature of the gas. The force on the
-    axle balances inertia, quadratic oil damping, the gas pressure on the area theta4, Coulomb friction (with a part
-    proportional to the pressure) smoothed by an arctan, and a constant, which is the ambient pressure on the same area
-    if theta11 = −theta4 · ambient pressure:
+    The equations are eq. (9) of de Kraker, Verbeek & van de Wouw (1997, see `Model`). q is the compression and T the
+    absolute temperature of the gas. The force on the axle balances inertia, quadratic oil damping, the gas pressure on
+    the area theta4, Coulomb friction (with a part proportional to the pressure) smoothed by an arctan, and a constant,
+    which is the ambient pressure on the same area if theta11 = −theta4 · ambient pressure:
 
     .. math::
 
@@ -190,12 +190,6 @@ def landing_gear(drive: str = "force") -> Model:
     ------
     ValueError
         For another drive.
-
-    References
-    ----------
-    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
-       equilibrium states, in: D. H. van Campen (Ed.), Interaction between Dynamics and Control in Advanced
-       Mechanical Systems, Kluwer, 1997, 191-198.
 
     Examples
     --------

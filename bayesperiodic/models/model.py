@@ -12,10 +12,11 @@ import sympy as sp
 
 from bayesperiodic import _checks
 from bayesperiodic.models.cache import load
-from bayesperiodic.models.code_generation import GridFunction, Kernels, SymbolicModel, VjpKernels
+from bayesperiodic.models.code_generation import GridFunction, Kernels, SymbolicModel, VjpKernels, grid_functions
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
 DERIVATIVES = ("", "d", "dd")
+VJP_FUNCTIONS = ("outputs_vjp", "equations_vjp")
 
 
 class Names:
@@ -208,8 +209,8 @@ class Model:
 
     @cached_property
     def jacobian_change(self) -> GridFunction:
-        """The compiled directional derivative of ∂g/∂(q, q̇, q̈); see `SymbolicModel.jacobian_change`."""
-        return self.symbolic.jacobian_change()
+        """The compiled directional derivative of ∂g/∂(q, q̇, q̈); see `SymbolicModel.jacobian_change_source`."""
+        return grid_functions(self.symbolic.jacobian_change_source(), ["jacobian_change"])[0]
 
     def vjp_kernels(self, moving: tuple[int, ...]) -> VjpKernels:
         """Return the compiled vector-Jacobian products of a gradient.
@@ -225,7 +226,7 @@ class Model:
         """
         known = self.__dict__.setdefault("_vjp_kernels", {})
         if moving not in known:
-            known[moving] = self.symbolic.vjp_kernels(moving)
+            known[moving] = VjpKernels(*grid_functions(self.symbolic.vjp_source(moving), VJP_FUNCTIONS))
         return known[moving]
 
     def input_derivatives(self) -> dict[str, int]:
