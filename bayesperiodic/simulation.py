@@ -53,18 +53,12 @@ def simulate(
         One forcing period on an equidistant grid, end point excluded, which is repeated and differentiated spectrally;
         or a smooth function of arrays of time [s], which is differentiated by differences of sixth order with a step of
         0.2 % of the forcing period.
-    frequency : float
-        Forcing frequency [Hz].
-    duration : float
-        Duration [s].
-    sampling_rate : float
-        Sampling rate [Hz].
+    frequency, duration, sampling_rate : float
+        Forcing frequency [Hz], duration [s] and sampling rate [Hz].
     start : mapping of str to float, optional
         States at time 0, and first derivatives of second-order states, such as ``dx``; the others are zero.
-    noise : mapping of str to float, optional
-        Standard deviation of independent normal noise on outputs and inputs.
-    seed : int, optional
-        Seed of the noise.
+    noise, seed : mapping of str to float and int, optional
+        Standard deviation of independent normal noise on outputs and inputs, and the seed of its generator.
 
     Returns
     -------

@@ -41,14 +41,11 @@ class Experiment(Result):
         same harmonics before the comparison. By default all harmonics are kept.
     amplitude_variance : mapping of str to array (harmonics + 1,), optional
         Variance of the mean's complex Fourier amplitudes.
-    frequency_se : float
-        Standard error of the frequency [Hz]; zero if it is known.
-    periodicity : float
-        Fraction of the variance that the mean period explains, of the channel with the smallest one.
+    frequency_se, periodicity, origin : float
+        Standard error of the frequency [Hz], zero if it is known; fraction of the variance that the mean period
+        explains, of the channel with the smallest one; time [s] of the recording at which τ = 0.
     drift : mapping of str to float
         Relative growth of the fundamental of each channel over the recording.
-    origin : float
-        Time [s] of the recording at which τ = 0.
     synthetic : bool
         True if the data were simulated.
     mask : bool array (samples·periods,), optional

@@ -351,8 +351,7 @@ def smooth_abs(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
 
     Parameters
     ----------
-    x : sympy expression
-    width : number > 0 or sympy expression, in the units of `x`
+    x, width : sympy expression, and number > 0 or sympy expression in the same unit
         The value tends to ``|x|`` − width for large ``|x|``; the curvature at zero is 1 / width.
 
     Returns

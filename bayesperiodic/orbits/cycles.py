@@ -111,24 +111,19 @@ def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) 
     starts, members = _close_returns(maps, section, period)
     chains = section[starts[:, None] + np.arange(period)]
     step, heir = _converge(maps, atlas, chains)
-    kept = np.unique(heir)
+    kept = np.array([k for k in np.unique(heir) if step[k] < NEARLY], dtype=int)
     members = [np.concatenate([members[i] for i in np.flatnonzero(heir == k)]) for k in kept]
-    near = step[kept] < NEARLY
-    chains, step = chains[kept[near]], step[kept[near]]
+    chains = chains[kept]
     # The maps of the atlas are discontinuous between centres, so the last steps fit about the points themselves.
     for _ in range(EXACT_STEPS):
         step = _newton(maps, chains, atlas.exactly)[0]
-    return _distinct(maps, section, chains, step, [m for m, is_near in zip(members, near, strict=True) if is_near])
+    return _distinct(maps, section, chains, step, members)
 
 
 def _converge(maps: ReturnMap, atlas: Atlas, chains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Move chains (m, period, 2) by Newton's method on the atlas.
-
-    Return their last steps, and the chain into which each one was merged.
-    """
-    noise = float(maps.noise.max())
-    step, heir = np.full(len(chains), np.inf), np.arange(len(chains))
-    active = heir
+    """Move chains (m, period, 2) on the atlas; return their last steps and the chains into which they were merged."""
+    noise, heir = float(maps.noise.max()), np.arange(len(chains))
+    step, active = np.full(len(chains), np.inf), heir
     for _ in range(STEPS):
         if active.size == 0:
             break
@@ -281,7 +276,7 @@ def _along(fit: LocalFit, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarr
 def _eigenvectors(jacobian: np.ndarray, which: int) -> tuple[np.ndarray, np.ndarray]:
     """Return right eigenvectors (p, 2) of the monodromy matrix at each point, and left ones at each image.
 
-    They belong to the eigenvalue of largest modulus, or to the other one.
+    They belong to the eigenvalue of largest modulus (`which` = 0) or to the other one.
     """
     monodromy = np.stack([_monodromy(np.roll(jacobian, -j, axis=0)) for j in range(len(jacobian))])
     vectors = []

@@ -400,12 +400,9 @@ def select_orbits(
         Those to be estimated.
     model : Model, optional
         If given, unstable eigenvalues are included, as in ``orbit.experiment(multipliers=True)``.
-    largest_multiplier : float
-        Limit of the modulus of the largest multiplier of the model's orbit.
-    least_quality : float
-        Lower limit of `Orbit.quality`.
-    least_gain : float
-        Largest acceptable relative rise of a standard deviation.
+    largest_multiplier, least_quality, least_gain : float
+        Limits of the modulus of the largest multiplier of the model's orbit, of `Orbit.quality`, and of the relative
+        rise of a standard deviation.
 
     Returns
     -------

@@ -45,10 +45,8 @@ class Structure(Result):
     ----------
     model : str
         Name of the model.
-    outputs : tuple of str
-        The measured outputs.
-    known : tuple of str
-        Parameters assumed to be known.
+    outputs, known : tuple of str
+        The measured outputs, and the parameters assumed to be known.
     table : DataFrame
         One row per unknown parameter. verdict: "determined", "only in combination", "not determined" (in no combination
         either) or "does not appear"; enters: the combinations that contain it (for a determined parameter, the
@@ -58,14 +56,12 @@ class Structure(Result):
         Independent identifiable combinations of the parameters that are not determined; expressions for `derive`. With
         `unexplained` directions they are confirmed at random values only.
     symmetries : tuple of Symmetry
-        Independent symmetries.
+        Independent ones.
     to_fix : tuple of str
         The first parameters, in the model's order, that remove all symmetries if they are fixed.
-    rank : int or None
-        Rank of exact sensitivities of the outputs to the parameters that appear, at random parameter values; None if it
-        could not be computed.
-    points : int
-        Number of random parameter values.
+    rank, points : int or None, int
+        Rank of exact sensitivities of the outputs to the parameters that appear (None if it could not be computed), and
+        number of random parameter values.
     unexplained : tuple of str
         Parameters in directions without sensitivity that no symmetry found explains.
 
