@@ -5,7 +5,8 @@ import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from itertools import chain
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -18,18 +19,10 @@ SHOWN = 80
 
 @dataclass(frozen=True)
 class Operation:
-    """A function of one or two numbers.
-
-    Attributes
-    ----------
-    value : callable
-        The function of the operands.
-    slopes : tuple of callable
-        Its derivatives with respect to each operand, as functions of the operands.
-    """
+    """A function of one or two numbers."""
 
     value: Callable[..., Any]
-    slopes: tuple[Callable[..., Any], ...]
+    slopes: tuple[Callable[..., Any], ...]  # its derivatives with respect to each operand
 
 
 def _slope_by_base(a: Any, b: Any) -> Any:
@@ -63,57 +56,48 @@ FUNCTIONS = {
     "abs": Operation(np.abs, (lambda a: np.where(a == 0.0, np.nan, np.sign(a)),)),
 }
 CONSTANTS = {"pi": np.pi}
+DESCRIBED = {
+    "Attribute": "an attribute (a dot)",
+    "BitXor": "^ (powers are written **)",
+    "Call": "a call of something other than a function name",
+    "Compare": "a comparison",
+    "Subscript": "a subscript",
+}
 ALLOWED = f"numbers, names, pi, + - * / **, parentheses and {', '.join(FUNCTIONS)} of one argument"
 
 
 @dataclass(frozen=True)
 class Expression:
-    """A function of named numbers; made by `parse`.
-
-    Attributes
-    ----------
-    text : str
-    names : tuple of str
-        The names that appear, in order of appearance.
-    steps : tuple of float, str or Operation
-        Numbers, names and operations in postfix order.
-    """
+    """A function of named numbers; made by `parse`."""
 
     text: str
-    names: tuple[str, ...]
-    steps: tuple[float | str | Operation, ...]
+    names: tuple[str, ...]  # those that appear, in order of appearance
+    steps: tuple[float | str | Operation, ...]  # in postfix order
 
     def __reduce__(self) -> tuple[Any, ...]:
         return parse, ("expression", self.text, self.names)
 
     def value(self, values: Mapping[str, Any]) -> np.ndarray:
         """Return the value at numbers or arrays, which are broadcast; NaN or infinite where undefined."""
-        given, shape = self._given(values)
-        stack: list[Any] = []
-        with np.errstate(all="ignore"):
-            for step in self.steps:
-                if isinstance(step, Operation):
-                    operands = _pop(stack, step)
-                    stack.append(step.value(*operands))
-                else:
-                    stack.append(given[step] if isinstance(step, str) else step)
-        result = np.empty(shape)
-        result[...] = stack[0]
-        return result
+        return self._evaluate(values, ())[0]
 
     def gradient(self, values: Mapping[str, Any], by: Iterable[str] | None = None) -> dict[str, np.ndarray]:
         """Return the derivatives with respect to the names `by`, by default those that appear.
 
-        They are computed by forward differentiation. A derivative that does not exist is NaN or infinite, such as those
-        of abs and sqrt at 0.
+        A derivative that does not exist is NaN or infinite, such as those of abs and sqrt at 0.
         """
-        wanted = self.names if by is None else tuple(by)
-        given, shape = self._given(values)
+        return self._evaluate(values, self.names if by is None else tuple(by))[1]
+
+    def _evaluate(self, values: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Return the value and the wanted derivatives, by forward differentiation."""
+        if missing := [name for name in self.names if name not in values]:
+            raise ValueError(f"values: must have {list(self.names)} for {self.text!r}, got no {missing}.")
+        given = {name: np.asarray(values[name], dtype=float) for name in self.names}
         stack: list[tuple[Any, dict[str, Any]]] = []
         with np.errstate(all="ignore"):
             for step in self.steps:
                 if isinstance(step, Operation):
-                    terms = _pop(stack, step)
+                    terms = _popped(stack, len(step.slopes))
                     operands = [value for value, _ in terms]
                     total: dict[str, Any] = {}
                     for slope, (_, partials) in zip(step.slopes, terms, strict=True):
@@ -125,42 +109,33 @@ class Expression:
                     stack.append((given[step], {step: 1.0} if step in wanted else {}))
                 else:
                     stack.append((step, {}))
-        partials = stack[0][1]
-        result = {name: np.empty(shape) for name in wanted}
-        for name, slopes in result.items():
-            slopes[...] = partials.get(name, 0.0)
-        return result
+        value, partials = stack[0]
+        shapes = {array.shape for array in given.values()}
+        shape = shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
 
-    def _given(self, values: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
-        """Return the values of the names that appear, and the shape of the result."""
-        if missing := [name for name in self.names if name not in values]:
-            raise ValueError(f"values: must have {list(self.names)} for {self.text!r}, got no {missing}.")
-        given = {name: np.asarray(values[name], dtype=float) for name in self.names}
-        shapes = {value.shape for value in given.values()}
-        return given, shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
+        def filled(number: Any) -> np.ndarray:
+            result = np.empty(shape)
+            result[...] = number
+            return result
+
+        return filled(value), {name: filled(partials.get(name, 0.0)) for name in wanted}
+
+
+def _popped(stack: list[Any], count: int) -> list[Any]:
+    """Remove the last entries of a stack and return them."""
+    start = len(stack) - count
+    last = stack[start:]
+    del stack[start:]
+    return last
 
 
 def parse(argument: str, text: Any, names: Iterable[str], note: str = "") -> Expression:
     """Parse a text such as ``"k1/(m*l**2)"``.
 
-    Only numbers, `names`, pi, + - * / **, parentheses and `FUNCTIONS` are accepted. Numbers are floats, and parts
-    without names are evaluated when the text is parsed.
-
-    Parameters
-    ----------
-    argument : str
-        Name of the argument, for error messages.
-    text : str
-    names : iterable of str
-        Names that the text may contain; a name pi replaces the constant.
-    note : str
-        Added to the message about an unknown name.
-
-    Raises
-    ------
-    ValueError
-        For anything else, more than 1000 characters, a number or a part without names that is not finite, and a
-        constant exponent beyond ±1000.
+    Only numbers, `names`, pi, + - * / **, parentheses and `FUNCTIONS` are accepted; a name pi replaces the constant.
+    Numbers are floats, and parts without names are evaluated when the text is parsed. A ValueError, which names the
+    `argument` and for an unknown name ends with the `note`, is raised for anything else, more than 1000 characters, a
+    number or a part without names that is not finite, and a constant exponent beyond ±1000.
 
     Examples
     --------
@@ -171,12 +146,18 @@ def parse(argument: str, text: Any, names: Iterable[str], note: str = "") -> Exp
     >>> stiffness.gradient({"k1": 8.0, "m": 2.0, "l": 1.0}, by=["l"])
     {'l': array(-8.)}
     """
-    reader = _Reader(argument, text, names, note)
-    for node in _postfix(reader, _tree(reader)):
-        reader.read(node)
-    steps = tuple(reader.steps)
-    appearing = tuple(dict.fromkeys(step for step in steps if isinstance(step, str)))
-    return Expression(reader.text, appearing, steps)
+    parser = _Parser(argument, text, names, note)
+    nodes, pending = [], [parser.tree()]
+    while pending:  # without recursion, which deep nesting would exhaust
+        node = pending.pop()
+        children = parser.children(node)
+        nodes.append((node, len(children)))
+        pending.extend(children)
+    stack: list[Steps] = []
+    for node, count in reversed(nodes):
+        stack.append(parser.steps(node, _popped(stack, count)))
+    appearing = tuple(dict.fromkeys(step for step in stack[0] if isinstance(step, str)))
+    return Expression(parser.text, appearing, tuple(stack[0]))
 
 
 def parse_all(
@@ -192,26 +173,37 @@ def parse_all(
     return {name: parse(f"{argument}[{name!r}]", text, known, note) for name, text in expressions.items()}
 
 
-class _Reader:
-    """Collects the steps of one text from its nodes in postfix order."""
+Steps = list[float | str | Operation]
+
+
+class _Parser:
+    """The text of one expression, and the steps of its nodes."""
 
     def __init__(self, argument: str, text: Any, names: Iterable[str], note: str):
         if not isinstance(text, str):
             raise ValueError(f"{argument}: must be a text of {ALLOWED}, got {text!r}.")
         self.text = text.strip()
-        shown = text if len(text) <= SHOWN else f"{text[:SHOWN]}…"
-        self.argument, self.shown = argument, repr(shown)
+        self.argument, self.shown = argument, repr(text if len(text) <= SHOWN else f"{text[:SHOWN]}…")
         # Python's parser normalises names, for example µ (micro) to μ (mu).
         self.names = {unicodedata.normalize("NFKC", name): name for name in names}
         self.note = note
-        self.steps: list[float | str | Operation] = []
-        self._numbers: list[bool] = []
         if len(text) > MAX_LENGTH:
             self.refuse(f"which has {len(text)} characters, more than {MAX_LENGTH}")
 
-    def refuse(self, reason: str) -> None:
+    def refuse(self, reason: str) -> NoReturn:
         """Raise the ValueError."""
         raise ValueError(f"{self.argument}: must consist of {ALLOWED}, got {self.shown}, {reason}.") from None
+
+    def tree(self) -> ast.expr:
+        """Return the root of Python's syntax tree."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                return ast.parse(self.text, mode="eval").body
+        except (SyntaxError, ValueError):
+            self.refuse("which is not an expression" if self.text else "which is empty")
+        except (RecursionError, MemoryError):
+            self.refuse("which is nested too deeply")
 
     def children(self, node: ast.AST) -> list[ast.expr]:
         """Return the operands of a node; raise a ValueError unless the node is on the whitelist."""
@@ -222,59 +214,41 @@ class _Reader:
         if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
             return [node.left, node.right]
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-            self.known(node.func.id, FUNCTIONS, "functions")
+            self._check_name(node.func.id, FUNCTIONS, "functions")
             if node.keywords or len(node.args) != 1:
                 self.refuse(f"in which {node.func.id} has not exactly one argument")
             return node.args
-        self.refuse(f"which contains {_described(node)}")
-        return []
+        kind = type(getattr(node, "op", node)).__name__
+        self.refuse("which contains " + DESCRIBED.get(kind, f"Python's {kind}"))
 
-    def known(self, name: str, allowed: Iterable[str], kind: str = "names") -> None:
-        """Raise the ValueError of `_checks.one_of`, with the note, unless a name is allowed."""
+    def steps(self, node: Any, operands: list[Steps]) -> Steps:
+        """Return the steps of a node, or its value if all operands are numbers."""
+        if isinstance(node, ast.Constant):
+            return [self._number(node.value)]
+        if isinstance(node, ast.Name) and node.id in self.names:
+            return [self.names[node.id]]
+        if isinstance(node, ast.Name):
+            self._check_name(node.id, dict.fromkeys((*self.names.values(), *CONSTANTS)), "names")
+            return [CONSTANTS[node.id]]
+        numbers = [part[0] for part in operands if len(part) == 1 and isinstance(part[0], float)]
+        called = isinstance(node, ast.Call)
+        operation = FUNCTIONS[node.func.id] if called else OPERATORS[type(node.op)]
+        if operation is OPERATORS[ast.Pow] and isinstance(exponent := operands[1][-1], float):
+            if abs(exponent) > MAX_EXPONENT:
+                self.refuse(f"whose exponent {exponent:g} is beyond ±{MAX_EXPONENT:g}")
+        if len(numbers) < len(operands):
+            return [*chain.from_iterable(operands), operation]
+        with np.errstate(all="ignore"):
+            result = float(operation.value(*numbers))
+        if not np.isfinite(result):
+            self.refuse("in which a part without names is not finite")
+        return [result]
+
+    def _check_name(self, name: str, allowed: Iterable[str], kind: str) -> None:
         try:
             _checks.one_of(f"{self.argument}: {kind} in {self.shown}", name, allowed)
         except ValueError as error:
             raise ValueError(f"{error} {self.note}".strip()) from None
-
-    def read(self, node: ast.AST) -> None:
-        """Append the step of a node after those of its operands."""
-        if isinstance(node, ast.Constant):
-            self._append(self._number(node.value), True)
-        elif isinstance(node, ast.Name) and node.id not in self.names:
-            self.known(node.id, dict.fromkeys((*self.names.values(), *CONSTANTS)))
-            self._append(CONSTANTS[node.id], True)
-        elif isinstance(node, ast.Name):
-            self._append(self.names[node.id], False)
-        elif isinstance(node, ast.Call):
-            assert isinstance(node.func, ast.Name)
-            self._operate(FUNCTIONS[node.func.id])
-        elif isinstance(node, ast.BinOp | ast.UnaryOp):
-            if isinstance(node.op, ast.Pow) and self._numbers[-1] and abs(self._last_number()) > MAX_EXPONENT:
-                self.refuse(f"whose exponent {self._last_number():g} is beyond ±{MAX_EXPONENT:g}")
-            self._operate(OPERATORS[type(node.op)])
-
-    def _append(self, step: float | str, number: bool) -> None:
-        self.steps.append(step)
-        self._numbers.append(number)
-
-    def _last_number(self) -> float:
-        last = self.steps[-1]
-        assert isinstance(last, float)
-        return last
-
-    def _operate(self, operation: Operation) -> None:
-        """Append an operation, or its value if all operands are numbers."""
-        arity = len(operation.slopes)
-        if not all(self._numbers[-arity:]):
-            self.steps.append(operation)
-            self._numbers[-arity:] = [False]
-            return
-        with np.errstate(all="ignore"):
-            result = float(operation.value(*self.steps[-arity:]))
-        if not np.isfinite(result):
-            self.refuse("in which a part without names is not finite")
-        self.steps[-arity:] = [result]
-        self._numbers[-arity:] = [True]
 
     def _number(self, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -286,46 +260,3 @@ class _Reader:
         if not np.isfinite(number):
             self.refuse("which contains a number beyond the largest float")
         return number
-
-
-def _tree(reader: _Reader) -> ast.expr:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return ast.parse(reader.text, mode="eval").body
-    except (SyntaxError, ValueError):
-        reader.refuse("which is not an expression" if reader.text else "which is empty")
-    except (RecursionError, MemoryError):
-        reader.refuse("which is nested too deeply")
-    raise AssertionError("unreachable")
-
-
-def _postfix(reader: _Reader, tree: ast.expr) -> list[ast.expr]:
-    """Return the nodes in postfix order, without recursion."""
-    found, pending = [], [tree]
-    while pending:
-        node = pending.pop()
-        found.append(node)
-        pending.extend(reader.children(node))
-    return found[::-1]
-
-
-def _pop(stack: list[Any], operation: Operation) -> list[Any]:
-    """Remove the operands of an operation from the stack and return them."""
-    arity = len(operation.slopes)
-    operands = stack[-arity:]
-    del stack[-arity:]
-    return operands
-
-
-def _described(node: ast.AST) -> str:
-    operator = getattr(node, "op", None)
-    kind = type(node if operator is None else operator).__name__
-    words = {
-        "Attribute": "an attribute (a dot)",
-        "BitXor": "^ (powers are written **)",
-        "Call": "a call of something other than a function name",
-        "Compare": "a comparison",
-        "Subscript": "a subscript",
-    }
-    return words.get(kind, f"Python's {kind}")

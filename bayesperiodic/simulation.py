@@ -1,6 +1,7 @@
 """Simulated recordings by time integration, independent of the periodic solver."""
 
 from collections.abc import Callable, Mapping
+from functools import cache
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -8,8 +9,7 @@ from scipy.integrate import solve_ivp
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.models.code_generation import as_columns
-from bayesperiodic.models.integrate import integrate_accurately
-from bayesperiodic.models.model import Model
+from bayesperiodic.models.model import Model, integration_kernels
 
 RELATIVE_TOLERANCE = 1e-10
 SIXTH_ORDER = {
@@ -19,6 +19,11 @@ SIXTH_ORDER = {
 DIFFERENCE_STEP = 2e-3
 # In forcing periods.
 LONGEST_STEP, TRIAL = 0.05, 3.0
+# Largest number of steps between two output times.
+STEPS = 100_000
+# Steady cycles: periods of a transient, number of transients, Newton iterations; tolerance and difference step.
+TRANSIENT, ROUNDS, NEWTON = 5, 12, 12
+TOLERANCE, STEP = 1e-9, 1e-5
 
 REMEDY = "The motion may be unbounded; check the signs and units of the parameters, and the start."
 
@@ -48,18 +53,12 @@ def simulate(
         One forcing period on an equidistant grid, end point excluded, which is repeated and differentiated spectrally;
         or a smooth function of arrays of time [s], which is differentiated by differences of sixth order with a step of
         0.2 % of the forcing period.
-    frequency : float
-        Forcing frequency [Hz].
-    duration : float
-        Duration [s].
-    sampling_rate : float
-        Sampling rate [Hz].
+    frequency, duration, sampling_rate : float
+        Forcing frequency [Hz], duration [s] and sampling rate [Hz].
     start : mapping of str to float, optional
         States at time 0, and first derivatives of second-order states, such as ``dx``; the others are zero.
-    noise : mapping of str to float, optional
-        Standard deviation of independent normal noise on outputs and inputs.
-    seed : int, optional
-        Seed of the noise.
+    noise, seed : mapping of str to float and int, optional
+        Standard deviation of independent normal noise on outputs and inputs, and the seed of its generator.
 
     Returns
     -------
@@ -75,7 +74,6 @@ def simulate(
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
     >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0}, {"force": np.ones(8)},
     ...                   frequency=0.2, duration=100, sampling_rate=10)
     >>> round(float(run.outputs["displacement"][-1]), 3)
@@ -84,41 +82,31 @@ def simulate(
     frequency = _checks.positive("frequency", frequency)
     samples = int(_checks.positive("duration", duration) * _checks.positive("sampling_rate", sampling_rate)) + 1
     time = np.arange(samples) / sampling_rate
-    system = FirstOrder.of(model, parameters, inputs or {}, frequency)
-    signals = system.signals
+    system = _FirstOrder(model, parameters, inputs or {}, frequency)
     for name in noise or {}:
         _checks.one_of("noise", name, (*model.outputs, *model.inputs))
-    integrate = integrate_periodic if all(isinstance(s, _Periodic) for s in signals) else _integrate
-    path = integrate(system, system.start(start or {}), time)
-    outputs = system.outputs(time, path)
+    integrate = _integrate_periodic if all(isinstance(s, _Periodic) for s in system.signals) else _integrate
+    channels = system.outputs(time, integrate(system, system.start(start or {}), time))
     generator = np.random.default_rng(seed)
-    channels = {name: outputs[:, i] for i, name in enumerate(model.outputs)}
-    measured_inputs = {name: signals[i](time)[0] for i, name in enumerate(model.inputs)}
+    measured_inputs = {name: signal(time)[0] for name, signal in zip(model.inputs, system.signals, strict=True)}
     for name, sd in (noise or {}).items():
         target = channels if name in channels else measured_inputs
         target[name] = target[name] + _checks.finite_number(f"noise[{name!r}]", sd) * generator.standard_normal(samples)
     return Recording(time, channels, measured_inputs, name=f"synthetic {model.name}", synthetic=True)
 
 
-class FirstOrder:
+class _FirstOrder:
     """A model as ẏ = f(t, y), where y contains the states and the first derivatives of the second-order states."""
 
-    def __init__(self, model: Model, theta: np.ndarray, frequency: float, signals: list[Callable]):
-        self.model, self.theta, self.frequency, self.signals = model, theta, frequency, signals
-        self.count = len(model.states)
-        self.second = [i for i, state in enumerate(model.states) if model.orders[state] == 2]
-        self.highest = [(2 if i in self.second else 1) * self.count + i for i in range(self.count)]
-
-    @classmethod
-    def of(
-        cls, model: Model, parameters: Mapping[str, float], inputs: Mapping[str, Signal], frequency: float
-    ) -> "FirstOrder":
-        """Return the system for validated parameters and inputs."""
+    def __init__(self, model: Model, parameters: Mapping[str, float], inputs: Mapping[str, Signal], frequency: float):
         _checks.same_names("parameters", parameters, model.parameters)
-        theta = np.array([_checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
+        self.model, self.frequency, self.count = model, frequency, len(model.states)
+        self.theta = np.array([_checks.finite_number(f"parameters[{n!r}]", parameters[n]) for n in model.parameters])
         _checks.same_names("inputs", inputs, model.inputs)
-        signals = [_with_derivatives(name, inputs[name], frequency) for name in model.inputs]
-        return cls(model, theta, frequency, signals)
+        self.signals = [_with_derivatives(name, inputs[name], frequency) for name in model.inputs]
+        self.orders = np.array([model.orders[state] for state in model.states])
+        self.second = np.flatnonzero(self.orders == 2)
+        self.highest = self.orders * self.count + np.arange(self.count)
 
     def start(self, given: Mapping[str, float]) -> np.ndarray:
         """Return y from the given states and rates; the others are zero."""
@@ -137,19 +125,18 @@ class FirstOrder:
         present = (size > 1e-15 * size.max(axis=0, initial=0.0)).any(axis=1)
         return table[: 1 + np.flatnonzero(present).max(initial=0)]
 
-    def inputs(self, time: np.ndarray) -> np.ndarray:
-        """Return u, u̇, ü, (points, 3·inputs)."""
+    def _evaluate(self, function: str, states: np.ndarray, time: np.ndarray) -> np.ndarray:
         derivatives = [signal(time) for signal in self.signals]
-        return as_columns((d[order] for order in range(3) for d in derivatives), time.size)
+        inputs = as_columns((d[order] for order in range(3) for d in derivatives), time.size)
+        tau = time * self.frequency
+        return self.model.kernels.evaluate(function, states, inputs, self.theta, tau, self.frequency)
 
     def states(self, time: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return q, q̇, q̈, (points, 3·states), with the highest derivatives solved from the equations."""
         states = np.zeros((time.size, 3 * self.count))
         states[:, : self.count] = y[:, : self.count]
-        for column, i in enumerate(self.second):
-            states[:, self.count + i] = y[:, self.count + column]
-        inputs, tau = self.inputs(time), time * self.frequency
-        columns = self.model.kernels.evaluate("residual_jacobian", states, inputs, self.theta, tau, self.frequency)
+        states[:, self.count + self.second] = y[:, self.count :]
+        columns = self._evaluate("residual_jacobian", states, time)
         jacobian = columns[:, self.count :].reshape(-1, self.count, 3 * self.count)[:, :, self.highest]
         states[:, self.highest] = -np.linalg.solve(jacobian, columns[:, : self.count, None])[..., 0]
         return states
@@ -157,16 +144,14 @@ class FirstOrder:
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         """Return ẏ."""
         states = self.states(np.array([t]), y[None])[0]
-        rates = [states[self.count + i] for i in range(self.count)]
-        return np.array([*rates, *(states[2 * self.count + i] for i in self.second)])
+        return np.concatenate([states[self.count : 2 * self.count], states[2 * self.count + self.second]])
 
-    def outputs(self, time: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return (points, outputs)."""
-        states, tau = self.states(time, y), time * self.frequency
-        return self.model.kernels.evaluate("outputs", states, self.inputs(time), self.theta, tau, self.frequency)
+    def outputs(self, time: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the outputs by name, (points,) each."""
+        return dict(zip(self.model.outputs, self._evaluate("outputs", self.states(time, y), time).T, strict=True))
 
 
-def _integrate(system: FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
+def _integrate(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
     step = LONGEST_STEP / system.frequency
     short = (time[0], min(time[-1], TRIAL / system.frequency))
     size = np.abs(solve_ivp(system, short, start, rtol=1e-3, max_step=step).y).max(axis=1)
@@ -185,22 +170,26 @@ def _integrate(system: FirstOrder, start: np.ndarray, time: np.ndarray) -> np.nd
     return result.y.T
 
 
-def integrate_periodic(system: FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
+@cache
+def _tableau() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return stages, nodes and error weights of the method of order 8, with the step's end as the last stage."""
+    from scipy.integrate import DOP853  # an import of half a second
+
+    a = np.vstack([DOP853.A, DOP853.B])
+    return a, np.append(DOP853.C, 1.0), np.stack([DOP853.E5, DOP853.E3])
+
+
+def _integrate_periodic(system: _FirstOrder, start: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Return the same as `_integrate` for inputs that are Fourier series, by compiled code."""
+    amplitudes, tau, ones = system.amplitudes(), time * system.frequency, np.ones(start.size)
+    function, dormand_prince = system.model.kernels.residual_jacobian, integration_kernels().dormand_prince
 
     def path(tau: np.ndarray, absolute: np.ndarray, relative: np.ndarray) -> np.ndarray:
-        return integrate_accurately(
-            system.model,
-            start,
-            amplitudes,
-            system.theta,
-            frequency=system.frequency,
-            time=tau,
-            absolute=absolute,
-            relative=relative,
-        )
+        found = np.empty((tau.size, start.size))
+        found[0] = start
+        settings = (amplitudes, system.theta, system.frequency, system.orders, tau)
+        return found[: dormand_prince(function, *settings, found, *_tableau(), absolute, relative, STEPS)]
 
-    amplitudes, tau, ones = system.amplitudes(), time * system.frequency, np.ones(start.size)
     trial = path(np.linspace(0.0, min(tau[-1], TRIAL), 61), 1e-12 * ones, 1e-3 * ones)
     size, relative = np.abs(trial).max(axis=0) + np.finfo(float).tiny, RELATIVE_TOLERANCE * ones
     # The error of an angle is relative to one turn, not to its value.
@@ -245,10 +234,6 @@ def _with_derivatives(name: str, signal: Signal, frequency: float) -> Callable[[
     return sampled
 
 
-TRANSIENT, ROUNDS, NEWTON = 5, 12, 12
-TOLERANCE, STEP = 1e-9, 1e-5
-
-
 class NotSettled(RuntimeError):
     """The simulated motion did not converge to a stable steady cycle."""
 
@@ -262,36 +247,13 @@ def steady_cycle(
     samples: int,
     start: Mapping[str, float] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Return one steady cycle of every output, without noise.
+    """Return one steady cycle (samples,) of every output, without noise; arguments as for `simulate`.
 
     Five cycles are integrated from the start. Then Newton's method solves for the state that is repeated after one
     cycle, which avoids long integrations of slow transients, such as thermal ones. Only a stable cycle is accepted;
-    otherwise five more cycles are integrated and the solution is repeated, at most twelve times in total.
-
-    Parameters
-    ----------
-    model : Model
-    parameters : mapping of str to float
-        A value for every parameter.
-    inputs : mapping of str to array (points,)
-        One forcing period each, end point excluded.
-    frequency : float
-        Forcing frequency [Hz].
-    samples : int
-        Samples of the cycle, end point excluded.
-    start : mapping of str to float, optional
-        As for `simulate`.
-
-    Returns
-    -------
-    dict of str to array (samples,)
-
-    Raises
-    ------
-    NotSettled
-        If there is no stable steady cycle, or the integration fails.
+    otherwise this is repeated, up to twelve times. Without a stable cycle, `NotSettled` is raised.
     """
-    system = FirstOrder.of(model, parameters, inputs, frequency)
+    system = _FirstOrder(model, parameters, inputs, frequency)
     try:
         y = system.start(start or {})
         for _ in range(ROUNDS):
@@ -299,18 +261,17 @@ def steady_cycle(
             found = _fixed_point(system, y)
             if found is not None:
                 time = np.arange(samples) / (samples * frequency)
-                values = system.outputs(time, integrate_periodic(system, found, time))
-                return {name: values[:, i] for i, name in enumerate(model.outputs)}
+                return system.outputs(time, _integrate_periodic(system, found, time))
     except (RuntimeError, np.linalg.LinAlgError) as error:
         raise NotSettled(f"{model.name!r}: {error}") from error
     raise NotSettled(f"{model.name!r} does not converge to a stable cycle in {ROUNDS * TRANSIENT} periods.")
 
 
-def _advanced(system: FirstOrder, y: np.ndarray, periods: int) -> np.ndarray:
-    return integrate_periodic(system, y, np.array([0.0, periods / system.frequency]))[-1]
+def _advanced(system: _FirstOrder, y: np.ndarray, periods: int) -> np.ndarray:
+    return _integrate_periodic(system, y, np.array([0.0, periods / system.frequency]))[-1]
 
 
-def _fixed_point(system: FirstOrder, y: np.ndarray) -> np.ndarray | None:
+def _fixed_point(system: _FirstOrder, y: np.ndarray) -> np.ndarray | None:
     """Return the state near y that is repeated after one cycle; None if there is none or it is unstable."""
     identity = np.eye(y.size)
     for _ in range(NEWTON):

@@ -25,10 +25,8 @@ class Experiment(Result):
         Forcing frequency [Hz].
     outputs, inputs : mapping of str to array (samples·periods,)
         Values on the grid, end point excluded.
-    samples : int
-        Grid points per forcing period.
-    periods : int
-        Forcing periods per response period.
+    samples, periods : int
+        Grid points per forcing period, and forcing periods per response period.
     winding : int or mapping of str to int
         Turns of an angle per response period.
     scatter : mapping of str to float, optional
@@ -43,14 +41,11 @@ class Experiment(Result):
         same harmonics before the comparison. By default all harmonics are kept.
     amplitude_variance : mapping of str to array (harmonics + 1,), optional
         Variance of the mean's complex Fourier amplitudes.
-    frequency_se : float
-        Standard error of the frequency [Hz]; zero if it is known.
-    periodicity : float
-        Fraction of the variance that the mean period explains, of the channel with the smallest one.
+    frequency_se, periodicity, origin : float
+        Standard error of the frequency [Hz], zero if it is known; fraction of the variance that the mean period
+        explains, of the channel with the smallest one; time [s] of the recording at which τ = 0.
     drift : mapping of str to float
         Relative growth of the fundamental of each channel over the recording.
-    origin : float
-        Time [s] of the recording at which τ = 0.
     synthetic : bool
         True if the data were simulated.
     mask : bool array (samples·periods,), optional
@@ -59,10 +54,9 @@ class Experiment(Result):
     covariance : array (values, values) or (values + multipliers, values + multipliers), optional
         Covariance of the outputs at the points of the mask, point by point and in the order of `outputs` within a
         point, up to one unknown factor ("scale"). It may have further rows for the logarithms of ``multipliers``.
-    multipliers : array (multipliers,), optional
-        Measured Floquet multipliers, real and signed, largest modulus first; they are compared as log|μ|.
-    multiplier_sd : array (multipliers,), optional
-        Standard deviations of log|μ|, if ``covariance`` has no rows for them.
+    multipliers, multiplier_sd : array (multipliers,), optional
+        Measured Floquet multipliers, real and signed, largest modulus first, which are compared as log|μ|, and the
+        standard deviations of log|μ|, if ``covariance`` has no rows for them.
     guess : mapping of str to array (samples·periods,), optional
         States of the model, including turns of angles, from which the first periodic solve starts; by default the
         equilibrium. An unstable orbit needs a guess.
@@ -78,7 +72,6 @@ class Experiment(Result):
     --------
     A force measured over 20 cycles, with five harmonics kept:
 
-    >>> import numpy as np, bayesperiodic as bp
     >>> tau = np.arange(64) / 64
     >>> force, stroke = 30.0 * np.sin(2 * np.pi * tau), 0.01 * np.cos(2 * np.pi * tau)
     >>> run = bp.Experiment("run 1", 2.0, {"force": force}, {"stroke": stroke}, samples=64,
@@ -137,8 +130,9 @@ class Experiment(Result):
                 _checks.one_of(argument, key, (*self.inputs, *self.outputs))
         measured = points if self.mask is None else int(self.mask.sum())
         counts = {key: min(measured, 2 * self.harmonics.get(key, points) + 1) for key in self.outputs}
-        _checks.same_names("independent", counts | dict(self.independent), self.outputs)
-        object.__setattr__(self, "independent", counts | dict(self.independent))
+        counts |= self.independent
+        _checks.same_names("independent", counts, self.outputs)
+        object.__setattr__(self, "independent", counts)
         self._check_multipliers()
         self._check_covariance(measured * len(self.outputs))
 
@@ -175,9 +169,9 @@ class Experiment(Result):
         matrix = np.asarray(self.covariance, dtype=float)
         size = values if self.multiplier_sd is not None else values + logarithms
         if matrix.shape != (size, size):
+            further = f" and {logarithms} multipliers" if size > values else ""
             raise ValueError(
-                f"covariance: must have shape {(size, size)}, for {values} measured values"
-                f"{f' and {logarithms} multipliers' if size > values else ''}, got {matrix.shape}."
+                f"covariance: must have shape {(size, size)}, for {values} values{further}, got {matrix.shape}."
             )
         if bad := np.count_nonzero(~np.isfinite(matrix)):
             raise ValueError(f"covariance: must be finite and symmetric, got {bad} entries that are not finite.")
@@ -205,7 +199,7 @@ class Experiment(Result):
         *,
         samples: int = 800,
     ) -> "Experiment":
-        """Make an experiment from harmonic amplitudes instead of time histories.
+        """Make an experiment from harmonic amplitudes.
 
         Parameters
         ----------
@@ -226,32 +220,28 @@ class Experiment(Result):
         Raises
         ------
         ValueError
-            For amplitudes that are not a finite vector, a mean that is not real, too few samples for the highest
-            harmonic, and as for `Experiment`.
+            As for `Experiment`, and for amplitudes that are not a finite vector, a mean that is not real, too few
+            samples for the highest harmonic.
 
         Examples
         --------
-        >>> import bayesperiodic as bp
         >>> run = bp.Experiment.from_harmonics("run", 2.0, {"x": [0.1, 0.02 - 0.01j]}, {"force": [0, 5]}, samples=8)
         >>> run.independent, run.inputs["force"].round(3)[:3].tolist()
         ({'x': 3}, [5.0, 3.536, 0.0])
         """
         samples = _checks.integer("samples", samples, 4)
-        signals: dict[str, dict[str, np.ndarray]] = {"outputs": {}, "inputs": {}}
-        highest: dict[str, int] = {}
-        for kind, channels in (("outputs", outputs), ("inputs", inputs or {})):
-            for channel, values in channels.items():
-                amplitudes = _amplitudes(f"{kind}[{channel!r}]", values, samples)
-                signals[kind][channel] = _fourier.on_grid(amplitudes, samples)
-                highest[channel] = amplitudes.size - 1
+        measured, driven = (
+            {channel: _amplitudes(f"{kind}[{channel!r}]", values, samples) for channel, values in given.items()}
+            for kind, given in (("outputs", outputs), ("inputs", inputs or {}))
+        )
         return cls(
             name,
             frequency,
-            signals["outputs"],
-            signals["inputs"],
+            {channel: _fourier.on_grid(amplitudes, samples) for channel, amplitudes in measured.items()},
+            {channel: _fourier.on_grid(amplitudes, samples) for channel, amplitudes in driven.items()},
             samples=samples,
-            harmonics={channel: highest[channel] for channel in outputs},
-            independent={channel: 2 * highest[channel] + 1 for channel in outputs},
+            harmonics={channel: amplitudes.size - 1 for channel, amplitudes in measured.items()},
+            independent={channel: 2 * amplitudes.size - 1 for channel, amplitudes in measured.items()},
         )
 
     @property
@@ -271,15 +261,12 @@ class Experiment(Result):
         ----------
         channel : str
         values : array (…, samples·periods)
-            In the channel's unit.
 
         Returns
         -------
         array (…, samples·periods)
         """
-        if channel not in self.harmonics:
-            return values
-        return _fourier.project(values, self.harmonics[channel])
+        return _fourier.project(values, self.harmonics[channel]) if channel in self.harmonics else values
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())

@@ -1,7 +1,8 @@
 """Estimation of the mean steady period of sampled signals, and of its uncertainty."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
@@ -20,25 +21,13 @@ CROSSING = "crossing"
 
 @dataclass(frozen=True)
 class Signals:
-    """Channels sampled at the same times.
+    """Channels sampled at the same times."""
 
-    Attributes
-    ----------
-    name : str
-        Of the recording, for messages.
-    time : array (samples,)
-    channels : tuple of str
-        Inputs first.
-    values : array (channels, samples)
-    inputs : int
-        Number of inputs.
-    """
-
-    name: str
-    time: np.ndarray
-    channels: tuple[str, ...]
-    values: np.ndarray
-    inputs: int
+    name: str  # of the recording, for messages
+    time: np.ndarray  # (samples,)
+    channels: tuple[str, ...]  # inputs first
+    values: np.ndarray  # (channels, samples)
+    inputs: int  # number of inputs
 
     def __post_init__(self) -> None:
         for i, (channel, values) in enumerate(zip(self.channels, self.values, strict=True)):
@@ -57,37 +46,24 @@ class Signals:
 
 @dataclass(frozen=True)
 class HarmonicFit:
-    """A Fourier series fitted to several channels.
+    """A Fourier series fitted to several channels."""
 
-    Attributes
-    ----------
-    frequency : float
-        Fundamental frequency [Hz].
-    amplitudes : array (channels, harmonics + 1), complex
-        As in `_fourier`, with phases relative to time 0.
-    residuals : array (channels, samples)
-    """
-
-    frequency: float
-    amplitudes: np.ndarray
-    residuals: np.ndarray
-
-    @property
-    def degrees_of_freedom(self) -> int:
-        """Samples less fitted coefficients, at least 1."""
-        return max(self.residuals.shape[1] - (2 * self.amplitudes.shape[1] - 1), 1)
+    frequency: float  # fundamental frequency [Hz]
+    amplitudes: np.ndarray  # complex, as in `_fourier`, with phases relative to time 0, (channels, harmonics + 1)
+    residuals: np.ndarray  # (channels, samples)
 
     @property
     def variances(self) -> np.ndarray:
         """Residual variance of each channel, (channels,)."""
-        return np.sum(self.residuals**2, axis=1) / self.degrees_of_freedom
+        degrees_of_freedom = max(self.residuals.shape[1] - (2 * self.amplitudes.shape[1] - 1), 1)
+        return np.sum(self.residuals**2, axis=1) / degrees_of_freedom
 
 
 def fit_harmonics(time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int) -> HarmonicFit:
     """Fit harmonics 0 … `harmonics` of `frequency` to channels (channels, samples) by least squares.
 
-    The matrix of the normal equations of the exponentials exp(2πi h f t), h = −H … H, is Hermitian Toeplitz, and well
-    conditioned if the samples resolve the highest harmonic.
+    The normal matrix of exp(2πi h f t), h = −H … H, is Hermitian Toeplitz, and well conditioned if the samples resolve
+    the highest harmonic.
     """
     turn = np.exp(-2j * np.pi * frequency * time)
     power = np.ones_like(turn)
@@ -113,8 +89,7 @@ def refine_frequency(
 
     Gauss-Newton iteration for the fundamental, with the amplitudes projected out and every channel weighted by its
     residual variance. The standard error is robust to correlation within a cycle, because the scores are summed over
-    each cycle before they are squared; it is at least that for independent samples. The slope contains the largest
-    harmonic and those whose squared amplitude is ten times its noise; noise in the others would count as information.
+    each cycle before they are squared; it is at least that for independent samples.
     """
     for _ in range(iterations):
         fit, slope, weights = _linearised(time, channels, frequency, harmonics)
@@ -137,6 +112,7 @@ def _linearised(
     fit = fit_harmonics(time, channels, frequency, harmonics)
     noise = 4.0 * fit.variances[:, None] / time.size
     power = np.abs(fit.amplitudes) ** 2
+    # The slope contains the largest and the significant harmonics; noise in the others would count as information.
     largest = power[:, 1:].max(axis=1, keepdims=True)
     clear = np.where((power > SIGNIFICANT_POWER * noise) | (power == largest), fit.amplitudes, 0.0)
     rate = _fourier.derivative(clear, 1.0)
@@ -149,8 +125,7 @@ def _linearised(
 def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
     """Estimate the fundamental frequency [Hz] from the autocorrelation; None if it has no positive peak.
 
-    The lag is the smallest one whose peak reaches 90 % of the highest. A multiple of its frequency is preferred if it
-    explains the signals equally well.
+    The lag is the smallest one whose peak reaches 90 % of the highest.
     """
     samples = time.size
     step = (time[-1] - time[0]) / (samples - 1)
@@ -178,6 +153,7 @@ def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
 
 
 def _largest_equivalent(time: np.ndarray, channels: np.ndarray, frequency: float) -> float:
+    """Return the largest multiple of a frequency that explains the signals equally well."""
     last = time >= time[-1] - 6.0 / frequency
     time, channels = time[last], channels[:, last]
     nyquist = 0.5 * (time.size - 1) / np.ptp(time)
@@ -195,70 +171,20 @@ def _largest_equivalent(time: np.ndarray, channels: np.ndarray, frequency: float
     return frequency
 
 
-@dataclass(frozen=True)
-class CycleScatter:
-    """Differences between the cycles of one channel and their mean, by harmonic.
-
-    Attributes
-    ----------
-    one_cycle : array (harmonics + 1,)
-        Variance E|c − c̄|² of one cycle's complex amplitude.
-    mean : array (harmonics + 1,)
-        Variance of the mean's complex amplitude, corrected for correlation between successive cycles.
-    """
-
-    one_cycle: np.ndarray
-    mean: np.ndarray
-
-
-@dataclass(frozen=True)
-class MeanPeriod:
-    """Mean period of steady signals.
-
-    Attributes
-    ----------
-    frequency, frequency_se : float
-        Fundamental frequency and its standard error [Hz].
-    amplitudes : dict of str to array (harmonics + 1,), complex
-        Harmonics that each channel keeps, phases relative to the origin.
-    sd : dict of str to float
-        Standard deviation of one cycle about the mean, within the kept harmonics.
-    amplitude_variance : dict of str to array (harmonics + 1,)
-        Variance of the mean's amplitudes.
-    cycles, samples : int
-        Numbers of cycles and samples used.
-    periodicity : float
-        Fraction of the variance that the mean period explains, of the channel with the smallest one.
-    drift : dict of str to float
-        Relative growth of each channel's fundamental over the signals.
-    origin : float
-        Time [s] at which τ = 0.
-    """
-
-    frequency: float
-    frequency_se: float
-    amplitudes: dict[str, np.ndarray]
-    sd: dict[str, float]
-    amplitude_variance: dict[str, np.ndarray]
-    cycles: int
-    samples: int
-    periodicity: float
-    drift: dict[str, float]
-    origin: float
-
-
-def mean_period(
+def fold_signals(
     signals: Signals,
-    points: int,
-    *,
-    frequency: float | None,
+    samples: int,
     periods: int,
+    frequency: float | None,
     harmonics: int | Mapping[str, int] | None,
     origin: float | str,
     largest_drift: float | None,
-) -> MeanPeriod:
-    """Estimate the mean period of the steady part of signals; see `Recording.fold`."""
-    start = _checked_origin(origin)
+) -> dict[str, Any]:
+    """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`."""
+    points = samples * periods
+    if isinstance(origin, str) and origin != CROSSING:
+        raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
+    start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
     signals = replace(signals, time=signals.time - start)
     fundamental = _first_guess(signals, frequency, periods)
     if frequency is None:
@@ -274,42 +200,45 @@ def mean_period(
         fit, fundamental_se = fit_harmonics(steady.time, steady.values, fundamental, limit), 0.0
     periodicity = _periodicity(steady, fit)
     cycles = round(np.ptp(steady.time) * fit.frequency)
-    scatter = [_cycle_scatter(steady.time, fit, channel, cycles) for channel in range(len(signals.channels))]
-    kept = {
-        channel: _last_significant(fit.amplitudes[i], scatter[i].mean, cycles)
-        for i, channel in enumerate(signals.channels)
-    } | _chosen(harmonics, signals.channels, limit)
+    one_cycle, mean = zip(*(_cycle_scatter(steady.time, fit, own, cycles) for own in fit.residuals), strict=True)
+    significant = [_last_significant(a, variance, cycles) for a, variance in zip(fit.amplitudes, mean, strict=True)]
+    kept = dict(zip(signals.channels, significant, strict=True)) | _chosen(harmonics, signals.channels, limit)
     amplitudes = fit.amplitudes
     if origin == CROSSING:
-        start = _crossing(amplitudes[signals.inputs, 1], fit.frequency)
+        # The first time ≥ 0 at which the fundamental of the first output crosses zero upwards.
+        phase = np.angle(amplitudes[signals.inputs, 1]) / (2 * np.pi)
+        start = float((-0.25 - phase) % 1.0 / fit.frequency)
         amplitudes = amplitudes * np.exp(2j * np.pi * fit.frequency * start * np.arange(amplitudes.shape[1]))
-    used = {channel: slice(kept[channel] + 1) for channel in signals.channels}
-    return MeanPeriod(
-        frequency=fit.frequency,
-        frequency_se=fundamental_se,
-        amplitudes={channel: amplitudes[i, own] for i, (channel, own) in enumerate(used.items())},
-        sd={c: float(np.sqrt(_power(scatter[i].one_cycle[own]))) for i, (c, own) in enumerate(used.items())},
-        amplitude_variance={channel: scatter[i].mean[own] for i, (channel, own) in enumerate(used.items())},
-        cycles=cycles,
-        samples=steady.time.size,
-        periodicity=periodicity,
-        drift=drift,
-        origin=start,
-    )
+    used = [slice(kept[channel] + 1) for channel in signals.channels]
 
+    def by_channel(values: Iterable[Any]) -> dict[str, Any]:
+        return dict(zip(signals.channels, values, strict=True))
 
-def _checked_origin(origin: float | str) -> float:
-    """Return the time of τ = 0 [s]; 0 if a crossing defines it later."""
-    if origin == CROSSING:
-        return 0.0
-    if isinstance(origin, str):
-        raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
-    return _checks.finite_number("origin", origin)
+    folded = by_channel(_fourier.on_grid(a[own], points) for a, own in zip(amplitudes, used, strict=True))
+    inputs, outputs = signals.channels[: signals.inputs], signals.channels[signals.inputs :]
+    return {
+        "frequency": fit.frequency * periods,
+        "frequency_se": fundamental_se * periods,
+        "outputs": {channel: folded[channel] for channel in outputs},
+        "inputs": {channel: folded[channel] for channel in inputs},
+        "samples": samples,
+        "periods": periods,
+        "cycles": cycles,
+        "scatter": by_channel(float(np.sqrt(_power(v[own]))) for v, own in zip(one_cycle, used, strict=True)),
+        "independent": {channel: min(2 * kept[channel] + 1, steady.time.size) for channel in outputs},
+        "harmonics": kept,
+        "amplitude_variance": by_channel(v[own] for v, own in zip(mean, used, strict=True)),
+        "periodicity": periodicity,
+        "drift": drift,
+        "origin": start,
+    }
 
 
 def _first_guess(signals: Signals, frequency: float | None, periods: int) -> float:
+    remedy = "give the forcing frequency"
     if frequency is not None:
         fundamental: float | None = _checks.positive("frequency", frequency) / periods
+        remedy = f"check frequency = {frequency!r} Hz and periods = {periods}"
     elif signals.inputs:
         guess = guess_frequency(signals.time, signals.values[: signals.inputs])
         fundamental = guess / periods if guess else None
@@ -317,11 +246,9 @@ def _first_guess(signals: Signals, frequency: float | None, periods: int) -> flo
         fundamental = guess_frequency(signals.time, signals.values)
     if fundamental is None or _cycles(signals.time, fundamental) < MINIMUM_CYCLES:
         found = "no period" if fundamental is None else f"{_cycles(signals.time, fundamental):.2f} cycles"
-        remedy = f"check frequency = {frequency!r} Hz and periods = {periods}"
         raise ValueError(
             f"recording: must have at least {MINIMUM_CYCLES} cycles, got {found} in {signals.name!r} of "
-            f"{np.ptp(signals.time):g} s; record longer, or "
-            f"{'give the forcing frequency' if frequency is None else remedy}."
+            f"{np.ptp(signals.time):g} s; record longer, or {remedy}."
         )
     return fundamental
 
@@ -356,10 +283,9 @@ def _resolved(time: np.ndarray, fundamental: float, points: int) -> int:
 
 
 def _cycles_apart(signals: Signals, fundamental: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cycle of each sample, counted back from the end, and the amplitudes of the whole cycles.
+    """Return the cycle of each sample, counted back from the end, and the amplitudes of the whole cycles, last first.
 
-    The amplitudes (cycles, channels, harmonics + 1) are relative to each channel's standard deviation; the last cycle
-    comes first.
+    The amplitudes (cycles, channels, harmonics + 1) are relative to each channel's standard deviation.
     """
     time, values = signals.time, signals.values
     period = 1.0 / fundamental
@@ -390,11 +316,6 @@ def _refuse_drift(name: str, drift: Mapping[str, float], largest: float | None) 
         )
 
 
-def _crossing(amplitude: complex, frequency: float) -> float:
-    """Return the first time ≥ 0 at which the signal Re a·exp(2πi f t) crosses zero upwards."""
-    return float((-0.25 - np.angle(amplitude) / (2 * np.pi)) % 1.0 / frequency)
-
-
 def _steady_part(cycle: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Return a mask of the last whole cycles, without the first ones if they differ from the later half."""
     total = len(shape)
@@ -420,20 +341,27 @@ def _periodicity(signals: Signals, fit: HarmonicFit) -> float:
     return float(explained[worst])
 
 
-def _cycle_scatter(time: np.ndarray, fit: HarmonicFit, channel: int, cycles: int) -> CycleScatter:
+def _cycle_scatter(
+    time: np.ndarray, fit: HarmonicFit, residuals: np.ndarray, cycles: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the variances of one cycle's complex amplitudes and of the mean's, (harmonics + 1,) each.
+
+    The latter are corrected for correlation between successive cycles.
+    """
     count = fit.amplitudes.shape[1]
     cycle = np.minimum(((time - time[0]) * fit.frequency).astype(int), cycles - 1)
     size = np.bincount(cycle, minlength=cycles)
     turn, power = np.exp(-2j * np.pi * fit.frequency * time), np.ones(time.size, dtype=complex)
     deviation = np.empty((cycles, count), dtype=complex)
     for h in range(count):
-        wave = fit.residuals[channel] * power
+        wave = residuals * power
         total = np.bincount(cycle, wave.real, cycles) + 1j * np.bincount(cycle, wave.imag, cycles)
         deviation[:, h] = total / size * (1.0 if h == 0 else 2.0)
         power *= turn
-    one_cycle = np.sum(np.abs(deviation) ** 2, axis=0) / (cycles - 1)
+    squared = np.sum(np.abs(deviation) ** 2, axis=0)
+    one_cycle = squared / (cycles - 1)
     follow = np.sum((deviation[1:] * np.conj(deviation[:-1])).real, axis=0)
-    return CycleScatter(one_cycle, one_cycle / cycles * _inflation(follow, np.sum(np.abs(deviation) ** 2, axis=0)))
+    return one_cycle, one_cycle / cycles * _inflation(follow, squared)
 
 
 def _inflation(follow: np.ndarray, total: np.ndarray) -> np.ndarray:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from bayesperiodic import _checks, _fourier
+from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.data.folding import Signals, mean_period
+from bayesperiodic.data.folding import Signals, fold_signals
 
 
 def read_csv(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
@@ -110,21 +110,7 @@ def _numbers(path: str | Path, column: str, values: Any) -> np.ndarray:
 
 
 def convert(name: str, values: np.ndarray, unit: float | Sequence[str]) -> np.ndarray:
-    """Return values multiplied by a factor or converted by a pair of units.
-
-    Parameters
-    ----------
-    name : str
-        Channel, for messages.
-    values : array
-    unit : float or (from, to)
-        Factor, or two unit names such as ("mm", "m").
-
-    Raises
-    ------
-    ValueError
-        For a factor that is zero or not finite, an unknown unit, or units of different dimensions.
-    """
+    """Return the values of a channel, multiplied by a factor or converted by a pair of units such as ("mm", "m")."""
     argument = f"units[{name!r}]"
     if isinstance(unit, int | float):
         factor = _checks.finite_number(argument, unit)
@@ -163,11 +149,10 @@ class Recording(Result):
     ------
     ValueError
         For fewer than two samples, samples that are NaN or infinite, different lengths, a time that does not increase,
-        no output, names that are not identifiers or are repeated.
+        no output, names that are repeated or not identifiers.
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
     >>> t = np.arange(0, 60, 0.01)
     >>> recording = bp.Recording.from_arrays(t, {"angle": np.sin(2 * np.pi * 1.3 * t)}, name="swing")
     >>> recording.between(10, 50)
@@ -184,7 +169,7 @@ class Recording(Result):
     synthetic: bool = False
 
     def __post_init__(self) -> None:
-        _checks.finite_vector("time", self.time)
+        object.__setattr__(self, "time", _checks.finite_vector("time", self.time))
         if self.time.size < 2:
             raise ValueError(f"time: must have at least 2 samples, got {self.time.size}.")
         step = np.diff(self.time)
@@ -197,9 +182,12 @@ class Recording(Result):
         if not self.outputs:
             raise ValueError("outputs: must have at least one channel, got none.")
         _checks.identifiers("outputs and inputs", (*self.outputs, *self.inputs))
-        for kind, channels in (("outputs", self.outputs), ("inputs", self.inputs)):
-            for name, values in channels.items():
-                _checks.finite_vector(f"{kind}[{name!r}]", values, self.time.size, "one per time")
+        for kind in ("outputs", "inputs"):
+            channels = {
+                name: _checks.finite_vector(f"{kind}[{name!r}]", values, self.time.size, "one per time")
+                for name, values in getattr(self, kind).items()
+            }
+            object.__setattr__(self, kind, channels)
 
     @property
     def sampling_rate(self) -> float:
@@ -228,25 +216,11 @@ class Recording(Result):
         Raises
         ------
         ValueError
-            For samples that are NaN or infinite, different lengths, or a time that does not increase.
-
-        Examples
-        --------
-        >>> import numpy as np, bayesperiodic as bp
-        >>> t = np.arange(1000) / 100
-        >>> bp.Recording.from_arrays(t, {"angle": np.sin(2 * np.pi * 1.3 * t)}).sampling_rate
-        100.0
+            As for `Recording`.
         """
-        time = _checks.finite_vector("time", time)
-        inputs = {} if inputs is None else inputs
-        for argument, given in (("outputs", outputs), ("inputs", inputs)):
-            _checks.mapping(argument, given, "{'force': values}")
-        return cls(
-            time,
-            {key: _checks.finite_vector(f"outputs[{key!r}]", values) for key, values in outputs.items()},
-            {key: _checks.finite_vector(f"inputs[{key!r}]", values) for key, values in inputs.items()},
-            name or "recording",
-        )
+        measured = _checks.mapping("outputs", outputs, "{'force': values}")
+        given = _checks.mapping("inputs", {} if inputs is None else inputs, "{'force': values}")
+        return cls(time, dict(measured.items()), dict(given.items()), name or "recording")
 
     @classmethod
     def from_csv(
@@ -285,12 +259,12 @@ class Recording(Result):
         FileNotFoundError
             If there is no such file.
         ValueError
-            For a missing column, a cell that is not a number, NaN or infinite samples, a time that does not increase,
-            both or neither of ``time`` and ``sampling_rate``, an unknown unit.
+            As for `Recording`, and for a missing column, a cell that is not a number, both or neither of ``time`` and
+            ``sampling_rate``, an unknown unit.
 
         Examples
         --------
-        >>> import pathlib, tempfile, numpy as np, pandas as pd, bayesperiodic as bp
+        >>> import pathlib, tempfile, numpy as np, pandas as pd
         >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.csv"
         >>> t = np.arange(500) / 50
         >>> pd.DataFrame({"t": t, "x_mm": 25 * np.sin(2 * np.pi * t)}).to_csv(path, index=False)
@@ -312,20 +286,12 @@ class Recording(Result):
         units: Units | None = None,
         name: str | None = None,
     ) -> "Recording":
-        """Read a recording from the arrays of an NPZ file; see `from_csv`.
+        """Read a recording from the named arrays of an NPZ file.
 
         Parameters
         ----------
-        path : path
-        outputs, inputs : mapping of str to str
-            Array by channel.
-        time : str, optional
-            Array of times [s].
-        sampling_rate : float, optional
-            Sampling rate [Hz], if the file has no times.
-        units : mapping of str to float or (from, to), optional
-        name : str, optional
-            By default the file name without its extension.
+        path, outputs, inputs, time, sampling_rate, units, name
+            As for `from_csv`, with arrays in place of columns.
 
         Returns
         -------
@@ -333,10 +299,8 @@ class Recording(Result):
 
         Raises
         ------
-        FileNotFoundError
-            If there is no such file.
-        ValueError
-            As `from_csv`, and for an array of objects, which would have to be unpickled.
+        FileNotFoundError, ValueError
+            As for `from_csv`, and for an array of objects, which would have to be unpickled.
         """
         return cls._from_file(read_npz, path, outputs, inputs, time, sampling_rate, units, name)
 
@@ -352,20 +316,12 @@ class Recording(Result):
         units: Units | None = None,
         name: str | None = None,
     ) -> "Recording":
-        """Read a recording from a MAT file, version 5 or 7.3; see `from_csv`.
+        """Read a recording from the variables of a MAT file, version 5 or 7.3.
 
         Parameters
         ----------
-        path : path
-        outputs, inputs : mapping of str to str
-            Variable by channel.
-        time : str, optional
-            Variable of times [s].
-        sampling_rate : float, optional
-            Sampling rate [Hz], if the file has no times.
-        units : mapping of str to float or (from, to), optional
-        name : str, optional
-            By default the file name without its extension.
+        path, outputs, inputs, time, sampling_rate, units, name
+            As for `from_csv`, with variables in place of columns.
 
         Returns
         -------
@@ -373,10 +329,8 @@ class Recording(Result):
 
         Raises
         ------
-        FileNotFoundError
-            If there is no such file.
-        ValueError
-            As `from_csv`, and for a variable that is not a vector of real numbers.
+        FileNotFoundError, ValueError
+            As for `from_csv`, and for a variable that is not a vector of real numbers.
         """
         return cls._from_file(read_mat, path, outputs, inputs, time, sampling_rate, units, name)
 
@@ -392,9 +346,9 @@ class Recording(Result):
         units: Units | None,
         name: str | None,
     ) -> "Recording":
-        inputs, units = {} if inputs is None else inputs, units or {}
-        for argument, given in (("outputs", outputs), ("inputs", inputs)):
-            _checks.mapping(argument, given, "{'force': 'the column of the force'}")
+        example = "{'force': 'the column of the force'}"
+        _checks.mapping("outputs", outputs, example)
+        inputs, units = _checks.mapping("inputs", {} if inputs is None else inputs, example), units or {}
         if (time is None) == (sampling_rate is None):
             raise ValueError(f"time: must be given or sampling_rate, and not both, got {time!r} and {sampling_rate!r}.")
         for key in units:
@@ -406,18 +360,13 @@ class Recording(Result):
             values = _checks.finite_vector(f"{key} (column {column!r} of {Path(path).name})", columns[column])
             return convert(key, values, units[key]) if key in units else values
 
-        signals = {key: channel(key, column) for key, column in (*outputs.items(), *inputs.items())}
+        measured, given = ({key: channel(key, name) for key, name in kind.items()} for kind in (outputs, inputs))
         if time:
             seconds = channel("time", time)
         else:
-            samples = next(iter(signals.values())).size if signals else 0
+            samples = next((values.size for values in (measured | given).values()), 0)
             seconds = np.arange(samples) / _checks.positive("sampling_rate", sampling_rate)
-        return cls(
-            seconds,
-            {key: signals[key] for key in outputs},
-            {key: signals[key] for key in inputs},
-            name or Path(path).stem,
-        )
+        return cls(seconds, measured, given, name or Path(path).stem)
 
     def between(self, start: float, stop: float) -> "Recording":
         """Return the part with start ≤ time ≤ stop.
@@ -442,12 +391,8 @@ class Recording(Result):
                 f"start, stop: must select at least two samples between {self.time[0]:g} and {self.time[-1]:g} s, got "
                 f"{start!r}, {stop!r}."
             )
-        return replace(
-            self,
-            time=self.time[keep],
-            outputs={key: values[keep] for key, values in self.outputs.items()},
-            inputs={key: values[keep] for key, values in self.inputs.items()},
-        )
+        outputs, inputs = ({key: values[keep] for key, values in kind.items()} for kind in (self.outputs, self.inputs))
+        return replace(self, time=self.time[keep], outputs=outputs, inputs=inputs)
 
     def fold(
         self,
@@ -462,9 +407,8 @@ class Recording(Result):
     ) -> Experiment:
         """Fold the steady part of the recording into its mean period on an equidistant grid.
 
-        The fundamental frequency is estimated by least squares over the whole steady part. The mean period is a
-        least-squares Fourier series, so that the sampling rate may be arbitrary. Only whole cycles after the transient
-        are used.
+        The whole cycles after the transient are used. The fundamental frequency is estimated by least squares over all
+        of them. The mean period is a least-squares Fourier series, so that the sampling rate may be arbitrary.
 
         Parameters
         ----------
@@ -482,16 +426,14 @@ class Recording(Result):
             Time [s] at which τ = 0. "crossing", for autonomous systems, whose phase is arbitrary: the first time >= 0
             at which the fundamental of the first output crosses zero upwards.
         largest_drift : float, optional
-            Limit of the relative change of a channel's fundamental over the recording, by linear regression on the
-            amplitudes of the cycles. By default there is no limit.
+            Limit of the relative change of a channel's fundamental over the recording, by linear regression.
         name : str, optional
             By default the recording's name.
 
         Returns
         -------
         Experiment
-            With `.frequency_se`, `.cycles` (the number used), `.scatter`, `.independent` (2·harmonics + 1, at most the
-            number of samples), `.harmonics`, `.periodicity` and `.drift`.
+            NOPE
 
         Raises
         ------
@@ -503,47 +445,17 @@ class Recording(Result):
         --------
         The displacement of an oscillator with noise of 0.1 mm; forcing and sampling rate are incommensurate:
 
-        >>> import numpy as np, bayesperiodic as bp
-        >>> force = {"force": np.cos(2 * np.pi * np.arange(64) / 64)}
         >>> recording = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1,
         ...                         duration=400, sampling_rate=9.7, noise={"displacement": 1e-4}, seed=1)
         >>> run = recording.fold(samples=64, harmonics={"displacement": 9}, name="run 1")
         >>> print(f"{run.frequency:.4f} Hz, {run.independent['displacement']} independent values")
         0.1000 Hz, 19 independent values
         """
-        periods = _checks.integer("periods", periods, 1)
-        points = _checks.integer("samples", samples, 4) * periods
+        periods, samples = _checks.integer("periods", periods, 1), _checks.integer("samples", samples, 4)
         channels = self.inputs | self.outputs
         signals = Signals(self.name, self.time, tuple(channels), np.stack([*channels.values()]), len(self.inputs))
-        mean = mean_period(
-            signals,
-            points,
-            frequency=frequency,
-            periods=periods,
-            harmonics=harmonics,
-            origin=origin,
-            largest_drift=largest_drift,
-        )
-        folded = {channel: _fourier.on_grid(amplitudes, points) for channel, amplitudes in mean.amplitudes.items()}
-        kept = {channel: amplitudes.size - 1 for channel, amplitudes in mean.amplitudes.items()}
-        return Experiment(
-            name or self.name,
-            mean.frequency * periods,
-            {channel: folded[channel] for channel in self.outputs},
-            {channel: folded[channel] for channel in self.inputs},
-            samples=samples,
-            periods=periods,
-            scatter=mean.sd,
-            cycles=mean.cycles,
-            independent={channel: min(2 * kept[channel] + 1, mean.samples) for channel in self.outputs},
-            frequency_se=mean.frequency_se * periods,
-            harmonics=kept,
-            amplitude_variance=mean.amplitude_variance,
-            periodicity=mean.periodicity,
-            drift=mean.drift,
-            origin=mean.origin,
-            synthetic=self.synthetic,
-        )
+        folded = fold_signals(signals, samples, periods, frequency, harmonics, origin, largest_drift)
+        return Experiment(name or self.name, synthetic=self.synthetic, **folded)
 
     def __repr__(self) -> str:
         kind = "synthetic recording" if self.synthetic else "recording"

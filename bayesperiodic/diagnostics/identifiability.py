@@ -21,8 +21,8 @@ from bayesperiodic.models.model import Model
 from bayesperiodic.posterior.labels import local_names
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
+from bayesperiodic.symmetry.determining import system_of
 from bayesperiodic.symmetry.structure import Structure, analyse_structure
-from bayesperiodic.symmetry.system import system_of
 
 
 def structure_of(problem: Problem) -> Structure:

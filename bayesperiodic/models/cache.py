@@ -1,9 +1,9 @@
 """Disk cache of compiled kernels: one folder per source text and constants, private to its user.
 
-An entry is built in a temporary folder and renamed into place, so that any number of processes may fill the cache
-at once. Before anything of an entry is executed, the folder must belong to the user and be closed to others, the
-source must equal the expected one, and every compiled file must have the digest recorded when it was written.
-Otherwise the kernels are compiled in memory, with a warning.
+An entry is built in a temporary folder and renamed, so that several processes can fill the cache at once. Before an
+entry is executed, the folder must belong to the user and be closed to others, the source must equal the expected one,
+and every compiled file must have the digest recorded when it was written. Otherwise the kernels are compiled in
+memory, with a warning.
 """
 
 import hashlib
@@ -42,15 +42,9 @@ def load(
 ) -> types.ModuleType:
     """Return a source text as a module of compiled functions, from the cache or freshly compiled (and then cached).
 
-    Parameters
-    ----------
-    body : str
-        Its functions are compiled with the signatures that it states and the Numba option ``cache=CACHE``.
-    constants : mapping of str to object, optional
-        Values with a unique `repr`, defined in the module before its text is executed.
-    shared : module, optional
-        A module returned by this function, whose names are defined in the module too. An entry is compiled again when
-        the text or the constants of the shared module change.
+    Its functions have Numba signatures and the option ``cache=CACHE``. The constants, values with a unique `repr`, and
+    the names of the `shared` module, which this function returned, are defined in the module before its text is
+    executed. An entry is compiled again when the text, the constants or the shared module change.
     """
     constants = dict(constants or {})
     source = f"{_header()}# {constants!r}, {shared.__name__ if shared else None}\n{body}"
@@ -76,10 +70,9 @@ def load(
 
 def _header() -> str:
     """Return the versions and the processor, on which the machine code depends besides the text."""
-    python = ".".join(map(str, sys.version_info[:3]))
-    machine = f"{platform.machine()} {' '.join(map(str, cpu_target.target_context.codegen().magic_tuple()))}"
-    versions = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, python {python}, {machine}"
-    return f"# {versions}\n"
+    machine = " ".join(map(str, (platform.machine(), *cpu_target.target_context.codegen().magic_tuple())))
+    versions = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, python {platform.python_version()}"
+    return f"# {versions}, {machine}\n"
 
 
 def _private_folder() -> Path:

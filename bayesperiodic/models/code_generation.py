@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import llvmlite.binding
 import numpy as np
 import sympy as sp
 from numba import types
@@ -26,19 +27,16 @@ from bayesperiodic.models.cache import load
 GRID_SIGNATURE = "void(float64[:,::1], float64[:,::1], float64[::1], float64[::1], float64, float64[:,::1])"
 FUNCTIONS = ("residual", "residual_jacobian", "outputs", "derivatives", "transitions")
 MANY_ZEROS = 30
-GATHERS = "from bayesperiodic.models._kernels.gathers import without_gathers"
+GATHERS = "from bayesperiodic.models.code_generation import without_gathers"
+NO_GATHER, FIRST_LLVM = "+prefer-no-gather", 17  # and the first version of LLVM that has this feature
 
 
 class GridFunction(types.WrapperAddressProtocol):
     """A compiled grid function that can be passed to other compiled functions.
 
     Numba looks up the address of a compiled function at every call that takes one as an argument, which takes longer
-    than a periodic solve. Here the address is looked up once, and so is the type (`_numba_type_`).
-
-    Attributes
-    ----------
-    address : int
-        For short calls, in which even the conversion of this argument counts; see `grid_function_at`.
+    than a periodic solve. Here the address is looked up once, and so is the type (`_numba_type_`). In short calls even
+    the conversion of this argument counts; these take the `address`, see `grid_function_at`.
     """
 
     def __init__(self, compiled: Any):
@@ -75,51 +73,47 @@ def grid_function_at(typing_context: Any, address: Any) -> Any:
     return kind(types.int64), structure
 
 
-@dataclass(frozen=True)
-class Kernels:
-    """The compiled grid functions of one model.
+@intrinsic
+def without_gathers(typing_context: Any) -> Any:
+    """Compile the calling function without gather instructions: strided columns are loaded one number at a time.
 
-    Attributes
-    ----------
-    residual : GridFunction
-        Columns: g (states).
-    residual_jacobian : GridFunction
-        Columns: g, then ∂g/∂(q, q̇, q̈) row by row (states × 3·states).
-    outputs : GridFunction
-        Columns: ŷ (outputs).
-    derivatives : GridFunction
-        Columns: ∂g/∂θ, ∂g/∂(u, u̇, ü), ∂g/∂ν, ∂f/∂(q, q̇, q̈), ∂f/∂θ, ∂f/∂(u, u̇, ü), ∂f/∂ν, each row by row; see
-        `split_derivatives`.
-    transitions : GridFunction
-        Columns: the arguments of the smooth signs in the equations, whose transitions are within −1 … 1.
-    output_rates : bool
-        Whether `outputs` depends on q̇ or q̈.
+    Gathers are slow on most Intel processors since the mitigation of gather data sampling (Intel, advisory 00828,
+    2023): without them the sweeps of a landing gear over its grid take a third of the time.
     """
 
-    residual: GridFunction
-    residual_jacobian: GridFunction
-    outputs: GridFunction
-    derivatives: GridFunction
-    transitions: GridFunction
+    def attribute(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        features = context.codegen().magic_tuple()[2]
+        if "+avx2" in features.split(",") and llvmlite.binding.llvm_version_info[0] >= FIRST_LLVM:
+            given = builder.function.attributes
+            set.add(given, f'"target-features"="{features},{NO_GATHER}"')  # `given.add` accepts only a few names.
+            given.add("noinline")  # A caller that inlines the loop has its own attributes.
+        return context.get_dummy_value()
+
+    return types.void(), attribute
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """The compiled grid functions of one model, and the numbers of its variables."""
+
+    residual: GridFunction  # g (states)
+    residual_jacobian: GridFunction  # g, then ∂g/∂(q, q̇, q̈) row by row (states × 3·states)
+    outputs: GridFunction  # ŷ (channels)
+    derivatives: GridFunction  # see `split_derivatives`, each row by row
+    transitions: GridFunction  # arguments of the smooth signs in g, whose transitions are within −1 … 1
     states: int
     inputs: int
     parameters: int
     channels: int
     smooth_signs: int
-    output_rates: bool
+    output_rates: bool  # whether the outputs depend on q̇ or q̈
 
     def evaluate(
-        self,
-        name: str,
-        states: np.ndarray,
-        inputs: np.ndarray,
-        parameters: np.ndarray,
-        tau: np.ndarray,
-        frequency: float,
+        self, name: str, states: np.ndarray, inputs: np.ndarray, theta: np.ndarray, tau: np.ndarray, frequency: float
     ) -> np.ndarray:
         """Return one of the functions on a grid, (points, columns)."""
         out = np.empty((tau.size, self.columns(name)))
-        getattr(self, name)(states, inputs, parameters, tau, frequency, out)
+        getattr(self, name)(states, inputs, theta, tau, frequency, out)
         return out
 
     def columns(self, name: str) -> int:
@@ -134,12 +128,10 @@ class Kernels:
 
     def split_derivatives(self, columns: np.ndarray) -> list[np.ndarray]:
         """Return g_θ, g_u, g_ν, f_q, f_θ, f_u, f_ν as arrays (points, rows, columns), ν being the frequency."""
-        parts, start = [], 0
-        for shape in self._derivative_shapes():
-            stop = start + shape[0] * shape[1]
-            parts.append(columns[:, start:stop].reshape(len(columns), *shape))
-            start = stop
-        return parts
+        shapes = self._derivative_shapes()
+        ends = np.cumsum([rows * columns for rows, columns in shapes])
+        parts = np.split(columns, ends[:-1], axis=1)
+        return [part.reshape(len(columns), *shape) for part, shape in zip(parts, shapes, strict=True)]
 
     def _derivative_shapes(self) -> list[tuple[int, int]]:
         g, f = self.states, self.channels
@@ -149,18 +141,13 @@ class Kernels:
 
 @dataclass(frozen=True)
 class VjpKernels:
-    """Compiled vector-Jacobian products, with respect to some of a model's parameters.
+    """Compiled vector-Jacobian products, with respect to some of a model's parameters θ.
 
-    Models that are expensive to evaluate are so in the outputs or in the equations, rarely in both; therefore these
-    are two functions.
+    Usually either the outputs or the equations of a model are expensive; therefore these are two functions.
 
-    Attributes
-    ----------
-    outputs_vjp : GridFunction
-        Of states (q, q̇, q̈, weights w of the outputs). Columns: Σ w·∂f/∂(q, q̇, q̈); then, after the last row, summed
-        over the grid: Σ w·∂f/∂θ.
-    equations_vjp : GridFunction
-        Of states (q, q̇, q̈, adjoint state λ). Summed over the grid: −Σ λ·∂g/∂θ.
+    - outputs_vjp, of states (q, q̇, q̈, weights w of the outputs): columns Σ w·∂f/∂(q, q̇, q̈); then, after the last
+      row, Σ w·∂f/∂θ summed over the grid.
+    - equations_vjp, of states (q, q̇, q̈, adjoint state λ): −Σ λ·∂g/∂θ summed over the grid.
     """
 
     outputs_vjp: GridFunction
@@ -169,34 +156,22 @@ class VjpKernels:
 
 @dataclass(frozen=True)
 class SymbolicModel:
-    """Symbols and expressions of a model, from which its compiled functions are generated.
+    """Symbols and expressions of a model, from which its compiled functions are generated."""
 
-    Attributes
-    ----------
-    states, inputs : tuple of symbol
-        q, q̇, q̈ and u, u̇, ü.
-    parameters : tuple of symbol
-    tau, frequency : symbol
-    equations, outputs : tuple of expression
-        g and f.
-    transitions : tuple of expression
-        Arguments of the smooth signs in g.
-    """
-
-    states: tuple[sp.Symbol, ...]
-    inputs: tuple[sp.Symbol, ...]
+    states: tuple[sp.Symbol, ...]  # q, q̇, q̈
+    inputs: tuple[sp.Symbol, ...]  # u, u̇, ü
     parameters: tuple[sp.Symbol, ...]
     tau: sp.Symbol
     frequency: sp.Symbol
-    equations: tuple[sp.Expr, ...]
-    outputs: tuple[sp.Expr, ...]
-    transitions: tuple[sp.Expr, ...]
+    equations: tuple[sp.Expr, ...]  # g
+    outputs: tuple[sp.Expr, ...]  # f
+    transitions: tuple[sp.Expr, ...]  # arguments of the smooth signs in g
 
     def kernels(self) -> Kernels:
         """Return the compiled residual, Jacobian, outputs and derivatives."""
         rates = set(self.states[len(self.equations) :])
         return Kernels(
-            **_grid_functions(self.kernel_source(), FUNCTIONS),
+            **dict(zip(FUNCTIONS, grid_functions(self.kernel_source(), FUNCTIONS), strict=True)),
             states=len(self.equations),
             inputs=len(self.inputs) // 3,
             parameters=len(self.parameters),
@@ -206,7 +181,7 @@ class SymbolicModel:
         )
 
     def kernel_source(self) -> str:
-        """Return the generated module of `Kernels` as text; the same model always gives the same text."""
+        """Return the module of `kernels` as text; the same model always gives the same text."""
         g, f, q, u = self.equations, self.outputs, self.states, self.inputs
         theta, frequency = self.parameters, (self.frequency,)
         blocks = ((g, theta), (g, u), (g, frequency), (f, q), (f, theta), (f, u), (f, frequency))
@@ -220,16 +195,12 @@ class SymbolicModel:
         arguments = self._arguments(q, u, theta)
         return _module([_function(name, needed, arguments) for name, needed in expressions.items()])
 
-    def jacobian_change(self) -> GridFunction:
-        """Return the compiled directional derivative of ∂g/∂(q, q̇, q̈).
+    def jacobian_change_source(self) -> str:
+        """Return the module of the directional derivative of ∂g/∂(q, q̇, q̈), row by row (states × 3·states), as text.
 
         It is a function of states (q, q̇, q̈ and their changes), inputs (u, u̇, ü and their changes) and parameters (θ,
-        its change and that of the frequency); columns row by row (states × 3·states).
+        its change and that of the frequency).
         """
-        return _grid_functions(self.jacobian_change_source(), ("jacobian_change",))["jacobian_change"]
-
-    def jacobian_change_source(self) -> str:
-        """Return the generated module of `jacobian_change` as text."""
         moving = (*self.states, *self.inputs, *self.parameters, self.frequency)
         change = {symbol: sp.Symbol(f"c_{symbol.name}", real=True) for symbol in moving}
         q, u, theta = ((*own, *map(change.get, own)) for own in (self.states, self.inputs, self.parameters))
@@ -240,18 +211,18 @@ class SymbolicModel:
         ]
         return _module([_function("jacobian_change", changes, arguments)])
 
-    def vjp_kernels(self, moving: tuple[int, ...]) -> VjpKernels:
-        """Return the compiled vector-Jacobian products with respect to the parameters of these indices."""
-        return VjpKernels(**_grid_functions(self.vjp_source(moving), ("outputs_vjp", "equations_vjp")))
-
     def vjp_source(self, moving: tuple[int, ...]) -> str:
-        """Return the generated module of `VjpKernels` as text."""
+        """Return the module of `VjpKernels`, with respect to the parameters of these indices, as text."""
         by = tuple(self.parameters[i] for i in moving)
 
         def function(name: str, letter: str, rows: tuple[sp.Expr, ...], columns: tuple[sp.Symbol, ...]) -> str:
             factors = tuple(sp.Symbol(f"{letter}_{i}", real=True) for i in range(len(rows)))
+            products = [
+                sum((w * sp.diff(e, x) for w, e in zip(factors, rows, strict=True) if x in e.free_symbols), sp.S.Zero)
+                for x in columns
+            ]
             arguments = self._arguments((*self.states, *factors), self.inputs, self.parameters)
-            return _function(name, _vjp(factors, rows, columns), arguments, len(by))
+            return _function(name, products, arguments, len(by))
 
         outputs = function("outputs_vjp", "w", self.outputs, (*self.states, *by))
         return _module([outputs, function("equations_vjp", "l", tuple(-e for e in self.equations), by)])
@@ -260,26 +231,18 @@ class SymbolicModel:
         self, states: tuple[sp.Symbol, ...], inputs: tuple[sp.Symbol, ...], parameters: tuple[sp.Symbol, ...]
     ) -> dict[sp.Symbol, str]:
         """Return the Python expression of every symbol in a grid function."""
-        return {
-            **{symbol: f"flat_states[{len(states)}*i + {column}]" for column, symbol in enumerate(states)},
-            **{symbol: f"flat_inputs[{len(inputs)}*i + {column}]" for column, symbol in enumerate(inputs)},
-            **{symbol: f"parameters[{index}]" for index, symbol in enumerate(parameters)},
-            self.tau: "tau[i]",
-            self.frequency: "frequency",
-        }
+        return (
+            {symbol: f"flat_states[{len(states)}*i + {column}]" for column, symbol in enumerate(states)}
+            | {symbol: f"flat_inputs[{len(inputs)}*i + {column}]" for column, symbol in enumerate(inputs)}
+            | {symbol: f"parameters[{index}]" for index, symbol in enumerate(parameters)}
+            | {self.tau: "tau[i]", self.frequency: "frequency"}
+        )
 
 
-def _grid_functions(source: str, names: Sequence[str]) -> dict[str, GridFunction]:
+def grid_functions(source: str, names: Sequence[str]) -> list[GridFunction]:
+    """Return functions of a generated module, compiled or from the cache."""
     module = load(source)
-    return {name: GridFunction(getattr(module, name)) for name in names}
-
-
-def _vjp(weights: Sequence[sp.Symbol], rows: Sequence[sp.Expr], columns: Sequence[sp.Symbol]) -> list[sp.Expr]:
-    """Return Σ weight·∂row/∂column of each column."""
-    return [
-        sum((w * sp.diff(e, x) for w, e in zip(weights, rows, strict=True) if x in e.free_symbols), sp.S.Zero)
-        for x in columns
-    ]
+    return [GridFunction(getattr(module, name)) for name in names]
 
 
 def _jacobian(rows: Sequence[sp.Expr], columns: Sequence[sp.Symbol]) -> list[sp.Expr]:
@@ -331,15 +294,12 @@ def _row(expressions: list[sp.Expr]) -> list[str]:
     """Return the lines that fill a row; many zeros are set in a loop."""
     size, zeros = len(expressions), sum(expression == 0 for expression in expressions)
     cleared = zeros > MANY_ZEROS
-    lines = (
-        [f"        for column in range({size}):", f"            flat_out[{size}*i + column] = 0.0"] if cleared else []
-    )
-    lines += [
+    clearing = [f"        for column in range({size}):", f"            flat_out[{size}*i + column] = 0.0"]
+    return (clearing if cleared else []) + [
         f"        flat_out[{size}*i + {column}] = {_code(expression)}"
         for column, expression in enumerate(expressions)
         if not cleared or expression != 0
     ]
-    return lines
 
 
 def _sums(expressions: list[sp.Expr], columns: int) -> tuple[list[str], list[str], list[str]]:
@@ -354,7 +314,7 @@ def _sums(expressions: list[sp.Expr], columns: int) -> tuple[list[str], list[str
 
 
 class _Printer(PythonCodePrinter):
-    """SymPy's Python printer, extended by the generalised functions that result from differentiation."""
+    """SymPy's Python printer, with the elementary functions of `_kernels` and generalised functions."""
 
     def _print_sign(self, expression: sp.Expr) -> str:
         argument = self._print(expression.args[0])
@@ -364,14 +324,10 @@ class _Printer(PythonCodePrinter):
         argument = self._print(expression.args[0])
         return f"(0.5*(({argument} > 0.0) + ({argument} >= 0.0)))"
 
-    def _print_exp(self, expression: sp.Expr) -> str:
-        return f"exp({self._print(expression.args[0])})"
+    def _print_elementary(self, expression: sp.Expr) -> str:
+        return f"{expression.func.__name__}({self._print(expression.args[0])})"
 
-    def _print_tanh(self, expression: sp.Expr) -> str:
-        return f"tanh({self._print(expression.args[0])})"
-
-    def _print_atan(self, expression: sp.Expr) -> str:
-        return f"atan({self._print(expression.args[0])})"
+    _print_exp = _print_tanh = _print_atan = _print_elementary
 
     def _print_DiracDelta(self, expression: sp.Expr) -> str:
         return "0.0"

@@ -1,6 +1,7 @@
 """Library of models; ``help(bayesperiodic.models.pendulum)`` shows the equations and the source of one."""
 
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import sympy as sp
@@ -19,12 +20,11 @@ duffing = Model(
     description="""A mass on a damper and a hardening or softening spring: m ẍ + c ẋ + k x + k3 x³ = force.
 
     The cubic term is the first nonlinear term of any smooth symmetric restoring force (G. Duffing, Erzwungene
-    Schwingungen bei veränderlicher Eigenfrequenz, Vieweg, 1918). For first experiments, and for structures near a
-    resonance, which have up to three periodic solutions at one frequency.
+    Schwingungen bei veränderlicher Eigenfrequenz, Vieweg, 1918). For structures near a resonance, which have up to
+    three periodic solutions at one frequency.
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
     >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": np.ones(8)},
     ...                   frequency=0.2, duration=100, sampling_rate=10)
     """,
@@ -50,7 +50,6 @@ dahl = Model(
     With an amplitude of 10 mm, 50 times 1/rho, friction slides most of the time and dissipates almost the
     4·Kw·10 mm = 2 J per period of ideal Coulomb friction:
 
-    >>> import numpy as np, bayesperiodic as bp
     >>> x = 0.01 * np.cos(2 * np.pi * np.arange(800) / 800)
     >>> theta = {"Kx": 0, "K": 0, "F0": 0, "Kw": 50.0, "rho": 5e3}
     >>> solution = bp.solve_periodic(bp.models.dahl, theta, {"displacement": x}, frequency=1.0)
@@ -63,9 +62,7 @@ dahl = Model(
 def _pendulum(s: Any, p: Any, u: Any) -> list[sp.Expr]:
     inertia, omega = p.m * p.l**2, 2 * sp.pi * s.frequency
     friction = p.k1 * smooth_sign(s.dphi, p.v0) + p.k2 * s.dphi + p.k3 * s.dphi * abs(s.dphi)
-    return [
-        s.ddphi + friction / inertia + (p.g + p.a * omega**2 * sp.cos(2 * sp.pi * s.tau)) / p.l * sp.sin(s.phi),
-    ]
+    return [s.ddphi + friction / inertia + (p.g + p.a * omega**2 * sp.cos(2 * sp.pi * s.tau)) / p.l * sp.sin(s.phi)]
 
 
 pendulum = Model(
@@ -100,7 +97,6 @@ pendulum = Model(
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> theta = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
     >>> run = bp.simulate(bp.models.pendulum, theta, frequency=1.4467, duration=7, sampling_rate=100, start={"phi": 1})
     """,
@@ -121,12 +117,10 @@ silverbox = Model(
     The usual model of the Silverbox, an electronic circuit that is equivalent to a mass on a hardening spring
     (T. Wigren, J. Schoukens, Three free data sets for development and benchmarking in nonlinear system identification,
     European Control Conference, 2013). k2 and u0 represent offsets of the measured signals. w0 is a time scale and not
-    identifiable: twice w0 with c/2 and a quarter of the other parameters gives the same response; fix it. The response
-    has no offset parameter, because other values of k1, k2 and u0 have the same effect.
+    identifiable: twice w0 with c/2 and a quarter of the other parameters gives the same response; fix it.
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
     >>> theta = {"w0": 408.4, "c": 0.1, "k1": 1.1, "k2": 0, "k3": 4.4, "g": 1.1, "u0": 0}
     >>> run = bp.simulate(bp.models.silverbox, theta, {"drive": 0.1 * np.cos(2 * np.pi * np.arange(16) / 16)},
     ...                   frequency=60, duration=0.5, sampling_rate=600)
@@ -144,44 +138,30 @@ van_der_pol = Model(
 
     Van der Pol's equation (Philosophical Magazine 2, 1926, 978-992) with time scaled by omega. The damping is negative
     for ``|x|`` < 1 and positive for ``|x|`` > 1, so that every motion except rest converges to one limit cycle, with
-    amplitude about 2 and, for small mu, period (2π/omega)(1 + mu²/16 + …). The displacement is relative to the one at
-    which the damping vanishes. For autonomous systems, whose frequency is unknown and whose phase is arbitrary.
+    amplitude about 2 and, for small mu, period (2π/omega)(1 + mu²/16 + …).
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.models.van_der_pol.autonomous
     True
     """,
 )
 
 _GEAR_UNITS = {
-    "theta1": "kg",
-    "theta2": "m/s^2",
-    "theta3": "N s^2/m^2",
-    "theta4": "m^2",
-    "theta5": "Pa/K",
-    "theta6": "1/m",
-    "theta7": "1/K",
-    "theta8": "N",
-    "theta9": "m^2",
-    "theta10": "s/m",
-    "theta11": "N",
-    "theta12": "m",
-    "theta15": "J/K",
-    "theta16": "W/K",
-    "theta17": "K",
-}
+    "theta1": "kg", "theta2": "m/s^2", "theta3": "N s^2/m^2", "theta4": "m^2", "theta5": "Pa/K", "theta6": "1/m",
+    "theta7": "1/K", "theta8": "N", "theta9": "m^2", "theta10": "s/m", "theta11": "N", "theta12": "m",
+    "theta15": "J/K", "theta16": "W/K", "theta17": "K",
+}  # fmt: skip
 _GEAR_CHANNELS = {"displacement": "m", "force": "N", "pressure": "Pa", "q": "m", "T": "K"}
 
 
 def landing_gear(drive: str = "force") -> Model:
     r"""Return the model of a nose landing gear damper, driven by a force or by a displacement.
 
-    The equations are eq. (9) of [1]_. q is the compression and T the absolute temperature of the gas. The force on the
-    axle balances inertia, quadratic oil damping, the gas pressure on the area theta4, Coulomb friction (with a part
-    proportional to the pressure) smoothed by an arctan, and a constant, which is the ambient pressure on the same area
-    if theta11 = −theta4 · ambient pressure:
+    The equations are eq. (9) of de Kraker, Verbeek & van de Wouw (1997, see `Model`). q is the compression and T the
+    absolute temperature of the gas. The force on the axle balances inertia, quadratic oil damping, the gas pressure on
+    the area theta4, Coulomb friction (with a part proportional to the pressure) smoothed by an arctan, and a constant,
+    which is the ambient pressure on the same area if theta11 = −theta4 · ambient pressure:
 
     .. math::
 
@@ -198,28 +178,21 @@ def landing_gear(drive: str = "force") -> Model:
     ----------
     drive : {"force", "displacement"}
         "force": states q and T, input force, outputs displacement and pressure; for a gear under a prescribed load.
-        "displacement": state T, input displacement, which determines q and its derivatives, outputs force and pressure;
-        for a test rig with prescribed motion, such as the paper's, and faster to solve.
+        "displacement": state T, input displacement, outputs force and pressure; for a test rig with prescribed motion,
+        such as the paper's, and faster to solve.
 
     Returns
     -------
     Model
-        The same object for the same drive. If theta4 is free and theta11 represents the ambient pressure, tie them.
+        If theta4 is free and theta11 represents the ambient pressure, tie them.
 
     Raises
     ------
     ValueError
         For another drive.
 
-    References
-    ----------
-    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
-       equilibrium states, in: D. H. van Campen (Ed.), Interaction between Dynamics and Control in Advanced
-       Mechanical Systems, Kluwer, 1997, 191-198.
-
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.models.landing_gear("displacement").outputs
     ('force', 'pressure')
     """
@@ -231,28 +204,26 @@ def landing_gear(drive: str = "force") -> Model:
 def _landing_gear(drive: str) -> Model:
     forced = drive == "force"
 
-    def motion(s: Any, p: Any, u: Any) -> tuple[sp.Expr, sp.Expr, sp.Expr]:
-        return (s.q, s.dq, s.ddq) if forced else (u.displacement - p.theta12, u.ddisplacement, u.dddisplacement)
-
-    def pressure(s: Any, p: Any, u: Any) -> sp.Expr:
-        q, _, _ = motion(s, p, u)
-        return p.theta5 * s.T / (1 + p.theta6 * q + p.theta7 * s.T)
-
-    def force(s: Any, p: Any, u: Any) -> sp.Expr:
-        _, v, a = motion(s, p, u)
-        gas = pressure(s, p, u)
+    def terms(s: Any, p: Any, u: Any) -> tuple[sp.Expr, sp.Expr, sp.Expr]:
+        """Return pressure, force and the energy balance."""
+        q, v, a = (s.q, s.dq, s.ddq) if forced else (u.displacement - p.theta12, u.ddisplacement, u.dddisplacement)
+        gas = p.theta5 * s.T / (1 + p.theta6 * q + p.theta7 * s.T)
         friction = (p.theta8 + p.theta9 * gas) * sp.atan(p.theta10 * v)
-        return p.theta1 * (a + p.theta2) + p.theta3 * v * abs(v) + p.theta4 * gas + friction + p.theta11
+        force = p.theta1 * (a + p.theta2) + p.theta3 * v * abs(v) + p.theta4 * gas + friction + p.theta11
+        conduction = p.theta16 * (1 + p.theta6 * q) * (s.T + p.theta17)
+        return gas, force, p.theta15 * s.dT + conduction - (p.theta4 * gas + p.theta11) * v
 
     def equations(s: Any, p: Any, u: Any) -> list[sp.Expr]:
-        q, v, _ = motion(s, p, u)
-        conduction = p.theta16 * (1 + p.theta6 * q) * (s.T + p.theta17)
-        energy = p.theta15 * s.dT + conduction - (p.theta4 * pressure(s, p, u) + p.theta11) * v
-        return [force(s, p, u) - u.force, energy] if forced else [energy]
+        _, force, energy = terms(s, p, u)
+        return [force - u.force, energy] if forced else [energy]
 
     def outputs(s: Any, p: Any, u: Any) -> dict[str, sp.Expr]:
-        measured = {"displacement": s.q + p.theta12} if forced else {"force": force(s, p, u)}
-        return measured | {"pressure": pressure(s, p, u)}
+        pressure, force, _ = terms(s, p, u)
+        return (
+            {"displacement": s.q + p.theta12, "pressure": pressure}
+            if forced
+            else {"force": force, "pressure": pressure}
+        )
 
     names = ["q", "T", "force", "displacement", "pressure"] if forced else ["T", "displacement", "force", "pressure"]
     return Model(
@@ -281,8 +252,7 @@ def chain(masses: int) -> Model:
         m \ddot x_i + R(e_i, \dot e_i) - R(e_{i+1}, \dot e_{i+1}) = 0,
         \qquad R(e, \dot e) = c \dot e + k e + k_3 e^3,
 
-    with the force in place of −R after the last mass. One mass is the Duffing oscillator. For several modes with few
-    parameters: internal resonances, identifiability from one channel, cost as a function of the number of states.
+    with the force in place of −R after the last mass. One mass is the Duffing oscillator.
 
     Parameters
     ----------
@@ -292,8 +262,7 @@ def chain(masses: int) -> Model:
     Returns
     -------
     Model
-        States x1, x2, …; input force; parameters m, c, k, k3; output displacement, that of the last mass. The same
-        object for the same number.
+        States x1, x2, …; input force; parameters m, c, k, k3; output displacement, that of the last mass.
 
     Raises
     ------
@@ -302,7 +271,6 @@ def chain(masses: int) -> Model:
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.models.chain(3).states
     ('x1', 'x2', 'x3')
     """
@@ -316,10 +284,8 @@ def _chain(masses: int) -> Model:
     def equations(s: Any, p: Any, u: Any) -> list[sp.Expr]:
         x = [sp.S.Zero, *(getattr(s, name) for name in states)]
         v = [sp.S.Zero, *(getattr(s, f"d{name}") for name in states)]
-        pull = [
-            p.c * (v[i] - v[i - 1]) + p.k * (x[i] - x[i - 1]) + p.k3 * (x[i] - x[i - 1]) ** 3
-            for i in range(1, masses + 1)
-        ]
+        elongation, rate = ([b - a for a, b in pairwise(values)] for values in (x, v))
+        pull = [p.c * de + p.k * e + p.k3 * e**3 for e, de in zip(elongation, rate, strict=True)]
         pull.append(u.force)
         return [p.m * getattr(s, f"dd{name}") + pull[i] - pull[i + 1] for i, name in enumerate(states)]
 
@@ -377,30 +343,16 @@ def _flutter(s: Any, p: Any, u: Any) -> list[sp.Expr]:
     return [heave, pitch, wake]
 
 
+_FLUTTER_UNITS = {
+    "U": "m/s", "b": "m", "a": "1", "span": "m", "rho": "kg/m^3", "x_alpha": "1", "m": "kg", "m_T": "kg",
+    "I_alpha": "kg m^2", "c_h": "N s/m", "c_alpha": "N m s", "k_h": "N/m", "k_alpha": "N m", "k_alpha2": "N m",
+    "k_alpha3": "N m", "gain_heave": "1/m", "gain_pitch": "1", "offset_heave": "1", "offset_pitch": "1",
+}  # fmt: skip
+
 flutter = Model(
     "flutter",
     states=["h", "alpha", "w"],
-    parameters={
-        "U": "m/s",
-        "b": "m",
-        "a": "1",
-        "span": "m",
-        "rho": "kg/m^3",
-        "x_alpha": "1",
-        "m": "kg",
-        "m_T": "kg",
-        "I_alpha": "kg m^2",
-        "c_h": "N s/m",
-        "c_alpha": "N m s",
-        "k_h": "N/m",
-        "k_alpha": "N m",
-        "k_alpha2": "N m",
-        "k_alpha3": "N m",
-        "gain_heave": "1/m",
-        "gain_pitch": "1",
-        "offset_heave": "1",
-        "offset_pitch": "1",
-    },
+    parameters=_FLUTTER_UNITS,
     units={"h": "m", "alpha": "rad", "w": "s", "heave": "1", "pitch": "1"},
     equations=_flutter,
     outputs=lambda s, p, u: {
@@ -416,15 +368,14 @@ flutter = Model(
     0) = 0. The air (density rho, wing of length span) adds mass, damping and stiffness; the lift increases with the
     wind speed U and depends on past motion through the wake, by Jones's approximation of Wagner's function. The spring
     in pitch hardens, so that limit cycles exist below the speed at which the equilibrium loses its stability: an
-    unstable one inside a stable one.
-    The wing has mass m and inertia I_alpha about its pitch axis, which is a·b behind the middle of the chord and
-    x_alpha·b ahead of the centre of mass; the total heaving mass is m_T. The springs and dampers are k_h, c_h in heave
-    and k_alpha, k_alpha2, k_alpha3, c_alpha in pitch. The sensors are linear: heave = offset_heave + gain_heave h,
-    pitch = offset_pitch + gain_pitch α. For self-excited systems whose unstable cycles are also measured.
+    unstable one inside a stable one. The wing has mass m and inertia I_alpha about its pitch axis, which is a·b behind
+    the middle of the chord and x_alpha·b ahead of the centre of mass; the total heaving mass is m_T. The springs and
+    dampers are k_h, c_h in heave and k_alpha, k_alpha2, k_alpha3, c_alpha in pitch. The sensors are linear: heave =
+    offset_heave + gain_heave h, pitch = offset_pitch + gain_pitch α. For self-excited systems whose unstable cycles are
+    also measured.
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> rig = {"b": 0.15, "span": 1, "a": -0.5, "rho": 1.204, "x_alpha": 0.234, "m": 5.3, "m_T": 16.9,
     ...     "I_alpha": 0.1726, "c_h": 15.443, "c_alpha": 0.562767, "k_h": 3529.4, "k_alpha": 54.1162, "k_alpha2": 751.6,
     ...     "k_alpha3": 5006, "gain_heave": 1, "gain_pitch": 1, "offset_heave": 0, "offset_pitch": 0}

@@ -1,23 +1,29 @@
-"""Models: differential and output equations in symbolic form."""
+"""Models: differential and output equations in symbolic form, and their time integration."""
 
 from collections.abc import Callable, Iterable, Mapping
-from functools import cached_property
+from copy import copy
+from functools import cache, cached_property
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic.models.code_generation import GridFunction, Kernels, SymbolicModel, VjpKernels
+from bayesperiodic.models.cache import load
+from bayesperiodic.models.code_generation import GridFunction, Kernels, SymbolicModel, VjpKernels, grid_functions
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
+DERIVATIVES = ("", "d", "dd")
+VJP_FUNCTIONS = ("outputs_vjp", "equations_vjp")
 
 
 class Names:
     """Symbols as attributes, such as ``s.dx`` and ``p.k3``."""
 
     def __init__(self, kind: str, symbols: Mapping[str, sp.Symbol]):
-        self._kind = kind
-        self._symbols = dict(symbols)
+        self._kind, self._symbols = kind, dict(symbols)
 
     def __getattr__(self, name: str) -> sp.Symbol:
         if name.startswith("_"):
@@ -72,7 +78,6 @@ class Model:
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> model = bp.Model("spring", states=["x"], inputs=["force"], parameters={"m": "kg", "k": "N/m"},
     ...     equations=lambda s, p, u: [p.m * s.ddx + p.k * s.x - u.force],
     ...     outputs=lambda s, p, u: {"displacement": s.x})
@@ -99,9 +104,8 @@ class Model:
         self.states = _checks.identifiers("states", states, RESERVED)
         self.inputs = _checks.identifiers("inputs", inputs, (*RESERVED, *self.states))
         self.parameters = _checks.identifiers("parameters", parameters, RESERVED)
-        for argument, names in (("states", self.states), ("inputs", self.inputs)):
-            _check_derivative_names(argument, names)
-            _checks.identifiers(argument, [d + n for d in ("", "d", "dd") for n in names], RESERVED)
+        for argument, space, names in (("states", "s", self.states), ("inputs", "u", self.inputs)):
+            _check_derivative_names(argument, space, names)
         if not self.states:
             raise ValueError("states: must have at least one name, got none.")
 
@@ -153,9 +157,8 @@ class Model:
         return given
 
     def _order(self, state: str) -> int:
-        appearing = set().union(*(e.free_symbols for e in self.equations))
-        for order, prefix in ((2, "dd"), (1, "d")):
-            if self.state_symbols[prefix + state] in appearing:
+        for order in (2, 1):
+            if self.state_symbols[DERIVATIVES[order] + state] in _symbols(self.equations):
                 return order
         raise ValueError(
             f"states: must have a derivative in an equation, got {state!r} without one; eliminate it, or add its "
@@ -166,7 +169,7 @@ class Model:
     def autonomous(self) -> bool:
         """True if the equations contain neither inputs nor τ, so that the period is unknown."""
         forcing = {*self.input_symbols.values(), self.time_symbols["tau"]}
-        return not any(e.free_symbols & forcing for e in self.equations)
+        return not _symbols(self.equations) & forcing
 
     @cached_property
     def smooth_signs(self) -> tuple[sp.Expr, ...]:
@@ -179,8 +182,7 @@ class Model:
         """Return the model with an additional last parameter that multiplies the arguments of all smooth signs."""
         sharpness = sp.Symbol("p_sharpness_of_signs", real=True)
         softer = {sign: sign.func(sharpness * sign.args[0]) for sign in self.smooth_signs}
-        other = object.__new__(Model)
-        other.__dict__.update(self.__getstate__())
+        other = copy(self)
         other.equations = tuple(e.xreplace(softer) for e in self.equations)
         other.parameters = (*self.parameters, "sharpness_of_signs")
         other.parameter_symbols = {**self.parameter_symbols, "sharpness_of_signs": sharpness}
@@ -207,11 +209,11 @@ class Model:
 
     @cached_property
     def jacobian_change(self) -> GridFunction:
-        """The compiled directional derivative of ∂g/∂(q, q̇, q̈); see `SymbolicModel.jacobian_change`."""
-        return self.symbolic.jacobian_change()
+        """The compiled directional derivative of ∂g/∂(q, q̇, q̈); see `SymbolicModel.jacobian_change_source`."""
+        return grid_functions(self.symbolic.jacobian_change_source(), ["jacobian_change"])[0]
 
     def vjp_kernels(self, moving: tuple[int, ...]) -> VjpKernels:
-        """Return the compiled vector-Jacobian products that gradients need.
+        """Return the compiled vector-Jacobian products of a gradient.
 
         Parameters
         ----------
@@ -222,23 +224,16 @@ class Model:
         -------
         VjpKernels
         """
-        if moving not in self._vjp_kernels:
-            self._vjp_kernels[moving] = self.symbolic.vjp_kernels(moving)
-        return self._vjp_kernels[moving]
-
-    @cached_property
-    def _vjp_kernels(self) -> dict[tuple[int, ...], VjpKernels]:
-        return {}
+        known = self.__dict__.setdefault("_vjp_kernels", {})
+        if moving not in known:
+            known[moving] = VjpKernels(*grid_functions(self.symbolic.vjp_source(moving), VJP_FUNCTIONS))
+        return known[moving]
 
     def input_derivatives(self) -> dict[str, int]:
         """Return the order of the highest time derivative of every input that the model uses."""
-        used = set().union(*(e.free_symbols for e in (*self.equations, *self.output_expressions)))
+        used = _symbols((*self.equations, *self.output_expressions))
         return {
-            name: max(
-                order
-                for order, prefix in enumerate(("", "d", "dd"))
-                if order == 0 or self.input_symbols[prefix + name] in used
-            )
+            name: max(order for order in range(3) if not order or self.input_symbols[DERIVATIVES[order] + name] in used)
             for name in self.inputs
         }
 
@@ -269,8 +264,11 @@ class Model:
         )
 
 
-def _check_derivative_names(argument: str, names: tuple[str, ...]) -> None:
-    space = "s" if argument == "states" else "u"
+def _symbols(expressions: Iterable[sp.Expr]) -> set[sp.Symbol]:
+    return set().union(*(e.free_symbols for e in expressions))
+
+
+def _check_derivative_names(argument: str, space: str, names: tuple[str, ...]) -> None:
     for name in names:
         for derivative in (f"d{name}", f"dd{name}"):
             if derivative in names:
@@ -278,10 +276,42 @@ def _check_derivative_names(argument: str, names: tuple[str, ...]) -> None:
                     f"{argument}: must not contain derivatives, got {derivative!r} and {name!r}; leave {derivative!r} "
                     f"out and write {space}.{derivative}."
                 )
+    _checks.identifiers(argument, [d + n for d in DERIVATIVES for n in names], RESERVED)
 
 
-def _with_derivatives(prefix: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]:
-    return {d + n: sp.Symbol(f"{prefix}_{d}_{n}", real=True) for d in ("", "d", "dd") for n in names}
+def _with_derivatives(space: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]:
+    return {d + n: sp.Symbol(f"{space}_{d}_{n}", real=True) for d in DERIVATIVES for n in names}
+
+
+@cache
+def integration_kernels() -> ModuleType:
+    """Return the compiled functions of time integration."""
+    return load(Path(__file__).with_name("_kernels").joinpath("integrate.py").read_text(encoding="utf-8"))
+
+
+def integrate(
+    model: Model,
+    start: np.ndarray,
+    inputs: np.ndarray,
+    parameters: np.ndarray,
+    *,
+    frequency: float,
+    samples: int,
+    steps: int,
+    kept: int,
+) -> np.ndarray | None:
+    """Integrate by the classical fourth-order Runge-Kutta method; None if the states overflow.
+
+    `start` (size,) contains the states and then the rates of the second-order ones at tau = 0; `inputs`
+    (2·samples·periods, 3·inputs) u, u̇, ü at half steps over one response period, which is repeated. There are `samples`
+    steps per forcing period. The result (kept, size) contains `start`'s variables before each of the last steps.
+    """
+    orders = np.array(list(model.orders.values()))
+    path = np.empty((kept, orders.sum()))
+    start, inputs = np.array(start, dtype=float), np.ascontiguousarray(inputs)
+    function = model.kernels.residual_jacobian
+    runge_kutta = integration_kernels().runge_kutta
+    return path if runge_kutta(function, start, inputs, samples, parameters, frequency, orders, steps, path) else None
 
 
 def smooth_sign(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
@@ -296,8 +326,7 @@ def smooth_sign(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
 
     Returns
     -------
-    sympy expression
-        Dimensionless.
+    sympy expression, dimensionless
 
     Raises
     ------
@@ -308,7 +337,7 @@ def smooth_sign(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
     --------
     Coulomb friction of 20 N with a transition within about ±1 mm/s:
 
-    >>> import sympy as sp, bayesperiodic as bp
+    >>> import sympy as sp
     >>> v = sp.Symbol("v")
     >>> friction = 20 * bp.smooth_sign(v, 1e-3)
     >>> [round(float(friction.subs(v, speed)), 2) for speed in (-1e-3, 0, 1e-3, 1e-2)]
@@ -322,14 +351,12 @@ def smooth_abs(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
 
     Parameters
     ----------
-    x : sympy expression
-    width : number > 0 or sympy expression, in the units of `x`
+    x, width : sympy expression, and number > 0 or sympy expression in the same unit
         The value tends to ``|x|`` − width for large ``|x|``; the curvature at zero is 1 / width.
 
     Returns
     -------
-    sympy expression
-        In the unit of `x`.
+    sympy expression, in the unit of `x`
 
     Raises
     ------
@@ -338,7 +365,7 @@ def smooth_abs(x: sp.Expr, width: float | sp.Expr) -> sp.Expr:
 
     Examples
     --------
-    >>> import sympy as sp, bayesperiodic as bp
+    >>> import sympy as sp
     >>> v = sp.Symbol("v")
     >>> [round(float(bp.smooth_abs(v, 0.1).subs(v, speed)), 3) for speed in (0, 0.1, 1, -10)]
     [0.0, 0.041, 0.905, 9.9]

@@ -111,24 +111,19 @@ def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) 
     starts, members = _close_returns(maps, section, period)
     chains = section[starts[:, None] + np.arange(period)]
     step, heir = _converge(maps, atlas, chains)
-    kept = np.unique(heir)
+    kept = np.array([k for k in np.unique(heir) if step[k] < NEARLY], dtype=int)
     members = [np.concatenate([members[i] for i in np.flatnonzero(heir == k)]) for k in kept]
-    near = step[kept] < NEARLY
-    chains, step = chains[kept[near]], step[kept[near]]
+    chains = chains[kept]
     # The maps of the atlas are discontinuous between centres, so the last steps fit about the points themselves.
     for _ in range(EXACT_STEPS):
         step = _newton(maps, chains, atlas.exactly)[0]
-    return _distinct(maps, section, chains, step, [m for m, is_near in zip(members, near, strict=True) if is_near])
+    return _distinct(maps, section, chains, step, members)
 
 
 def _converge(maps: ReturnMap, atlas: Atlas, chains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Move chains (m, period, 2) by Newton's method on the atlas.
-
-    Return their last steps, and the chain into which each one was merged.
-    """
-    noise = float(maps.noise.max())
-    step, heir = np.full(len(chains), np.inf), np.arange(len(chains))
-    active = heir
+    """Move chains (m, period, 2) on the atlas; return their last steps and the chains into which they were merged."""
+    noise, heir = float(maps.noise.max()), np.arange(len(chains))
+    step, active = np.full(len(chains), np.inf), heir
     for _ in range(STEPS):
         if active.size == 0:
             break
@@ -182,8 +177,8 @@ def _distinct(
 ) -> list[Candidate]:
     noise = float(maps.noise.max())
     tolerance = max(SAME, 3.0 * noise)
-    # Each cycle with the first points of its close returns and their shifts.
-    found: list[tuple[np.ndarray, list[tuple[np.ndarray, int]]]] = []
+    # Each cycle with the first points and the shift of each of its close returns, (returns, 2).
+    found: list[tuple[np.ndarray, list[np.ndarray]]] = []
     for k in np.argsort(step, kind="stable"):
         if step[k] > max(CONVERGED, 0.1 * noise):
             break
@@ -192,15 +187,14 @@ def _distinct(
         for cycle, group in found:
             distance, shift = shift_between(chains[k], cycle, maps.wrap)
             if distance < tolerance:
-                group.append((members[k], shift))
+                group.append(np.stack([members[k], np.full(len(members[k]), shift)]))
                 break
         else:
-            found.append((maps.wrap(chains[k]), [(members[k], 0)]))
+            found.append((maps.wrap(chains[k]), [np.stack([members[k], np.zeros_like(members[k])])]))
     result = []
     for cycle, group in found:
         steps = np.arange(len(cycle) + 1)
-        starts = np.concatenate([first for first, _ in group])
-        shifts = np.concatenate([np.full(len(first), shift) for first, shift in group])
+        starts, shifts = np.concatenate(group, axis=1)
         expected = cycle[(steps + shifts[:, None]) % len(cycle)]
         closest = int(np.argmin(np.abs(maps.wrap(section[starts[:, None] + steps] - expected)).max((1, 2))))
         result.append(Candidate(cycle, len(starts), int(starts[closest]), int(shifts[closest])))
@@ -259,7 +253,6 @@ def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndar
     most = len(maps.arguments) // 8
     start = np.concatenate([maps.fit(p[None], n, DEGREE).jacobian for p, n in zip(points, counts[0], strict=True)])
     right, left = _eigenvectors(start, 0)
-    left = np.roll(left, -1, axis=0)
     chosen = []
     for j, point in enumerate(points):
         accepted: list[tuple[np.ndarray, np.ndarray]] = []
@@ -281,21 +274,23 @@ def _along(fit: LocalFit, left: np.ndarray, right: np.ndarray) -> tuple[np.ndarr
 
 
 def _eigenvectors(jacobian: np.ndarray, which: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return right and left eigenvectors (p, 2) of the monodromy matrix at each point, largest eigenvalue first."""
+    """Return right eigenvectors (p, 2) of the monodromy matrix at each point, and left ones at each image.
+
+    They belong to the eigenvalue of largest modulus (`which` = 0) or to the other one.
+    """
     monodromy = np.stack([_monodromy(np.roll(jacobian, -j, axis=0)) for j in range(len(jacobian))])
     vectors = []
     for matrices in (monodromy, monodromy.transpose(0, 2, 1)):
         values, columns = np.linalg.eig(matrices)
         chosen = np.argsort(-np.abs(values), axis=1, kind="stable")[:, which]
         vectors.append(columns[np.arange(len(columns)), :, chosen])
-    return vectors[0], vectors[1]
+    return vectors[0], np.roll(vectors[1], -1, axis=0)
 
 
 def _joint_covariance(fits: list[LocalFit], cycle: np.ndarray) -> np.ndarray:
     """Return the joint covariance of the points and of log|eigenvalue|, by the delta method.
 
-    Consecutive pairs of points share the noise of a point, so errors are summed over runs of consecutive pairs, which
-    are independent of each other.
+    Consecutive pairs of points share the noise of a point, so errors are summed over runs of consecutive pairs.
     """
     p = len(cycle)
     jacobian, hessian = (np.concatenate([getattr(fit, name) for fit in fits]) for name in ("jacobian", "hessian"))
@@ -303,7 +298,6 @@ def _joint_covariance(fits: list[LocalFit], cycle: np.ndarray) -> np.ndarray:
     by_slope, by_point = np.zeros((2, p, 2, 2)), np.zeros((2, p, 2))
     for k in range(2):
         right, left = _eigenvectors(jacobian, k)
-        left = np.roll(left, -1, axis=0)
         slope = np.einsum("pi,pij,pj->p", left, jacobian, right)
         by_slope[k] = (np.einsum("pi,pj->pij", left, right) / slope[:, None, None]).real
         by_point[k] = (np.einsum("pi,pijl,pj->pl", left, hessian, right) / slope[:, None]).real
@@ -322,11 +316,11 @@ def _joint_covariance(fits: list[LocalFit], cycle: np.ndarray) -> np.ndarray:
 def box_orbits(
     maps: ReturnMap, section: np.ndarray, period: int, neighbours: int, box: float
 ) -> list[tuple[Candidate, Estimate]]:
-    """Return the orbits of one period by the method of de Kraker et al. (1997), section 5; see `find_orbits`.
+    """Return the orbits of one period by the method "boxes" of `find_orbits`.
 
-    The section is divided into boxes. A point that is in its own or an adjacent box again after `period` steps is
-    recurrent; adjacent boxes with several recurrent points are a candidate. The nearest points and their images after
-    `period` steps give a linear map, whose fixed point and eigenvalues are the orbit's.
+    A point that is in its own or an adjacent box again after `period` steps is recurrent; adjacent boxes with several
+    recurrent points are a candidate. The nearest points and their images after `period` steps give a linear map, whose
+    fixed point and eigenvalues are the orbit's.
     """
     count = int(2.25 * neighbours)
     iterates = [_iterated(maps, section, k) for k in range(1, period + 1)]

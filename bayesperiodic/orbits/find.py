@@ -10,15 +10,8 @@ from scipy.stats import chi2
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic.orbits.cycles import (
-    Candidate,
-    Estimate,
-    box_orbits,
-    candidates,
-    has_shorter_period,
-    refine,
-    shift_between,
-)
+from bayesperiodic.orbits import cycles
+from bayesperiodic.orbits.cycles import Candidate, Estimate
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.return_map import REACH, Atlas, ReturnMap, check_chaos, estimate_noise
 from bayesperiodic.orbits.section import PoincareSection, wrapped
@@ -61,8 +54,8 @@ def find_orbits(
     product of the derivatives along the chain. Covariances are sandwich estimates over runs of consecutive points and
     include the estimated bias.
 
-    "boxes": the method of [1]_ as a baseline: boxes of 1 % of the attractor, recurrence to the same or an adjacent box,
-    and one linear fit of the map over the whole period. Noise and curvature bias its eigenvalues.
+    "boxes": the method of de Kraker et al. (1997, see `Model`), section 5, as a baseline: recurrence to the same or an
+    adjacent box, and one linear fit of the map over the whole period. Noise and curvature bias its eigenvalues.
 
     Parameters
     ----------
@@ -88,37 +81,26 @@ def find_orbits(
         For a section that is periodic, quasi-periodic or shows no return map (the message names which), for an unknown
         method, and for periods that are not whole numbers.
 
-    References
-    ----------
-    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
-       equilibrium states, in: D. H. van Campen (Ed.), Interaction between Dynamics and Control in Advanced
-       Mechanical Systems, Kluwer, 1997, 191-198; section 5.
-
     Examples
     --------
-    The Hénon map has one orbit of period 1 and one of period 2 on its attractor:
+    `henon_section`: 1,900 points of the Hénon map x' = 1 − 1.4 x² + y, y' = 0.3 x. Its attractor contains one orbit of
+    period 1 and one of period 2:
 
-    >>> import numpy as np, bayesperiodic as bp
-    >>> x = np.zeros((2000, 2))
-    >>> for k in range(1999):
-    ...     x[k + 1] = 1 - 1.4 * x[k, 0] ** 2 + x[k, 1], 0.3 * x[k, 0]
-    >>> henon_section = bp.PoincareSection.from_points(x[100:], ("x", "y"), frequency=1.0)
     >>> [orbit.period for orbit in bp.find_orbits(henon_section, periods=[1, 2, 3])]
     [1, 2]
     """
     wanted = _periods(periods, len(section))
     _checks.one_of("method", method, METHODS)
-    neighbours = _checks.integer("neighbours", neighbours, 16)
-    box = _checks.positive("box", box)
+    neighbours, box = _checks.integer("neighbours", neighbours, 16), _checks.positive("box", box)
     scaled = _scaled(section, neighbours)
     if method == "boxes":
-        found = [pair for p in wanted for pair in box_orbits(scaled.maps, scaled.points, p, neighbours, box)]
+        found = [pair for p in wanted for pair in cycles.box_orbits(scaled.maps, scaled.points, p, neighbours, box)]
     else:
         atlas = Atlas(scaled.maps, _search_count(scaled.maps, neighbours))
         found = [pair for p in wanted for pair in _chained(scaled, atlas, p, neighbours)]
     quality_count = _search_count(scaled.maps, FEWEST_NEIGHBOURS)
     orbits = [_orbit(section, scaled, *pair, _quality(scaled, *pair, quality_count)) for pair in found]
-    return Orbits(tuple(_named(_with_partners(orbits, scaled))), values=section.values, method=method)
+    return Orbits(_finished(orbits, scaled), values=section.values, method=method)
 
 
 def _periods(periods: Iterable[int], count: int) -> list[int]:
@@ -145,8 +127,7 @@ def _scaled(section: PoincareSection, neighbours: int) -> _ScaledSection:
     maps = ReturnMap(points[:-1], section.increments / size, turn, section.winds, noise)
     check_chaos(maps, points)
     if section.noise is None:
-        noise = estimate_noise(maps, neighbours)
-        maps = ReturnMap(points[:-1], section.increments / size, turn, section.winds, noise)
+        maps.noise = estimate_noise(maps, neighbours)
     return _ScaledSection(points, size, maps)
 
 
@@ -164,27 +145,23 @@ def _search_count(maps: ReturnMap, neighbours: int) -> int:
 def _chained(scaled: _ScaledSection, atlas: Atlas, period: int, neighbours: int) -> list[tuple[Candidate, Estimate]]:
     maps = scaled.maps
     found: list[tuple[Candidate, Estimate]] = []
-    for candidate in candidates(maps, atlas, scaled.points, period):
-        estimate = refine(maps, candidate.points, neighbours)
-        if estimate is None or not _acceptable(maps, estimate):
+
+    def same(one: Estimate, other: Estimate) -> bool:
+        distance, _ = cycles.shift_between(one.points, other.points, maps.wrap)
+        return distance < max(1e-3, 2.0 * max(_largest_sd(one), _largest_sd(other)))
+
+    for candidate in cycles.candidates(maps, atlas, scaled.points, period):
+        estimate = cycles.refine(maps, candidate.points, neighbours)
+        if estimate is None or not (sd := _largest_sd(estimate)) < LARGEST_SD:
             continue
-        if not any(_same(maps, estimate, other) for _, other in found):
+        repeats = cycles.has_shorter_period(estimate.points, maps.wrap, max(2e-3, 3.0 * sd))
+        if not repeats and not any(same(estimate, other) for _, other in found):
             found.append((candidate, estimate))
     return found
 
 
 def _largest_sd(estimate: Estimate) -> float:
     return float(np.sqrt(np.diag(estimate.covariance)[: estimate.points.size].max()))
-
-
-def _acceptable(maps: ReturnMap, estimate: Estimate) -> bool:
-    sd = _largest_sd(estimate)
-    return sd < LARGEST_SD and not has_shorter_period(estimate.points, maps.wrap, max(2e-3, 3.0 * sd))
-
-
-def _same(maps: ReturnMap, one: Estimate, other: Estimate) -> bool:
-    distance, _ = shift_between(one.points, other.points, maps.wrap)
-    return distance < max(1e-3, 2.0 * max(_largest_sd(one), _largest_sd(other)))
 
 
 def _orbit(
@@ -205,11 +182,11 @@ def _orbit(
         if not (abs(bias[k]) <= sd[k] and sd[k] < LARGEST_LOGARITHM_SD):
             covariance[k, :] = covariance[:, k] = np.nan
     cycle = section.cycle(candidate.closest, period)
-    for k, name in enumerate(section.coordinates):
-        if name in section.angles:
-            points[:, k] = wrapped(points[:, k])
-            if cycle is not None:
-                cycle[name] += 2.0 * np.pi * np.round((points[0, k] - cycle[name][0]) / (2.0 * np.pi))
+    for column in np.flatnonzero(scaled.maps.angle):
+        points[:, column] = wrapped(points[:, column])
+        if cycle is not None:
+            values = cycle[section.coordinates[column]]
+            values += 2.0 * np.pi * np.round((points[0, column] - values[0]) / (2.0 * np.pi))
     return Orbit(
         name="",
         coordinates=section.coordinates,
@@ -254,30 +231,25 @@ def _quality(scaled: _ScaledSection, candidate: Candidate, estimate: Estimate, n
     return float(chi2.sf(statistic, 2 * period))
 
 
-def _with_partners(orbits: list[Orbit], scaled: _ScaledSection) -> list[Orbit]:
-    """Return the orbits with the positions of their mirror images under the change of all signs."""
+def _finished(orbits: list[Orbit], scaled: _ScaledSection) -> tuple[Orbit, ...]:
+    """Return the orbits with names, and with the positions of their mirror images under the change of all signs."""
     result: list[Orbit] = []
+    counts: Counter[tuple[int, int | None]] = Counter()
     for orbit in orbits:
         partner, closest = None, np.inf
         for k, other in enumerate(orbits):
             if other.period != orbit.period:
                 continue
-            distance, _ = shift_between(orbit.points / scaled.size, -other.points / scaled.size, scaled.maps.wrap)
+            distance, _ = cycles.shift_between(
+                orbit.points / scaled.size, -other.points / scaled.size, scaled.maps.wrap
+            )
             sd = np.sqrt([np.diag(o.covariance).reshape(-1, 2).max(0) / scaled.size**2 for o in (orbit, other)]).max()
             if distance < max(2e-3, 4.0 * sd) and distance < closest:
                 partner, closest = k, distance
         # Without a measured cycle, a symmetric fixed point is taken for a state of rest.
         rest = orbit.equilibrium or (orbit.cycle is None and orbit.period == 1 and partner == len(result))
-        result.append(replace(orbit, partner=partner, equilibrium=rest))
-    return result
-
-
-def _named(orbits: list[Orbit]) -> list[Orbit]:
-    counts: Counter[tuple[int, int | None]] = Counter()
-    result = []
-    for orbit in orbits:
-        key = (orbit.period, orbit.winding)
-        counts[key] += 1
+        counts[orbit.period, orbit.winding] += 1
         winding = "" if orbit.winding is None else f", winding {orbit.winding}"
-        result.append(replace(orbit, name=f"period {orbit.period}{winding}, orbit {counts[key]}"))
-    return result
+        name = f"period {orbit.period}{winding}, orbit {counts[orbit.period, orbit.winding]}"
+        result.append(replace(orbit, name=name, partner=partner, equilibrium=rest))
+    return tuple(result)

@@ -17,7 +17,7 @@ from bayesperiodic.periodic.solution import PeriodicSolution
 if TYPE_CHECKING:
     import pandas as pd
 
-# A harmonic is significant above this multiple of the median amplitude of the spectrum's upper half.
+# The last significant harmonic exceeds this multiple of the median amplitude of the spectrum's upper half.
 NOISE_FLOOR = 5.0
 # Largest bias of an eigenvalue that is used as data, in standard deviations.
 MOST_BIAS = 0.5
@@ -36,26 +36,21 @@ class Orbit(Result):
     ----------
     name : str
         Unique among the orbits of a section, such as ``"period 3, winding 1, orbit 2"``.
-    coordinates : tuple of str
-        The section's two coordinates, which are outputs of the model.
-    angles : tuple of str
-        The coordinates that are angles.
+    coordinates, angles : tuple of str
+        The section's two coordinates, which are outputs of the model, and those of them that are angles.
     frequency : float
         Of the forcing [Hz].
     period : int
         Prime period in forcing periods.
     winding : int or None
-        Turns of the angle per response period; None if the section does not determine it, 0 if no coordinate is an
-        angle.
+        Turns of the angle per response period, 0 without an angle; None if the section does not determine it.
     points : array (period, 2)
         Section values at tau = 0, 1, …, angles in (−π, π].
     joint_covariance : array (2·period + 2, 2·period + 2)
-        Of the points, point by point, and of log|eigenvalue|, largest first; NaN for eigenvalues that are not
-        estimated.
-    eigenvalues : array (2,)
-        Of the linearised return map over the period, largest modulus first, real or complex.
-    eigenvalue_bias : array (2,)
-        Estimated bias of log|eigenvalue|, which is not subtracted.
+        Of the points, point by point, and of log|eigenvalue|, largest first; NaN where not estimated.
+    eigenvalues, eigenvalue_bias : array (2,)
+        Of the linearised return map over the period, largest modulus first, real or complex, and the estimated bias of
+        log|eigenvalue|, which is not subtracted.
     returns : int
         Number of measured close returns.
     quality : float
@@ -76,7 +71,6 @@ class Orbit(Result):
     The fixed point of the Hénon map (section as in `find_orbits`) is x = (√6.09 − 0.7)/2.8; its multipliers are the
     roots of μ² + 2.8 x μ = 0.3:
 
-    >>> import bayesperiodic as bp
     >>> orbit = bp.find_orbits(henon_section, periods=[1])[0]
     >>> orbit.points.round(4).tolist(), orbit.eigenvalues.round(3).tolist()
     ([[0.6314, 0.1894]], [-1.924, 0.156])
@@ -137,8 +131,8 @@ class Orbit(Result):
             Grid points per forcing period.
         multipliers : bool
             Compare the unstable eigenvalues too, as log|μ| with fixed sign and with their covariance with the points.
-            One that is complex, not estimated, or whose bias exceeds half its standard deviation is left out, and so is
-            every smaller one.
+            One that is complex, not estimated, or whose bias exceeds half its standard deviation is left out, and so
+            are all smaller ones.
         whole : bool
             Compare all samples of the measured cycle instead, with a variance per channel. The measured cycle is a
             close return and does not close exactly; the gap counts as noise.
@@ -206,7 +200,6 @@ class Orbits(Result):
     --------
     Two orbits of the Hénon map (section as in `find_orbits`):
 
-    >>> import bayesperiodic as bp
     >>> orbits = bp.find_orbits(henon_section, periods=[1, 2])
     >>> len(orbits), orbits[1].name, orbits.rejected
     (2, 'period 2, winding 0, orbit 1', ())
@@ -223,12 +216,11 @@ class Orbits(Result):
 
     @property
     def table(self) -> pd.DataFrame:
-        """One row per orbit, followed by the rejected candidates with the reason.
+        """One row per orbit, followed by the rejected candidates with the reason in the column `rejected`.
 
-        Columns: name, period, winding (missing if unknown), returns, quality, multiplier and contraction (the two
-        eigenvalues), their standard deviations (NaN: not estimated), `estimated` (whether that of the multiplier is),
-        modulus of the multiplier, largest standard deviation of a point in the first and in the second coordinate,
-        the partner's name, equilibrium, rejected (the reason, empty for accepted orbits).
+        `winding` is missing if unknown; `multiplier` and `contraction` are the two eigenvalues, whose standard
+        deviations are NaN if not estimated; `sd_first` and `sd_second` are the largest standard deviations of a point
+        in the two coordinates.
         """
         import pandas as pd
 
@@ -260,15 +252,13 @@ def counted_turns(orbit: Orbit) -> int | None:
     """Return the winding number counted in the section or in its measured cycle; None if neither determines it."""
     if orbit.winding is not None or orbit.cycle is None:
         return orbit.winding
-    turns = [round(float(_end(orbit.cycle[name]) - orbit.cycle[name][0]) / TURN) for name in orbit.angles]
-    return int(turns[0]) if turns else 0
+    return sum(round(float(_end(orbit.cycle[name]) - orbit.cycle[name][0]) / TURN) for name in orbit.angles)
 
 
 def resampled_cycle(orbit: Orbit, winding: int, samples: int) -> np.ndarray:
     """Return the measured cycle (samples·period, 2) on another grid, closed, with its significant harmonics only.
 
-    The gap between its end and its start is distributed over the cycle. Harmonics above the last one that exceeds five
-    times the median amplitude of the upper half of the spectrum are removed.
+    The gap between its end and its start is distributed over the cycle.
     """
     assert orbit.cycle is not None
     tau, columns = np.arange(samples * orbit.period) / samples, []
@@ -293,7 +283,6 @@ def _on_grid(values: np.ndarray, points: int) -> np.ndarray:
 
 
 def _measured_cycle(orbit: Orbit, samples: int) -> Mapping[str, np.ndarray]:
-    """Return the measured cycle, whose samples are grid points."""
     if orbit.cycle is None:
         raise ValueError(f"whole: must be False, got True; {orbit.name!r} has no measured cycle.")
     measured = len(orbit.cycle[orbit.coordinates[0]]) // orbit.period
@@ -335,13 +324,10 @@ def _with_multipliers(orbit: Orbit, experiment: Experiment) -> Experiment:
     unstable = np.abs(orbit.eigenvalues) > 1.0
     kept, omitted = np.flatnonzero(unstable & known), np.flatnonzero(unstable & ~known)
     if omitted.size:
-        complex_pair = np.iscomplex(orbit.eigenvalues[omitted[0]])
-        why = "complex" if complex_pair else "not estimated, or its bias exceeds half its standard deviation"
-        warnings.warn(
-            f"The eigenvalue {orbit.eigenvalues[omitted[0]]:.4g} of {orbit.name!r} is left out: it is {why}.",
-            UserWarning,
-            stacklevel=3,
-        )
+        value = orbit.eigenvalues[omitted[0]]
+        why = "complex" if np.iscomplex(value) else "not estimated, or its bias exceeds half its standard deviation"
+        text = f"The eigenvalue {value:.4g} of {orbit.name!r} is left out: it is {why}."
+        warnings.warn(text, UserWarning, stacklevel=3)
         # Multipliers are compared in the order of their moduli, so none below an omitted one can be used.
         kept = kept[kept < omitted[0]]
     if not kept.size:

@@ -1,6 +1,6 @@
-"""polish_orbits: orbits of a section become periodic solutions of a model, or are rejected with a reason."""
+"""polish_orbits and select_orbits: a model's solutions for the orbits of a section, and their choice as data."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 
@@ -8,15 +8,14 @@ import numpy as np
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic.models.integrate import integrate
-from bayesperiodic.models.model import Model
+from bayesperiodic.models.model import Model, integrate
 from bayesperiodic.orbits.cycles import shift_between
 from bayesperiodic.orbits.orbit import TURN, Orbit, Orbits, counted_turns, resampled_cycle
 from bayesperiodic.orbits.section import wrapped
 from bayesperiodic.periodic.compiled import CONVERGED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme
-from bayesperiodic.periodic.solution import describe
+from bayesperiodic.periodic.solution import PeriodicSolution, describe, multiplier_sensitivities
 from bayesperiodic.periodic.solve import solve_driven
 
 # In units of the attractor's size: solutions that coincide, the largest range of a state of rest.
@@ -27,6 +26,8 @@ MOST_ERRORS = 5.0
 SURE, REAL = 0.3, 1e-6
 # Number of winding numbers tried for an orbit whose turns are not counted.
 MOST_TRIED = 12
+# Directions with less information than this fraction of the largest are ignored.
+LEAST_EIGENVALUE = 1e-10
 
 
 @in_one_thread
@@ -43,14 +44,13 @@ def polish_orbits(
 ) -> Orbits:
     """Solve a model for every orbit of a section, and accept the solutions that agree with the measured orbits.
 
-    Newton's method starts from the measured cycle with its winding number. For points alone it starts from the model
-    integrated over one forcing period from each section point, for all winding numbers that this leaves possible. A
-    solution that repeats itself is reduced to its prime period, and the measured points with it. It is accepted if
-    every section point is within five standard errors of the measured one, and if its unstable multiplier has the sign
-    of the measured eigenvalue, where that is known to 30 %. The standard error combines the covariance of the points,
-    `tolerance` and the uncertainty of the parameters. Of several candidates for one orbit (cyclic shifts included), the
-    one with the most returns is kept. An orbit and its mirror image under the change of all signs are two orbits with
-    independent noise; each has the other as its partner.
+    Newton's method starts from the measured cycle with its winding number; for points alone, from the model integrated
+    over one forcing period from each section point, for all possible winding numbers. A solution that repeats itself is
+    reduced to its prime period, and the measured points with it. It is accepted if every section point is within five
+    standard errors of the measured one, and if its unstable multiplier has the sign of the measured eigenvalue, where
+    that is known to 30 %. The standard error combines the covariance of the points, `tolerance` and the uncertainty of
+    the parameters. Of several candidates for one orbit (cyclic shifts included), the one with the most returns is kept.
+    An orbit and its mirror image under the change of all signs are two orbits with independent noise, and partners.
 
     Parameters
     ----------
@@ -58,17 +58,11 @@ def polish_orbits(
         A forced one, whose states (and rates, if there is no measured cycle) follow from the section's coordinates.
     orbits : Orbits, or sequence of Orbit
         From `find_orbits`; those rejected before stay rejected.
-    parameters : mapping of str to float
-        A value for every parameter.
-    inputs : mapping of str to array (samples,), optional
-        Every input over one forcing period.
+    parameters, inputs, samples, scheme
+        As for `solve_periodic`; inputs over one forcing period.
     parameter_sd : mapping of str to float, optional
         Standard deviations of uncertain parameters. They widen the accepted distances by their effect on the section
         points, to first order.
-    samples : int
-        Grid points per forcing period.
-    scheme : str or Scheme
-        See `solve_periodic`.
     tolerance : float
         Additional standard error of every measured coordinate, as a fraction of the range of all measured values, of a
         turn for an angle.
@@ -82,16 +76,13 @@ def polish_orbits(
     Raises
     ------
     ValueError
-        For an autonomous model, unknown names, coordinates that do not determine the model's states, and arguments that
-        `solve_periodic` does not accept.
+        As for `solve_periodic`, and for an autonomous model or coordinates that do not determine the model's states.
 
     Examples
     --------
     `pendulum_orbits`: the orbits of period 1 in 2,000 forcing periods of the pendulum in `PoincareSection`'s example.
-    Newton's method on the return map of the integrated model gives the multiplier −1.7059 for the orbit with winding
-    number 1:
+    Newton's method on the return map of the integrated model gives the multiplier −1.7059:
 
-    >>> import bayesperiodic as bp
     >>> polished = bp.polish_orbits(bp.models.pendulum, pendulum_orbits, pendulum_parameters, samples=200)
     >>> [turning] = [orbit for orbit in polished if orbit.winding == 1 and orbit.eigenvalues[0].real < 0]
     >>> print(f"{turning.solution.multipliers[0].real:.3f}")
@@ -99,14 +90,9 @@ def polish_orbits(
     """
     given = orbits if isinstance(orbits, Orbits) else Orbits(tuple(orbits))
     polisher = _Polisher(model, given.orbits, parameters, inputs or {}, parameter_sd or {}, samples, scheme, tolerance)
-    rejected = list(given.rejected)
-    polished: list[Orbit] = []
-    for orbit in given:
-        found, reason = polisher.polish(orbit)
-        if reason:
-            rejected.append((orbit, reason))
-        else:
-            polished.append(found)
+    results = [(orbit, *polisher.polish(orbit)) for orbit in given]
+    rejected = [*given.rejected, *((orbit, reason) for orbit, _, reason in results if reason)]
+    polished = [found for _, found, reason in results if not reason]
     kept: list[int] = []
     for i in sorted(range(len(polished)), key=lambda i: -polished[i].returns):
         for k in kept:
@@ -122,8 +108,14 @@ def polish_orbits(
         next((j for j, other in enumerate(accepted) if polisher.shift(one, other, sign=-1) is not None), None)
         for one in accepted
     ]
-    final = tuple(replace(orbit, partner=partner) for orbit, partner in zip(accepted, partners, strict=True))
-    return replace(given, orbits=final, rejected=tuple(rejected))
+    return _selection(given, accepted, partners, rejected)
+
+
+def _selection(
+    orbits: Orbits, kept: list[Orbit], partners: list[int | None], rejected: list[tuple[Orbit, str]]
+) -> Orbits:
+    paired = tuple(replace(orbit, partner=partner) for orbit, partner in zip(kept, partners, strict=True))
+    return replace(orbits, orbits=paired, rejected=tuple(rejected))
 
 
 class _Polisher:
@@ -170,13 +162,13 @@ class _Polisher:
 
     def polish(self, orbit: Orbit) -> tuple[Orbit, str]:
         """Return the orbit with its solution and an empty reason, or unchanged with the reason for its rejection."""
-        reasons = []
+        first = ""
         for winding, states in self._starts(orbit):
             found, reason = self._solve(orbit, winding, states)
             if not reason:
                 return found, ""
-            reasons.append(reason)
-        return orbit, reasons[0] if reasons else "the model's states diverge from its section points"
+            first = first or reason
+        return orbit, first or "the model's states diverge from its section points"
 
     def shift(self, one: Orbit, other: Orbit, sign: int = 1) -> int | None:
         """Return the cyclic shift under which two polished orbits, one of them times `sign`, coincide; None if none."""
@@ -234,8 +226,8 @@ class _Polisher:
     def _reduced(self, orbit: Orbit, times: int) -> Orbit:
         """Return an orbit that repeats itself `times` times within its period with its prime period.
 
-        Points are averaged, log|eigenvalue| is divided by `times`, and the covariance is propagated. An even number of
-        repetitions leaves the signs of the eigenvalues undetermined; the moduli are given.
+        Points are averaged and log|eigenvalue| is divided by `times`. For even `times`, the signs of the eigenvalues
+        are undetermined, and the moduli are given.
         """
         period, coordinates = orbit.period // times, orbit.points.shape[1]
         repeats = orbit.points.reshape(times, period, coordinates)
@@ -267,8 +259,7 @@ class _Polisher:
         assert solution is not None
         variance = np.diag(orbit.covariance).reshape(orbit.points.shape) + (self.tolerance * self.scales) ** 2
         for name, sd in self.parameter_sd.items():
-            slopes = [solution.sensitivities[c][name][:: self.samples] for c in orbit.coordinates]
-            variance = variance + (sd * np.stack(slopes, axis=-1)) ** 2
+            variance = variance + (sd * _slopes(orbit, solution, name)) ** 2
         off = np.abs(self._wrap(self._section_points(orbit) - orbit.points)) / np.sqrt(variance)
         at, coordinate = np.unravel_index(int(np.argmax(off)), off.shape)
         if off.max() <= MOST_ERRORS:
@@ -282,31 +273,29 @@ class _Polisher:
     def _starts(self, orbit: Orbit) -> Iterator[tuple[int, np.ndarray]]:
         """Yield winding numbers and states (points, states), whole turns included, from which to solve.
 
-        The measured cycle comes first. If there is none, or it does not lead to the orbit, the model is integrated over
-        one forcing period from each section point, and the segments are corrected so that they meet. If the turns of an
-        angle are unknown, winding numbers follow in the order of the corrections they need.
+        The measured cycle comes first, then segments that are integrated from the section points.
         """
         winding = counted_turns(orbit)
         equations = self._equations(orbit, 0)
         if orbit.cycle is not None:
             assert winding is not None
-            values = resampled_cycle(orbit, winding, self.samples)
-            phases = self._phases(orbit, equations, values, equations.grid.tau, equations.inputs)
+            phases = self._phases(orbit, equations, resampled_cycle(orbit, winding, self.samples))
             yield winding, phases[:, : equations.count]
         for turns, states in self._integrated(orbit, equations):
             if winding is None or turns == winding:
                 yield turns, states
 
     def _integrated(self, orbit: Orbit, equations: PeriodicEquations) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield winding numbers and states (points, states), whole turns included, through the section points."""
+        """Yield winding numbers and states through the section points.
+
+        The model is integrated over one forcing period from each point, and the segments are corrected so that they
+        meet. Several winding numbers are possible; they follow in the order of the corrections they need.
+        """
         samples, periods, count = self.samples, orbit.period, equations.count
-        tau = np.arange(periods, dtype=float)
-        starts = self._phases(orbit, equations, orbit.points, tau, equations.inputs[::samples], rates=True)
+        starts = self._phases(orbit, equations, orbit.points, rates=True)
         half = _fourier.on_grid(_fourier.coefficients(equations.inputs[:samples].T), 2 * samples).T
-        steps = {"samples": samples, "steps": samples + 1, "kept": samples + 1}
-        paths = [
-            integrate(self.model, start, half, self.theta, frequency=equations.frequency, **steps) for start in starts
-        ]
+        grid = {"samples": samples, "steps": samples + 1, "kept": samples + 1}
+        paths = [integrate(self.model, s, half, self.theta, frequency=equations.frequency, **grid) for s in starts]
         segments = [path[:, :count] for path in paths if path is not None]
         if len(segments) < periods:
             return
@@ -324,23 +313,17 @@ class _Polisher:
             yield int(sum(turns)), _connected(np.stack(segments), missed, whole)
 
     def _phases(
-        self,
-        orbit: Orbit,
-        equations: PeriodicEquations,
-        values: np.ndarray,
-        tau: np.ndarray,
-        inputs: np.ndarray,
-        rates: bool = False,
+        self, orbit: Orbit, equations: PeriodicEquations, values: np.ndarray, rates: bool = False
     ) -> np.ndarray:
         """Return the states, then the rates of the second-order ones, (points, size), from the section's coordinates.
 
-        The rates are valid only if they are requested.
+        The values of the coordinates are at whole tau if rates are needed; else on the grid, and the rates are invalid.
         """
-        model, count = self.model, equations.count
+        model, count, every = self.model, equations.count, self.samples if rates else 1
+        tau, here = np.ascontiguousarray(equations.grid.tau[::every]), np.ascontiguousarray(equations.inputs[::every])
         columns = [model.outputs.index(name) for name in orbit.coordinates]
         second = [i for i, state in enumerate(model.states) if model.orders[state] == 2]
         places = [*range(count), *(count + i for i in second)]
-        here = np.ascontiguousarray(inputs)
 
         def outputs(phase: np.ndarray) -> np.ndarray:
             states = np.zeros((tau.size, 3 * count))
@@ -376,7 +359,7 @@ def _connected(segments: np.ndarray, missed: np.ndarray, turns: np.ndarray) -> n
 
 
 def _sign_mismatch(orbit: Orbit) -> str:
-    """Return that the solution's multiplier has another sign than the measured one; empty if it has not.
+    """Return a message if the solution's multiplier has another sign than the measured one, else an empty text.
 
     The sign of a multiplier with modulus above 1 cannot change along a branch.
     """
@@ -388,3 +371,130 @@ def _sign_mismatch(orbit: Orbit) -> str:
     if not sure or measured.real * own.real > 0.0:
         return ""
     return f"the solution is another orbit: its multiplier is {own.real:.4g}, the measured one {measured.real:.4g}"
+
+
+@in_one_thread
+def select_orbits(
+    orbits: Orbits,
+    parameters: Iterable[str],
+    *,
+    model: Model | None = None,
+    largest_multiplier: float = 50.0,
+    least_quality: float = 1e-3,
+    least_gain: float = 0.01,
+) -> Orbits:
+    """Choose polished orbits as data for the estimation of some parameters.
+
+    States of rest, orbits that disagree with their own returns, and very unstable orbits are left out: a return map
+    with ``|μ|`` = 50 stretches 1 % of the attractor to half its size within one period; linear maps do not hold over
+    such distances, and the error estimates become unreliable. The information of an orbit about the parameters is
+    SᵀC⁻¹S, with the sensitivities S of its section points (and unstable eigenvalues) and their covariance C. The least
+    informative orbit is removed repeatedly, as long as the standard deviation of no combination of the parameters rises
+    by more than `least_gain` in total. Both of two symmetric partners may remain, because their noise is independent.
+
+    Parameters
+    ----------
+    orbits : Orbits
+        From `polish_orbits`.
+    parameters : iterable of str
+        Those to be estimated.
+    model : Model, optional
+        If given, unstable eigenvalues are included, as in ``orbit.experiment(multipliers=True)``.
+    largest_multiplier, least_quality, least_gain : float
+        Limits of the modulus of the largest multiplier of the model's orbit, of `Orbit.quality`, and of the relative
+        rise of a standard deviation.
+
+    Returns
+    -------
+    Orbits
+        Those left out are added to `.rejected` with the reasons; partners are positions among the selected ones.
+
+    Raises
+    ------
+    ValueError
+        For an orbit that is not polished, an unknown parameter, or a limit that is not positive.
+
+    Examples
+    --------
+    The pendulum at rest does not depend on the parameters:
+
+    >>> polished = bp.polish_orbits(bp.models.pendulum, pendulum_orbits, pendulum_parameters, samples=200)
+    >>> best = bp.select_orbits(polished, ["m", "l"])
+    >>> 0 < len(best) < len(polished), "a state of rest" in [reason for _, reason in best.rejected]
+    (True, True)
+    """
+    names = list(parameters)
+    _checks.positive("largest_multiplier", largest_multiplier)
+    _checks.finite_number("least_quality", least_quality)
+    _checks.positive("least_gain", least_gain)
+    reasons = [_unsuitable(orbit, largest_multiplier, least_quality) for orbit in orbits]
+    rejected = [*orbits.rejected, *((orbit, why) for orbit, why in zip(orbits, reasons, strict=True) if why)]
+    kept = [orbit for orbit, why in zip(orbits, reasons, strict=True) if not why]
+    dropped = _uninformative([orbit_information(orbit, names, model) for orbit in kept], least_gain)
+    for i, rise in dropped.items():
+        rejected.append((kept[i], f"little information: without it, standard deviations rise by {rise:.2%} at most"))
+    chosen = [orbit for i, orbit in enumerate(kept) if i not in dropped]
+    position = {orbit.name: i for i, orbit in enumerate(chosen)}
+    partners = [None if orbit.partner is None else position.get(orbits[orbit.partner].name) for orbit in chosen]
+    return _selection(orbits, chosen, partners, rejected)
+
+
+def _slopes(orbit: Orbit, solution: PeriodicSolution, parameter: str) -> np.ndarray:
+    """Return the derivatives of the section points by a parameter, (period, 2)."""
+    columns = [solution.sensitivities[name][parameter][:: solution.samples] for name in orbit.coordinates]
+    return np.stack(columns, axis=-1)
+
+
+def _polished(orbit: Orbit) -> PeriodicSolution:
+    if orbit.solution is None:
+        raise ValueError(f"orbits: must be polished, got {orbit.name!r} without a solution. Use polish_orbits first.")
+    return orbit.solution
+
+
+def orbit_information(orbit: Orbit, parameters: list[str], model: Model | None = None) -> np.ndarray:
+    """Return SᵀC⁻¹S (parameters, parameters), with the derivatives S by relative changes of the parameters."""
+    solution = _polished(orbit)
+    for name in parameters:
+        _checks.one_of("parameters", name, solution.parameters)
+    experiment = orbit.experiment(samples=solution.samples, multipliers=model is not None)
+    by_name = multiplier_sensitivities(model, solution) if model is not None else {}
+    count = 0 if experiment.multipliers is None else experiment.multipliers.size
+    columns = []
+    for name in parameters:
+        column = _slopes(orbit, solution, name).ravel()
+        if count:
+            column = np.concatenate([column, (by_name[name] / solution.multipliers).real[:count]])
+        columns.append(column * (solution.parameters[name] or 1.0))
+    slopes = np.stack(columns, axis=-1)
+    assert experiment.covariance is not None
+    return slopes.T @ np.linalg.solve(experiment.covariance, slopes)
+
+
+def _unsuitable(orbit: Orbit, largest_multiplier: float, least_quality: float) -> str:
+    """Return why an orbit cannot be used as data; empty if it can."""
+    modulus = float(np.abs(_polished(orbit).multipliers).max())
+    if orbit.equilibrium:
+        return "a state of rest"
+    if orbit.quality < least_quality:
+        return f"disagrees with its returns: quality {orbit.quality:.2g} < {least_quality:g}"
+    return f"too unstable: |μ| = {modulus:.4g} > {largest_multiplier:g}" if modulus > largest_multiplier else ""
+
+
+def _uninformative(information: list[np.ndarray], most: float) -> dict[int, float]:
+    """Return the orbits to leave out, with the rise of standard deviations without them and all before them."""
+    dropped: dict[int, float] = {}
+    if not information:
+        return dropped
+    values, vectors = np.linalg.eigh(np.sum(information, axis=0))
+    informed = values > LEAST_EIGENVALUE * values.max()
+    whitening = vectors[:, informed] / np.sqrt(values[informed])
+    parts = [whitening.T @ one @ whitening for one in information]
+    remaining = np.eye(whitening.shape[1])
+    while len(dropped) < len(parts) - 1:
+        least = {i: np.linalg.eigvalsh(remaining - part)[0] for i, part in enumerate(parts) if i not in dropped}
+        best = max(least, key=least.__getitem__)
+        rise = float(1.0 / np.sqrt(least[best]) - 1.0) if least[best] > 0.0 else np.inf
+        if rise > most:
+            break
+        dropped[best], remaining = rise, remaining - parts[best]
+    return dropped

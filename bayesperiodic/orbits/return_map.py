@@ -40,11 +40,9 @@ class LocalFit(NamedTuple):
     @property
     def hessian(self) -> np.ndarray:
         """Second derivatives (m, image, argument, argument); zero for linear fits."""
-        result = np.zeros((len(self.derivatives), 2, 2, 2))
-        if self.derivatives.shape[1] > 3:
-            for term, (row, column) in zip((3, 4, 4, 5), ((0, 0), (0, 1), (1, 0), (1, 1)), strict=True):
-                result[:, :, row, column] = self.derivatives[:, term]
-        return result
+        if self.derivatives.shape[1] <= 3:
+            return np.zeros((len(self.derivatives), 2, 2, 2))
+        return np.ascontiguousarray(self.derivatives[:, [[3, 4], [4, 5]]].transpose(0, 3, 1, 2))
 
 
 class ReturnMap:
@@ -53,28 +51,16 @@ class ReturnMap:
     Neighbours are weighted by a Gaussian kernel. The normal equations are sums of the kernel times powers of noise-free
     arguments. For normal noise in the arguments, of known variance below the kernel's, there are functions of the noisy
     arguments with exactly these expectations: a narrower Gaussian times Hermite polynomials, the deconvoluting kernels
-    of [1]_. They make the normal equations unbiased and so remove the attenuation of the slopes.
-
-    Parameters
-    ----------
-    arguments : array (n, 2)
-        Points with a known image.
-    increments : array (n, 2)
-        Image minus argument; angles with whole turns, or modulo a turn.
-    turn : array (2,)
-        One turn in these units; infinite for coordinates that are not angles.
-    winds : bool
-        Whether the increments of angles include whole turns.
-    noise : array (2,)
-        Standard deviation of the arguments.
-
-    References
-    ----------
-    .. [1] J. Fan, Y. K. Truong, Nonparametric regression with errors in variables, Annals of Statistics 21, 1993.
+    of J. Fan, Y. K. Truong, Nonparametric regression with errors in variables, Annals of Statistics 21, 1993. They make
+    the normal equations unbiased and so remove the attenuation of the slopes.
     """
 
     def __init__(self, arguments: np.ndarray, increments: np.ndarray, turn: np.ndarray, winds: bool, noise: np.ndarray):
-        self.arguments, self.increments, self.turn, self.winds, self.noise = arguments, increments, turn, winds, noise
+        self.arguments = arguments  # points with a known image, (n, 2)
+        self.increments = increments  # image minus argument, (n, 2)
+        self.turn = turn  # one turn in these units; infinite for coordinates that are not angles, (2,)
+        self.winds = winds  # whether the increments of angles include whole turns
+        self.noise = noise  # standard deviation of the arguments, (2,)
         self.angle = np.isfinite(turn)
         self._tree = self.tree(arguments)
 
@@ -84,10 +70,10 @@ class ReturnMap:
 
     def wrap_points(self, points: np.ndarray) -> np.ndarray:
         """Return points with angles in [0, turn)."""
-        result = np.array(points)
-        result[:, self.angle] %= self.turn[self.angle]
+        result, turn = np.array(points), self.turn[self.angle]
+        inside = result[:, self.angle] % turn
         # The remainder of a tiny negative number is the turn itself, which the tree does not accept.
-        result[:, self.angle] = np.where(result[:, self.angle] >= self.turn[self.angle], 0.0, result[:, self.angle])
+        result[:, self.angle] = np.where(inside >= turn, 0.0, inside)
         return result
 
     def wrap(self, difference: np.ndarray) -> np.ndarray:
@@ -225,8 +211,8 @@ ROOM = 4.0
 def estimate_noise(maps: ReturnMap, neighbours: int) -> np.ndarray:
     """Return the standard deviations (2,) of independent errors of the two coordinates.
 
-    Where the return map is quadratic, the residual variance of an image is the variance of its own error plus that of
-    the argument's error, propagated by the map. The densest neighbourhoods are used, where curvature matters least, and
+    Where the return map is quadratic, the residual variance of an image is the variance of its own error plus the
+    propagated one of the argument's error. The densest neighbourhoods are used, where curvature matters least, and
     widened until they are large compared with the noise.
     """
     centres = maps.arguments[:: max(1, len(maps.arguments) // NOISE_CENTRES)]

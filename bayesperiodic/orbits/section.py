@@ -23,15 +23,14 @@ BLOCK = 20_000
 
 @dataclass(frozen=True)
 class PoincareSection(Result):
-    """Points of a motion in a Poincaré section, in the order of time: the input of `find_orbits`, see [1]_, section 5.
+    """Points of a motion in a Poincaré section, in the order of time: the input of `find_orbits`.
 
     Attributes
     ----------
     points : array (count, 2)
         Angles in (−π, π].
-    coordinates : tuple of str
-    angles : tuple of str
-        The coordinates that are angles, one at most.
+    coordinates, angles : tuple of str
+        The two coordinates, and those of them that are angles, one at most.
     frequency : float
         Forcing frequency [Hz]; for crossings of a plane, returns per second.
     increments : array (count − 1, 2)
@@ -49,19 +48,12 @@ class PoincareSection(Result):
     synthetic : bool
         True if the data were simulated.
 
-    References
-    ----------
-    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
-       equilibrium states, 1997.
-
     Examples
     --------
     The driven pendulum in chaotic motion, once a forcing period:
 
-    >>> import bayesperiodic as bp
-    >>> theta = {"m": 0.1, "l": 0.3, "k1": 1.8e-4, "k2": 4.5e-4, "k3": 4.5e-4, "a": 0.11, "g": 9.81, "v0": 0.05}
-    >>> recording = bp.simulate(bp.models.pendulum, theta, frequency=1.4467, duration=200, sampling_rate=60,
-    ...                         start={"phi": 1})
+    >>> recording = bp.simulate(bp.models.pendulum, pendulum_parameters, frequency=1.4467, duration=200,
+    ...                         sampling_rate=60, start={"phi": 1})
     >>> section = bp.PoincareSection.from_recording(recording, ("angle", "rate"), frequency=1.4467, angles=["angle"])
     >>> section
     PoincareSection(290 points of angle, rate at 1.4467 Hz from a recording of 12001 samples)
@@ -94,8 +86,8 @@ class PoincareSection(Result):
     ) -> "PoincareSection":
         """Evaluate a recording once a forcing period, at whole tau.
 
-        Values between samples come from local polynomials. Their window is as wide as the signal allows without bias,
-        so that points of a densely sampled recording have less noise than single samples.
+        Values come from local polynomials, in windows as wide as the signal allows without bias, so that points of a
+        densely sampled recording have less noise than single samples.
 
         Parameters
         ----------
@@ -125,9 +117,10 @@ class PoincareSection(Result):
         signals = _signals(recording, names, angle_names)
         time = recording.time
         if recording.sampling_rate < FEWEST_SAMPLES * frequency:
+            found = f"{recording.sampling_rate / frequency:.3g}"
             raise ValueError(
-                f"recording: must have at least {FEWEST_SAMPLES} samples a period, got "
-                f"{recording.sampling_rate / frequency:.3g}. For samples taken once a period, use from_points."
+                f"recording: must have at least {FEWEST_SAMPLES} samples a period, got {found}. For samples taken once "
+                "a period, use from_points."
             )
         first = int(np.ceil((time[0] - origin) * frequency - 1e-9))
         last = int(np.floor((time[-1] - origin) * frequency + 1e-9))
@@ -139,7 +132,7 @@ class PoincareSection(Result):
                 "recording: must be chaotic, got a motion of period 1, whose section points coincide. Use "
                 "recording.fold instead."
             )
-        return cls._build(values, names, angle_names, frequency, noise, instants, recording, signals)
+        return cls._of(recording, names, angle_names, frequency, instants, signals, values, noise)
 
     @classmethod
     def from_crossings(
@@ -156,16 +149,13 @@ class PoincareSection(Result):
 
         Parameters
         ----------
-        recording : Recording
-        coordinates : sequence of two str
-            Outputs of the section, other than `channel`.
+        recording, coordinates, angles
+            As for `from_recording`.
         channel : str
-            Output whose crossings define the section.
+            Output whose crossings define the section; not one of the coordinates.
         level : float
         direction : {1, -1}
             Upwards or downwards.
-        angles : sequence of str
-            The coordinates that are angles [rad].
 
         Returns
         -------
@@ -175,7 +165,7 @@ class PoincareSection(Result):
         Raises
         ------
         ValueError
-            For an unknown channel or coordinate, too few crossings, or an angle that does not seem to be in radians.
+            For an unknown channel, too few crossings, and as for `from_recording`.
         """
         names, angle_names = _names(coordinates, angles)
         _checks.one_of("channel", channel, [name for name in recording.outputs if name not in names])
@@ -185,9 +175,9 @@ class PoincareSection(Result):
         signals = _signals(recording, names, angle_names)
         instants = _upward_crossings(recording.time, direction * (recording.outputs[channel] - level))
         _check_count(instants.size)
-        values, noise = _estimate(recording.time, signals, instants)
         frequency = float((instants.size - 1) / (instants[-1] - instants[0]))
-        return cls._build(values, names, angle_names, frequency, noise, instants, recording, signals)
+        values, noise = _estimate(recording.time, signals, instants)
+        return cls._of(recording, names, angle_names, frequency, instants, signals, values, noise)
 
     @classmethod
     def from_points(
@@ -199,12 +189,8 @@ class PoincareSection(Result):
         ----------
         points : array (count, 2)
             All consecutive points in the order of time; angles [rad] with any number of turns.
-        coordinates : sequence of two str
-            Their names, which are outputs of the model.
-        frequency : float
-            Of the forcing [Hz].
-        angles : sequence of str
-            The coordinates that are angles.
+        coordinates, frequency, angles
+            As for `from_recording`.
 
         Returns
         -------
@@ -223,40 +209,36 @@ class PoincareSection(Result):
             raise ValueError(f"points: must be an array of real numbers, got {points!r}.") from None
         if values.ndim != 2 or values.shape[1] != 2:
             raise ValueError(f"points: must have the shape (count, 2), got {values.shape}.")
+        turning = np.isin(names, angle_names)
         for k, name in enumerate(names):
-            _checks.finite_vector(f"points[:, {k}] ({name})", values[:, k])
-            if name in angle_names and 6.5 * np.pi < np.ptp(values[:, k]) < 361.0:
+            extent = np.ptp(_checks.finite_vector(f"points[:, {k}] ({name})", values[:, k]))
+            if turning[k] and 6.5 * np.pi < extent < 361.0:
                 raise ValueError(
-                    f"points[:, {k}] ({name}): must be an angle in radians, got a range of {np.ptp(values[:, k]):.4g}. "
-                    "It seems to be in degrees: convert it with numpy.radians."
+                    f"points[:, {k}] ({name}): must be an angle in radians, got a range of {extent:.4g}. It seems to "
+                    "be in degrees: convert it with numpy.radians."
                 )
         _check_count(len(values))
-        return cls._build(values, names, angle_names, frequency)
+        increments = np.diff(values, axis=0)
+        values[:, turning], increments[:, turning] = wrapped(values[:, turning]), wrapped(increments[:, turning])
+        winds = not angle_names
+        return cls(values, names, angle_names, frequency, increments, winds, values=values.size)
 
     @classmethod
-    def _build(
+    def _of(
         cls,
-        values: np.ndarray,
+        recording: Recording,
         names: tuple[str, str],
         angles: tuple[str, ...],
         frequency: float,
-        noise: np.ndarray | None = None,
-        instants: np.ndarray | None = None,
-        recording: Recording | None = None,
-        signals: np.ndarray | None = None,
+        instants: np.ndarray,
+        signals: np.ndarray,
+        values: np.ndarray,
+        noise: np.ndarray,
     ) -> "PoincareSection":
-        points, increments = values.copy(), np.diff(values, axis=0)
-        for k, name in enumerate(names):
-            if name in angles:
-                points[:, k] = wrapped(values[:, k])
-                if signals is None:
-                    increments[:, k] = wrapped(increments[:, k])
-        winds = signals is not None or not angles
-        count = values.size if signals is None else signals.size
-        time, synthetic = (None, False) if recording is None else (recording.time, recording.synthetic)
-        return cls(
-            points, names, angles, frequency, increments, winds, noise, instants, time, signals, count, synthetic
-        )
+        points, increments, turning = values.copy(), np.diff(values, axis=0), np.isin(names, angles)
+        points[:, turning] = wrapped(points[:, turning])
+        measured = (instants, recording.time, signals, signals.size, recording.synthetic)
+        return cls(points, names, angles, frequency, increments, True, noise, *measured)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -266,12 +248,8 @@ class PoincareSection(Result):
 
         Parameters
         ----------
-        index : int
-            Position of the first point.
-        period : int
-            Number of returns.
-        samples : int
-            Per return.
+        index, period, samples : int
+            Position of the first point, number of returns, samples per return.
 
         Returns
         -------
@@ -284,17 +262,14 @@ class PoincareSection(Result):
         at = np.interp(np.arange(samples * period) / samples, knots, self.instants[index : index + period + 1])
         values = _fit(self.time, self.signals, at)[0]
         shift = self.points[index] - _fit(self.time, self.signals, self.instants[index : index + 1])[0][0]
-        for k, name in enumerate(self.coordinates):
-            if name in self.angles:
-                values[:, k] += 2.0 * np.pi * np.round(shift[k] / (2.0 * np.pi))
-        return {name: values[:, k] for k, name in enumerate(self.coordinates)}
+        turning = np.isin(self.coordinates, self.angles)
+        values[:, turning] += 2.0 * np.pi * np.round(shift[turning] / (2.0 * np.pi))
+        return dict(zip(self.coordinates, values.T, strict=True))
 
     def __repr__(self) -> str:
         source = "points alone" if self.signals is None else f"a recording of {len(self.signals)} samples"
-        return (
-            f"PoincareSection({len(self.points)} points of {', '.join(self.coordinates)} at {self.frequency:.6g} Hz "
-            f"from {source})"
-        )
+        names = ", ".join(self.coordinates)
+        return f"PoincareSection({len(self.points)} points of {names} at {self.frequency:.6g} Hz from {source})"
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:
@@ -317,11 +292,11 @@ def _names(coordinates: Sequence[str], angles: Iterable[str]) -> tuple[tuple[str
 def _signals(recording: Recording, names: tuple[str, str], angles: tuple[str, ...]) -> np.ndarray:
     for name in names:
         _checks.one_of("coordinates", name, recording.outputs)
-    for name in angles:
-        _check_angle(name, recording.outputs[name])
-    signals = np.stack([np.unwrap(recording.outputs[n]) if n in angles else recording.outputs[n] for n in names], -1)
+    signals = np.stack([recording.outputs[name] for name in names], -1)
     for name in angles:
         k = names.index(name)
+        _check_angle(name, signals[:, k])
+        signals[:, k] = np.unwrap(signals[:, k])
         _check_rate(name, names[1 - k], recording.time, signals[:, k], signals[:, 1 - k])
     return signals
 
@@ -395,11 +370,10 @@ def _upward_crossings(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
 def _estimate(time: np.ndarray, signals: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return signals (instants, channels) at given instants, and the standard deviation of their errors (channels,).
 
-    Polynomials of degree 7 are fitted in windows of increasing width around each instant. For white noise the expected
-    squared difference between a narrow and a wide estimate is known except for the squared bias of the wide one; the
-    excess is tested for significance. Bias is proportional to the eighth power of the width, so in a window 1.6 times
-    narrower than the first significant one it is 40 times smaller, and negligible even in averages over hundreds of
-    instants.
+    Polynomials of degree 7 are fitted in windows of increasing width. For white noise the expected squared difference
+    between a narrow and a wide estimate is known except for the squared bias of the wide one; the excess is tested for
+    significance. Bias is proportional to the eighth power of the width, so in a window 1.6 times narrower than the
+    first significant one it is 40 times smaller, and negligible even in averages over hundreds of instants.
     """
     narrow, narrow_gain, _ = _fit(time, signals, at)
     # A higher degree on few samples: noise dominates the residual.

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from bayesperiodic import _checks, _fourier
-from bayesperiodic.models.integrate import integrate
-from bayesperiodic.models.model import Model
+from bayesperiodic.models.model import Model, integrate
 from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, OTHER_ORBIT
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved

@@ -1,22 +1,142 @@
-"""Determining equations of Lie symmetries, solved by exact linear algebra modulo a prime and over the rationals."""
+"""Symbolic equations of a model, and their Lie symmetries by determining equations, solved by exact linear algebra."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
 import sympy as sp
+from sympy.logic.boolalg import BooleanFunction
 from sympy.polys.fields import field
 from sympy.polys.matrices import DomainMatrix
 
-from bayesperiodic.symmetry.system import System
+from bayesperiodic.models.model import Model
 
 PRIME = 2_147_483_629
+HEAVY = 100
 
 
-def reduced(matrix: np.ndarray) -> tuple[np.ndarray, list[int]]:
+@dataclass(frozen=True)
+class System:
+    """Equations g = 0 and measured outputs y of states, inputs, time and parameters."""
+
+    # 1 or 2, of the states that the measured outputs depend on; 0 if known parameters removed the derivatives.
+    orders: dict[str, int]
+    inputs: tuple[str, ...]
+    symbols: dict[str, sp.Symbol]  # jet variables: of states ("x", "dx", "ddx"), inputs, "tau" and "frequency"
+    parameters: dict[str, sp.Symbol]  # the unknown ones
+    known: dict[str, sp.Symbol]  # the known parameters
+    equations: tuple[sp.Expr, ...]
+    outputs: dict[str, sp.Expr]
+
+    @property
+    def expressions(self) -> tuple[sp.Expr, ...]:
+        """The equations and the measured outputs."""
+        return *self.equations, *self.outputs.values()
+
+    @property
+    def used(self) -> set[sp.Symbol]:
+        """The symbols in the equations and the measured outputs."""
+        return set().union(*(e.free_symbols for e in self.expressions))
+
+    @property
+    def signs(self) -> set[sp.Expr]:
+        """The signs in the equations and the measured outputs."""
+        return set().union(*(e.atoms(sp.sign) for e in self.expressions))
+
+    @property
+    def highest(self) -> list[sp.Symbol]:
+        """The highest derivative of each state."""
+        return [self.symbols["d" * order + state] for state, order in self.orders.items()]
+
+    def given(self, known: Iterable[str], values: Mapping[sp.Symbol, sp.Expr]) -> "System":
+        """Return the system with known parameters, and with parameters replaced by expressions."""
+        taken = {self.parameters[name] for name in known} | set(values)
+        return _observed(
+            replace(
+                self,
+                parameters={n: s for n, s in self.parameters.items() if s not in taken},
+                known=self.known | {n: s for n, s in self.parameters.items() if s in taken and s not in values},
+                equations=tuple(e.subs(values, simultaneous=True) for e in self.equations),
+                outputs={n: e.subs(values, simultaneous=True) for n, e in self.outputs.items()},
+            )
+        )
+
+
+def system_of(model: Model, outputs: Iterable[str]) -> System:
+    """Return the symbolic system of a model with the measured outputs."""
+    expressions = dict(zip(model.outputs, model.output_expressions, strict=True))
+    return _observed(
+        System(
+            orders=dict(model.orders),
+            inputs=model.inputs,
+            symbols=model.state_symbols | model.input_symbols | model.time_symbols,
+            parameters=dict(model.parameter_symbols),
+            known={},
+            equations=tuple(_with_signs(e) for e in model.equations),
+            outputs={name: _with_signs(expressions[name]) for name in outputs},
+        )
+    )
+
+
+def _observed(system: System) -> System:
+    """Return the system without the states and equations that no measured output depends on; update the orders."""
+    used = system.used
+    left = {s: max((k for k in range(3) if system.symbols["d" * k + s] in used), default=0) for s in system.orders}
+    system = replace(system, orders=left)
+    pending = list(system.outputs.values())
+    states: set[str] = set()
+    rows: set[int] = set()
+    while pending:
+        used = pending.pop().free_symbols
+        for state in set(system.orders) - states:
+            if used & {system.symbols[d + state] for d in ("", "d", "dd")}:
+                states.add(state)
+                highest = system.symbols["d" * system.orders[state] + state]
+                new = {i for i, g in enumerate(system.equations) if highest in g.free_symbols} - rows
+                rows |= new
+                pending += [system.equations[i] for i in new]
+    return replace(
+        system,
+        orders={s: order for s, order in system.orders.items() if s in states},
+        equations=tuple(g for i, g in enumerate(system.equations) if i in rows),
+    )
+
+
+def _with_signs(expression: sp.Expr) -> sp.Expr:
+    """Return the expression with exact numbers, and with kinks and branches written as sums of signs."""
+    exact = sp.nsimplify(expression, rational=True)
+    exact = exact.replace(sp.Piecewise, _pieces).replace(sp.Heaviside, lambda x, *_: (1 + sp.sign(x)) / 2)
+    exact = exact.replace(lambda e: isinstance(e, sp.Max | sp.Min), lambda e: e.rewrite(sp.Abs))
+    return exact.replace(sp.Abs, lambda x: x * sp.sign(x))
+
+
+def _pieces(*pieces: Any) -> sp.Expr:
+    total, left = sp.S.Zero, sp.S.One
+    for value, condition in pieces:
+        weight = _weight(condition)
+        total, left = total + left * weight * value, left * (1 - weight)
+    return total
+
+
+def _weight(condition: Any) -> sp.Expr:
+    """Return the indicator function of a condition."""
+    if condition in (sp.true, sp.false):
+        return sp.Integer(1 if condition else 0)
+    if isinstance(condition, sp.And):
+        return sp.Mul(*map(_weight, condition.args))
+    if isinstance(condition, sp.Or):
+        return 1 - sp.Mul(*(1 - _weight(part) for part in condition.args))
+    if isinstance(condition, sp.Not):
+        return 1 - _weight(condition.args[0])
+    if isinstance(condition, BooleanFunction) or not hasattr(condition, "gts"):
+        return sp.Integer(0 if isinstance(condition, sp.Eq) else 1)
+    return (1 + sp.sign(condition.gts - condition.lts)) / 2
+
+
+def _reduced(matrix: np.ndarray) -> tuple[np.ndarray, list[int]]:
     """Return the reduced row echelon form of an integer matrix modulo the prime, and its pivot columns."""
     rows = np.array(matrix, dtype=np.int64) % PRIME
     pivots: list[int] = []
@@ -34,14 +154,13 @@ def reduced(matrix: np.ndarray) -> tuple[np.ndarray, list[int]]:
     return rows[: len(pivots)], pivots
 
 
-def rank(matrix: np.ndarray) -> int:
-    """Return the rank modulo the prime."""
-    return len(reduced(matrix)[1])
+def _rank(matrix: np.ndarray) -> int:
+    return len(_reduced(matrix)[1])
 
 
 def nullspace(matrix: np.ndarray) -> np.ndarray:
     """Return vectors (nullity, columns) that span the null space modulo the prime."""
-    rows, pivots = reduced(matrix)
+    rows, pivots = _reduced(matrix)
     columns = matrix.shape[1]
     free = [c for c in range(columns) if c not in pivots]
     vectors = np.zeros((len(free), columns), dtype=np.int64)
@@ -51,16 +170,10 @@ def nullspace(matrix: np.ndarray) -> np.ndarray:
     return vectors
 
 
-def independent_rows(matrix: np.ndarray) -> list[int]:
-    """Return the indices of rows that span all rows."""
-    return reduced(np.asarray(matrix).T)[1]
-
-
-def circuits(vectors: np.ndarray, weights: np.ndarray, tries: int = 200) -> list[tuple[int, ...]]:
+def _circuits(vectors: np.ndarray, weights: np.ndarray, tries: int = 200) -> list[tuple[int, ...]]:
     """Return supports of combinations of the vectors that contain no smaller support, the lightest first.
 
-    Every reduced echelon form consists of such combinations; forms for `tries` random orders of the columns, from a
-    fixed seed, are used.
+    The rows of reduced echelon forms are such combinations; the orders of the columns are random, with a fixed seed.
     """
     random = np.random.default_rng(0)
     found: set[tuple[int, ...]] = set()
@@ -68,23 +181,15 @@ def circuits(vectors: np.ndarray, weights: np.ndarray, tries: int = 200) -> list
     for trial in range(tries if len(vectors) > 1 else 1):
         # Heavy columns are the first pivots, so that each appears in one row only.
         order = np.lexsort((random.permutation(columns), -weights)) if trial % 2 else random.permutation(columns)
-        for row in reduced(vectors[:, order])[0]:
+        for row in _reduced(vectors[:, order])[0]:
             found.add(tuple(sorted(int(c) for c in order[np.flatnonzero(row)])))
     return sorted(found, key=lambda support: (weights[list(support)].sum(), support))
 
 
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the matrix product modulo the prime."""
-    total = np.zeros((len(a), b.shape[1]), dtype=np.int64)
-    for column, row in zip(a.T, b, strict=True):
-        total = (total + column[:, None] % PRIME * (row % PRIME)[None] % PRIME) % PRIME
-    return total
-
-
 def integer_circuits(vectors: np.ndarray, weights: np.ndarray) -> list[np.ndarray]:
-    """Return the combinations of integer vectors of `circuits`, in the smallest integers."""
+    """Return combinations of integer vectors with minimal supports, in the smallest integers."""
     found = []
-    for support in circuits(vectors, weights) if len(vectors) else []:
+    for support in _circuits(vectors, weights) if len(vectors) else []:
         rest = [c for c in range(vectors.shape[1]) if c not in support]
         exact = DomainMatrix.from_Matrix(sp.Matrix(vectors[:, rest].T.tolist() or [[0] * len(vectors)]))
         combination = integer_rows(exact.convert_to(sp.QQ).nullspace())[0]
@@ -96,14 +201,15 @@ def integer_circuits(vectors: np.ndarray, weights: np.ndarray) -> list[np.ndarra
 
 def integer_rows(matrix: DomainMatrix) -> np.ndarray:
     """Return the rows of a rational matrix, scaled to integers without common factor."""
-    rows = matrix.to_Matrix()
-    result = np.zeros(rows.shape, dtype=np.int64)
-    for i in range(rows.shape[0]):
-        row = list(rows.row(i))
+    result = np.zeros(matrix.shape, dtype=np.int64)
+    for i, row in enumerate(matrix.to_Matrix().tolist()):
         common = math.lcm(*(int(v.q) for v in row))
         result[i] = [int(v * common) for v in row]
         result[i] //= np.gcd.reduce(result[i])
     return result
+
+
+Polynomial = dict[tuple[int, ...], Any]
 
 
 class Algebra:
@@ -111,13 +217,8 @@ class Algebra:
 
     Transcendental functions and roots are represented by variables. Two expressions are equal if their elements are.
     The converse holds for the relations sin² + cos² = 1, cosh² − sinh² = 1, sign² = 1 and powers of roots, not for
-    others such as tan = sin/cos. Denominators under roots are assumed to be positive.
-
-    Parameters
-    ----------
-    expressions : iterable of expressions
-    moving : iterable of symbols
-        Symbols that vary along a motion. Coefficients of their powers are polynomials of the other symbols.
+    others such as tan = sin/cos. Denominators under roots are assumed to be positive. Coefficients of powers of the
+    `moving` symbols, which vary along a motion, are polynomials of the other symbols.
     """
 
     def __init__(self, expressions: Iterable[sp.Expr], moving: Iterable[sp.Symbol]):
@@ -135,13 +236,9 @@ class Algebra:
         self.field = field(self.generators or [sp.Dummy("one")], sp.QQ, "lex")[0]
         self._divisors = [self.field.from_expr(r).numer for r in self._relations]
 
-    def element(self, expression: sp.Expr) -> Any:
-        """Return the field element of an expression whose functions occur in the given expressions."""
-        return self.field.from_expr(self._replaced(expression))
-
     def numerators(self, expressions: Sequence[sp.Expr]) -> list[Any]:
-        """Return polynomials proportional to the expressions, reduced by the relations."""
-        elements = [self.element(e) for e in expressions]
+        """Return polynomials proportional to expressions of known functions, reduced by the relations."""
+        elements = [self.field.from_expr(self._replaced(e)) for e in expressions]
         common = reduce(lambda a, b: a.lcm(b), (e.denom for e in elements))
         found = [e.numer * common.exquo(e.denom) for e in elements]
         return [n.rem(self._divisors) for n in found] if self._divisors else found
@@ -150,9 +247,9 @@ class Algebra:
         """Return whether an expression vanishes identically."""
         return not self.numerators([expression])[0]
 
-    def split(self, polynomial: Any) -> dict[tuple[int, ...], dict[tuple[int, ...], Any]]:
+    def split(self, polynomial: Any) -> dict[tuple[int, ...], Polynomial]:
         """Return {powers of the varying symbols: {powers of the other generators: coefficient}}."""
-        parts: dict[tuple[int, ...], dict[tuple[int, ...], Any]] = {}
+        parts: dict[tuple[int, ...], Polynomial] = {}
         for powers, coefficient in polynomial.terms():
             parts.setdefault(powers[: self.size], {})[powers[self.size :]] = coefficient
         return parts
@@ -216,32 +313,19 @@ class Algebra:
                     self._relations.append(other**2 + sign * symbol**2 - 1)
 
 
-Polynomial = dict[tuple[int, ...], Any]
-
-
 @dataclass(frozen=True)
 class Term:
-    """Basis element of the infinitesimal transformations of one parameter or state.
-
-    Attributes
-    ----------
-    name : str
-        Name of the parameter or state.
-    moves : expression
-        Factor of the unknown coefficient: 1 for a parameter; 1, a state, or an input for a state.
-    field : dict
-        Symbol -> change, including the derivatives of the state.
-    is_parameter : bool
-    """
+    """Basis element of the infinitesimal transformations of one parameter or state."""
 
     name: str
-    moves: sp.Expr
-    field: dict[sp.Symbol, sp.Expr]
+    moves: sp.Expr  # factor of the unknown coefficient: 1 for a parameter; 1, a state, or an input for a state
+    field: dict[sp.Symbol, sp.Expr]  # change of each symbol, including the derivatives of the state
     is_parameter: bool
 
-    def applied(self, expression: sp.Expr) -> sp.Expr:
-        """Return the Lie derivative of an expression."""
-        return lie_derivative(self.field, expression)
+    @property
+    def own(self) -> sp.Symbol:
+        """The symbol of the parameter or state."""
+        return next(iter(self.field))
 
 
 def lie_derivative(field: Mapping[sp.Symbol, sp.Expr], expression: sp.Expr) -> sp.Expr:
@@ -250,7 +334,7 @@ def lie_derivative(field: Mapping[sp.Symbol, sp.Expr], expression: sp.Expr) -> s
     return sp.Add(*(move * slopes[symbol] for symbol, move in field.items()))
 
 
-def terms_of(system: System) -> list[Term]:
+def _terms(system: System) -> list[Term]:
     """Return the basis: every parameter, and every state with terms affine in the states and inputs."""
     found = [Term(n, sp.S.One, {s: sp.S.One}, True) for n, s in system.parameters.items()]
     signals = [(n, order) for n, order in system.orders.items()] + [(n, 2) for n in system.inputs]
@@ -270,22 +354,22 @@ class Determining:
 
     The arguments of signs must keep their signs, which gives further rows like those of g. The coefficients of all
     powers of the varying symbols must vanish separately.
-
-    Attributes
-    ----------
-    terms : tuple of Term
-        The first columns.
-    algebra : Algebra
-    rows : tuple of dict
-        Column -> {powers of the parameters: coefficient}.
-    multipliers : tuple of bool
-        The other columns: whether the element of Λ is on its diagonal.
     """
 
-    terms: tuple[Term, ...]
+    terms: tuple[Term, ...]  # the first columns
     algebra: Algebra
-    rows: tuple[dict[int, Polynomial], ...]
-    multipliers: tuple[bool, ...]
+    rows: tuple[dict[int, Polynomial], ...]  # by column
+    multipliers: tuple[bool, ...]  # the other columns: whether the element of Λ is on its diagonal
+
+    @property
+    def parameters(self) -> list[int]:
+        """The terms of parameters."""
+        return [k for k, term in enumerate(self.terms) if term.is_parameter]
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Weights of the terms, by which transformations of few parameters are preferred, (terms,)."""
+        return np.array([HEAVY if term.is_parameter else 1 for term in self.terms])
 
     @property
     def unknowns(self) -> list[sp.Symbol]:
@@ -314,7 +398,7 @@ class Determining:
         own = sorted(support)
         columns = [*own, *range(len(self.terms), self.matrix.shape[1])]
         part = self.matrix[:, columns]
-        chosen = independent_rows(part)
+        chosen = _reduced(part.T)[1]
         domain = sp.QQ[tuple(self.unknowns)]
         entries = [[domain.ring.from_dict(dict(self.rows[i].get(c, {}))) for c in columns] for i in chosen]
         matrix = DomainMatrix(entries, (len(chosen), len(columns)), domain)
@@ -325,20 +409,19 @@ class Determining:
 
 def determining_equations(system: System) -> Determining:
     """Return the determining equations of a system."""
-    terms = terms_of(system)
-    held = set().union(*(e.atoms(sp.sign) for e in (*system.equations, *system.outputs.values())))
-    groups = [system.equations, *((s.args[0],) for s in sorted(held, key=sp.default_sort_key))]
+    terms = _terms(system)
+    groups = [system.equations, *((s.args[0],) for s in sorted(system.signs, key=sp.default_sort_key))]
     multipliers: list[bool] = []
     table: list[dict[int, sp.Expr]] = []
     for group in groups:
         for i, expression in enumerate(group):
             first = len(terms) + len(multipliers)
             multiplied = {first + j: -other for j, other in enumerate(group)}
-            table.append({k: t.applied(expression) for k, t in enumerate(terms)} | multiplied)
+            table.append({k: lie_derivative(t.field, expression) for k, t in enumerate(terms)} | multiplied)
             multipliers += [i == j for j in range(len(group))]
-    table += [{k: t.applied(y) for k, t in enumerate(terms)} for y in system.outputs.values()]
+    table += [{k: lie_derivative(t.field, y) for k, t in enumerate(terms)} for y in system.outputs.values()]
     expressions = [e for row in table for e in row.values()]
-    algebra = Algebra([*expressions, *system.parameters.values()], system.jets)
+    algebra = Algebra([*expressions, *system.parameters.values()], system.symbols.values())
     rows = [part for row in table for part in _coefficients(row, algebra)]
     return Determining(tuple(terms), algebra, tuple(rows), tuple(multipliers))
 
@@ -370,62 +453,50 @@ def _primitive(vector: list[sp.Expr]) -> list[sp.Expr]:
     return [sp.factor(sp.cancel(e / shared)) for e in whole]
 
 
-HEAVY = 100
-
-
 @dataclass(frozen=True, eq=False)
 class Generator:
-    """An infinitesimal symmetry.
-
-    Attributes
-    ----------
-    parameters, states : dict
-        Name -> change, of those that change.
-    field : dict
-        Symbol -> change, including derivatives of the states.
-    weights : dict or None
-        For scalings, name -> integer ratio of the change to the parameter or state.
-    """
+    """An infinitesimal symmetry: the changes of the parameters and states that change."""
 
     parameters: dict[str, sp.Expr]
     states: dict[str, sp.Expr]
-    field: dict[sp.Symbol, sp.Expr]
-    weights: dict[str, int] | None = None
+    field: dict[sp.Symbol, sp.Expr]  # by symbol, including derivatives of the states
+    scaling: bool = False
 
-    def applied(self, expression: sp.Expr) -> sp.Expr:
-        """Return the Lie derivative of an expression."""
-        return lie_derivative(self.field, expression)
+    @property
+    def _parts(self) -> tuple[dict, dict, dict]:
+        return self.parameters, self.states, self.field
 
     def times(self, factor: sp.Expr) -> "Generator":
         """Return the generator multiplied by a function of the parameters."""
-        parts = [{k: sp.factor(v * factor) for k, v in part.items()} for part in _parts(self)]
-        return Generator(*parts)
+        parameters, states, moves = ({k: sp.factor(v * factor) for k, v in part.items()} for part in self._parts)
+        return Generator(parameters, states, moves)
 
     def minus(self, other: "Generator", factor: sp.Expr) -> "Generator":
         """Return self − factor · other."""
-        parts = []
-        for own, its in zip(_parts(self), _parts(other), strict=True):
+
+        def difference(own: dict, its: dict) -> dict:
             moves = {k: sp.factor(own.get(k, 0) - factor * its.get(k, 0)) for k in dict.fromkeys((*own, *its))}
-            parts.append({k: v for k, v in moves.items() if v != 0})
-        return Generator(*parts)
+            return {k: v for k, v in moves.items() if v != 0}
+
+        parameters, states, moves = map(difference, self._parts, other._parts)
+        return Generator(parameters, states, moves)
 
 
 def generators_of(equations: Determining) -> list[Generator]:
     """Return a maximal set of symmetries of the parameters that are independent at generic values."""
-    scalings = _scalings(equations)
-    moves = _moves_of_parameters(equations, scalings)
-    count = len(equations.terms)
-    vectors = nullspace(equations.matrix)[:, :count]
-    heavy = np.array([HEAVY if term.is_parameter else 1 for term in equations.terms])
-    parameters = [k for k, term in enumerate(equations.terms) if term.is_parameter]
-    wanted = rank(vectors[:, parameters])
-    chosen = [_generator(equations, {k: _own(equations, k) * w for k, w in s.items()}, s) for s in scalings]
-    for support in circuits(vectors, heavy) if len(chosen) < wanted else []:
-        rest = [k for k in range(count) if k not in support]
+    terms, parameters, scalings = equations.terms, equations.parameters, _scalings(equations)
+    values = dict(zip(equations.unknowns, equations.point, strict=True))
+    rows = [[scaling.get(k, 0) * values[terms[k].own] % PRIME for k in parameters] for scaling in scalings]
+    moves = np.array(rows, dtype=np.int64).reshape(len(scalings), len(parameters))
+    vectors = nullspace(equations.matrix)[:, : len(terms)]
+    wanted = _rank(vectors[:, parameters])
+    chosen = [_generator(equations, {k: terms[k].own * w for k, w in s.items()}, s) for s in scalings]
+    for support in _circuits(vectors, equations.weights) if len(chosen) < wanted else []:
+        rest = [k for k in range(len(terms)) if k not in support]
         (move,) = nullspace(vectors[:, rest].T) if rest else np.ones((1, len(vectors)), dtype=np.int64)
-        row = product(move[None], vectors)[:, parameters]
-        if rank(np.concatenate([moves, row])) > len(moves):
-            moves = np.concatenate([moves, row])
+        row = (move[:, None] * vectors[:, parameters] % PRIME).sum(axis=0) % PRIME
+        if _rank(np.vstack([moves, row])) > len(moves):
+            moves = np.vstack([moves, row])
             chosen.append(_generator(equations, equations.solution(support)))
         if len(chosen) == wanted:
             break
@@ -434,12 +505,12 @@ def generators_of(equations: Determining) -> list[Generator]:
 
 def _scalings(equations: Determining) -> list[dict[int, int]]:
     """Return {term: weight} of independent scalings of parameters and states."""
-    terms, rows = equations.terms, equations.rows
-    columns = [k for k, t in enumerate(terms) if t.is_parameter or t.moves == _own(equations, k)]
+    terms = equations.terms
+    columns = [k for k, t in enumerate(terms) if t.is_parameter or t.moves == t.own]
     diagonal = [len(terms) + j for j, on in enumerate(equations.multipliers) if on]
-    index = {k: equations.unknowns.index(_own(equations, k)) for k in columns if terms[k].is_parameter}
+    index = {k: equations.unknowns.index(terms[k].own) for k in equations.parameters}
     table: list[dict[int, sp.Rational]] = []
-    for row in rows:
+    for row in equations.rows:
         parts: dict[tuple[int, ...], dict[int, sp.Rational]] = {}
         for place, column in enumerate([*columns, *diagonal]):
             for powers, coefficient in row.get(column, {}).items():
@@ -449,28 +520,14 @@ def _scalings(equations: Determining) -> list[dict[int, int]]:
     size = len(columns) + len(diagonal)
     exact = DomainMatrix([[sp.QQ(row.get(c, 0)) for c in range(size)] for row in table], (len(table), size), sp.QQ)
     whole = integer_rows(exact.to_sparse().nullspace())
-    heavy = np.array([HEAVY if terms[k].is_parameter else 1 for k in columns] + [0] * len(diagonal))
     parameters = [place for place, k in enumerate(columns) if terms[k].is_parameter]
     found: list[dict[int, int]] = []
     taken = np.empty((0, len(parameters)), dtype=np.int64)
-    for vector in integer_circuits(whole, heavy):
-        if rank(np.concatenate([taken, vector[None, parameters]])) > len(taken):
-            taken = np.concatenate([taken, vector[None, parameters]])
+    for vector in integer_circuits(whole, np.append(equations.weights[columns], np.zeros(len(diagonal), dtype=int))):
+        if _rank(np.vstack([taken, vector[parameters]])) > len(taken):
+            taken = np.vstack([taken, vector[parameters]])
             found.append({k: int(w) for k, w in zip(columns, vector, strict=False) if w})
     return found
-
-
-def _moves_of_parameters(equations: Determining, scalings: list[dict[int, int]]) -> np.ndarray:
-    """Return the changes of the parameters by the scalings, modulo the prime at the point of the matrix."""
-    values = dict(zip(equations.unknowns, equations.point, strict=True))
-    parameters = [k for k, term in enumerate(equations.terms) if term.is_parameter]
-    rows = [[s.get(k, 0) * values[_own(equations, k)] % PRIME for k in parameters] for s in scalings]
-    return np.array(rows, dtype=np.int64).reshape(len(scalings), len(parameters))
-
-
-def _own(equations: Determining, term: int) -> sp.Symbol:
-    """Return the symbol of the parameter or state of a term."""
-    return next(iter(equations.terms[term].field))
 
 
 def _generator(
@@ -479,17 +536,10 @@ def _generator(
     parameters: dict[str, sp.Expr] = {}
     states: dict[str, sp.Expr] = {}
     field: dict[sp.Symbol, sp.Expr] = {}
-    named = {}
     for k, move in moves.items():
         term = equations.terms[k]
         part = parameters if term.is_parameter else states
         part[term.name] = part.get(term.name, sp.S.Zero) + move * (1 if weights else term.moves)
         for symbol, rate in term.field.items():
             field[symbol] = field.get(symbol, sp.S.Zero) + (weights[k] * symbol if weights else move * rate)
-        if weights:
-            named[term.name] = weights[k]
-    return Generator(parameters, states, field, named or None)
-
-
-def _parts(generator: Generator) -> tuple[dict, dict, dict]:
-    return generator.parameters, generator.states, generator.field
+    return Generator(parameters, states, field, bool(weights))

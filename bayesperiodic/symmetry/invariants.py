@@ -1,43 +1,216 @@
 """Unidentifiable directions of the parameters, finite symmetry transformations, and identifiable combinations."""
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 import sympy as sp
 from sympy.polys.matrices import DomainMatrix
 
 from bayesperiodic.symmetry import determining
-from bayesperiodic.symmetry.determining import Algebra, Generator
-from bayesperiodic.symmetry.system import System, null_directions
+from bayesperiodic.symmetry.determining import Algebra, Generator, System, lie_derivative
 
+# Sensitivities: complex step, number of random parameter values, Newton steps, relative size of zero singular values.
+STEP, VALUES, NEWTON_STEPS, ZERO = 1e-30, 4, 30, 1e-9
 SMALL = 1e-7
+# Flows: longest Lie series, and powers of a symbol whose series is tried.
+LONGEST, POWERS = 5, (1, -1, 2)
+# Operations that a sum in a denominator counts for.
+AWKWARD = 5
+
+
+def series(expression: sp.Expr, values: Mapping[sp.Symbol, np.ndarray]) -> np.ndarray:
+    """Return the power series of an expression of power series, complex arrays (order + 1, …).
+
+    The sign of a series is that of the real part of its leading coefficient. A function that NumPy lacks raises a
+    TypeError.
+    """
+    known: dict[sp.Expr, np.ndarray] = dict(values)
+    template = next(iter(values.values()))
+
+    def constant(number: Any) -> np.ndarray:
+        result = np.zeros_like(template)
+        result[0] = complex(number)
+        return result
+
+    def value(e: sp.Expr) -> np.ndarray:
+        if e not in known:
+            known[e] = combined(e)
+        return known[e]
+
+    def combined(e: sp.Expr) -> np.ndarray:
+        if e.is_number:
+            return constant(e)
+        if e.is_Add:
+            return sum(map(value, e.args[1:]), value(e.args[0]))
+        if e.is_Mul:
+            result = value(e.args[0])
+            for factor in e.args[1:]:
+                result = _product(result, value(factor))
+            return result
+        if e.is_Pow and e.exp.is_number:
+            return _composed(lambda x: x**e.exp, e.exp, value(e.base))
+        if e.is_Pow:
+            return value(sp.exp(e.exp * sp.log(e.base), evaluate=False))
+        if isinstance(e, sp.sign):
+            leading = np.sign(value(e.args[0])[0].real)
+            return constant(1.0) * leading
+        if len(e.args) != 1:
+            raise TypeError(f"expression: must consist of functions of one argument, got {e.func}.")
+        return _composed(e.func, e.func, value(e.args[0]))
+
+    return value(expression)
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the product of two power series."""
+    return np.stack([sum((a[i] * b[k - i] for i in range(1, k + 1)), a[0] * b[k]) for k in range(len(a))])
+
+
+def _composed(function: Callable[[Any], Any], key: Any, inner: np.ndarray) -> np.ndarray:
+    """Return a function of a power series, by Horner's rule with its derivatives of all orders."""
+    rest, x = inner.copy(), sp.Symbol("x")
+    rest[0] = 0.0
+    result = np.zeros_like(inner)
+    for order in range(len(inner) - 1, -1, -1):
+        result = _product(result, rest)
+        result[0] += _compiled(key, order, function(x), x)(inner[0]) / math.factorial(order)
+    return result
+
+
+def differentiated(a: np.ndarray) -> np.ndarray:
+    """Return the time derivative; its last coefficient is unknown and set to zero."""
+    result = np.zeros_like(a)
+    for k in range(1, len(a)):
+        result[k - 1] = k * a[k]
+    return result
+
+
+@cache
+def _compiled(key: Any, order: int, written: sp.Expr, x: sp.Symbol) -> Callable[[np.ndarray], np.ndarray]:
+    return sp.lambdify(x, sp.diff(written, x, order), "numpy")
+
+
+def null_directions(system: System) -> list[tuple[dict[sp.Symbol, float], np.ndarray]]:
+    """Return parameter values, and directions without effect on the outputs there, at several random values.
+
+    The directions (directions, parameters) are orthonormal in the logarithms of the unknown parameters. The list is
+    empty if the equations cannot be solved for the highest derivatives or contain functions that NumPy lacks.
+
+    The first time derivatives of the outputs, as many as there are initial values, are computed at many unrelated
+    instants (with random states, inputs, their derivatives, time and frequency), with their exact sensitivities to the
+    parameters and to the states at that instant. Effects that the states can compensate are projected out. These
+    derivatives contain the information of the input-output equations (A. Ovchinnikov, A. Pillay, G. Pogudin,
+    T. Scanlon, SIAM Journal on Applied Algebra and Geometry 6, 2022, 339-367).
+    """
+    random = np.random.default_rng(7)
+    found = []
+    for _ in range(VALUES):
+        theta = random.uniform(0.5, 1.5, len(system.parameters))
+        known = random.uniform(0.5, 1.5, len(system.known))
+        try:
+            sensitivities = _sensitivities(system, theta, known, random)
+        except (TypeError, NameError, np.linalg.LinAlgError):
+            return []
+        if len(sensitivities) < len(theta):
+            return []
+        _, size, directions = np.linalg.svd(sensitivities)
+        values = dict(zip((*system.parameters.values(), *system.known.values()), [*theta, *known], strict=True))
+        found.append((values, directions[np.count_nonzero(size > ZERO * size[0]) :]))
+    return found
+
+
+def _sensitivities(system: System, theta: np.ndarray, known: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Return sensitivities to the logarithms of the parameters that changes of the states cannot compensate."""
+    order, points = sum(system.orders.values()) + 1, 20 + 3 * len(theta)
+    taylor = _motions(system, theta, known, order, points, random)
+    rows = []
+    for values in taylor.transpose(1, 0, 3, 2).reshape(points, -1, taylor.shape[2]):
+        if not np.all(np.isfinite(values)) or np.any(np.abs(values.imag) > 1e-12 * (1.0 + np.abs(values.real))):
+            continue
+        slopes = values.imag / STEP
+        slopes[:, : len(theta)] *= theta
+        size = np.abs(slopes).max(axis=1)
+        slopes = slopes[size > 0.0] / size[size > 0.0, None]
+        basis, singular, _ = np.linalg.svd(slopes[:, len(theta) :])
+        rank = np.count_nonzero(singular > ZERO * max(singular, default=1.0))
+        rows.append(basis[:, rank:].T @ slopes[:, : len(theta)])
+    return np.concatenate(rows) if rows else np.empty((0, len(theta)))
+
+
+def _motions(
+    system: System, theta: np.ndarray, known: np.ndarray, order: int, points: int, random: np.random.Generator
+) -> np.ndarray:
+    """Return Taylor coefficients of the outputs (order + 1, points, directions, outputs), with complex steps."""
+    starts = [system.symbols["d" * k + s] for s, highest in system.orders.items() for k in range(highest)]
+    directions = len(theta) + len(starts)
+    shape = (order + 3, points, directions)
+
+    def fixed(number: np.ndarray | float) -> np.ndarray:
+        result = np.zeros(shape, dtype=complex)
+        result[0] = number
+        return result
+
+    values = {s: fixed(v) for s, v in zip(system.known.values(), known, strict=True)}
+    for i, (symbol, value) in enumerate(zip(system.parameters.values(), theta, strict=True)):
+        values[symbol] = fixed(value)
+        values[symbol][0, :, i] += STEP * 1j
+    frequency = random.uniform(0.3, 1.0, (points, 1))
+    values[system.symbols["frequency"]] = fixed(frequency)
+    values[system.symbols["tau"]] = fixed(random.uniform(0.0, 1.0, (points, 1)))
+    values[system.symbols["tau"]][1] = frequency
+    for name in system.inputs:
+        signal = fixed(0.0) + random.uniform(-1.0, 1.0, (order + 3, points, 1))
+        for prefix in ("", "d", "dd"):
+            values[system.symbols[prefix + name]] = signal
+            signal = differentiated(signal)
+    for i, symbol in enumerate(starts):
+        values[symbol] = fixed(random.uniform(-1.5, 1.5, (points, 1)))
+        values[symbol][0, :, len(theta) + i] += STEP * 1j
+    with np.errstate(all="ignore"):
+        _follow(system, values, order)
+        shortened = {symbol: v[: order + 1] for symbol, v in values.items()}
+        return np.stack([series(y, shortened) for y in system.outputs.values()], axis=-1)
+
+
+def _follow(system: System, values: dict[sp.Symbol, np.ndarray], order: int) -> None:
+    """Compute the Taylor coefficients of the states, order by order."""
+    highest = system.highest
+    if not highest:
+        return
+    for symbol in highest:
+        values[symbol] = np.zeros_like(next(iter(values.values())))
+    jacobian = [[sp.diff(g, symbol) for symbol in highest] for g in system.equations]
+    for k in range(order + 1):
+        for _ in range(NEWTON_STEPS if k == 0 else 1):
+            now = {symbol: v[: k + 1] for symbol, v in values.items()}
+            residual = np.stack([series(g, now)[k] for g in system.equations], axis=-1)
+            start = {symbol: v[:1] for symbol, v in values.items()}
+            slopes = np.stack([np.stack([series(e, start)[0] for e in row], axis=-1) for row in jacobian], axis=-2)
+            change = np.linalg.solve(slopes, residual[..., None])[..., 0]
+            for i, symbol in enumerate(highest):
+                values[symbol][k] -= change[..., i]
+            if not np.any(np.abs(change.real) > 1e-13 * (1.0 + np.abs(values[highest[0]][k].real)[..., None])):
+                break
+        for state, n in system.orders.items():
+            chain = [values[system.symbols["d" * j + state]] for j in range(n, -1, -1)]
+            for rate, integral in zip(chain, chain[1:], strict=False):
+                for j in range(k + 2):
+                    integral[j + 1 : j + 2] = rate[j] / (j + 1)
 
 
 @dataclass(frozen=True)
 class Directions:
-    """Parameter directions without effect on the outputs.
+    """Parameter directions without effect on the outputs."""
 
-    Attributes
-    ----------
-    rows : array (directions, parameters)
-        Orthonormal in the logarithms of the parameters.
-    names : tuple of str
-        The parameters.
-    values : dict
-        Symbol -> value, including known parameters.
-    points : int
-        Number of parameter values with sensitivities; 0 if the rows are those of the symmetries.
-    unexplained : tuple of str
-        Parameters in directions that no symmetry explains.
-    """
-
-    rows: np.ndarray
-    names: tuple[str, ...]
-    values: dict[sp.Symbol, float]
-    points: int = 0
-    unexplained: tuple[str, ...] = ()
+    rows: np.ndarray  # orthonormal in the logarithms of the parameters, (directions, parameters)
+    names: tuple[str, ...]  # of the parameters
+    values: dict[sp.Symbol, float]  # of all parameters
+    points: int = 0  # number of parameter values with sensitivities; 0 if the rows are those of the symmetries
+    unexplained: tuple[str, ...] = ()  # parameters in directions that no symmetry explains
 
     @property
     def moved(self) -> list[str]:
@@ -84,7 +257,9 @@ def directions_of(system: System, generators: Sequence[Generator]) -> Directions
     explained = _explained(system, generators, values)
     rest = rows - rows @ explained.T @ explained
     unexplained = tuple(n for n, size in zip(names, np.abs(rest).max(axis=0, initial=0.0), strict=True) if size > SMALL)
-    if unexplained and _has_moving_switches(system):
+    # Sensitivities do not detect the effect of a parameter on the location of a discontinuity.
+    located = {symbol for switch in system.signs for symbol in switch.free_symbols}
+    if unexplained and located & set(system.parameters.values()):
         return Directions(explained, names, values)
     return Directions(rows, names, values, len(found), unexplained)
 
@@ -95,40 +270,18 @@ def _explained(system: System, generators: Sequence[Generator], values: dict[sp.
     return np.linalg.qr(slopes.reshape(len(generators), len(system.parameters)).T)[0].T
 
 
-def _has_moving_switches(system: System) -> bool:
-    """Return whether the location of a discontinuity may depend on a parameter."""
-    switches = set().union(*(e.atoms(sp.sign) for e in (*system.equations, *system.outputs.values())))
-    return any(switch.free_symbols & set(system.parameters.values()) for switch in switches)
-
-
 def _rank(matrix: np.ndarray) -> int:
     return int(np.linalg.matrix_rank(matrix, tol=SMALL)) if matrix.size else 0
 
 
-LONGEST = 5
-POWERS = (1, -1, 2)
-
-
 @dataclass(frozen=True)
 class Flow:
-    """A one-parameter group of transformations.
+    """A one-parameter group of transformations."""
 
-    Attributes
-    ----------
-    generator : Generator
-        Generator in the normalisation of the transformation.
-    amount : symbol
-        Group parameter: a factor > 0 for scalings, otherwise a real number, 0 for the identity.
-    images : dict
-        Symbol -> image, for parameters, states and derivatives of states that change.
-    factor : Matrix or None
-        Factor of the transformed equations; None until the flow is verified.
-    """
-
-    generator: Generator
-    amount: sp.Symbol
-    images: dict[sp.Symbol, sp.Expr]
-    factor: sp.Matrix | None = None
+    generator: Generator  # in the normalisation of the transformation
+    amount: sp.Symbol  # group parameter: a factor > 0 for scalings, otherwise a real number, 0 for the identity
+    images: dict[sp.Symbol, sp.Expr]  # of the parameters, states and derivatives of states that change
+    factor: sp.Matrix | None = None  # of the transformed equations; None until the flow is verified
 
     def of(self, expression: sp.Expr) -> sp.Expr:
         """Return the image of an expression."""
@@ -141,7 +294,7 @@ def flow_of(generator: Generator) -> Flow | None:
     The form of scalings is known. For others, the Lie series exp(δ X) of every symbol, its reciprocal or its square
     must terminate or be an exponential series.
     """
-    if generator.weights is not None:
+    if generator.scaling:
         factor = sp.Symbol("t", positive=True)
         images = {s: s * factor ** int(sp.cancel(move / s)) for s, move in generator.field.items() if move != 0}
         return Flow(generator, factor, images)
@@ -178,20 +331,20 @@ def verified(system: System, flow: Flow) -> Flow | None:
     """
     images = [flow.of(g) for g in system.equations]
     changes = [flow.of(y) - y for y in system.outputs.values()]
-    highest = [system.symbols["d" * n + s] for s, n in system.orders.items()]
+    highest = system.highest
     before, after = sp.Matrix(system.equations), sp.Matrix(images)
-    algebra = Algebra([*before, *after, *changes, *flow.images.values()], system.jets)
+    algebra = Algebra([*before, *after, *changes, *flow.images.values()], system.symbols.values())
     if not all(algebra.is_zero(change) for change in changes):
         return None
     if not highest:
-        return Flow(flow.generator, flow.amount, flow.images, sp.Matrix(0, 0, []))
+        return replace(flow, factor=sp.Matrix(0, 0, []))
     try:
         factor = (after.jacobian(highest) * before.jacobian(highest).inv()).applyfunc(sp.factor)
     except sp.matrices.exceptions.NonInvertibleMatrixError:
         return None
     if factor.det() == 0 or not all(algebra.is_zero(e) for e in after - factor * before):
         return None
-    return Flow(flow.generator, flow.amount, flow.images, factor)
+    return replace(flow, factor=factor)
 
 
 def _image(generator: Generator, symbol: sp.Symbol, amount: sp.Symbol) -> sp.Expr | None:
@@ -215,11 +368,11 @@ def _series(generator: Generator, start: sp.Expr, amount: sp.Symbol) -> sp.Expr 
     """Return exp(δ X) f if X^(n+1) f = c X^n f for a small n and an invariant c of X, which may be 0."""
     total, term = sp.S.Zero, start
     for order in range(LONGEST):
-        following = sp.cancel(generator.applied(term))
+        following = sp.cancel(lie_derivative(generator.field, term))
         rate = sp.cancel(following / term)
         if following == 0:
             return total + amount**order / sp.factorial(order) * term
-        if sp.cancel(generator.applied(rate)) == 0:
+        if sp.cancel(lie_derivative(generator.field, rate)) == 0:
             begun = sum((rate * amount) ** j / sp.factorial(j) for j in range(order))
             return total + term * (sp.exp(rate * amount) - begun) / rate**order
         total += amount**order / sp.factorial(order) * term
@@ -227,18 +380,14 @@ def _series(generator: Generator, start: sp.Expr, amount: sp.Symbol) -> sp.Expr 
     return None
 
 
-AWKWARD = 5
-
-
 def coefficients_of(system: System) -> dict[sp.Expr, bool]:
     """Return the coefficients of the equations and outputs, and whether each belongs to a forcing term.
 
     An equation is first divided by the coefficient of its highest derivative. Arguments of functions are included.
     """
-    highest = [system.symbols["d" * n + s] for s, n in system.orders.items()]
     parameters = (*system.parameters.values(), *system.known.values())
     drive = {system.symbols["tau"], *(system.symbols[d + n] for d in ("", "d", "dd") for n in system.inputs)}
-    moving = set(system.jets)
+    moving = set(system.symbols.values())
     found: dict[sp.Expr, bool] = {}
 
     def collect(expression: sp.Expr) -> None:
@@ -246,7 +395,7 @@ def coefficients_of(system: System) -> dict[sp.Expr, bool]:
         for term in sp.Add.make_args(sp.expand(expression)):
             coefficient, rest = term.as_independent(*moving, as_Add=False)
             parts[rest] = parts.get(rest, sp.S.Zero) + coefficient
-        leading = next((parts[h] for h in highest if h in parts), sp.S.One)
+        leading = next((parts[h] for h in system.highest if h in parts), sp.S.One)
         for rest, coefficient in parts.items():
             ratio = sp.factor(sp.cancel(coefficient / leading)).as_independent(*parameters, as_Add=False)[1]
             if ratio.free_symbols:
@@ -255,7 +404,7 @@ def coefficients_of(system: System) -> dict[sp.Expr, bool]:
                 for argument in function.args:
                     collect(argument)
 
-    for expression in (*system.equations, *system.outputs.values()):
+    for expression in system.expressions:
         collect(expression)
     return found
 
@@ -284,7 +433,8 @@ def combinations_of(
     for candidate in dict.fromkeys([*plain, *others]):
         if len(chosen) == wanted:
             break
-        if not directions.preserve(candidate, symbols) or any(_normal(g.applied(candidate)) != 0 for g in generators):
+        changes = (_normal(lie_derivative(g.field, candidate)) for g in generators)
+        if not directions.preserve(candidate, symbols) or any(change != 0 for change in changes):
             continue
         extended = np.vstack([slopes, directions.slope(candidate, moving)])
         if np.linalg.matrix_rank(extended, tol=1e-9) == len(extended):
@@ -317,7 +467,7 @@ def _others(
 
 
 def _weights_of_parameters(system: System, generator: Generator) -> dict[str, int]:
-    """Return integer weights of the parameters that a symmetry scales, regardless of the others and the states."""
+    """Return integer weights of the parameters that a symmetry scales, regardless of the others."""
     rates = {n: sp.cancel(move / system.parameters[n]) for n, move in generator.parameters.items()}
     best: dict[str, sp.Expr] = {}
     for unit in rates.values():

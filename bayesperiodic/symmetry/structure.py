@@ -9,49 +9,26 @@ import sympy as sp
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic.models.model import Model
-from bayesperiodic.symmetry.determining import Generator, determining_equations, generators_of
-from bayesperiodic.symmetry.invariants import (
-    Directions,
-    Flow,
-    coefficients_of,
-    combinations_of,
-    directions_of,
-    flow_of,
-    verified,
-)
-from bayesperiodic.symmetry.system import System, system_of
+from bayesperiodic.symmetry import invariants
+from bayesperiodic.symmetry.determining import Generator, System, determining_equations, generators_of, system_of
+from bayesperiodic.symmetry.invariants import Directions, Flow
 
 
 @dataclass(frozen=True)
 class Symmetry:
     """Transformation of parameters, and of states that are not measured, that leaves all measured outputs unchanged.
 
-    Attributes
-    ----------
-    kind : {"scaling", "shift", "other"}
-        "shift" adds a constant to a parameter or a state, and may also transform others.
-    parameters : tuple of str
-        The parameters that change. Fixing any one of them removes the symmetry.
-    generator : dict of str to str
-        Parameter or state -> its infinitesimal change.
-    transformation : dict of str to str
-        Parameter or state -> its image under the finite transformation with the group parameter `amount`, confirmed by
-        exact substitution in the equations. Empty if no closed form was found.
-    amount : str
-        Name of the group parameter: a factor > 0 for scalings, otherwise a number that is 0 for the identity.
-    factor : tuple of tuple of str
-        The matrix by which the transformation multiplies the equations.
-    no_help : tuple of str
-        Parameters that enter the same combinations, but do not remove the symmetry if they are fixed.
+    Its kind is "scaling", "shift" (which adds a constant to a parameter or a state, and may also transform others) or
+    "other". The finite transformation is confirmed by exact substitution in the equations.
     """
 
     kind: str
-    parameters: tuple[str, ...]
-    generator: dict[str, str]
-    transformation: dict[str, str]
-    amount: str
-    factor: tuple[tuple[str, ...], ...]
-    no_help: tuple[str, ...]
+    parameters: tuple[str, ...]  # those that change; fixing any one of them removes the symmetry
+    generator: dict[str, str]  # infinitesimal changes by parameter or state
+    transformation: dict[str, str]  # images by parameter or state; empty if no closed form was found
+    amount: str  # name of the group parameter: a factor > 0 for scalings, otherwise a number, 0 for the identity
+    factor: tuple[tuple[str, ...], ...]  # matrix by which the transformation multiplies the equations
+    no_help: tuple[str, ...]  # parameters in the same combinations that do not remove the symmetry if they are fixed
 
     def __repr__(self) -> str:
         if self.transformation:
@@ -68,33 +45,28 @@ class Structure(Result):
     ----------
     model : str
         Name of the model.
-    outputs : tuple of str
-        The measured outputs.
-    known : tuple of str
-        Parameters assumed to be known.
+    outputs, known : tuple of str
+        The measured outputs, and the parameters assumed to be known.
     table : DataFrame
         One row per unknown parameter. verdict: "determined", "only in combination", "not determined" (in no combination
         either) or "does not appear"; enters: the combinations that contain it (for a determined parameter, the
         coefficients without undetermined ones); fix: numbers, from 1, of the symmetries that fixing it removes;
-        partners: other parameters, of which any one determines it if known.
+        partners: other parameters, any one of which determines it if known.
     combinations : tuple of str
         Independent identifiable combinations of the parameters that are not determined; expressions for `derive`. With
         `unexplained` directions they are confirmed at random values only.
     symmetries : tuple of Symmetry
-        Independent symmetries.
+        Independent ones.
     to_fix : tuple of str
         The first parameters, in the model's order, that remove all symmetries if they are fixed.
-    rank : int or None
-        Rank of exact sensitivities of the outputs to the parameters that appear, at random parameter values; None if it
-        could not be computed.
-    points : int
-        Number of random parameter values.
+    rank, points : int or None, int
+        Rank of exact sensitivities of the outputs to the parameters that appear (None if it could not be computed), and
+        number of random parameter values.
     unexplained : tuple of str
         Parameters in directions without sensitivity that no symmetry found explains.
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> found = bp.structure(bp.models.duffing, fixed=["k"])
     >>> found.complete, found.table["verdict"].to_dict()
     (True, {'m': 'determined', 'c': 'determined', 'k3': 'determined'})
@@ -181,14 +153,7 @@ def _listed(names: Sequence[str], conjunction: str) -> str:
 
 
 def written(expression: sp.Expr, names: Mapping[sp.Symbol, str]) -> str:
-    """Return an expression as text such as "k1/(m*l**2)".
-
-    Parameters
-    ----------
-    expression : expression
-    names : dict
-        Symbol -> name, in the order of factors and terms.
-    """
+    """Return an expression as text such as "k1/(m*l**2)", with factors and terms in the order of the names."""
     order = {symbol: place for place, symbol in enumerate(names)}
     number, rest = sp.factor_terms(expression).as_coeff_Mul()
     negative = number.is_negative
@@ -245,14 +210,16 @@ def structure(
 
     The analysis assumes unlimited data without noise, arbitrary inputs, frequencies and motions, and generic parameter
     values. A parameter that is not determined here cannot be determined by any experiment; the converse depends on the
-    data.
+    data. "Determined" means locally: discrete ambiguities, such as the common sign of two factors, are not searched
+    for.
 
-    Two methods are combined. The first finds transformations of parameters and states that map solutions to solutions
-    and leave outputs, inputs and time unchanged: Lie symmetries [1]_ [2]_, affine in states and inputs. They satisfy
+    Two methods are combined. The first finds Lie symmetries [1]_ [2]_, affine in states and inputs: transformations of
+    parameters and states that map solutions to solutions and leave outputs, inputs and time unchanged. They satisfy
     linear equations, which are solved exactly over the rational functions of the parameters; a finite transformation
     is accepted only if substitution in the symbolic equations confirms it. The second computes the rank of exact
     sensitivities of the outputs' Taylor coefficients at random values, which bounds the number of symmetries of any
     kind [3]_. If the rank and the number of symmetries add up to the number of parameters, the result is complete.
+    Sensitivities do not detect the dependence of a discontinuity on a parameter; no rank is returned in this case.
 
     Parameters
     ----------
@@ -271,12 +238,6 @@ def structure(
     ValueError
         For an unknown output or parameter, no output, or a value of zero that the equations divide by.
 
-    Notes
-    -----
-    "Determined" means locally: discrete ambiguities, such as the common sign of two factors, are not searched for.
-    Sensitivities do not detect the dependence of a discontinuity on a parameter (unlike that of a kink), and no rank is
-    returned in this case.
-
     References
     ----------
     .. [1] J. W. T. Yates, N. D. Evans, M. J. Chappell, Structural identifiability analysis via symmetries of
@@ -288,7 +249,6 @@ def structure(
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> found = bp.structure(bp.models.pendulum, fixed=["a", "g", "v0"])
     >>> found.combinations
     ('k1/(m*l**2)', 'k2/(m*l**2)', 'k3/(m*l**2)')
@@ -308,19 +268,24 @@ def structure(
     whole = system_of(model, measured)
     system = whole.given(known, {whole.parameters[name]: sp.S.Zero for name in zeros})
     for name in zeros:
-        if any(e.has(sp.zoo, sp.nan, sp.oo) for e in (*system.equations, *system.outputs.values())):
+        if any(e.has(sp.zoo, sp.nan, sp.oo) for e in system.expressions):
             raise ValueError(f"fixed: must not be zero if the equations divide by it, got {name} = 0.")
     return analyse_structure(model.name, system, known)
 
 
 def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Structure:
     """Return the structure of a symbolic system, whose parameters may have been replaced by expressions."""
-    system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if n in whole.appearing})
+    used = whole.used
+    system = replace(whole, parameters={n: s for n, s in whole.parameters.items() if s in used})
     names = {s: n for n, s in (whole.parameters | whole.known).items()}
-    kinds, generators, flows = _symmetries(system)
-    directions = directions_of(system, generators)
-    coefficients = coefficients_of(system)
-    found = combinations_of(system, generators, [f for f in flows if f], directions, coefficients)
+    symmetries = generators_of(determining_equations(system)) if system.parameters else []
+    flows = [
+        invariants.verified(system, flow) if (flow := invariants.flow_of(symmetry)) else None for symmetry in symmetries
+    ]
+    generators = [flow.generator if flow else symmetry for symmetry, flow in zip(symmetries, flows, strict=True)]
+    directions = invariants.directions_of(system, generators)
+    coefficients = invariants.coefficients_of(system)
+    found = invariants.combinations_of(system, generators, [f for f in flows if f], directions, coefficients)
     combinations = {c: written(c, names).removeprefix("-") for c in found}
     return Structure(
         model=name,
@@ -329,8 +294,8 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
         table=_table(whole, system, generators, directions, coefficients, combinations, names),
         combinations=tuple(combinations.values()),
         symmetries=tuple(
-            _symmetry(system, kind, generator, flow, combinations, names)
-            for kind, generator, flow in zip(kinds, generators, flows, strict=True)
+            _symmetry(system, _kind(symmetry), generator, flow, combinations, names)
+            for symmetry, generator, flow in zip(symmetries, generators, flows, strict=True)
         ),
         to_fix=directions.smallest_set(),
         rank=len(system.parameters) - len(directions.rows) if directions.points or not system.parameters else None,
@@ -339,19 +304,8 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
     )
 
 
-def _symmetries(system: System) -> tuple[list[str], list[Generator], list[Flow | None]]:
-    """Return the kinds of the symmetries, their generators and, if there are closed forms, their flows."""
-    found = generators_of(determining_equations(system)) if system.parameters else []
-    flows = [verified(system, flow) if (flow := flow_of(g)) else None for g in found]
-    return (
-        [_kind(g) for g in found],
-        [flow.generator if flow else g for g, flow in zip(found, flows, strict=True)],
-        flows,
-    )
-
-
 def _kind(generator: Generator) -> str:
-    if generator.weights:
+    if generator.scaling:
         return "scaling"
     constant = any(move.is_number for move in (*generator.parameters.values(), *generator.states.values()))
     return "shift" if constant else "other"
@@ -402,22 +356,21 @@ def _symmetry(
     symbols = system.parameters | {s: system.symbols[s] for s in generator.states}
     moves = generator.parameters | generator.states
     shared = [c.free_symbols for c in combinations if c.free_symbols & {symbols[n] for n in generator.parameters}]
-    texts = {**names, **{system.symbols[s]: s for s in (*system.symbols,)}}
+    others = {n: s for n, s in system.parameters.items() if n not in generator.parameters}
+    texts = {**names, **{symbol: name for name, symbol in system.symbols.items()}}
     amount = ""
+    rows: list[list[sp.Expr]] = []
     if flow is not None:
         wanted = ("t", "scale", "scale_factor") if flow.amount.is_positive else ("delta", "shift_by", "amount")
         amount = next(n for n in wanted if n not in texts.values())
         texts[flow.amount] = amount
+        rows = flow.factor.tolist() if flow.factor else []
     return Symmetry(
         kind=kind,
         parameters=tuple(generator.parameters),
         generator={n: written(move, texts) for n, move in moves.items()},
         transformation={n: written(flow.images[symbols[n]], texts) for n in moves} if flow else {},
         amount=amount,
-        factor=tuple(tuple(written(e, texts) for e in flow.factor.row(i)) for i in range(flow.factor.rows))
-        if flow and flow.factor
-        else (),
-        no_help=tuple(
-            n for n, s in system.parameters.items() if n not in generator.parameters and any(s in c for c in shared)
-        ),
+        factor=tuple(tuple(written(e, texts) for e in row) for row in rows),
+        no_help=tuple(n for n, s in others.items() if any(s in c for c in shared)),
     )

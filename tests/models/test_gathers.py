@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from bayesperiodic.models._kernels.gathers import without_gathers
+from bayesperiodic.models.code_generation import without_gathers
 from bayesperiodic.models.library import duffing
 
 

@@ -206,7 +206,7 @@ def test_every_quantity_has_a_unit_and_every_model_a_description_that_runs(name)
     assert set(model.units) == {*model.parameters, *model.states, *model.inputs, *model.outputs}
     text = inspect.getdoc(model)
     assert len(text.splitlines()[0]) > 40 and text != inspect.getdoc(bp.Model)
-    example = doctest.DocTestParser().get_doctest(text, {}, name, None, None)
+    example = doctest.DocTestParser().get_doctest(text, {"bp": bp, "np": np}, name, None, None)
     assert doctest.DocTestRunner(verbose=False).run(example).failed == 0
 
 

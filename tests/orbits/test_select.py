@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.orbits.select import orbit_information
+from bayesperiodic.orbits.polish import orbit_information
 from studies import shooting
 from tests.pendulum import GENTLE, PENDULUM, at_rest, measured, mirrored, section_problem
 

@@ -8,10 +8,9 @@ import sympy as sp
 
 import bayesperiodic as bp
 from bayesperiodic._expressions import parse
-from bayesperiodic.symmetry.determining import Generator
+from bayesperiodic.symmetry.determining import Generator, system_of
 from bayesperiodic.symmetry.invariants import Flow, verified
 from bayesperiodic.symmetry.structure import analyse_structure
-from bayesperiodic.symmetry.system import system_of
 
 GEAR = {
     "theta1": 1.0, "theta2": 0.5, "theta3": 0.6, "theta4": 1.0, "theta5": 1.2, "theta6": -0.5, "theta7": 0.3,

@@ -63,23 +63,9 @@ def slope(residual_jacobian, y, time, parameters, frequency, orders, states, row
 
 @njit(f"boolean({FUNCTION}, {VECTOR}, {MATRIX}, int64, {VECTOR}, float64, int64[::1], int64, {MATRIX})", **OPTIONS)
 def runge_kutta(residual_jacobian, start, inputs, samples, parameters, frequency, orders, steps, path):
-    """Take fixed steps of the classical fourth-order method and fill `path` with the states before the last steps.
+    """Fill `path` (kept, size) with the states before the last of the steps; see `models.model.integrate`.
 
-    Parameters
-    ----------
-    start : array (size,)
-        The states, then the rates of the second-order ones.
-    inputs : array (2·samples·periods, 3·inputs)
-        u, u̇, ü at half steps; repeated.
-    samples : int
-        Steps per forcing period.
-    steps : int
-    path : array (kept, size)
-
-    Returns
-    -------
-    bool
-        False if the states grew beyond all bounds or the equations cannot be solved for the highest derivatives.
+    Return False if the states overflow or the equations cannot be solved for the highest derivatives.
     """
     size, count = start.size, orders.size
     states, row = np.empty((1, 3 * count)), np.empty((1, inputs.shape[1]))
@@ -131,30 +117,11 @@ def fill_inputs(amplitudes, time, row):
 def dormand_prince(
     residual_jacobian, amplitudes, parameters, frequency, orders, time, path, a, c, errors, absolute, relative, trials
 ):  # fmt: skip
-    """Integrate by the explicit Runge-Kutta method of order 8 with error control, stopping at every output time.
+    """Fill `path` (times, size) from its first row by the Runge-Kutta method of order 8; return the number of rows.
 
-    Parameters
-    ----------
-    amplitudes : complex array (harmonics, 3·inputs)
-        Of u, u̇, ü, from harmonic 0 on.
-    time : array (times,)
-        In forcing periods.
-    path : array (times, size)
-        The first row is the start; the others are filled.
-    a : array (stages + 1, stages)
-        The last row holds the weights of the step.
-    c : array (stages + 1,)
-    errors : array (2, stages + 1)
-        Weights of the estimates of orders 5 and 3.
-    absolute, relative : array (size,)
-        Tolerances.
-    trials : int
-        Of steps between two output times.
-
-    Returns
-    -------
-    int
-        How many rows of the path are known.
+    The amplitudes (harmonics, 3·inputs) are those of u, u̇, ü, from harmonic 0 on; `time` is in forcing periods. The
+    last row of `a` (stages + 1, stages) contains the weights of a step, `errors` (2, stages + 1) those of the error
+    estimates of orders 5 and 3, `trials` limits the steps between two output times.
     """
     size, count, stages = path.shape[1], orders.size, c.size - 1
     states, row = np.empty((1, 3 * count)), np.empty((1, amplitudes.shape[1]))
@@ -204,7 +171,7 @@ def dormand_prince(
                 now = time[k] if used == remaining else now + used
                 for i in range(size):
                     y[i], rates[0, i] = trial[i], rates[stages, i]
-                # A step cut short by an output time says nothing against the longer one.
+                # A step shortened by an output time does not reduce the next one.
                 growth = 10.0 if error == 0.0 else min(10.0, 0.9 * error ** (-0.125))
                 step = max(step, used * growth) if used < step and growth >= 1.0 else used * growth
             elif finite and error < np.inf:
