@@ -17,60 +17,43 @@ Value = TypeVar("Value")
 TINY = np.finfo(float).tiny
 
 
+def scaled(matrix: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """Return M_ij u_i u_j of a matrix (n, n) and units (n,)."""
+    return matrix * np.outer(units, units)
+
+
 def hessian_scale(hessian: np.ndarray) -> np.ndarray:
     """Return 1/√|H_ii|, the units in which a Hessian H has a unit diagonal."""
     return 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), TINY))
 
 
 def hessian_eigh(hessian: np.ndarray, scale: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Decompose a Hessian or information matrix H into the eigenpairs of H_ij s_i s_j.
+    """Return eigenvalues (ascending), eigenvectors (columns) of H_ij s_i s_j, and the units s.
 
-    Parameters
-    ----------
-    hessian : array (n, n)
-        Symmetric.
-    scale : array (n,), optional
-        The units s; by default `hessian_scale`.
-
-    Returns
-    -------
-    values : array (n,)
-        Ascending eigenvalues w.
-    vectors : array (n, n)
-        Eigenvectors V, in columns. The inverse is H⁻¹ = (V / w) Vᵀ s_i s_j.
-    scale : array (n,)
+    By default s is `hessian_scale`. The inverse of H is ``composed(1 / values, vectors, scale)``.
 
     Examples
     --------
-    >>> import numpy as np
     >>> values, vectors, scale = hessian_eigh(np.array([[4e12, 1e6], [1e6, 1.0]]))
     >>> values.round(12).tolist(), scale.tolist()
     ([0.5, 1.5], [5e-07, 1.0])
     """
     scale = hessian_scale(hessian) if scale is None else scale
-    return *np.linalg.eigh(hessian * np.outer(scale, scale)), scale
+    return *np.linalg.eigh(scaled(hessian, scale)), scale
 
 
 def covariance_eigh(covariance: np.ndarray, sd: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Decompose a covariance C into the eigenpairs of the correlation C_ij / (sd_i sd_j).
+    """Return eigenvalues (ascending), eigenvectors (columns) of the correlation C_ij / (sd_i sd_j), and the sd.
 
-    Parameters
-    ----------
-    covariance : array (n, n)
-        Symmetric.
-    sd : array (n,), optional
-        By default the standard deviations √C_ii.
-
-    Returns
-    -------
-    values : array (n,)
-        Ascending eigenvalues w.
-    vectors : array (n, n)
-        Eigenvectors V, in columns. The covariance is C = V w Vᵀ sd_i sd_j.
-    sd : array (n,)
+    By default these are √C_ii. C is ``composed(values, vectors, sd)``.
     """
     sd = _standard_deviations(covariance) if sd is None else sd
     return *np.linalg.eigh(covariance / np.outer(sd, sd)), sd
+
+
+def composed(values: np.ndarray, vectors: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """Return the symmetric matrix (V w Vᵀ)_ij u_i u_j of eigenvalues w, eigenvectors V (in columns) and units u."""
+    return scaled((vectors * values) @ vectors.T, units)
 
 
 def covariance_cholesky(covariance: np.ndarray) -> np.ndarray:

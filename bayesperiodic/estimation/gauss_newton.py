@@ -1,10 +1,11 @@
-"""The staged Gauss-Newton iteration: noise parameters from the residuals, then a step in θ (eq. 7-8)."""
+"""Staged Gauss-Newton iteration: noise parameters from the residuals, then a step in θ (eq. 7-8)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bayesperiodic._linalg import hessian_eigh, hessian_scale
 from bayesperiodic.posterior.density import Linearisation, LogPosterior
 from bayesperiodic.posterior.description import Description
 from bayesperiodic.posterior.likelihood import estimate_noise
@@ -21,14 +22,8 @@ MAX_ROUNDS, PRESSED = 10, 1e-3
 class Iterate:
     """State of the Gauss-Newton iteration.
 
-    Attributes
-    ----------
-    theta : array (names,)
-    here : Linearisation
-        At θ; its anchors are those of the next solves.
-    noise : array (noise_names,)
-        Best noise parameters for the residuals at θ.
-    objective : float
+    `here` holds residuals and Jacobians at θ, whose anchors are those of the next solves; `noise` the best noise
+    parameters for these residuals.
     """
 
     theta: np.ndarray
@@ -39,14 +34,10 @@ class Iterate:
 
 @dataclass(frozen=True)
 class Objective:
-    """The density that the iteration maximises over θ, with the best noise parameters at every θ.
+    """Density that the iteration maximises over θ, with the best noise parameters at every θ.
 
-    Attributes
-    ----------
-    density : LogPosterior
-    share : float
-        Factor of the logarithms of the variances: with 1 − l/Σn their best values are those of eq. (7), with 1 those of
-        the maximum of eq. (6).
+    `share` is the factor of the logarithms of the variances: with 1 − l/Σn their best values are those of eq. (7), with
+    1 those of the maximum of eq. (6).
     """
 
     density: LogPosterior
@@ -73,7 +64,7 @@ class Objective:
     def moved(self, theta: np.ndarray, step: np.ndarray) -> np.ndarray:
         """Return θ after a step; parameters whose density is over the logarithm change by a factor.
 
-        Ridges of products are straight in logarithms, so that the step stays on them.
+        A step along the ridge of a product, which is straight in logarithms, stays on the ridge.
         """
         result, logs = theta + step, self.density.logarithmic
         with np.errstate(over="ignore"):
@@ -106,20 +97,19 @@ def climb(
     held: np.ndarray | None = None,
     report: Callable[[Iterate, float], None] | None = None,
 ) -> tuple[Iterate, str, np.ndarray]:
-    """Raise the objective from a start until the steps are small, and never lower it.
+    """Increase the objective from an anchored start until the steps are small.
 
     Where H is not positive definite (convex log-priors that outweigh the data) steps take its negative curvature with
-    the opposite sign; directions without curvature are left alone. Each solve starts from the iterate before and is
-    checked to lie on the same branch, so that a step cannot slip to another periodic solution; steps whose solve fails
-    are halved. A parameter at the end of its prior's support is held while the gradient presses it outwards.
+    the opposite sign; directions without curvature are left out. Each solve starts from the previous iterate and is
+    checked to lie on the same branch, so that a step cannot change to another periodic solution; steps whose solve
+    fails are halved. A parameter at the end of its prior's support is fixed while the gradient points outwards.
 
     Parameters
     ----------
     objective : Objective
     start : Iterate
-        Anchored.
     held : bool array (names,), optional
-        Parameters that stay.
+        Parameters that are fixed.
     report : callable, optional
         Called with every new iterate and the length of its step in standard deviations.
 
@@ -127,7 +117,7 @@ def climb(
     -------
     iterate : Iterate
     status : str
-        "converged", "stalled" (no step raised the objective), "iterations" (their limit was reached) or "singular".
+        "converged", "stalled" (no step increased the objective), "iterations" (their limit was reached) or "singular".
     history : array (iterations,)
         The objective at each iterate.
     """
@@ -149,14 +139,14 @@ def at_ends(objective: Objective, iterate: Iterate) -> np.ndarray:
     """Return −1 or 1 for parameters next to the lower or upper end of their support, 0 for others, (names,)."""
     hessian, _ = objective.hessian_and_gradient(iterate)
     low, high = np.transpose(list(objective.density.problem.joint_prior.supports.values()))
-    near = PRESSED / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
+    near = PRESSED * hessian_scale(hessian)
     return 1.0 * (high - iterate.theta < near) - (iterate.theta - low < near)
 
 
 def _ascend(
     objective: Objective, start: Iterate, held: np.ndarray, report: Callable[[Iterate, float], None] | None
 ) -> tuple[Iterate, str, list[float]]:
-    """Climb with the same parameters held throughout; return the end, the status, and the objectives on the way."""
+    """Climb with the same parameters fixed; return the end, the status, and the objectives of all steps."""
     now = start
     history: list[float] = []
     for _ in range(MAX_ITERATIONS):
@@ -191,9 +181,7 @@ def _step(hessian: np.ndarray, gradient: np.ndarray, held: np.ndarray) -> tuple[
     step = np.zeros_like(gradient)
     if not moving.size:
         return step, 0.0
-    part = hessian[np.ix_(moving, moving)]
-    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(part)), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(part * np.outer(scale, scale))
+    values, vectors, scale = hessian_eigh(hessian[np.ix_(moving, moving)])
     values = np.abs(values)
     along, curved = vectors.T @ (scale * gradient[moving]), values > SINGULAR * values.max()
     along = np.where(curved, along / np.where(curved, values, 1.0), 0.0)
