@@ -30,7 +30,7 @@ def hessian_scale(hessian: np.ndarray) -> np.ndarray:
 def hessian_eigh(hessian: np.ndarray, scale: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return eigenvalues (ascending), eigenvectors (columns) of H_ij s_i s_j, and the units s.
 
-    By default s is `hessian_scale`. The inverse of H is ``composed(1 / values, vectors, scale)``.
+    By default s is `hessian_scale`. The inverse of H is ``scaled((vectors / values) @ vectors.T, scale)``.
 
     Examples
     --------
@@ -45,15 +45,10 @@ def hessian_eigh(hessian: np.ndarray, scale: np.ndarray | None = None) -> tuple[
 def covariance_eigh(covariance: np.ndarray, sd: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return eigenvalues (ascending), eigenvectors (columns) of the correlation C_ij / (sd_i sd_j), and the sd.
 
-    By default these are √C_ii. C is ``composed(values, vectors, sd)``.
+    By default these are √C_ii. C is ``scaled((vectors * values) @ vectors.T, sd)``.
     """
     sd = _standard_deviations(covariance) if sd is None else sd
     return *np.linalg.eigh(covariance / np.outer(sd, sd)), sd
-
-
-def composed(values: np.ndarray, vectors: np.ndarray, units: np.ndarray) -> np.ndarray:
-    """Return the symmetric matrix (V w Vᵀ)_ij u_i u_j of eigenvalues w, eigenvectors V (in columns) and units u."""
-    return scaled((vectors * values) @ vectors.T, units)
 
 
 def covariance_cholesky(covariance: np.ndarray) -> np.ndarray:

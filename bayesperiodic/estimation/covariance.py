@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from bayesperiodic import _fourier
-from bayesperiodic._linalg import TINY, composed, covariance_eigh, hessian_scale, scaled
+from bayesperiodic._linalg import TINY, covariance_eigh, hessian_scale, scaled
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.estimation.gauss_newton import Iterate, information
 from bayesperiodic.periodic.compiled import CONVERGED
@@ -154,7 +154,7 @@ def with_uncertain_noise(problem: Problem, estimate: Iterate, covariance: np.nda
     for group, members in shaped:
         result += _mixture(problem, estimate, total, covariance, group, members) - covariance
     values, vectors, sd = covariance_eigh(result, np.sqrt(np.diag(covariance)))
-    return composed(np.maximum(values, 0.0), vectors, sd)
+    return scaled((vectors * np.maximum(values, 0.0)) @ vectors.T, sd)
 
 
 def _is_shaped(problem: Problem, group: tuple[str, ...], members: list[int]) -> bool:

@@ -6,7 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pandas as pd
 
-from bayesperiodic._linalg import composed, covariance_eigh, hessian_eigh, hessian_scale, scaled
+from bayesperiodic._linalg import covariance_eigh, hessian_eigh, hessian_scale, scaled
 from bayesperiodic.estimation.gauss_newton import SINGULAR, Iterate, Objective, climb
 from bayesperiodic.posterior.density import LogPosterior
 from bayesperiodic.posterior.description import Description
@@ -40,7 +40,7 @@ def joint_laplace(density: LogPosterior, start: Iterate) -> tuple[dict[str, floa
     if np.isfinite(hessian).all() and np.all(np.diag(hessian) > 0.0):
         curvatures, vectors, scale = hessian_eigh(hessian)
         if curvatures.min() >= SINGULAR * curvatures.max():
-            covariance.iloc[:, :] = composed(1.0 / curvatures, vectors, scale)
+            covariance.iloc[:, :] = scaled((vectors / curvatures) @ vectors.T, scale)
     return dict(zip(labels, [*mode.theta.tolist(), *mode.noise[free].tolist()], strict=True)), covariance
 
 

@@ -9,7 +9,7 @@ import pandas as pd
 from tqdm import tqdm
 
 from bayesperiodic import _checks
-from bayesperiodic._linalg import composed, hessian_eigh, in_one_thread
+from bayesperiodic._linalg import hessian_eigh, in_one_thread, scaled
 from bayesperiodic.estimation.covariance import doubling_shift, input_noise, robust_covariance, with_uncertain_noise
 from bayesperiodic.estimation.gauss_newton import (
     SINGULAR,
@@ -231,7 +231,7 @@ def _inverse(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the inverse of H without its directions of no curvature, and which parameters belong to these."""
     values, vectors, scale = hessian_eigh(hessian)
     curved = np.abs(values) > SINGULAR * np.abs(values).max()
-    inverse = composed(1.0 / values[curved], vectors[:, curved], scale)
+    inverse = scaled((vectors[:, curved] / values[curved]) @ vectors[:, curved].T, scale)
     return inverse, np.any(np.abs(vectors[:, ~curved]) > LOST, axis=1)
 
 
