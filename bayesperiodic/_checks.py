@@ -1,4 +1,4 @@
-"""Argument validation: every message names the argument, what it must be, and what was given."""
+"""Argument validation, with messages `name: must be …, got …`."""
 
 import difflib
 import reprlib

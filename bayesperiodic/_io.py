@@ -45,7 +45,7 @@ MODULES = {
 
 
 class Result:
-    """Base of frozen dataclasses of plain data with a `save` method; `load` reads them."""
+    """Base class of frozen dataclasses of plain data, with a `save` method; `load` reads them."""
 
     def save(self, path: str | Path) -> None:
         """Write the result to an HDF5 file; an existing file is replaced when the new one is complete.
@@ -60,7 +60,7 @@ class Result:
         Raises
         ------
         OSError
-            If the file cannot be written there.
+            If the file cannot be written.
         TypeError
             If the result contains something other than plain data, such as a function.
         """

@@ -127,7 +127,7 @@ def _smoothed(block: Block, square: np.ndarray, left: np.ndarray) -> np.ndarray:
 
 
 def _excess(freedom: np.ndarray) -> np.ndarray:
-    """Return the mean of a variance over its estimate, ν/(ν − 2), for estimates with ν degrees of freedom."""
+    """Return the mean ratio ν/(ν − 2) of a variance to its estimate with ν degrees of freedom."""
     return np.maximum(freedom, 1.0) / np.maximum(freedom - 2.0, 1.0)
 
 
