@@ -146,10 +146,7 @@ class TaskPool:
         self._unsent, self._at_once = workers or 1, workers and QUEUED_PER_WORKER * workers
 
     def run(
-        self,
-        function: Callable[[Any, Any], Any],
-        tasks: Iterable[Any],
-        then: Callable[[int, Any], Any] | None = None,
+        self, function: Callable[[Any, Any], Any], tasks: Iterable[Any], then: Callable[[int, Any], Any] | None = None
     ) -> Iterator[tuple[int, Any]]:
         """Yield the number and the result function(shared, task) of every task when it is finished.
 

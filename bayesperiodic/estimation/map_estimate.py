@@ -35,12 +35,7 @@ LOST = 1e-6
 
 @in_one_thread
 def map_estimate(
-    problem: Problem,
-    *,
-    start: Mapping[str, float] | None = None,
-    starts: int = 1,
-    seed: int = 0,
-    progress: bool = True,
+    problem: Problem, *, start: Mapping[str, float] | None = None, starts: int = 1, seed: int = 0, progress: bool = True
 ) -> MapEstimate:
     r"""Find the MAP point by staged Gauss-Newton, and the Laplace covariance there.
 

@@ -47,13 +47,7 @@ def refuse_for_nuts(walkers: int | None, variances: str, checkpoint: str | Path 
 
 
 def sample_nuts(
-    density: LogPosterior,
-    fit: MapEstimate,
-    seed: int,
-    ensembles: int,
-    max_steps: int,
-    start: str,
-    progress: bool,
+    density: LogPosterior, fit: MapEstimate, seed: int, ensembles: int, max_steps: int, start: str, progress: bool
 ) -> Posterior:
     """Sample a density with independent chains of the no-U-turn sampler, each an ensemble of one walker.
 
