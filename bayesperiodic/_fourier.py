@@ -8,10 +8,7 @@ import numpy as np
 
 
 def coefficients(values: np.ndarray, harmonics: int | None = None) -> np.ndarray:
-    """Return the amplitudes (…, harmonics + 1) of signals (…, points) over one response period.
-
-    By default up to the highest harmonic below the Nyquist harmonic of the grid.
-    """
+    """Return the amplitudes (…, harmonics + 1) of signals (…, points), by default all below the Nyquist harmonic."""
     points = values.shape[-1]
     limit = highest_harmonic(points)
     amplitudes = np.fft.rfft(values, axis=-1)[..., : 1 + (limit if harmonics is None else min(harmonics, limit))]

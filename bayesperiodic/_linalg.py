@@ -28,25 +28,13 @@ def hessian_scale(hessian: np.ndarray) -> np.ndarray:
 
 
 def hessian_eigh(hessian: np.ndarray, scale: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return eigenvalues (ascending), eigenvectors (columns) of H_ij s_i s_j, and the units s.
-
-    By default s is `hessian_scale`. The inverse of H is ``scaled((vectors / values) @ vectors.T, scale)``.
-
-    Examples
-    --------
-    >>> values, vectors, scale = hessian_eigh(np.array([[4e12, 1e6], [1e6, 1.0]]))
-    >>> values.round(12).tolist(), scale.tolist()
-    ([0.5, 1.5], [5e-07, 1.0])
-    """
+    """Return eigenvalues w, eigenvectors V of H_ij s_i s_j, and s; H⁻¹ = ``scaled((V / w) @ V.T, s)``."""
     scale = hessian_scale(hessian) if scale is None else scale
     return *np.linalg.eigh(scaled(hessian, scale)), scale
 
 
 def covariance_eigh(covariance: np.ndarray, sd: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return eigenvalues (ascending), eigenvectors (columns) of the correlation C_ij / (sd_i sd_j), and the sd.
-
-    By default these are √C_ii. C is ``scaled((vectors * values) @ vectors.T, sd)``.
-    """
+    """Return eigenvalues w, eigenvectors V of the correlation C_ij / (sd_i sd_j), and sd, by default √C_ii."""
     sd = _standard_deviations(covariance) if sd is None else sd
     return *np.linalg.eigh(covariance / np.outer(sd, sd)), sd
 

@@ -45,9 +45,7 @@ def available_cores() -> int:
 
 
 def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def in_threads(function: Callable[[Item], Value], items: Sequence[Item], threads: int) -> list[Value]:
@@ -275,28 +273,12 @@ def checkpointed_tasks(
 ) -> list[Line]:
     """Run the tasks whose results a file lacks, and return the results (lines) of all in the order of the tasks.
 
-    A line is written when its task is finished. After an interruption the same call runs the remaining tasks; an
-    incomplete last line is removed. Raises a ValueError if another process uses the file or the executor takes no
+    The file has one JSON line per task, written when the task is finished; without a path nothing is stored. After an
+    interruption the same call runs the remaining tasks; an incomplete last line is removed. Tasks are distinct,
+    hashable and picklable. work(shared, task), defined in a module, returns the line; its "source" identifies version
+    and settings, and lines of another source are ignored. task_of(line) returns the task. Without an executor the tasks
+    run sequentially in this process. Raises a ValueError if another process uses the file or the executor takes no
     tasks, a WorkersLost if workers died; finished tasks are in the file.
-
-    Parameters
-    ----------
-    path : Path, optional
-        File with one JSON line per task, in which lines of another source are ignored; by default nothing is stored.
-    tasks : sequence
-        Distinct, hashable and picklable.
-    work : callable
-        Function of the shared object and a task, defined in a module, that returns the line, with the key "source".
-    task_of : callable
-        Returns the task of a line.
-    source : str
-        Identifies the version and the settings of a result.
-    shared : object
-        Data of all tasks, sent once to each worker.
-    executor : None, int, Dask Client, or executor with the interface of concurrent.futures
-        None runs the tasks sequentially in this process.
-    progress : bool
-        Show a progress bar.
     """
     given = checked_executor(executor)
     with nullcontext() if path is None else _locked(path):

@@ -69,7 +69,9 @@ def _residual_variance(
     """
     shape, log_prior = _shapes(block, unit)
     scale = hessian_scale(information)
-    others = _positive(scaled(information - s @ s.T, scale))
+    others = scaled(information - s @ s.T, scale)
+    values, vectors = np.linalg.eigh(0.5 * (others + others.T))
+    others = (vectors * np.maximum(values, RIDGE)) @ vectors.T
     s, score = s * scale[:, None], (s * scale[:, None]) @ r
     own = (s / shape[:, None, :]) @ s.T
     pull = (r / shape) @ s.T
@@ -105,12 +107,6 @@ def _shapes(block: Block, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return shape / shape.mean(axis=1, keepdims=True), np.log(weight)
 
 
-def _positive(matrix: np.ndarray) -> np.ndarray:
-    """Return a symmetric matrix with its negative eigenvalues cut off."""
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    return (vectors * np.maximum(values, RIDGE)) @ vectors.T
-
-
 def _smoothed(block: Block, square: np.ndarray, left: np.ndarray) -> np.ndarray:
     """Return squares over their expectation (size,), smoothed over harmonics, as the mean of an unknown variance."""
     highest = int(block.harmonic.max())
@@ -140,13 +136,12 @@ UPDATES, JITTER = 3, 1e-12
 def with_uncertain_noise(problem: Problem, estimate: Iterate, covariance: np.ndarray) -> np.ndarray:
     """Return the covariance of θ (names, names) with the shape of the noise spectrum integrated out.
 
-    Noise models whose variances alone are unknown keep their covariance: Student's t accounts for the variances. For
-    others, θ is estimated again by linear least squares for shapes from the whole support of their prior. Their
-    posterior is that of the restricted likelihood (Harville, see `robust_covariance`), with θ integrated out; the
-    covariance is that of the mixture about the estimate. With several channels their changes of the covariance are
-    added.
+    If variances alone are unknown, the covariance is kept: Student's t accounts for them. Otherwise θ is estimated
+    again by linear least squares for shapes from the whole support of their prior. Their posterior is that of the
+    restricted likelihood (Harville, see `robust_covariance`), with θ integrated out; the covariance is that of the
+    mixture about the estimate. The changes of the covariance by several channels are added.
     """
-    shaped = [(group, members) for group, members in problem.likelihood.groups() if _is_shaped(problem, group, members)]
+    shaped = [group for group in problem.likelihood.groups() if _is_shaped(problem, *group)]
     if not shaped or not np.all(np.diag(covariance) > 0.0):
         return covariance
     total = information(problem, estimate)[0] + problem.joint_prior.curvature(estimate.theta)
@@ -220,10 +215,9 @@ def _points(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 def doubling_shift(
     problem: Problem, estimate: Iterate, solutions: Mapping[str, PeriodicSolution], covariance: np.ndarray
 ) -> np.ndarray:
-    """Return the change of the estimate on twice as many points, in standard deviations, (names,).
+    """Return the change of the estimate on twice as many points, in sds (names,), by a Gauss-Newton step.
 
-    Every experiment is solved again on the finer grid at the estimate; a Gauss-Newton step converts the change of the
-    residuals to that of the parameters. NaN if a solve fails.
+    NaN if a solve fails.
     """
     finer: list[np.ndarray] = []
     for e in problem.experiments:
@@ -270,8 +264,8 @@ def _on_twice_the_points(
 def input_noise(problem: Problem, theta: np.ndarray, solutions: Mapping[str, PeriodicSolution]) -> dict[str, float]:
     """Return the standard deviation that the inputs' noise causes in each channel, root mean square over experiments.
 
-    The noise of each kept Fourier amplitude of an input, and of its derivatives, is propagated through the linearised
-    periodic problem; the variance is averaged over the period, within the harmonics kept.
+    The noise of each kept Fourier amplitude of an input and of its derivatives is propagated through the linearised
+    problem; the variance is averaged over the period.
     """
     variances: dict[str, list[float]] = {channel: [0.0] for channel in problem.channels}
     for e in problem.experiments:

@@ -20,11 +20,7 @@ MAX_ROUNDS, PRESSED = 10, 1e-3
 
 @dataclass(frozen=True)
 class Iterate:
-    """State of the Gauss-Newton iteration.
-
-    `here` holds residuals and Jacobians at θ, whose anchors are those of the next solves; `noise` the best noise
-    parameters for these residuals.
-    """
+    """State of the iteration: θ, residuals and Jacobians there, their best noise parameters, and the objective."""
 
     theta: np.ndarray
     here: Linearisation
@@ -36,8 +32,8 @@ class Iterate:
 class Objective:
     """Density that the iteration maximises over θ, with the best noise parameters at every θ.
 
-    `share` is the factor of the logarithms of the variances: with 1 − l/Σn their best values are those of eq. (7), with
-    1 those of the maximum of eq. (6).
+    `share` is a factor of the logarithms of the variances: their best values are those of eq. (7) for 1 − l/Σn, and
+    those of eq. (6) for 1.
     """
 
     density: LogPosterior
@@ -104,22 +100,8 @@ def climb(
     checked to lie on the same branch, so that a step cannot change to another periodic solution; steps whose solve
     fails are halved. A parameter at the end of its prior's support is fixed while the gradient points outwards.
 
-    Parameters
-    ----------
-    objective : Objective
-    start : Iterate
-    held : bool array (names,), optional
-        Parameters that are fixed.
-    report : callable, optional
-        Called with every new iterate and the length of its step in standard deviations.
-
-    Returns
-    -------
-    iterate : Iterate
-    status : str
-        "converged", "stalled" (no step increased the objective), "iterations" (their limit was reached) or "singular".
-    history : array (iterations,)
-        The objective at each iterate.
+    Parameters `held` (names,) are fixed; report(iterate, step in standard deviations) is called for every new iterate.
+    Returns the last iterate, the status, as in `MapEstimate`, and the objective at each iterate.
     """
     always = np.zeros(start.theta.size, dtype=bool) if held is None else held
     now, resting, history = start, always, [start.objective]

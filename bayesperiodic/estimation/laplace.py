@@ -19,14 +19,8 @@ def joint_laplace(density: LogPosterior, start: Iterate) -> tuple[dict[str, floa
     """Climb from the estimate to the mode in sampling coordinates and invert the exact Hessian there.
 
     The Hessian over θ comes from central differences of the exact gradient; parameters local to experiments are changed
-    together, because each experiment depends on its own only.
-
-    Returns
-    -------
-    mode : dict of str to float
-        Natural values of the parameters and of the free noise parameters.
-    covariance : DataFrame (coordinates × coordinates)
-        Of the sampling coordinates, see `MapEstimate.joint_covariance`. NaN where there is no maximum.
+    together, because each experiment depends on its own only. Returns the mode (natural values) and the covariance of
+    the sampling coordinates, see `MapEstimate.joint_covariance`.
     """
     problem, objective = density.problem, Objective(density, 1.0)
     first = objective.at(start.theta, start.here, start.noise)
@@ -49,8 +43,8 @@ def _hessian(objective: Objective, mode: Iterate, free: list[int]) -> np.ndarray
     problem, logs = objective.density.problem, objective.density.logarithmic
     count = len(problem.names)
     by_theta = -_second_derivatives(objective, mode) + problem.joint_prior.curvature(mode.theta)
-    gradient = _total(mode.here.vjp(problem.likelihood.gradients(mode.here.residuals, mode.noise)[0], adjoint=False))
-    gradient = gradient + problem.joint_prior.gradient(mode.theta)
+    by_residual, _ = problem.likelihood.gradients(mode.here.residuals, mode.noise)
+    gradient = sum(mode.here.vjp(by_residual, adjoint=False).values()) + problem.joint_prior.gradient(mode.theta)
     slopes = np.where(logs, mode.theta, 1.0)
     hessian = np.zeros((count + len(free), count + len(free)))
     hessian[:count, :count] = scaled(by_theta, slopes) - np.diag(np.where(logs, gradient * mode.theta, 0.0))
@@ -60,7 +54,8 @@ def _hessian(objective: Objective, mode: Iterate, free: list[int]) -> np.ndarray
             noise = mode.noise.copy()
             noise[column] *= np.exp(sign * NOISE_STEP)
             by_residual, by_noise = problem.likelihood.gradients(mode.here.residuals, noise)
-            changes.append(np.concatenate([_total(mode.here.vjp(by_residual, adjoint=False)) * slopes, by_noise[free]]))
+            total = sum(mode.here.vjp(by_residual, adjoint=False).values())
+            changes.append(np.concatenate([total * slopes, by_noise[free]]))
         hessian[count + row] = -(changes[0] - changes[1]) / (2.0 * NOISE_STEP)
         hessian[:count, count + row] = hessian[count + row, :count]
     return 0.5 * (hessian + hessian.T)
@@ -102,23 +97,13 @@ def _gradients(problem: Description, theta: np.ndarray, mode: Iterate) -> dict[s
     return there.vjp(by_residual, adjoint=not problem.model.autonomous)
 
 
-def _total(by_experiment: dict[str, np.ndarray]) -> np.ndarray:
-    return np.sum(list(by_experiment.values()), axis=0)
-
-
 SHOWN = 0.05
 LARGEST = 4
 ROUNDED = 0.06
 
 
 def reduced(directions: np.ndarray) -> np.ndarray:
-    """Return vectors that span the same space (directions, names), by Gauss-Jordan elimination.
-
-    Examples
-    --------
-    >>> reduced(np.array([[2.0, 2.0, 4.0], [0.0, 3.0, 3.0]])).tolist()
-    [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]
-    """
+    """Return vectors that span the same space (directions, names), by Gauss-Jordan elimination."""
     rows = directions.copy()
     for i in range(len(rows)):
         relative = np.abs(rows) / np.abs(rows).max(axis=1, keepdims=True)
@@ -131,13 +116,7 @@ def reduced(directions: np.ndarray) -> np.ndarray:
 
 
 def exponents(direction: np.ndarray) -> list[Fraction] | None:
-    """Return a direction in logarithms as simple fractions, the first positive; None if there are none nearby.
-
-    Examples
-    --------
-    >>> exponents(np.array([0.499, -0.001, -0.998]))
-    [Fraction(1, 1), Fraction(0, 1), Fraction(-2, 1)]
-    """
+    """Return a direction in logarithms as simple fractions, the first positive; None if there are none nearby."""
     shown = np.abs(direction) > SHOWN * np.abs(direction).max()
     smallest = np.abs(direction[shown]).min()
     for unit in (smallest, np.abs(direction).max()):
@@ -158,38 +137,28 @@ def combinations(direction: np.ndarray, names: Sequence[str], logarithmic: np.nd
 
     Examples
     --------
-    >>> combinations(np.array([1.0, -1.0]), ["a", "b"], np.array([True, True]))
-    ['a*b']
     >>> combinations(np.array([1.0, 0.5, 0.5]), ["m", "k", "c"], np.array([True, True, True]))
     ['m/k**2', 'c/k']
     >>> combinations(np.array([1.0, -1.0]), ["a", "b"], np.array([False, False]))
     ['a + b']
     """
     shown = np.flatnonzero(np.abs(direction) > SHOWN * np.abs(direction).max())
-    if shown.size < 2:
+    own, direction, powers = [names[i] for i in shown.tolist()], direction[shown], logarithmic[shown]
+    if shown.size < 2 or powers.any() != powers.all():
         return []
-    powers = logarithmic[shown]
-    if powers.all():
-        rational = exponents(direction[shown])
-        if rational is None:
-            return []
-        pivot = min(range(len(rational)), key=lambda i: (abs(rational[i]), i))
-        ratios = [r / rational[pivot] for r in rational]
-        if max(max(abs(r.numerator), r.denominator) for r in ratios) > LARGEST:
-            return []
+    if not powers.all():
+        pivot = int(np.argmax(np.abs(direction)))
         return [
-            _product(names[shown[i]], ratios[i], names[shown[pivot]], first=i < pivot)
-            for i in range(len(rational))
-            if i != pivot
+            _sum(own[pivot], -float(direction[pivot] / direction[i]), own[i]) for i in range(shown.size) if i != pivot
         ]
-    if powers.any():
+    rational = exponents(direction)
+    if rational is None:
         return []
-    pivot = int(np.argmax(np.abs(direction[shown])))
-    return [
-        _sum(names[shown[pivot]], -float(direction[shown[pivot]] / direction[shown[i]]), names[shown[i]])
-        for i in range(shown.size)
-        if i != pivot
-    ]
+    pivot = min(range(len(rational)), key=lambda i: (abs(rational[i]), i))
+    ratios = [r / rational[pivot] for r in rational]
+    if max(max(abs(r.numerator), r.denominator) for r in ratios) > LARGEST:
+        return []
+    return [_product(own[i], ratios[i], own[pivot], first=i < pivot) for i in range(len(rational)) if i != pivot]
 
 
 def _product(name: str, ratio: Fraction, other: str, *, first: bool) -> str:
@@ -240,9 +209,7 @@ SILENT = "no output depends on it"
 def undetermined(
     information: np.ndarray, theta: np.ndarray, names: Sequence[str], logarithmic: np.ndarray
 ) -> tuple[str, ...]:
-    """Return, in words, the directions in which the data's information (names, names) vanishes.
-
-    The information is the data's part of H of eq. (8); combinations of logarithmic parameters are products of powers.
+    """Return, in words, the directions in which the data's part of H of eq. (8) (names, names) vanishes.
 
     Examples
     --------

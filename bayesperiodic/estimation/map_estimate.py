@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator, Mapping
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,7 +22,7 @@ from bayesperiodic.estimation.gauss_newton import (
     information,
 )
 from bayesperiodic.estimation.laplace import SILENT, joint_laplace, undetermined
-from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, deferred, noise_split
+from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, noise_split
 from bayesperiodic.posterior.density import NATURAL, RIDGE, Linearisation, LogPosterior
 from bayesperiodic.posterior.initial import InitialEstimate, simultaneous_fit
 from bayesperiodic.posterior.problem import Problem
@@ -31,6 +32,8 @@ NOISE_SHARE = 0.1
 LARGEST_SHIFT = 0.1
 SHOWN = 3
 LOST = 1e-6
+# Value of a field of MapEstimate that is computed at its first use.
+deferred: Any = partial
 
 
 @in_one_thread

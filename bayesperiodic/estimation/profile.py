@@ -90,8 +90,7 @@ class Ridge:
 
     def _size(self) -> float:
         """Return the standard deviation by the ridge's curvature at the peak, at most the width of the prior."""
-        quartiles = self._prior.quantile(np.array([0.25, 0.75]))
-        width = float(quartiles[1] - quartiles[0])
+        width = float(np.ptp(self._prior.quantile(np.array([0.25, 0.75]))))
         _, curvature = self._tangent(self.peak)
         if curvature > 0.0:
             return min(curvature**-0.5, width)
@@ -148,9 +147,7 @@ class Ridge:
         tangent = start.theta + (value - start.theta[self.column]) * self._tangent(start)[0]
         found = [self.objective.at(theta, start.here, start.noise) for theta in (tangent, plain)]
         first = max(filter(None, found), key=lambda iterate: iterate.objective, default=None)
-        if first is None:
-            return None
-        return climb(self.objective, self.objective.anchored(first), self._held)[0]
+        return None if first is None else climb(self.objective, self.objective.anchored(first), self._held)[0]
 
     @property
     def _held(self) -> np.ndarray:
@@ -180,10 +177,8 @@ def _root(top: float, iterate: Iterate) -> float:
 
 def _next(now: float, step: float, end: float, limit: float) -> float:
     """Return the value after a step, at most a limit and nine tenths of the way to the support's end."""
-    if np.isinf(end):
-        return now + step
     inside = min if step > 0.0 else max
-    return inside(now + step, end + NEARER * (now - end), limit)
+    return now + step if np.isinf(end) else inside(now + step, end + NEARER * (now - end), limit)
 
 
 WIDEST = 0.99
@@ -328,7 +323,7 @@ def _crossing(values: np.ndarray, roots: np.ndarray, level: float, limit: float)
 def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = None, *, executor: Any = None) -> Profile:
     """Follow the maximum of the log-density from the estimate along every parameter, outwards and back.
 
-    The objective is that of `map_estimate`: eq. (6) of [1]_ with the bias correction of eq. (7), the priors included.
+    The objective is that of `map_estimate`: eq. (6) with the bias correction of eq. (7), the priors included.
     For every value of a parameter the staged iteration estimates all others, started from the neighbouring point.
     Points are spaced by about half a standard deviation of the drop, until the profile has dropped below the level of a
     99 % interval, the prior's support ends, or solves fail. Then every point is also started from its outer neighbour,
@@ -360,11 +355,6 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     UserWarning
         If a profile finds a better point than the estimate.
 
-    References
-    ----------
-    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
-       equilibrium states, 1997.
-
     Examples
     --------
     >>> profile = bp.profile(problem, fit)
@@ -379,7 +369,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     objective, peak = _at_estimate(problem, fit)
     with TaskPool(executor, (objective, peak)) as pool:
         found = dict(pool.run(_followed, [problem.names.index(name) for name in chosen]))
-    top, best = peak.objective, peak.theta
+    top, best, units = peak.objective, peak.theta, problem.model.units | {SHIFT: "s"}
     values, density, paths, limits = {}, {}, {}, {}
     for number, name in enumerate(chosen):
         limits[name], values[name], density[name], paths[name] = found[number]
@@ -394,7 +384,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
         limits=limits,
         best=dict(zip(problem.names, best.tolist(), strict=True)),
         improvement=float(top - peak.objective),
-        units={name: _unit(problem, name) for name in problem.names},
+        units={name: units.get(name.partition("[")[0], "") for name in problem.names},
     )
     if result.improvement > BETTER:
         warnings.warn(
@@ -444,11 +434,6 @@ def _followed(
     density = [np.nan if iterate is None else iterate.objective for iterate in iterates]
     paths = [missing if iterate is None else iterate.theta for iterate in iterates]
     return ridge.limits(), np.array(values), np.array(density), np.array(paths)
-
-
-def _unit(problem: Problem, name: str) -> str:
-    plain = name.partition("[")[0]
-    return "s" if plain == SHIFT else problem.model.units.get(plain, "")
 
 
 def _written(theta: dict[str, float]) -> str:

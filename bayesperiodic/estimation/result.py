@@ -1,9 +1,10 @@
 """MapEstimate: the MAP point, its Laplace approximations, and tests of the residual."""
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import partial
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from bayesperiodic.posterior.problem import Problem
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Bartlett's test of a residual that repeats every period.
+    """Test by M. S. Bartlett (An Introduction to Stochastic Processes, 1955) of a residual that repeats every period.
 
     `p` is the probability, for white residuals, of a cumulative periodogram at least as far from a straight line: the
     Kolmogorov-Smirnov distance of the kept harmonics, exact for independent normal values; NaN if not tested. `lag1` is
@@ -34,20 +35,8 @@ class Whiteness:
     lag1: float
 
 
-def of_components(components: np.ndarray, harmonic: np.ndarray) -> Whiteness:
-    """Test real Fourier components (size,) of given harmonics (size,)."""
-    power = np.bincount(harmonic, components**2)
-    complete = np.bincount(harmonic) == 2
-    return of_periodogram(power[complete])
-
-
 def of_periodogram(power: np.ndarray) -> Whiteness:
-    """Test whether the squared amplitudes of harmonics 1, 2, … are those of white noise.
-
-    References
-    ----------
-    M. S. Bartlett, An Introduction to Stochastic Processes, Cambridge University Press, 1955.
-    """
+    """Test whether the squared amplitudes of harmonics 1, 2, … are those of white noise (Bartlett 1955)."""
     from scipy.stats import kstest
 
     if power.size < 2 or power.sum() == 0.0:
@@ -94,22 +83,14 @@ def channel_whiteness(problem: Problem, estimate: Iterate) -> dict[str, Whitenes
     tests: dict[str, list[Whiteness]] = {channel: [] for channel in problem.channels}
     for block, r in zip(problem.likelihood.blocks, white, strict=True):
         if block.kind == SPECTRAL:
-            tests[block.channel].append(of_components(r, block.harmonic))
+            complete = np.bincount(block.harmonic) == 2
+            tests[block.channel].append(of_periodogram(np.bincount(block.harmonic, r**2)[complete]))
     return {
         channel: Whiteness(min(1.0, len(found) * min(t.p for t in found)), float(np.mean([t.lag1 for t in found])))
         if found
         else Whiteness(np.nan, np.nan)
         for channel, found in tests.items()
     }
-
-
-class _Deferred(partial):
-    pass
-
-
-def deferred(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Return a value of a field of `MapEstimate` that is computed when it is first used, because that takes long."""
-    return _Deferred(function, *arguments)
 
 
 @dataclass(frozen=True)
@@ -126,7 +107,7 @@ class MapEstimate(Result):
         Standard deviations that are valid for residuals that deviate from the noise model (sandwich covariance with the
         residual's smoothed spectrum); if they differ much from `sd`, the noise model is wrong.
     variances : dict of str to float
-        Variance of the mean period of each channel (or "channel, experiment"), and "scale", eq. (7) ([1]_) or as fixed.
+        Variance of the mean period of each channel (or "channel, experiment"), and "scale", by eq. (7) or fixed.
     noise : dict of str to float
         All noise parameters by their full names.
     noise_prior : str
@@ -136,8 +117,8 @@ class MapEstimate(Result):
     joint_mode : dict of str to float
         Mode of the density in sampling coordinates: natural values of parameters and free noise parameters.
     joint_covariance : DataFrame
-        Inverse of the exact Hessian there, over the sampling coordinates: logarithms of the parameters whose prior's
-        support is (0, ∞) and of the noise parameters, other parameters as they are. NaN where there is no maximum.
+        Inverse of the exact Hessian there; NaN if it is no maximum. Sampling coordinates are the logarithms of noise
+        parameters and of parameters whose prior's support is (0, ∞), and the other parameters.
     degrees_of_freedom : float
         Independent values less free parameters; infinite where all variances are fixed.
     independent : dict of str to float
@@ -147,8 +128,7 @@ class MapEstimate(Result):
     residuals : dict of str to dict of str to array (points,)
         y − ŷ within the kept harmonics, by experiment and channel.
     rms, fvu : dict of str to float
-        Root mean square of the residuals of each channel, and their mean square over the variance of the measured
-        channel (the fraction of variance unexplained).
+        Root mean square of each channel's residuals, and the fraction of the measured variance that they are.
     whiteness : dict of str to Whiteness
         Of the residuals in units of the noise model, by channel; with several experiments p is the smallest, corrected
         for their number, lag1 the mean.
@@ -168,11 +148,6 @@ class MapEstimate(Result):
         Of every start, the objective reached (−inf: none) under "objective", and the estimates.
     tied : dict of str to dict of str to float
         Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
-
-    References
-    ----------
-    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
-       equilibrium states, 1997.
 
     Examples
     --------
@@ -213,10 +188,10 @@ class MapEstimate(Result):
     tied: dict[str, dict[str, float]]
 
     if not TYPE_CHECKING:
-
+        # Fields that take long and that few users need are functions until they are used.
         def __getattribute__(self, name: str) -> Any:
             value = super().__getattribute__(name)
-            if isinstance(value, _Deferred):
+            if isinstance(value, partial):
                 value = value()
                 object.__setattr__(self, name, value)
             return value
@@ -236,9 +211,7 @@ class MapEstimate(Result):
         return pd.DataFrame(self.covariance / np.outer(sd, sd))
 
     def interval(self, probability: float = 0.9, *, robust: bool = False) -> dict[str, tuple[float, float]]:
-        """Return the equal-tailed interval of each parameter, Student's t with `degrees_of_freedom`.
-
-        With few independent values a normal interval would be too short, because the variance is estimated too.
+        """Return the equal-tailed interval of each parameter, by Student's t with `degrees_of_freedom`.
 
         Parameters
         ----------
@@ -308,7 +281,8 @@ class MapEstimate(Result):
                 raise ValueError(
                     f"expressions[{name!r}]: must be finite at the estimate, got {value} for {quantities[name].text!r}."
                 )
-        covariance = _carried(self.covariance, [self._gradient(q, values, named) for q in quantities.values()])
+        gradients = [self._gradient(quantity, values, named) for quantity in quantities.values()]
+        covariance = _carried(self.covariance.to_numpy(), gradients)
         with np.errstate(invalid="ignore"):
             sd = np.sqrt(np.diag(covariance))
         table = pd.DataFrame({"value": list(at.values()), "sd": sd}, index=list(at))
@@ -362,16 +336,15 @@ class MapEstimate(Result):
             )
         return MultivariateNormal(mean, covariance)
 
-    def _gradient(self, quantity: Expression, values: dict[str, float], named: dict[str, str]) -> dict[str, np.ndarray]:
-        """Return the derivatives by the free parameters, those through tied ones included; `named` by plain name."""
-        partial = quantity.gradient(values)
-        total = dict.fromkeys(self.theta, np.array(0.0))
-        for plain, slope in partial.items():
+    def _gradient(self, quantity: Expression, values: dict[str, float], named: dict[str, str]) -> np.ndarray:
+        """Return the derivatives by the free parameters (names,), those through tied ones included."""
+        total = dict.fromkeys(self.theta, 0.0)
+        for plain, slope in quantity.gradient(values).items():
             if plain in named:
-                total[named[plain]] = total[named[plain]] + slope
+                total[named[plain]] += float(slope)
             for name, through in self.tied.get(plain, {}).items():
-                total[name] = total[name] + slope * through
-        return total
+                total[name] += float(slope) * through
+        return np.array(list(total.values()))
 
     def _fixed(self, experiment: str | None) -> dict[str, float]:
         """Return the fixed and tied parameters of one experiment, or those with the same value in all."""
@@ -404,13 +377,10 @@ class MapEstimate(Result):
         return "\n".join(lines)
 
 
-def _carried(covariance: pd.DataFrame, gradients: list[dict[str, np.ndarray]]) -> np.ndarray:
+def _carried(matrix: np.ndarray, gradients: list[np.ndarray]) -> np.ndarray:
     """Return the covariance of quantities with these gradients; parameters of gradient 0 may have an infinite sd."""
-    matrix = covariance.to_numpy()
-    rows = [np.array([float(gradient[name]) for name in covariance.columns]) for gradient in gradients]
-    result = np.zeros((len(rows), len(rows)))
+    result = np.zeros((len(gradients), len(gradients)))
     with np.errstate(invalid="ignore", over="ignore"):
-        for i, a in enumerate(rows):
-            for j, b in enumerate(rows):
-                result[i, j] = a[a != 0.0] @ matrix[np.ix_(a != 0.0, b != 0.0)] @ b[b != 0.0]
+        for (i, a), (j, b) in product(enumerate(gradients), repeat=2):
+            result[i, j] = a[a != 0.0] @ matrix[np.ix_(a != 0.0, b != 0.0)] @ b[b != 0.0]
     return result

@@ -34,25 +34,13 @@ class Checkpoint:
     emcee's HDF5 backend writes every step in pieces, and a run killed between two of them leaves a damaged file. Here
     chains grow in memory; from time to time they are written to a new file, which then replaces the old one. The time
     between is at least twenty times the time of a write.
-
-    Parameters
-    ----------
-    path : path
-    problem : Description
-    settings : str
-        Settings that must be equal when a run is resumed: seed, numbers of ensembles and walkers, and so on.
-
-    Raises
-    ------
-    ValueError
-        If the file cannot be read, belongs to another problem or other settings, or is in use by another run.
+    Problem and settings (seed, numbers of ensembles and walkers …) must be equal when a run is resumed.
     """
 
     def __init__(self, path: str | Path, problem: Description, settings: str):
         self._path, self._mark = Path(path), f"{fingerprint(problem)}; {settings}"
         self._lock = FileLock(f"{path}.lock", timeout=0.0)
         self._next = 0.0
-        self._check()
 
     def __enter__(self) -> "Checkpoint":
         try:
@@ -72,30 +60,25 @@ class Checkpoint:
             Path(self._lock.lock_file).unlink()
         self._lock.release()
 
-    def _check(self) -> None:
+    def load(self) -> Saved | None:
+        """Return the content of the file; None if there is no file."""
         if not self._path.exists():
-            return
+            return None
         try:
             with h5py.File(self._path, "r") as file:
                 found = file.attrs.get(MARK, "no run of this package")
+                if found != self._mark:
+                    raise ValueError(
+                        f"checkpoint: must be a file of this run ({self._mark}), got {str(self._path)!r} of another "
+                        f"run ({found}); name another file or delete it."
+                    )
+                state = json.loads(file[RUN][()])
+                names = sorted((name for name in file if name.startswith("ensemble ")), key=lambda name: int(name[9:]))
         except OSError as error:
             raise ValueError(
                 f"checkpoint: must be an intact HDF5 file, got {str(self._path)!r} ({error}); name another file or "
                 "delete it."
             ) from None
-        if found != self._mark:
-            raise ValueError(
-                f"checkpoint: must be a file of this run ({self._mark}), got {str(self._path)!r} of another run "
-                f"({found}); name another file or delete it."
-            )
-
-    def load(self) -> Saved | None:
-        """Return the content of the file; None if there is no file."""
-        if not self._path.exists():
-            return None
-        with h5py.File(self._path, "r") as file:
-            state = json.loads(file[RUN][()])
-            names = sorted((name for name in file if name.startswith("ensemble ")), key=lambda name: int(name[9:]))
         stored = [emcee.backends.HDFBackend(str(self._path), name=name, read_only=True) for name in names]
         return Saved([_in_memory(backend) for backend in stored], state)
 

@@ -24,8 +24,8 @@ def rhat(chains: np.ndarray) -> np.ndarray:
 
     The walkers of an ensemble depend on each other; therefore an ensemble is one chain here, its steps in order.
     """
-    ensembles, steps, walkers, count = chains.shape
-    pooled = chains.reshape(ensembles, steps * walkers, count)
+    count = chains.shape[-1]
+    pooled = chains.reshape(len(chains), -1, count)
     data = xr.Dataset({str(i): (("chain", "draw"), pooled[:, :, i]) for i in range(count)})
     result = arviz().rhat(data, method="rank")
     return np.array([float(result[str(i)]) for i in range(count)])
@@ -40,21 +40,16 @@ def autocorrelation_time(chains: np.ndarray) -> np.ndarray:
 
 def quantile_spread(chains: np.ndarray) -> np.ndarray:
     """Return the largest difference between ensembles of the 5, 50 and 95 % quantiles, in pooled sds."""
-    ensembles, steps, walkers, count = chains.shape
-    pooled = chains.reshape(ensembles, steps * walkers, count)
+    pooled = chains.reshape(len(chains), -1, chains.shape[-1])
     quantiles = np.quantile(pooled, [0.05, 0.5, 0.95], axis=1)
-    return np.ptp(quantiles, axis=1).max(axis=0) / pooled.reshape(-1, count).std(axis=0)
+    return np.ptp(quantiles, axis=1).max(axis=0) / pooled.reshape(-1, pooled.shape[-1]).std(axis=0)
 
 
 def pareto_k(log_weights: np.ndarray) -> float:
-    """Return the Pareto shape k̂ of the upper tail of importance weights [1]_; ∞ if less than a quarter are positive.
+    """Return the Pareto shape k̂ of the upper tail of importance weights; ∞ if less than a quarter are positive.
 
-    Equal weights, to within a millionth, have no tail: 0. The logarithm of a weight of zero is −∞.
-
-    References
-    ----------
-    .. [1] A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry, Pareto smoothed importance sampling, Journal of Machine
-       Learning Research 25 (2024) 1-58.
+    Equal weights, to within a millionth, have no tail: 0. The logarithm of a weight of zero is −∞. From A. Vehtari et
+    al., Pareto smoothed importance sampling, Journal of Machine Learning Research 25 (2024) 1-58.
     """
     positive = np.isfinite(log_weights)
     if positive.mean() < FEWEST_WEIGHTS:
@@ -87,13 +82,8 @@ def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: 
     would contain 50; therefore it must be 500 autocorrelation times long. The mean of a walker scatters by its standard
     deviation over √(steps/tau); one that is eight times as far off remains in a mode of its own.
 
-    Parameters
-    ----------
-    kept : array (ensembles, steps, walkers, coordinates)
-    tau, last : array (coordinates,)
-        Autocorrelation time [steps], now and at the previous check.
-    labels : sequence of str
-        Names of the coordinates.
+    `kept` are chains (ensembles, steps, walkers, coordinates); `tau` and `last` are autocorrelation times [steps] of
+    the coordinates, now and at the previous check; `labels` are the names of the coordinates.
     """
     found = []
     if not np.isfinite(tau).all():

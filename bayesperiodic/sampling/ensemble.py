@@ -70,13 +70,9 @@ class SamplingTarget(NamedTuple):
 
 
 class ChainSegment(NamedTuple):
-    """Steps of an ensemble: arrays (steps, walkers, …), accepted proposals (walkers,), random state after the last."""
+    """Steps of an ensemble, and the number of calls that they took."""
 
-    chain: np.ndarray
-    log_prob: np.ndarray
-    blobs: np.ndarray | None
-    accepted: np.ndarray
-    random_state: tuple
+    backend: emcee.backends.Backend
     calls: CallCount
 
 
@@ -93,8 +89,7 @@ def advance(target: SamplingTarget, task: tuple[emcee.State, int]) -> ChainSegme
     moves = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)]
     sampler = emcee.EnsembleSampler(*state.coords.shape, log_prob, moves=moves, vectorize=True)
     sampler.run_mcmc(state, steps, skip_initial_state_check=True, progress=False)
-    end = sampler.backend
-    return ChainSegment(end.chain, end.log_prob, end.blobs, end.accepted, end.random_state, calls)
+    return ChainSegment(sampler.backend, calls)
 
 
 @dataclass(frozen=True)
@@ -124,24 +119,22 @@ class Ensemble:
 
     def extended(self, segment: ChainSegment) -> "Ensemble":
         """Return the ensemble with a segment appended, in the same memory."""
-        backend, first = copy(self.backend), self.steps
-        last = first + len(segment.chain)
-        blobs = None if segment.blobs is None else segment.blobs[0]
+        backend, new, first = copy(self.backend), segment.backend, self.steps
+        last = first + new.iteration
         if last > len(backend.chain):
-            backend.grow(max(last - first, ROOM), blobs)
-        backend.chain[first:last], backend.log_prob[first:last] = segment.chain, segment.log_prob
-        if segment.blobs is not None:
-            backend.blobs[first:last] = segment.blobs
-        backend.accepted = backend.accepted + segment.accepted
-        backend.random_state, backend.iteration = segment.random_state, last
+            backend.grow(max(new.iteration, ROOM), None if new.blobs is None else new.blobs[0])
+        backend.chain[first:last], backend.log_prob[first:last] = new.chain, new.log_prob
+        if new.blobs is not None:
+            backend.blobs[first:last] = new.blobs
+        backend.accepted = backend.accepted + new.accepted
+        backend.random_state, backend.iteration = new.random_state, last
         return Ensemble(backend, backend.get_last_sample(), self.calls + segment.calls)
 
 
 class LockstepPool:
-    """Runs tasks like `TaskPool`, each in a thread that waits for the others at every evaluation of the density.
+    """Runs tasks like `TaskPool`, in threads whose points are evaluated in one call.
 
-    The points of all threads are evaluated in one call: the overhead dominates small calls, and one large call uses the
-    cores better than several small ones.
+    The overhead dominates small calls, and one large call uses the cores better than several small ones.
     """
 
     def __init__(self, target: SamplingTarget):

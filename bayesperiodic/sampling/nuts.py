@@ -66,7 +66,9 @@ def sample_nuts(
             run.chains.append(_Chain(nutpie, density, axes, u, chain_seed, max_steps))
         run.go(max_steps, progress)
     except BaseException:
-        run.cancel()
+        for chain in run.chains:
+            with suppress(RuntimeError):  # of a chain that failed
+                chain.sampler.cancel()
         raise
     return run.posterior(nutpie.__version__, seed)
 
@@ -145,12 +147,6 @@ class _Run:
         self.chains: list[_Chain] = []
         self.steps, self.converged, self.reason = 0, False, ""
 
-    def cancel(self) -> None:
-        """Abort all chains."""
-        for chain in self.chains:
-            with suppress(RuntimeError):  # of a chain that failed
-                chain.sampler.cancel()
-
     def go(self, max_steps: int, progress: bool) -> None:
         """Wait until the stop rule is passed twice in succession, `max_steps` are reached, or Ctrl-C."""
         try:
@@ -200,7 +196,15 @@ class _Run:
             for ours, theirs in STATISTICS.items()
         }
         log_density = np.stack([np.asarray(one["logp"])[0, : self.steps] for one in found])
-        self._report(int(stats["diverging"].sum()), log_density.size)
+        if diverged := int(stats["diverging"].sum()):
+            lost = f"{diverged} of {log_density.size} trajectories diverged"
+            self.reason += f", {lost}"
+            warnings.warn(
+                f"{lost}: they reached points where the log-posterior is not finite, such as the ends of a prior's "
+                "support or failed solves, or its curvature is too large. The draws may miss a part of the posterior; "
+                "compare them with those of sampler='emcee'.",
+                stacklevel=5,
+            )
         accounts = [chain.accounts[TUNE + self.steps - 1] for chain in self.chains]
         result = gather(
             self.density,
@@ -218,15 +222,3 @@ class _Run:
         )
         result.data.attrs["nutpie"] = version
         return result
-
-    def _report(self, diverged: int, total: int) -> None:
-        """Add the number of diverged trajectories to the reason, and warn."""
-        if not diverged:
-            return
-        self.reason += f", {diverged} of {total} trajectories diverged"
-        warnings.warn(
-            f"{diverged} of {total} trajectories diverged: they reached points where the log-posterior is not finite, "
-            "such as the ends of a prior's support or failed solves, or its curvature is too large. The draws may "
-            "miss a part of the posterior; compare them with those of sampler='emcee'.",
-            stacklevel=6,
-        )

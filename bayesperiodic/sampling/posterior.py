@@ -267,21 +267,16 @@ MOST = {CHAIN: 20, DRAW: 5}
 def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, time: dict[str, str], seed: int) -> xr.Dataset:
     """Return replicates of the measured mean periods, noise included, for some draws of some walkers.
 
-    Returns
-    -------
-    Dataset
-        Variables ``<experiment> <channel>`` with dims (chain, draw, time axis); ``largest_multiplier``, the modulus of
-        the largest Floquet multiplier, with dims (chain, draw, experiment). NaN where a solve fails.
+    Variables are ``<experiment> <channel>`` with dims (chain, draw, time axis), and ``largest_multiplier``, the modulus
+    of the largest Floquet multiplier, with dims (chain, draw, experiment); NaN where a solve fails.
     """
     problem = density.problem
-    chosen = posterior.isel({dim: _spread(posterior.sizes[dim], most) for dim, most in MOST.items()})
+    chosen = posterior.isel({d: _spread(posterior.sizes[d], n) for d, n in MOST.items()})
     shape = chosen.sizes[CHAIN], chosen.sizes[DRAW]
     theta, noise = (
-        np.array([labels.column(chosen, name).ravel() for name in names]).reshape(len(names), -1).T
+        np.array([labels.column(chosen, name).ravel() for name in names]).reshape(len(names), shape[0] * shape[1]).T
         for names in (problem.names, problem.noise_names)
     )
-    if not problem.noise_names:
-        noise = np.empty((len(theta), 0))
     components = problem.likelihood.simulate(noise, np.random.default_rng(seed))
     simulation, variables, largest = density.simulator.solve(theta, keep=True, polish=True), {}, []
     for e in problem.experiments:
@@ -297,14 +292,12 @@ def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, time: dic
 
 def orbits(density: LogPosterior, theta: np.ndarray, time: dict[str, str]) -> xr.Dataset:
     """Return the states, turns included, of every experiment at one θ (names,): ``<experiment> <state>`` over time."""
-    return xr.Dataset(
-        {
-            f"{name} {state}": ((time[name],), values)
-            for name, solution in density.solve(theta).items()
-            for state, values in solution.states.items()
-        },
-        coords={time[e.name]: e.time for e in density.problem.experiments},
-    )
+    states = {
+        f"{name} {state}": ((time[name],), values)
+        for name, solution in density.solve(theta).items()
+        for state, values in solution.states.items()
+    }
+    return xr.Dataset(states, coords={time[e.name]: e.time for e in density.problem.experiments})
 
 
 def _spread(size: int, wanted: int) -> np.ndarray:
@@ -326,10 +319,7 @@ def gather(
     acceptance: float,
     seed: int,
 ) -> Posterior:
-    """Return the posterior of chains (ensembles, steps, walkers, coordinates) in sampling coordinates.
-
-    `log_density` has the shape (ensembles, steps, walkers); `calls` are those of all ensembles. See `Posterior`.
-    """
+    """Return the posterior of chains (ensembles, steps, walkers, coordinates) in sampling coordinates."""
     names = density.labels
     data = tree(density, *density.to_natural(kept), log_density, seed)
     data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason}
@@ -351,11 +341,7 @@ def gather(
 def tree(
     density: LogPosterior, theta: np.ndarray, noise: np.ndarray, log_density: np.ndarray, seed: int
 ) -> xr.DataTree:
-    """Return draws as the groups of `Posterior.data`.
-
-    Natural values of the parameters and noise parameters have the shape (ensembles, steps, walkers, names), the
-    log-density (ensembles, steps, walkers). The seed is that of the replicates.
-    """
+    """Return draws (ensembles, steps, walkers, names), in natural values, as the groups of `Posterior.data`."""
     problem = density.problem
     ensembles, steps, walkers = log_density.shape
     best = theta.reshape(-1, theta.shape[-1])[np.argmax(log_density)]
@@ -371,18 +357,16 @@ def tree(
         "flag_values": list(range(len(STATUSES))),
         "flag_meanings": " ".join(s.replace(" ", "_") for s in STATUSES),
     }
-    result = xr.DataTree.from_dict(
-        {
-            "posterior": posterior,
-            "sample_stats": xr.Dataset(
-                {"lp": ((CHAIN, DRAW), lp[..., 0]), "status": ((CHAIN, DRAW), status, meanings)}, coords=coords
-            ),
-            "posterior_predictive": posterior_predictive(density, posterior, time, seed),
-            "orbits": orbits(density, best, time),
-            "observed_data": _signals(problem, "outputs"),
-            "constant_data": _signals(problem, "inputs"),
-        }
-    )
+    stats = {"lp": ((CHAIN, DRAW), lp[..., 0]), "status": ((CHAIN, DRAW), status, meanings)}
+    groups = {
+        "posterior": posterior,
+        "sample_stats": xr.Dataset(stats, coords=coords),
+        "posterior_predictive": posterior_predictive(density, posterior, time, seed),
+        "orbits": orbits(density, best, time),
+        "observed_data": _signals(problem, "outputs", time),
+        "constant_data": _signals(problem, "inputs", time),
+    }
+    result = xr.DataTree.from_dict(groups)
     result.attrs = {
         "fingerprint": fingerprint(problem),
         "synthetic": int(any(e.synthetic for e in problem.experiments)),
@@ -441,16 +425,13 @@ def _noise_attributes(problem: Description, variable: str) -> dict[str, str]:
     return {NOISE: problem.noise.name} | each
 
 
-def _signals(problem: Description, kind: str) -> xr.Dataset:
-    times = _time_axes(problem)
-    return xr.Dataset(
-        {
-            f"{e.name} {channel}": ((times[e.name],), values)
-            for e in problem.experiments
-            for channel, values in getattr(e, kind).items()
-        },
-        coords={times[e.name]: e.time for e in problem.experiments},
-    )
+def _signals(problem: Description, kind: str, time: dict[str, str]) -> xr.Dataset:
+    signals = {
+        f"{e.name} {channel}": ((time[e.name],), values)
+        for e in problem.experiments
+        for channel, values in getattr(e, kind).items()
+    }
+    return xr.Dataset(signals, coords={time[e.name]: e.time for e in problem.experiments})
 
 
 def _time_axes(problem: Description) -> dict[str, str]:

@@ -1,7 +1,6 @@
 """Sampling of θ and the noise parameters with emcee."""
 
 from collections import Counter
-from collections.abc import Mapping
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -180,7 +179,8 @@ def sample(
         density = LogPosterior(problem, anchored, coordinates=coordinates, variances=variances)
         if sampler == NUTS:
             return sample_nuts(density, fit, seed, ensembles, max_steps, start, progress)
-        state = {"anchor": anchor.tolist(), "guesses": _as_lists(guesses)}
+        lists = {run: {state: [*map(float, x)] for state, x in states.items()} for run, states in guesses.items()}
+        state = {"anchor": anchor.tolist(), "guesses": lists}
         run = _Run(density, fit, seed, start, size, ensembles, saved, state)
         run.go(max_steps, store, executor, progress)
         return run.posterior()
@@ -348,9 +348,3 @@ class _Run:
             acceptance=self._acceptance(),
             seed=self.seed,
         )
-
-
-def _as_lists(guesses: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, list[float]]]:
-    return {
-        run: {state: np.asarray(values).tolist() for state, values in states.items()} for run, states in guesses.items()
-    }

@@ -86,8 +86,7 @@ def mirrored_modes(
 ) -> list[tuple[np.ndarray, float]]:
     """Return the signs (dimension,) that lead to other modes, and their relative densities; highest first.
 
-    The signs of up to four signed parameters are changed in all combinations, those of more one by one and all
-    together.
+    Up to four signs are changed in all combinations, more than four one by one and all together.
     """
     supports = density.problem.joint_prior.supports.values()
     signed = [i for i, (low, high) in enumerate(supports) if low < 0.0 < high]
@@ -98,21 +97,16 @@ def mirrored_modes(
     signs = np.ones((len(turned), mean.size))
     for row, columns in zip(signs, turned, strict=True):
         row[columns] = -1.0
-    values = _counted(density, np.concatenate([mean[None], signs * mean]), calls)
+    found = density.evaluate(np.concatenate([mean[None], signs * mean]), threads=None)
+    if calls is not None:
+        calls.add(found.status)
+    values = found.log_prob
     with np.errstate(over="ignore"):
         shares = np.exp(values[1:] - values[0])
     steps = (signs - 1.0) * mean
     far = np.einsum("mi,mi->m", steps, np.linalg.solve(covariance, steps.T).T) > SEPARATE**2
     kept = [i for i in np.argsort(-shares) if far[i] and shares[i] > CREDIBLE]
     return [(signs[i], float(shares[i])) for i in kept]
-
-
-def _counted(density: LogPosterior, points: np.ndarray, calls: CallCount | None) -> np.ndarray:
-    """Return the log-densities of points (points, dimension), and count them."""
-    found = density.evaluate(points, threads=None)
-    if calls is not None:
-        calls.add(found.status)
-    return found.log_prob
 
 
 def _finite(
@@ -123,8 +117,10 @@ def _finite(
     while len(points) < wanted and tried < REDRAWS * wanted:
         candidates = drawn(wanted)
         tried += wanted
-        values = _counted(density, candidates, calls) if len(candidates) else np.empty(0)
-        points = np.concatenate([points, candidates[np.isfinite(values)]])
+        if len(candidates):
+            found = density.evaluate(candidates, threads=None)
+            calls.add(found.status)
+            points = np.concatenate([points, candidates[np.isfinite(found.log_prob)]])
     if len(points) < wanted:
         other = "give a converged fit of this problem, or start='prior'"
         remedy = "narrow the priors, see prior_predictive(problem)" if start == PRIOR else other
