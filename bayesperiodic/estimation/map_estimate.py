@@ -174,7 +174,7 @@ def _describe(
     data, _ = information(problem, best)
     solutions = best.here.simulator.solutions(best.theta)
     inverse, lost = _inverse(data + problem.joint_prior.curvature(best.theta))
-    covariance = with_uncertain_noise(problem, best, inverse)
+    covariance = with_uncertain_noise(problem, best, inverse).copy()
     shift = doubling_shift(problem, best, solutions, covariance)
     shift[lost] = np.nan
     covariance[lost], covariance[:, lost] = np.nan, np.nan

@@ -172,7 +172,8 @@ def test_determined_parameter_keeps_its_sd_beside_undetermined_ones():
         fit = bp.map_estimate(bp.Problem(PRODUCT, [run], priors=priors, fixed=fixed), progress=False)
     rate = 2 * np.pi * np.cos(2 * np.pi * grid(60))
     assert fit.sd["shift_a"] == pytest.approx(np.sqrt(0.25 / np.sum(rate**2)), rel=1e-6)
-    assert fit.sd["a"] == fit.sd["b"] == np.inf
+    assert fit.sd["a"] == fit.sd["b"] == fit.robust_sd["a"] == fit.robust_sd["b"] == np.inf
+    assert 0.0 < fit.robust_sd["shift_a"] < fit.sd["shift_a"]  # the noise is smaller than the fixed variance
 
 
 def test_estimate_at_a_bound_is_the_bounded_least_squares_solution():
