@@ -1,4 +1,4 @@
-"""Argument validation: every message names the argument, what it must be, and what was given."""
+"""Argument validation, with messages `name: must be …, got …`."""
 
 import difflib
 import reprlib
@@ -88,10 +88,7 @@ def integer(argument: str, value: Any, minimum: int | None = None) -> int:
 
 
 def finite_vector(argument: str, values: Any, length: int | None = None, meaning: str = "") -> np.ndarray:
-    """Return `values` as a 1-d float array; raise a ValueError for text, a wrong length, NaN or infinity.
-
-    `meaning` explains the length in the message, such as "samples·periods".
-    """
+    """Return `values` as a finite 1-d float array; `meaning` explains the length, such as "samples·periods"."""
     try:
         array = np.asarray(values, dtype=float)
     except (TypeError, ValueError):

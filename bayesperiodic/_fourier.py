@@ -8,19 +8,7 @@ import numpy as np
 
 
 def coefficients(values: np.ndarray, harmonics: int | None = None) -> np.ndarray:
-    """Return the complex amplitudes 0 … `harmonics` of signals on a grid.
-
-    Parameters
-    ----------
-    values : array (…, points)
-        One response period, end point excluded.
-    harmonics : int, optional
-        The highest harmonic; by default the highest one below the Nyquist harmonic of the grid.
-
-    Returns
-    -------
-    array (…, harmonics + 1), complex
-    """
+    """Return the amplitudes (…, harmonics + 1) of signals (…, points), by default all below the Nyquist harmonic."""
     points = values.shape[-1]
     limit = highest_harmonic(points)
     amplitudes = np.fft.rfft(values, axis=-1)[..., : 1 + (limit if harmonics is None else min(harmonics, limit))]
@@ -39,7 +27,7 @@ def on_grid(amplitudes: np.ndarray, points: int) -> np.ndarray:
 
 
 def at_times(amplitudes: np.ndarray, phase: np.ndarray) -> np.ndarray:
-    """Return one signal at arbitrary phases (fractions of the period), by Horner's rule in exp(2πi phase)."""
+    """Return one signal at given phases (fractions of the period), by Horner's rule in exp(2πi phase)."""
     turn = np.exp(2j * np.pi * np.asarray(phase))
     total = np.zeros_like(turn)
     for amplitude in amplitudes[::-1]:

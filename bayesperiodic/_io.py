@@ -14,10 +14,38 @@ import numpy as np
 
 HEADER = "bayesperiodic_result"
 ARRAYS = "arrays"
+REMEDY = "load it with the version that saved it, or compute it again"
+# Module of every class in files. Modules are named, not imported: this module is below them.
+MODULES = {
+    "Bands": "bayesperiodic.diagnostics.predictive",
+    "Branch": "bayesperiodic.periodic.continuation",
+    "Calibration": "bayesperiodic.diagnostics.calibration",
+    "Comparison": "bayesperiodic.diagnostics.comparison",
+    "Experiment": "bayesperiodic.data.experiment",
+    "FourierScheme": "bayesperiodic.periodic.schemes",
+    "HopfPoint": "bayesperiodic.periodic.hopf",
+    "Identifiability": "bayesperiodic.diagnostics.identifiability",
+    "MapEstimate": "bayesperiodic.estimation.result",
+    "NoiseSplit": "bayesperiodic.estimation.result",
+    "Orbit": "bayesperiodic.orbits.orbit",
+    "Orbits": "bayesperiodic.orbits.orbit",
+    "PeriodicSolution": "bayesperiodic.periodic.solution",
+    "PoincareSection": "bayesperiodic.orbits.section",
+    "Posterior": "bayesperiodic.sampling.posterior",
+    "Prediction": "bayesperiodic.diagnostics.predictive",
+    "PriorPredictive": "bayesperiodic.diagnostics.predictive",
+    "Profile": "bayesperiodic.estimation.profile",
+    "Recording": "bayesperiodic.data.recording",
+    "Scheme": "bayesperiodic.periodic.schemes",
+    "Structure": "bayesperiodic.symmetry.structure",
+    "Symmetry": "bayesperiodic.symmetry.structure",
+    "Transient": "bayesperiodic.diagnostics.predictive",
+    "Whiteness": "bayesperiodic.estimation.result",
+}
 
 
 class Result:
-    """Base of frozen dataclasses of plain data with a `save` method; `load` reads them."""
+    """Base class of frozen dataclasses of plain data, with a `save` method; `load` reads them."""
 
     def save(self, path: str | Path) -> None:
         """Write the result to an HDF5 file; an existing file is replaced when the new one is complete.
@@ -32,7 +60,7 @@ class Result:
         Raises
         ------
         OSError
-            If the file cannot be written there.
+            If the file cannot be written.
         TypeError
             If the result contains something other than plain data, such as a function.
         """
@@ -85,15 +113,15 @@ def load(path: str | Path) -> Any:
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file contains no saved result, or one of a version of this package with other fields.
+        If the file contains no saved result, or one of another version of this package.
 
     Examples
     --------
-    >>> import pathlib, tempfile, bayesperiodic as bp
-    >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.h5"
-    >>> bp.Experiment("run", 2.0, {"x": [0.0, 1.0, 0.0, -1.0]}, samples=4).save(path)
-    >>> bp.load(path).outputs["x"].tolist()
-    [0.0, 1.0, 0.0, -1.0]
+    >>> import pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "fit.h5"
+    >>> fit.save(path)
+    >>> bp.load(path).theta == fit.theta
+    True
     """
     import h5py
 
@@ -115,8 +143,10 @@ def load(path: str | Path) -> Any:
 def _encode(value: Any, arrays: dict[str, Any], trees: list[Any]) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         kind = type(value)
+        if MODULES.get(kind.__name__) != kind.__module__:
+            raise TypeError(f"result: must consist of plain data and results of bayesperiodic, got {kind.__name__}.")
         content = {f.name: _encode(getattr(value, f.name), arrays, trees) for f in fields(value)}
-        return {"result": f"{kind.__module__}:{kind.__qualname__}", "fields": content}
+        return {"result": kind.__name__, "fields": content}
     if isinstance(value, np.ndarray):
         key = str(len(arrays))
         arrays[key] = value
@@ -153,13 +183,16 @@ def _decode(value: Any, arrays: dict[str, Any], path: str | Path) -> Any:
         return pd.DataFrame(value["table"], index=value["index"])
     if "tree" in value:
         return _read_tree(path)
-    content = {name: _decode(item, arrays, path) for name, item in value["fields"].items()}
-    kind = _result_class(value["result"])
+    name = str(value["result"])
+    if name not in MODULES:
+        raise ValueError(f"path: must contain a result of this version of bayesperiodic, got class {name!r}; {REMEDY}.")
+    kind = getattr(import_module(MODULES[name]), name)
+    content = {field: _decode(item, arrays, path) for field, item in value["fields"].items()}
     needed = {f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING}
     if not needed <= content.keys() <= {f.name for f in fields(kind)}:
         raise ValueError(
-            f"path: must contain a result of this version of bayesperiodic, got {str(path)!r}, whose {kind.__name__} "
-            "has other fields; load it with the version that saved it, or compute it again."
+            f"path: must contain a result of this version of bayesperiodic, got {str(path)!r}, whose {name} has other "
+            f"fields; {REMEDY}."
         )
     return kind(**content)
 
@@ -173,14 +206,3 @@ def _read_tree(path: str | Path) -> Any:
     result = xr.DataTree.from_dict(groups)
     result.attrs = {key: value for key, value in loaded.attrs.items() if key != HEADER}
     return result
-
-
-def _result_class(name: str) -> Any:
-    module, _, qualname = name.partition(":")
-    try:
-        found = getattr(import_module(module), qualname, None) if module.startswith("bayesperiodic.") else None
-    except ModuleNotFoundError:
-        found = None
-    if not is_dataclass(found):
-        raise ValueError(f"path: must contain a result of bayesperiodic, got {name!r}; load it with its own version.")
-    return found

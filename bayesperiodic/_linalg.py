@@ -17,58 +17,24 @@ Value = TypeVar("Value")
 TINY = np.finfo(float).tiny
 
 
+def scaled(matrix: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """Return M_ij u_i u_j of a matrix (n, n) and units (n,)."""
+    return matrix * np.outer(units, units)
+
+
 def hessian_scale(hessian: np.ndarray) -> np.ndarray:
     """Return 1/√|H_ii|, the units in which a Hessian H has a unit diagonal."""
     return 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), TINY))
 
 
 def hessian_eigh(hessian: np.ndarray, scale: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Decompose a Hessian or information matrix H into the eigenpairs of H_ij s_i s_j.
-
-    Parameters
-    ----------
-    hessian : array (n, n)
-        Symmetric.
-    scale : array (n,), optional
-        The units s; by default `hessian_scale`.
-
-    Returns
-    -------
-    values : array (n,)
-        Ascending eigenvalues w.
-    vectors : array (n, n)
-        Eigenvectors V, in columns. The inverse is H⁻¹ = (V / w) Vᵀ s_i s_j.
-    scale : array (n,)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> values, vectors, scale = hessian_eigh(np.array([[4e12, 1e6], [1e6, 1.0]]))
-    >>> values.round(12).tolist(), scale.tolist()
-    ([0.5, 1.5], [5e-07, 1.0])
-    """
+    """Return eigenvalues w, eigenvectors V of H_ij s_i s_j, and s; H⁻¹ = ``scaled((V / w) @ V.T, s)``."""
     scale = hessian_scale(hessian) if scale is None else scale
-    return *np.linalg.eigh(hessian * np.outer(scale, scale)), scale
+    return *np.linalg.eigh(scaled(hessian, scale)), scale
 
 
 def covariance_eigh(covariance: np.ndarray, sd: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Decompose a covariance C into the eigenpairs of the correlation C_ij / (sd_i sd_j).
-
-    Parameters
-    ----------
-    covariance : array (n, n)
-        Symmetric.
-    sd : array (n,), optional
-        By default the standard deviations √C_ii.
-
-    Returns
-    -------
-    values : array (n,)
-        Ascending eigenvalues w.
-    vectors : array (n, n)
-        Eigenvectors V, in columns. The covariance is C = V w Vᵀ sd_i sd_j.
-    sd : array (n,)
-    """
+    """Return eigenvalues w, eigenvectors V of the correlation C_ij / (sd_i sd_j), and sd, by default √C_ii."""
     sd = _standard_deviations(covariance) if sd is None else sd
     return *np.linalg.eigh(covariance / np.outer(sd, sd)), sd
 

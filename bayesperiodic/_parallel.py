@@ -1,4 +1,4 @@
-"""Independent tasks on the cores of this machine or on the workers of a cluster: the implementation of `executor=`."""
+"""Independent tasks on the cores of this machine or on the workers of a cluster, for the argument `executor`."""
 
 import hashlib
 import json
@@ -45,13 +45,11 @@ def available_cores() -> int:
 
 
 def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def in_threads(function: Callable[[Item], Value], items: Sequence[Item], threads: int) -> list[Value]:
-    """Return function(item) of every item, in order, computed by this thread and `threads` − 1 others."""
+    """Return function(item) of every item, in order, computed by `threads` threads, this one included."""
     if min(threads, len(items)) <= 1:
         return [function(item) for item in items]
     results: list[Any] = [None] * len(items)
@@ -88,32 +86,21 @@ def checked_executor(executor: Any) -> Any:
 
 
 def _ignore_interrupts() -> None:
-    """Leave Ctrl-C, which all processes of a terminal receive, to the main process, which saves the results."""
+    """Ignore Ctrl-C, which all processes of a terminal receive; the main process handles it and saves the results."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class TaskPool:
     """Workers for independent tasks that need the same data; a context manager.
 
-    The executor that is given stays open; one that is made here is closed at the end. None stands for threads of this
-    process, which share its memory. A number stands for new processes; they are spawned, because forked processes
+    A given executor stays open; one that is created here is closed at the end. None stands for threads of this process,
+    which use the shared object directly. A number stands for new processes; they are spawned, because forked processes
     would inherit the locks of threads that run kernels, and wait for them forever.
 
-    The shared object is pickled once. It is sent with the first tasks, one per worker that the executor reports. Each
+    The shared object is pickled once and sent with the first tasks, one per worker that the executor reports. Each
     process keeps it under its digest; a process that lacks it returns a marker, and the task is sent again with the
-    object. With Dask the object is a result on the cluster, which workers pass to each other and which the scheduler
-    computes again if all workers that held it are lost. Threads use the object directly.
-
-    Parameters
-    ----------
-    executor : None, int, Dask Client, or executor
-    shared : object
-        What all tasks need.
-
-    Raises
-    ------
-    ValueError
-        If the executor takes no tasks, or the shared object cannot be pickled.
+    object. With Dask the object is a result on the cluster, which is computed again if all workers with it are lost.
+    Raises a ValueError if the executor takes no tasks, or the shared object cannot be pickled.
     """
 
     def __init__(self, executor: Any, shared: Any):
@@ -157,29 +144,14 @@ class TaskPool:
         self._unsent, self._at_once = workers or 1, workers and QUEUED_PER_WORKER * workers
 
     def run(
-        self,
-        function: Callable[[Any, Any], Any],
-        tasks: Iterable[Any],
-        then: Callable[[int, Any], Any] | None = None,
+        self, function: Callable[[Any, Any], Any], tasks: Iterable[Any], then: Callable[[int, Any], Any] | None = None
     ) -> Iterator[tuple[int, Any]]:
         """Yield the number and the result function(shared, task) of every task when it is finished.
 
-        Exceptions of the function are raised here. A task must depend on its arguments only, because clusters repeat
-        the tasks of a lost worker.
-
-        Parameters
-        ----------
-        function : callable
-            Defined in a module, so that workers can import it.
-        tasks : iterable
-            Consumed as workers become free.
-        then : callable, optional
-            Function of a number and its result that returns the next task with the same number, or None.
-
-        Raises
-        ------
-        WorkersLost
-            If the workers died or cannot be reached.
+        The function is defined in a module, so that workers can import it, and depends on its arguments only, because
+        clusters repeat the tasks of a lost worker. Tasks are consumed as workers become free; then(number, result)
+        returns the next task with the same number, or None. Exceptions of the function are raised here, a WorkersLost
+        if the workers died or cannot be reached.
         """
         finished: SimpleQueue[int] = SimpleQueue()
         pending = enumerate(tasks)
@@ -246,7 +218,7 @@ def _losses(*more: type[Exception], hint: str = "") -> Iterator[None]:
 
 
 class _Missing:
-    """Returned by a process that lacks the shared object."""
+    """Result of a process that lacks the shared object."""
 
 
 _TASK = threading.local()
@@ -301,35 +273,12 @@ def checkpointed_tasks(
 ) -> list[Line]:
     """Run the tasks whose results a file lacks, and return the results (lines) of all in the order of the tasks.
 
-    A line is written when its task is finished. After an interruption at any time, the same call runs the rest; an
-    incomplete last line is removed.
-
-    Parameters
-    ----------
-    path : Path, optional
-        File with one JSON line per task. Lines of another source remain in it and are ignored. By default nothing is
-        stored.
-    tasks : sequence
-        Distinct, hashable and picklable.
-    work : callable
-        Function of the shared object and a task, defined in a module, that returns the line, with the key "source".
-    task_of : callable
-        Returns the task of a line.
-    source : str
-        Identifies the version and the settings of a result.
-    shared : object
-        What all tasks need; sent once to each worker.
-    executor : None, int, Dask Client, or executor with the interface of concurrent.futures
-        None runs the tasks one after the other in this process.
-    progress : bool
-        Show a progress bar.
-
-    Raises
-    ------
-    ValueError
-        If another process uses the file, or the executor takes no tasks.
-    WorkersLost
-        If the executor's workers died (a RuntimeError); finished tasks are in the file.
+    The file has one JSON line per task, written when the task is finished; without a path nothing is stored. After an
+    interruption the same call runs the remaining tasks; an incomplete last line is removed. Tasks are distinct,
+    hashable and picklable. work(shared, task), defined in a module, returns the line; its "source" identifies version
+    and settings, and lines of another source are ignored. task_of(line) returns the task. Without an executor the tasks
+    run sequentially in this process. Raises a ValueError if another process uses the file or the executor takes no
+    tasks, a WorkersLost if workers died; finished tasks are in the file.
     """
     given = checked_executor(executor)
     with nullcontext() if path is None else _locked(path):
@@ -363,7 +312,7 @@ def _locked(path: Path) -> Any:
 
 
 def _read(path: Path | None) -> list[Line]:
-    """Return the complete lines of a file; remove an incomplete last line from it."""
+    """Return the complete lines of a file; remove an incomplete last line."""
     if path is None or not path.is_file():
         return []
     content = path.read_bytes()

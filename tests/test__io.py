@@ -1,5 +1,11 @@
+import dataclasses
+import importlib
 import json
 import os
+import pkgutil
+import re
+import sys
+import typing
 
 import h5py
 import numpy as np
@@ -8,6 +14,7 @@ import pytest
 import xarray as xr
 
 import bayesperiodic as bp
+from bayesperiodic import _io
 from tests.known import grid
 
 
@@ -110,10 +117,61 @@ def test_error_names_the_missing_folder(tmp_path):
         experiment.save(tmp_path / "nowhere" / "run.h5")
 
 
-@pytest.mark.parametrize("kind", ["subprocess:Popen", "bayesperiodic.of_old:MapEstimate"])
-def test_file_cannot_load_classes_of_other_packages_or_versions(solved, tmp_path, kind):
+def classes_in_files() -> list[tuple[str, str]]:
+    """Return names and modules of all results and of the dataclasses that they contain."""
+    for module in pkgutil.walk_packages(bp.__path__, "bayesperiodic."):
+        if "_kernels" not in module.name:
+            importlib.import_module(module.name)
+    found = set()
+
+    def visit(kind):
+        for argument in typing.get_args(kind):
+            visit(argument)
+        if isinstance(kind, type) and kind.__module__.startswith("bayesperiodic.") and kind not in found:
+            if dataclasses.is_dataclass(kind):
+                found.add(kind)
+                hints = typing.get_type_hints(kind)
+                for field in dataclasses.fields(kind):
+                    visit(hints[field.name])
+            for subclass in kind.__subclasses__():
+                visit(subclass)
+
+    visit(_io.Result)
+    return sorted((kind.__name__, kind.__module__) for kind in found)
+
+
+def test_table_of_classes_contains_every_result_and_no_other_class():
+    assert classes_in_files() == sorted(_io.MODULES.items())
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "subprocess:Popen",
+        "Popen",
+        "antigravity",
+        "Iterate",
+        "__import__",
+        "bayesperiodic.of_old:MapEstimate",
+        "bayesperiodic.estimation.result:MapEstimate",
+        ["MapEstimate"],
+    ],
+)
+def test_file_cannot_import_or_create_other_classes(solved, tmp_path, kind):
     solved[1].save(tmp_path / "fit.h5")
+    before = set(sys.modules)
     with h5py.File(tmp_path / "fit.h5", "a") as file:
-        file.attrs["bayesperiodic_result"] = f'{{"result": "{kind}", "fields": {{"args": "true"}}}}'
-    with pytest.raises(ValueError, match=f"path: must contain a result of bayesperiodic, got '{kind}'"):
+        file.attrs["bayesperiodic_result"] = json.dumps({"result": kind, "fields": {"args": "true"}})
+    message = f"path: must contain a result of this version of bayesperiodic, got class {str(kind)!r}; load it with"
+    with pytest.raises(ValueError, match=re.escape(message)):
         bp.load(tmp_path / "fit.h5")
+    assert set(sys.modules) == before
+
+
+def test_result_with_an_object_of_another_class_cannot_be_saved(tmp_path):
+    class Experiment(bp.Experiment):
+        pass
+
+    run = Experiment("run", 2.0, {"x": [0.0, 1.0, 0.0, -1.0]}, samples=4)
+    with pytest.raises(TypeError, match="result: must consist of plain data and results of bayesperiodic, got"):
+        run.save(tmp_path / "run.h5")

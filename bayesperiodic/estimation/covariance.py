@@ -1,11 +1,11 @@
-"""Standard deviations that hold although the noise model does not: the sandwich with the residual's own spectrum."""
+"""Diagnostics of an estimate: robust covariance, uncertain noise parameters, discretisation, noise of the inputs."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from bayesperiodic import _fourier
+from bayesperiodic._linalg import TINY, covariance_eigh, hessian_scale, scaled
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.estimation.gauss_newton import Iterate, information
 from bayesperiodic.periodic.compiled import CONVERGED
@@ -17,7 +17,7 @@ from bayesperiodic.posterior.observation import Response
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import orbit_multipliers
 
-# Correlation lengths tried, in response periods; white noise beside them has this prior probability.
+# Correlation lengths tried, in response periods, and the prior probability of white noise, the alternative to them.
 LENGTHSCALES = np.geomspace(1e-3, 3.0, 40)
 WHITE = 0.5
 ROUNDS, SETTLED = 10, 1e-3
@@ -27,12 +27,12 @@ RIDGE = 1e-12
 def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarray) -> np.ndarray:
     """Return C (J + P) C, with C the inverse of H of eq. (8), P the prior's curvature and J the scores' variance.
 
-    J takes the variance of each Fourier component from the residual itself. A first-order autoregressive spectrum (or
-    white noise) is fitted to it, the residual is divided by that (prewhitening, [1]_), and what is left is smoothed
-    over neighbouring harmonics. Two things make the low harmonics, on which most outputs depend, honest: the fit takes
-    out just these, so that the spectrum has the restricted likelihood [2]_, with the parameters integrated out; and
-    the little that is left tells the correlation length poorly, so that J is averaged over its posterior, and raised
-    for the few values behind each smoothed one. Components that are no Fourier components keep the model's variance.
+    J takes the variance of each Fourier component from the residual: a first-order autoregressive spectrum, or white
+    noise, is fitted to it, the residual is divided by that spectrum (prewhitening, [1]_), and the remaining spectrum is
+    smoothed over neighbouring harmonics. Most outputs depend on the low harmonics, which the fit removes from the
+    residual. Therefore the spectrum is fitted by restricted likelihood [2]_, with the parameters integrated out, J is
+    averaged over the posterior of the correlation length, and raised for the few values behind each smoothed one.
+    Components that are no Fourier components keep the variance of the noise model.
 
     References
     ----------
@@ -54,65 +54,47 @@ def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarra
     for block, s, r, unit in zip(likelihood.blocks, changes, residuals, units, strict=True):
         variance = np.ones(block.size)
         if block.kind == SPECTRAL:
-            variance = _Refits.of(block, s, r, unit, information).variance(block) if r.any() else np.zeros(block.size)
+            variance = _residual_variance(block, s, r, unit, information) if r.any() else np.zeros(block.size)
         middle = middle + (s * variance) @ s.T
     return covariance @ middle @ covariance
 
 
-@dataclass(frozen=True)
-class _Refits:
-    """Least squares of one block's whitened residual, once for each spectrum that it may have.
+def _residual_variance(
+    block: Block, s: np.ndarray, r: np.ndarray, unit: np.ndarray, information: np.ndarray
+) -> np.ndarray:
+    """Return the variance (size,) of a block's whitened residual r, averaged over the spectra that it may have.
 
-    Attributes
-    ----------
-    spectrum : array (spectra, size)
-        Of the whitened residual, with the scale that suits it best.
-    square : array (spectra, size)
-        Squared residuals of the fits in units of their spectra.
-    left : array (spectra, size)
-        What to expect of these: the independent values per component, less what the fit takes out.
-    posterior : array (spectra,)
-        Probabilities of the spectra.
+    For every spectrum r is fitted again by least squares; the information of other blocks and the prior on θ is kept.
     """
+    shape, log_prior = _shapes(block, unit)
+    scale = hessian_scale(information)
+    others = scaled(information - s @ s.T, scale)
+    values, vectors = np.linalg.eigh(0.5 * (others + others.T))
+    others = (vectors * np.maximum(values, RIDGE)) @ vectors.T
+    s, score = s * scale[:, None], (s * scale[:, None]) @ r
+    own = (s / shape[:, None, :]) @ s.T
+    pull = (r / shape) @ s.T
+    size = np.ones(len(shape))
+    for _ in range(ROUNDS):
+        total = own / size[:, None, None] + others
+        step = np.linalg.solve(total, (pull / size[:, None] - score)[..., None])[..., 0]
+        square = (r - step @ s) ** 2 / shape
+        taken = np.einsum("am,gam->gm", s, np.linalg.solve(total, s / shape[:, None, :])) / size[:, None]
+        # Expected squares: the independent values per component, less those removed by the fit.
+        left = np.maximum(block.weight - taken, 0.0)
+        before = size
+        size = np.maximum(square.sum(axis=1), TINY) / np.maximum(left.sum(axis=1), RIDGE)
+        if np.allclose(size, before, rtol=SETTLED, atol=0.0):
+            break
+    misfit = square.sum(axis=1) / size + np.einsum("ga,ab,gb->g", step, others, step) + 2.0 * step @ score
+    logarithms = block.weight * np.sum(np.log(size[:, None] * shape), axis=1) + np.linalg.slogdet(total)[1]
+    ratios = [_smoothed(block, *one) for one in zip(square / size[:, None], left, strict=True)]
+    return _probabilities(log_prior - 0.5 * (misfit + logarithms)) @ (size[:, None] * shape * ratios)
 
-    spectrum: np.ndarray
-    square: np.ndarray
-    left: np.ndarray
-    posterior: np.ndarray
 
-    @classmethod
-    def of(cls, block: Block, s: np.ndarray, r: np.ndarray, unit: np.ndarray, information: np.ndarray) -> "_Refits":
-        """Return the fits; what other blocks and the prior say of θ stays as it is."""
-        shape, log_prior = _shapes(block, unit)
-        scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(information)), np.finfo(float).tiny))
-        others = _positive((information - s @ s.T) * np.outer(scale, scale))
-        s, score = s * scale[:, None], (s * scale[:, None]) @ r
-        own = (s / shape[:, None, :]) @ s.T
-        pull = (r / shape) @ s.T
-        size = np.ones(len(shape))
-        for _ in range(ROUNDS):
-            total = own / size[:, None, None] + others
-            step = np.linalg.solve(total, (pull / size[:, None] - score)[..., None])[..., 0]
-            square = (r - step @ s) ** 2 / shape
-            taken = np.einsum("am,gam->gm", s, np.linalg.solve(total, s / shape[:, None, :])) / size[:, None]
-            left = np.maximum(block.weight - taken, 0.0)
-            before = size
-            size = np.maximum(square.sum(axis=1), np.finfo(float).tiny) / np.maximum(left.sum(axis=1), RIDGE)
-            if np.allclose(size, before, rtol=SETTLED, atol=0.0):
-                break
-        misfit = square.sum(axis=1) / size + np.einsum("ga,ab,gb->g", step, others, step) + 2.0 * step @ score
-        logarithms = block.weight * np.sum(np.log(size[:, None] * shape), axis=1) + np.linalg.slogdet(total)[1]
-        log_posterior = log_prior - 0.5 * (misfit + logarithms)
-        posterior = np.exp(log_posterior - log_posterior.max())
-        return cls(size[:, None] * shape, square / size[:, None], left, posterior / posterior.sum())
-
-    def variance(self, block: Block) -> np.ndarray:
-        """Return the variance (size,) of the whitened residual's components, corrected and averaged."""
-        corrected = [
-            spectrum * _smoothed(block, square, left)
-            for spectrum, square, left in zip(self.spectrum, self.square, self.left, strict=True)
-        ]
-        return self.posterior @ np.array(corrected)
+def _probabilities(log_weights: np.ndarray) -> np.ndarray:
+    weights = np.exp(log_weights - log_weights.max())
+    return weights / weights.sum()
 
 
 def _shapes(block: Block, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -122,12 +104,6 @@ def _shapes(block: Block, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     weight = np.exp(LENGTHSCALE.log_prob(LENGTHSCALES)) * LENGTHSCALES
     weight = np.concatenate([[WHITE], (1.0 - WHITE) * weight / weight.sum()])
     return shape / shape.mean(axis=1, keepdims=True), np.log(weight)
-
-
-def _positive(matrix: np.ndarray) -> np.ndarray:
-    """Return a symmetric matrix with its negative eigenvalues cut off."""
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    return (vectors * np.maximum(values, RIDGE)) @ vectors.T
 
 
 def _smoothed(block: Block, square: np.ndarray, left: np.ndarray) -> np.ndarray:
@@ -146,51 +122,37 @@ def _smoothed(block: Block, square: np.ndarray, left: np.ndarray) -> np.ndarray:
 
 
 def _excess(freedom: np.ndarray) -> np.ndarray:
-    """Return the mean of a variance over its estimate, ν/(ν − 2), for estimates with ν degrees of freedom."""
+    """Return the mean ratio ν/(ν − 2) of a variance to its estimate with ν degrees of freedom."""
     return np.maximum(freedom, 1.0) / np.maximum(freedom - 2.0, 1.0)
 
 
-# Quantiles of the priors of a spectrum's shape that are tried: many of the first parameter, few of any other.
+# Values tried of the first parameter of a spectrum's shape and of any other, between these quantiles of their priors.
 MANY, FEW = 60, 9
 TAIL = 0.005
 UPDATES, JITTER = 3, 1e-12
 
 
 def with_uncertain_noise(problem: Problem, estimate: Iterate, covariance: np.ndarray) -> np.ndarray:
-    """Return the covariance of θ (names, names) with the noise parameters integrated out instead of held.
+    """Return the covariance of θ (names, names) with the shape of the noise spectrum integrated out.
 
-    Models without a shape, whose variances alone are unknown, keep their covariance; intervals by Student's t are all
-    they need. A spectrum's shape is known poorly from the low harmonics, on which most outputs depend and which the fit
-    takes out. So θ is estimated again, by linear least squares, for shapes from all over their prior; their posterior
-    is that of the restricted likelihood [1]_, with θ integrated out, and the covariance is that of the mixture about
-    the estimate. With several channels the changes that each brings by itself are added.
-
-    Parameters
-    ----------
-    problem : Problem
-    estimate : Iterate
-    covariance : array (names, names)
-        Inverse of H of eq. (8) at the estimate.
-
-    References
-    ----------
-    .. [1] D. A. Harville, Maximum likelihood approaches to variance component estimation and to related problems,
-       Journal of the American Statistical Association 72 (1977) 320-338.
+    If variances alone are unknown, the covariance is kept: Student's t accounts for them. Otherwise θ is estimated
+    again by linear least squares for shapes from the whole support of their prior. Their posterior is that of the
+    restricted likelihood (Harville, see `robust_covariance`), with θ integrated out; the covariance is that of the
+    mixture about the estimate. The changes of the covariance by several channels are added.
     """
-    shaped = [(group, members) for group, members in problem.likelihood.groups() if _is_shaped(problem, group, members)]
+    shaped = [group for group in problem.likelihood.groups() if _is_shaped(problem, *group)]
     if not shaped or not np.all(np.diag(covariance) > 0.0):
         return covariance
     total = information(problem, estimate)[0] + problem.joint_prior.curvature(estimate.theta)
     result = covariance.copy()
     for group, members in shaped:
         result += _mixture(problem, estimate, total, covariance, group, members) - covariance
-    scale = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(result / np.outer(scale, scale))
-    return (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale)
+    values, vectors, sd = covariance_eigh(result, np.sqrt(np.diag(covariance)))
+    return scaled((vectors * np.maximum(values, 0.0)) @ vectors.T, sd)
 
 
 def _is_shaped(problem: Problem, group: tuple[str, ...], members: list[int]) -> bool:
-    """Return whether a group of noise parameters, all unknown, has a shape beside its variance, over whole periods."""
+    """Return whether a group of unknown noise parameters, for whole periods, has others than a variance."""
     shaped = any(name.partition("[")[0] in problem.noise.shape_priors for name in group)
     spectral = all(problem.likelihood.blocks[b].kind == SPECTRAL for b in members)
     return shaped and spectral and set(group) <= set(problem.free_noise)
@@ -204,7 +166,7 @@ def _mixture(
     group: tuple[str, ...],
     members: list[int],
 ) -> np.ndarray:
-    """Return the covariance of the mixture over the noise parameters of one group, the others held."""
+    """Return the covariance of the mixture over the noise parameters of one group, the others fixed."""
     likelihood, blocks = problem.likelihood, [problem.likelihood.blocks[b] for b in members]
     scale = np.sqrt(np.diag(covariance))
     s = np.concatenate([estimate.here.changes[b] for b in members], axis=1) * scale[:, None]
@@ -212,30 +174,27 @@ def _mixture(
     weight = np.concatenate([np.full(block.size, block.weight) for block in blocks])
     here = estimate.noise[[likelihood.names.index(name) for name in group]]
     now = weight / _spectra(problem, blocks, here)
-    others = hessian * np.outer(scale, scale) - (s * now) @ s.T + JITTER * np.eye(scale.size)
+    others = scaled(hessian, scale) - (s * now) @ s.T + JITTER * np.eye(scale.size)
     pull, freedom = -(s * now) @ r, max(float(weight.sum()) - len(problem.names), 1.0)
     points, log_prior = _points(problem)
     log_posterior, found = np.empty(len(points)), np.empty((len(points), *covariance.shape))
-    spectra = _spectra(problem, blocks, np.column_stack([np.ones(len(points)), points]))
-    for i in range(len(points)):
-        shape = spectra[i]
+    for i, shape in enumerate(_spectra(problem, blocks, np.column_stack([np.ones(len(points)), points]))):
         own = weight / shape
         left, variance = r, float(np.sum(own * r**2)) / freedom
         for _ in range(UPDATES):
             total = (s * own) @ s.T / variance + others
             step = np.linalg.solve(total, s @ (own * r) / variance + pull)
             left = r - step @ s
-            variance = max(float(np.sum(own * left**2)) / freedom, np.finfo(float).tiny)
+            variance = max(float(np.sum(own * left**2)) / freedom, TINY)
         misfit = np.sum(own * left**2) / variance + step @ others @ step - 2.0 * step @ pull
         logarithms = float(np.sum(weight * np.log(variance * shape))) + np.linalg.slogdet(total)[1]
         log_posterior[i] = log_prior[i] - 0.5 * (misfit + logarithms)
         found[i] = np.linalg.inv(total) + np.outer(step, step)
-    posterior = np.exp(log_posterior - log_posterior.max())
-    return np.tensordot(posterior / posterior.sum(), found, 1) * np.outer(scale, scale)
+    return scaled(np.tensordot(_probabilities(log_posterior), found, 1), scale)
 
 
 def _spectra(problem: Problem, blocks: list[Block], values: np.ndarray) -> np.ndarray:
-    """Return the variances of the components of all blocks one after the other, (…, components)."""
+    """Return the variances of the components of all blocks, (…, components)."""
     return np.concatenate([problem.noise.spectrum(block, values)[0] for block in blocks], axis=-1)
 
 
@@ -255,18 +214,9 @@ def _points(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 def doubling_shift(
     problem: Problem, estimate: Iterate, solutions: Mapping[str, PeriodicSolution], covariance: np.ndarray
 ) -> np.ndarray:
-    """Return by how many standard deviations the estimate would move on twice as many points, (names,).
+    """Return the change of the estimate on twice as many points, in sds (names,), by a Gauss-Newton step.
 
-    Every experiment is solved again on the finer grid at the estimate; a Gauss-Newton step turns the change of the
-    residuals into that of the parameters. NaN if a solve fails.
-
-    Parameters
-    ----------
-    problem : Problem
-    estimate : Iterate
-    solutions : mapping of str to PeriodicSolution
-        At the estimate.
-    covariance : array (names, names)
+    NaN if a solve fails.
     """
     finer: list[np.ndarray] = []
     for e in problem.experiments:
@@ -311,17 +261,10 @@ def _on_twice_the_points(
 
 
 def input_noise(problem: Problem, theta: np.ndarray, solutions: Mapping[str, PeriodicSolution]) -> dict[str, float]:
-    """Return the standard deviation that the inputs' noise brings to each channel, root mean square over experiments.
+    """Return the standard deviation that the inputs' noise causes in each channel, root mean square over experiments.
 
-    The noise of each kept Fourier amplitude of an input, and of its derivatives, is carried through the linearised
-    periodic problem; the variance is averaged over the period, within the harmonics kept.
-
-    Parameters
-    ----------
-    problem : Problem
-    theta : array (names,)
-    solutions : mapping of str to PeriodicSolution
-        At θ, by experiment.
+    The noise of each kept Fourier amplitude of an input and of its derivatives is propagated through the linearised
+    problem; the variance is averaged over the period.
     """
     variances: dict[str, list[float]] = {channel: [0.0] for channel in problem.channels}
     for e in problem.experiments:
@@ -329,11 +272,8 @@ def input_noise(problem: Problem, theta: np.ndarray, solutions: Mapping[str, Per
         if not len(directions):
             continue
         equations = problem.equations[e.name].at_frequency(solutions[e.name].frequency)
-        z, parameters = (
-            periodic_part(equations, solutions[e.name].states),
-            problem.parameters(theta[None], e.name)[0],
-        )
-        derivative = input_sensitivities(equations, z, parameters, directions)
+        z = periodic_part(equations, solutions[e.name].states)
+        derivative = input_sensitivities(equations, z, problem.parameters(theta[None], e.name)[0], directions)
         if derivative is None:
             continue
         for channel in e.outputs:

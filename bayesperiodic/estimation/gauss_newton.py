@@ -1,10 +1,11 @@
-"""The staged Gauss-Newton iteration: noise parameters from the residuals, then a step in θ (eq. 7-8)."""
+"""Staged Gauss-Newton iteration: noise parameters from the residuals, then a step in θ (eq. 7-8)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bayesperiodic._linalg import hessian_eigh, hessian_scale
 from bayesperiodic.posterior.density import Linearisation, LogPosterior
 from bayesperiodic.posterior.description import Description
 from bayesperiodic.posterior.likelihood import estimate_noise
@@ -19,17 +20,7 @@ MAX_ROUNDS, PRESSED = 10, 1e-3
 
 @dataclass(frozen=True)
 class Iterate:
-    """State of the Gauss-Newton iteration.
-
-    Attributes
-    ----------
-    theta : array (names,)
-    here : Linearisation
-        At θ; its anchors are those of the next solves.
-    noise : array (noise_names,)
-        Best noise parameters for the residuals at θ.
-    objective : float
-    """
+    """State of the iteration: θ, residuals and Jacobians there, their best noise parameters, and the objective."""
 
     theta: np.ndarray
     here: Linearisation
@@ -39,14 +30,10 @@ class Iterate:
 
 @dataclass(frozen=True)
 class Objective:
-    """The density that the iteration maximises over θ, with the best noise parameters at every θ.
+    """Density that the iteration maximises over θ, with the best noise parameters at every θ.
 
-    Attributes
-    ----------
-    density : LogPosterior
-    share : float
-        Factor of the logarithms of the variances: with 1 − l/Σn their best values are those of eq. (7), with 1 those of
-        the maximum of eq. (6).
+    `share` is a factor of the logarithms of the variances: their best values are those of eq. (7) for 1 − l/Σn, and
+    those of eq. (6) for 1.
     """
 
     density: LogPosterior
@@ -73,7 +60,7 @@ class Objective:
     def moved(self, theta: np.ndarray, step: np.ndarray) -> np.ndarray:
         """Return θ after a step; parameters whose density is over the logarithm change by a factor.
 
-        Ridges of products are straight in logarithms, so that the step stays on them.
+        A step along the ridge of a product, which is straight in logarithms, stays on the ridge.
         """
         result, logs = theta + step, self.density.logarithmic
         with np.errstate(over="ignore"):
@@ -106,30 +93,15 @@ def climb(
     held: np.ndarray | None = None,
     report: Callable[[Iterate, float], None] | None = None,
 ) -> tuple[Iterate, str, np.ndarray]:
-    """Raise the objective from a start until the steps are small, and never lower it.
+    """Increase the objective from an anchored start until the steps are small.
 
     Where H is not positive definite (convex log-priors that outweigh the data) steps take its negative curvature with
-    the opposite sign; directions without curvature are left alone. Each solve starts from the iterate before and is
-    checked to lie on the same branch, so that a step cannot slip to another periodic solution; steps whose solve fails
-    are halved. A parameter at the end of its prior's support is held while the gradient presses it outwards.
+    the opposite sign; directions without curvature are left out. Each solve starts from the previous iterate and is
+    checked to lie on the same branch, so that a step cannot change to another periodic solution; steps whose solve
+    fails are halved. A parameter at the end of its prior's support is fixed while the gradient points outwards.
 
-    Parameters
-    ----------
-    objective : Objective
-    start : Iterate
-        Anchored.
-    held : bool array (names,), optional
-        Parameters that stay.
-    report : callable, optional
-        Called with every new iterate and the length of its step in standard deviations.
-
-    Returns
-    -------
-    iterate : Iterate
-    status : str
-        "converged", "stalled" (no step raised the objective), "iterations" (their limit was reached) or "singular".
-    history : array (iterations,)
-        The objective at each iterate.
+    Parameters `held` (names,) are fixed; report(iterate, step in standard deviations) is called for every new iterate.
+    Returns the last iterate, the status, as in `MapEstimate`, and the objective at each iterate.
     """
     always = np.zeros(start.theta.size, dtype=bool) if held is None else held
     now, resting, history = start, always, [start.objective]
@@ -149,14 +121,14 @@ def at_ends(objective: Objective, iterate: Iterate) -> np.ndarray:
     """Return −1 or 1 for parameters next to the lower or upper end of their support, 0 for others, (names,)."""
     hessian, _ = objective.hessian_and_gradient(iterate)
     low, high = np.transpose(list(objective.density.problem.joint_prior.supports.values()))
-    near = PRESSED / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
+    near = PRESSED * hessian_scale(hessian)
     return 1.0 * (high - iterate.theta < near) - (iterate.theta - low < near)
 
 
 def _ascend(
     objective: Objective, start: Iterate, held: np.ndarray, report: Callable[[Iterate, float], None] | None
 ) -> tuple[Iterate, str, list[float]]:
-    """Climb with the same parameters held throughout; return the end, the status, and the objectives on the way."""
+    """Climb with the same parameters fixed; return the end, the status, and the objectives of all steps."""
     now = start
     history: list[float] = []
     for _ in range(MAX_ITERATIONS):
@@ -191,9 +163,7 @@ def _step(hessian: np.ndarray, gradient: np.ndarray, held: np.ndarray) -> tuple[
     step = np.zeros_like(gradient)
     if not moving.size:
         return step, 0.0
-    part = hessian[np.ix_(moving, moving)]
-    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(part)), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(part * np.outer(scale, scale))
+    values, vectors, scale = hessian_eigh(hessian[np.ix_(moving, moving)])
     values = np.abs(values)
     along, curved = vectors.T @ (scale * gradient[moving]), values > SINGULAR * values.max()
     along = np.where(curved, along / np.where(curved, values, 1.0), 0.0)

@@ -1,12 +1,12 @@
-"""The Laplace approximation over all sampling coordinates together, from the exact Hessian."""
+"""Laplace approximation over all sampling coordinates, from the exact Hessian; directions without information."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 import pandas as pd
 
+from bayesperiodic._linalg import covariance_eigh, hessian_eigh, hessian_scale, scaled
 from bayesperiodic.estimation.gauss_newton import SINGULAR, Iterate, Objective, climb
 from bayesperiodic.posterior.density import LogPosterior
 from bayesperiodic.posterior.description import Description
@@ -15,47 +15,27 @@ STEP = 1e-3
 NOISE_STEP = 1e-4
 
 
-@dataclass(frozen=True)
-class JointLaplace:
-    """The mode of the density in sampling coordinates and the inverse of its exact Hessian.
+def joint_laplace(density: LogPosterior, start: Iterate) -> tuple[dict[str, float], pd.DataFrame]:
+    """Climb from the estimate to the mode in sampling coordinates and invert the exact Hessian there.
 
-    Attributes
-    ----------
-    mode : dict of str to float
-        Natural values of the parameters and of the free noise parameters.
-    covariance : DataFrame (coordinates × coordinates)
-        Of the sampling coordinates, by the names of what they are made of: the logarithm of a parameter whose prior's
-        support is (0, ∞) and of every noise parameter, any other parameter itself. NaN where there is no maximum.
-    """
-
-    mode: dict[str, float]
-    covariance: pd.DataFrame
-
-
-def joint_laplace(density: LogPosterior, start: Iterate) -> JointLaplace:
-    """Climb from the estimate to the mode in sampling coordinates and take the exact Hessian there.
-
-    The Hessian over θ comes from central differences of the exact gradient; parameters local to experiments are moved
-    together, because each experiment knows only its own.
+    The Hessian over θ comes from central differences of the exact gradient; parameters local to experiments are changed
+    together, because each experiment depends on its own only. Returns the mode (natural values) and the covariance of
+    the sampling coordinates, see `MapEstimate.joint_covariance`.
     """
     problem, objective = density.problem, Objective(density, 1.0)
     first = objective.at(start.theta, start.here, start.noise)
     labels = [*problem.names, *problem.free_noise]
-    nothing = pd.DataFrame(np.full((len(labels), len(labels)), np.nan), index=labels, columns=labels)
+    covariance = pd.DataFrame(np.full((len(labels), len(labels)), np.nan), index=labels, columns=labels)
     if first is None:
-        return JointLaplace({}, nothing)
+        return {}, covariance
     mode, _, _ = climb(objective, objective.anchored(first))
     free = [problem.noise_names.index(name) for name in problem.free_noise]
-    values = [*mode.theta.tolist(), *mode.noise[free].tolist()]
     hessian = _hessian(objective, mode, free)
-    if not np.isfinite(hessian).all() or not np.all(np.diag(hessian) > 0.0):
-        return JointLaplace(dict(zip(labels, values, strict=True)), nothing)
-    scale = 1.0 / np.sqrt(np.diag(hessian))
-    curvatures, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
-    if curvatures.min() < SINGULAR * curvatures.max():
-        return JointLaplace(dict(zip(labels, values, strict=True)), nothing)
-    covariance = (vectors / curvatures) @ vectors.T * np.outer(scale, scale)
-    return JointLaplace(dict(zip(labels, values, strict=True)), pd.DataFrame(covariance, index=labels, columns=labels))
+    if np.isfinite(hessian).all() and np.all(np.diag(hessian) > 0.0):
+        curvatures, vectors, scale = hessian_eigh(hessian)
+        if curvatures.min() >= SINGULAR * curvatures.max():
+            covariance.iloc[:, :] = scaled((vectors / curvatures) @ vectors.T, scale)
+    return dict(zip(labels, [*mode.theta.tolist(), *mode.noise[free].tolist()], strict=True)), covariance
 
 
 def _hessian(objective: Objective, mode: Iterate, free: list[int]) -> np.ndarray:
@@ -63,18 +43,19 @@ def _hessian(objective: Objective, mode: Iterate, free: list[int]) -> np.ndarray
     problem, logs = objective.density.problem, objective.density.logarithmic
     count = len(problem.names)
     by_theta = -_second_derivatives(objective, mode) + problem.joint_prior.curvature(mode.theta)
-    gradient = _total(mode.here.vjp(problem.likelihood.gradients(mode.here.residuals, mode.noise)[0], adjoint=False))
-    gradient = gradient + problem.joint_prior.gradient(mode.theta)
+    by_residual, _ = problem.likelihood.gradients(mode.here.residuals, mode.noise)
+    gradient = sum(mode.here.vjp(by_residual, adjoint=False).values()) + problem.joint_prior.gradient(mode.theta)
     slopes = np.where(logs, mode.theta, 1.0)
     hessian = np.zeros((count + len(free), count + len(free)))
-    hessian[:count, :count] = by_theta * np.outer(slopes, slopes) - np.diag(np.where(logs, gradient * mode.theta, 0.0))
+    hessian[:count, :count] = scaled(by_theta, slopes) - np.diag(np.where(logs, gradient * mode.theta, 0.0))
     for row, column in enumerate(free):
         changes = []
         for sign in (1.0, -1.0):
             noise = mode.noise.copy()
             noise[column] *= np.exp(sign * NOISE_STEP)
             by_residual, by_noise = problem.likelihood.gradients(mode.here.residuals, noise)
-            changes.append(np.concatenate([_total(mode.here.vjp(by_residual, adjoint=False)) * slopes, by_noise[free]]))
+            total = sum(mode.here.vjp(by_residual, adjoint=False).values())
+            changes.append(np.concatenate([total * slopes, by_noise[free]]))
         hessian[count + row] = -(changes[0] - changes[1]) / (2.0 * NOISE_STEP)
         hessian[:count, count + row] = hessian[count + row, :count]
     return 0.5 * (hessian + hessian.T)
@@ -83,7 +64,7 @@ def _hessian(objective: Objective, mode: Iterate, free: list[int]) -> np.ndarray
 def _second_derivatives(objective: Objective, mode: Iterate) -> np.ndarray:
     """Return ∂² log-likelihood/∂θ² at the mode, (names, names)."""
     problem, (hessian, _) = objective.density.problem, objective.hessian_and_gradient(mode)
-    sd = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
+    sd = hessian_scale(hessian)
     result = np.zeros((len(problem.names),) * 2)
     for group in _moved_together(problem):
         ends = []
@@ -97,7 +78,7 @@ def _second_derivatives(objective: Objective, mode: Iterate) -> np.ndarray:
 
 
 def _moved_together(problem: Description) -> list[dict[str, int]]:
-    """Return sets of columns of θ of which every experiment knows at most one, by experiment."""
+    """Return sets of columns of θ, by experiment; every experiment depends on at most one column of a set."""
     groups: dict[str, dict[str, int]] = {}
     for experiment, parameter_map in problem.parameter_maps.items():
         for name, column in parameter_map.columns.items():
@@ -116,25 +97,13 @@ def _gradients(problem: Description, theta: np.ndarray, mode: Iterate) -> dict[s
     return there.vjp(by_residual, adjoint=not problem.model.autonomous)
 
 
-def _total(by_experiment: dict[str, np.ndarray]) -> np.ndarray:
-    return np.sum(list(by_experiment.values()), axis=0)
-
-
 SHOWN = 0.05
 LARGEST = 4
 ROUNDED = 0.06
 
 
 def reduced(directions: np.ndarray) -> np.ndarray:
-    """Return vectors that span the same space (directions, names), each without what the others begin with.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from bayesperiodic.estimation.laplace import reduced
-    >>> reduced(np.array([[2.0, 2.0, 4.0], [0.0, 3.0, 3.0]])).tolist()
-    [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]
-    """
+    """Return vectors that span the same space (directions, names), by Gauss-Jordan elimination."""
     rows = directions.copy()
     for i in range(len(rows)):
         relative = np.abs(rows) / np.abs(rows).max(axis=1, keepdims=True)
@@ -147,15 +116,7 @@ def reduced(directions: np.ndarray) -> np.ndarray:
 
 
 def exponents(direction: np.ndarray) -> list[Fraction] | None:
-    """Return a direction in logarithms as simple fractions, the first positive; None if there are none nearby.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from bayesperiodic.estimation.laplace import exponents
-    >>> exponents(np.array([0.499, -0.001, -0.998]))
-    [Fraction(1, 1), Fraction(0, 1), Fraction(-2, 1)]
-    """
+    """Return a direction in logarithms as simple fractions, the first positive; None if there are none nearby."""
     shown = np.abs(direction) > SHOWN * np.abs(direction).max()
     smallest = np.abs(direction[shown]).min()
     for unit in (smallest, np.abs(direction).max()):
@@ -171,68 +132,45 @@ def exponents(direction: np.ndarray) -> list[Fraction] | None:
 def combinations(direction: np.ndarray, names: Sequence[str], logarithmic: np.ndarray) -> list[str]:
     """Return combinations of the parameters that do not change along a direction, as expressions.
 
-    Products of powers where all that move are positive, sums where none is; nothing for a mixture or where no simple
-    exponents fit.
-
-    Parameters
-    ----------
-    direction : array (names,)
-        In logarithms of positive parameters and in signed ones as they are.
-    names : sequence of str
-    logarithmic : bool array (names,)
+    Products of powers if the direction (names,), in logarithms of positive parameters, changes positive parameters
+    only, sums if it changes none of them; an empty list for a mixture, or if no simple exponents fit.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from bayesperiodic.estimation.laplace import combinations
-    >>> combinations(np.array([1.0, -1.0]), ["a", "b"], np.array([True, True]))
-    ['a*b']
     >>> combinations(np.array([1.0, 0.5, 0.5]), ["m", "k", "c"], np.array([True, True, True]))
     ['m/k**2', 'c/k']
     >>> combinations(np.array([1.0, -1.0]), ["a", "b"], np.array([False, False]))
     ['a + b']
     """
     shown = np.flatnonzero(np.abs(direction) > SHOWN * np.abs(direction).max())
-    if shown.size < 2:
+    own, direction, powers = [names[i] for i in shown.tolist()], direction[shown], logarithmic[shown]
+    if shown.size < 2 or powers.any() != powers.all():
         return []
-    powers = logarithmic[shown]
-    if powers.all():
-        rational = exponents(direction[shown])
-        if rational is None:
-            return []
-        pivot = min(range(len(rational)), key=lambda i: (abs(rational[i]), i))
-        ratios = [r / rational[pivot] for r in rational]
-        if max(max(abs(r.numerator), r.denominator) for r in ratios) > LARGEST:
-            return []
+    if not powers.all():
+        pivot = int(np.argmax(np.abs(direction)))
         return [
-            _product(names[shown[i]], ratios[i], names[shown[pivot]], first=i < pivot)
-            for i in range(len(rational))
-            if i != pivot
+            _sum(own[pivot], -float(direction[pivot] / direction[i]), own[i]) for i in range(shown.size) if i != pivot
         ]
-    if powers.any():
+    rational = exponents(direction)
+    if rational is None:
         return []
-    pivot = int(np.argmax(np.abs(direction[shown])))
-    return [
-        _sum(names[shown[pivot]], -float(direction[shown[pivot]] / direction[shown[i]]), names[shown[i]])
-        for i in range(shown.size)
-        if i != pivot
-    ]
+    pivot = min(range(len(rational)), key=lambda i: (abs(rational[i]), i))
+    ratios = [r / rational[pivot] for r in rational]
+    if max(max(abs(r.numerator), r.denominator) for r in ratios) > LARGEST:
+        return []
+    return [_product(own[i], ratios[i], own[pivot], first=i < pivot) for i in range(len(rational)) if i != pivot]
 
 
 def _product(name: str, ratio: Fraction, other: str, *, first: bool) -> str:
     """Return name·other^(−ratio), raised to whole exponents that begin with a positive one."""
-    own, its = ratio.denominator, -ratio.numerator
-    factors = [(name, own), (other, its)] if first or its < 0 else [(other, its), (name, own)]
-    return _of_powers(factors)
 
-
-def _of_powers(factors: list[tuple[str, int]]) -> str:
     def power(name: str, exponent: int) -> str:
         return name if exponent == 1 else f"{name}**{exponent}"
 
-    above = [power(n, e) for n, e in factors if e > 0]
-    below = [power(n, -e) for n, e in factors if e < 0]
-    return "/".join(["*".join(above), *below])
+    own, its = power(name, ratio.denominator), power(other, abs(ratio.numerator))
+    if ratio > 0:
+        return f"{own}/{its}"
+    return f"{own}*{its}" if first else f"{its}*{own}"
 
 
 def _sum(name: str, ratio: float, other: str) -> str:
@@ -241,12 +179,10 @@ def _sum(name: str, ratio: float, other: str) -> str:
 
 
 def in_words(direction: np.ndarray, names: Sequence[str], logarithmic: np.ndarray) -> str:
-    """Return what moves together along a direction, the simplest exponents put in where they fit.
+    """Return the joint change of the parameters along a direction, with simple exponents where they fit.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from bayesperiodic.estimation.laplace import in_words
     >>> in_words(np.array([0.5, -1.0]), ["a", "b"], np.array([True, True]))
     'a → a·t, b → b·t^-2'
     """
@@ -273,39 +209,22 @@ SILENT = "no output depends on it"
 def undetermined(
     information: np.ndarray, theta: np.ndarray, names: Sequence[str], logarithmic: np.ndarray
 ) -> tuple[str, ...]:
-    """Return, in words, the directions in which the data's information vanishes.
-
-    Parameters
-    ----------
-    information : array (names, names)
-        The data's part of H of eq. (8).
-    theta : array (names,)
-    names : sequence of str
-    logarithmic : bool array (names,)
-        Positive parameters; their combinations are written as products of powers.
-
-    Returns
-    -------
-    tuple of str
-        Such as "a: no output depends on it" or "a → a·t, b → b·t^-1": changes of the parameters that change no output.
+    """Return, in words, the directions in which the data's part of H of eq. (8) (names, names) vanishes.
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from bayesperiodic.estimation.laplace import undetermined
     >>> row = np.array([2.0, 1.0]) / [3.0, 5.0]
     >>> undetermined(np.outer(row, row), np.array([3.0, 5.0]), ["a", "b"], np.array([True, True]))
     ('a → a·t, b → b·t^-2',)
     """
     slopes = np.where(logarithmic, theta, 1.0)
-    scaled = information * np.outer(slopes, slopes)
-    size = np.sqrt(np.diag(scaled))
+    information = scaled(information, slopes)
+    size = np.sqrt(np.diag(information))
     silent = [f"{name}: {SILENT}" for name, own in zip(names, size, strict=True) if own == 0.0]
     acting = np.flatnonzero(size > 0.0)
     if not acting.size:
         return tuple(silent)
-    part = scaled[np.ix_(acting, acting)] / np.outer(size[acting], size[acting])
-    values, vectors = np.linalg.eigh(part)
+    values, vectors, _ = covariance_eigh(information[np.ix_(acting, acting)], size[acting])
     directions = reduced(vectors[:, values < NEARLY_SINGULAR].T / size[acting])
     own = [names[i] for i in acting.tolist()]
     return tuple(silent + [in_words(direction, own, logarithmic[acting]) for direction in directions])

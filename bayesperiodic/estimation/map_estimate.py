@@ -1,14 +1,16 @@
-"""The paper's Bayesian estimator: staged Gauss-Newton to the MAP point, and its Laplace covariance."""
+"""Bayesian estimator of the paper: staged Gauss-Newton to the MAP point, and its Laplace covariance."""
 
 import warnings
 from collections.abc import Iterator, Mapping
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from tqdm import tqdm
 
 from bayesperiodic import _checks
-from bayesperiodic._linalg import in_one_thread
+from bayesperiodic._linalg import hessian_eigh, in_one_thread, scaled
 from bayesperiodic.estimation.covariance import doubling_shift, input_noise, robust_covariance, with_uncertain_noise
 from bayesperiodic.estimation.gauss_newton import (
     SINGULAR,
@@ -30,16 +32,13 @@ NOISE_SHARE = 0.1
 LARGEST_SHIFT = 0.1
 SHOWN = 3
 LOST = 1e-6
+# Value of a field of MapEstimate that is computed at its first use.
+deferred: Any = partial
 
 
 @in_one_thread
 def map_estimate(
-    problem: Problem,
-    *,
-    start: Mapping[str, float] | None = None,
-    starts: int = 1,
-    seed: int = 0,
-    progress: bool = True,
+    problem: Problem, *, start: Mapping[str, float] | None = None, starts: int = 1, seed: int = 0, progress: bool = True
 ) -> MapEstimate:
     r"""Find the MAP point by staged Gauss-Newton, and the Laplace covariance there.
 
@@ -49,22 +48,22 @@ def map_estimate(
 
         v_\beta = \frac{M_\beta}{n_\beta \, (1 - l / \sum_\beta n_\beta)},
 
-    for l parameters, which is s·Σe²/(nNs − l) for equal counts, and then updates θ by eq. (8). Printed there, the
+    for l parameters, which is s·Σe²/(nNs − l) for equal counts, and then updates θ by eq. (8). As printed, its
     right-hand side lacks the prior's gradient (θ̄ − θ)/σ², without which the iteration would not end at a maximum of
-    eq. (6); it is added. Other noise models have their parameters in place of the variances, found by maximising the
-    same objective. Steps are halved until the objective, eq. (6) with nN replaced by nN − l/s, rises; it never falls.
-    Where convex log-priors outweigh the data, steps (not the covariance) take their curvature with the opposite sign.
+    eq. (6); it is added. The parameters of other noise models are found by maximising the same objective. Steps are
+    halved until the objective, eq. (6) with nN replaced by nN − l/s, increases. Where convex log-priors outweigh the
+    data, steps (not the covariance) take their curvature with the opposite sign.
 
-    Where every experiment of a forced model has a guess of its orbit, orbits and parameters are first found together,
-    from these guesses and `start`: the orbits need not exist at the start, and none is lost or swapped on the way.
+    Where every experiment of a forced model has a guess of its orbit, orbits and parameters are first estimated
+    together, from these guesses and `start`: the orbits need not exist at the start, and none is lost or exchanged.
 
     Parameters
     ----------
     problem : Problem
     start : mapping of str to float, optional
-        A first guess of every free parameter; by default the medians of the priors.
+        First guess of every free parameter; by default the medians of the priors.
     starts : int
-        How many starts to try; those after the first are draws from the priors, and the best estimate is kept.
+        Number of starts; those after the first are draws from the priors. The best estimate is returned.
     seed : int
         Of these draws.
     progress : bool
@@ -82,9 +81,9 @@ def map_estimate(
     Warns
     -----
     UserWarning
-        If the noise of the measured inputs brings more than a tenth of the residual to an output, if twice as many
-        points would move an estimate by more than a tenth of its standard deviation, if an estimate lies at the end of
-        its prior's support, and if the data do not determine a parameter or a combination of them.
+        If the noise of the measured inputs causes more than a tenth of an output's residual, if twice as many points
+        would move an estimate by more than a tenth of its standard deviation, if an estimate lies at the end of its
+        prior's support, and if the data do not determine a parameter or a combination of parameters.
 
     References
     ----------
@@ -93,16 +92,8 @@ def map_estimate(
 
     Examples
     --------
-    The spring of an oscillator from 40 noisy periods, its mass known:
-
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(2, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
-    >>> fit.status, abs(fit.theta["k"] - 1.0) < 3 * fit.sd["k"]
+    >>> estimate = bp.map_estimate(problem, start={"c": 0.3, "k": 1.2}, progress=False)
+    >>> estimate.status, abs(estimate.theta["k"] - 1.0) < 3 * estimate.sd["k"]
     ('converged', True)
     """
     if isinstance(start, Mapping):
@@ -135,23 +126,25 @@ def _objective(problem: Problem, near: Linearisation) -> Objective:
 
 
 def _first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:
-    """Return the anchored iterate at a start; None where the log-posterior is not finite."""
+    """Return the anchored iterate at a start; None if the log-posterior is not finite there."""
     if not np.isfinite(problem.joint_prior.log_prob(theta)):
         return None
     found = simultaneous_fit(problem, theta)
     if found is not None and found.states:
-        near = _at_fitted_orbits(problem, found)
+        near = _linearised(problem, theta, found)
         iterate = _objective(problem, near).iterate(near, problem.likelihood.guess())
         if iterate is not None:
             return iterate
     if found is not None and all(e.mask is not None for e in problem.experiments):
         return None
-    near = problem.density().linearise(theta)
+    near = _linearised(problem, theta, None)
     return _objective(problem, near).iterate(near, problem.likelihood.guess())
 
 
-def _at_fitted_orbits(problem: Problem, found: InitialEstimate) -> Linearisation:
-    """Return residuals and Jacobian where orbits and parameters fit together."""
+def _linearised(problem: Problem, theta: np.ndarray, found: InitialEstimate | None) -> Linearisation:
+    """Return residuals and Jacobian where orbits and parameters fit together, or else at θ."""
+    if found is None or not found.states:
+        return problem.density().linearise(theta)
     return LogPosterior(problem, Simulator.start(problem, found.theta, found.states)).linearise(found.theta)
 
 
@@ -180,32 +173,28 @@ def _describe(
     share, names, likelihood = objective.share, problem.names, problem.likelihood
     data, _ = information(problem, best)
     solutions = best.here.simulator.solutions(best.theta)
-    covariance, lost = _inverse(data + problem.joint_prior.curvature(best.theta))
-    robust = robust_covariance(problem, best, covariance)
-    covariance = with_uncertain_noise(problem, best, covariance)
+    inverse, lost = _inverse(data + problem.joint_prior.curvature(best.theta))
+    covariance = with_uncertain_noise(problem, best, inverse).copy()
     shift = doubling_shift(problem, best, solutions, covariance)
     shift[lost] = np.nan
-    for matrix in (covariance, robust):
-        matrix[lost], matrix[:, lost] = np.nan, np.nan
-        matrix[lost, lost] = np.inf
-    with np.errstate(invalid="ignore"):
-        sd, robust_sd = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
+    covariance[lost], covariance[:, lost] = np.nan, np.nan
+    covariance[lost, lost] = np.inf
     residuals = best.here.compared()
-    joint = joint_laplace(objective.density.with_settings(coordinates=RIDGE), best)
+    joint = cache(partial(in_one_thread(joint_laplace), objective.density.with_settings(coordinates=RIDGE), best))
     noise = dict(zip(problem.noise_names, best.noise.tolist(), strict=True))
     rms = {c: _pooled(problem, c, residuals) for c in problem.channels}
     measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} for e in problem.experiments}
     return MapEstimate(
         status=status,
         theta=dict(zip(names, best.theta.tolist(), strict=True)),
-        sd=dict(zip(names, sd.tolist(), strict=True)),
-        robust_sd=dict(zip(names, robust_sd.tolist(), strict=True)),
+        sd=_sd(problem, covariance),
+        robust_sd=deferred(_robust_sd, problem, best, inverse, lost),
         variances={_short(name): noise[name] for name in likelihood.counts},
         noise=noise,
         noise_prior=problem.noise.prior_text,
         covariance=pd.DataFrame(covariance, index=list(names), columns=list(names)),
-        joint_mode=joint.mode,
-        joint_covariance=joint.covariance,
+        joint_mode=deferred(lambda: joint()[0]),
+        joint_covariance=deferred(lambda: joint()[1]),
         degrees_of_freedom=max(float(problem.counted - len(names)), 1.0) if problem.free_noise else np.inf,
         independent={_short(name): count for name, count in likelihood.counts.items()},
         solutions=solutions,
@@ -224,24 +213,32 @@ def _describe(
     )
 
 
-def _inverse(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inverse of a symmetric matrix, and which parameters are in directions without curvature.
+def _sd(problem: Problem, covariance: np.ndarray) -> dict[str, float]:
+    with np.errstate(invalid="ignore"):
+        return dict(zip(problem.names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
 
-    These directions are left out of the inverse.
-    """
-    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+
+@in_one_thread
+def _robust_sd(problem: Problem, estimate: Iterate, inverse: np.ndarray, lost: np.ndarray) -> dict[str, float]:
+    robust = robust_covariance(problem, estimate, inverse)
+    robust[lost, lost] = np.inf
+    return _sd(problem, robust)
+
+
+def _inverse(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inverse of H without its directions of no curvature, and which parameters belong to these."""
+    values, vectors, scale = hessian_eigh(hessian)
     curved = np.abs(values) > SINGULAR * np.abs(values).max()
-    inverse = (vectors[:, curved] / values[curved]) @ vectors[:, curved].T * np.outer(scale, scale)
+    inverse = scaled((vectors[:, curved] / values[curved]) @ vectors[:, curved].T, scale)
     return inverse, np.any(np.abs(vectors[:, ~curved]) > LOST, axis=1)
 
 
 def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
-    """Yield the warnings about an estimate: its limitations, and what to do about them."""
+    """Yield the warnings about an estimate."""
     for channel, noise in fit.input_noise.items():
         if noise > NOISE_SHARE * fit.rms[channel]:
             yield (
-                f"The noise of the measured inputs, differentiated, brings {noise:.3g} to {channel!r}, "
+                f"The noise of the measured inputs, differentiated, causes {noise:.3g} in {channel!r}, "
                 f"{noise / fit.rms[channel]:.0%} of the residual's {fit.rms[channel]:.3g}; keep fewer input harmonics "
                 "(fold(harmonics=…)) or measure the derivative."
             )
@@ -261,20 +258,20 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
     silent = [text for text in fit.undetermined if text.endswith(SILENT)]
     if silent:
         named = ", ".join(repr(text.removesuffix(f": {SILENT}")) for text in silent)
-        yield f"The data do not depend on {named}; what is said of each is the prior's. Fix it."
+        yield f"The data do not depend on {named}; its posterior equals its prior. Fix it."
     directions = [text for text in fit.undetermined if text not in silent]
     if directions:
         more = len(directions) - SHOWN
         shown = "; or under ".join(directions[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
         yield (
-            f"The data do not change under {shown}, whatever t. What is said of these is the prior's; fix one of them, "
-            "or report the combination that stays."
+            f"The data do not change under {shown}, for any t. In these directions the posterior equals the prior; fix "
+            "one of the parameters, or report the combination that does not change."
         )
 
 
 def _short(name: str) -> str:
     """Return a channel from ``variance[channel]``, other names as they are."""
-    return name[len("variance[") : -1] if name.startswith("variance[") else name
+    return name.removeprefix("variance[").removesuffix("]") if name.startswith("variance[") else name
 
 
 def _tied_slopes(problem: Problem, theta: np.ndarray) -> dict[str, dict[str, float]]:
@@ -287,10 +284,11 @@ def _tied_slopes(problem: Problem, theta: np.ndarray) -> dict[str, dict[str, flo
 
 def _pooled(problem: Problem, channel: str, signals: Mapping[str, Mapping[str, np.ndarray]]) -> float:
     """Return the root mean square of a channel over the measured points of all experiments."""
-    values = []
-    for e in problem.experiments:
-        if channel in e.outputs:
-            values.append(signals[e.name][channel][slice(None) if e.mask is None else e.mask])
+    values = [
+        signals[e.name][channel][slice(None) if e.mask is None else e.mask]
+        for e in problem.experiments
+        if channel in e.outputs
+    ]
     return float(np.sqrt(np.mean(np.concatenate(values) ** 2)))
 
 
@@ -313,10 +311,7 @@ def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
             f"followed from its guess to parameters at which {where}. Leave it out if it may be no orbit, or give "
             "start={…} nearer to the truth."
         )
-    if found is not None and found.states:
-        near = _at_fitted_orbits(problem, found)
-    else:
-        near = problem.density().linearise(theta)
+    near = _linearised(problem, theta, found)
     failed = ", ".join(f"{name!r} ({status})" for name, status in near.statuses.items() if status != "converged")
     ended = f"without the orbit of {failed}" if failed else "well, but the outputs or the noise are not finite"
     return (

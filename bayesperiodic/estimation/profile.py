@@ -1,4 +1,4 @@
-"""Profiles: the best log-density for every value of one parameter, found by following the ridge from the estimate."""
+"""Profiles: the maximum of the log-density for every value of one parameter, followed from the estimate."""
 
 import warnings
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from scipy.special import ndtri
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
-from bayesperiodic._linalg import in_one_thread
+from bayesperiodic._linalg import hessian_scale, in_one_thread, scaled
 from bayesperiodic._parallel import TaskPool, checked_executor
 from bayesperiodic.estimation.gauss_newton import PRESSED, Iterate, Objective, bias_correction, climb
 from bayesperiodic.estimation.result import MapEstimate
@@ -23,19 +23,19 @@ from bayesperiodic.posterior.priors import Prior
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import Simulator
 
-# How far apart points lie, as changes of the root of the drop; how steps grow, are cut, and when they are short.
+# Distance of points, as the change of the root of the drop; growth, shortening and smallest size of steps.
 SPACING, GROWTH, SHORTENED, SMALLEST = 0.5, 3.0, 0.25, 0.01
-# Beyond the root that belongs to 99 %, 2.576, so that the end of that interval lies between two points.
+# Above the root 2.576 of a 99 % interval, so that the end of this interval lies between two points.
 FURTHEST = 2.8
-# A step leaves a tenth of the distance to the support's end; the last point leaves a millionth of the peak's, so that
-# priors that vanish at the end are seen to, or lies at the outermost thousandth of the prior if that is closer.
+# A step leaves a tenth of the distance to the support's end. The last point leaves a millionth of the peak's distance,
+# because priors may vanish at the end, or is the outermost thousandth of the prior if that is closer.
 NEARER, NEAREST, TAIL = 0.1, 1e-6, 1e-3
 MOST_POINTS, MOST_FAILURES, MOST_ROUNDS = 60, 5, 5
 GAIN, CUT = 1e-6, 1e-12
 
 
 class Point(NamedTuple):
-    """A value of the parameter and the best iterate found there; None without a finite log-posterior."""
+    """Value of the parameter, and the best iterate there; None without a finite log-posterior."""
 
     value: float
     iterate: Iterate | None
@@ -43,16 +43,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Ridge:
-    """The best points of an objective for every value of one parameter.
-
-    Attributes
-    ----------
-    objective : Objective
-    column : int
-        The parameter's place in θ.
-    peak : Iterate
-        Where to start, anchored.
-    """
+    """The maxima of an objective for every value of the parameter in one column of θ, from an anchored peak on."""
 
     objective: Objective
     column: int
@@ -69,7 +60,7 @@ class Ridge:
         return joint.marginals[joint.names[self.column]]
 
     def limits(self) -> tuple[float, float]:
-        """Return the outermost values that are tried: close to the ends of the prior's support, or infinite."""
+        """Return the outermost values: close to the ends of the prior's support, or infinite."""
         tails = self._prior.quantile(np.array([TAIL, 1.0 - TAIL]))
         below, above = (self._limit(end, tail) for end, tail in zip(self._prior.support, tails, strict=True))
         return below, above
@@ -85,7 +76,7 @@ class Ridge:
     def followed(self) -> list[Point]:
         """Return points, ascending, found from the peak outwards and back from both ends.
 
-        Where the way back finds that an end is too high, the profile goes on from there.
+        If the way back raises an end, the profile is extended from there.
         """
         step, points = SPACING * self._size(), [Point(self.at, self.peak)]
         for _ in range(MOST_ROUNDS):
@@ -98,19 +89,18 @@ class Ridge:
         return points
 
     def _size(self) -> float:
-        """Return the standard deviation that the ridge's curvature at the peak tells, or what the prior allows."""
-        quartiles = self._prior.quantile(np.array([0.25, 0.75]))
-        width = float(quartiles[1] - quartiles[0])
+        """Return the standard deviation by the ridge's curvature at the peak, at most the width of the prior."""
+        width = float(np.ptp(self._prior.quantile(np.array([0.25, 0.75]))))
         _, curvature = self._tangent(self.peak)
         if curvature > 0.0:
             return min(curvature**-0.5, width)
         return min(width, *(abs(self.at - end) for end in self._prior.support))
 
     def _outwards(self, start: Point, step: float, top: float) -> list[Point]:
-        """Return points from one on in one direction, each started from the one before.
+        """Return points in one direction, each started from the previous one.
 
         The root of twice the drop from the top changes by about `SPACING` from point to point; a step that changes it
-        by more than twice that is shortened, unless it is short already and so across a jump.
+        by more than twice that is shortened, unless it is short already, which means that the density jumps.
         """
         end, limit = self._prior.support[step > 0.0], self.limits()[step > 0.0]
         points: list[Point] = []
@@ -138,9 +128,9 @@ class Ridge:
         return points
 
     def _swept(self, points: list[Point]) -> list[Point]:
-        """Return the points from an end on, each started from the one before too, and the better iterates kept.
+        """Return the points from an end on, each also started from the previous one, with the better iterates.
 
-        Beyond the peak that has been done, and is repeated only as long as it improves.
+        Beyond the peak this repeats `_outwards`, and ends when it does not improve.
         """
         kept, improved, side = points[:1], False, np.sign(points[0].value - self.at)
         for point in points[1:]:
@@ -153,15 +143,11 @@ class Ridge:
 
     def _climbed(self, start: Iterate, value: float) -> Iterate | None:
         """Return the best iterate with the parameter at a value, climbed from a neighbour."""
-        held = self._held
-        plain = np.where(held, value, start.theta)
+        plain = np.where(self._held, value, start.theta)
         tangent = start.theta + (value - start.theta[self.column]) * self._tangent(start)[0]
         found = [self.objective.at(theta, start.here, start.noise) for theta in (tangent, plain)]
-        finite = [iterate for iterate in found if iterate is not None]
-        if not finite:
-            return None
-        first = max(finite, key=lambda iterate: iterate.objective)
-        return climb(self.objective, self.objective.anchored(first), held)[0]
+        first = max(filter(None, found), key=lambda iterate: iterate.objective, default=None)
+        return None if first is None else climb(self.objective, self.objective.anchored(first), self._held)[0]
 
     @property
     def _held(self) -> np.ndarray:
@@ -170,31 +156,29 @@ class Ridge:
     def _tangent(self, iterate: Iterate) -> tuple[np.ndarray, float]:
         """Return ∂θ/∂parameter along the ridge, (names,), and the curvature −∂²objective/∂parameter² along it.
 
-        Directions of the other parameters without curvature stay where they are.
+        Directions of the other parameters without curvature are left out.
         """
         hessian, _ = self.objective.hessian_and_gradient(iterate)
         held, slope = self._held, self._held.astype(float)
         if not np.isfinite(hessian).all():
             return slope, 0.0
-        scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
-        scaled = hessian * np.outer(scale, scale)
-        others = np.linalg.pinv(scaled[np.ix_(~held, ~held)], rcond=CUT, hermitian=True) @ scaled[~held, self.column]
-        curvature = scaled[self.column, self.column] - others @ scaled[~held, self.column]
+        scale = hessian_scale(hessian)
+        hessian = scaled(hessian, scale)
+        others = np.linalg.pinv(hessian[np.ix_(~held, ~held)], rcond=CUT, hermitian=True) @ hessian[~held, self.column]
+        curvature = hessian[self.column, self.column] - others @ hessian[~held, self.column]
         slope[~held] = -scale[~held] * others / scale[self.column]
         return slope, float(curvature / scale[self.column] ** 2) if curvature > CUT else 0.0
 
 
 def _root(top: float, iterate: Iterate) -> float:
-    """Return how many standard deviations the drop from the top is worth."""
+    """Return the drop from the top in standard deviations, √(2·drop)."""
     return float(np.sqrt(2.0 * max(top - iterate.objective, 0.0)))
 
 
 def _next(now: float, step: float, end: float, limit: float) -> float:
-    """Return the value a step further, but no further than a limit and most of the way to the support's end."""
-    if np.isinf(end):
-        return now + step
+    """Return the value after a step, at most a limit and nine tenths of the way to the support's end."""
     inside = min if step > 0.0 else max
-    return inside(now + step, end + NEARER * (now - end), limit)
+    return now + step if np.isinf(end) else inside(now + step, end + NEARER * (now - end), limit)
 
 
 WIDEST = 0.99
@@ -204,37 +188,30 @@ CLOSED, ONE_SIDED, FLAT = "closed", "one-sided", "flat"
 
 @dataclass(frozen=True)
 class Profile(Result):
-    """The best log-density for every value of a parameter, all others and the noise parameters being free.
+    """Maximum of the log-density over all other parameters and the noise parameters, for every value of a parameter.
 
     Attributes
     ----------
     map, sd : dict of str to float
-        The estimate and its Laplace standard deviations, of all free parameters. The Laplace approximation of a profile
-        is −improvement − ½((values − map)/sd)².
+        Estimate and Laplace standard deviations of all free parameters. The Laplace approximation of a profile is
+        −improvement − ½((values − map)/sd)².
     values : dict of str to array (points,)
         By profiled parameter, ascending, in its unit.
     log_density : dict of str to array (points,)
-        The profile there, relative to the best value found at all; NaN where no finite log-posterior was found.
+        The profile relative to its maximum over all profiles; NaN where no finite log-posterior was found.
     paths : dict of str to array (points, names)
-        All free parameters along the profile, in the order of `map`; NaN where there is no profile.
+        All free parameters along the profile, in the order of `map`; NaN like the profile.
     limits : dict of str to (float, float)
-        The outermost values tried, close to the ends of the prior's support, or infinite.
+        Limits of the values, close to the ends of the prior's support, or infinite.
     best : dict of str to float
-        Where the best value was found: the estimate, unless there is a better one.
+        Point of that maximum: the estimate, unless a profile finds a better one.
     improvement : float
-        By how much the log-density is higher there than at the estimate.
+        Log-density at `best` minus that at the estimate.
     units : dict of str to str
         Of all free parameters.
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
     >>> found = bp.profile(problem, fit, ["k"])
     >>> found.shape, found.failed
     ({'k': 'closed'}, {'k': 0})
@@ -260,24 +237,24 @@ class Profile(Result):
 
     @property
     def failed(self) -> dict[str, int]:
-        """How many points of each profile have no finite log-posterior."""
+        """Number of points of each profile without a finite log-posterior."""
         return {name: int(np.isnan(density).sum()) for name, density in self.log_density.items()}
 
     def interval(self, probability: float = 0.9) -> dict[str, tuple[float, float]]:
-        """Return where each profile has dropped by ½χ² with one degree of freedom (likelihood ratio), outermost.
+        """Return the outermost values where each profile has dropped by ½χ² with one degree of freedom.
 
         Between points the root of the drop, a straight line for a parabola, is interpolated monotonically.
 
         Parameters
         ----------
         probability : float
-            Above 0 and at most 0.99, which is as far as profiles are followed.
+            Above 0 and at most 0.99, the limit of the profiles.
 
         Returns
         -------
         dict of str to (float, float)
-            An end is −∞ or ∞ where the profile does not come down before the prior's support ends, NaN where solves
-            fail before it has come down.
+            Likelihood-ratio intervals. An end is −∞ or ∞ if the profile does not drop so far before the prior's support
+            ends, NaN if solves fail before.
 
         Raises
         ------
@@ -296,23 +273,25 @@ class Profile(Result):
 
     @property
     def shape(self) -> dict[str, str]:
-        """How many ends of the 99 % interval are finite: "closed" (both), "one-sided" or "flat" (none).
+        """Finite ends of the 99 % interval: "closed" (both), "one-sided" or "flat" (none).
 
-        An informative prior closes a profile too.
+        An informative prior also closes a profile.
         """
         named = (FLAT, ONE_SIDED, CLOSED)
         return {name: named[int(np.isfinite(ends).sum())] for name, ends in self.interval(WIDEST).items()}
 
     @property
     def table(self) -> pd.DataFrame:
-        """A row a profile: map, sd, the 90 % intervals of Laplace and of the profile, shape, points and failed."""
+        """One row per profile: map, sd, the 90 % intervals of Laplace and of the profile, shape, points and failed."""
         half = float(ndtri(0.95))
         rows: dict[str, dict[str, object]] = {}
         for name, (low, high) in self.interval(0.9).items():
             at, sd = self.map[name], self.sd[name]
-            rows[name] = {"map": at, "sd": sd, "laplace_low": at - half * sd, "laplace_high": at + half * sd}
-            rows[name] |= {"low": low, "high": high, "shape": self.shape[name]}
-            rows[name] |= {"points": self.values[name].size, "failed": self.failed[name]}
+            rows[name] = {
+                "map": at, "sd": sd, "laplace_low": at - half * sd, "laplace_high": at + half * sd,
+                "low": low, "high": high, "shape": self.shape[name],
+                "points": self.values[name].size, "failed": self.failed[name],
+            }  # fmt: skip
         return pd.DataFrame.from_dict(rows, orient="index")
 
     def __repr__(self) -> str:
@@ -323,9 +302,9 @@ class Profile(Result):
 
 
 def _crossing(values: np.ndarray, roots: np.ndarray, level: float, limit: float) -> float:
-    """Return where the roots, right of the lowest, cross a level for the last time.
+    """Return the last value, right of the lowest root, at which the roots cross a level.
 
-    Infinite if they do not up to the limit; NaN if solves fail before they have, or no root is below the level.
+    Infinite if they stay below it up to the limit; NaN if solves fail before, or no root is below the level.
     """
     top = int(np.nanargmin(roots))
     found = top + np.flatnonzero(np.isfinite(roots[top:]))
@@ -342,13 +321,13 @@ def _crossing(values: np.ndarray, roots: np.ndarray, level: float, limit: float)
 
 @in_one_thread
 def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = None, *, executor: Any = None) -> Profile:
-    """Follow the best log-density from the estimate along every parameter, outwards and back again.
+    """Follow the maximum of the log-density from the estimate along every parameter, outwards and back.
 
-    What is profiled is what `map_estimate` maximises: eq. (6) of [1]_ with the bias correction of eq. (7), the priors
-    included. At every value of a parameter the staged iteration runs over all the others, started from its neighbour.
-    Points are spaced by about half a standard deviation of the drop; they go on until the profile has dropped beyond
-    what a 99 % interval takes, the prior's support ends, or solves fail. Then every point is started from its outer
-    neighbour too, and the better value is kept: where branches cross, the way out stays on the first one for too long.
+    The objective is that of `map_estimate`: eq. (6) with the bias correction of eq. (7), the priors included.
+    For every value of a parameter the staged iteration estimates all others, started from the neighbouring point.
+    Points are spaced by about half a standard deviation of the drop, until the profile has dropped below the level of a
+    99 % interval, the prior's support ends, or solves fail. Then every point is also started from its outer neighbour,
+    and the better value is kept, because the way out may have missed a branch that crosses the first one.
 
     Parameters
     ----------
@@ -358,8 +337,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     names : sequence of str, optional
         Parameters to profile; by default all that are free.
     executor : None, int, Dask Client, or executor with the interface of concurrent.futures
-        Who follows them, one parameter a task, as in `sample`: by default threads of this process. It does not change
-        the result.
+        Runs one task per parameter, as in `sample`; by default threads of this process. It does not change the result.
 
     Returns
     -------
@@ -368,8 +346,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     Raises
     ------
     ValueError
-        For an unknown name, an estimate that has no finite log-posterior in this problem, or an executor that takes no
-        tasks.
+        For an unknown name, an estimate without a finite log-posterior in this problem, or an invalid executor.
     WorkersLost
         If the executor's workers died (a RuntimeError).
 
@@ -378,34 +355,21 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     UserWarning
         If a profile finds a better point than the estimate.
 
-    References
-    ----------
-    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
-       equilibrium states, 1997.
-
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
-    >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
-    ...                          frequency=0.1, samples=50)
-    >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5, "variance[displacement]": 0.01})
-    >>> profile = bp.profile(problem, bp.map_estimate(problem, progress=False))
+    >>> profile = bp.profile(problem, fit)
     >>> profile.shape
     {'c': 'closed', 'k': 'closed'}
-    >>> profile.table[["laplace_low", "low", "laplace_high", "high"]].round(2)
-       laplace_low   low  laplace_high  high
-    c         0.15  0.15          0.25  0.25
-    k         0.94  0.94          1.06  1.06
+    >>> profile.table[["laplace_low", "low", "laplace_high", "high"]].round(4)
+       laplace_low     low  laplace_high    high
+    c       0.1980  0.1979        0.2011  0.2012
+    k       0.9986  0.9984        1.0022  1.0023
     """
-    chosen = _checked_names(problem, names)
-    executor = checked_executor(executor)
+    chosen, executor = _checked_names(problem, names), checked_executor(executor)
     objective, peak = _at_estimate(problem, fit)
     with TaskPool(executor, (objective, peak)) as pool:
         found = dict(pool.run(_followed, [problem.names.index(name) for name in chosen]))
-    top, best = peak.objective, peak.theta
+    top, best, units = peak.objective, peak.theta, problem.model.units | {SHIFT: "s"}
     values, density, paths, limits = {}, {}, {}, {}
     for number, name in enumerate(chosen):
         limits[name], values[name], density[name], paths[name] = found[number]
@@ -420,7 +384,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
         limits=limits,
         best=dict(zip(problem.names, best.tolist(), strict=True)),
         improvement=float(top - peak.objective),
-        units={name: _unit(problem, name) for name in problem.names},
+        units={name: units.get(name.partition("[")[0], "") for name in problem.names},
     )
     if result.improvement > BETTER:
         warnings.warn(
@@ -464,23 +428,12 @@ def _followed(
     start: tuple[Objective, Iterate], column: int
 ) -> tuple[tuple[float, float], np.ndarray, np.ndarray, np.ndarray]:
     """Return the limits of the parameter in a column of θ, and the values, the objective and θ along its profile."""
-    ridge = Ridge(start[0], column, start[1])
-    return ridge.limits(), *_arrays(ridge.followed(), start[1].theta.size)
-
-
-def _arrays(points: list[Point], size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the values, the objective and θ of points, NaN where there is none."""
-    nothing = np.full(size, np.nan)
-    return (
-        np.array([value for value, _ in points]),
-        np.array([np.nan if iterate is None else iterate.objective for _, iterate in points]),
-        np.array([nothing if iterate is None else iterate.theta for _, iterate in points]),
-    )
-
-
-def _unit(problem: Problem, name: str) -> str:
-    plain = name.partition("[")[0]
-    return "s" if plain == SHIFT else problem.model.units.get(plain, "")
+    objective, peak = start
+    ridge, missing = Ridge(objective, column, peak), np.full(peak.theta.size, np.nan)
+    values, iterates = zip(*ridge.followed(), strict=True)
+    density = [np.nan if iterate is None else iterate.objective for iterate in iterates]
+    paths = [missing if iterate is None else iterate.theta for iterate in iterates]
+    return ridge.limits(), np.array(values), np.array(density), np.array(paths)
 
 
 def _written(theta: dict[str, float]) -> str:

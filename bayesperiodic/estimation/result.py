@@ -1,14 +1,17 @@
-"""MapEstimate: the MAP point, its Laplace approximations, and an account of the residual."""
+"""MapEstimate: the MAP point, its Laplace approximations, and tests of the residual."""
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import partial
+from itertools import product
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from scipy.special import stdtrit
 
-from bayesperiodic import _checks, _fourier
+from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse_all
 from bayesperiodic._io import Result
 from bayesperiodic.estimation.gauss_newton import Iterate
@@ -21,40 +24,19 @@ from bayesperiodic.posterior.problem import Problem
 
 @dataclass(frozen=True)
 class Whiteness:
-    """Bartlett's test of a residual that repeats every period.
+    """Test by M. S. Bartlett (An Introduction to Stochastic Processes, 1955) of a residual that repeats every period.
 
-    Attributes
-    ----------
-    p : float
-        Probability, for white residuals, of a cumulative periodogram at least as far from a straight line; the
-        Kolmogorov-Smirnov distance of the kept harmonics, exact for independent normal values. NaN if not tested.
-    lag1 : float
-        Circular autocorrelation at the distance of two independent values, one period / (2·harmonics + 1).
+    `p` is the probability, for white residuals, of a cumulative periodogram at least as far from a straight line: the
+    Kolmogorov-Smirnov distance of the kept harmonics, exact for independent normal values; NaN if not tested. `lag1` is
+    the circular autocorrelation at the distance of two independent values, one period / (2·harmonics + 1).
     """
 
     p: float
     lag1: float
 
 
-def whiteness(residual: np.ndarray, harmonics: int | None = None) -> Whiteness:
-    """Test one residual period (points,) for whiteness; by default over all harmonics of the grid."""
-    return of_periodogram(np.abs(_fourier.coefficients(residual, harmonics)[1:]) ** 2)
-
-
-def of_components(components: np.ndarray, harmonic: np.ndarray) -> Whiteness:
-    """Test real Fourier components (size,) that belong to given harmonics (size,)."""
-    power = np.bincount(harmonic, components**2)
-    complete = np.bincount(harmonic) == 2
-    return of_periodogram(power[complete])
-
-
 def of_periodogram(power: np.ndarray) -> Whiteness:
-    """Test the squared amplitudes of harmonics 1, 2, … for being those of white noise.
-
-    References
-    ----------
-    M. S. Bartlett, An Introduction to Stochastic Processes, Cambridge University Press, 1955.
-    """
+    """Test whether the squared amplitudes of harmonics 1, 2, … are those of white noise (Bartlett 1955)."""
     from scipy.stats import kstest
 
     if power.size < 2 or power.sum() == 0.0:
@@ -72,14 +54,8 @@ def of_periodogram(power: np.ndarray) -> Whiteness:
 class NoiseSplit:
     """Standard deviations of one value of a channel's mean period, in the channel's units.
 
-    Attributes
-    ----------
-    measurement : float
-        What the scatter of the measured cycles explains; NaN where that is not known.
-    model : float
-        What is left: √(total² − measurement²), or zero.
-    total : float
-        That of the residual, corrected for the number of free parameters as in eq. (7).
+    `measurement` follows from the scatter of the measured cycles, NaN if unknown; `total` is that of the residual,
+    corrected for the number of free parameters as in eq. (7); `model` is √(total² − measurement²), or zero.
     """
 
     measurement: float
@@ -88,7 +64,7 @@ class NoiseSplit:
 
 
 def noise_split(problem: Problem, estimate: Iterate, share: float) -> dict[str, NoiseSplit]:
-    """Return the split of every channel whose history was compared; `share` is 1 − l/Σn of eq. (7)."""
+    """Return the split of every channel with compared time histories; `share` is 1 − l/Σn of eq. (7)."""
     sums = {channel: np.zeros(3) for channel in problem.channels}
     for block, r in zip(problem.likelihood.blocks, estimate.here.residuals, strict=True):
         if block.kind in (SPECTRAL, POINTS):
@@ -102,53 +78,47 @@ def noise_split(problem: Problem, estimate: Iterate, share: float) -> dict[str, 
 
 
 def channel_whiteness(problem: Problem, estimate: Iterate) -> dict[str, Whiteness]:
-    """Return the whiteness of every channel's residual in units of the noise model.
-
-    With several experiments p is the smallest, corrected for their number, lag1 the mean; NaN where only single points
-    were compared.
-    """
+    """Return `MapEstimate.whiteness`; NaN where only single points were compared."""
     white = problem.likelihood.whitened(estimate.here.residuals, estimate.noise)
     tests: dict[str, list[Whiteness]] = {channel: [] for channel in problem.channels}
     for block, r in zip(problem.likelihood.blocks, white, strict=True):
         if block.kind == SPECTRAL:
-            tests[block.channel].append(of_components(r, block.harmonic))
-    nothing = [Whiteness(float("nan"), float("nan"))]
+            complete = np.bincount(block.harmonic) == 2
+            tests[block.channel].append(of_periodogram(np.bincount(block.harmonic, r**2)[complete]))
     return {
-        channel: Whiteness(
-            float(np.minimum(1.0, len(found or nothing) * min(t.p for t in found or nothing))),
-            float(np.mean([t.lag1 for t in found or nothing])),
-        )
+        channel: Whiteness(min(1.0, len(found) * min(t.p for t in found)), float(np.mean([t.lag1 for t in found])))
+        if found
+        else Whiteness(np.nan, np.nan)
         for channel, found in tests.items()
     }
 
 
 @dataclass(frozen=True)
 class MapEstimate(Result):
-    """The maximum of the posterior density and the normal approximation around it.
+    """Maximum of the posterior density, and the normal approximation around it.
 
     Attributes
     ----------
     status : str
-        "converged", "stalled" (no step raised the objective), "iterations" (their limit was reached) or "singular".
+        "converged", "stalled" (no step increased the objective), "iterations" (their limit was reached) or "singular".
     theta, sd : dict of str to float
         Estimates and their standard deviations, in natural values and the parameters' units.
     robust_sd : dict of str to float
-        Standard deviations that hold although the residuals are not as the noise model says (sandwich with the
-        residual's smoothed spectrum); far from `sd`, the noise model is too sure of itself or not sure enough.
+        Standard deviations that are valid for residuals that deviate from the noise model (sandwich covariance with the
+        residual's smoothed spectrum); if they differ much from `sd`, the noise model is wrong.
     variances : dict of str to float
-        Variance of the mean period of each channel (or "channel, experiment"), and "scale", eq. (7) ([1]_) or as fixed.
+        Variance of the mean period of each channel (or "channel, experiment"), and "scale", by eq. (7) or fixed.
     noise : dict of str to float
         All noise parameters by their full names.
     noise_prior : str
-        The prior of the variances, in words.
+        Prior of the variances, in words.
     covariance : DataFrame (names × names)
-        Inverse of H of eq. (8) at these variances; where the correlation of the noise is estimated too (`Circulant`),
-        with that uncertainty integrated in.
+        Inverse of H of eq. (8) at these variances; for `Circulant` noise, with its unknown correlation integrated out.
     joint_mode : dict of str to float
         Mode of the density in sampling coordinates: natural values of parameters and free noise parameters.
     joint_covariance : DataFrame
-        Inverse of the exact Hessian there, over the sampling coordinates: logarithms of the parameters whose prior's
-        support is (0, ∞) and of the noise parameters, other parameters as they are. NaN where there is no maximum.
+        Inverse of the exact Hessian there; NaN if it is no maximum. Sampling coordinates are the logarithms of noise
+        parameters and of parameters whose prior's support is (0, ∞), and the other parameters.
     degrees_of_freedom : float
         Independent values less free parameters; infinite where all variances are fixed.
     independent : dict of str to float
@@ -158,41 +128,29 @@ class MapEstimate(Result):
     residuals : dict of str to dict of str to array (points,)
         y − ŷ within the kept harmonics, by experiment and channel.
     rms, fvu : dict of str to float
-        Root mean square of the residuals of each channel, and their mean square over the variance of the measured
-        channel (the fraction of variance unexplained).
+        Root mean square of each channel's residuals, and the fraction of the measured variance that they are.
     whiteness : dict of str to Whiteness
         Of the residuals in units of the noise model, by channel; with several experiments p is the smallest, corrected
         for their number, lag1 the mean.
     noise_split : dict of str to NoiseSplit
         Measurement noise and model error of each channel.
     input_noise : dict of str to float
-        Standard deviation that the noise of the measured inputs brings to each channel.
+        Standard deviation that the noise of the measured inputs causes in each channel.
     doubling_shift : dict of str to float
-        By how many standard deviations each estimate would move on twice as many points; NaN if those solves fail.
+        Change of each estimate on twice as many points, in standard deviations; NaN if those solves fail.
     at_ends : tuple of str
         Parameters whose estimate lies at the end of their prior's support.
     undetermined : tuple of str
-        Parameters or combinations of them that change no output at all, in words; what is said of them is the prior's.
+        Changes of parameters, in words, that change no output; in these directions the posterior equals the prior.
     history : array (iterations,)
         The objective before each step and at the end.
     starts : tuple of dict of str to float
-        Of every start, the objective it led to (−inf: none) under "objective", and the estimates.
+        Of every start, the objective reached (−inf: none) under "objective", and the estimates.
     tied : dict of str to dict of str to float
         Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
 
-    References
-    ----------
-    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
-       equilibrium states, 1997.
-
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
     >>> fit = bp.map_estimate(problem, progress=False)
     >>> for name, value in fit.theta.items():
     ...     print(f"{name} = {value:.3f} ± {fit.sd[name]:.3f}")
@@ -229,6 +187,18 @@ class MapEstimate(Result):
     starts: tuple[dict[str, float], ...]
     tied: dict[str, dict[str, float]]
 
+    if not TYPE_CHECKING:
+        # Fields that take long and that few users need are functions until they are used.
+        def __getattribute__(self, name: str) -> Any:
+            value = super().__getattribute__(name)
+            if isinstance(value, partial):
+                value = value()
+                object.__setattr__(self, name, value)
+            return value
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
     @property
     def converged(self) -> bool:
         """True if the status is "converged"."""
@@ -241,9 +211,7 @@ class MapEstimate(Result):
         return pd.DataFrame(self.covariance / np.outer(sd, sd))
 
     def interval(self, probability: float = 0.9, *, robust: bool = False) -> dict[str, tuple[float, float]]:
-        """Return the equal-tailed interval of each parameter, Student's t with `degrees_of_freedom`.
-
-        With few independent values a normal interval is too short, because the variance is estimated too.
+        """Return the equal-tailed interval of each parameter, by Student's t with `degrees_of_freedom`.
 
         Parameters
         ----------
@@ -272,7 +240,7 @@ class MapEstimate(Result):
         """Return quantities derived from the parameters, with standard deviations by the delta method.
 
         The standard deviation is √(gᵀ C g) with the exact gradient g by the free parameters and the `covariance` C:
-        exact for linear combinations, otherwise good as far as the expression is straight within the uncertainty.
+        exact for linear combinations, otherwise accurate if the expression is nearly linear within the uncertainty.
 
         Parameters
         ----------
@@ -280,34 +248,26 @@ class MapEstimate(Result):
             By new name: numbers, names of parameters (free, fixed or tied), pi, + - * / ** and sqrt, exp, log, sin,
             cos, tan, atan, sinh, cosh, tanh, abs.
         experiment : str, optional
-            Whose local parameters, and fixed values, the expressions mean, by their plain names: with "run 7"
-            ``theta16`` is ``theta16[run 7]``. Without it they can name only what all experiments share.
+            Its local parameters and fixed values are named without brackets: with "run 7" ``theta16`` is
+            ``theta16[run 7]``. Without it, expressions contain only parameters that all experiments share.
 
         Returns
         -------
         DataFrame
-            Columns value and sd, a row a quantity; ``attrs["covariance"]`` holds the covariances between the quantities
-            as a dict of dict of floats. The sd is NaN where a tied parameter enters that follows a local one.
+            Columns value and sd, one row per quantity; ``attrs["covariance"]`` holds the covariances between the
+            quantities as a dict of dict of floats. The sd is NaN where a tied parameter depends on a local one.
 
         Raises
         ------
         ValueError
-            For an invalid expression or one without a finite value at the estimate, a new name that is no
-            identifier or that a parameter has, an unknown experiment.
+            For an invalid expression or one without a finite value at the estimate, a new name that is no identifier or
+            the name of a parameter, an unknown experiment.
 
         Examples
         --------
-        >>> import numpy as np, bayesperiodic as bp
-        >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
-        >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
-        ...                          frequency=0.1, samples=50, scheme="central4")
-        >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
-        >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)},
-        ...                      fixed={"m": 1, "k3": 0.5, "variance[displacement]": 1e-4}, scheme="central4")
-        >>> fit = bp.map_estimate(problem, progress=False)
-        >>> fit.derive({"damping_ratio": "c/(2*sqrt(k*m))"}).round(4)
-                       value      sd
-        damping_ratio    0.1  0.0016
+        >>> fit.derive({"damping_ratio": "c/(2*sqrt(k))"}).round(4)
+                        value      sd
+        damping_ratio  0.0998  0.0005
         """
         if experiment is not None:
             _checks.one_of("experiment", experiment, self.solutions)
@@ -321,7 +281,8 @@ class MapEstimate(Result):
                 raise ValueError(
                     f"expressions[{name!r}]: must be finite at the estimate, got {value} for {quantities[name].text!r}."
                 )
-        covariance = _carried(self.covariance, [self._gradient(q, values, named) for q in quantities.values()])
+        gradients = [self._gradient(quantity, values, named) for quantity in quantities.values()]
+        covariance = _carried(self.covariance.to_numpy(), gradients)
         with np.errstate(invalid="ignore"):
             sd = np.sqrt(np.diag(covariance))
         table = pd.DataFrame({"value": list(at.values()), "sd": sd}, index=list(at))
@@ -331,9 +292,7 @@ class MapEstimate(Result):
         return table
 
     def as_prior(self, names: tuple[str, ...]) -> MultivariateNormal:
-        """Return the normal approximation of these parameters, as the prior of the next problem.
-
-        See `Posterior.as_prior`; the mean is the maximum, and the covariance is taken from `covariance`.
+        """Return the normal approximation of these parameters, as the prior of another problem.
 
         Parameters
         ----------
@@ -343,11 +302,12 @@ class MapEstimate(Result):
         Returns
         -------
         MultivariateNormal
+            With the estimate as mean and the part of `covariance`; see `Posterior.as_prior`.
 
         Raises
         ------
         ValueError
-            For anything else than a tuple of different free parameters.
+            For anything else than a tuple of different free parameters with finite standard deviations.
 
         Warns
         -----
@@ -356,24 +316,15 @@ class MapEstimate(Result):
 
         Examples
         --------
-        >>> import numpy as np, bayesperiodic as bp
-        >>> force = np.cos(2 * np.pi * np.arange(50) / 50)
-        >>> true = bp.solve_periodic(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, {"force": force},
-        ...                          frequency=0.1, samples=50, scheme="central4")
-        >>> run = bp.Experiment("run", 0.1, true.outputs, {"force": force}, samples=50)
-        >>> known = {"m": 1, "k3": 0.5, "variance[displacement]": 1e-4}
-        >>> problem = bp.Problem(bp.models.duffing, [run], fixed=known, scheme="central4",
-        ...                      priors={"c": bp.Normal(0.2, 0.1), "k": bp.Normal(1, 0.5)})
-        >>> names = ("c", "k")
-        >>> prior = bp.map_estimate(problem, progress=False).as_prior(names)
-        >>> bp.Problem(bp.models.duffing, [run], fixed=known, priors={names: prior}).median().round(3).tolist()
+        >>> priors = {("c", "k"): fit.as_prior(("c", "k"))}
+        >>> bp.Problem(bp.models.duffing, [run], priors=priors, fixed={"m": 1, "k3": 0.5}).median().round(2).tolist()
         [0.2, 1.0]
         """
         key = labels.checked_key(names, self.theta, self.noise)
         if not self.converged:
             warnings.warn(
-                f"The estimate has not converged ({self.status}), nor has this prior. Try map_estimate from another "
-                "start, or from several.",
+                f"The estimate has not converged ({self.status}), and the prior is unreliable. Try map_estimate from "
+                "another start, or from several.",
                 stacklevel=2,
             )
         mean = np.array([self.theta[name] for name in key])
@@ -385,19 +336,18 @@ class MapEstimate(Result):
             )
         return MultivariateNormal(mean, covariance)
 
-    def _gradient(self, quantity: Expression, values: dict[str, float], named: dict[str, str]) -> dict[str, np.ndarray]:
-        """Return the derivatives by the free parameters, those through tied ones included; `named` by plain name."""
-        partial = quantity.gradient(values)
-        total = {name: np.array(0.0) for name in self.theta}
-        for plain, slope in partial.items():
+    def _gradient(self, quantity: Expression, values: dict[str, float], named: dict[str, str]) -> np.ndarray:
+        """Return the derivatives by the free parameters (names,), those through tied ones included."""
+        total = dict.fromkeys(self.theta, 0.0)
+        for plain, slope in quantity.gradient(values).items():
             if plain in named:
-                total[named[plain]] = total[named[plain]] + slope
+                total[named[plain]] += float(slope)
             for name, through in self.tied.get(plain, {}).items():
-                total[name] = total[name] + slope * through
-        return total
+                total[name] += float(slope) * through
+        return np.array(list(total.values()))
 
     def _fixed(self, experiment: str | None) -> dict[str, float]:
-        """Return the parameters that are not free, tied ones among them: of one experiment, or common to all."""
+        """Return the fixed and tied parameters of one experiment, or those with the same value in all."""
         free = {*self.theta, *(labels.local_names(self.theta) if experiment is None else ())}
         first, *others = (solution.parameters for run, solution in self.solutions.items() if experiment in (None, run))
         return {
@@ -427,13 +377,10 @@ class MapEstimate(Result):
         return "\n".join(lines)
 
 
-def _carried(covariance: pd.DataFrame, gradients: list[dict[str, np.ndarray]]) -> np.ndarray:
-    """Return the covariance of quantities with these gradients; what a quantity does not depend on has no say."""
-    matrix = covariance.to_numpy()
-    rows = [np.array([float(gradient[name]) for name in covariance.columns]) for gradient in gradients]
-    result = np.zeros((len(rows), len(rows)))
+def _carried(matrix: np.ndarray, gradients: list[np.ndarray]) -> np.ndarray:
+    """Return the covariance of quantities with these gradients; parameters of gradient 0 may have an infinite sd."""
+    result = np.zeros((len(gradients), len(gradients)))
     with np.errstate(invalid="ignore", over="ignore"):
-        for i, a in enumerate(rows):
-            for j, b in enumerate(rows):
-                result[i, j] = a[a != 0.0] @ matrix[np.ix_(a != 0.0, b != 0.0)] @ b[b != 0.0]
+        for (i, a), (j, b) in product(enumerate(gradients), repeat=2):
+            result[i, j] = a[a != 0.0] @ matrix[np.ix_(a != 0.0, b != 0.0)] @ b[b != 0.0]
     return result

@@ -1,4 +1,4 @@
-"""Where a sampling run is kept while it goes on: one HDF5 file, always whole, that emcee's own backend reads."""
+"""Checkpoints of sampling runs: one HDF5 file, always complete, in the format of emcee's backend."""
 
 import hashlib
 import json
@@ -7,9 +7,8 @@ import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import emcee
 import h5py
@@ -22,57 +21,38 @@ PATIENCE = 20.0
 MARK, RUN = "fingerprint", "run"
 
 
-@dataclass(frozen=True)
-class Saved:
-    """What a checkpoint holds.
-
-    Attributes
-    ----------
-    backends : list of emcee.backends.Backend
-        In memory, one an ensemble.
-    state : dict
-        Whatever else the run needs to go on as if nothing had happened.
-    """
+class Saved(NamedTuple):
+    """Content of a checkpoint: the chains of each ensemble, in memory, and the other data needed to resume the run."""
 
     backends: list[emcee.backends.Backend]
     state: dict[str, Any]
 
 
 class Checkpoint:
-    """A file that holds all steps up to some moment, or the one before it, and never anything between.
+    """A file with all steps up to some moment; an interrupted write leaves the previous content.
 
-    emcee's HDF5 backend writes every step in pieces, and a run killed between two of them leaves a torn file. Here
-    chains grow in memory; now and then they are written to a new file that then takes the place of the old one. The
-    time between is at least twenty times what writing takes.
-
-    Parameters
-    ----------
-    path : path
-    problem : Description
-    settings : str
-        What else must be the same for a run to go on: seed, numbers of ensembles and walkers, and so on.
-
-    Raises
-    ------
-    ValueError
-        If the file cannot be read, belongs to another problem or other settings, or is in use by another run.
+    emcee's HDF5 backend writes every step in pieces, and a run killed between two of them leaves a damaged file. Here
+    chains grow in memory; from time to time they are written to a new file, which then replaces the old one. The time
+    between is at least twenty times the time of a write.
+    Problem and settings (seed, numbers of ensembles and walkers …) must be equal when a run is resumed.
     """
 
     def __init__(self, path: str | Path, problem: Description, settings: str):
         self._path, self._mark = Path(path), f"{fingerprint(problem)}; {settings}"
         self._lock = FileLock(f"{path}.lock", timeout=0.0)
         self._next = 0.0
-        self._check()
 
     def __enter__(self) -> "Checkpoint":
         try:
             self._lock.acquire()
         except Timeout:
             raise ValueError(
-                f"checkpoint: {str(self._path)!r} is in use by another run; wait for it, or name another file."
+                f"checkpoint: must not be in use by another run, got {str(self._path)!r}; wait, or name another file."
             ) from None
         except OSError as error:
-            raise ValueError(f"checkpoint: {str(self._path)!r} cannot be used ({error}); name another file.") from None
+            raise ValueError(
+                f"checkpoint: must be a writable file, got {str(self._path)!r} ({error}); name another file."
+            ) from None
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -80,35 +60,30 @@ class Checkpoint:
             Path(self._lock.lock_file).unlink()
         self._lock.release()
 
-    def _check(self) -> None:
+    def load(self) -> Saved | None:
+        """Return the content of the file; None if there is no file."""
         if not self._path.exists():
-            return
+            return None
         try:
             with h5py.File(self._path, "r") as file:
                 found = file.attrs.get(MARK, "no run of this package")
+                if found != self._mark:
+                    raise ValueError(
+                        f"checkpoint: must be a file of this run ({self._mark}), got {str(self._path)!r} of another "
+                        f"run ({found}); name another file or delete it."
+                    )
+                state = json.loads(file[RUN][()])
+                names = sorted((name for name in file if name.startswith("ensemble ")), key=lambda name: int(name[9:]))
         except OSError as error:
             raise ValueError(
-                f"checkpoint: {str(self._path)!r} cannot be used, it is damaged or no HDF5 file ({error}); name "
-                "another file or delete it."
+                f"checkpoint: must be an intact HDF5 file, got {str(self._path)!r} ({error}); name another file or "
+                "delete it."
             ) from None
-        if found != self._mark:
-            raise ValueError(
-                f"checkpoint: {str(self._path)!r} belongs to another run ({found}), this one is ({self._mark}); name "
-                "another file or delete it."
-            )
-
-    def load(self) -> Saved | None:
-        """Return what the file holds; None if there is no file."""
-        if not self._path.exists():
-            return None
-        with h5py.File(self._path, "r") as file:
-            state = json.loads(file[RUN][()])
-            names = sorted((name for name in file if name.startswith("ensemble ")), key=lambda name: int(name[9:]))
         stored = [emcee.backends.HDFBackend(str(self._path), name=name, read_only=True) for name in names]
         return Saved([_in_memory(backend) for backend in stored], state)
 
     def save(self, backends: Sequence[emcee.backends.Backend], state: dict[str, Any], *, now: bool = False) -> None:
-        """Write all steps so far; without `now` only if the last time was long enough ago."""
+        """Write all steps so far; without `now` only if the last write was long enough ago."""
         started = time.monotonic()
         if not now and started < self._next:
             return
@@ -144,7 +119,7 @@ def _write(group: h5py.Group, backend: emcee.backends.Backend) -> None:
 
 
 def _in_memory(stored: emcee.backends.HDFBackend) -> emcee.backends.Backend:
-    """Return a chain read whole into memory, ready to grow."""
+    """Return a chain read into memory, which can be extended."""
     backend = emcee.backends.Backend()
     backend.reset(*stored.shape)
     backend.iteration = stored.iteration
@@ -160,21 +135,9 @@ def fingerprint(problem: Description) -> str:
     """Return a digest of model, data, priors, fixed values, ties, noise model and scheme."""
     digest = hashlib.sha256(problem.model.symbolic.kernel_source().encode())
     for experiment in problem.experiments:
-        digest.update(
-            repr(
-                (
-                    experiment.name,
-                    experiment.frequency,
-                    experiment.samples,
-                    experiment.periods,
-                    experiment.winding,
-                    experiment.independent,
-                    experiment.harmonics,
-                    experiment.frequency_se,
-                    [(b.channel, b.kind, b.count, b.measured) for b in problem.observations[experiment.name].blocks],
-                )
-            ).encode()
-        )
+        names = ("name", "frequency", "samples", "periods", "winding", "independent", "harmonics", "frequency_se")
+        blocks = [(b.channel, b.kind, b.count, b.measured) for b in problem.observations[experiment.name].blocks]
+        digest.update(repr((*(getattr(experiment, name) for name in names), blocks)).encode())
         for signals in (experiment.outputs, experiment.inputs):
             for name, values in signals.items():
                 digest.update(name.encode() + np.ascontiguousarray(values).tobytes())

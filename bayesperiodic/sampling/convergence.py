@@ -1,4 +1,4 @@
-"""Chains and their diagnostics: the one place that knows ArviZ (0.23 and 1.x)."""
+"""Convergence diagnostics of chains; calls of ArviZ (0.23 and 1.x)."""
 
 import warnings
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ FEWEST_WEIGHTS, EQUAL, SMALLEST = 0.25, 1e-6, 700.0
 
 
 def arviz() -> ModuleType:
-    """Return the arviz module, imported without the notice that its 0.23 series prints."""
+    """Return the arviz module, imported without the notice of version 0.23."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=FutureWarning, module="arviz")
         import arviz as module
@@ -20,15 +20,12 @@ def arviz() -> ModuleType:
 
 
 def rhat(chains: np.ndarray) -> np.ndarray:
-    """Return the rank-normalised split R-hat of each coordinate from independent ensembles.
+    """Return the rank-normalised split R-hat of each coordinate of chains (ensembles, steps, walkers, coordinates).
 
-    Parameters
-    ----------
-    chains : array (ensembles, steps, walkers, coordinates)
-        The walkers of an ensemble depend on each other, so an ensemble is one chain here, its steps in order.
+    The walkers of an ensemble depend on each other; therefore an ensemble is one chain here, its steps in order.
     """
-    ensembles, steps, walkers, count = chains.shape
-    pooled = chains.reshape(ensembles, steps * walkers, count)
+    count = chains.shape[-1]
+    pooled = chains.reshape(len(chains), -1, count)
     data = xr.Dataset({str(i): (("chain", "draw"), pooled[:, :, i]) for i in range(count)})
     result = arviz().rhat(data, method="rank")
     return np.array([float(result[str(i)]) for i in range(count)])
@@ -43,26 +40,16 @@ def autocorrelation_time(chains: np.ndarray) -> np.ndarray:
 
 def quantile_spread(chains: np.ndarray) -> np.ndarray:
     """Return the largest difference between ensembles of the 5, 50 and 95 % quantiles, in pooled sds."""
-    ensembles, steps, walkers, count = chains.shape
-    pooled = chains.reshape(ensembles, steps * walkers, count)
+    pooled = chains.reshape(len(chains), -1, chains.shape[-1])
     quantiles = np.quantile(pooled, [0.05, 0.5, 0.95], axis=1)
-    return np.ptp(quantiles, axis=1).max(axis=0) / pooled.reshape(-1, count).std(axis=0)
+    return np.ptp(quantiles, axis=1).max(axis=0) / pooled.reshape(-1, pooled.shape[-1]).std(axis=0)
 
 
 def pareto_k(log_weights: np.ndarray) -> float:
-    """Return the Pareto shape k̂ of the upper tail of importance weights [1]_; ∞ where few of them are positive.
+    """Return the Pareto shape k̂ of the upper tail of importance weights; ∞ if less than a quarter are positive.
 
-    Equal weights, to within a millionth, have no tail: 0.
-
-    Parameters
-    ----------
-    log_weights : array (draws,)
-        −∞ for a weight of zero.
-
-    References
-    ----------
-    .. [1] A. Vehtari, D. Simpson, A. Gelman, Y. Yao, J. Gabry, Pareto smoothed importance sampling, Journal of Machine
-       Learning Research 25 (2024) 1-58.
+    Equal weights, to within a millionth, have no tail: 0. The logarithm of a weight of zero is −∞. From A. Vehtari et
+    al., Pareto smoothed importance sampling, Journal of Machine Learning Research 25 (2024) 1-58.
     """
     positive = np.isfinite(log_weights)
     if positive.mean() < FEWEST_WEIGHTS:
@@ -74,10 +61,12 @@ def pareto_k(log_weights: np.ndarray) -> float:
     module = arviz()
     if hasattr(module, "psislw"):
         return float(module.psislw(weights)[1])
-    # ArviZ 1.x takes the negative, as if it were a log-likelihood that is left out.
+    # ArviZ 1.x expects the negative, as of a log-likelihood that is left out.
     return float(xr.DataArray(-weights, dims="draw").azstats.psislw(dim="draw")[1])
 
 
+# Steps between checks of the stop rule, and the number of passes in succession after which sampling ends.
+BLOCK, PASSES = 250, 2
 LENGTHS = 50.0
 LENGTHS_ALONE = 500.0
 TAU_CHANGE = 0.05
@@ -89,17 +78,12 @@ APART = 8.0
 def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: Sequence[str]) -> list[str]:
     """Return the criteria of the stop rule that are not met, in words.
 
-    An ensemble of 32 walkers that is 50 autocorrelation times long holds 1600 independent draws, a walker alone would
-    hold 50, so that it has to be 500 long; all else is the same for both. The mean of a walker scatters by its standard
-    deviation over √(steps/tau); one that is eight times as far off stays in a mode of its own.
+    An ensemble of 32 walkers that is 50 autocorrelation times long contains 1600 independent draws, a single walker
+    would contain 50; therefore it must be 500 autocorrelation times long. The mean of a walker scatters by its standard
+    deviation over √(steps/tau); one that is eight times as far off remains in a mode of its own.
 
-    Parameters
-    ----------
-    kept : array (ensembles, steps, walkers, coordinates)
-    tau, last : array (coordinates,)
-        Autocorrelation time [steps], now and at the check before.
-    labels : sequence of str
-        Names of the coordinates.
+    `kept` are chains (ensembles, steps, walkers, coordinates); `tau` and `last` are autocorrelation times [steps] of
+    the coordinates, now and at the previous check; `labels` are the names of the coordinates.
     """
     found = []
     if not np.isfinite(tau).all():
@@ -120,6 +104,6 @@ def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: 
 
 
 def _furthest(kept: np.ndarray, tau: np.ndarray) -> float:
-    """Return how far the mean of a walker is from that of all, at most, in standard errors of such a mean."""
+    """Return the largest distance of a walker's mean from the mean of all, in standard errors of such a mean."""
     off = np.abs(kept.mean(axis=1) - kept.mean(axis=(0, 1, 2)))
     return float(np.max(off / (kept.std(axis=(0, 1, 2)) * np.sqrt(tau / kept.shape[1]))))

@@ -1,4 +1,4 @@
-"""Ensembles of walkers, advanced segment by segment; a segment is a pure function of its task, in any process."""
+"""Ensembles of walkers, advanced by segments; a segment is a pure function of its task, in any process."""
 
 import threading
 from collections import Counter
@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import emcee
 import numpy as np
 
+from bayesperiodic._linalg import covariance_eigh
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 from bayesperiodic.posterior.density import Evaluation
 
@@ -22,14 +23,9 @@ Evaluate = Callable[[np.ndarray], Evaluation]
 class AffineTransform:
     """Sampling coordinates x = origin + axes·u, in which the Laplace approximation is a standard normal distribution.
 
-    emcee's moves are invariant under linear maps but for the small jitter that differential evolution adds to every
-    proposal: in coordinates whose scales differ by powers of ten it would block the narrow ones.
-
-    Attributes
-    ----------
-    origin : array (dimension,)
-    axes : array (dimension, dimension)
-        Columns are the eigenvectors of the Laplace covariance times the standard deviations along them.
+    The columns of `axes` are the eigenvectors of the Laplace covariance times the standard deviations along them.
+    emcee's moves are invariant under linear maps, except for the jitter that differential evolution adds to every
+    proposal: it would block narrow coordinates if the scales differed by powers of ten.
     """
 
     origin: np.ndarray
@@ -38,9 +34,8 @@ class AffineTransform:
     @classmethod
     def of(cls, mean: np.ndarray, covariance: np.ndarray) -> "AffineTransform":
         """Return the transform of a normal distribution."""
-        scale = np.sqrt(np.diag(covariance))
-        values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-        return cls(mean, scale[:, None] * vectors * np.sqrt(np.maximum(values, np.finfo(float).eps)))
+        values, vectors, sd = covariance_eigh(covariance)
+        return cls(mean, sd[:, None] * vectors * np.sqrt(np.maximum(values, np.finfo(float).eps)))
 
     def unwhiten(self, u: np.ndarray) -> np.ndarray:
         """Return x (…, dimension)."""
@@ -68,32 +63,16 @@ class CallCount:
 
 
 class SamplingTarget(NamedTuple):
-    """The density that all ensembles sample, `LogPosterior.evaluate`, and the transform to its coordinates."""
+    """Density of all ensembles, `LogPosterior.evaluate`, and the transform to its coordinates."""
 
     evaluate: Evaluate
     transform: AffineTransform
 
 
 class ChainSegment(NamedTuple):
-    """Some steps of an ensemble.
+    """Steps of an ensemble, and the number of calls that they took."""
 
-    Attributes
-    ----------
-    chain : array (steps, walkers, dimension)
-    log_prob : array (steps, walkers)
-    blobs : array (steps, walkers, …), or None
-    accepted : array (walkers,)
-        Number of accepted proposals.
-    random_state : tuple
-        After the last step.
-    calls : CallCount
-    """
-
-    chain: np.ndarray
-    log_prob: np.ndarray
-    blobs: np.ndarray | None
-    accepted: np.ndarray
-    random_state: tuple
+    backend: emcee.backends.Backend
     calls: CallCount
 
 
@@ -106,27 +85,16 @@ def advance(target: SamplingTarget, task: tuple[emcee.State, int]) -> ChainSegme
         calls.add(found.status)
         return np.column_stack([found.log_prob, found.moments]) if found.moments.size else found.log_prob
 
-    np.random.RandomState().set_state(state.random_state)  # raises where emcee would go on with another one
+    np.random.RandomState().set_state(state.random_state)  # raises, while emcee would continue with another one
     moves = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)]
     sampler = emcee.EnsembleSampler(*state.coords.shape, log_prob, moves=moves, vectorize=True)
     sampler.run_mcmc(state, steps, skip_initial_state_check=True, progress=False)
-    end = sampler.backend
-    return ChainSegment(end.chain, end.log_prob, end.blobs, end.accepted, end.random_state, calls)
+    return ChainSegment(sampler.backend, calls)
 
 
 @dataclass(frozen=True)
 class Ensemble:
-    """State of one ensemble.
-
-    Attributes
-    ----------
-    backend : emcee.backends.Backend
-        In memory.
-    start : emcee.State
-        Coordinates, log-densities and random state after the last step.
-    calls : CallCount
-        So far.
-    """
+    """State of one ensemble: chain in memory, coordinates and random state after the last step, number of calls."""
 
     backend: emcee.backends.Backend
     start: emcee.State
@@ -134,7 +102,7 @@ class Ensemble:
 
     @classmethod
     def at(cls, points: np.ndarray, generator: np.random.RandomState, calls: CallCount) -> "Ensemble":
-        """Return the ensemble that starts at points (walkers, dimension), found by a number of calls."""
+        """Return the ensemble that starts at points (walkers, dimension), which took a number of calls."""
         backend = emcee.backends.Backend()
         backend.reset(*points.shape)
         return cls(backend, emcee.State(points, random_state=generator.get_state()), calls)
@@ -145,34 +113,28 @@ class Ensemble:
         return self.backend.iteration
 
     def next_task(self, until: int) -> tuple[emcee.State, int] | None:
-        """Return the next task for `advance` towards a number of steps; None if they are done."""
+        """Return the next task for `advance` up to a number of steps; None if they are done."""
         missing = until - self.steps
         return (self.start, min(missing, PIECE)) if missing > 0 else None
 
     def extended(self, segment: ChainSegment) -> "Ensemble":
-        """Return the ensemble with a segment appended, in the memory of this one."""
-        backend, first = copy(self.backend), self.steps
-        last = first + len(segment.chain)
-        blobs = None if segment.blobs is None else segment.blobs[0]
+        """Return the ensemble with a segment appended, in the same memory."""
+        backend, new, first = copy(self.backend), segment.backend, self.steps
+        last = first + new.iteration
         if last > len(backend.chain):
-            backend.grow(max(last - first, ROOM), blobs)
-        backend.chain[first:last], backend.log_prob[first:last] = segment.chain, segment.log_prob
-        if segment.blobs is not None:
-            backend.blobs[first:last] = segment.blobs
-        backend.accepted = backend.accepted + segment.accepted
-        backend.random_state, backend.iteration = segment.random_state, last
+            backend.grow(max(new.iteration, ROOM), None if new.blobs is None else new.blobs[0])
+        backend.chain[first:last], backend.log_prob[first:last] = new.chain, new.log_prob
+        if new.blobs is not None:
+            backend.blobs[first:last] = new.blobs
+        backend.accepted = backend.accepted + new.accepted
+        backend.random_state, backend.iteration = new.random_state, last
         return Ensemble(backend, backend.get_last_sample(), self.calls + segment.calls)
 
 
 class LockstepPool:
-    """Runs tasks as `TaskPool` does, each in a thread that waits for the others at every evaluation of the density.
+    """Runs tasks like `TaskPool`, in threads whose points are evaluated in one call.
 
-    The points of all threads are evaluated in one call: small calls are dominated by their overhead, and the cores
-    share the solves of one large call better than those of several small ones.
-
-    Parameters
-    ----------
-    target : SamplingTarget
+    The overhead dominates small calls, and one large call uses the cores better than several small ones.
     """
 
     def __init__(self, target: SamplingTarget):
@@ -181,17 +143,9 @@ class LockstepPool:
     def run(
         self, advance: Callable[[SamplingTarget, Any], Any], tasks: Sequence[Any], then: Callable[[int, Any], Any]
     ) -> Iterator[tuple[int, Any]]:
-        """Yield the number and the result advance(target, task) of every task, one round after the other.
+        """Yield number and result advance(target, task) of every task, round by round; raise the exceptions of tasks.
 
-        An exception raised in a task is raised here.
-
-        Parameters
-        ----------
-        advance : callable
-        tasks : sequence
-            The first of each ensemble.
-        then : callable
-            Of an ensemble's number and its result: its next task, or None.
+        `tasks` are the first ones of each ensemble; then(number, result) returns its next task, or None.
         """
         waiting = dict(enumerate(tasks))
         with ThreadPoolExecutor(max(1, len(waiting))) as threads:
@@ -206,15 +160,7 @@ class LockstepPool:
 
 
 class JointEvaluation:
-    """Collects the calls of several threads and evaluates the points of all of them in one call.
-
-    Parameters
-    ----------
-    evaluate : callable
-        From points (points, dimension) to arrays (points, …), each row of its point alone.
-    callers : int
-        Number of threads.
-    """
+    """Collects the calls of several threads and evaluates their points (points, dimension) in one call."""
 
     def __init__(self, evaluate: Evaluate, callers: int):
         self._evaluate, self._callers = evaluate, callers
@@ -222,7 +168,7 @@ class JointEvaluation:
         self._lock = threading.Lock()
 
     def call(self, advance: Callable[[SamplingTarget, Any], Any], target: SamplingTarget, task: Any) -> Any:
-        """Return advance(target, task); afterwards the other threads no longer wait for this one."""
+        """Return advance(target, task); then the other threads no longer wait for this one."""
         try:
             return advance(target, task)
         finally:
@@ -232,7 +178,7 @@ class JointEvaluation:
             self._answer(calls)
 
     def evaluate(self, points: np.ndarray) -> Evaluation:
-        """Return the evaluation of these points, once all other threads have called too."""
+        """Return the evaluation of these points when all other threads have called too."""
         own: Future = Future()
         with self._lock:
             self._calls.append((points, own))
@@ -242,9 +188,9 @@ class JointEvaluation:
 
     def _complete(self) -> list[tuple[np.ndarray, Future]]:
         """Return the calls if all threads have called, else none."""
-        calls: list[tuple[np.ndarray, Future]] = []
-        if len(self._calls) == self._callers:
-            calls, self._calls = self._calls, calls
+        if len(self._calls) < self._callers:
+            return []
+        calls, self._calls = self._calls, []
         return calls
 
     def _answer(self, calls: list[tuple[np.ndarray, Future]]) -> None:

@@ -1,4 +1,4 @@
-"""Sampling of θ and the noise parameters by their gradient, with nutpie's NUTS: a check on the other sampler."""
+"""Sampling of θ and the noise parameters with nutpie's no-U-turn sampler, which uses the gradient."""
 
 import time
 import warnings
@@ -15,17 +15,15 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.density import SAMPLED, LogPosterior
 from bayesperiodic.posterior.labels import CHAIN, DRAW
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.convergence import unmet_criteria
+from bayesperiodic.sampling.convergence import BLOCK, PASSES, unmet_criteria
 from bayesperiodic.sampling.ensemble import AffineTransform, CallCount
 from bayesperiodic.sampling.posterior import Posterior, gather
 from bayesperiodic.sampling.starts import sampling_axes, start_points
 
 TUNE = 300
-BLOCK = 250
-PASSES = 2
 PAUSE = 0.01
 POSITION = "u"
-# By their names in ArviZ's schema.
+# Statistics of nutpie by their names in ArviZ's schema.
 STATISTICS = {
     "diverging": "diverging",
     "energy": "energy",
@@ -40,12 +38,7 @@ def refuse_for_nuts(walkers: int | None, variances: str, checkpoint: str | Path 
     """Raise a ValueError for arguments of `sample` that the no-U-turn sampler does not take."""
     for argument, value, default, hint in (
         ("walkers", walkers, None, "a chain has no walkers, so leave it out, and see ensembles"),
-        (
-            "variances",
-            variances,
-            SAMPLED,
-            "their gradient is not to be had when they are integrated out, so sample them",
-        ),
+        ("variances", variances, SAMPLED, "integrated variances have no gradient, so sample them"),
         ("checkpoint", checkpoint, None, "its chains cannot be resumed, so leave it out"),
         ("executor", executor, None, "its chains run in threads of this process, so leave it out"),
     ):
@@ -54,41 +47,13 @@ def refuse_for_nuts(walkers: int | None, variances: str, checkpoint: str | Path 
 
 
 def sample_nuts(
-    density: LogPosterior,
-    fit: MapEstimate,
-    seed: int,
-    ensembles: int,
-    max_steps: int,
-    start: str,
-    progress: bool,
+    density: LogPosterior, fit: MapEstimate, seed: int, ensembles: int, max_steps: int, start: str, progress: bool
 ) -> Posterior:
     """Sample a density with independent chains of the no-U-turn sampler, each an ensemble of one walker.
 
-    A chain starts where a walker would and moves along the same axes. Nothing else is shared with emcee but the density
-    itself; its gradient comes from a transposed solve. The chains run side by side and are looked at every 250 draws,
-    so that the result depends on the seed alone, and not on how far each of them had got.
-
-    Parameters
-    ----------
-    density : LogPosterior
-        Anchored at the estimate.
-    fit, seed, ensembles, max_steps, start, progress
-        See `sample`.
-
-    Returns
-    -------
-    Posterior
-        `failures` are fractions of all points of all trajectories, tuning included.
-
-    Raises
-    ------
-    ImportError
-        Without nutpie.
-
-    Warns
-    -----
-    UserWarning
-        If trajectories diverged.
+    Start points and axes are those of emcee's walkers; the gradient of the density comes from a transposed solve. The
+    chains run concurrently and are checked every 250 draws, so that the result depends on the seed alone, not on the
+    progress of each chain. `Posterior.failures` are fractions of all points of all trajectories, tuning included.
     """
     nutpie = _nutpie()
     sequences = np.random.SeedSequence(seed).spawn(ensembles + 2)
@@ -101,13 +66,15 @@ def sample_nuts(
             run.chains.append(_Chain(nutpie, density, axes, u, chain_seed, max_steps))
         run.go(max_steps, progress)
     except BaseException:
-        run.cancel()
+        for chain in run.chains:
+            with suppress(RuntimeError):  # of a chain that failed
+                chain.sampler.cancel()
         raise
     return run.posterior(nutpie.__version__, seed)
 
 
 def _nutpie() -> ModuleType:
-    """Return the nutpie module, imported without the notice of the ArviZ that it imports."""
+    """Return the nutpie module, imported without the notice of ArviZ."""
     convergence.arviz()
     try:
         import nutpie
@@ -121,7 +88,7 @@ def _nutpie() -> ModuleType:
 
 
 class _Chain:
-    """One chain, which nutpie moves in a thread of its own."""
+    """One chain, which nutpie runs in a thread."""
 
     def __init__(
         self, nutpie: ModuleType, density: LogPosterior, axes: AffineTransform, u: np.ndarray, seed: int, most: int
@@ -161,30 +128,24 @@ class _Chain:
 
     @property
     def done(self) -> int:
-        """Draws since the end of tuning that nutpie surely has too: it may not have filed the last one yet."""
+        """Number of draws since the end of tuning, without the last one, which nutpie may not have stored yet."""
         return max(0, len(self.draws) - TUNE - 1)
 
     def check(self) -> None:
-        """Raise what ended the chain before its time."""
+        """Raise the error that ended the chain."""
         if self.error is not None:
             raise self.error
-        with suppress(TimeoutError):  # It raises one while all is well.
+        with suppress(TimeoutError):  # raised by a running chain
             _ = self.sampler.is_finished
 
 
 class _Run:
-    """The chains, how far they are, and what the stop rule says."""
+    """The chains, their number of draws, and the result of the stop rule."""
 
     def __init__(self, density: LogPosterior, axes: AffineTransform):
         self.density, self.axes = density, axes
         self.chains: list[_Chain] = []
         self.steps, self.converged, self.reason = 0, False, ""
-
-    def cancel(self) -> None:
-        """Abort all chains."""
-        for chain in self.chains:
-            with suppress(RuntimeError):  # That of a chain that failed.
-                chain.sampler.cancel()
 
     def go(self, max_steps: int, progress: bool) -> None:
         """Wait until the stop rule is passed twice in succession, `max_steps` are reached, or Ctrl-C."""
@@ -214,7 +175,7 @@ class _Run:
         self.reason = f"max_steps = {max_steps} reached with {left}"
 
     def _wait(self, steps: int, bar: tqdm) -> None:
-        """Wait until every chain has so many draws."""
+        """Wait until every chain has a number of draws."""
         while (done := min(chain.done for chain in self.chains)) < steps:
             bar.update(done - bar.n)
             for chain in self.chains:
@@ -228,14 +189,22 @@ class _Run:
         return self.axes.unwhiten(walked)[:, :, None, :]
 
     def posterior(self, version: str, seed: int) -> Posterior:
-        """End the chains and return their draws, with what nutpie tells about each of them."""
+        """End the chains and return their draws with nutpie's statistics."""
         found = [chain.sampler.abort()["sample_stats"] for chain in self.chains]
         stats = {
             ours: np.stack([np.asarray(one[theirs])[0, : self.steps] for one in found])
             for ours, theirs in STATISTICS.items()
         }
         log_density = np.stack([np.asarray(one["logp"])[0, : self.steps] for one in found])
-        self._report(int(stats["diverging"].sum()), log_density.size)
+        if diverged := int(stats["diverging"].sum()):
+            lost = f"{diverged} of {log_density.size} trajectories diverged"
+            self.reason += f", {lost}"
+            warnings.warn(
+                f"{lost}: they reached points where the log-posterior is not finite, such as the ends of a prior's "
+                "support or failed solves, or its curvature is too large. The draws may miss a part of the posterior; "
+                "compare them with those of sampler='emcee'.",
+                stacklevel=5,
+            )
         accounts = [chain.accounts[TUNE + self.steps - 1] for chain in self.chains]
         result = gather(
             self.density,
@@ -253,15 +222,3 @@ class _Run:
         )
         result.data.attrs["nutpie"] = version
         return result
-
-    def _report(self, diverged: int, total: int) -> None:
-        """Say in the reason, and in a warning, how many trajectories diverged."""
-        if not diverged:
-            return
-        self.reason += f", {diverged} of {total} trajectories diverged"
-        warnings.warn(
-            f"{diverged} of {total} trajectories diverged: they ran into points where the log-posterior is not finite, "
-            "such as the ends of a prior's support or failed solves, or where it bends too sharply. The draws may miss "
-            "what lies behind; compare them with those of sampler='emcee'.",
-            stacklevel=6,
-        )

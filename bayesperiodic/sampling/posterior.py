@@ -1,4 +1,4 @@
-"""Posterior: draws, and how far they can be trusted."""
+"""Posterior: draws with their convergence diagnostics."""
 
 import importlib.metadata
 import warnings
@@ -13,31 +13,19 @@ import xarray as xr
 from bayesperiodic import _checks
 from bayesperiodic._expressions import parse_all
 from bayesperiodic._io import Result
-from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 from bayesperiodic.posterior import labels
 from bayesperiodic.posterior.density import LogPosterior
 from bayesperiodic.posterior.description import Description
 from bayesperiodic.posterior.joint_priors import MultivariateNormal
-from bayesperiodic.posterior.labels import (
-    CHAIN,
-    CHANNEL,
-    DRAW,
-    EXPERIMENT,
-    NOISE,
-    column,
-    full_name,
-    local_names,
-    pack,
-    squared,
-)
+from bayesperiodic.posterior.labels import CHAIN, CHANNEL, DRAW, EXPERIMENT, NOISE
 from bayesperiodic.posterior.noise import SCALE
 from bayesperiodic.posterior.parameters import SHIFT
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.checkpoint import fingerprint
 from bayesperiodic.sampling.ensemble import CallCount
 
-SAMPLED_ONLY = "Only sampled parameters are kept with the draws; write the value of a fixed one as a number."
+SAMPLED_ONLY = "Only sampled parameters are part of the draws; write the value of a fixed one as a number."
 
 
 @dataclass(frozen=True)
@@ -50,19 +38,19 @@ class Posterior(Result):
     Attributes
     ----------
     data : DataTree
-        Group ``posterior``: variables with dims (chain, draw) first; a chain is a walker, the coordinate ``ensemble``
-        tells to which ensemble it belongs. A parameter that experiments have their own of is one variable with the dim
-        ``experiment``, which holds its fixed value where it is not free. ``variance``, ``lengthscale`` and ``floor``
-        have the dim ``channel``, then ``experiment`` where each has its own; ``scale`` has at most the latter. Known
-        noise parameters are kept with the others, with their values; NaN stands where there is none, such as the
-        variance of a channel in an experiment that lacks it. Attributes: ``units``, or ``units of <channel>`` of
-        ``variance``; ``noise``, the noise model's name, on its parameters alone. Group ``sample_stats``: lp, the
-        log-density in sampling coordinates, and the status of the draw's solves. Group ``posterior_predictive``: at a
-        few draws, replicates of the measured outputs, noise included, and largest_multiplier, the modulus of each
-        orbit's largest Floquet multiplier. Group ``orbits``: every experiment's states, turns included, at the draw
-        with the highest density. Groups ``observed_data`` and ``constant_data``: outputs and inputs.
+        Group ``posterior``: variables with dims (chain, draw) first; a chain is a walker, its coordinate ``ensemble``
+        the number of its ensemble. A local parameter is one variable with the dim ``experiment``, with its fixed value
+        where it is not free. ``variance``, ``lengthscale`` and ``floor`` have the dim ``channel``, then ``experiment``
+        if each has its own; ``scale`` has at most the latter. Known noise parameters are included with their values;
+        NaN marks missing ones, such as the variance of a channel in an experiment without it. Attributes: ``units``, or
+        ``units of <channel>`` of ``variance``; ``noise``, the name of the noise model, on its parameters. Group
+        ``sample_stats``: lp, the log-density in sampling coordinates, and the status of the draw's solves. Group
+        ``posterior_predictive``: for some draws, replicates of the measured outputs, noise included, and
+        largest_multiplier, the modulus of each orbit's largest Floquet multiplier. Group ``orbits``: states of every
+        experiment, turns included, at the draw with the highest density. Groups ``observed_data`` and
+        ``constant_data``: outputs and inputs.
     converged : bool
-        True if the stop rule was passed.
+        True if the stop rule was met.
     reason : str
         Why sampling stopped.
     tau, ess, rhat : dict of str to float
@@ -78,22 +66,12 @@ class Posterior(Result):
 
     Examples
     --------
-    A short run, which the stop rule does not pass:
-
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
-    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
     >>> posterior.converged, posterior.names
-    (False, ('c', 'k', 'variance[displacement]'))
+    (True, ('c', 'k', 'variance[displacement]'))
     >>> summary = posterior.summary()
     >>> bool(summary.loc["k", "q05"] < 1.0 < summary.loc["k", "q95"])
     True
-    >>> posterior.data["posterior"]["k"].dims, posterior.draws("k").size == 16 * 200
+    >>> posterior.data["posterior"]["k"].dims, posterior.draws("k").size == posterior.data["posterior"]["k"].size
     (('chain', 'draw'), True)
     >>> list(posterior.derive({"damping_ratio": "c/(2*sqrt(k))"}).index)
     ['damping_ratio']
@@ -112,16 +90,16 @@ class Posterior(Result):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Full names of all that was sampled, parameters first, in the order of the summary."""
+        """Full names of the sampled quantities, parameters first, in the order of the summary."""
         return tuple(self.tau)
 
     def draws(self, name: str) -> np.ndarray:
-        """Return all draws of what has this full name, chains one after the other.
+        """Return all draws of a quantity, chain by chain.
 
         Parameters
         ----------
         name : str
-            Such as "k", "theta16[run 7]" or "variance[force]"; see `names`.
+            Full name, such as "k", "theta16[run 7]" or "variance[force]"; see `names`.
 
         Returns
         -------
@@ -136,7 +114,7 @@ class Posterior(Result):
         return labels.column(self._group, name).ravel()
 
     def guesses(self, experiments: Iterable[str], states: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
-        """Return the states at the draw with the highest density, from which to solve again.
+        """Return the states at the draw with the highest density, as guesses for further solves.
 
         Parameters
         ----------
@@ -161,9 +139,9 @@ class Posterior(Result):
         return [n for n, (variable, _) in labels.places(self._group).items() if labels.is_noise(self._group, variable)]
 
     def summary(self) -> pd.DataFrame:
-        """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, a row a parameter.
+        """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, one row per parameter.
 
-        Its ``attrs`` tell the interval, whether the draws converged and why, and the failed solves by status.
+        Its ``attrs`` contain interval, converged, reason and failures.
         """
         table = _table(
             {
@@ -180,24 +158,23 @@ class Posterior(Result):
         Parameters
         ----------
         expressions : mapping of str to str
-            By new name, such as ``{"damping_ratio": "c/(2*sqrt(k*1.5))"}``: numbers, names of sampled parameters, pi,
-            + - * / ** and sqrt, exp, log, sin, cos, tan, atan, sinh, cosh, tanh, abs. Fixed parameters are not kept
-            with the draws; their values are written as numbers.
+            By new name, such as ``{"damping_ratio": "c/(2*sqrt(k*1.5))"}``, as in `MapEstimate.derive`. Values of fixed
+            parameters, which the draws do not contain, are written as numbers.
         experiment : str, optional
-            Whose local parameters the expressions mean, by their plain names: with "run 7" ``theta16`` is
-            ``theta16[run 7]``. Without it they can name shared parameters only.
+            Its local parameters are named without brackets: with "run 7" ``theta16`` is ``theta16[run 7]``. Without it,
+            expressions contain shared parameters only.
 
         Returns
         -------
         DataFrame
-            Mean, sd, 90 % equal-tailed interval, Monte Carlo error and ESS, a row a quantity, as in `summary`; the ESS
-            is that of the quantity itself, NaN for one that does not vary.
+            Mean, sd, 90 % equal-tailed interval, Monte Carlo error and ESS, one row per quantity, as in `summary`; the
+            ESS is that of the quantity, NaN if it does not vary.
 
         Raises
         ------
         ValueError
-            For an invalid expression or one that is not finite at some draw, a new name that is no identifier or that a
-            parameter has, an unknown experiment.
+            For an invalid expression or one that is not finite at some draw, a new name that is no identifier or the
+            name of a parameter, an unknown experiment.
         """
         group, noise = self._group, self._noise
         if experiment is not None:
@@ -219,11 +196,11 @@ class Posterior(Result):
         return _table(rows)
 
     def as_prior(self, names: tuple[str, ...]) -> MultivariateNormal:
-        """Return the normal distribution with the mean and covariance of the draws: the prior of the next problem.
+        """Return the normal distribution with the mean and covariance of the draws, as the prior of another problem.
 
-        It is given for the same names, ``priors={names: posterior.as_prior(names)}``. It is over natural values, so
-        that a parameter that was positive is no longer kept positive, and noise parameters are left out. A tail or a
-        second mode of the draws does not survive; see `compare`.
+        Use it as ``priors={names: posterior.as_prior(names)}``. It is a distribution of natural values, so that
+        positive parameters are no longer restricted to positive values; it contains no noise parameters, and no tails
+        or further modes of the draws, see `compare`.
 
         Parameters
         ----------
@@ -248,7 +225,8 @@ class Posterior(Result):
         key = labels.checked_key(names, [name for name in self.names if name not in noise], noise)
         if not self.converged:
             warnings.warn(
-                f"The draws have not converged ({self.reason}), nor has this prior. Sample longer, see max_steps.",
+                f"The draws have not converged ({self.reason}), and the prior is unreliable. Sample longer, see "
+                "max_steps.",
                 stacklevel=2,
             )
         draws = np.stack([self.draws(name) for name in key])
@@ -273,15 +251,8 @@ class Posterior(Result):
 def _described(draws: np.ndarray, ess: float) -> dict[str, float]:
     low, median, high = np.quantile(draws, [0.05, 0.5, 0.95])
     sd = draws.std(ddof=1)
-    return {
-        "mean": draws.mean(),
-        "sd": sd,
-        "q05": low,
-        "q50": median,
-        "q95": high,
-        "mcse_mean": sd / np.sqrt(ess),
-        "ess": ess,
-    }
+    found = {"mean": draws.mean(), "sd": sd, "q05": low, "q50": median, "q95": high}
+    return found | {"mcse_mean": sd / np.sqrt(ess), "ess": ess}
 
 
 def _table(rows: dict[str, dict[str, float]]) -> pd.DataFrame:
@@ -294,33 +265,18 @@ MOST = {CHAIN: 20, DRAW: 5}
 
 
 def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, time: dict[str, str], seed: int) -> xr.Dataset:
-    """Return replicates of the measured mean periods, noise included, at a few draws of a few walkers.
+    """Return replicates of the measured mean periods, noise included, for some draws of some walkers.
 
-    Parameters
-    ----------
-    density : LogPosterior
-        Anchored at the estimate.
-    posterior : Dataset
-        Draws of all parameters, dims (chain, draw).
-    time : dict of str to str
-        Name of each experiment's time axis.
-    seed : int
-
-    Returns
-    -------
-    Dataset
-        Variables ``<experiment> <channel>`` with dims (chain, draw, time axis); ``largest_multiplier``, the modulus of
-        the largest Floquet multiplier, with dims (chain, draw, experiment). NaN where a solve fails.
+    Variables are ``<experiment> <channel>`` with dims (chain, draw, time axis), and ``largest_multiplier``, the modulus
+    of the largest Floquet multiplier, with dims (chain, draw, experiment); NaN where a solve fails.
     """
     problem = density.problem
-    chosen = posterior.isel({dim: _spread(posterior.sizes[dim], most) for dim, most in MOST.items()})
+    chosen = posterior.isel({d: _spread(posterior.sizes[d], n) for d, n in MOST.items()})
     shape = chosen.sizes[CHAIN], chosen.sizes[DRAW]
     theta, noise = (
-        np.array([column(chosen, name).ravel() for name in names]).reshape(len(names), -1).T
+        np.array([labels.column(chosen, name).ravel() for name in names]).reshape(len(names), shape[0] * shape[1]).T
         for names in (problem.names, problem.noise_names)
     )
-    if not problem.noise_names:
-        noise = np.empty((len(theta), 0))
     components = problem.likelihood.simulate(noise, np.random.default_rng(seed))
     simulation, variables, largest = density.simulator.solve(theta, keep=True, polish=True), {}, []
     for e in problem.experiments:
@@ -335,25 +291,17 @@ def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, time: dic
 
 
 def orbits(density: LogPosterior, theta: np.ndarray, time: dict[str, str]) -> xr.Dataset:
-    """Return the states, turns included, of every experiment's orbit at one θ (names,).
-
-    Returns
-    -------
-    Dataset
-        Variables ``<experiment> <state>`` over the experiment's time axis.
-    """
-    return xr.Dataset(
-        {
-            f"{name} {state}": ((time[name],), values)
-            for name, solution in density.solve(theta).items()
-            for state, values in solution.states.items()
-        },
-        coords={time[e.name]: e.time for e in density.problem.experiments},
-    )
+    """Return the states, turns included, of every experiment at one θ (names,): ``<experiment> <state>`` over time."""
+    states = {
+        f"{name} {state}": ((time[name],), values)
+        for name, solution in density.solve(theta).items()
+        for state, values in solution.states.items()
+    }
+    return xr.Dataset(states, coords={time[e.name]: e.time for e in density.problem.experiments})
 
 
 def _spread(size: int, wanted: int) -> np.ndarray:
-    """Return at most so many indices, equally spaced."""
+    """Return at most `wanted` indices, equally spaced."""
     return np.linspace(0, size - 1, min(size, wanted)).astype(int)
 
 
@@ -371,19 +319,8 @@ def gather(
     acceptance: float,
     seed: int,
 ) -> Posterior:
-    """Return the posterior that chains in sampling coordinates hold.
-
-    Parameters
-    ----------
-    density : LogPosterior
-    kept : array (ensembles, steps, walkers, coordinates)
-    log_density : array (ensembles, steps, walkers)
-    calls : CallCount
-        Of all ensembles.
-    converged, reason, acceptance, seed
-        See `Posterior`.
-    """
-    labels = density.labels
+    """Return the posterior of chains (ensembles, steps, walkers, coordinates) in sampling coordinates."""
+    names = density.labels
     data = tree(density, *density.to_natural(kept), log_density, seed)
     data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason}
     tau = convergence.autocorrelation_time(kept)
@@ -391,9 +328,9 @@ def gather(
         data=data,
         converged=converged,
         reason=reason,
-        tau=dict(zip(labels, tau.tolist(), strict=True)),
-        ess=dict(zip(labels, (log_density.size / tau).tolist(), strict=True)),
-        rhat=dict(zip(labels, convergence.rhat(kept).tolist(), strict=True)),
+        tau=dict(zip(names, tau.tolist(), strict=True)),
+        ess=dict(zip(names, (log_density.size / tau).tolist(), strict=True)),
+        rhat=dict(zip(names, convergence.rhat(kept).tolist(), strict=True)),
         acceptance=acceptance,
         failures={status: count / calls.points for status, count in calls.failures.items()},
         log_posterior_calls=calls.points,
@@ -404,18 +341,7 @@ def gather(
 def tree(
     density: LogPosterior, theta: np.ndarray, noise: np.ndarray, log_density: np.ndarray, seed: int
 ) -> xr.DataTree:
-    """Return draws as the groups of `Posterior.data`.
-
-    Parameters
-    ----------
-    density : LogPosterior
-    theta : array (ensembles, steps, walkers, names)
-        Natural values.
-    noise : array (ensembles, steps, walkers, noise_names)
-    log_density : array (ensembles, steps, walkers)
-    seed : int
-        Of the replicates.
-    """
+    """Return draws (ensembles, steps, walkers, names), in natural values, as the groups of `Posterior.data`."""
     problem = density.problem
     ensembles, steps, walkers = log_density.shape
     best = theta.reshape(-1, theta.shape[-1])[np.argmax(log_density)]
@@ -431,18 +357,16 @@ def tree(
         "flag_values": list(range(len(STATUSES))),
         "flag_meanings": " ".join(s.replace(" ", "_") for s in STATUSES),
     }
-    result = xr.DataTree.from_dict(
-        {
-            "posterior": posterior,
-            "sample_stats": xr.Dataset(
-                {"lp": ((CHAIN, DRAW), lp[..., 0]), "status": ((CHAIN, DRAW), status, meanings)}, coords=coords
-            ),
-            "posterior_predictive": posterior_predictive(density, posterior, time, seed),
-            "orbits": orbits(density, best, time),
-            "observed_data": _signals(problem, "outputs"),
-            "constant_data": _signals(problem, "inputs"),
-        }
-    )
+    stats = {"lp": ((CHAIN, DRAW), lp[..., 0]), "status": ((CHAIN, DRAW), status, meanings)}
+    groups = {
+        "posterior": posterior,
+        "sample_stats": xr.Dataset(stats, coords=coords),
+        "posterior_predictive": posterior_predictive(density, posterior, time, seed),
+        "orbits": orbits(density, best, time),
+        "observed_data": _signals(problem, "outputs", time),
+        "constant_data": _signals(problem, "inputs", time),
+    }
+    result = xr.DataTree.from_dict(groups)
     result.attrs = {
         "fingerprint": fingerprint(problem),
         "synthetic": int(any(e.synthetic for e in problem.experiments)),
@@ -466,30 +390,23 @@ def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr
     dims = {name.partition("[")[0]: _dims(problem, name) for name in (*problem.names, *problem.noise_names)}
     coords = {CHANNEL: list(problem.channels), EXPERIMENT: [e.name for e in problem.experiments]}
     noises = {name.partition("[")[0] for name in problem.noise_names}
-    return xr.Dataset(
-        {
-            variable: (
-                *packed,
-                _noise_attributes(problem, variable) if variable in noises else _unit(problem, variable),
-            )
-            for variable, packed in pack(columns, dims, coords).items()
-        },
-        coords=coords,
-    )
+    attributes = {v: (_noise_attributes if v in noises else _unit)(problem, v) for v in dims}
+    packed = labels.pack(columns, dims, coords)
+    return xr.Dataset({v: (*values, attributes[v]) for v, values in packed.items()}, coords=coords)
 
 
 def _fixed_locals(problem: Description, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
     """Return the values of local parameters in the experiments where they are fixed."""
     return {
-        full_name(plain, (run,)): np.full(shape, parameter_map.fixed[plain])
-        for plain in local_names(problem.names)
+        labels.full_name(plain, (run,)): np.full(shape, parameter_map.fixed[plain])
+        for plain in labels.local_names(problem.names)
         for run, parameter_map in problem.parameter_maps.items()
         if plain in parameter_map.fixed
     }
 
 
 def _dims(problem: Description, name: str) -> tuple[str, ...]:
-    """Return the dims, after chain and draw, of the variable that a full name belongs to."""
+    """Return the dims, after chain and draw, of the variable of a full name."""
     if "[" not in name:
         return ()
     if name in problem.names or name.startswith(f"{SCALE}["):
@@ -504,25 +421,19 @@ def _unit(problem: Description, parameter: str) -> dict[str, str]:
 def _noise_attributes(problem: Description, variable: str) -> dict[str, str]:
     """Return the noise model's name, and the unit of each channel's variance."""
     units = problem.model.units if variable == "variance" else {}
-    each = {f"units of {channel}": squared(units[channel]) for channel in problem.channels if channel in units}
+    each = {f"units of {channel}": labels.squared(units[channel]) for channel in problem.channels if channel in units}
     return {NOISE: problem.noise.name} | each
 
 
-def _signals(problem: Description, kind: str) -> xr.Dataset:
-    return xr.Dataset(
-        {
-            f"{experiment.name} {channel}": ((_time(experiment),), values)
-            for experiment in problem.experiments
-            for channel, values in getattr(experiment, kind).items()
-        },
-        coords={_time(experiment): experiment.time for experiment in problem.experiments},
-    )
+def _signals(problem: Description, kind: str, time: dict[str, str]) -> xr.Dataset:
+    signals = {
+        f"{e.name} {channel}": ((time[e.name],), values)
+        for e in problem.experiments
+        for channel, values in getattr(e, kind).items()
+    }
+    return xr.Dataset(signals, coords={time[e.name]: e.time for e in problem.experiments})
 
 
 def _time_axes(problem: Description) -> dict[str, str]:
-    return {experiment.name: _time(experiment) for experiment in problem.experiments}
-
-
-def _time(experiment: Experiment) -> str:
-    """Return the name of an experiment's time axis, which no channel can have."""
-    return f"{experiment.name} time [s]"
+    """Return the name of each experiment's time axis, which no channel can have."""
+    return {e.name: f"{e.name} time [s]" for e in problem.experiments}

@@ -1,7 +1,6 @@
 """Sampling of θ and the noise parameters with emcee."""
 
 from collections import Counter
-from collections.abc import Mapping
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -27,7 +26,7 @@ from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import Simulator
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.checkpoint import Checkpoint, Saved
-from bayesperiodic.sampling.convergence import unmet_criteria
+from bayesperiodic.sampling.convergence import BLOCK, PASSES, unmet_criteria
 from bayesperiodic.sampling.ensemble import (
     AffineTransform,
     CallCount,
@@ -42,8 +41,6 @@ from bayesperiodic.sampling.posterior import Posterior, gather
 from bayesperiodic.sampling.starts import LAPLACE, STARTS, sampling_axes, start_points
 
 EMCEE, NUTS = "emcee", "nuts"
-BLOCK = 250
-PASSES = 2
 FEWEST_STEPS = 50
 
 
@@ -67,35 +64,34 @@ def sample(
     """Sample the posterior of θ and the free noise parameters with emcee's affine-invariant ensembles.
 
     Several independent ensembles [1]_ start from draws of the Laplace approximation with doubled standard deviations.
-    Parameters with positive support and the noise parameters are sampled in their logarithms, where products become
-    straight ridges; Jeffreys' prior 1/v is flat there. The eigenvectors of the Laplace approximation in these
-    coordinates are the axes of the walk. Seven steps in ten are differential-evolution moves [2]_, which mix three
-    times faster than stretch moves on a normal target of six dimensions (tau 21 against 67), two are stretch moves, and
-    one is a differential-evolution move of full length, which can jump between modes.
+    Parameters with positive support and the noise parameters are sampled in their logarithms, where ridges of products
+    are straight; Jeffreys' prior 1/v is constant there. The eigenvectors of the Laplace approximation in these
+    coordinates are the axes. Seven steps in ten are differential-evolution moves [2]_, which mix three times faster
+    than stretch moves on a normal target of six dimensions (tau 21 against 67), two are stretch moves, and one is a
+    differential-evolution move of full length, which can jump between modes.
 
-    Sampling stops when the chain is 50 autocorrelation times long after a fifth of it was dropped, that time has
-    changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and 95 % quantiles agree
-    within a quarter of a standard deviation, twice in succession. Ctrl-C ends it with what is there, not converged, and
-    so does the loss of the executor's workers.
+    Sampling stops if, twice in succession, the chain is 50 autocorrelation times long after its first fifth was
+    removed, that time has changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and 95
+    % quantiles agree within a quarter of a standard deviation. Ctrl-C, or the loss of the executor's workers, ends it
+    with the steps so far, not converged.
 
-    A second sampler checks the first: ``sampler="nuts"`` samples the same density by its gradient, with the no-U-turn
-    sampler [3]_ of nutpie. Each ensemble is then a single chain, which tunes itself over 300 draws that are dropped,
-    and has to be 500 autocorrelation times long; the rest of the stop rule is the same, and so are start, axes and
-    Ctrl-C.
+    ``sampler="nuts"`` checks the result: it samples the same density by its gradient, with the no-U-turn sampler [3]_
+    of nutpie. Each ensemble is then a single chain with 300 tuning draws, which are removed, and must be 500
+    autocorrelation times long; start, axes, Ctrl-C and the rest of the stop rule are the same.
 
     Parameters
     ----------
     problem : Problem
     fit : MapEstimate
-        Its point anchors the periodic solves and starts the walkers.
+        Anchor of the periodic solves, and start of the walkers.
     seed : int
-        The same seed gives the same draws, bit for bit, whatever the executor and the number of threads.
+        The same seed gives the same draws, bit for bit, for all executors and numbers of threads.
     ensembles : int
-        At least 2; as many workers of an executor are busy.
+        At least 2; also the largest number of busy workers of an executor.
     walkers : int, optional
         Of each ensemble, even and at least twice the number of coordinates.
     max_steps : int
-        Reaching it is reported as not converged.
+        A run that reaches it has not converged.
     start : "laplace", "prior" or "overdispersed"
         Draws of the Laplace approximation with twice its standard deviations, of the priors, or of the Laplace
         approximation with five times its standard deviations.
@@ -103,23 +99,21 @@ def sample(
         "natural" takes no logarithms of parameters.
     variances : "sampled" or "collapsed"
         "collapsed" integrates the unknown variances out and draws them exactly afterwards: the same posterior in fewer
-        dimensions. Only with the prior 1/v or a flat one, for independent errors or circulant ones whose length scale
-        and floor are fixed.
+        dimensions. Only with the prior 1/v or a flat one, for independent errors or circulant ones with fixed length
+        scale and floor.
     sampler : "emcee" or "nuts"
-        "nuts" takes ``pip install "bayesperiodic[nuts]"``; no walkers, checkpoint, executor or collapsed variances;
-        `max_steps` does not count its tuning, `acceptance` is that of its trajectories, and ``sample_stats`` tells more
-        about each draw. Trajectories that diverge are counted in `reason`.
+        "nuts" requires ``pip install "bayesperiodic[nuts]"`` and takes no walkers, checkpoint, executor or collapsed
+        variances; `max_steps` does not include its tuning, `acceptance` is that of its trajectories, and
+        ``sample_stats`` contains its statistics. Diverged trajectories are counted in `reason`.
     checkpoint : path, optional
-        An HDF5 file that holds the run so far, whenever the process may be killed; the same call resumes it. A finished
-        one returns at once. emcee's HDFBackend reads it, in coordinates in which the Laplace approximation is a unit
-        sphere. A run may go on with another executor.
+        An HDF5 file that contains the run so far at any time; after an interruption the same call resumes the run, also
+        with another executor, and returns at once if it is finished. It can be read by emcee's HDFBackend, in
+        coordinates in which the Laplace approximation is a standard normal distribution.
     executor : None, int, Dask Client, or executor with the interface of concurrent.futures
-        Who walks. By default all ensembles walk in step in this process, and the cores share the solves of calls with
-        what all of them propose, which is fastest where there is one machine. A number means that many processes,
-        for which a script must keep its calls below ``if __name__ == "__main__":``. ``mpi4py.futures.MPIPoolExecutor``
-        and Dask reach the nodes of a cluster, which should be alike: other processors may round differently. A worker
-        takes an ensemble some steps on, so that at most `ensembles` of them are busy; it uses one core. The problem is
-        sent to it once.
+        Executor that advances the ensembles. By default all ensembles advance in this process, with their proposals
+        solved together on all cores, which is fastest on one machine. A number is a number of processes; a script needs
+        its calls below ``if __name__ == "__main__":``. ``mpi4py.futures.MPIPoolExecutor`` and Dask use the nodes of a
+        cluster, with processors of the same kind, because others may round differently. Each worker uses one core.
     progress : bool
         Show a progress bar with acceptance, tau and length in units of tau.
 
@@ -130,12 +124,11 @@ def sample(
     Raises
     ------
     ValueError
-        For too few or an odd number of walkers, a start with no finite log-posterior, variances that cannot be
-        integrated out, a checkpoint of another problem, damaged or in use, an executor that takes no tasks, an argument
+        For too few or an odd number of walkers, a start without a finite log-posterior, variances that cannot be
+        integrated out, a checkpoint that is damaged, in use or of another problem, an invalid executor, an argument
         that "nuts" does not take.
     RuntimeError
-        If the executor's workers were lost before there were enough steps for a result; what there was is in the
-        checkpoint.
+        If the executor's workers were lost after fewer than 50 steps; the checkpoint contains these.
     ImportError
         For "nuts" without nutpie.
 
@@ -154,19 +147,9 @@ def sample(
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
-    >>> fit = bp.map_estimate(problem, progress=False)
-    >>> posterior = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
-    >>> posterior.reason.split(" with ")[0], posterior.failures
+    >>> draws = bp.sample(problem, fit, seed=1, ensembles=2, walkers=8, max_steps=250, progress=False)
+    >>> draws.reason.split(" with ")[0], draws.failures
     ('max_steps = 250 reached', {})
-
-    Without `max_steps` it goes on until the stop rule is passed; with ``checkpoint="run.h5"`` the same line resumes a
-    run that was killed.
     """
     _checks.integer("ensembles", ensembles, 2)
     _checks.integer("max_steps", max_steps, BLOCK)
@@ -196,7 +179,8 @@ def sample(
         density = LogPosterior(problem, anchored, coordinates=coordinates, variances=variances)
         if sampler == NUTS:
             return sample_nuts(density, fit, seed, ensembles, max_steps, start, progress)
-        state = {"anchor": anchor.tolist(), "guesses": _as_lists(guesses)}
+        lists = {run: {state: [*map(float, x)] for state, x in states.items()} for run, states in guesses.items()}
+        state = {"anchor": anchor.tolist(), "guesses": lists}
         run = _Run(density, fit, seed, start, size, ensembles, saved, state)
         run.go(max_steps, store, executor, progress)
         return run.posterior()
@@ -256,7 +240,7 @@ class _Run:
         return Ensemble.at(self.transform.whiten(points), steps, calls)
 
     def go(self, max_steps: int, store: Checkpoint | None, executor: Any, progress: bool) -> None:
-        """Sample until the stop rule is passed twice in succession, `max_steps` are reached, Ctrl-C, or workers die."""
+        """Sample until the stop rule is met, `max_steps` are reached, Ctrl-C is pressed, or workers are lost."""
         if self.state["converged"]:
             return
         try:
@@ -276,11 +260,11 @@ class _Run:
 
     @property
     def _done(self) -> int:
-        """Number of steps that all ensembles have done."""
+        """Number of steps of the shortest ensemble."""
         return min(ensemble.steps for ensemble in self.ensembles)
 
     def _stopped(self, how: str, store: Checkpoint | None, why: str = "") -> bool:
-        """Save a run that was stopped; return whether its steps are enough for a result."""
+        """Save a stopped run; return whether its steps are enough for a result."""
         enough = self._done >= FEWEST_STEPS
         if enough:
             self.state |= {"steps": self._done, "converged": False, "reason": f"{how} after {self._done} steps{why}"}
@@ -346,7 +330,7 @@ class _Run:
         return float(np.mean([e.backend.accepted / e.steps for e in self.ensembles]))
 
     def posterior(self) -> Posterior:
-        """Return the draws, with the variances that were integrated out drawn again."""
+        """Return the draws, with draws of the variances that were integrated out."""
         steps = self.state["steps"]
         kept, part = self._kept(steps), slice(steps // 5, steps)
         log_density = np.stack([e.backend.get_log_prob()[part] for e in self.ensembles])
@@ -364,9 +348,3 @@ class _Run:
             acceptance=self._acceptance(),
             seed=self.seed,
         )
-
-
-def _as_lists(guesses: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, list[float]]]:
-    return {
-        run: {state: np.asarray(values).tolist() for state, values in states.items()} for run, states in guesses.items()
-    }

@@ -1,4 +1,4 @@
-"""Start points of the walkers, and the Laplace approximation in sampling coordinates."""
+"""Start points of the walkers, and Laplace approximation in sampling coordinates."""
 
 from collections.abc import Callable
 from functools import partial
@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
+from bayesperiodic._linalg import covariance_cholesky
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.posterior.density import LogPosterior, SamplingCoordinates
@@ -17,20 +18,14 @@ STARTS = (LAPLACE, PRIOR, OVERDISPERSED)
 SPREAD = {LAPLACE: 2.0, OVERDISPERSED: 5.0}
 REDRAWS = 100
 NOISE_SPREAD = 0.3
-# A mirrored mode counts from this share of the first one's density on, and this many standard deviations away; how many
-# signs are turned in all combinations.
+# Smallest density of a mirrored mode, as a share of the first one's, its smallest distance in standard deviations, and
+# the largest number of parameters whose signs are changed in all combinations.
 CREDIBLE, SEPARATE, MOST_SIGNS = 1e-3, 3.0, 4
 FEWEST = 2
 
 
 def laplace_approximation(density: SamplingCoordinates, fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and covariance of the Laplace approximation in sampling coordinates.
-
-    Raises
-    ------
-    ValueError
-        If the estimate has none.
-    """
+    """Return mean and covariance in sampling coordinates; raise a ValueError if the estimate has none."""
     labels = [*density.labels]
     mode = np.array([fit.joint_mode.get(label, np.nan) for label in labels])
     covariance = fit.joint_covariance.loc[labels, labels].to_numpy().copy()
@@ -60,48 +55,38 @@ def start_points(
     generator: np.random.Generator,
     calls: CallCount | None = None,
 ) -> np.ndarray:
-    """Return start points (walkers, dimension) with a finite density, drawn again until there are enough.
+    """Return start points (walkers, dimension) with a finite density; raise a ValueError if too few draws have one.
 
     "laplace" and "overdispersed" draw from the Laplace approximation with twice and five times its standard deviations,
-    "prior" draws the parameters from their priors, and the noise parameters around those that suit them best.
+    "prior" draws the parameters from their priors, and the noise parameters around their best values.
 
-    Where turning the signs of signed parameters leads to another mode, as in a·b with both negative, the first two of
-    these also start walkers there: its share, but at least two, and no more than half of them in all such modes.
-
-    Raises
-    ------
-    ValueError
-        If after a hundred times as many draws there are too few.
+    If a change of signs of signed parameters leads to another mode, as in a·b with both negative, the first two also
+    start walkers there: a part according to its density, at least two, and at most half of them in all such modes.
     """
     calls = CallCount() if calls is None else calls
     if start == PRIOR:
         return _finite(density, calls, lambda count: _from_prior(density, count, generator), walkers, start)
     mean, covariance = laplace_approximation(density, fit)
-    scale = np.sqrt(np.diag(covariance))
-    factor = SPREAD[start] * scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
+    factor = SPREAD[start] * covariance_cholesky(covariance)
 
-    def drawn(count: int) -> np.ndarray:
-        return mean + generator.standard_normal((count, mean.size)) @ factor.T
+    def drawn(count: int, signs: np.ndarray | float = 1.0) -> np.ndarray:
+        return signs * (mean + generator.standard_normal((count, mean.size)) @ factor.T)
 
     points = _finite(density, calls, drawn, walkers, start)
     left = walkers // 2
     for signs, share in mirrored_modes(density, mean, covariance, calls):
         count = min(max(FEWEST, round(share * walkers)), left)
-        points[left - count : left] = _finite(density, calls, partial(_turned, signs, drawn), count, start)
+        points[left - count : left] = _finite(density, calls, partial(drawn, signs=signs), count, start)
         left -= count
     return points
-
-
-def _turned(signs: np.ndarray, drawn: Callable[[int], np.ndarray], count: int) -> np.ndarray:
-    return signs * drawn(count)
 
 
 def mirrored_modes(
     density: LogPosterior, mean: np.ndarray, covariance: np.ndarray, calls: CallCount | None = None
 ) -> list[tuple[np.ndarray, float]]:
-    """Return the signs (dimension,) that lead from a mode to others, and the density there over its own; highest first.
+    """Return the signs (dimension,) that lead to other modes, and their relative densities; highest first.
 
-    The signs of up to four signed parameters are turned in all combinations, those of more one by one and all together.
+    Up to four signs are changed in all combinations, more than four one by one and all together.
     """
     supports = density.problem.joint_prior.supports.values()
     signed = [i for i, (low, high) in enumerate(supports) if low < 0.0 < high]
@@ -112,7 +97,10 @@ def mirrored_modes(
     signs = np.ones((len(turned), mean.size))
     for row, columns in zip(signs, turned, strict=True):
         row[columns] = -1.0
-    values = _counted(density, np.concatenate([mean[None], signs * mean]), calls)
+    found = density.evaluate(np.concatenate([mean[None], signs * mean]), threads=None)
+    if calls is not None:
+        calls.add(found.status)
+    values = found.log_prob
     with np.errstate(over="ignore"):
         shares = np.exp(values[1:] - values[0])
     steps = (signs - 1.0) * mean
@@ -121,30 +109,24 @@ def mirrored_modes(
     return [(signs[i], float(shares[i])) for i in kept]
 
 
-def _counted(density: LogPosterior, points: np.ndarray, calls: CallCount | None) -> np.ndarray:
-    """Return the log-densities of points (points, dimension), and count them."""
-    found = density.evaluate(points, threads=None)
-    if calls is not None:
-        calls.add(found.status)
-    return found.log_prob
-
-
 def _finite(
     density: LogPosterior, calls: CallCount, drawn: Callable[[int], np.ndarray], wanted: int, start: str
 ) -> np.ndarray:
-    """Return so many drawn points with a finite density, drawn again until there are enough."""
+    """Return drawn points with a finite density, `wanted` of them; other draws are repeated."""
     points, tried = np.empty((0, density.dimension)), 0
     while len(points) < wanted and tried < REDRAWS * wanted:
         candidates = drawn(wanted)
         tried += wanted
-        values = _counted(density, candidates, calls) if len(candidates) else np.empty(0)
-        points = np.concatenate([points, candidates[np.isfinite(values)]])
+        if len(candidates):
+            found = density.evaluate(candidates, threads=None)
+            calls.add(found.status)
+            points = np.concatenate([points, candidates[np.isfinite(found.log_prob)]])
     if len(points) < wanted:
         other = "give a converged fit of this problem, or start='prior'"
         remedy = "narrow the priors, see prior_predictive(problem)" if start == PRIOR else other
         raise ValueError(
-            f"start: must give points with a finite log-posterior, got {start!r}; {1 - len(points) / tried:.1%} of "
-            f"{tried} start points drawn have none, so the walkers cannot start; {remedy}."
+            f"start: must give points with a finite log-posterior, got {start!r}, where {1 - len(points) / tried:.1%} "
+            f"of {tried} start points have none; {remedy}."
         )
     return points[:wanted]
 

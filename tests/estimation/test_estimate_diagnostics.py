@@ -1,11 +1,13 @@
 """Diagnostics of an estimate: joint Laplace, discretisation, undetermined directions, starts, orbit identity."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic.estimation import map_estimate
 from bayesperiodic.estimation.laplace import undetermined
 from bayesperiodic.posterior.density import LogPosterior
 from bayesperiodic.sampling.starts import laplace_approximation
@@ -170,7 +172,8 @@ def test_determined_parameter_keeps_its_sd_beside_undetermined_ones():
         fit = bp.map_estimate(bp.Problem(PRODUCT, [run], priors=priors, fixed=fixed), progress=False)
     rate = 2 * np.pi * np.cos(2 * np.pi * grid(60))
     assert fit.sd["shift_a"] == pytest.approx(np.sqrt(0.25 / np.sum(rate**2)), rel=1e-6)
-    assert fit.sd["a"] == fit.sd["b"] == np.inf
+    assert fit.sd["a"] == fit.sd["b"] == fit.robust_sd["a"] == fit.robust_sd["b"] == np.inf
+    assert 0.0 < fit.robust_sd["shift_a"] < fit.sd["shift_a"]  # the noise is smaller than the fixed variance
 
 
 def test_estimate_at_a_bound_is_the_bounded_least_squares_solution():
@@ -266,6 +269,32 @@ def test_noise_is_split_into_measurement_noise_and_model_error():
     assert split.measurement == pytest.approx(3.0)
     assert split.total == pytest.approx(np.sqrt(total), rel=1e-9)
     assert split.model == pytest.approx(np.sqrt(total - 9.0), rel=1e-9)
+
+
+def test_joint_laplace_and_robust_sd_are_computed_at_their_first_use(monkeypatch):
+    problem, calls = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS), []
+    for name in ("joint_laplace", "robust_covariance"):
+        monkeypatch.setattr(map_estimate, name, counted(getattr(map_estimate, name), calls))
+    fit = bp.map_estimate(problem, progress=False)
+    assert calls == []
+    assert fit.joint_covariance is fit.joint_covariance and fit.joint_mode == fit.joint_mode
+    assert fit.robust_sd == fit.robust_sd
+    assert calls == ["joint_laplace", "robust_covariance"]
+
+
+def counted(function, calls):
+    def count(*arguments):
+        calls.append(function.__name__)
+        return function(*arguments)
+
+    return count
+
+
+def test_estimate_is_pickled_with_all_its_values():
+    fit = bp.map_estimate(bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS), progress=False)
+    again = pickle.loads(pickle.dumps(fit))
+    assert again.robust_sd == fit.robust_sd and again.joint_mode == fit.joint_mode
+    assert again.joint_covariance.equals(fit.joint_covariance)
 
 
 def test_estimate_is_read_back_from_its_file(tmp_path):

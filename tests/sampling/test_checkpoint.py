@@ -185,14 +185,14 @@ def test_checkpoint_that_is_damaged_locked_or_of_another_run_is_rejected(problem
     path = tmp_path / "run.h5"
     bp.sample(*problem, checkpoint=path, **(RUN | {"max_steps": 50}))
     with pytest.raises(
-        ValueError, match=r"checkpoint: .* belongs to another run \(.* seed 5.*\), this one is .* seed 6"
+        ValueError, match=r"checkpoint: must be a file of this run \(.* seed 6.*\), got .* of another run \(.* seed 5"
     ):
         bp.sample(*problem, checkpoint=path, **(RUN | {"seed": 6}))
-    with FileLock(f"{path}.lock"), pytest.raises(ValueError, match="checkpoint: .* is in use by another run"):
+    with FileLock(f"{path}.lock"), pytest.raises(ValueError, match="checkpoint: must not be in use by another run"):
         bp.sample(*problem, checkpoint=path, **RUN)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match="checkpoint: .* it is damaged or no HDF5 file"):
+    with pytest.raises(ValueError, match="checkpoint: must be an intact HDF5 file, got"):
         bp.sample(*problem, checkpoint=path, **RUN)
 
 

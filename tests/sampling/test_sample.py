@@ -165,10 +165,10 @@ def test_finished_run_comes_back_from_its_checkpoint(known_variance, tmp_path, m
 
 def test_checkpoint_of_another_run_is_refused(known_variance, tmp_path):
     bp.sample(*known_variance, seed=5, max_steps=250, checkpoint=tmp_path / "run.h5", **PAIR)
-    with pytest.raises(ValueError, match="belongs to another run"):
+    with pytest.raises(ValueError, match="must be a file of this run"):
         bp.sample(*known_variance, seed=6, max_steps=250, checkpoint=tmp_path / "run.h5", **PAIR)
     (tmp_path / "text.h5").write_text("no HDF5")
-    with pytest.raises(ValueError, match="checkpoint: .* cannot be used"):
+    with pytest.raises(ValueError, match="checkpoint: must be an intact HDF5 file, got"):
         bp.sample(*known_variance, seed=6, max_steps=250, checkpoint=tmp_path / "text.h5", **PAIR)
 
 
@@ -223,7 +223,7 @@ def test_start_without_finite_log_posterior_raises(known_variance):
     other = bp.Problem(
         LINEAR, problem.experiments, priors=PRIORS | {"k": bp.Uniform(0.0, 1.0)}, fixed={"variance[force]": 9.0}
     )
-    with pytest.raises(ValueError, match=r"100\.0% of .* drawn have none, .*; give a converged fit"):
+    with pytest.raises(ValueError, match=r"100\.0% of .* start points have none; give a converged fit"):
         bp.sample(other, fit, seed=1, **PAIR)
 
 
