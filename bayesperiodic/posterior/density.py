@@ -102,8 +102,8 @@ class Linearisation:
             Take one transposed solve an experiment (forced models) instead of `changes`.
         """
         if adjoint:
-            weights = self._comparisons.vjp(self._simulation, self.residuals.like(by_residual))
-            return {name: -own for name, own in self.simulator.vjp(self.theta, self._simulation, weights).items()}
+            by_response = self._comparisons.vjp(self._simulation, self.residuals.like(by_residual))
+            return {name: -own for name, own in self.simulator.vjp(self.theta, self._simulation, *by_response).items()}
         result, start, blocks = {}, 0, list(by_residual)
         for name, observation in self._observations.items():
             stop = start + len(observation.blocks)
@@ -158,10 +158,11 @@ class SamplingCoordinates:
     def __init__(self, problem: Description, *, coordinates: str = RIDGE, variances: str = SAMPLED):
         self.problem, self.coordinates = problem, coordinates
         self.logarithmic = problem.logarithmic & (coordinates == RIDGE)
+        self._logarithms = np.flatnonzero(self.logarithmic)
         self.collapsed = collapsible(problem) if variances == COLLAPSED else ()
         self.free = tuple(name for name in problem.free_noise if name not in self.collapsed)
         self.labels = (*problem.names, *self.free)
-        self._noise_columns = [problem.noise_names.index(name) for name in self.free]
+        self.noise_columns = [problem.noise_names.index(name) for name in self.free]
         fixed = problem.likelihood.fixed
         self._noise = np.array([fixed.get(name, 1.0) for name in problem.noise_names])
 
@@ -177,13 +178,13 @@ class SamplingCoordinates:
         with np.errstate(over="ignore"):
             np.exp(theta, out=theta, where=self.logarithmic)
             noise[...] = self._noise
-            noise[..., self._noise_columns] = np.exp(points[..., count:])
+            noise[..., self.noise_columns] = np.exp(points[..., count:])
         return theta, noise
 
     def from_natural(self, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return coordinates (…, dimension) from θ (…, names) and all noise parameters (…, noise_names)."""
         points = np.log(theta, out=np.array(theta), where=self.logarithmic)
-        return np.concatenate([points, np.log(noise[..., self._noise_columns])], axis=-1)
+        return np.concatenate([points, np.log(noise[..., self.noise_columns])], axis=-1)
 
 
 class LogPosterior(SamplingCoordinates):
@@ -259,8 +260,8 @@ class LogPosterior(SamplingCoordinates):
         """Return the log-prior density over the coordinates (…,) at θ (…, names) and noise parameters."""
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             prior = self.problem.joint_prior.log_prob(theta) + self.problem.likelihood.log_prior(noise)
-            if self.logarithmic.any():
-                prior = prior + np.log(theta[..., self.logarithmic]).sum(axis=-1)
+            if self._logarithms.size:
+                prior = prior + np.log(theta[..., self._logarithms]).sum(axis=-1)
         return np.asarray(prior)
 
     def add_prior(
@@ -275,9 +276,10 @@ class LogPosterior(SamplingCoordinates):
         curvature : array (names, names), optional
             Minus the Hessian.
         """
-        logs, prior = self.logarithmic, self.problem.joint_prior
+        logs, prior = self._logarithms, self.problem.joint_prior
         gradient = gradient + prior.gradient(theta)
-        gradient[logs] += 1.0 / theta[logs]
+        if logs.size:
+            gradient[logs] += 1.0 / theta[logs]
         if curvature is not None:
             curvature = curvature + prior.curvature(theta)
             curvature[logs, logs] += theta[logs] ** -2
@@ -295,10 +297,11 @@ class LogPosterior(SamplingCoordinates):
         """
         simulation = self.simulator.solve(theta, threads, whole=True)
         good = simulation.status == CONVERGED
-        if good.all():
+        count = np.count_nonzero(good)
+        if count == good.size:
             return Evaluation(*self._log_likelihood(simulation, noise, threads), simulation.status)
         log_prob, moments = self._nothing(len(theta))
-        if good.any():
+        if count:
             log_prob[good], moments[good] = self._log_likelihood(simulation.at(good), noise[good], threads)
         return Evaluation(log_prob, moments, simulation.status)
 
@@ -312,7 +315,8 @@ class LogPosterior(SamplingCoordinates):
             return values, np.empty((len(values), 0))
         by_name = self.problem.likelihood.moments(residuals)
         moments = np.stack([by_name[name] for name in self.collapsed], axis=-1)
-        return values + np.sum(0.5 * moments + self._integrals(moments), axis=-1), moments
+        values = values + np.sum(0.5 * moments + self._integrals(moments), axis=-1)
+        return np.where(np.isfinite(values), values, -np.inf), moments
 
     def _nothing(self, points: int) -> tuple[np.ndarray, np.ndarray]:
         """Return log-densities and moments of points without a solution."""
@@ -322,14 +326,14 @@ class LogPosterior(SamplingCoordinates):
         """Return the log-density over the coordinates at natural values; arguments as in `log_likelihood`."""
         prior = self.log_prior(theta, noise)
         inside = np.isfinite(prior)
-        if inside.all():
-            found = self.log_likelihood(theta, noise, threads)
-            return found._replace(log_prob=_finite(prior + found.log_prob))
+        count = np.count_nonzero(inside)
+        if count == inside.size:
+            likelihood, moments, status = self.log_likelihood(theta, noise, threads)
+            return Evaluation(prior + likelihood, moments, status)
         (log_prob, moments), status = self._nothing(len(theta)), np.full(len(theta), CONVERGED)
-        if inside.any():
-            found = self.log_likelihood(theta[inside], noise[inside], threads)
-            log_prob[inside], status[inside] = _finite(prior[inside] + found.log_prob), found.status
-            moments[inside] = found.moments
+        if count:
+            likelihood, moments[inside], status[inside] = self.log_likelihood(theta[inside], noise[inside], threads)
+            log_prob[inside] = prior[inside] + likelihood
         return Evaluation(log_prob, moments, status)
 
     def evaluate(self, points: np.ndarray, threads: int | None = 1) -> Evaluation:
@@ -363,7 +367,7 @@ class LogPosterior(SamplingCoordinates):
         theta, noise = self.to_natural(point)
         value, by_theta, by_noise, status = self.value_and_gradient_at(theta, noise)
         by_theta[self.logarithmic] *= theta[self.logarithmic]
-        return value, np.concatenate([by_theta, by_noise[self._noise_columns]]), status
+        return value, np.concatenate([by_theta, by_noise[self.noise_columns]]), status
 
     def value_and_gradient_at(
         self, theta: np.ndarray, noise: np.ndarray, *, forward: bool = False
@@ -391,7 +395,7 @@ class LogPosterior(SamplingCoordinates):
         by_residual, by_noise = self.problem.likelihood.gradients(here.residuals, noise)
         if forward or any(e.multipliers is not None for e in self.problem.experiments):
             here = here.anchored()
-        by_theta = np.sum(list(here.vjp(by_residual, adjoint=not forward).values()), axis=0)
+        by_theta = np.add.reduce(list(here.vjp(by_residual, adjoint=not forward).values()))
         by_theta, _ = self.add_prior(theta, by_theta)
         if not (np.isfinite(by_theta).all() and np.isfinite(by_noise).all()):
             return -np.inf, *zeros, SINGULAR
@@ -476,10 +480,6 @@ class LogPosterior(SamplingCoordinates):
         columns |= {name: np.log(variances[..., i]) for i, name in enumerate(self.collapsed)}
         noise = np.stack([columns[name] for name in self.problem.free_noise], axis=-1)
         return np.concatenate([points[..., :count], noise], axis=-1), log_prob
-
-
-def _finite(values: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(values), values, -np.inf)
 
 
 def collapsible(problem: Description) -> tuple[str, ...]:

@@ -81,11 +81,11 @@ class Residuals(Sequence[np.ndarray]):
 
     @cached_property
     def squares(self) -> np.ndarray:
-        """The sum of the squares of each block, (blocks, …)."""
-        sums = [np.einsum("...i,...i->...", stack, stack) for stack in self._stacks]
-        result = np.empty((len(self._places), *sums[0].shape[1:]))
+        """The sum of the squares of each block, (…, blocks)."""
+        sums = [_square(stack) for stack in self._stacks]
+        result = np.empty((*sums[0].shape[1:], len(self._places)))
         for block, (stack, member) in enumerate(self._places):
-            result[block] = sums[stack][member]
+            result[..., block] = sums[stack][member]
         return result
 
 
@@ -154,7 +154,7 @@ class Likelihood:
         """
         result: dict[str, np.ndarray] = {}
         own = Residuals.of(residuals if self.model.flat else self._unit(residuals))
-        for block, columns, square in zip(self.blocks, self._columns, own.squares, strict=True):
+        for block, columns, square in zip(self.blocks, self._columns, np.moveaxis(own.squares, -1, 0), strict=True):
             if block.counted:
                 name = self.names[columns[0]]
                 result[name] = result.get(name, 0.0) + block.weight * square
@@ -235,13 +235,13 @@ class Likelihood:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, known, columns, sizes, weights, measured = self._levels
         squares = Residuals.of(residuals).squares
-        squares = squares.transpose(*range(1, squares.ndim), 0)
         v = self.model.level(values[..., columns], measured)
-        parts = [weights * (share * sizes * np.log(v) + squares[..., at] / v)]
-        if known.size:
-            parts.append(squares[..., known])
         # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
-        return -0.5 * sum(np.ascontiguousarray(part).sum(axis=-1) for part in parts)
+        terms = np.ascontiguousarray(weights * (share * sizes * np.log(v) + squares[..., at] / v))
+        total = np.add.reduce(terms, axis=-1)
+        if known.size:
+            total = total + np.add.reduce(np.ascontiguousarray(squares[..., known]), axis=-1)
+        return -0.5 * total
 
     @cached_property
     def _levels(self) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -252,7 +252,7 @@ class Likelihood:
             np.flatnonzero(~known) if known.any() else slice(None),
             np.flatnonzero(known),
             np.array([column for _, column in own], dtype=int),
-            np.array([block.size for block, _ in own]),
+            np.array([block.size for block, _ in own], dtype=float),
             np.array([block.weight for block, _ in own]),
             np.array([0.0 if block.kind == CORRELATED else block.measured for block, _ in own]),
         )

@@ -1,5 +1,6 @@
 """From a periodic response to what is compared with one experiment, and the derivatives of that."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from bayesperiodic.posterior.noise import CORRELATED, KNOWN, POINTS, SCALE, SPEC
 # Outputs (numbers) from which on their comparison with the data is shared among the cores.
 SMALLEST_SHARED = 10_000
 LARGEST_TRANSFORM = 16_384
+ROOT_TWO = math.sqrt(2.0)
 
 
 class Response(NamedTuple):
@@ -47,8 +49,10 @@ class GroupSolution(NamedTuple):
     ----------
     outputs : array (experiments, solves, points, channels)
         In the order of the model's outputs.
-    frequency, delay : array (experiments, solves)
-        [Hz], [s].
+    frequency : array (experiments, solves)
+        [Hz].
+    values : array (experiments, solves, parameters + 1)
+        All parameters, the delay last.
     log_multipliers : list of array (solves, multipliers)
         log|μ| of the measured multipliers of each experiment, largest first.
     z : array (experiments, solves, points, states)
@@ -59,21 +63,22 @@ class GroupSolution(NamedTuple):
 
     outputs: np.ndarray
     frequency: np.ndarray
-    delay: np.ndarray
+    values: np.ndarray
     log_multipliers: list[np.ndarray]
     z: np.ndarray
     status: np.ndarray
 
     def response(self, member: int) -> Response:
         """Return the responses of one experiment, θ on the leading axis."""
-        return Response(self.outputs[member], self.frequency[member], self.log_multipliers[member], self.delay[member])
+        delay = self.values[member, :, -1]
+        return Response(self.outputs[member], self.frequency[member], self.log_multipliers[member], delay)
 
     def at(self, solves: Any) -> "GroupSolution":
         """Return the solutions at some of the θ."""
         return GroupSolution(
             self.outputs[:, solves],
             self.frequency[:, solves],
-            self.delay[:, solves],
+            self.values[:, solves],
             [values[solves] for values in self.log_multipliers],
             self.z[:, solves],
             self.status[:, solves],
@@ -97,8 +102,8 @@ class Simulation:
 
     def __init__(self, groups: Sequence[GroupSolution], places: Mapping[str, tuple[int, int]]):
         self.groups, self._places = groups, places
-        worst = [group.status.max(axis=0) for group in groups]
-        self.status = worst[0] if len(worst) == 1 else np.max(worst, axis=0)
+        worst = [np.maximum.reduce(group.status) for group in groups]
+        self.status = worst[0] if len(worst) == 1 else np.maximum.reduce(worst)
 
     def at(self, solves: Any) -> "Simulation":
         """Return the solutions at some of the θ (a mask or indices)."""
@@ -225,12 +230,9 @@ class Observation:
         pairs = zip(self.columns, self.channels, strict=True)
         return [self._spectral(outputs[..., column], self._harmonics[name]) for column, name in pairs]
 
-    def spread(self, weights: Sequence[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
-        """Return the transpose of `components` applied to weights (…, size) a channel: (…, points, channels)."""
-        total = np.zeros((*weights[0].shape[:-1], *shape))
-        for own, column, name in zip(weights, self.columns, self.channels, strict=True):
-            total[..., column] = self._spread(own, self._harmonics[name])
-        return total
+    def spread(self, weights: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return the transpose of `components` applied to weights (…, size) a channel: (…, points) a channel."""
+        return [self._spread(own, self._harmonics[name]) for own, name in zip(weights, self.channels, strict=True)]
 
     def residuals(self, response: Response) -> list[np.ndarray]:
         """Return the residual components, one array (…, size) a block."""
@@ -353,10 +355,10 @@ class Observation:
     def _spectral(self, signal: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
         """Return real Fourier components whose mean square is that of the signal within the harmonics."""
         result = np.empty((*signal.shape[:-1], harmonic.size))
-        step = max(1, LARGEST_TRANSFORM // self._points)
-        if signal.ndim < 3 or signal.size <= LARGEST_TRANSFORM:
+        if signal.size <= LARGEST_TRANSFORM or signal.ndim < 3:
             self._transform(signal, result)
         else:  # In parts that stay in the cache; larger ones cost more for their memory than for the transform.
+            step = max(1, LARGEST_TRANSFORM // self._points)
             for own, components in zip(signal, result, strict=True):
                 for first in range(0, len(own), step):
                     self._transform(own[first : first + step], components[first : first + step])
@@ -365,28 +367,30 @@ class Observation:
     def _transform(self, signal: np.ndarray, result: np.ndarray) -> None:
         """Fill in the real Fourier components (…, size) of signals (…, points)."""
         size = result.shape[-1]
-        highest = (size - 1) // 2
+        highest, factor = (size - 1) // 2, math.sqrt(0.5 * size)
         amplitudes = _fourier.coefficients(signal, highest)
-        amplitudes *= np.sqrt(0.5 * size)
-        result[..., : highest + 1] = amplitudes.real
-        result[..., 0] *= np.sqrt(2.0)
-        result[..., highest + 1 : 2 * highest + 1] = amplitudes.imag[..., 1:]
+        np.multiply(amplitudes.real, factor, out=result[..., : highest + 1])
+        np.multiply(amplitudes.imag[..., 1:], factor, out=result[..., highest + 1 : 2 * highest + 1])
+        result[..., 0] *= ROOT_TWO
         if size % 2 == 0:
-            alternating = np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0) / self._points
-            result[..., -1] = np.sum(signal * alternating, axis=-1) * np.sqrt(size)
+            result[..., -1] = np.sum(signal * (self._alternating / self._points), axis=-1) * math.sqrt(size)
 
     def _signal(self, components: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
         """Return the signals (…, points) that have these real Fourier components (…, size): `_spectral` undone."""
         highest = (harmonic.size - 1) // 2
         amplitudes = components[..., : highest + 1].astype(complex)
-        amplitudes[..., 1:] += 1j * components[..., highest + 1 : 2 * highest + 1]
-        amplitudes *= np.sqrt(2.0 / harmonic.size)
-        amplitudes[..., 0] *= np.sqrt(0.5)
+        amplitudes.imag[..., 1:] = components[..., highest + 1 : 2 * highest + 1]
+        amplitudes *= math.sqrt(2.0 / harmonic.size)
+        amplitudes[..., 0] *= math.sqrt(0.5)
         signal = _fourier.on_grid(amplitudes, self._points)
         if harmonic.size % 2 == 0:
-            alternating = np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0)
-            signal += components[..., -1:] / np.sqrt(harmonic.size) * alternating
+            signal += components[..., -1:] / math.sqrt(harmonic.size) * self._alternating
         return signal
+
+    @cached_property
+    def _alternating(self) -> np.ndarray:
+        """The signal (points,) 1, −1, 1, … of the Nyquist harmonic."""
+        return np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0)
 
     def _spread(self, weights: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
         """Return the transpose of `_spectral` applied to weights (size,), its inverse but for a factor."""
@@ -549,8 +553,8 @@ class Comparisons:
             That share the θ; None for one per core. The result does not depend on it.
         """
         solves = simulation.status.size
-        values = max(group.outputs.size for group in simulation.groups)
-        parts = 1 if values < SMALLEST_SHARED else min(threads or available_cores(), solves)
+        small = solves == 1 or max(group.outputs.size for group in simulation.groups) < SMALLEST_SHARED
+        parts = 1 if small else min(threads or available_cores(), solves)
         with np.errstate(over="ignore", invalid="ignore"):
             if parts <= 1:
                 return Residuals(self._stacks(simulation), self._places)
@@ -571,8 +575,10 @@ class Comparisons:
                 result += [block[None] for block in first.residuals(solved.response(member))]
         return result
 
-    def vjp(self, simulation: Simulation, weights: Residuals) -> dict[str, Response]:
-        """Return the derivatives of Σ weights · predicted components by the responses at one θ, by experiment.
+    def vjp(
+        self, simulation: Simulation, weights: Residuals
+    ) -> tuple[list[np.ndarray], list[np.ndarray], dict[str, np.ndarray]]:
+        """Return the derivatives of Σ weights · predicted components by the responses at one θ.
 
         Parameters
         ----------
@@ -580,15 +586,27 @@ class Comparisons:
             At one θ.
         weights : Residuals
             As `residuals` returns them at this θ, without the axis of the θ.
+
+        Returns
+        -------
+        by_outputs : list of array (experiments, points, channels)
+            One per group.
+        by_delay : list of array (experiments,)
+            One per group.
+        by_multipliers : dict of str to array (multipliers,)
+            By log|μ| of the experiments whose multipliers were measured.
         """
-        result, stacks = {}, iter(weights.stacks())
-        for group, _, observations, data in self._parts:
+        by_outputs = [np.zeros((len(group.outputs), *group.outputs.shape[2:])) for group in simulation.groups]
+        by_delay, by_multipliers = [np.zeros(len(group.outputs)) for group in simulation.groups], {}
+        stacks = iter(weights.stacks())
+        for group, members, observations, data in self._parts:
             first, own = observations[0], [next(stacks) for _ in observations[0].blocks]
             if data:
-                outputs = first.spread(own, simulation.groups[group].outputs.shape[-2:])
-                for o, by_outputs in zip(observations, outputs, strict=True):
-                    result[o.experiment.name] = Response(by_outputs, np.zeros(()), np.zeros(0), np.zeros(()))
+                for column, signal in zip(first.columns, first.spread(own), strict=True):
+                    by_outputs[group][members, :, column] = signal
             else:
                 response = simulation.at(0).response(first.experiment.name)
-                result[first.experiment.name] = first.vjp(response, [stack[0] for stack in own])
-        return result
+                found = first.vjp(response, [stack[0] for stack in own])
+                by_outputs[group][members], by_delay[group][members] = found.outputs, found.delay
+                by_multipliers[first.experiment.name] = found.log_multipliers
+        return by_outputs, by_delay, by_multipliers

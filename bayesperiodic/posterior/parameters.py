@@ -152,16 +152,18 @@ class ParameterMaps:
             raise ValueError("maps: the same parameters must be free, and the same tied.")
         self._tied, self._size = first.tied, first.size
         self._fixed = np.array([[m.fixed.get(name, np.nan) for name in first.parameters] for m in maps])
-        self._places = [first.parameters.index(name) for name in first.columns]
+        self._places = np.array([first.parameters.index(name) for name in first.columns], dtype=int)
         self._columns = np.array([[m.columns[name] for name in first.columns] for m in maps], dtype=int)
         named = {name for expression in self._tied.values() for name in expression.names} | self._tied.keys()
         self._named = {name: i for i, name in enumerate(first.parameters) if name in named}
         free = {*first.columns, *self._tied} - {SHIFT}
+        self._rows = np.arange(len(maps))[:, None]
         self.moving = tuple(i for i, name in enumerate(first.parameters) if name in free)
 
     def values(self, theta: np.ndarray) -> np.ndarray:
         """Return all parameters (maps, points, parameters + 1), the delay last, of θ (points, names)."""
-        result = np.repeat(self._fixed[:, None], len(theta), axis=1)
+        result = np.empty((len(self._fixed), len(theta), self._fixed.shape[1]))
+        result[...] = self._fixed[:, None]
         result[:, :, self._places] = theta[:, self._columns].transpose(1, 0, 2)
         if self._tied:
             known = {name: result[..., i] for name, i in self._named.items()}
@@ -183,7 +185,7 @@ class ParameterMaps:
             for name, expression in reversed(self._tied.items()):
                 for argument, slope in expression.gradient(known).items():
                     left[:, self._named[argument]] += slope * left[:, self._named[name]]
-        result[np.arange(len(result))[:, None], self._columns] = left[:, self._places]
+        result[self._rows, self._columns] = left[:, self._places]
         return result
 
 

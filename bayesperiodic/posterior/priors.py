@@ -139,8 +139,12 @@ class Univariate(ABC):
             number: Any = np.float64(x)
             number = np.float64(function(number) if low < number < high else outside)
             return number
-        x = np.asarray(x, dtype=float)
+        x = np.ascontiguousarray(x, dtype=float)
         inside = (x > low) & (x < high)
+        if np.count_nonzero(inside) == x.size:
+            result = np.empty(x.shape)
+            result[...] = function(x)
+            return result
         result = np.full(x.shape, outside)
         result[inside] = function(x[inside])
         return result
@@ -150,6 +154,7 @@ class Univariate(ABC):
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
+    # Squares are products in the formulas: x**2 of a number and of an array may differ in the last bit.
     @abstractmethod
     def _log_density(self, x: np.ndarray) -> Any: ...
 
@@ -209,7 +214,8 @@ class Normal(Univariate):
         self._store(mean=_checks.finite_number("mean", self.mean), sd=_checks.positive("sd", self.sd))
 
     def _log_density(self, x: np.ndarray) -> Any:
-        return -0.5 * ((x - self.mean) / self.sd) ** 2 - (math.log(self.sd) + LOG_ROOT_TWO_PI)
+        score = (x - self.mean) / self.sd
+        return -0.5 * (score * score) - (math.log(self.sd) + LOG_ROOT_TWO_PI)
 
     def _gradient(self, x: np.ndarray) -> Any:
         return -(x - self.mean) / self.sd**2
@@ -250,7 +256,9 @@ class LogNormal(_Positive):
         self._store(median=_checks.positive("median", self.median), spread=_checks.positive("spread", self.spread))
 
     def _log_density(self, x: np.ndarray) -> Any:
-        return -0.5 * self._score(x) ** 2 - np.log(x) - (math.log(self.spread) + LOG_ROOT_TWO_PI)
+        logarithm = np.log(x)
+        score = (logarithm - math.log(self.median)) / self.spread
+        return -0.5 * (score * score) - logarithm - (math.log(self.spread) + LOG_ROOT_TWO_PI)
 
     def _gradient(self, x: np.ndarray) -> Any:
         return -(1.0 + self._score(x) / self.spread) / x
@@ -383,7 +391,8 @@ class HalfNormal(_Positive):
         self._store(scale=_checks.positive("scale", self.scale))
 
     def _log_density(self, x: np.ndarray) -> Any:
-        return -0.5 * (x / self.scale) ** 2 + (math.log(2.0) - math.log(self.scale) - LOG_ROOT_TWO_PI)
+        score = x / self.scale
+        return -0.5 * (score * score) + (math.log(2.0) - math.log(self.scale) - LOG_ROOT_TWO_PI)
 
     def _gradient(self, x: np.ndarray) -> Any:
         return -x / self.scale**2
@@ -517,7 +526,8 @@ class StudentT(Univariate):
 
     def _log_density(self, x: np.ndarray) -> Any:
         constant = special.betaln(0.5 * self.dof, 0.5) + 0.5 * math.log(self.dof) + math.log(self.scale)
-        return -0.5 * (self.dof + 1.0) * np.log1p(self._score(x) ** 2 / self.dof) - constant
+        score = self._score(x)
+        return -0.5 * (self.dof + 1.0) * np.log1p(score * score / self.dof) - constant
 
     def _gradient(self, x: np.ndarray) -> Any:
         score = self._score(x)

@@ -138,9 +138,10 @@ class Problem(Description):
         return other
 
     def _evaluated(self, evaluate: str, theta: Any, variances: Any, threads: int | None = None) -> np.ndarray:
-        values = self.vector(theta)
-        noise = np.broadcast_to(self.noise_values(variances), (*values.shape[:-1], len(self.noise_names)))
-        flat = values.reshape(-1, len(self.names)), noise.reshape(-1, len(self.noise_names))
+        values, noise = self.vector(theta), self.noise_values(variances)
+        if noise.shape[:-1] != values.shape[:-1]:
+            noise = np.broadcast_to(noise, (*values.shape[:-1], noise.shape[-1]))
+        flat = values.reshape(-1, values.shape[-1]), noise.reshape(-1, noise.shape[-1])
         found: Evaluation = getattr(self.density(coordinates=NATURAL), evaluate)(*flat, threads)
         return found.log_prob.reshape(values.shape[:-1])
 
@@ -246,10 +247,8 @@ class Problem(Description):
     def _value_and_gradient(self, theta: Any, variances: Any, *, forward: bool) -> tuple[float, np.ndarray]:
         natural = self.vector(theta), self.noise_values(variances)
         density = self.density(coordinates=NATURAL)
-        density = self.density(coordinates=NATURAL)
         value, by_theta, by_noise, _ = density.value_and_gradient_at(*natural, forward=forward)
-        free = [self.noise_names.index(name) for name in self.free_noise]
-        return value, np.concatenate([by_theta, by_noise[free]])
+        return value, np.concatenate([by_theta, by_noise[density.noise_columns]])
 
     def outputs(self, theta: Mapping[str, float] | np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
         """Return the predicted outputs at many θ, and whether the solves converged.

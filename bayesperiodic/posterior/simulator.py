@@ -1,6 +1,6 @@
 """Periodic responses of all experiments of a problem at any θ, solved from anchors."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -115,14 +115,15 @@ class Simulator:
         return {e.name: (g, m) for g, group in enumerate(self.groups) for m, e in enumerate(group)}
 
     @cached_property
-    def _batches(self) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch]]:
-        """The groups with what solves them."""
+    def _batches(self) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch, bool]]:
+        """The groups, their parameters, their solver, and whether multipliers were measured."""
         kind = AutonomousBatch if self.problem.model.autonomous else Batch
         return [
             (
                 group,
                 ParameterMaps([self.problem.parameter_maps[e.name] for e in group]),
                 kind([self.problem.equations[e.name] for e in group], [self._anchors[e.name] for e in group]),
+                any(e.multipliers is not None for e in group),
             )
             for group in self.groups
         ]
@@ -151,9 +152,9 @@ class Simulator:
             A θ counts only if every solve converges; the other experiments may then be skipped where one has failed.
         """
         found = []
-        for experiments, maps, batch in self._batches:
+        for experiments, maps, batch, multipliers in self._batches:
             values = maps.values(theta)
-            parameters, multipliers = values[..., :-1], any(e.multipliers is not None for e in experiments)
+            parameters = values[..., :-1]
             if isinstance(batch, AutonomousBatch):
                 solved = batch.solve(parameters, threads, keep=keep or multipliers, whole=whole)
             else:
@@ -165,7 +166,7 @@ class Simulator:
                     self._log_multipliers(e, solved.z[i], solved.frequency[i], parameters[i], status[i])
                     for i, e in enumerate(experiments)
                 ]
-            found.append(GroupSolution(solved.outputs, solved.frequency, values[..., -1], logarithms, solved.z, status))
+            found.append(GroupSolution(solved.outputs, solved.frequency, values, logarithms, solved.z, status))
         return Simulation(found, self._places)
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
@@ -253,8 +254,15 @@ class Simulator:
         ).real
         return np.array([_without_trivial(solution, row)[:count] for row in every])
 
-    def vjp(self, theta: np.ndarray, simulation: Simulation, weights: Mapping[str, Response]) -> dict[str, np.ndarray]:
-        """Return Σ weights · derivatives of a forced model's responses by θ, (names,) by experiment.
+    def vjp(
+        self,
+        theta: np.ndarray,
+        simulation: Simulation,
+        by_outputs: Sequence[np.ndarray],
+        by_delay: Sequence[np.ndarray],
+        by_multipliers: Mapping[str, np.ndarray],
+    ) -> dict[str, np.ndarray]:
+        """Return the derivatives of a scalar by θ from those by a forced model's responses, (names,) by experiment.
 
         That of the outputs takes one transposed solve an experiment; NaN where the derivatives do not exist.
 
@@ -263,24 +271,23 @@ class Simulator:
         theta : array (names,)
         simulation : Simulation
             At this θ alone, with z.
-        weights : mapping of str to Response
-            Derivatives of a scalar by the response of every experiment.
+        by_outputs, by_delay, by_multipliers
+            As `Comparisons.vjp` returns them.
         """
         result: dict[str, np.ndarray] = {}
-        for (experiments, maps, batch), solved in zip(self._batches, simulation.groups, strict=True):
+        for g, (experiments, maps, batch, _) in enumerate(self._batches):
             assert isinstance(batch, Batch)
-            names = [e.name for e in experiments]
-            values = maps.values(theta[None])[:, 0]
-            outputs = np.stack([weights[n].outputs for n in names])
+            solved = simulation.groups[g]
+            values = solved.values[:, 0]
             by_parameter = np.zeros(values.shape)
-            by_parameter[:, maps.moving] = batch.vjp(values[:, :-1], solved.z[:, 0], outputs, maps.moving)
-            by_parameter[:, -1] = [weights[n].delay for n in names]
-            result |= dict(zip(names, maps.vjp(values, by_parameter), strict=True))
+            by_parameter[:, maps.moving] = batch.vjp(values[:, :-1], solved.z[:, 0], by_outputs[g], maps.moving)
+            by_parameter[:, -1] = by_delay[g]
+            result |= zip((e.name for e in experiments), maps.vjp(values, by_parameter), strict=True)
         for e in self.problem.experiments:
             if e.multipliers is not None:
                 response = simulation.at(0).response(e.name)
                 changes = self._multiplier_changes(theta, e.name, simulation.z(e.name)[0], response)
-                result[e.name] = result[e.name] + changes @ weights[e.name].log_multipliers
+                result[e.name] = result[e.name] + changes @ by_multipliers[e.name]
         return result
 
 
