@@ -70,7 +70,7 @@ class GroupSolution(NamedTuple):
 
     def response(self, member: int) -> Response:
         """Return the responses of one experiment, θ on the leading axis."""
-        delay = self.values[member, :, -1]
+        delay = self.values[member][..., -1]
         return Response(self.outputs[member], self.frequency[member], self.log_multipliers[member], delay)
 
     def at(self, solves: Any) -> "GroupSolution":
