@@ -256,18 +256,10 @@ ALLOWED = "a prior such as Normal(mean, sd), or a frozen continuous distribution
 
 @dataclass(frozen=True)
 class JointPrior:
-    """The prior of all free parameters: independent blocks, each of one parameter or of several jointly.
+    """Prior of all free parameters: independent blocks, each of one parameter or of several jointly."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        The free parameters, in the order of the last axis of θ.
-    blocks : dict of str or tuple of str to prior
-        In the order of their first names.
-    """
-
-    names: tuple[str, ...]
-    blocks: dict[str | tuple[str, ...], Any]
+    names: tuple[str, ...]  # the free parameters, in the order of the last axis of θ
+    blocks: dict[str | tuple[str, ...], Any]  # in the order of their first names
 
     @classmethod
     def of(cls, priors: Mapping[Any, Any], known: Iterable[str]) -> "JointPrior":

@@ -30,13 +30,8 @@ def pack(
 ) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
     """Return variables, dims and values (chain, draw, …), made of columns (chain, draw) by full name.
 
-    Parameters
-    ----------
-    columns : mapping of str to array (chains, draws)
-    dims : mapping of str to sequence of str
-        Of each variable, after chain and draw.
-    coords : mapping of str to sequence of str
-        The names along each dim. Where a variable has no column the values are NaN.
+    `dims` are those of each variable after chain and draw, `coords` the names along each. Values without a column are
+    NaN.
     """
     shape = next(iter(columns.values())).shape
     packed = {}
@@ -64,13 +59,7 @@ def places(group: xr.Dataset) -> dict[str, tuple[str, dict[str, str]]]:
 
 
 def column(group: xr.Dataset, name: str) -> np.ndarray:
-    """Return the draws (chains, draws) of what has this full name.
-
-    Raises
-    ------
-    ValueError
-        For an unknown name.
-    """
+    """Return the draws (chains, draws) of what has this full name; raise a ValueError if it is unknown."""
     known = places(group)
     _checks.one_of("name", name, known)
     variable, at = known[name]

@@ -26,14 +26,7 @@ from bayesperiodic.posterior.noise import (
 
 
 class Residuals(Sequence[np.ndarray]):
-    """One array (…, size) of components a block.
-
-    Parameters
-    ----------
-    stacks : sequence of array (members, …, size)
-    places : sequence of (int, int)
-        Stack and member of each block.
-    """
+    """One array (…, size) of components a block, stored as stacks (members, …, size) with the place of each block."""
 
     def __init__(self, stacks: Sequence[np.ndarray], places: Sequence[tuple[int, int]]):
         self._stacks, self._places = tuple(stacks), tuple(places)
@@ -90,21 +83,9 @@ class Residuals(Sequence[np.ndarray]):
 
 
 class Likelihood:
-    """A noise model on the blocks of a problem: the log-likelihood of their residuals and its derivatives.
+    """Log-likelihood of the residuals of a problem's blocks under a noise model, and its derivatives.
 
-    Parameters
-    ----------
-    model : Noise
-    blocks : sequence of Block
-    fixed : mapping of str to float
-        Noise parameters with known values.
-
-    Attributes
-    ----------
-    names : tuple of str
-        All noise parameters.
-    free : tuple of str
-        Those without a known value.
+    `names` are all noise parameters, `fixed` those with known values, `free` the others.
     """
 
     def __init__(self, model: Noise, blocks: Sequence[Block], fixed: Mapping[str, float]):
@@ -406,19 +387,10 @@ TINY = np.finfo(float).tiny
 def estimate_noise(
     likelihood: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, share: float
 ) -> np.ndarray:
-    """Return the noise parameters that suit given residuals best, (names,).
+    """Return the noise parameters (names,) that fit residuals best, one array (size,) a block, from a start.
 
     For independent errors with the prior 1/v this is eq. (7) of [1]_, v = Σe²/(n·share); otherwise it maximises the
     log-likelihood, its logarithms multiplied by `share`, plus the log-prior.
-
-    Parameters
-    ----------
-    likelihood : Likelihood
-    residuals : sequence of array (size,)
-        One a block.
-    start : array (names,)
-    share : float
-        1 − l/Σn for the bias correction of eq. (7), 1 for the maximum of eq. (6).
 
     References
     ----------

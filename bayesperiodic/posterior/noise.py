@@ -23,40 +23,23 @@ SCALE = "scale"
 
 @dataclass(frozen=True)
 class Block:
-    """What a noise model must know about one vector of residual components.
+    """Description of one vector of residual components.
 
-    Attributes
-    ----------
-    experiment : str
-    channel : str
-        An output; "scale" for all section values of an experiment together, "multipliers" or "frequency".
-    kind : str
-        "spectral": real Fourier components, of which white noise of variance v has independent ones of variance v;
-        "points": values at the points of a mask; "correlated": values whitened by their given covariance, up to one
-        unknown factor; "known": values in units of their known standard deviations.
-    count : float
-        Independent values behind the components.
-    size : int
-        Number of components.
-    harmonic : array (size,)
-        Of the response period, of each spectral component.
-    position : array (size,)
-        Of each point, in response periods.
-    points : int
-        Grid points of the response period.
-    measured : float
-        Variance of one value that the scatter of the measured cycles explains; NaN where that is not known.
+    A `channel` is an output; "scale" for all section values of an experiment together, "multipliers" or "frequency".
+    The `kind` is "spectral" for real Fourier components, which are independent and have variance v under white noise of
+    variance v; "points" for values at the points of a mask; "correlated" for values whitened by their given covariance,
+    up to one unknown factor; "known" for values in units of their known standard deviations.
     """
 
     experiment: str
     channel: str
     kind: str
-    count: float
-    size: int
-    harmonic: np.ndarray
-    position: np.ndarray
-    points: int
-    measured: float
+    count: float  # independent values behind the components
+    size: int  # number of components
+    harmonic: np.ndarray  # (size,), of the response period, of each spectral component
+    position: np.ndarray  # (size,), of each point, in response periods
+    points: int  # grid points of the response period
+    measured: float  # variance of one value that the scatter of the cycles explains; NaN if unknown
 
     @property
     def weight(self) -> float:
@@ -472,13 +455,7 @@ NAMED: dict[str, type[Noise]] = {model.name: model for model in (Independent, Me
 
 
 def as_noise(given: str | Noise) -> Noise:
-    """Return a noise model from its name or itself.
-
-    Raises
-    ------
-    ValueError
-        If it is neither.
-    """
+    """Return a noise model from its name or itself."""
     if isinstance(given, Noise):
         return given
     if not isinstance(given, str):

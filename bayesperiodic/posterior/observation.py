@@ -22,51 +22,23 @@ ROOT_TWO = math.sqrt(2.0)
 
 
 class Response(NamedTuple):
-    """What a model answers in one experiment, or the derivatives of that along directions on the leading axis.
+    """Response of a model in one experiment, or its derivatives along directions on the leading axis."""
 
-    Attributes
-    ----------
-    outputs : array (…, points, channels)
-        In the order of the model's outputs.
-    frequency : array (…,)
-        [Hz].
-    log_multipliers : array (…, multipliers)
-        log|μ|, largest first, as many as were measured.
-    delay : array (…,)
-        By how much the measured outputs are late against the model's [s].
-    """
-
-    outputs: np.ndarray
-    frequency: np.ndarray
-    log_multipliers: np.ndarray
-    delay: np.ndarray
+    outputs: np.ndarray  # (…, points, channels), in the order of the model's outputs
+    frequency: np.ndarray  # (…,) [Hz]
+    log_multipliers: np.ndarray  # (…, multipliers), log|μ|, largest first, as many as were measured
+    delay: np.ndarray  # (…,) of the measured outputs against the model's [s]
 
 
 class GroupSolution(NamedTuple):
-    """Solutions of experiments that are solved together, at several θ.
+    """Solutions of experiments that are solved together, at several θ."""
 
-    Attributes
-    ----------
-    outputs : array (experiments, solves, points, channels)
-        In the order of the model's outputs.
-    frequency : array (experiments, solves)
-        [Hz].
-    values : array (experiments, solves, parameters + 1)
-        All parameters, the delay last.
-    log_multipliers : list of array (solves, multipliers)
-        log|μ| of the measured multipliers of each experiment, largest first.
-    z : array (experiments, solves, points, states)
-        The periodic parts of the states.
-    status : int array (experiments, solves)
-        Index into `compiled.STATUSES`.
-    """
-
-    outputs: np.ndarray
-    frequency: np.ndarray
-    values: np.ndarray
-    log_multipliers: list[np.ndarray]
-    z: np.ndarray
-    status: np.ndarray
+    outputs: np.ndarray  # (experiments, solves, points, channels), in the order of the model's outputs
+    frequency: np.ndarray  # (experiments, solves) [Hz]
+    values: np.ndarray  # (experiments, solves, parameters + 1), all parameters, the delay last
+    log_multipliers: list[np.ndarray]  # (solves, multipliers) of each experiment, log|μ|, largest first
+    z: np.ndarray  # (experiments, solves, points, states), periodic parts of the states
+    status: np.ndarray  # int (experiments, solves), index into `compiled.STATUSES`
 
     def response(self, member: int) -> Response:
         """Return the responses of one experiment, θ on the leading axis."""
@@ -86,19 +58,7 @@ class GroupSolution(NamedTuple):
 
 
 class Simulation:
-    """Solutions of all experiments at several θ.
-
-    Parameters
-    ----------
-    groups : sequence of GroupSolution
-    places : mapping of str to (int, int)
-        Group and member of each experiment.
-
-    Attributes
-    ----------
-    status : int array (solves,)
-        The worst status code of the experiments.
-    """
+    """Solutions of all experiments at several θ; `status` (solves,) is the worst code of the experiments."""
 
     def __init__(self, groups: Sequence[GroupSolution], places: Mapping[str, tuple[int, int]]):
         self.groups, self._places = groups, places
@@ -126,25 +86,19 @@ class Simulation:
 
 
 class Observation:
-    """The comparison of a response with one experiment.
+    """Comparison of a response with one experiment.
 
     Outputs are delayed, compared with the data (angles modulo 2π), and taken at the points of the mask or as Fourier
     components within the harmonics kept. The orbit of an autonomous model, whose phase is free, is first turned until
-    the first harmonics of its measured outputs agree best with those of the data.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    model : Model
-    delayed : bool
-        Whether the delay is a parameter; without it outputs are not shifted at all, unless the phase is free.
+    the first harmonics of its measured outputs agree best with those of the data. Other outputs are shifted only if the
+    delay is a parameter.
 
     Attributes
     ----------
     channels : tuple of str
         Those measured, in the order of the model's outputs.
     columns : list of int
-        Where these are among the model's outputs.
+        Their indices among the model's outputs.
     data : array (points, channels)
     """
 
@@ -295,16 +249,10 @@ class Observation:
         return dict(zip(self.channels, np.moveaxis(self._predicted(response), -1, 0), strict=True))
 
     def replicates(self, response: Response, components: list[np.ndarray]) -> dict[str, np.ndarray]:
-        """Return what might have been measured, ŷ plus noise (draws, points), by channel; NaN outside the mask.
+        """Return possible measurements, ŷ plus noise (draws, points), by channel; NaN outside the mask.
 
-        Angles are within half a turn of the data.
-
-        Parameters
-        ----------
-        response : Response
-            With draws on its leading axis.
-        components : list of array (draws, size)
-            Of the noise, one array a block.
+        The response has draws on its leading axis, the noise one array (draws, size) a block. Angles are within half a
+        turn of the data.
         """
         e, noise = self.experiment, np.full((len(components[0]), *self.data.shape), np.nan)
         if e.covariance is not None:
@@ -495,34 +443,18 @@ def _measured_variance(experiment: Experiment, channel: str) -> float:
 
 
 class _Part(NamedTuple):
-    """Experiments whose residuals are computed together.
+    """Experiments whose residuals are computed together."""
 
-    Attributes
-    ----------
-    group : int
-        Index of the group of experiments that are solved together.
-    members : slice or list of int
-        Their places in the group.
-    observations : list of Observation
-    data : list of array (experiments, 1, size)
-        Fourier components of the measured channels; empty for an experiment with a comparison of its own.
-    """
-
-    group: int
-    members: Any
+    group: int  # index of the group of experiments that are solved together
+    members: Any  # slice or list of int, their places in the group
     observations: list[Observation]
-    data: list[np.ndarray]
+    data: list[np.ndarray]  # Fourier components (experiments, 1, size) a channel; empty if more than these is compared
 
 
 class Comparisons:
     """Residual components of all experiments, computed together where experiments have the same layout.
 
-    Parameters
-    ----------
-    groups : sequence of sequence of Observation
-        Of experiments that are solved together, as in `Simulator.groups`.
-    order : sequence of str
-        Experiments in the order of their blocks.
+    The groups are of experiments that are solved together, as in `Simulator.groups`, the order that of the blocks.
     """
 
     def __init__(self, groups: Sequence[Sequence[Observation]], order: Iterable[str]):
@@ -544,14 +476,7 @@ class Comparisons:
         self._places = [place for name in order for place in places[name]]
 
     def residuals(self, simulation: Simulation, threads: int | None = 1) -> Residuals:
-        """Return the residual components at all θ of a simulation, an array (solves, size) a block.
-
-        Parameters
-        ----------
-        simulation : Simulation
-        threads : int, optional
-            That share the θ; None for one per core. The result does not depend on it.
-        """
+        """Return the residual components at all θ, (solves, size) a block; None means one thread per core."""
         solves = simulation.status.size
         small = solves == 1 or max(group.outputs.size for group in simulation.groups) < SMALLEST_SHARED
         parts = 1 if small else min(threads or available_cores(), solves)
@@ -580,21 +505,8 @@ class Comparisons:
     ) -> tuple[list[np.ndarray], list[np.ndarray], dict[str, np.ndarray]]:
         """Return the derivatives of Σ weights · predicted components by the responses at one θ.
 
-        Parameters
-        ----------
-        simulation : Simulation
-            At one θ.
-        weights : Residuals
-            As `residuals` returns them at this θ, without the axis of the θ.
-
-        Returns
-        -------
-        by_outputs : list of array (experiments, points, channels)
-            One per group.
-        by_delay : list of array (experiments,)
-            One per group.
-        by_multipliers : dict of str to array (multipliers,)
-            By log|μ| of the experiments whose multipliers were measured.
+        They are by the outputs (experiments, points, channels) and the delays (experiments,) of each group, and by
+        log|μ| of the experiments whose multipliers were measured. The weights are arranged as the residuals at this θ.
         """
         by_outputs = [np.zeros((len(group.outputs), *group.outputs.shape[2:])) for group in simulation.groups]
         by_delay, by_multipliers = [np.zeros(len(group.outputs)) for group in simulation.groups], {}

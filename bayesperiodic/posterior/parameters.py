@@ -48,26 +48,13 @@ def free_names(parameters: Iterable[str], local: Iterable[str], experiments: Ite
 
 @dataclass(frozen=True)
 class ParameterMap:
-    """From θ, the free parameters of all experiments, to all parameters of one experiment.
+    """Map from θ, the free parameters of all experiments, to all parameters of one experiment."""
 
-    Attributes
-    ----------
-    parameters : tuple of str
-        All of the model's, and last "shift", the delay of the measured outputs [s].
-    columns : dict of str to int
-        Where the free ones of this experiment are in θ.
-    size : int
-        Length of θ.
-    fixed : dict of str to float
-    tied : dict of str to Expression
-        Each only of parameters that are free, fixed or tied before it.
-    """
-
-    parameters: tuple[str, ...]
-    columns: dict[str, int]
-    size: int
+    parameters: tuple[str, ...]  # all of the model's, and last "shift", the delay of the measured outputs [s]
+    columns: dict[str, int]  # places of this experiment's free ones in θ
+    size: int  # length of θ
     fixed: dict[str, float]
-    tied: dict[str, Expression]
+    tied: dict[str, Expression]  # each only of parameters that are free, fixed or tied before it
 
     @classmethod
     def of(
@@ -78,14 +65,7 @@ class ParameterMap:
         fixed: Mapping[str, float],
         tied: Mapping[str, Any],
     ) -> "ParameterMap":
-        """Return the checked map of an experiment; `names` are those of θ.
-
-        Raises
-        ------
-        ValueError
-            For a parameter that is none of the three or two of them, an unknown name, an invalid expression
-            or that comes back to itself.
-        """
+        """Return the checked map of an experiment; `names` are those of θ."""
         every = (*parameters, SHIFT)
         columns = {}
         for name in every:
@@ -134,17 +114,7 @@ class ParameterMap:
 
 
 class ParameterMaps:
-    """Maps of several experiments in which the same parameters are free, evaluated together.
-
-    Parameters
-    ----------
-    maps : sequence of ParameterMap
-
-    Attributes
-    ----------
-    moving : tuple of int
-        Which of the model's parameters are free or tied.
-    """
+    """Maps of several experiments with the same free parameters; `moving` are the indices of free and tied ones."""
 
     def __init__(self, maps: Sequence[ParameterMap]):
         first = maps[0]
@@ -172,13 +142,7 @@ class ParameterMaps:
         return result
 
     def vjp(self, values: np.ndarray, by_parameter: np.ndarray) -> np.ndarray:
-        """Return derivatives by θ, (maps, names), from those by all parameters at their values (maps, parameters + 1).
-
-        Parameters
-        ----------
-        values, by_parameter : array (maps, parameters + 1)
-            The delay last.
-        """
+        """Return derivatives by θ, (maps, names), from those by all parameters, (maps, parameters + 1)."""
         left, result = by_parameter.copy(), np.zeros((len(by_parameter), self._size))
         if self._tied:
             known = {name: values[:, i] for name, i in self._named.items()}

@@ -70,12 +70,6 @@ class Problem(Description):
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
     >>> problem
     Problem('duffing', 1 experiments, free: c, k, channels: displacement with 11 independent values, independent noise)
     >>> at = {"c": 0.2, "k": 1.0}, {"displacement": 1e-6}
@@ -153,10 +147,9 @@ class Problem(Description):
         Parameters
         ----------
         theta : mapping of str to float, or array (…, names)
-            Natural values, in the parameters' units.
+            See `vector`, which raises for unknown or missing names.
         variances : mapping of str to float, or array (…, noise_names)
-            In a mapping a channel's name stands for its variance [channel's unit squared], and those with a known value
-            may be left out.
+            See `noise_values`, which does likewise.
         threads : int, optional
             By default one per core. The value does not depend on it.
 
@@ -164,11 +157,6 @@ class Problem(Description):
         -------
         array (…)
             −inf where a periodic solve fails.
-
-        Raises
-        ------
-        ValueError
-            For unknown or missing names, or another last axis.
         """
         return self._evaluated("log_likelihood", theta, variances, threads)
 
@@ -178,20 +166,13 @@ class Problem(Description):
         Parameters
         ----------
         theta : mapping of str to float, or array (…, names)
-            Natural values, in the parameters' units.
         variances : mapping of str to float, or array (…, noise_names)
-            In a mapping a channel's name stands for its variance [channel's unit squared], and those with a known value
-            may be left out.
+            See `log_likelihood`.
 
         Returns
         -------
         array (…)
             −inf outside the priors' support and where a periodic solve fails.
-
-        Raises
-        ------
-        ValueError
-            For unknown or missing names, or another last axis.
         """
         return self._evaluated("at", theta, variances)
 
@@ -245,8 +226,8 @@ class Problem(Description):
         return self._value_and_gradient(theta, variances, forward=False)
 
     def _value_and_gradient(self, theta: Any, variances: Any, *, forward: bool) -> tuple[float, np.ndarray]:
-        natural = self.vector(theta), self.noise_values(variances)
         density = self.density(coordinates=NATURAL)
+        natural = self.vector(theta), self.noise_values(variances)
         value, by_theta, by_noise, _ = density.value_and_gradient_at(*natural, forward=forward)
         return value, np.concatenate([by_theta, by_noise[density.noise_columns]])
 

@@ -25,17 +25,10 @@ Guesses = Mapping[str, Mapping[str, np.ndarray]]
 
 
 class Simulator:
-    """Solves the experiments of a problem for any θ, from anchors: solutions and their sensitivities at one θ.
+    """Periodic solutions of a problem's experiments at any θ, solved from anchors, and their derivatives at one θ.
 
-    Parameters
-    ----------
-    problem : Description
-    guesses : mapping of str to (str or mapping of str to array (points,))
-        First guess of the states of every experiment, from which to solve where the anchors fail.
-    anchors : mapping of str to Anchor
-        By experiment.
-    derivatives : mapping of str to Sensitivities or None
-        Of outputs and frequency at the anchors by all parameters; None where they do not exist.
+    By experiment: the guesses are states (points,), or "static", to solve from where the anchors fail; the derivatives
+    are those of outputs and frequency at the anchors by all parameters, None where they do not exist.
     """
 
     def __init__(
@@ -49,15 +42,7 @@ class Simulator:
 
     @classmethod
     def start(cls, problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> "Simulator":
-        """Return the simulator anchored at θ (names,), solved from guesses.
-
-        Parameters
-        ----------
-        problem : Description
-        theta : array (names,)
-        guesses : mapping of str to mapping of str to array (points,), optional
-            States of every experiment, turns included; by default the experiments' own guesses, else the equilibrium.
-        """
+        """Return the simulator anchored at θ (names,), solved from guesses, the experiments' own or the equilibrium."""
         if guesses is not None:
             _checks.same_names("guesses", guesses, [e.name for e in problem.experiments])
         own = {
@@ -139,17 +124,9 @@ class Simulator:
     ) -> Simulation:
         """Solve every experiment for θ (solves, names); the result does not depend on the number of threads.
 
-        Parameters
-        ----------
-        theta : array (solves, names)
-        threads : int, optional
-            By default one per core.
-        keep : bool
-            Return the periodic parts z too.
-        polish : bool
-            Solve as accurately as possible, as is done wherever multipliers are measured.
-        whole : bool
-            A θ counts only if every solve converges; the other experiments may then be skipped where one has failed.
+        With `keep` the periodic parts z are returned too; with `polish` the solves are as accurate as possible, as
+        wherever multipliers are measured. With `whole` a θ counts only if every solve converges; where one has failed,
+        other experiments may be skipped.
         """
         found = []
         for experiments, maps, batch, multipliers in self._batches:
@@ -216,16 +193,7 @@ class Simulator:
         return solutions
 
     def changes(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:
-        """Return the derivatives of the response at the anchor by θ, (names, …); None where they do not exist.
-
-        Parameters
-        ----------
-        theta : array (names,)
-            Where the anchors are.
-        experiment : str
-        response, z
-            There.
-        """
+        """Return the derivatives of a response at the anchor by θ, (names, …); None where they do not exist."""
         slopes, derivative = self.problem.parameter_maps[experiment].slopes(theta), self._derivatives[experiment]
         if derivative is None:
             return None
@@ -262,17 +230,10 @@ class Simulator:
         by_delay: Sequence[np.ndarray],
         by_multipliers: Mapping[str, np.ndarray],
     ) -> dict[str, np.ndarray]:
-        """Return the derivatives of a scalar by θ from those by a forced model's responses, (names,) by experiment.
+        """Return the derivatives of a scalar by θ, (names,) by experiment, from those that `Comparisons.vjp` returns.
 
-        That of the outputs takes one transposed solve an experiment; NaN where the derivatives do not exist.
-
-        Parameters
-        ----------
-        theta : array (names,)
-        simulation : Simulation
-            At this θ alone, with z.
-        by_outputs, by_delay, by_multipliers
-            As `Comparisons.vjp` returns them.
+        The simulation is of a driven model, at this θ alone, with z. Each experiment takes one transposed solve; NaN
+        where the derivatives do not exist.
         """
         result: dict[str, np.ndarray] = {}
         for g, (experiments, maps, batch, _) in enumerate(self._batches):
