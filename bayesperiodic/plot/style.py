@@ -2,7 +2,7 @@
 
 import textwrap
 
-from bayesperiodic.posterior import labels
+from bayesperiodic.posterior.parameters import unit
 from bayesperiodic.sampling.posterior import Posterior
 
 #: Colours of measurements, of the MAP estimate, of the Laplace approximation and of MCMC, in all figures.
@@ -23,7 +23,7 @@ def caveats(synthetic: bool, converged: bool) -> str:
 
 def unit_of(posterior: Posterior, name: str) -> str:
     """Return the unit of a quantity by its full name; "" without one."""
-    return labels.unit(posterior.data["posterior"].to_dataset(), name)
+    return unit(posterior.data["posterior"].to_dataset(), name)
 
 
 def wrapped_label(name: str, unit: str) -> str:

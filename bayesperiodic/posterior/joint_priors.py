@@ -39,12 +39,6 @@ class MultivariateNormal(Density):
     Normal(mean=2.0, sd=3.0)
     >>> prior.gradient([1.0, 5.5]).round(6).tolist()
     [0.1, -0.4]
-
-    An estimate of two parameters becomes the prior of the next experiment, ``fit`` being a `MapEstimate`::
-
-        names = ("k", "c")
-        known = bp.MultivariateNormal([fit.theta[n] for n in names], fit.covariance.loc[[*names], [*names]])
-        problem = bp.Problem(model, [experiment], priors={names: known})
     """
 
     mean: np.ndarray

@@ -1,6 +1,6 @@
 """The log-likelihood of residuals under a noise model, and its derivatives."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -111,21 +111,21 @@ class Likelihood:
     @cached_property
     def counts(self) -> dict[str, float]:
         """Independent values behind each variance (and "scale"), by its name."""
-        result: dict[str, float] = {}
-        for block, columns in zip(self.blocks, self._columns, strict=True):
+        return self._summed(block.count for block in self.blocks)
+
+    def _summed(self, values: Iterable[Any]) -> dict[str, Any]:
+        """Return the sum of values, one a block, behind each variance."""
+        result: dict[str, Any] = {}
+        for block, columns, value in zip(self.blocks, self._columns, values, strict=True):
             if block.counted:
                 name = self.names[columns[0]]
-                result[name] = result.get(name, 0.0) + block.count
+                result[name] = result.get(name, 0.0) + value
         return result
 
     @cached_property
     def measured(self) -> dict[str, float]:
         """Measured variance behind each variance, the mean over its values; NaN where it is not known."""
-        total: dict[str, float] = {}
-        for block, columns in zip(self.blocks, self._columns, strict=True):
-            if block.counted:
-                name = self.names[columns[0]]
-                total[name] = total.get(name, 0.0) + block.count * block.measured
+        total = self._summed(block.count * block.measured for block in self.blocks)
         return {name: value / self.counts[name] for name, value in total.items()}
 
     def moments(self, residuals: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
@@ -133,13 +133,8 @@ class Likelihood:
 
         S, the spectrum for a variance of 1, is 1 for errors whose spectrum is flat; all else has to be known.
         """
-        result: dict[str, np.ndarray] = {}
-        own = Residuals.of(residuals if self.model.flat else self._unit(residuals))
-        for block, columns, square in zip(self.blocks, self._columns, np.moveaxis(own.squares, -1, 0), strict=True):
-            if block.counted:
-                name = self.names[columns[0]]
-                result[name] = result.get(name, 0.0) + block.weight * square
-        return result
+        squares = Residuals.of(residuals if self.model.flat else self._unit(residuals)).squares
+        return self._summed(block.weight * squares[..., b] for b, block in enumerate(self.blocks))
 
     def _unit(self, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the residuals over the square roots of the spectra for variances of 1."""
@@ -205,7 +200,7 @@ class Likelihood:
         return np.where(np.isfinite(total), total, -np.inf)
 
     def _by_kind(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
-        """Return the log-likelihood (…,), alike blocks together."""
+        """Return the log-likelihood (…,) of errors whose spectrum is not flat, alike blocks together."""
         total = np.zeros(values.shape[:-1])
         for members in self._alike:
             own = values[..., self._columns[members[0]]]
@@ -250,26 +245,20 @@ class Likelihood:
 
     def _together(self, residuals: list[np.ndarray], block: Block, values: np.ndarray, share: float) -> np.ndarray:
         """Return the log-likelihood (…,) of blocks like this one, the logarithms multiplied by `share`."""
-        if block.kind != SPECTRAL:
-            return self._alone(block, residuals[0], values, share)
-        variances = self._variances(block, values)[0]
-        squares = sum(r**2 for r in residuals)
-        terms = len(residuals) * share * np.log(variances) + squares / variances
-        return -0.5 * block.weight * np.sum(terms, axis=-1)
-
-    def _alone(self, block: Block, r: np.ndarray, values: np.ndarray, share: float) -> np.ndarray:
-        """Return the log-likelihood (…,) of one block, the logarithms of the variances multiplied by `share`."""
+        r = residuals[0]
         if block.kind == KNOWN:
             return -0.5 * _square(r)
         if self._is_dense(block):
             flat, rows = values.reshape(-1, values.shape[-1]), r.reshape(-1, r.shape[-1])
             each = [self._dense(block, row, v, share)[0] for row, v in zip(rows, flat, strict=True)]
             return np.array(each).reshape(values.shape[:-1])
-        variances = self._variances(block, values)[0]
         if block.kind == CORRELATED:
-            v = variances[..., 0]
+            v = values[..., 0]
             return -0.5 * block.weight * (share * block.size * np.log(v) + _square(r) / v)
-        return -0.5 * block.weight * np.sum(share * np.log(variances) + r**2 / variances, axis=-1)
+        variances = self._variances(block, values)[0]
+        squares = sum(r**2 for r in residuals)
+        terms = len(residuals) * share * np.log(variances) + squares / variances
+        return -0.5 * block.weight * np.sum(terms, axis=-1)
 
     def _is_dense(self, block: Block) -> bool:
         """Return whether the components of a block are correlated: points under noise that is not white."""

@@ -83,7 +83,6 @@ class Noise(ABC):
     --------
     Every noise model has a name, which a `Problem` takes in its place, and a prior of its variances:
 
-    >>> import bayesperiodic as bp
     >>> models = bp.noise.Independent(), bp.noise.Measured(), bp.noise.Circulant(prior=bp.InverseGamma(3, 2))
     >>> {noise.name: noise.prior_text for noise in models if isinstance(noise, bp.noise.Noise)}["circulant"]
     'prior InverseGamma(shape=3.0, scale=2.0)'
@@ -136,7 +135,7 @@ class Noise(ABC):
         Raises
         ------
         ValueError
-            For channels whose scatter is needed and not known, or grids that cannot be mixed.
+            If a scatter that the model needs is unknown, or experiments on different grids share a correlation.
         """
         points: dict[str, int] = {}
         for block in (b for b in blocks if b.kind in (SPECTRAL, POINTS)):
@@ -290,8 +289,7 @@ class Independent(Noise):
 
     Parameters
     ----------
-    per : "channel" or "experiment"
-    prior : "jeffreys", "flat" or a prior
+    per, prior
         See `Noise`.
 
     Raises
@@ -306,7 +304,6 @@ class Independent(Noise):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.noise.Independent(per="experiment").prior_text
     'Jeffreys prior 1/v'
     """
@@ -329,9 +326,8 @@ class Measured(Noise):
 
     Parameters
     ----------
-    per : "channel" or "experiment"
-    prior : "jeffreys", "flat" or a prior
-        Of the model error's variance.
+    per, prior
+        See `Noise`; the prior is that of the model error's variance.
 
     Raises
     ------
@@ -340,7 +336,6 @@ class Measured(Noise):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.noise.Measured().name
     'measured'
     """
@@ -402,7 +397,6 @@ class Circulant(Noise):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.noise.Circulant(kernel="exponential").shape_priors
     {'lengthscale': LogNormal(median=0.03, spread=1.5)}
     """

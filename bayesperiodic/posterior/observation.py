@@ -191,13 +191,9 @@ class Observation:
     def residuals(self, response: Response) -> list[np.ndarray]:
         """Return the residual components, one array (…, size) a block."""
         e = self.experiment
-        difference = self.data - self._predicted(response)
-        for c, angle in enumerate(self._angles):
-            if angle:
-                difference[..., c] = np.mod(difference[..., c] + np.pi, 2 * np.pi) - np.pi
         known = [] if e.multipliers is None else [np.log(np.abs(e.multipliers)) - response.log_multipliers]
         frequency = [e.frequency - response.frequency] if self._free_phase else []
-        return self._components(difference, known, frequency)
+        return self._components(self._difference(response), known, frequency)
 
     @cached_property
     def layout(self) -> tuple[Any, ...] | None:
@@ -271,14 +267,18 @@ class Observation:
 
     def compared(self, response: Response) -> dict[str, np.ndarray]:
         """Return y − ŷ (points,) of each channel, within the harmonics kept and zero where nothing was measured."""
-        difference = self.data - self._predicted(response)
-        result = {}
+        difference, mask, result = self._difference(response), self.experiment.mask, {}
         for c, channel in enumerate(self.channels):
             e = difference[:, c]
-            e = np.mod(e + np.pi, 2 * np.pi) - np.pi if self._angles[c] else e
-            mask = self.experiment.mask
             result[channel] = self.experiment.project(channel, e) if mask is None else np.where(mask, e, 0.0)
         return result
+
+    def _difference(self, response: Response) -> np.ndarray:
+        """Return y − ŷ (…, points, channels), angles within half a turn."""
+        difference = self.data - self._predicted(response)
+        for c in np.flatnonzero(self._angles):
+            difference[..., c] = np.mod(difference[..., c] + np.pi, 2 * np.pi) - np.pi
+        return difference
 
     def _components(
         self, values: np.ndarray, multipliers: list[np.ndarray], frequency: list[np.ndarray]

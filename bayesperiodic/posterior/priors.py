@@ -35,44 +35,13 @@ class Density(Protocol):
         """
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
-        """Return ∂ log p/∂x, NaN outside the support.
-
-        Parameters
-        ----------
-        x : array (…) or (…, n)
-            In the parameters' units.
-
-        Returns
-        -------
-        array (…) or (…, n)
-        """
+        """Return ∂ log p/∂x, (…) or (…, n), NaN outside the support."""
 
     def curvature(self, x: np.ndarray) -> np.ndarray:
-        """Return −∂² log p/∂x², NaN outside the support; negative where the log-density is convex.
-
-        Parameters
-        ----------
-        x : array (…) or (…, n)
-            In the parameters' units.
-
-        Returns
-        -------
-        array (…) or (…, n, n)
-        """
+        """Return −∂² log p/∂x², (…) or (…, n, n), NaN outside the support; negative where log p is convex."""
 
     def sample(self, size: int, generator: np.random.Generator) -> np.ndarray:
-        """Return independent draws.
-
-        Parameters
-        ----------
-        size : int
-        generator : numpy.random.Generator
-
-        Returns
-        -------
-        array (size,) or (size, n)
-            In the parameters' units.
-        """
+        """Return independent draws, (size,) or (size, n)."""
 
 
 @runtime_checkable
@@ -84,17 +53,7 @@ class Prior(Density, Protocol):
         """The open interval outside of which the density is zero."""
 
     def quantile(self, probability: np.ndarray) -> np.ndarray:
-        """Return the inverse of the distribution function.
-
-        Parameters
-        ----------
-        probability : array (…)
-
-        Returns
-        -------
-        array (…)
-            In the parameter's unit; NaN unless the probability is between 0 and 1.
-        """
+        """Return the inverse of the distribution function, (…); NaN unless the probability is between 0 and 1."""
 
 
 class Univariate(Prior, ABC):

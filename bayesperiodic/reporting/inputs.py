@@ -19,8 +19,7 @@ from bayesperiodic.diagnostics.predictive import Prediction, predict
 from bayesperiodic.estimation.map_estimate import estimation_warnings
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
-from bayesperiodic.posterior import labels
-from bayesperiodic.posterior.parameters import SHIFT
+from bayesperiodic.posterior.parameters import SHIFT, squared
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.reporting import html
 from bayesperiodic.sampling.posterior import Posterior
@@ -130,7 +129,7 @@ class ReportInputs:
             return "s"
         if name in self.problem.noise_names:
             channel = units.get(place.rstrip("]").partition(",")[0], "")
-            return html.unit(labels.squared(channel) if plain == "variance" and channel else "")
+            return html.unit(squared(channel) if plain == "variance" and channel else "")
         return html.unit(units.get(plain, ""))
 
 

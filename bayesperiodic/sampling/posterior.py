@@ -15,24 +15,28 @@ from bayesperiodic._expressions import parse_all
 from bayesperiodic._io import Result
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
-from bayesperiodic.posterior import labels
 from bayesperiodic.posterior.density import LogPosterior
 from bayesperiodic.posterior.description import Description
 from bayesperiodic.posterior.joint_priors import MultivariateNormal
-from bayesperiodic.posterior.labels import (
+from bayesperiodic.posterior.noise import SCALE
+from bayesperiodic.posterior.parameters import (
     CHAIN,
     CHANNEL,
     DRAW,
     EXPERIMENT,
     NOISE,
+    SHIFT,
+    checked_key,
     column,
     full_name,
+    in_experiment,
+    is_noise,
+    local_hint,
     local_names,
     pack,
+    places,
     squared,
 )
-from bayesperiodic.posterior.noise import SCALE
-from bayesperiodic.posterior.parameters import SHIFT
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.checkpoint import fingerprint
 from bayesperiodic.sampling.ensemble import CallCount
@@ -133,7 +137,7 @@ class Posterior(Result):
         ValueError
             For an unknown name.
         """
-        return labels.column(self._group, name).ravel()
+        return column(self._group, name).ravel()
 
     def guesses(self, experiments: Iterable[str], states: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
         """Return the states at the draw with the highest density, from which to solve again.
@@ -158,7 +162,7 @@ class Posterior(Result):
     @property
     def _noise(self) -> list[str]:
         """Full names of the noise parameters."""
-        return [n for n, (variable, _) in labels.places(self._group).items() if labels.is_noise(self._group, variable)]
+        return [n for n, (variable, _) in places(self._group).items() if is_noise(self._group, variable)]
 
     def summary(self) -> pd.DataFrame:
         """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, a row a parameter.
@@ -201,12 +205,12 @@ class Posterior(Result):
         """
         group, noise = self._group, self._noise
         if experiment is not None:
-            _checks.one_of("experiment", experiment, group[labels.EXPERIMENT].values.tolist())
-        kept = [name for name in labels.places(group) if name not in noise]
-        named = labels.in_experiment(kept, experiment)
-        note = f"{SAMPLED_ONLY} {labels.local_hint(kept, experiment)}".strip()
+            _checks.one_of("experiment", experiment, group[EXPERIMENT].values.tolist())
+        kept = [name for name in places(group) if name not in noise]
+        named = in_experiment(kept, experiment)
+        note = f"{SAMPLED_ONLY} {local_hint(kept, experiment)}".strip()
         quantities = parse_all("expressions", expressions, named, ["variance", *map(str, group.data_vars)], note)
-        values = {plain: labels.column(group, name) for plain, name in named.items()}
+        values = {plain: column(group, name) for plain, name in named.items()}
         rows = {}
         for name, quantity in quantities.items():
             draws = np.broadcast_to(quantity.value(values), (group.sizes["chain"], group.sizes["draw"]))
@@ -245,7 +249,7 @@ class Posterior(Result):
             If the draws have not converged.
         """
         noise = self._noise
-        key = labels.checked_key(names, [name for name in self.names if name not in noise], noise)
+        key = checked_key(names, [name for name in self.names if name not in noise], noise)
         if not self.converged:
             warnings.warn(
                 f"The draws have not converged ({self.reason}), nor has this prior. Sample longer, see max_steps.",
