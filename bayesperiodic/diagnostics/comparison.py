@@ -18,7 +18,7 @@ from bayesperiodic.diagnostics import verdicts
 from bayesperiodic.diagnostics.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, USABLE_K, WIDE, Sample
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.density import COLLAPSED, NATURAL, LogPosterior, SamplingCoordinates
-from bayesperiodic.posterior.labels import unit
+from bayesperiodic.posterior.parameters import unit
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.posterior import Posterior

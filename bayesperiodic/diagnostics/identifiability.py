@@ -18,7 +18,7 @@ from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
-from bayesperiodic.posterior.labels import local_names
+from bayesperiodic.posterior.parameters import local_names
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
 from bayesperiodic.symmetry.determining import system_of

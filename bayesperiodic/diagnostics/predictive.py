@@ -18,7 +18,7 @@ from bayesperiodic.data.recording import Recording
 from bayesperiodic.diagnostics.adequacy import ALL, LEVEL, TESTS, UNTESTED, adequacy, adjusted_p
 from bayesperiodic.periodic import arclength
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
-from bayesperiodic.posterior.labels import CHAIN, DRAW
+from bayesperiodic.posterior.parameters import CHAIN, DRAW
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
 

@@ -16,9 +16,9 @@ from bayesperiodic._expressions import Expression, parse_all
 from bayesperiodic._io import Result
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.periodic.solution import PeriodicSolution
-from bayesperiodic.posterior import labels
 from bayesperiodic.posterior.joint_priors import MultivariateNormal
 from bayesperiodic.posterior.noise import POINTS, SPECTRAL
+from bayesperiodic.posterior.parameters import checked_key, in_experiment, local_hint, local_names
 from bayesperiodic.posterior.problem import Problem
 
 
@@ -271,10 +271,10 @@ class MapEstimate(Result):
         """
         if experiment is not None:
             _checks.one_of("experiment", experiment, self.solutions)
-        named = labels.in_experiment(self.theta, experiment)
+        named = in_experiment(self.theta, experiment)
         values = self._fixed(experiment) | {plain: self.theta[name] for plain, name in named.items()}
-        hint = labels.local_hint(self.theta, experiment)
-        quantities = parse_all("expressions", expressions, values, labels.local_names(self.theta), hint)
+        hint = local_hint(self.theta, experiment)
+        quantities = parse_all("expressions", expressions, values, local_names(self.theta), hint)
         at = {name: float(quantity.value(values)) for name, quantity in quantities.items()}
         for name, value in at.items():
             if not np.isfinite(value):
@@ -320,7 +320,7 @@ class MapEstimate(Result):
         >>> bp.Problem(bp.models.duffing, [run], priors=priors, fixed={"m": 1, "k3": 0.5}).median().round(2).tolist()
         [0.2, 1.0]
         """
-        key = labels.checked_key(names, self.theta, self.noise)
+        key = checked_key(names, self.theta, self.noise)
         if not self.converged:
             warnings.warn(
                 f"The estimate has not converged ({self.status}), and the prior is unreliable. Try map_estimate from "
@@ -348,7 +348,7 @@ class MapEstimate(Result):
 
     def _fixed(self, experiment: str | None) -> dict[str, float]:
         """Return the fixed and tied parameters of one experiment, or those with the same value in all."""
-        free = {*self.theta, *(labels.local_names(self.theta) if experiment is None else ())}
+        free = {*self.theta, *(local_names(self.theta) if experiment is None else ())}
         first, *others = (solution.parameters for run, solution in self.solutions.items() if experiment in (None, run))
         return {
             name: value

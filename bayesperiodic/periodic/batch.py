@@ -171,8 +171,11 @@ def _in_blocks(
     part: Callable[[tuple[int, int]], None], total: int, smallest: int, threads: int | None, each: int = PARTS_EACH
 ) -> None:
     """Call a function for blocks (start, stop) of a range, up to `each` per thread, none below the smallest size."""
-    workers = max(1, min(threads or available_cores(), total // smallest))
-    parts = 1 if workers == 1 else workers * min(each, max(1, total // (workers * smallest)))
+    workers = 1 if total < 2 * smallest else min(threads or available_cores(), total // smallest)
+    if workers == 1:
+        part((0, total))
+        return
+    parts = workers * min(each, max(1, total // (workers * smallest)))
     in_threads(part, list(pairwise([total * k // parts for k in range(parts + 1)])), workers)
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import FigureBase
 from scipy.stats import norm
 
 from bayesperiodic import _checks
-from bayesperiodic.posterior import labels
+from bayesperiodic.posterior.parameters import unit
 from bayesperiodic.sampling.posterior import Posterior
 
 #: Colours of measurements, of the MAP estimate, of the Laplace approximation and of MCMC, in all figures.
@@ -32,7 +32,7 @@ def caveats(synthetic: bool, converged: bool) -> str:
 
 def draws_label(posterior: Posterior, name: str) -> str:
     """Return the label of a quantity by its full name."""
-    return wrapped_label(name, labels.unit(posterior.data["posterior"].to_dataset(), name))
+    return wrapped_label(name, unit(posterior.data["posterior"].to_dataset(), name))
 
 
 def wrapped_label(name: str, unit: str) -> str:

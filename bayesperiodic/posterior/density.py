@@ -21,16 +21,10 @@ SAMPLED, COLLAPSED = "sampled", "collapsed"
 
 
 class Linearisation:
-    """Residuals at one θ and their Jacobian (de Kraker et al. 1997, eq. 4-5).
+    """Residuals at one θ (names,) and their Jacobian (de Kraker et al. 1997, eq. 4-5).
 
-    Parameters
-    ----------
-    theta : array (names,)
-    simulator : Simulator
-        Anchored at θ where derivatives by `changes` are wanted.
-    comparisons : Comparisons
-    polish : bool
-        Solve as accurately as possible; without it the residuals are those of `LogPosterior.evaluate`.
+    Derivatives by `changes` need a simulator anchored at θ. With `polish` the solves are as accurate as possible;
+    without it the residuals are those of `LogPosterior.evaluate`.
     """
 
     def __init__(self, theta: np.ndarray, simulator: Simulator, comparisons: Comparisons, polish: bool = True):
@@ -94,16 +88,12 @@ class Linearisation:
     def vjp(self, by_residual: Sequence[np.ndarray], *, adjoint: bool) -> dict[str, np.ndarray]:
         """Return Σ by_residual · ∂residual/∂θ, (names,) by experiment; NaN where the derivatives do not exist.
 
-        Parameters
-        ----------
-        by_residual : sequence of array (size,)
-            Derivatives of a scalar by the residuals, one array a block.
-        adjoint : bool
-            Take one transposed solve an experiment (forced models) instead of `changes`.
+        `by_residual` has one array (size,) a block. `adjoint` takes one transposed solve an experiment (driven models)
+        instead of `changes`.
         """
         if adjoint:
-            weights = self._comparisons.vjp(self._simulation, self.residuals.like(by_residual))
-            return {name: -own for name, own in self.simulator.vjp(self.theta, self._simulation, weights).items()}
+            by_response = self._comparisons.vjp(self._simulation, self.residuals.like(by_residual))
+            return {name: -own for name, own in self.simulator.vjp(self.theta, self._simulation, *by_response).items()}
         result, start, blocks = {}, 0, list(by_residual)
         for name, observation in self._observations.items():
             stop = start + len(observation.blocks)
@@ -114,36 +104,19 @@ class Linearisation:
 
 
 class Evaluation(NamedTuple):
-    """Log-densities at several points.
+    """Log-densities at several points."""
 
-    Attributes
-    ----------
-    log_prob : array (points,)
-        −inf where a periodic solve fails or the prior is zero.
-    moments : array (points, collapsed)
-        M of eq. (6) of each variance that is integrated out; NaN where a solve fails.
-    status : int array (points,)
-        The worst status code of the periodic solves; that of "converged" where nothing was solved.
-    """
-
-    log_prob: np.ndarray
-    moments: np.ndarray
-    status: np.ndarray
+    log_prob: np.ndarray  # (points,), −inf where a periodic solve fails or the prior is zero
+    moments: np.ndarray  # (points, collapsed), M of eq. (6) of each collapsed variance; NaN where a solve fails
+    status: np.ndarray  # int (points,), worst status code of the periodic solves; "converged" where nothing was solved
 
 
 class SamplingCoordinates:
     """Coordinates of a problem's posterior density.
 
     A parameter whose prior's support is (0, ∞) is replaced by its logarithm, any other is its own coordinate; the
-    logarithms of the free noise parameters follow.
-
-    Parameters
-    ----------
-    problem : Description
-    coordinates : "ridge" or "natural"
-        "natural" takes no logarithms of parameters.
-    variances : "sampled" or "collapsed"
-        "collapsed" leaves out the variances that can be integrated out in closed form.
+    logarithms of the free noise parameters follow. `coordinates` "natural" takes no logarithms of parameters,
+    `variances` "collapsed" leaves out the variances that can be integrated out in closed form.
 
     Attributes
     ----------
@@ -158,10 +131,11 @@ class SamplingCoordinates:
     def __init__(self, problem: Description, *, coordinates: str = RIDGE, variances: str = SAMPLED):
         self.problem, self.coordinates = problem, coordinates
         self.logarithmic = problem.logarithmic & (coordinates == RIDGE)
+        self._logarithms = np.flatnonzero(self.logarithmic)
         self.collapsed = collapsible(problem) if variances == COLLAPSED else ()
         self.free = tuple(name for name in problem.free_noise if name not in self.collapsed)
         self.labels = (*problem.names, *self.free)
-        self._noise_columns = [problem.noise_names.index(name) for name in self.free]
+        self.noise_columns = [problem.noise_names.index(name) for name in self.free]
         fixed = problem.likelihood.fixed
         self._noise = np.array([fixed.get(name, 1.0) for name in problem.noise_names])
 
@@ -177,30 +151,19 @@ class SamplingCoordinates:
         with np.errstate(over="ignore"):
             np.exp(theta, out=theta, where=self.logarithmic)
             noise[...] = self._noise
-            noise[..., self._noise_columns] = np.exp(points[..., count:])
+            noise[..., self.noise_columns] = np.exp(points[..., count:])
         return theta, noise
 
     def from_natural(self, theta: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return coordinates (…, dimension) from θ (…, names) and all noise parameters (…, noise_names)."""
         points = np.log(theta, out=np.array(theta), where=self.logarithmic)
-        return np.concatenate([points, np.log(noise[..., self._noise_columns])], axis=-1)
+        return np.concatenate([points, np.log(noise[..., self.noise_columns])], axis=-1)
 
 
 class LogPosterior(SamplingCoordinates):
-    """Log-posterior density over the sampling coordinates of a problem.
+    """Log-posterior density over the sampling coordinates of a problem, the Jacobian determinant included.
 
-    The density includes the Jacobian of the change of variables. Its value depends on the point alone: periodic solves
-    start from fixed anchors.
-
-    Parameters
-    ----------
-    problem : Description
-    simulator : Simulator
-        Anchored.
-    coordinates, variances : str
-        See `SamplingCoordinates`.
-    comparisons : Comparisons, optional
-        Those of another density of the problem.
+    Its value depends on the point alone: periodic solves start from the fixed anchors of the simulator.
     """
 
     def __init__(
@@ -232,14 +195,7 @@ class LogPosterior(SamplingCoordinates):
         return cls(problem, Simulator.start(problem, theta))
 
     def anchored(self, theta: np.ndarray, guesses: Guesses | None = None) -> "LogPosterior":
-        """Return the density with its anchors at another θ.
-
-        Parameters
-        ----------
-        theta : array (names,)
-        guesses : mapping of str to mapping of str to array (points,), optional
-            States of every experiment, turns included, from which to solve; by default the present anchors.
-        """
+        """Return the density anchored at another θ (names,), solved from guesses or the present anchors."""
         moved = self.simulator.anchored(theta) if guesses is None else Simulator.start(self.problem, theta, guesses)
         return self.with_settings(simulator=moved)
 
@@ -259,46 +215,38 @@ class LogPosterior(SamplingCoordinates):
         """Return the log-prior density over the coordinates (…,) at θ (…, names) and noise parameters."""
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             prior = self.problem.joint_prior.log_prob(theta) + self.problem.likelihood.log_prior(noise)
-            if self.logarithmic.any():
-                prior = prior + np.log(theta[..., self.logarithmic]).sum(axis=-1)
+            if self._logarithms.size:
+                prior = prior + np.log(theta[..., self._logarithms]).sum(axis=-1)
         return np.asarray(prior)
 
     def add_prior(
         self, theta: np.ndarray, gradient: np.ndarray, curvature: np.ndarray | None = None
     ) -> tuple[np.ndarray, Any]:
-        """Return derivatives of the log-likelihood by θ with those of the log-prior over the coordinates added.
+        """Add the derivatives of the log-prior over the coordinates to those of the log-likelihood at θ (names,).
 
-        Parameters
-        ----------
-        theta : array (names,)
-        gradient : array (names,)
-        curvature : array (names, names), optional
-            Minus the Hessian.
+        They are the gradient (names,) and, if it is given, minus the Hessian (names, names).
         """
-        logs, prior = self.logarithmic, self.problem.joint_prior
+        logs, prior = self._logarithms, self.problem.joint_prior
         gradient = gradient + prior.gradient(theta)
-        gradient[logs] += 1.0 / theta[logs]
+        if logs.size:
+            gradient[logs] += 1.0 / theta[logs]
         if curvature is not None:
             curvature = curvature + prior.curvature(theta)
             curvature[logs, logs] += theta[logs] ** -2
         return gradient, curvature
 
     def log_likelihood(self, theta: np.ndarray, noise: np.ndarray, threads: int | None = None) -> Evaluation:
-        """Return log-likelihoods at natural values, collapsed variances integrated out.
+        """Return log-likelihoods at θ (points, names) and noise (points, noise_names), see `collapsed`.
 
-        Parameters
-        ----------
-        theta : array (points, names)
-        noise : array (points, noise_names)
-        threads : int, optional
-            By default one per core. The values do not depend on it.
+        The values do not depend on the number of threads, by default one per core.
         """
         simulation = self.simulator.solve(theta, threads, whole=True)
         good = simulation.status == CONVERGED
-        if good.all():
+        count = np.count_nonzero(good)
+        if count == good.size:
             return Evaluation(*self._log_likelihood(simulation, noise, threads), simulation.status)
         log_prob, moments = self._nothing(len(theta))
-        if good.any():
+        if count:
             log_prob[good], moments[good] = self._log_likelihood(simulation.at(good), noise[good], threads)
         return Evaluation(log_prob, moments, simulation.status)
 
@@ -312,7 +260,8 @@ class LogPosterior(SamplingCoordinates):
             return values, np.empty((len(values), 0))
         by_name = self.problem.likelihood.moments(residuals)
         moments = np.stack([by_name[name] for name in self.collapsed], axis=-1)
-        return values + np.sum(0.5 * moments + self._integrals(moments), axis=-1), moments
+        values = values + np.sum(0.5 * moments + self._integrals(moments), axis=-1)
+        return np.where(np.isfinite(values), values, -np.inf), moments
 
     def _nothing(self, points: int) -> tuple[np.ndarray, np.ndarray]:
         """Return log-densities and moments of points without a solution."""
@@ -322,60 +271,38 @@ class LogPosterior(SamplingCoordinates):
         """Return the log-density over the coordinates at natural values; arguments as in `log_likelihood`."""
         prior = self.log_prior(theta, noise)
         inside = np.isfinite(prior)
-        if inside.all():
-            found = self.log_likelihood(theta, noise, threads)
-            return found._replace(log_prob=_finite(prior + found.log_prob))
+        count = np.count_nonzero(inside)
+        if count == inside.size:
+            likelihood, moments, status = self.log_likelihood(theta, noise, threads)
+            return Evaluation(prior + likelihood, moments, status)
         (log_prob, moments), status = self._nothing(len(theta)), np.full(len(theta), CONVERGED)
-        if inside.any():
-            found = self.log_likelihood(theta[inside], noise[inside], threads)
-            log_prob[inside], status[inside] = _finite(prior[inside] + found.log_prob), found.status
-            moments[inside] = found.moments
+        if count:
+            likelihood, moments[inside], status[inside] = self.log_likelihood(theta[inside], noise[inside], threads)
+            log_prob[inside] = prior[inside] + likelihood
         return Evaluation(log_prob, moments, status)
 
     def evaluate(self, points: np.ndarray, threads: int | None = 1) -> Evaluation:
-        """Return the log-density at points (points, dimension), each value of its point alone.
-
-        Parameters
-        ----------
-        points : array (points, dimension)
-        threads : int, optional
-            None for one per core. The values do not depend on it.
-        """
+        """Return the log-density at points (points, dimension), by default in one thread."""
         return self.at(*self.to_natural(points), threads)
 
     def value_and_gradient(self, point: np.ndarray) -> tuple[float, np.ndarray, int]:
-        """Return the log-density at one point, its gradient, and the status code; variances are not integrated out.
+        """Return the log-density at one point (dimension,), its gradient, and the status code.
 
-        A forced model takes one periodic solve and one transposed solve an experiment.
-
-        Parameters
-        ----------
-        point : array (dimension,)
-
-        Returns
-        -------
-        value : float
-            −inf where a solve fails or a derivative does not exist (status "singular").
-        gradient : array (dimension,)
-            Zero where the value is not finite.
-        status : int
+        Variances are not integrated out. The value is −inf and the gradient zero where a solve fails or a derivative
+        does not exist (status "singular").
         """
         theta, noise = self.to_natural(point)
         value, by_theta, by_noise, status = self.value_and_gradient_at(theta, noise)
         by_theta[self.logarithmic] *= theta[self.logarithmic]
-        return value, np.concatenate([by_theta, by_noise[self._noise_columns]]), status
+        return value, np.concatenate([by_theta, by_noise[self.noise_columns]]), status
 
     def value_and_gradient_at(
         self, theta: np.ndarray, noise: np.ndarray, *, forward: bool = False
     ) -> tuple[float, np.ndarray, np.ndarray, int]:
-        """Return `value_and_gradient` at natural values: value, gradient by θ, gradient by ln φ, status code.
+        """Return the log-density at θ (names,) and noise, its gradients by θ and ln φ, and the status code.
 
-        Parameters
-        ----------
-        theta : array (names,)
-        noise : array (noise_names,)
-        forward : bool
-            Take one solve a parameter instead of one transposed solve; an autonomous model always does.
+        A driven model takes one periodic solve and one transposed solve an experiment; with `forward`, or if the model
+        is autonomous, one solve a parameter.
         """
         zeros = np.zeros(theta.size), np.zeros(noise.size)
         prior = float(self.log_prior(theta, noise))
@@ -391,7 +318,7 @@ class LogPosterior(SamplingCoordinates):
         by_residual, by_noise = self.problem.likelihood.gradients(here.residuals, noise)
         if forward or any(e.multipliers is not None for e in self.problem.experiments):
             here = here.anchored()
-        by_theta = np.sum(list(here.vjp(by_residual, adjoint=not forward).values()), axis=0)
+        by_theta = np.add.reduce(list(here.vjp(by_residual, adjoint=not forward).values()))
         by_theta, _ = self.add_prior(theta, by_theta)
         if not (np.isfinite(by_theta).all() and np.isfinite(by_noise).all()):
             return -np.inf, *zeros, SINGULAR
@@ -402,15 +329,9 @@ class LogPosterior(SamplingCoordinates):
         return Linearisation(theta, self.simulator.anchored(theta), self.comparisons)
 
     def objective(self, here: Linearisation, noise: np.ndarray, share: float) -> float:
-        """Return the log-density over the coordinates, logarithms of variances in the likelihood times `share`.
+        """Return the log-density over the coordinates where all solves have converged.
 
-        Parameters
-        ----------
-        here : Linearisation
-            At a θ where all solves have converged.
-        noise : array (noise_names,)
-        share : float
-            1 − l/Σn for the bias correction of eq. (7), 1 for the density itself.
+        The logarithms of the variances in the likelihood are multiplied by `share`, see `Likelihood.__call__`.
         """
         prior = self.problem.joint_prior.log_prob(here.theta) + np.sum(np.log(here.theta[self.logarithmic]))
         likelihood = self.problem.likelihood
@@ -421,18 +342,7 @@ class LogPosterior(SamplingCoordinates):
         return self.simulator.solutions(theta)
 
     def outputs(self, theta: np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
-        """Return the predicted outputs at many θ, and whether the solves converged.
-
-        Parameters
-        ----------
-        theta : array (draws, names)
-
-        Returns
-        -------
-        outputs : dict of str to dict of str to array (draws, points)
-            By experiment and channel, in the channel's unit.
-        converged : bool array (draws,)
-        """
+        """Return the predicted outputs at θ (draws, names) and whether the solves converged, see `Problem.outputs`."""
         found = self.simulator.solve(theta)
         predicted = {name: o.predicted(found.response(name)) for name, o in self.problem.observations.items()}
         return predicted, found.status == CONVERGED
@@ -451,22 +361,10 @@ class LogPosterior(SamplingCoordinates):
     def with_variances(
         self, points: np.ndarray, log_prob: np.ndarray, moments: np.ndarray, generator: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return points and log-densities with the collapsed variances drawn from their conditional distribution.
+        """Draw the collapsed variances of points (…, dimension) from their conditional distribution.
 
-        It is InvGamma(n/2, M/2), with the flat prior InvGamma(n/2 − 1, M/2).
-
-        Parameters
-        ----------
-        points : array (…, dimension)
-        log_prob : array (…,)
-        moments : array (…, collapsed)
-        generator : numpy.random.Generator
-
-        Returns
-        -------
-        points : array (…, dimension + collapsed)
-            Coordinates of the density with all variances.
-        log_prob : array (…,)
+        It is InvGamma(n/2, M/2), with the flat prior InvGamma(n/2 − 1, M/2). The points returned are coordinates of the
+        density with all variances, (…, dimension + collapsed).
         """
         variances = 0.5 * moments / generator.gamma(self._shapes, size=moments.shape)
         joint = -self._shapes * np.log(variances) - 0.5 * moments / variances
@@ -476,10 +374,6 @@ class LogPosterior(SamplingCoordinates):
         columns |= {name: np.log(variances[..., i]) for i, name in enumerate(self.collapsed)}
         noise = np.stack([columns[name] for name in self.problem.free_noise], axis=-1)
         return np.concatenate([points[..., :count], noise], axis=-1), log_prob
-
-
-def _finite(values: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(values), values, -np.inf)
 
 
 def collapsible(problem: Description) -> tuple[str, ...]:

@@ -199,13 +199,7 @@ class Description:
         ValueError
             For unknown or missing names, or another last axis.
         """
-        if isinstance(theta, Mapping):
-            _checks.same_names("theta", theta, self.names)
-            theta = np.stack(np.broadcast_arrays(*(np.asarray(theta[name], dtype=float) for name in self.names)), -1)
-        values = np.asarray(theta, dtype=float)
-        if values.shape[-1:] != (len(self.names),):
-            raise ValueError(f"theta: last axis must be {list(self.names)}, got shape {values.shape}.")
-        return values
+        return _values("theta", theta, self.names)
 
     def noise_values(self, variances: Mapping[str, Any] | np.ndarray) -> np.ndarray:
         """Return the noise parameters as an array from a mapping or an array.
@@ -229,13 +223,8 @@ class Description:
         if isinstance(variances, Mapping):
             longer = {f"variance[{name}]": name for name in variances}
             renamed = {long if long in names else short: variances[short] for long, short in longer.items()}
-            given: dict[str, Any] = {**self.likelihood.fixed, **renamed}
-            _checks.same_names("variances", given, names)
-            variances = np.stack(np.broadcast_arrays(*(np.asarray(given[n], dtype=float) for n in names)), -1)
-        values = np.asarray(variances, dtype=float)
-        if values.shape[-1:] != (len(names),):
-            raise ValueError(f"variances: last axis must be {list(names)}, got shape {values.shape}.")
-        return values
+            variances = {**self.likelihood.fixed, **renamed}
+        return _values("variances", variances, names)
 
     def log_prior(self, theta: Mapping[str, float] | np.ndarray) -> np.ndarray:
         """Return Σ ln p(θ_α).
@@ -243,17 +232,12 @@ class Description:
         Parameters
         ----------
         theta : mapping of str to float, or array (…, names)
-            Natural values, in the parameters' units.
+            See `vector`.
 
         Returns
         -------
         array (…)
             −inf outside the support.
-
-        Raises
-        ------
-        ValueError
-            For unknown or missing names, or another last axis.
         """
         return self.joint_prior.log_prob(self.vector(theta))
 
@@ -318,6 +302,16 @@ class Description:
             f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
             f"channels: {', '.join(self.channels)} with {self.counted:.0f} independent values, {self.noise.name} noise)"
         )
+
+
+def _values(argument: str, given: Any, names: tuple[str, ...]) -> np.ndarray:
+    if isinstance(given, Mapping):
+        _checks.same_names(argument, given, names)
+        given = np.stack(np.broadcast_arrays(*(np.asarray(given[name], dtype=float) for name in names)), -1)
+    values = np.asarray(given, dtype=float)
+    if values.shape[-1:] != (len(names),):
+        raise ValueError(f"{argument}: last axis must be {list(names)}, got shape {values.shape}.")
+    return values
 
 
 def _checked_local(

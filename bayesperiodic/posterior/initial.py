@@ -33,57 +33,28 @@ ON_ORBIT, SMALL_STEP = 1e-6, 1e-2
 
 @dataclass(frozen=True)
 class Linear:
-    """One experiment's equations and outputs linearised where neither orbit nor parameters solve them.
+    """One experiment's equations and outputs linearised where neither orbit nor parameters solve them."""
 
-    Attributes
-    ----------
-    factors : CyclicFactors
-        Of ∂g/∂z.
-    correction : array (points, states)
-        −g_z⁻¹ g, Newton's step at fixed parameters.
-    response : array (names, points, states)
-        −g_z⁻¹ g_θ.
-    residuals : list of array (size,)
-        Of the corrected orbit, one array a block.
-    changes : list of array (names, size)
-        Derivatives of the predicted components by θ.
-    """
-
-    factors: CyclicFactors
-    correction: np.ndarray
-    response: np.ndarray
-    residuals: list[np.ndarray]
-    changes: list[np.ndarray]
+    factors: CyclicFactors  # of ∂g/∂z
+    correction: np.ndarray  # −g_z⁻¹ g (points, states), Newton's step at fixed parameters
+    response: np.ndarray  # −g_z⁻¹ g_θ (names, points, states)
+    residuals: list[np.ndarray]  # of the corrected orbit, (size,) a block
+    changes: list[np.ndarray]  # derivatives of the predicted components by θ, (names, size) a block
 
 
 class InitialEstimate(NamedTuple):
-    """Result of a simultaneous fit.
+    """Result of a simultaneous fit."""
 
-    Attributes
-    ----------
-    theta : array (names,)
-        The estimate, or the last θ that was reached.
-    states : dict of str to dict of str to array (points,)
-        States of every experiment, turns included; empty if the fit failed.
-    blocked : str
-        The experiment whose orbit could not be followed; empty otherwise.
-    """
-
-    theta: np.ndarray
-    states: dict[str, dict[str, np.ndarray]]
-    blocked: str
+    theta: np.ndarray  # (names,), the estimate, or the last θ that was reached
+    states: dict[str, dict[str, np.ndarray]]  # of every experiment, turns included; empty if the fit failed
+    blocked: str  # the experiment whose orbit could not be followed; empty otherwise
 
 
 def simultaneous_fit(problem: Description, theta: np.ndarray) -> InitialEstimate | None:
     """Return θ and orbits near the MAP point; None if the model is autonomous or an experiment has no guess.
 
-    The fit starts at a θ and at the experiments' guesses, ignores multipliers, and moves positive parameters in their
-    logarithms.
-
-    Parameters
-    ----------
-    problem : Description
-    theta : array (names,)
+    The fit starts at θ (names,) and at the experiments' guesses, ignores multipliers, and moves positive parameters in
+    their logarithms.
     """
     if problem.model.autonomous or not all(e.guess for e in problem.experiments):
         return None

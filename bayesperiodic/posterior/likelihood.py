@@ -1,6 +1,6 @@
 """The log-likelihood of residuals under a noise model, and its derivatives."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -26,14 +26,7 @@ from bayesperiodic.posterior.noise import (
 
 
 class Residuals(Sequence[np.ndarray]):
-    """One array (…, size) of components a block.
-
-    Parameters
-    ----------
-    stacks : sequence of array (members, …, size)
-    places : sequence of (int, int)
-        Stack and member of each block.
-    """
+    """One array (…, size) of components a block, stored as stacks (members, …, size) with the place of each block."""
 
     def __init__(self, stacks: Sequence[np.ndarray], places: Sequence[tuple[int, int]]):
         self._stacks, self._places = tuple(stacks), tuple(places)
@@ -81,30 +74,18 @@ class Residuals(Sequence[np.ndarray]):
 
     @cached_property
     def squares(self) -> np.ndarray:
-        """The sum of the squares of each block, (blocks, …)."""
-        sums = [np.einsum("...i,...i->...", stack, stack) for stack in self._stacks]
-        result = np.empty((len(self._places), *sums[0].shape[1:]))
+        """The sum of the squares of each block, (…, blocks)."""
+        sums = [_square(stack) for stack in self._stacks]
+        result = np.empty((*sums[0].shape[1:], len(self._places)))
         for block, (stack, member) in enumerate(self._places):
-            result[block] = sums[stack][member]
+            result[..., block] = sums[stack][member]
         return result
 
 
 class Likelihood:
-    """A noise model on the blocks of a problem: the log-likelihood of their residuals and its derivatives.
+    """Log-likelihood of the residuals of a problem's blocks under a noise model, and its derivatives.
 
-    Parameters
-    ----------
-    model : Noise
-    blocks : sequence of Block
-    fixed : mapping of str to float
-        Noise parameters with known values.
-
-    Attributes
-    ----------
-    names : tuple of str
-        All noise parameters.
-    free : tuple of str
-        Those without a known value.
+    `names` are all noise parameters, `fixed` those with known values, `free` the others.
     """
 
     def __init__(self, model: Noise, blocks: Sequence[Block], fixed: Mapping[str, float]):
@@ -130,21 +111,21 @@ class Likelihood:
     @cached_property
     def counts(self) -> dict[str, float]:
         """Independent values behind each variance (and "scale"), by its name."""
-        result: dict[str, float] = {}
-        for block, columns in zip(self.blocks, self._columns, strict=True):
+        return self._summed(block.count for block in self.blocks)
+
+    def _summed(self, values: Iterable[Any]) -> dict[str, Any]:
+        """Return the sum of values, one a block, behind each variance."""
+        result: dict[str, Any] = {}
+        for block, columns, value in zip(self.blocks, self._columns, values, strict=True):
             if block.counted:
                 name = self.names[columns[0]]
-                result[name] = result.get(name, 0.0) + block.count
+                result[name] = result.get(name, 0.0) + value
         return result
 
     @cached_property
     def measured(self) -> dict[str, float]:
         """Measured variance behind each variance, the mean over its values; NaN where it is not known."""
-        total: dict[str, float] = {}
-        for block, columns in zip(self.blocks, self._columns, strict=True):
-            if block.counted:
-                name = self.names[columns[0]]
-                total[name] = total.get(name, 0.0) + block.count * block.measured
+        total = self._summed(block.count * block.measured for block in self.blocks)
         return {name: value / self.counts[name] for name, value in total.items()}
 
     def moments(self, residuals: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
@@ -152,13 +133,8 @@ class Likelihood:
 
         S, the spectrum for a variance of 1, is 1 for errors whose spectrum is flat; all else has to be known.
         """
-        result: dict[str, np.ndarray] = {}
-        own = Residuals.of(residuals if self.model.flat else self._unit(residuals))
-        for block, columns, square in zip(self.blocks, self._columns, own.squares, strict=True):
-            if block.counted:
-                name = self.names[columns[0]]
-                result[name] = result.get(name, 0.0) + block.weight * square
-        return result
+        squares = Residuals.of(residuals if self.model.flat else self._unit(residuals)).squares
+        return self._summed(block.weight * squares[..., b] for b, block in enumerate(self.blocks))
 
     def _unit(self, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the residuals over the square roots of the spectra for variances of 1."""
@@ -224,7 +200,7 @@ class Likelihood:
         return np.where(np.isfinite(total), total, -np.inf)
 
     def _by_kind(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
-        """Return the log-likelihood (…,), alike blocks together."""
+        """Return the log-likelihood (…,) of errors whose spectrum is not flat, alike blocks together."""
         total = np.zeros(values.shape[:-1])
         for members in self._alike:
             own = values[..., self._columns[members[0]]]
@@ -235,13 +211,13 @@ class Likelihood:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, known, columns, sizes, weights, measured = self._levels
         squares = Residuals.of(residuals).squares
-        squares = squares.transpose(*range(1, squares.ndim), 0)
         v = self.model.level(values[..., columns], measured)
-        parts = [weights * (share * sizes * np.log(v) + squares[..., at] / v)]
-        if known.size:
-            parts.append(squares[..., known])
         # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
-        return -0.5 * sum(np.ascontiguousarray(part).sum(axis=-1) for part in parts)
+        terms = np.ascontiguousarray(weights * (share * sizes * np.log(v) + squares[..., at] / v))
+        total = np.add.reduce(terms, axis=-1)
+        if known.size:
+            total = total + np.add.reduce(np.ascontiguousarray(squares[..., known]), axis=-1)
+        return -0.5 * total
 
     @cached_property
     def _levels(self) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -252,7 +228,7 @@ class Likelihood:
             np.flatnonzero(~known) if known.any() else slice(None),
             np.flatnonzero(known),
             np.array([column for _, column in own], dtype=int),
-            np.array([block.size for block, _ in own]),
+            np.array([block.size for block, _ in own], dtype=float),
             np.array([block.weight for block, _ in own]),
             np.array([0.0 if block.kind == CORRELATED else block.measured for block, _ in own]),
         )
@@ -269,26 +245,20 @@ class Likelihood:
 
     def _together(self, residuals: list[np.ndarray], block: Block, values: np.ndarray, share: float) -> np.ndarray:
         """Return the log-likelihood (…,) of blocks like this one, the logarithms multiplied by `share`."""
-        if block.kind != SPECTRAL:
-            return self._alone(block, residuals[0], values, share)
-        variances = self._variances(block, values)[0]
-        squares = sum(r**2 for r in residuals)
-        terms = len(residuals) * share * np.log(variances) + squares / variances
-        return -0.5 * block.weight * np.sum(terms, axis=-1)
-
-    def _alone(self, block: Block, r: np.ndarray, values: np.ndarray, share: float) -> np.ndarray:
-        """Return the log-likelihood (…,) of one block, the logarithms of the variances multiplied by `share`."""
+        r = residuals[0]
         if block.kind == KNOWN:
             return -0.5 * _square(r)
         if self._is_dense(block):
             flat, rows = values.reshape(-1, values.shape[-1]), r.reshape(-1, r.shape[-1])
             each = [self._dense(block, row, v, share)[0] for row, v in zip(rows, flat, strict=True)]
             return np.array(each).reshape(values.shape[:-1])
-        variances = self._variances(block, values)[0]
         if block.kind == CORRELATED:
-            v = variances[..., 0]
+            v = values[..., 0]
             return -0.5 * block.weight * (share * block.size * np.log(v) + _square(r) / v)
-        return -0.5 * block.weight * np.sum(share * np.log(variances) + r**2 / variances, axis=-1)
+        variances = self._variances(block, values)[0]
+        squares = sum(r**2 for r in residuals)
+        terms = len(residuals) * share * np.log(variances) + squares / variances
+        return -0.5 * block.weight * np.sum(terms, axis=-1)
 
     def _is_dense(self, block: Block) -> bool:
         """Return whether the components of a block are correlated: points under noise that is not white."""
@@ -406,19 +376,10 @@ TINY = np.finfo(float).tiny
 def estimate_noise(
     likelihood: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, share: float
 ) -> np.ndarray:
-    """Return the noise parameters that suit given residuals best, (names,).
+    """Return the noise parameters (names,) that fit residuals best, one array (size,) a block, from a start.
 
     For independent errors with the prior 1/v this is eq. (7) of [1]_, v = Σe²/(n·share); otherwise it maximises the
     log-likelihood, its logarithms multiplied by `share`, plus the log-prior.
-
-    Parameters
-    ----------
-    likelihood : Likelihood
-    residuals : sequence of array (size,)
-        One a block.
-    start : array (names,)
-    share : float
-        1 − l/Σn for the bias correction of eq. (7), 1 for the maximum of eq. (6).
 
     References
     ----------

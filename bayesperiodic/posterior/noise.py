@@ -23,40 +23,23 @@ SCALE = "scale"
 
 @dataclass(frozen=True)
 class Block:
-    """What a noise model must know about one vector of residual components.
+    """Description of one vector of residual components.
 
-    Attributes
-    ----------
-    experiment : str
-    channel : str
-        An output; "scale" for all section values of an experiment together, "multipliers" or "frequency".
-    kind : str
-        "spectral": real Fourier components, of which white noise of variance v has independent ones of variance v;
-        "points": values at the points of a mask; "correlated": values whitened by their given covariance, up to one
-        unknown factor; "known": values in units of their known standard deviations.
-    count : float
-        Independent values behind the components.
-    size : int
-        Number of components.
-    harmonic : array (size,)
-        Of the response period, of each spectral component.
-    position : array (size,)
-        Of each point, in response periods.
-    points : int
-        Grid points of the response period.
-    measured : float
-        Variance of one value that the scatter of the measured cycles explains; NaN where that is not known.
+    A `channel` is an output; "scale" for all section values of an experiment together, "multipliers" or "frequency".
+    The `kind` is "spectral" for real Fourier components, which are independent and have variance v under white noise of
+    variance v; "points" for values at the points of a mask; "correlated" for values whitened by their given covariance,
+    up to one unknown factor; "known" for values in units of their known standard deviations.
     """
 
     experiment: str
     channel: str
     kind: str
-    count: float
-    size: int
-    harmonic: np.ndarray
-    position: np.ndarray
-    points: int
-    measured: float
+    count: float  # independent values behind the components
+    size: int  # number of components
+    harmonic: np.ndarray  # (size,), of the response period, of each spectral component
+    position: np.ndarray  # (size,), of each point, in response periods
+    points: int  # grid points of the response period
+    measured: float  # variance of one value that the scatter of the cycles explains; NaN if unknown
 
     @property
     def weight(self) -> float:
@@ -100,7 +83,6 @@ class Noise(ABC):
     --------
     Every noise model has a name, which a `Problem` takes in its place, and a prior of its variances:
 
-    >>> import bayesperiodic as bp
     >>> models = bp.noise.Independent(), bp.noise.Measured(), bp.noise.Circulant(prior=bp.InverseGamma(3, 2))
     >>> {noise.name: noise.prior_text for noise in models if isinstance(noise, bp.noise.Noise)}["circulant"]
     'prior InverseGamma(shape=3.0, scale=2.0)'
@@ -153,7 +135,7 @@ class Noise(ABC):
         Raises
         ------
         ValueError
-            For channels whose scatter is needed and not known, or grids that cannot be mixed.
+            If a scatter that the model needs is unknown, or experiments on different grids share a correlation.
         """
         points: dict[str, int] = {}
         for block in (b for b in blocks if b.kind in (SPECTRAL, POINTS)):
@@ -307,8 +289,7 @@ class Independent(Noise):
 
     Parameters
     ----------
-    per : "channel" or "experiment"
-    prior : "jeffreys", "flat" or a prior
+    per, prior
         See `Noise`.
 
     Raises
@@ -323,7 +304,6 @@ class Independent(Noise):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.noise.Independent(per="experiment").prior_text
     'Jeffreys prior 1/v'
     """
@@ -346,9 +326,8 @@ class Measured(Noise):
 
     Parameters
     ----------
-    per : "channel" or "experiment"
-    prior : "jeffreys", "flat" or a prior
-        Of the model error's variance.
+    per, prior
+        See `Noise`; the prior is that of the model error's variance.
 
     Raises
     ------
@@ -357,7 +336,6 @@ class Measured(Noise):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.noise.Measured().name
     'measured'
     """
@@ -419,7 +397,6 @@ class Circulant(Noise):
 
     Examples
     --------
-    >>> import bayesperiodic as bp
     >>> bp.noise.Circulant(kernel="exponential").shape_priors
     {'lengthscale': LogNormal(median=0.03, spread=1.5)}
     """
@@ -472,13 +449,7 @@ NAMED: dict[str, type[Noise]] = {model.name: model for model in (Independent, Me
 
 
 def as_noise(given: str | Noise) -> Noise:
-    """Return a noise model from its name or itself.
-
-    Raises
-    ------
-    ValueError
-        If it is neither.
-    """
+    """Return a noise model from its name or itself."""
     if isinstance(given, Noise):
         return given
     if not isinstance(given, str):

@@ -1,5 +1,6 @@
 """From a periodic response to what is compared with one experiment, and the derivatives of that."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,63 +18,39 @@ from bayesperiodic.posterior.noise import CORRELATED, KNOWN, POINTS, SCALE, SPEC
 # Outputs (numbers) from which on their comparison with the data is shared among the cores.
 SMALLEST_SHARED = 10_000
 LARGEST_TRANSFORM = 16_384
+ROOT_TWO = math.sqrt(2.0)
 
 
 class Response(NamedTuple):
-    """What a model answers in one experiment, or the derivatives of that along directions on the leading axis.
+    """Response of a model in one experiment, or its derivatives along directions on the leading axis."""
 
-    Attributes
-    ----------
-    outputs : array (…, points, channels)
-        In the order of the model's outputs.
-    frequency : array (…,)
-        [Hz].
-    log_multipliers : array (…, multipliers)
-        log|μ|, largest first, as many as were measured.
-    delay : array (…,)
-        By how much the measured outputs are late against the model's [s].
-    """
-
-    outputs: np.ndarray
-    frequency: np.ndarray
-    log_multipliers: np.ndarray
-    delay: np.ndarray
+    outputs: np.ndarray  # (…, points, channels), in the order of the model's outputs
+    frequency: np.ndarray  # (…,) [Hz]
+    log_multipliers: np.ndarray  # (…, multipliers), log|μ|, largest first, as many as were measured
+    delay: np.ndarray  # (…,) of the measured outputs against the model's [s]
 
 
 class GroupSolution(NamedTuple):
-    """Solutions of experiments that are solved together, at several θ.
+    """Solutions of experiments that are solved together, at several θ."""
 
-    Attributes
-    ----------
-    outputs : array (experiments, solves, points, channels)
-        In the order of the model's outputs.
-    frequency, delay : array (experiments, solves)
-        [Hz], [s].
-    log_multipliers : list of array (solves, multipliers)
-        log|μ| of the measured multipliers of each experiment, largest first.
-    z : array (experiments, solves, points, states)
-        The periodic parts of the states.
-    status : int array (experiments, solves)
-        Index into `compiled.STATUSES`.
-    """
-
-    outputs: np.ndarray
-    frequency: np.ndarray
-    delay: np.ndarray
-    log_multipliers: list[np.ndarray]
-    z: np.ndarray
-    status: np.ndarray
+    outputs: np.ndarray  # (experiments, solves, points, channels), in the order of the model's outputs
+    frequency: np.ndarray  # (experiments, solves) [Hz]
+    values: np.ndarray  # (experiments, solves, parameters + 1), all parameters, the delay last
+    log_multipliers: list[np.ndarray]  # (solves, multipliers) of each experiment, log|μ|, largest first
+    z: np.ndarray  # (experiments, solves, points, states), periodic parts of the states
+    status: np.ndarray  # int (experiments, solves), index into `compiled.STATUSES`
 
     def response(self, member: int) -> Response:
         """Return the responses of one experiment, θ on the leading axis."""
-        return Response(self.outputs[member], self.frequency[member], self.log_multipliers[member], self.delay[member])
+        delay = self.values[member][..., -1]
+        return Response(self.outputs[member], self.frequency[member], self.log_multipliers[member], delay)
 
     def at(self, solves: Any) -> "GroupSolution":
         """Return the solutions at some of the θ."""
         return GroupSolution(
             self.outputs[:, solves],
             self.frequency[:, solves],
-            self.delay[:, solves],
+            self.values[:, solves],
             [values[solves] for values in self.log_multipliers],
             self.z[:, solves],
             self.status[:, solves],
@@ -81,24 +58,12 @@ class GroupSolution(NamedTuple):
 
 
 class Simulation:
-    """Solutions of all experiments at several θ.
-
-    Parameters
-    ----------
-    groups : sequence of GroupSolution
-    places : mapping of str to (int, int)
-        Group and member of each experiment.
-
-    Attributes
-    ----------
-    status : int array (solves,)
-        The worst status code of the experiments.
-    """
+    """Solutions of all experiments at several θ; `status` (solves,) is the worst code of the experiments."""
 
     def __init__(self, groups: Sequence[GroupSolution], places: Mapping[str, tuple[int, int]]):
         self.groups, self._places = groups, places
-        worst = [group.status.max(axis=0) for group in groups]
-        self.status = worst[0] if len(worst) == 1 else np.max(worst, axis=0)
+        worst = [np.maximum.reduce(group.status) for group in groups]
+        self.status = worst[0] if len(worst) == 1 else np.maximum.reduce(worst)
 
     def at(self, solves: Any) -> "Simulation":
         """Return the solutions at some of the θ (a mask or indices)."""
@@ -121,25 +86,19 @@ class Simulation:
 
 
 class Observation:
-    """The comparison of a response with one experiment.
+    """Comparison of a response with one experiment.
 
     Outputs are delayed, compared with the data (angles modulo 2π), and taken at the points of the mask or as Fourier
     components within the harmonics kept. The orbit of an autonomous model, whose phase is free, is first turned until
-    the first harmonics of its measured outputs agree best with those of the data.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    model : Model
-    delayed : bool
-        Whether the delay is a parameter; without it outputs are not shifted at all, unless the phase is free.
+    the first harmonics of its measured outputs agree best with those of the data. Other outputs are shifted only if the
+    delay is a parameter.
 
     Attributes
     ----------
     channels : tuple of str
         Those measured, in the order of the model's outputs.
     columns : list of int
-        Where these are among the model's outputs.
+        Their indices among the model's outputs.
     data : array (points, channels)
     """
 
@@ -225,23 +184,16 @@ class Observation:
         pairs = zip(self.columns, self.channels, strict=True)
         return [self._spectral(outputs[..., column], self._harmonics[name]) for column, name in pairs]
 
-    def spread(self, weights: Sequence[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
-        """Return the transpose of `components` applied to weights (…, size) a channel: (…, points, channels)."""
-        total = np.zeros((*weights[0].shape[:-1], *shape))
-        for own, column, name in zip(weights, self.columns, self.channels, strict=True):
-            total[..., column] = self._spread(own, self._harmonics[name])
-        return total
+    def spread(self, weights: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return the transpose of `components` applied to weights (…, size) a channel: (…, points) a channel."""
+        return [self._spread(own, self._harmonics[name]) for own, name in zip(weights, self.channels, strict=True)]
 
     def residuals(self, response: Response) -> list[np.ndarray]:
         """Return the residual components, one array (…, size) a block."""
         e = self.experiment
-        difference = self.data - self._predicted(response)
-        for c, angle in enumerate(self._angles):
-            if angle:
-                difference[..., c] = np.mod(difference[..., c] + np.pi, 2 * np.pi) - np.pi
         known = [] if e.multipliers is None else [np.log(np.abs(e.multipliers)) - response.log_multipliers]
         frequency = [e.frequency - response.frequency] if self._free_phase else []
-        return self._components(difference, known, frequency)
+        return self._components(self._difference(response), known, frequency)
 
     @cached_property
     def layout(self) -> tuple[Any, ...] | None:
@@ -293,16 +245,10 @@ class Observation:
         return dict(zip(self.channels, np.moveaxis(self._predicted(response), -1, 0), strict=True))
 
     def replicates(self, response: Response, components: list[np.ndarray]) -> dict[str, np.ndarray]:
-        """Return what might have been measured, ŷ plus noise (draws, points), by channel; NaN outside the mask.
+        """Return possible measurements, ŷ plus noise (draws, points), by channel; NaN outside the mask.
 
-        Angles are within half a turn of the data.
-
-        Parameters
-        ----------
-        response : Response
-            With draws on its leading axis.
-        components : list of array (draws, size)
-            Of the noise, one array a block.
+        The response has draws on its leading axis, the noise one array (draws, size) a block. Angles are within half a
+        turn of the data.
         """
         e, noise = self.experiment, np.full((len(components[0]), *self.data.shape), np.nan)
         if e.covariance is not None:
@@ -321,14 +267,18 @@ class Observation:
 
     def compared(self, response: Response) -> dict[str, np.ndarray]:
         """Return y − ŷ (points,) of each channel, within the harmonics kept and zero where nothing was measured."""
-        difference = self.data - self._predicted(response)
-        result = {}
+        difference, mask, result = self._difference(response), self.experiment.mask, {}
         for c, channel in enumerate(self.channels):
             e = difference[:, c]
-            e = np.mod(e + np.pi, 2 * np.pi) - np.pi if self._angles[c] else e
-            mask = self.experiment.mask
             result[channel] = self.experiment.project(channel, e) if mask is None else np.where(mask, e, 0.0)
         return result
+
+    def _difference(self, response: Response) -> np.ndarray:
+        """Return y − ŷ (…, points, channels), angles within half a turn."""
+        difference = self.data - self._predicted(response)
+        for c in np.flatnonzero(self._angles):
+            difference[..., c] = np.mod(difference[..., c] + np.pi, 2 * np.pi) - np.pi
+        return difference
 
     def _components(
         self, values: np.ndarray, multipliers: list[np.ndarray], frequency: list[np.ndarray]
@@ -353,10 +303,10 @@ class Observation:
     def _spectral(self, signal: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
         """Return real Fourier components whose mean square is that of the signal within the harmonics."""
         result = np.empty((*signal.shape[:-1], harmonic.size))
-        step = max(1, LARGEST_TRANSFORM // self._points)
-        if signal.ndim < 3 or signal.size <= LARGEST_TRANSFORM:
+        if signal.size <= LARGEST_TRANSFORM or signal.ndim < 3:
             self._transform(signal, result)
         else:  # In parts that stay in the cache; larger ones cost more for their memory than for the transform.
+            step = max(1, LARGEST_TRANSFORM // self._points)
             for own, components in zip(signal, result, strict=True):
                 for first in range(0, len(own), step):
                     self._transform(own[first : first + step], components[first : first + step])
@@ -365,28 +315,30 @@ class Observation:
     def _transform(self, signal: np.ndarray, result: np.ndarray) -> None:
         """Fill in the real Fourier components (…, size) of signals (…, points)."""
         size = result.shape[-1]
-        highest = (size - 1) // 2
+        highest, factor = (size - 1) // 2, math.sqrt(0.5 * size)
         amplitudes = _fourier.coefficients(signal, highest)
-        amplitudes *= np.sqrt(0.5 * size)
-        result[..., : highest + 1] = amplitudes.real
-        result[..., 0] *= np.sqrt(2.0)
-        result[..., highest + 1 : 2 * highest + 1] = amplitudes.imag[..., 1:]
+        np.multiply(amplitudes.real, factor, out=result[..., : highest + 1])
+        np.multiply(amplitudes.imag[..., 1:], factor, out=result[..., highest + 1 : 2 * highest + 1])
+        result[..., 0] *= ROOT_TWO
         if size % 2 == 0:
-            alternating = np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0) / self._points
-            result[..., -1] = np.sum(signal * alternating, axis=-1) * np.sqrt(size)
+            result[..., -1] = np.sum(signal * (self._alternating / self._points), axis=-1) * math.sqrt(size)
 
     def _signal(self, components: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
         """Return the signals (…, points) that have these real Fourier components (…, size): `_spectral` undone."""
         highest = (harmonic.size - 1) // 2
         amplitudes = components[..., : highest + 1].astype(complex)
-        amplitudes[..., 1:] += 1j * components[..., highest + 1 : 2 * highest + 1]
-        amplitudes *= np.sqrt(2.0 / harmonic.size)
-        amplitudes[..., 0] *= np.sqrt(0.5)
+        amplitudes.imag[..., 1:] = components[..., highest + 1 : 2 * highest + 1]
+        amplitudes *= math.sqrt(2.0 / harmonic.size)
+        amplitudes[..., 0] *= math.sqrt(0.5)
         signal = _fourier.on_grid(amplitudes, self._points)
         if harmonic.size % 2 == 0:
-            alternating = np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0)
-            signal += components[..., -1:] / np.sqrt(harmonic.size) * alternating
+            signal += components[..., -1:] / math.sqrt(harmonic.size) * self._alternating
         return signal
+
+    @cached_property
+    def _alternating(self) -> np.ndarray:
+        """The signal (points,) 1, −1, 1, … of the Nyquist harmonic."""
+        return np.where(np.arange(self._points) % 2 == 0, 1.0, -1.0)
 
     def _spread(self, weights: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
         """Return the transpose of `_spectral` applied to weights (size,), its inverse but for a factor."""
@@ -491,34 +443,18 @@ def _measured_variance(experiment: Experiment, channel: str) -> float:
 
 
 class _Part(NamedTuple):
-    """Experiments whose residuals are computed together.
+    """Experiments whose residuals are computed together."""
 
-    Attributes
-    ----------
-    group : int
-        Index of the group of experiments that are solved together.
-    members : slice or list of int
-        Their places in the group.
-    observations : list of Observation
-    data : list of array (experiments, 1, size)
-        Fourier components of the measured channels; empty for an experiment with a comparison of its own.
-    """
-
-    group: int
-    members: Any
+    group: int  # index of the group of experiments that are solved together
+    members: Any  # slice or list of int, their places in the group
     observations: list[Observation]
-    data: list[np.ndarray]
+    data: list[np.ndarray]  # Fourier components (experiments, 1, size) a channel; empty if more than these is compared
 
 
 class Comparisons:
     """Residual components of all experiments, computed together where experiments have the same layout.
 
-    Parameters
-    ----------
-    groups : sequence of sequence of Observation
-        Of experiments that are solved together, as in `Simulator.groups`.
-    order : sequence of str
-        Experiments in the order of their blocks.
+    The groups are of experiments that are solved together, as in `Simulator.groups`, the order that of the blocks.
     """
 
     def __init__(self, groups: Sequence[Sequence[Observation]], order: Iterable[str]):
@@ -540,17 +476,10 @@ class Comparisons:
         self._places = [place for name in order for place in places[name]]
 
     def residuals(self, simulation: Simulation, threads: int | None = 1) -> Residuals:
-        """Return the residual components at all θ of a simulation, an array (solves, size) a block.
-
-        Parameters
-        ----------
-        simulation : Simulation
-        threads : int, optional
-            That share the θ; None for one per core. The result does not depend on it.
-        """
+        """Return the residual components at all θ, (solves, size) a block; None means one thread per core."""
         solves = simulation.status.size
-        values = max(group.outputs.size for group in simulation.groups)
-        parts = 1 if values < SMALLEST_SHARED else min(threads or available_cores(), solves)
+        small = solves == 1 or max(group.outputs.size for group in simulation.groups) < SMALLEST_SHARED
+        parts = 1 if small else min(threads or available_cores(), solves)
         with np.errstate(over="ignore", invalid="ignore"):
             if parts <= 1:
                 return Residuals(self._stacks(simulation), self._places)
@@ -571,24 +500,25 @@ class Comparisons:
                 result += [block[None] for block in first.residuals(solved.response(member))]
         return result
 
-    def vjp(self, simulation: Simulation, weights: Residuals) -> dict[str, Response]:
-        """Return the derivatives of Σ weights · predicted components by the responses at one θ, by experiment.
+    def vjp(
+        self, simulation: Simulation, weights: Residuals
+    ) -> tuple[list[np.ndarray], list[np.ndarray], dict[str, np.ndarray]]:
+        """Return the derivatives of Σ weights · predicted components by the responses at one θ.
 
-        Parameters
-        ----------
-        simulation : Simulation
-            At one θ.
-        weights : Residuals
-            As `residuals` returns them at this θ, without the axis of the θ.
+        They are by the outputs (experiments, points, channels) and the delays (experiments,) of each group, and by
+        log|μ| of the experiments whose multipliers were measured. The weights are arranged as the residuals at this θ.
         """
-        result, stacks = {}, iter(weights.stacks())
-        for group, _, observations, data in self._parts:
+        by_outputs = [np.zeros((len(group.outputs), *group.outputs.shape[2:])) for group in simulation.groups]
+        by_delay, by_multipliers = [np.zeros(len(group.outputs)) for group in simulation.groups], {}
+        stacks = iter(weights.stacks())
+        for group, members, observations, data in self._parts:
             first, own = observations[0], [next(stacks) for _ in observations[0].blocks]
             if data:
-                outputs = first.spread(own, simulation.groups[group].outputs.shape[-2:])
-                for o, by_outputs in zip(observations, outputs, strict=True):
-                    result[o.experiment.name] = Response(by_outputs, np.zeros(()), np.zeros(0), np.zeros(()))
+                for column, signal in zip(first.columns, first.spread(own), strict=True):
+                    by_outputs[group][members, :, column] = signal
             else:
                 response = simulation.at(0).response(first.experiment.name)
-                result[first.experiment.name] = first.vjp(response, [stack[0] for stack in own])
-        return result
+                found = first.vjp(response, [stack[0] for stack in own])
+                by_outputs[group][members], by_delay[group][members] = found.outputs, found.delay
+                by_multipliers[first.experiment.name] = found.log_multipliers
+        return by_outputs, by_delay, by_multipliers

@@ -1,16 +1,24 @@
-"""Which parameters of a model are free, fixed or tied, and how all of them follow from the free ones."""
+"""Parameters of a model that are free, fixed or tied, and names of parameters and their draws.
+
+A parameter local to an experiment is called ``theta16[run 7]``; its draws are one place of a variable with the dim
+"experiment".
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse
 
 SHIFT = "shift"
+CHAIN, DRAW, CHANNEL, EXPERIMENT = "chain", "draw", "channel", "experiment"
+NOISE = "noise"
 
 
 def local_name(name: str, experiment: str) -> str:
@@ -48,26 +56,13 @@ def free_names(parameters: Iterable[str], local: Iterable[str], experiments: Ite
 
 @dataclass(frozen=True)
 class ParameterMap:
-    """From θ, the free parameters of all experiments, to all parameters of one experiment.
+    """Map from θ, the free parameters of all experiments, to all parameters of one experiment."""
 
-    Attributes
-    ----------
-    parameters : tuple of str
-        All of the model's, and last "shift", the delay of the measured outputs [s].
-    columns : dict of str to int
-        Where the free ones of this experiment are in θ.
-    size : int
-        Length of θ.
-    fixed : dict of str to float
-    tied : dict of str to Expression
-        Each only of parameters that are free, fixed or tied before it.
-    """
-
-    parameters: tuple[str, ...]
-    columns: dict[str, int]
-    size: int
+    parameters: tuple[str, ...]  # all of the model's, and last "shift", the delay of the measured outputs [s]
+    columns: dict[str, int]  # places of this experiment's free ones in θ
+    size: int  # length of θ
     fixed: dict[str, float]
-    tied: dict[str, Expression]
+    tied: dict[str, Expression]  # each only of parameters that are free, fixed or tied before it
 
     @classmethod
     def of(
@@ -78,14 +73,7 @@ class ParameterMap:
         fixed: Mapping[str, float],
         tied: Mapping[str, Any],
     ) -> "ParameterMap":
-        """Return the checked map of an experiment; `names` are those of θ.
-
-        Raises
-        ------
-        ValueError
-            For a parameter that is none of the three or two of them, an unknown name, an invalid expression
-            or that comes back to itself.
-        """
+        """Return the checked map of an experiment; `names` are those of θ."""
         every = (*parameters, SHIFT)
         columns = {}
         for name in every:
@@ -134,17 +122,7 @@ class ParameterMap:
 
 
 class ParameterMaps:
-    """Maps of several experiments in which the same parameters are free, evaluated together.
-
-    Parameters
-    ----------
-    maps : sequence of ParameterMap
-
-    Attributes
-    ----------
-    moving : tuple of int
-        Which of the model's parameters are free or tied.
-    """
+    """Maps of several experiments with the same free parameters; `moving` are the indices of free and tied ones."""
 
     def __init__(self, maps: Sequence[ParameterMap]):
         first = maps[0]
@@ -152,16 +130,18 @@ class ParameterMaps:
             raise ValueError("maps: the same parameters must be free, and the same tied.")
         self._tied, self._size = first.tied, first.size
         self._fixed = np.array([[m.fixed.get(name, np.nan) for name in first.parameters] for m in maps])
-        self._places = [first.parameters.index(name) for name in first.columns]
+        self._places = np.array([first.parameters.index(name) for name in first.columns], dtype=int)
         self._columns = np.array([[m.columns[name] for name in first.columns] for m in maps], dtype=int)
         named = {name for expression in self._tied.values() for name in expression.names} | self._tied.keys()
         self._named = {name: i for i, name in enumerate(first.parameters) if name in named}
         free = {*first.columns, *self._tied} - {SHIFT}
+        self._rows = np.arange(len(maps))[:, None]
         self.moving = tuple(i for i, name in enumerate(first.parameters) if name in free)
 
     def values(self, theta: np.ndarray) -> np.ndarray:
         """Return all parameters (maps, points, parameters + 1), the delay last, of θ (points, names)."""
-        result = np.repeat(self._fixed[:, None], len(theta), axis=1)
+        result = np.empty((len(self._fixed), len(theta), self._fixed.shape[1]))
+        result[...] = self._fixed[:, None]
         result[:, :, self._places] = theta[:, self._columns].transpose(1, 0, 2)
         if self._tied:
             known = {name: result[..., i] for name, i in self._named.items()}
@@ -170,20 +150,14 @@ class ParameterMaps:
         return result
 
     def vjp(self, values: np.ndarray, by_parameter: np.ndarray) -> np.ndarray:
-        """Return derivatives by θ, (maps, names), from those by all parameters at their values (maps, parameters + 1).
-
-        Parameters
-        ----------
-        values, by_parameter : array (maps, parameters + 1)
-            The delay last.
-        """
+        """Return derivatives by θ, (maps, names), from those by all parameters, (maps, parameters + 1)."""
         left, result = by_parameter.copy(), np.zeros((len(by_parameter), self._size))
         if self._tied:
             known = {name: values[:, i] for name, i in self._named.items()}
             for name, expression in reversed(self._tied.items()):
                 for argument, slope in expression.gradient(known).items():
                     left[:, self._named[argument]] += slope * left[:, self._named[name]]
-        result[np.arange(len(result))[:, None], self._columns] = left[:, self._places]
+        result[self._rows, self._columns] = left[:, self._places]
         return result
 
 
@@ -201,3 +175,102 @@ def _ordered(expressions: dict[str, Expression]) -> dict[str, Expression]:
             raise ValueError(f"tied: must not be circular, got {circle!r}.")
         result |= {name: expressions[name] for name in ready}
     return result
+
+
+def full_name(variable: str, place: Sequence[str]) -> str:
+    """Return what one place of a variable is called: k, or variance[force, run 7]."""
+    return f"{variable}[{', '.join(place)}]" if place else variable
+
+
+def pack(
+    columns: Mapping[str, np.ndarray], dims: Mapping[str, Sequence[str]], coords: Mapping[str, Sequence[str]]
+) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
+    """Return variables, dims and values (chain, draw, …), made of columns (chain, draw) by full name.
+
+    `dims` are those of each variable after chain and draw, `coords` the names along each. Values without a column are
+    NaN.
+    """
+    shape = next(iter(columns.values())).shape
+    packed = {}
+    for variable, own in dims.items():
+        places = list(product(*(coords[dim] for dim in own)))
+        values = np.full((*shape, len(places)), np.nan)
+        for i, place in enumerate(places):
+            values[..., i] = columns.get(full_name(variable, place), np.nan)
+        sizes = [len(coords[dim]) for dim in own]
+        packed[variable] = (CHAIN, DRAW, *own), values.reshape(*shape, *sizes)
+    return packed
+
+
+def places(group: xr.Dataset) -> dict[str, tuple[str, dict[str, str]]]:
+    """Return where everything is that the draws hold, by full name: the variable, and its place by dim."""
+    found = {}
+    for key, values in group.data_vars.items():
+        first, variable = values.isel({CHAIN: 0, DRAW: 0}), str(key)
+        dims = [dim for dim in (CHANNEL, EXPERIMENT) if dim in first.dims]
+        for place in product(*(group[dim].values.tolist() for dim in dims)):
+            at = dict(zip(dims, place, strict=True))
+            if not np.isnan(float(first.sel(at))):
+                found[full_name(variable, place)] = (variable, at)
+    return found
+
+
+def column(group: xr.Dataset, name: str) -> np.ndarray:
+    """Return the draws (chains, draws) of what has this full name; raise a ValueError if it is unknown."""
+    known = places(group)
+    _checks.one_of("name", name, known)
+    variable, at = known[name]
+    return group[variable].sel(at).transpose(CHAIN, DRAW).to_numpy()
+
+
+def unit(group: xr.Dataset, name: str) -> str:
+    """Return the unit of what has this full name; "" where there is none."""
+    variable, at = places(group)[name]
+    key = f"units of {at[CHANNEL]}" if CHANNEL in at else "units"
+    return str(group[variable].attrs.get(key, ""))
+
+
+def squared(unit: str) -> str:
+    """Return the unit of a variance: N², or (m/s)²."""
+    return f"{unit}²" if unit.isalpha() else f"({unit})²"
+
+
+def is_noise(group: xr.Dataset, variable: str) -> bool:
+    """Return whether a variable is one of the noise model's."""
+    return NOISE in group[variable].attrs
+
+
+def in_experiment(names: Iterable[str], experiment: str | None) -> dict[str, str]:
+    """Return full names by the plain names that they have within one experiment; without it the shared ones."""
+    result = {}
+    for name in names:
+        plain, _, label = name.partition("[")
+        if not label or label[:-1] == experiment:
+            result[plain] = name
+    return result
+
+
+def local_names(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the plain names of the parameters that experiments have their own of."""
+    return tuple(dict.fromkeys(name.partition("[")[0] for name in names if "[" in name))
+
+
+def local_hint(names: Iterable[str], experiment: str | None) -> str:
+    """Return what to say of expressions that name a local parameter but no experiment."""
+    local = local_names(names)
+    if not local or experiment is not None:
+        return ""
+    return f"Experiments have their own {', '.join(local)}; derive(…, experiment=…) takes those of one."
+
+
+def checked_key(names: Any, free: Iterable[str], noise: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of a joint prior; raise a ValueError unless they are a tuple of different free parameters."""
+    if not isinstance(names, tuple) or not names:
+        raise ValueError(f"names: must be a tuple of names, such as ('k', 'c'), got {names!r}.")
+    for name in names:
+        if name in [*noise]:
+            raise ValueError(f"names: must be parameters of the model, got the noise parameter {name!r}.")
+        _checks.one_of("names", name, free)
+        if names.count(name) > 1:
+            raise ValueError(f"names: must differ, got {names!r}.")
+    return names

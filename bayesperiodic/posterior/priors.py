@@ -1,16 +1,11 @@
-"""Priors of one parameter, one vocabulary for all methods.
-
-A prior of one parameter has `log_prob`, its first derivative `gradient`, its negative second derivative `curvature`,
-`sample`, `quantile` and `support`. A support of (0, ∞) means that the parameter is sampled in its logarithm. Supports
-are open intervals; outside, `log_prob` is −∞, `gradient` and `curvature` are NaN.
-"""
+"""Priors of one parameter. A parameter whose prior has the support (0, ∞) is sampled in its logarithm."""
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from scipy import special
@@ -23,32 +18,53 @@ ROOT_TWO = math.sqrt(2.0)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(20)
 
 
+class Density(Protocol):
+    """Probability density of one parameter, or of n parameters jointly."""
+
+    def log_prob(self, x: np.ndarray) -> np.ndarray:
+        """Return the normalised log-density, −inf outside the support.
+
+        Parameters
+        ----------
+        x : array (…) or (…, n)
+            In the parameters' units.
+
+        Returns
+        -------
+        array (…)
+        """
+
+    def gradient(self, x: np.ndarray) -> np.ndarray:
+        """Return ∂ log p/∂x, (…) or (…, n), NaN outside the support."""
+
+    def curvature(self, x: np.ndarray) -> np.ndarray:
+        """Return −∂² log p/∂x², (…) or (…, n, n), NaN outside the support; negative where log p is convex."""
+
+    def sample(self, size: int, generator: np.random.Generator) -> np.ndarray:
+        """Return independent draws, (size,) or (size, n)."""
+
+
 @runtime_checkable
-class Prior(Protocol):
-    """What the estimator and the sampler ask of a prior; all functions take and return arrays of any shape."""
+class Prior(Density, Protocol):
+    """Interface of the priors of one parameter."""
 
     @property
     def support(self) -> tuple[float, float]:
         """The open interval outside of which the density is zero."""
 
-    def log_prob(self, x: np.ndarray) -> np.ndarray:
-        """Return the normalised log-density, −inf outside the support."""
-
-    def gradient(self, x: np.ndarray) -> np.ndarray:
-        """Return d log p / dx."""
-
-    def curvature(self, x: np.ndarray) -> np.ndarray:
-        """Return −d² log p / dx²."""
-
     def quantile(self, probability: np.ndarray) -> np.ndarray:
-        """Return the inverse of the distribution function."""
-
-    def sample(self, size: int, generator: np.random.Generator) -> np.ndarray:
-        """Return independent draws, (size,)."""
+        """Return the inverse of the distribution function, (…); NaN unless the probability is between 0 and 1."""
 
 
-class Univariate(ABC):
-    """What the priors of one parameter share: only points inside the support reach their formulas."""
+class Univariate(Prior, ABC):
+    """Base of the priors of one parameter; only points inside the support reach their formulas."""
+
+    # Checks of the arguments, by name; they return plain floats, so that equal priors print alike.
+    _arguments: ClassVar[Mapping[str, Callable[[str, Any], float]]] = {}
+
+    def __post_init__(self) -> None:
+        for name, check in self._arguments.items():
+            object.__setattr__(self, name, check(name, getattr(self, name)))
 
     @property
     def support(self) -> tuple[float, float]:
@@ -56,59 +72,19 @@ class Univariate(ABC):
         return -math.inf, math.inf
 
     def log_prob(self, x: np.ndarray) -> np.ndarray:
-        """Return the normalised log-density, −inf outside the support.
-
-        Parameters
-        ----------
-        x : array (…)
-            Values of the parameter, in its unit.
-
-        Returns
-        -------
-        array (…)
-        """
+        """Return the log-density."""
         return self._where_inside(self._log_density, x, -np.inf)
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
-        """Return d log p / dx, NaN outside the support.
-
-        Parameters
-        ----------
-        x : array (…)
-            Values of the parameter, in its unit.
-
-        Returns
-        -------
-        array (…)
-        """
+        """Return d log p/dx."""
         return self._where_inside(self._gradient, x, np.nan)
 
     def curvature(self, x: np.ndarray) -> np.ndarray:
-        """Return −d² log p / dx², NaN outside the support; negative where the log-density is convex.
-
-        Parameters
-        ----------
-        x : array (…)
-            Values of the parameter, in its unit.
-
-        Returns
-        -------
-        array (…)
-        """
+        """Return −d² log p/dx²."""
         return self._where_inside(self._curvature, x, np.nan)
 
     def quantile(self, probability: np.ndarray) -> np.ndarray:
-        """Return the inverse of the distribution function.
-
-        Parameters
-        ----------
-        probability : array (…)
-
-        Returns
-        -------
-        array (…)
-            In the parameter's unit; NaN unless the probability is between 0 and 1.
-        """
+        """Return the inverse of the distribution function."""
         p = np.asarray(probability, dtype=float)
         low, high = self.support
         result = np.full(p.shape, np.nan)
@@ -118,18 +94,7 @@ class Univariate(ABC):
         return result[()]
 
     def sample(self, size: int, generator: np.random.Generator) -> np.ndarray:
-        """Return independent draws.
-
-        Parameters
-        ----------
-        size : int
-        generator : numpy.random.Generator
-
-        Returns
-        -------
-        array (size,)
-            In the parameter's unit.
-        """
+        """Return independent draws."""
         return self.quantile(generator.uniform(size=size))
 
     def _where_inside(self, function: Callable[[np.ndarray], Any], x: np.ndarray, outside: float) -> np.ndarray:
@@ -139,17 +104,17 @@ class Univariate(ABC):
             number: Any = np.float64(x)
             number = np.float64(function(number) if low < number < high else outside)
             return number
-        x = np.asarray(x, dtype=float)
+        x = np.ascontiguousarray(x, dtype=float)
         inside = (x > low) & (x < high)
+        if np.count_nonzero(inside) == x.size:
+            result = np.empty(x.shape)
+            result[...] = function(x)
+            return result
         result = np.full(x.shape, outside)
         result[inside] = function(x[inside])
         return result
 
-    def _store(self, **values: float) -> None:
-        """Keep arguments as the plain floats they were checked to be, so that equal priors print alike."""
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
-
+    # Squares are products in the formulas: x**2 of a number and of an array may differ in the last bit.
     @abstractmethod
     def _log_density(self, x: np.ndarray) -> Any: ...
 
@@ -163,6 +128,16 @@ class Univariate(ABC):
     def _quantile(self, p: np.ndarray) -> np.ndarray: ...
 
 
+def _bound(argument: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if math.isnan(number):
+        raise ValueError(f"{argument}: must be a real number or infinite, got {value!r}.")
+    return number
+
+
 class _Positive(Univariate):
     @property
     def support(self) -> tuple[float, float]:
@@ -173,6 +148,11 @@ class _Positive(Univariate):
 class _Interval(Univariate):
     low: float
     high: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.low < self.high:
+            raise ValueError(f"low: must be less than high = {self.high!r}, got {self.low!r}.")
 
     @property
     def support(self) -> tuple[float, float]:
@@ -205,11 +185,11 @@ class Normal(Univariate):
     mean: float
     sd: float
 
-    def __post_init__(self) -> None:
-        self._store(mean=_checks.finite_number("mean", self.mean), sd=_checks.positive("sd", self.sd))
+    _arguments = {"mean": _checks.finite_number, "sd": _checks.positive}
 
     def _log_density(self, x: np.ndarray) -> Any:
-        return -0.5 * ((x - self.mean) / self.sd) ** 2 - (math.log(self.sd) + LOG_ROOT_TWO_PI)
+        score = (x - self.mean) / self.sd
+        return -0.5 * (score * score) - (math.log(self.sd) + LOG_ROOT_TWO_PI)
 
     def _gradient(self, x: np.ndarray) -> Any:
         return -(x - self.mean) / self.sd**2
@@ -246,11 +226,12 @@ class LogNormal(_Positive):
     median: float
     spread: float
 
-    def __post_init__(self) -> None:
-        self._store(median=_checks.positive("median", self.median), spread=_checks.positive("spread", self.spread))
+    _arguments = {"median": _checks.positive, "spread": _checks.positive}
 
     def _log_density(self, x: np.ndarray) -> Any:
-        return -0.5 * self._score(x) ** 2 - np.log(x) - (math.log(self.spread) + LOG_ROOT_TWO_PI)
+        logarithm = np.log(x)
+        score = (logarithm - math.log(self.median)) / self.spread
+        return -0.5 * (score * score) - logarithm - (math.log(self.spread) + LOG_ROOT_TWO_PI)
 
     def _gradient(self, x: np.ndarray) -> Any:
         return -(1.0 + self._score(x) / self.spread) / x
@@ -300,10 +281,7 @@ class TruncatedNormal(_Interval):
     low: float
     high: float
 
-    def __post_init__(self) -> None:
-        self._store(mean=_checks.finite_number("mean", self.mean), sd=_checks.positive("sd", self.sd))
-        self._store(low=_bound("low", self.low), high=_bound("high", self.high))
-        _require_order(self.low, self.high)
+    _arguments = {"mean": _checks.finite_number, "sd": _checks.positive, "low": _bound, "high": _bound}
 
     @cached_property
     def _tail(self) -> tuple[float, float, float, float]:
@@ -379,11 +357,11 @@ class HalfNormal(_Positive):
 
     scale: float
 
-    def __post_init__(self) -> None:
-        self._store(scale=_checks.positive("scale", self.scale))
+    _arguments = {"scale": _checks.positive}
 
     def _log_density(self, x: np.ndarray) -> Any:
-        return -0.5 * (x / self.scale) ** 2 + (math.log(2.0) - math.log(self.scale) - LOG_ROOT_TWO_PI)
+        score = x / self.scale
+        return -0.5 * (score * score) + (math.log(2.0) - math.log(self.scale) - LOG_ROOT_TWO_PI)
 
     def _gradient(self, x: np.ndarray) -> Any:
         return -x / self.scale**2
@@ -418,9 +396,7 @@ class Uniform(_Interval):
     low: float
     high: float
 
-    def __post_init__(self) -> None:
-        self._store(low=_checks.finite_number("low", self.low), high=_checks.finite_number("high", self.high))
-        _require_order(self.low, self.high)
+    _arguments = {"low": _checks.finite_number, "high": _checks.finite_number}
 
     def _log_density(self, x: np.ndarray) -> Any:
         return -math.log(self.high - self.low)
@@ -460,9 +436,7 @@ class LogUniform(_Interval):
     low: float
     high: float
 
-    def __post_init__(self) -> None:
-        self._store(low=_checks.positive("low", self.low), high=_checks.positive("high", self.high))
-        _require_order(self.low, self.high)
+    _arguments = {"low": _checks.positive, "high": _checks.positive}
 
     @cached_property
     def _width(self) -> float:
@@ -511,13 +485,12 @@ class StudentT(Univariate):
     scale: float
     dof: float
 
-    def __post_init__(self) -> None:
-        self._store(mean=_checks.finite_number("mean", self.mean), scale=_checks.positive("scale", self.scale))
-        self._store(dof=_checks.positive("dof", self.dof))
+    _arguments = {"mean": _checks.finite_number, "scale": _checks.positive, "dof": _checks.positive}
 
     def _log_density(self, x: np.ndarray) -> Any:
         constant = special.betaln(0.5 * self.dof, 0.5) + 0.5 * math.log(self.dof) + math.log(self.scale)
-        return -0.5 * (self.dof + 1.0) * np.log1p(self._score(x) ** 2 / self.dof) - constant
+        score = self._score(x)
+        return -0.5 * (self.dof + 1.0) * np.log1p(score * score / self.dof) - constant
 
     def _gradient(self, x: np.ndarray) -> Any:
         score = self._score(x)
@@ -559,8 +532,7 @@ class InverseGamma(_Positive):
     shape: float
     scale: float
 
-    def __post_init__(self) -> None:
-        self._store(shape=_checks.positive("shape", self.shape), scale=_checks.positive("scale", self.scale))
+    _arguments = {"shape": _checks.positive, "scale": _checks.positive}
 
     def _log_density(self, x: np.ndarray) -> Any:
         constant = self.shape * math.log(self.scale) - math.lgamma(self.shape)
@@ -574,21 +546,6 @@ class InverseGamma(_Positive):
 
     def _quantile(self, p: np.ndarray) -> np.ndarray:
         return self.scale / special.gammainccinv(self.shape, p)
-
-
-def _bound(argument: str, value: Any) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if math.isnan(number):
-        raise ValueError(f"{argument}: must be a real number or infinite, got {value!r}.")
-    return number
-
-
-def _require_order(low: float, high: float) -> None:
-    if not low < high:
-        raise ValueError(f"low: must be less than high = {high!r}, got {low!r}.")
 
 
 def _tail_mass(distance: float, t: np.ndarray) -> np.ndarray:

@@ -70,12 +70,6 @@ class Problem(Description):
 
     Examples
     --------
-    >>> import numpy as np, bayesperiodic as bp
-    >>> force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
-    >>> run = bp.simulate(bp.models.duffing, {"m": 1, "c": 0.2, "k": 1, "k3": 0.5}, force, frequency=0.1, duration=400,
-    ...                   sampling_rate=4, noise={"displacement": 0.01}, seed=1).fold(32)
-    >>> problem = bp.Problem(bp.models.duffing, [run], priors={"c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1, 0.5)},
-    ...                      fixed={"m": 1, "k3": 0.5}, scheme="fourier")
     >>> problem
     Problem('duffing', 1 experiments, free: c, k, channels: displacement with 11 independent values, independent noise)
     >>> at = {"c": 0.2, "k": 1.0}, {"displacement": 1e-6}
@@ -138,9 +132,10 @@ class Problem(Description):
         return other
 
     def _evaluated(self, evaluate: str, theta: Any, variances: Any, threads: int | None = None) -> np.ndarray:
-        values = self.vector(theta)
-        noise = np.broadcast_to(self.noise_values(variances), (*values.shape[:-1], len(self.noise_names)))
-        flat = values.reshape(-1, len(self.names)), noise.reshape(-1, len(self.noise_names))
+        values, noise = self.vector(theta), self.noise_values(variances)
+        if noise.shape[:-1] != values.shape[:-1]:
+            noise = np.broadcast_to(noise, (*values.shape[:-1], noise.shape[-1]))
+        flat = values.reshape(-1, values.shape[-1]), noise.reshape(-1, noise.shape[-1])
         found: Evaluation = getattr(self.density(coordinates=NATURAL), evaluate)(*flat, threads)
         return found.log_prob.reshape(values.shape[:-1])
 
@@ -152,10 +147,9 @@ class Problem(Description):
         Parameters
         ----------
         theta : mapping of str to float, or array (…, names)
-            Natural values, in the parameters' units.
+            See `vector`, which raises for unknown or missing names.
         variances : mapping of str to float, or array (…, noise_names)
-            In a mapping a channel's name stands for its variance [channel's unit squared], and those with a known value
-            may be left out.
+            See `noise_values`, which does likewise.
         threads : int, optional
             By default one per core. The value does not depend on it.
 
@@ -163,11 +157,6 @@ class Problem(Description):
         -------
         array (…)
             −inf where a periodic solve fails.
-
-        Raises
-        ------
-        ValueError
-            For unknown or missing names, or another last axis.
         """
         return self._evaluated("log_likelihood", theta, variances, threads)
 
@@ -177,20 +166,13 @@ class Problem(Description):
         Parameters
         ----------
         theta : mapping of str to float, or array (…, names)
-            Natural values, in the parameters' units.
         variances : mapping of str to float, or array (…, noise_names)
-            In a mapping a channel's name stands for its variance [channel's unit squared], and those with a known value
-            may be left out.
+            See `log_likelihood`.
 
         Returns
         -------
         array (…)
             −inf outside the priors' support and where a periodic solve fails.
-
-        Raises
-        ------
-        ValueError
-            For unknown or missing names, or another last axis.
         """
         return self._evaluated("at", theta, variances)
 
@@ -244,12 +226,10 @@ class Problem(Description):
         return self._value_and_gradient(theta, variances, forward=False)
 
     def _value_and_gradient(self, theta: Any, variances: Any, *, forward: bool) -> tuple[float, np.ndarray]:
+        density = self.density(coordinates=NATURAL)
         natural = self.vector(theta), self.noise_values(variances)
-        density = self.density(coordinates=NATURAL)
-        density = self.density(coordinates=NATURAL)
         value, by_theta, by_noise, _ = density.value_and_gradient_at(*natural, forward=forward)
-        free = [self.noise_names.index(name) for name in self.free_noise]
-        return value, np.concatenate([by_theta, by_noise[free]])
+        return value, np.concatenate([by_theta, by_noise[density.noise_columns]])
 
     def outputs(self, theta: Mapping[str, float] | np.ndarray) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
         """Return the predicted outputs at many θ, and whether the solves converged.

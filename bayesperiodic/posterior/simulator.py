@@ -1,6 +1,6 @@
 """Periodic responses of all experiments of a problem at any θ, solved from anchors."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -24,17 +24,10 @@ Guesses = Mapping[str, Mapping[str, np.ndarray]]
 
 
 class Simulator:
-    """Solves the experiments of a problem for any θ, from anchors: solutions and their sensitivities at one θ.
+    """Periodic solutions of a problem's experiments at any θ, solved from anchors, and their derivatives at one θ.
 
-    Parameters
-    ----------
-    problem : Description
-    guesses : mapping of str to (str or mapping of str to array (points,))
-        First guess of the states of every experiment, from which to solve where the anchors fail.
-    anchors : mapping of str to Anchor
-        By experiment.
-    derivatives : mapping of str to Sensitivities or None
-        Of outputs and frequency at the anchors by all parameters; None where they do not exist.
+    By experiment: the guesses are states (points,), or "static", to solve from where the anchors fail; the derivatives
+    are those of outputs and frequency at the anchors by all parameters, None where they do not exist.
     """
 
     def __init__(
@@ -48,15 +41,7 @@ class Simulator:
 
     @classmethod
     def start(cls, problem: Description, theta: np.ndarray, guesses: Guesses | None = None) -> "Simulator":
-        """Return the simulator anchored at θ (names,), solved from guesses.
-
-        Parameters
-        ----------
-        problem : Description
-        theta : array (names,)
-        guesses : mapping of str to mapping of str to array (points,), optional
-            States of every experiment, turns included; by default the experiments' own guesses, else the equilibrium.
-        """
+        """Return the simulator anchored at θ (names,), solved from guesses, the experiments' own or the equilibrium."""
         if guesses is not None:
             _checks.same_names("guesses", guesses, [e.name for e in problem.experiments])
         own = {
@@ -114,14 +99,15 @@ class Simulator:
         return {e.name: (g, m) for g, group in enumerate(self.groups) for m, e in enumerate(group)}
 
     @cached_property
-    def _batches(self) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch]]:
-        """The groups with what solves them."""
+    def _batches(self) -> list[tuple[tuple[Experiment, ...], ParameterMaps, Batch | AutonomousBatch, bool]]:
+        """The groups, their parameters, their solver, and whether multipliers were measured."""
         kind = AutonomousBatch if self.problem.model.autonomous else Batch
         return [
             (
                 group,
                 ParameterMaps([self.problem.parameter_maps[e.name] for e in group]),
                 kind([self.problem.equations[e.name] for e in group], [self._anchors[e.name] for e in group]),
+                any(e.multipliers is not None for e in group),
             )
             for group in self.groups
         ]
@@ -137,22 +123,14 @@ class Simulator:
     ) -> Simulation:
         """Solve every experiment for θ (solves, names); the result does not depend on the number of threads.
 
-        Parameters
-        ----------
-        theta : array (solves, names)
-        threads : int, optional
-            By default one per core.
-        keep : bool
-            Return the periodic parts z too.
-        polish : bool
-            Solve as accurately as possible, as is done wherever multipliers are measured.
-        whole : bool
-            A θ counts only if every solve converges; the other experiments may then be skipped where one has failed.
+        With `keep` the periodic parts z are returned too; with `polish` the solves are as accurate as possible, as
+        wherever multipliers are measured. With `whole` a θ counts only if every solve converges; where one has failed,
+        other experiments may be skipped.
         """
         found = []
-        for experiments, maps, batch in self._batches:
+        for experiments, maps, batch, multipliers in self._batches:
             values = maps.values(theta)
-            parameters, multipliers = values[..., :-1], any(e.multipliers is not None for e in experiments)
+            parameters = values[..., :-1]
             if isinstance(batch, AutonomousBatch):
                 solved = batch.solve(parameters, threads, keep=keep or multipliers, whole=whole)
             else:
@@ -164,7 +142,7 @@ class Simulator:
                     self._log_multipliers(e, solved.z[i], solved.frequency[i], parameters[i], status[i])
                     for i, e in enumerate(experiments)
                 ]
-            found.append(GroupSolution(solved.outputs, solved.frequency, values[..., -1], logarithms, solved.z, status))
+            found.append(GroupSolution(solved.outputs, solved.frequency, values, logarithms, solved.z, status))
         return Simulation(found, self._places)
 
     def path_outcome(self, theta: np.ndarray, experiment: str) -> str:
@@ -214,16 +192,7 @@ class Simulator:
         return solutions
 
     def changes(self, theta: np.ndarray, experiment: str, response: Response, z: np.ndarray) -> Response | None:
-        """Return the derivatives of the response at the anchor by θ, (names, …); None where they do not exist.
-
-        Parameters
-        ----------
-        theta : array (names,)
-            Where the anchors are.
-        experiment : str
-        response, z
-            There.
-        """
+        """Return the derivatives of a response at the anchor by θ, (names, …); None where they do not exist."""
         slopes, derivative = self.problem.parameter_maps[experiment].slopes(theta), self._derivatives[experiment]
         if derivative is None:
             return None
@@ -252,34 +221,33 @@ class Simulator:
         ).real
         return np.array([_without_trivial(solution, row)[:count] for row in every])
 
-    def vjp(self, theta: np.ndarray, simulation: Simulation, weights: Mapping[str, Response]) -> dict[str, np.ndarray]:
-        """Return Σ weights · derivatives of a forced model's responses by θ, (names,) by experiment.
+    def vjp(
+        self,
+        theta: np.ndarray,
+        simulation: Simulation,
+        by_outputs: Sequence[np.ndarray],
+        by_delay: Sequence[np.ndarray],
+        by_multipliers: Mapping[str, np.ndarray],
+    ) -> dict[str, np.ndarray]:
+        """Return the derivatives of a scalar by θ, (names,) by experiment, from those that `Comparisons.vjp` returns.
 
-        That of the outputs takes one transposed solve an experiment; NaN where the derivatives do not exist.
-
-        Parameters
-        ----------
-        theta : array (names,)
-        simulation : Simulation
-            At this θ alone, with z.
-        weights : mapping of str to Response
-            Derivatives of a scalar by the response of every experiment.
+        The simulation is of a driven model, at this θ alone, with z. Each experiment takes one transposed solve; NaN
+        where the derivatives do not exist.
         """
         result: dict[str, np.ndarray] = {}
-        for (experiments, maps, batch), solved in zip(self._batches, simulation.groups, strict=True):
+        for g, (experiments, maps, batch, _) in enumerate(self._batches):
             assert isinstance(batch, Batch)
-            names = [e.name for e in experiments]
-            values = maps.values(theta[None])[:, 0]
-            outputs = np.stack([weights[n].outputs for n in names])
+            solved = simulation.groups[g]
+            values = solved.values[:, 0]
             by_parameter = np.zeros(values.shape)
-            by_parameter[:, maps.moving] = batch.vjp(values[:, :-1], solved.z[:, 0], outputs, maps.moving)
-            by_parameter[:, -1] = [weights[n].delay for n in names]
-            result |= dict(zip(names, maps.vjp(values, by_parameter), strict=True))
+            by_parameter[:, maps.moving] = batch.vjp(values[:, :-1], solved.z[:, 0], by_outputs[g], maps.moving)
+            by_parameter[:, -1] = by_delay[g]
+            result |= zip((e.name for e in experiments), maps.vjp(values, by_parameter), strict=True)
         for e in self.problem.experiments:
             if e.multipliers is not None:
                 response = simulation.at(0).response(e.name)
                 changes = self._multiplier_changes(theta, e.name, simulation.z(e.name)[0], response)
-                result[e.name] = result[e.name] + changes @ weights[e.name].log_multipliers
+                result[e.name] = result[e.name] + changes @ by_multipliers[e.name]
         return result
 
 

@@ -23,8 +23,7 @@ from bayesperiodic.diagnostics.verdicts import FINE, MODE, UNCONVERGED
 from bayesperiodic.estimation.map_estimate import estimation_warnings
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.periodic.schemes import find_scheme
-from bayesperiodic.posterior import labels
-from bayesperiodic.posterior.parameters import SHIFT
+from bayesperiodic.posterior.parameters import SHIFT, squared
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.reporting import html
 from bayesperiodic.reporting.html import Rows, code, number
@@ -124,7 +123,7 @@ class ReportInputs:
             return "s"
         if name in self.problem.noise_names:
             channel = units.get(place.rstrip("]").partition(",")[0], "")
-            return html.unit(labels.squared(channel) if plain == "variance" and channel else "")
+            return html.unit(squared(channel) if plain == "variance" and channel else "")
         return html.unit(units.get(plain, ""))
 
 

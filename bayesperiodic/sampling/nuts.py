@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.density import SAMPLED, LogPosterior
-from bayesperiodic.posterior.labels import CHAIN, DRAW
+from bayesperiodic.posterior.parameters import CHAIN, DRAW
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.convergence import BLOCK, PASSES, unmet_criteria
 from bayesperiodic.sampling.ensemble import AffineTransform, CallCount

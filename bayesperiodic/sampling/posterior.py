@@ -14,13 +14,28 @@ from bayesperiodic import _checks
 from bayesperiodic._expressions import parse_all
 from bayesperiodic._io import Result
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
-from bayesperiodic.posterior import labels
 from bayesperiodic.posterior.density import LogPosterior
 from bayesperiodic.posterior.description import Description
 from bayesperiodic.posterior.joint_priors import MultivariateNormal
-from bayesperiodic.posterior.labels import CHAIN, CHANNEL, DRAW, EXPERIMENT, NOISE
 from bayesperiodic.posterior.noise import SCALE
-from bayesperiodic.posterior.parameters import SHIFT
+from bayesperiodic.posterior.parameters import (
+    CHAIN,
+    CHANNEL,
+    DRAW,
+    EXPERIMENT,
+    NOISE,
+    SHIFT,
+    checked_key,
+    column,
+    full_name,
+    in_experiment,
+    is_noise,
+    local_hint,
+    local_names,
+    pack,
+    places,
+    squared,
+)
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.checkpoint import fingerprint
 from bayesperiodic.sampling.ensemble import CallCount
@@ -111,7 +126,7 @@ class Posterior(Result):
         ValueError
             For an unknown name.
         """
-        return labels.column(self._group, name).ravel()
+        return column(self._group, name).ravel()
 
     def guesses(self, experiments: Iterable[str], states: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
         """Return the states at the draw with the highest density, as guesses for further solves.
@@ -136,7 +151,7 @@ class Posterior(Result):
     @property
     def _noise(self) -> list[str]:
         """Full names of the noise parameters."""
-        return [n for n, (variable, _) in labels.places(self._group).items() if labels.is_noise(self._group, variable)]
+        return [n for n, (variable, _) in places(self._group).items() if is_noise(self._group, variable)]
 
     def summary(self) -> pd.DataFrame:
         """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, one row per parameter.
@@ -178,12 +193,12 @@ class Posterior(Result):
         """
         group, noise = self._group, self._noise
         if experiment is not None:
-            _checks.one_of("experiment", experiment, group[labels.EXPERIMENT].values.tolist())
-        kept = [name for name in labels.places(group) if name not in noise]
-        named = labels.in_experiment(kept, experiment)
-        note = f"{SAMPLED_ONLY} {labels.local_hint(kept, experiment)}".strip()
+            _checks.one_of("experiment", experiment, group[EXPERIMENT].values.tolist())
+        kept = [name for name in places(group) if name not in noise]
+        named = in_experiment(kept, experiment)
+        note = f"{SAMPLED_ONLY} {local_hint(kept, experiment)}".strip()
         quantities = parse_all("expressions", expressions, named, ["variance", *map(str, group.data_vars)], note)
-        values = {plain: labels.column(group, name) for plain, name in named.items()}
+        values = {plain: column(group, name) for plain, name in named.items()}
         rows = {}
         for name, quantity in quantities.items():
             draws = np.broadcast_to(quantity.value(values), (group.sizes["chain"], group.sizes["draw"]))
@@ -222,7 +237,7 @@ class Posterior(Result):
             If the draws have not converged.
         """
         noise = self._noise
-        key = labels.checked_key(names, [name for name in self.names if name not in noise], noise)
+        key = checked_key(names, [name for name in self.names if name not in noise], noise)
         if not self.converged:
             warnings.warn(
                 f"The draws have not converged ({self.reason}), and the prior is unreliable. Sample longer, see "
@@ -274,7 +289,7 @@ def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, time: dic
     chosen = posterior.isel({d: _spread(posterior.sizes[d], n) for d, n in MOST.items()})
     shape = chosen.sizes[CHAIN], chosen.sizes[DRAW]
     theta, noise = (
-        np.array([labels.column(chosen, name).ravel() for name in names]).reshape(len(names), shape[0] * shape[1]).T
+        np.array([column(chosen, name).ravel() for name in names]).reshape(len(names), shape[0] * shape[1]).T
         for names in (problem.names, problem.noise_names)
     )
     components = problem.likelihood.simulate(noise, np.random.default_rng(seed))
@@ -391,15 +406,15 @@ def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr
     coords = {CHANNEL: list(problem.channels), EXPERIMENT: [e.name for e in problem.experiments]}
     noises = {name.partition("[")[0] for name in problem.noise_names}
     attributes = {v: (_noise_attributes if v in noises else _unit)(problem, v) for v in dims}
-    packed = labels.pack(columns, dims, coords)
+    packed = pack(columns, dims, coords)
     return xr.Dataset({v: (*values, attributes[v]) for v, values in packed.items()}, coords=coords)
 
 
 def _fixed_locals(problem: Description, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
     """Return the values of local parameters in the experiments where they are fixed."""
     return {
-        labels.full_name(plain, (run,)): np.full(shape, parameter_map.fixed[plain])
-        for plain in labels.local_names(problem.names)
+        full_name(plain, (run,)): np.full(shape, parameter_map.fixed[plain])
+        for plain in local_names(problem.names)
         for run, parameter_map in problem.parameter_maps.items()
         if plain in parameter_map.fixed
     }
@@ -421,7 +436,7 @@ def _unit(problem: Description, parameter: str) -> dict[str, str]:
 def _noise_attributes(problem: Description, variable: str) -> dict[str, str]:
     """Return the noise model's name, and the unit of each channel's variance."""
     units = problem.model.units if variable == "variance" else {}
-    each = {f"units of {channel}": labels.squared(units[channel]) for channel in problem.channels if channel in units}
+    each = {f"units of {channel}": squared(units[channel]) for channel in problem.channels if channel in units}
     return {NOISE: problem.noise.name} | each
 
 
