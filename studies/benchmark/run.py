@@ -26,6 +26,7 @@ from studies.benchmark import floor as floors
 from studies.benchmark import problems as made
 from studies.benchmark.equations import NUMPY, FirstOrder
 from studies.benchmark.integration import PREDICTED, SHOOTING, refer
+from studies.benchmark.scipy import add_scipy
 from studies.common import table_of_rows
 from studies.pendulum.orbits import shoot
 from studies.pendulum.recording import FREQUENCY, OMEGA, QUICK_PERIODS, TRUTH, section_of, simulate
@@ -162,11 +163,11 @@ def contest(setting: Any, quick: bool) -> tuple[dict[str, Any], Any]:
     """
     contest = contenders.Contest(refer(setting))
     scheme = contenders.add_own(contest)
-    compiled = contenders.add_compiled(contest)
-    contenders.add_scipy(contest, compiled, quick=quick)
+    contenders.add_compiled(contest)
+    add_scipy(contest, quick=quick)
     if not quick:
-        peers.add_peers(contest, compiled)
-    return contenders.measured(contest, scheme, 3 if quick else 15), compiled.get((SHOOTING, PREDICTED), [])
+        peers.add_peers(contest)
+    return contenders.measured(contest, scheme, 3 if quick else 15), contest.compiled.get((SHOOTING, PREDICTED), [])
 
 
 def measure(seed: int) -> dict[str, Any]:

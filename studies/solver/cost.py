@@ -208,11 +208,7 @@ def with_samples(sizes: tuple[int, ...], repeats: int) -> dict[str, Any]:
             z = equations.solve(theta, equations.static_guess(theta)).z
             newton, iterations = _prepared(equations, theta, z * (1.0 + OFF))
             times.append(_interleaved(repeats, calls=3, newton=newton)["newton"] / iterations)
-        result[scheme] = {
-            "samples": list(sizes),
-            "us": times,
-            "slope": slope(sizes[2:], times[2:]),
-        }
+        result[scheme] = {"samples": list(sizes), "us": times, "slope": slope(sizes[2:], times[2:])}
     return result
 
 

@@ -164,12 +164,7 @@ def measure_periods(values: tuple[float, ...]) -> dict[str, Any]:
             found = {}
             for n in grids:
                 solution = bp.solve_periodic(
-                    bp.models.van_der_pol,
-                    parameters,
-                    frequency=start.frequency,
-                    samples=n,
-                    scheme=scheme,
-                    guess=start,
+                    bp.models.van_der_pol, parameters, frequency=start.frequency, samples=n, scheme=scheme, guess=start
                 )
                 if solution.converged:
                     found[n] = solution
