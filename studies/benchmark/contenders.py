@@ -117,8 +117,9 @@ class Contest:
 
 
 def between(values: Sequence[float]) -> str:
-    """Return the range of values, one per experiment."""
-    return f"{min(values):.4g} … {max(values):.4g}" if values else ""
+    """Return the range of values, one per experiment, as text."""
+    low, high = min(values, default=np.nan), max(values, default=np.nan)
+    return f"{low:.5g}" if low == high else f"{low:.5g} … {high:.5g}"
 
 
 def add_own(contest: Contest) -> str | None:

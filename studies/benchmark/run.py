@@ -26,11 +26,10 @@ from studies.benchmark import floor as floors
 from studies.benchmark import problems as made
 from studies.benchmark.equations import NUMPY, FirstOrder
 from studies.benchmark.integration import PREDICTED, SHOOTING, refer
+from studies.benchmark.problems import Setting
 from studies.benchmark.scipy import add_scipy
-from studies.common import table_of_rows
-from studies.pendulum.orbits import shoot
+from studies.pendulum.orbits import distance, shoot
 from studies.pendulum.recording import FREQUENCY, OMEGA, QUICK_PERIODS, TRUTH, section_of, simulate
-from studies.shooting import TURN
 
 # Results that the guard compares with.
 KEPT = Path("figures/benchmark/results.json")
@@ -48,7 +47,6 @@ def run(options: argparse.Namespace) -> None:
     before = read_kept(KEPT) if options.guard else None
     if options.guard:
         options.quick, options.out = True, KEPT.parent.parent / "quick" / "benchmark"
-
     watch, kept = common.Stopwatch(), options.out / PARTS
     found: dict[str, Any] = {"seed": options.seed, "quick": options.quick, "cores": os.cpu_count()}
     found["load_average"] = [*os.getloadavg()] if hasattr(os, "getloadavg") else None
@@ -70,9 +68,14 @@ def run(options: argparse.Namespace) -> None:
             found["floor"][name] = one["floor"]
             print(targets.floor(name, one["floor"]), flush=True)
     if not options.quick:
-        _rest(found, options, watch)
+        with watch.part("pendulum", "an unstable orbit of the pendulum, by time integration"):
+            found["pendulum"] = measure(options.seed)
+        print(account(found["pendulum"]), flush=True)
+        with watch.part("scaling", "growth of time and memory"):
+            found["scaling"] = scaling.measure(options.seed)
+        print(scaling.account(found["scaling"]), flush=True)
     found["checks"] = targets.rows(found)
-    print("\nTargets\n" + table_of_rows(found["checks"]) + "\n")
+    print("\nTargets\n" + common.table_of_rows(found["checks"]) + "\n")
     with watch.part("figure", "drawing"):
         paths = common.save_figures(options.out, {"benchmark": figures.draw(found)})
     path = common.write_results(options.out, found | {"seconds": watch.total(), "versions": common.versions()})
@@ -82,36 +85,33 @@ def run(options: argparse.Namespace) -> None:
         guard(found, before)
 
 
-def _of_problem(name: str, make: Callable[[], Any], options: argparse.Namespace) -> dict[str, Any]:
-    """Return the results of one problem, and the measurements made on this problem only."""
-    setting = make()
+def _of_problem(name: str, make: Callable[[], Setting], options: argparse.Namespace) -> dict[str, Any]:
+    """Return the results of one problem, and the measurements made on this problem only.
+
+    A quick run omits other packages and SciPy's integrators.
+    """
+    setting, quick = make(), options.quick
     result: dict[str, Any] = {}
     if name.startswith("landing gear"):
-        result["floor"] = floors.measure(
-            setting, 5 if options.quick else 31
-        )  # before other packages start their threads
-    result["contest"], methods = contest(setting, options.quick)
-    if name == made.DUFFING and not options.quick:
+        result["floor"] = floors.measure(setting, 5 if quick else 31)  # before other packages start their threads
+    contest = contenders.Contest(refer(setting))
+    scheme = contenders.add_own(contest)
+    contenders.add_compiled(contest)
+    add_scipy(contest, quick=quick)
+    if not quick:
+        peers.add_peers(contest)
+    result["contest"] = contenders.measured(contest, scheme, 3 if quick else 15)
+    if name == made.DUFFING and not quick:
+        methods = contest.compiled[SHOOTING, PREDICTED]
         result["posterior"] = posteriors.measure(setting, result["contest"], methods, options.seed)
     return result
 
 
 def _source(options: argparse.Namespace, name: str) -> str:
     """Return a key that identifies version and settings of kept parts."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
-    own = [common.sha256(path) for path in files]
+    own = [common.sha256(path) for path in sorted(Path(__file__).parent.glob("*.py"))]
     settings = map(str, (options.seed, options.quick, options.guard))
     return " ".join([common.versions()["bayesperiodic"], name, *settings, *own])
-
-
-def _rest(found: dict[str, Any], options: argparse.Namespace, watch: common.Stopwatch) -> None:
-    """Measure the pendulum's unstable orbit and how time and memory grow."""
-    with watch.part("pendulum", "an unstable orbit of the pendulum, by time integration"):
-        found["pendulum"] = measure(options.seed)
-    print(account(found["pendulum"]), flush=True)
-    with watch.part("scaling", "growth of time and memory"):
-        found["scaling"] = scaling.measure(options.seed)
-    print(scaling.account(found["scaling"]), flush=True)
 
 
 def read_kept(path: Path) -> dict[str, Any]:
@@ -124,50 +124,33 @@ def read_kept(path: Path) -> dict[str, Any]:
 def guard(found: dict[str, Any], before: dict[str, Any]) -> None:
     """Compare ratios, never seconds, with those kept; raise a RuntimeError if any is worse."""
     lines = targets.worse(found, before)
-    print(f"guard: {targets.compared(found, before)} ratios compared, tolerance {targets.TOLERANCE:g}")
+    print(f"guard: {len(targets.pairs(found, before))} ratios compared, tolerance {targets.TOLERANCE:g}")
     if lines:
         raise RuntimeError("ratios are worse than the kept ones:\n" + "\n".join(lines))
 
 
-def problems(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
+def problems(options: argparse.Namespace) -> dict[str, Callable[[], Setting]]:
     """Return the functions that make the problems, by name; a quick run takes the first three.
 
     The guard uses the draws of the full run, because the time of a method depends on them.
     """
     count, seed = (2, options.seed) if options.quick and not options.guard else (5, options.seed)
-    every: dict[str, Callable[[], Any]] = {
+    every: dict[str, Callable[[], Setting]] = {
         made.FORCE: lambda: made.gear("force", count, seed),
         made.DISPLACEMENT: lambda: made.gear("displacement", count, seed),
         made.DUFFING: lambda: made.duffing(count, seed),
-    }
-    if options.quick:
-        return every
-    return every | {
         made.DAMPER: lambda: made.damped(options.data, count, seed),
         made.SILVERBOX: lambda: made.silverbox(None, count, seed),
     }
+    return dict(list(every.items())[: 3 if options.quick else None])
 
 
-def folded(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
+def folded(options: argparse.Namespace) -> dict[str, Callable[[], Setting]]:
     """Return the functions that make the problems with folded recordings and cut harmonics, by name."""
     return {
         made.FORCE + made.FOLDED: lambda: made.gear("force", 5, options.seed, cut=True),
         made.DUFFING + made.FOLDED: lambda: made.duffing(5, options.seed, cut=True),
     }
-
-
-def contest(setting: Any, quick: bool) -> tuple[dict[str, Any], Any]:
-    """Return the times of all methods on one problem, and the methods of shooting from the predicted orbit.
-
-    A quick run omits other packages and SciPy's integrators.
-    """
-    contest = contenders.Contest(refer(setting))
-    scheme = contenders.add_own(contest)
-    contenders.add_compiled(contest)
-    add_scipy(contest, quick=quick)
-    if not quick:
-        peers.add_peers(contest)
-    return contenders.measured(contest, scheme, 3 if quick else 15), contest.compiled.get((SHOOTING, PREDICTED), [])
 
 
 def measure(seed: int) -> dict[str, Any]:
@@ -201,13 +184,9 @@ def distances(start: np.ndarray) -> list[float]:
         function(y, [t * FREQUENCY], p, out)
         return out
 
-    span = PERIOD / FREQUENCY
-    path = solve_ivp(
-        slope, (0.0, ORBITS * span), start, "DOP853", span * np.arange(1, ORBITS + 1), rtol=TOLERANCE, atol=TOLERANCE
-    )
-    angle, rate = path.y - start[:, None]
-    turned = np.abs((angle + np.pi) % TURN - np.pi)
-    return np.maximum(turned, np.abs(rate) / 5.0).tolist()
+    at = PERIOD / FREQUENCY * np.arange(1, ORBITS + 1)
+    path = solve_ivp(slope, (0.0, at[-1]), start, "DOP853", at, rtol=TOLERANCE, atol=TOLERANCE).y
+    return [distance(point[None], start[None]) for point in path.T]
 
 
 def account(found: dict[str, Any]) -> str:
