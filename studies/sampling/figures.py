@@ -8,7 +8,6 @@ from matplotlib.figure import Figure
 
 from studies.sampling import cost as sampling_cost
 from studies.sampling import ridge as sampling_ridge
-from studies.sampling.damper import Sampled
 
 TRUTH, DRAWS, HISTOGRAM = "#000000", "#0072B2", "#56B4E9"
 SAMPLERS: dict[str, dict[str, Any]] = {
@@ -22,7 +21,7 @@ FARTHEST = 4.0
 BAR, NEUTRAL, LIMIT = "#56B4E9", "#BBBBBB", "#D55E00"
 
 
-def draw_ridge(ridge: sampling_ridge.Ridge) -> Figure:
+def draw_ridge(ridge: sampling_ridge.Runs) -> Figure:
     """Draw a and b of the short natural chain and of the default run, over the marginal densities of a."""
     from matplotlib import pyplot as plt
 
@@ -31,17 +30,16 @@ def draw_ridge(ridge: sampling_ridge.Ridge) -> Figure:
     a, density = sampling_ridge.marginal(cut=True)
     inside = (a > 0.0) & (a < FARTHEST)
     truth = sampling_ridge.spread(cut=True)
-    for top, bottom, name, posterior in zip(
-        above, below, ("natural coordinates, short chain", "default coordinates"), (ridge.natural, ridge.default),
-        strict=True,
-    ):  # fmt: skip
+    titles = {"natural": "natural coordinates, short chain", "default": "default coordinates"}
+    for top, bottom, (name, title) in zip(above, below, titles.items(), strict=True):
+        posterior, _ = ridge[name]
         draws = {n: posterior.draws(n) for n in ("a", "b")}
         some = np.linspace(0, draws["a"].size - 1, SHOWN).astype(int)
         curve = np.linspace(1.0 / FARTHEST, FARTHEST, 400)
         top.plot(curve, 1.0 / curve, color="0.6", lw=6.0, alpha=0.5, label="a·b = 1", zorder=1)
         top.plot(draws["a"][some], draws["b"][some], ".", color=DRAWS, ms=2.5, label=f"{SHOWN} of the draws")
         verdict = "converged" if posterior.converged else "NOT converged by the stop rule"
-        top.set_title(f"{name}:\n{verdict}", fontsize=11)
+        top.set_title(f"{title}:\n{verdict}", fontsize=11)
         bins = np.linspace(0.0, FARTHEST, 81)
         bottom.hist(draws["a"], bins, density=True, color=HISTOGRAM, alpha=0.7, label="draws")
         bottom.plot(a[inside], density[inside], color=TRUTH, lw=1.4, label="by quadrature")
@@ -56,14 +54,13 @@ def draw_ridge(ridge: sampling_ridge.Ridge) -> Figure:
     return figure
 
 
-def draw_samplers(sampled: Sampled, found: dict[str, Any]) -> Figure:
+def draw_samplers(sampled: sampling_ridge.Runs, found: dict[str, Any]) -> Figure:
     """Draw the marginals of every parameter by every sampler, one over the other."""
     from matplotlib import pyplot as plt
 
-    posteriors = sampled.posteriors
     figure = plt.figure(figsize=(10.0, 6.2), layout="constrained")
-    for axes, name in zip(figure.subplots(2, 3).flat, next(iter(posteriors.values())).names, strict=False):
-        draws = {sampler: posterior.draws(name) for sampler, posterior in posteriors.items()}
+    for axes, name in zip(figure.subplots(2, 3).flat, found["units"], strict=False):
+        draws = {sampler: posterior.draws(name) for sampler, (posterior, _) in sampled.items()}
         low, high = np.quantile(np.concatenate(list(draws.values())), [0.0005, 0.9995])
         bins = np.linspace(low, high, BINS)
         for sampler, values in draws.items():
@@ -95,14 +92,14 @@ def draw_costs(cost: dict[str, Any], busy: str) -> Figure:
         left.text(0.5, 0.4, "not measured", ha="center", va="center", transform=left.transAxes)
         left.set(xticks=[], ylim=(0.0, 8.0))
     else:
-        ratios = {f"one {name}\nworker": entry for name, entry in pools["ratios"].items()}
-        values = 1e2 * (np.array([[e["median"], *e["quartiles"]] for e in ratios.values()]) - 1.0)
-        _draw_bars(left, list(ratios), values, [NEUTRAL if busy else BAR] * len(ratios))
+        values = 1e2 * (np.array([[e["median"], *e["quartiles"]] for e in pools["ratios"].values()]) - 1.0)
+        names = [f"one {name}\nworker" for name in pools["ratios"]]
+        _draw_bars(left, names, values, [NEUTRAL if busy else BAR] * len(names))
         left.axhline(0.0, color="black", lw=0.8)
         left.set_ylim(min(-1.0, 1.2 * values.min()), max(8.0, 1.5 * values.max()))
     _draw_limit(left, 1e2 * (sampling_cost.POOL_LIMIT - 1.0), "limit: at most {:g} %")
-    left.set_ylabel("wall time beyond that of one thread [%]")
-    left.set_title(f"A pool of one worker, log-posteriors of {1e3 * sampling_cost.LOG_POSTERIOR:g} ms")
+    title = f"A pool of one worker, log-posteriors of {1e3 * sampling_cost.LOG_POSTERIOR:g} ms"
+    left.set(ylabel="wall time beyond that of one thread [%]", title=title)
     drives = {f"landing gear,\n{drive}-driven": gains[drive] for drive in ("force", "displacement")}
     colours = [NEUTRAL if busy or e["plain"] < sampling_cost.LEAST_GAIN else BAR for e in drives.values()]
     values = np.array([[e["ratio"], *e["ratio_quartiles"]] for e in drives.values()])
@@ -111,27 +108,18 @@ def draw_costs(cost: dict[str, Any], busy: str) -> Figure:
         right.text(at, 0.05, f"call × {entry['gain']:.2f}\nloop × {entry['plain']:.2f}", ha="center", va="bottom")
     right.set_ylim(0.0, max(1.35, 1.3 * values.max()))
     _draw_limit(right, sampling_cost.GAIN_LIMIT, "limit: at least {:g}")
-    right.set_ylabel("gain of the call / gain of a plain loop [1]")
-    right.set_title(
-        f"{gains['cores']} cores on a call of {gains['walkers']} walkers × {gains['experiments']} experiments"
-    )
+    title = f"{gains['cores']} cores on a call of {gains['walkers']} walkers × {gains['experiments']} experiments"
+    right.set(ylabel="gain of the call / gain of a plain loop [1]", title=title)
     figure.suptitle("Cost of sampling" + (f": {busy}" if busy else ""), fontsize=11)
     return figure
 
 
 def _draw_bars(axes: Axes, names: list[str], values: np.ndarray, colours: list[str]) -> None:
     """Draw medians and quartiles, (bars, 3)."""
-    at = np.arange(len(names))
+    at, ranges = np.arange(len(names)), np.abs(values[:, 1:] - values[:, :1]).T
     axes.bar(at, values[:, 0], width=0.5, color=colours, edgecolor="black")
-    axes.errorbar(
-        at,
-        values[:, 0],
-        np.abs(values[:, 1:] - values[:, :1]).T,
-        fmt="none",
-        ecolor="black",
-        capsize=5,
-        label="quartiles of the repeats",
-    )
+    label = "quartiles of the repeats"
+    axes.errorbar(at, values[:, 0], ranges, fmt="none", ecolor="black", capsize=5, label=label)
     axes.set_xticks(at, names)
     axes.set_xlim(-0.6, len(names) - 0.4)
 

@@ -25,10 +25,10 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("ridge", "the ridge a·b = 1, with known spread"):
         ridge = sampling_ridge.sample_ridge(options.seed, options.quick)
     with watch.part("damper", "the damper by three samplers"):
-        sampled = damper.sample_damper(options)
+        sampled, data = damper.sample_damper(options)
     found: dict[str, Any] = {
         "ridge": sampling_ridge.collect(ridge),
-        "damper": damper.collect(sampled),
+        "damper": damper.collect(sampled, data),
         "cost": cost | {"note": busy},
     }
     found["checks"] = [
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
     print("\n" + tables(found) + "\n")
     results = {"seed": options.seed, "quick": options.quick} | found
     path = common.write_results(options.out, results | {"seconds": watch.total(), "versions": common.versions()})
-    what = " (synthetic data)" if sampled.data["synthetic"] else ""
+    what = " (synthetic data)" if data["synthetic"] else ""
     print(f"figures{what}: {', '.join(map(str, paths))}\nresults: {path}")
 
 
