@@ -16,7 +16,7 @@ import bayesperiodic as bp
 from studies.benchmark.equations import table
 from studies.benchmark.kernels import Integrators, integrators, misfit
 from studies.damper import run as damper
-from studies.gear import FINE, GEAR, SAMPLES, folded, gear_at_rest, gear_problem, measured
+from studies.gear import FINE, GEAR, SAMPLES, gear_at_rest, gear_problem, measured
 from studies.silverbox import data as silverbox_data
 
 FORCE, DISPLACEMENT, DUFFING, DAMPER, SILVERBOX = (
@@ -237,11 +237,8 @@ def duffing(count: int, seed: int, *, cut: bool = False) -> Setting:
     samples = SAMPLES if cut else DUFFING_SAMPLES
     wave, model = np.cos(2 * np.pi * np.arange(samples) / samples), bp.models.duffing
     runs = [(frequency, {"force": amplitude * wave}) for frequency, amplitude in DUFFING_RUNS]
-    if cut:
-        harmonics = dict.fromkeys(("force", "displacement"), DUFFING_HARMONICS)
-        experiments = folded(model, DUFFING_TRUTH, runs, harmonics, samples, seed)
-    else:
-        experiments = measured(model, DUFFING_TRUTH, runs, samples, seed)
+    harmonics = dict.fromkeys(("force", "displacement"), DUFFING_HARMONICS) if cut else None
+    experiments = measured(model, DUFFING_TRUTH, runs, samples, seed, harmonics=harmonics)
     priors = {name: bp.LogNormal(DUFFING_TRUTH[name], 0.5) for name in ("c", "k", "k3")}
     problem = bp.Problem(model, experiments, priors=priors, fixed={"m": 1.0}, scheme=FINE)
     guess = {name: DUFFING_TRUTH[name] for name in priors}
