@@ -32,20 +32,18 @@ def draw(found: Mapping[str, Any]) -> Figure:
 
 
 def _contenders(ax: Axes, problems: Mapping[str, Any]) -> None:
-    names = list(dict.fromkeys(
-        e["name"] for one in problems.values() for e in one["rows"] if e["ratio"]
-    ))  # fmt: skip
-    for marker, (problem, found) in zip(MARKERS, problems.items(), strict=False):
-        entries = [e for e in found["rows"] if e["ratio"]]
+    timed = {problem: [e for e in found["rows"] if e["ratio"]] for problem, found in problems.items()}
+    names = list(dict.fromkeys(e["name"] for entries in timed.values() for e in entries))
+    for marker, (problem, entries) in zip(MARKERS, timed.items(), strict=False):
         if not entries:
             continue
         y = [names.index(e["name"]) for e in entries]
         x = np.array([[e["ratio"][key] for key in ("median", "least", "largest")] for e in entries]).T
-        kind = " (synthetic)" if found["synthetic"] else ""
+        kind = " (synthetic)" if problems[problem]["synthetic"] else ""
         ax.errorbar(x[0], y, xerr=[x[0] - x[1], x[2] - x[0]], fmt=marker, markersize=5, label=f"{problem}{kind}")
     ax.axvline(1.0, color="0.6", linewidth=1.0, zorder=0)
-    ax.set(xscale="log", xlabel="time / one warm log-posterior of this package [1]", yticks=range(len(names)))
-    ax.set_yticklabels(names, fontsize=8)
+    ax.set(xscale="log", xlabel="time / one warm log-posterior of this package [1]")
+    ax.set_yticks(range(len(names)), names, fontsize=8)
     ax.invert_yaxis()
     ax.grid(axis="x", alpha=0.3)
     ax.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=2)

@@ -125,16 +125,9 @@ def collect(ridge: Runs) -> dict[str, Any]:
     """Return the entries of results.json on the ridge."""
     table: dict[str, Any] = {"width": WIDTH, "sd_by_quadrature": {"cut": spread(cut=True), "uncut": spread(cut=False)}}
     for name, (posterior, seconds) in ridge.items():
-        table[name] = {
-            "sd": float(posterior.draws("a").std()),
-            "converged": posterior.converged,
-            "reason": posterior.reason,
-            "tau": posterior.tau,
-            "ess": posterior.ess,
-            "rhat": posterior.rhat,
-            "log_posteriors": posterior.log_posterior_calls,
-            "seconds": seconds,
-        }
+        judged = {key: getattr(posterior, key) for key in ("converged", "reason", "tau", "ess", "rhat")}
+        cost = {"log_posteriors": posterior.log_posterior_calls, "seconds": seconds}
+        table[name] = {"sd": float(posterior.draws("a").std())} | judged | cost
         if name in UNCUT:
             table[name]["negative_mass"] = _negative_share(posterior)
     return table
