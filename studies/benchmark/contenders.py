@@ -9,27 +9,14 @@ from typing import Any
 import numpy as np
 
 import bayesperiodic as bp
+from studies.benchmark import integration
 from studies.benchmark.floor import WALKERS, call, gradients, walk
-from studies.benchmark.integration import (
-    ALLOWED,
-    EQUILIBRIUM,
-    ESTIMATE,
-    PREDICTED,
-    SHOOTING,
-    STARTS,
-    STEADY,
-    TIMED_CYCLES,
-    TOLERANCES,
-    Method,
-    Reference,
-)
+from studies.benchmark.integration import EQUILIBRIUM, ESTIMATE, PREDICTED, SHOOTING, STEADY, Method, Reference
 from studies.benchmark.kernels import MAX_CYCLES
 from studies.benchmark.problems import SCHEMES, Setting
 from studies.timing import Action, gradient_error, interleaved, ratio, spread
 
-OWN_WARM, OWN_CALL, OWN_BATCHED, OWN_COLD = (
-    "this package, warm", "this package, warm, all cores", "this package, batched, all cores", "this package, cold",
-)  # fmt: skip
+OWN_WARM = "this package, warm"
 GRADIENT, OWN_GRADIENT = "shooting, value and gradient", "this package, value and gradient"
 SLOW_REPEATS, SLOW_DRAWS = 3, 2
 NEVER = f"not steady within {MAX_CYCLES} cycles, not converged, or not accurate enough with any setting"
@@ -56,7 +43,7 @@ class Contest:
 
         `note`: Its settings, or why it is not timed. `off`: Error of its gradient, relative to the largest component.
         """
-        if action is not None and error > ALLOWED:
+        if action is not None and error > integration.ALLOWED:
             action, note = None, f"{note}{'; ' if note else ''}not accurate enough"
         if action is not None:
             self.actions[name] = action
@@ -72,7 +59,7 @@ class Contest:
     def add_until_steady(self, name: str, methods: Sequence[Any], error: float, label: str) -> None:
         """Add an integrator of another package, its cycles counted by the compiled method."""
         note = f"{label} {between([m.setting for m in methods])}"
-        note += f"; {TIMED_CYCLES} cycles timed, scaled to the number needed"
+        note += f"; {integration.TIMED_CYCLES} cycles timed, scaled to the number needed"
         for start in (EQUILIBRIUM, ESTIMATE):
             action = Action(partial(self._seconds, methods, start), 1, 1)
             found = methods if (STEADY, start) in self.compiled else ()
@@ -129,13 +116,13 @@ def add_own(contest: Contest) -> str | None:
     for scheme in SCHEMES:
         warm = setting.schemed(scheme)
         error = contest.reference.error(warm.log_posterior(theta, noise))
-        best = best or (scheme if error <= ALLOWED else None)
+        best = best or (scheme if error <= integration.ALLOWED else None)
         many = np.resize(theta, (WALKERS, theta.shape[1]))
         for name, action in (
             (OWN_WARM, Action(partial(walk, warm, theta, noise), len(theta))),
-            (OWN_CALL, Action(partial(call, warm, theta, noise), len(theta))),
-            (OWN_BATCHED, Action(partial(warm.log_posterior, many, noise), WALKERS)),
-            (OWN_COLD, Action(partial(_cold, setting, scheme), 1, SLOW_REPEATS)),
+            (f"{OWN_WARM}, all cores", Action(partial(call, warm, theta, noise), len(theta))),
+            ("this package, batched, all cores", Action(partial(warm.log_posterior, many, noise), WALKERS)),
+            ("this package, cold", Action(partial(_cold, setting, scheme), 1, SLOW_REPEATS)),
         ):
             contest.add(f"{name}, {scheme}", error, action)
         gradient = Action(partial(gradients, warm, theta[:SLOW_DRAWS], noise), SLOW_DRAWS)
@@ -159,8 +146,8 @@ def _cold(setting: Setting, scheme: str) -> None:
 def add_compiled(contest: Contest) -> None:
     """Add the compiled Runge-Kutta method until steady and shooting on it, each from every start."""
     reference = contest.reference
-    for kind, start in product((STEADY, SHOOTING), STARTS):
-        methods, error = reference.tuned(partial(Method, kind=kind, start=start), TOLERANCES)
+    for kind, start in product((STEADY, SHOOTING), integration.STARTS):
+        methods, error = reference.tuned(partial(Method, kind=kind, start=start), integration.TOLERANCES)
         steps = between([method.discretised.steps for method in methods])
         cycles = between([method.cycles(p) for method, p in zip(methods, reference.parameters, strict=False)])
         label = f"{steps} steps per cycle, {cycles} cycles, tolerance"
@@ -196,7 +183,7 @@ def measured(contest: Contest, scheme: str | None, repeats: int) -> dict[str, An
         "experiments": len(contest.setting.cases),
         "samples": contest.setting.cases[0].experiment.samples,
         "draws": len(contest.setting.theta),
-        "allowed": ALLOWED,
+        "allowed": integration.ALLOWED,
         "reference_uncertainty": contest.reference.uncertainty,
         "scheme": scheme,
         "rows": rows,

@@ -20,7 +20,7 @@ from sympy.printing.pycode import PythonCodePrinter
 
 import bayesperiodic as bp
 
-# What evaluates the text: printer and module that it refers to.
+# Evaluators of the text: SymPy's printer and the module that the text refers to.
 NUMBA, NUMPY, JAX = (PythonCodePrinter, "math"), (NumPyPrinter, "numpy"), (JaxPrinter, "jax")
 
 

@@ -58,7 +58,7 @@ class Discretised:
 
     @cached_property
     def anchor(self) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """At the estimate: y(0), (I − Φ)⁻¹ and dy(0)/dp; None where shooting does not converge."""
+        """y(0), (I − Φ)⁻¹ and dy(0)/dp at the estimate; None if shooting does not converge."""
         if not any(self._newton(self.case.estimate, self.case.first, tolerance) for tolerance in (TIGHT, LOOSE)):
             return None
         last, size = self._buffers[2][-1], self.case.start.size
@@ -72,7 +72,7 @@ class Discretised:
         )
 
     def start(self, p: np.ndarray, kind: str) -> np.ndarray:
-        """Return y(0) to begin with."""
+        """Return the start y(0)."""
         if kind == EQUILIBRIUM:
             return self.case.start.copy()
         assert self.anchor is not None
@@ -81,7 +81,7 @@ class Discretised:
 
     @cached_property
     def columns(self) -> list[int]:
-        """Where the moving parameters are in p."""
+        """Indices of the moving parameters in p."""
         return [list(self.case.model.parameters).index(name) for name in self.case.moving]
 
     def settle(self, p: np.ndarray, kind: str, tolerance: float) -> int:
@@ -92,7 +92,7 @@ class Discretised:
         )
 
     def shoot(self, p: np.ndarray, kind: str, tolerance: float) -> int:
-        """Shoot, with the matrix of the estimate but from equilibrium; return the number of sweeps, 0 for failure."""
+        """Shoot, from an orbit with the matrix of the estimate; return the number of sweeps, 0 for failure."""
         case = self.case
         if kind == EQUILIBRIUM:
             return self._newton(p, case.start, tolerance)
@@ -166,7 +166,7 @@ class Method:
 class Peer:
     """A method of another package on one experiment."""
 
-    discretised: Discretised  # Where starts come from
+    discretised: Discretised  # Source of the starts
     setting: Any  # Tolerance or number of harmonics
 
     @property
@@ -184,7 +184,7 @@ class Peer:
         raise NotImplementedError
 
     def seconds(self, p: np.ndarray, start: str, count: float) -> float:
-        """Return the seconds until steady: those of a few cycles, times as many as it takes."""
+        """Return the seconds until steady, scaled from a few cycles to the number needed."""
         run = self.prepared(p, self.discretised.start(p, start))
         before = time.perf_counter()
         run()
@@ -232,9 +232,9 @@ class Reference:
     """Reference of all methods."""
 
     setting: Setting
-    parameters: list[np.ndarray]  # (draws, parameters + 1): One an experiment
-    exact: list[np.ndarray]  # (draws,): Log-likelihoods, one per experiment
-    uncertainty: float  # By how much steps twice as long would change a log-posterior
+    parameters: list[np.ndarray]  # (draws, parameters + 1), one per experiment
+    exact: list[np.ndarray]  # Log-likelihoods (draws,), one per experiment
+    uncertainty: float  # Change of a log-posterior with steps twice as long
 
     @property
     def each(self) -> float:
@@ -243,7 +243,7 @@ class Reference:
 
     @cached_property
     def log_priors(self) -> np.ndarray:
-        """At the draws."""
+        """Log-priors at the draws."""
         return np.array([self.setting.log_prior(theta) for theta in self.setting.theta])
 
     @cached_property

@@ -67,7 +67,7 @@ def _add_diffrax(contest: Contest) -> None:
 
 @dataclass(frozen=True)
 class Balanced(Peer):
-    """One experiment of the Duffing oscillator by so many harmonics, from the orbit at the estimate."""
+    """Harmonic balance of one experiment of the Duffing oscillator, from the orbit at the estimate."""
 
     @cached_property
     def _force(self) -> Any:
@@ -98,7 +98,7 @@ class Balanced(Peer):
             speed = sign * x.dt()
             return m * (sign * speed.dt()) + c * speed + k * x + k3 * x**3 - self._force
 
-        with contextlib.redirect_stdout(io.StringIO()):  # It prints its time.
+        with contextlib.redirect_stdout(io.StringIO()):  # The solver prints its time.
             found, account = fouriersolve(residual, self._start)
         if not account.success:
             return np.nan

@@ -38,8 +38,8 @@ Density = Callable[[np.ndarray], float]
 def measure(setting: Setting, contest: Mapping[str, Any], methods: Sequence[Method], seed: int) -> dict[str, Any]:
     """Return the samplers, and emcee with every timed method.
 
-    `setting`: With one channel, all harmonics, and positive parameters that are the model's own. `contest`: What
-    `contenders.measured` returned. `methods`: Those of the fastest method, one per experiment.
+    `setting`: Has one channel, all harmonics, and positive parameters that are the model's own. `contest`: Result of
+    `contenders.measured`. `methods`: Those of the fastest method, one per experiment.
     """
     walked = _emcee(setting, methods, seed)
     found = {name: _own(setting, seed, options) for name, options in OWN.items()}

@@ -52,7 +52,7 @@ class Case:
 
     @property
     def period(self) -> float:
-        """Of the orbit [s]."""
+        """Period of the orbit [s]."""
         return self.experiment.periods / self.experiment.frequency
 
     @property
@@ -61,7 +61,7 @@ class Case:
         return integrators(self.model, self.moving)
 
     def table(self, points: int) -> np.ndarray:
-        """Return the inputs at so many points of a period."""
+        """Return the inputs at equidistant points of a period."""
         return table(self.experiment, self.model.inputs, points)
 
     @cached_property
@@ -96,12 +96,12 @@ class Case:
 
     @cached_property
     def weights(self) -> np.ndarray:
-        """Of the squared residuals: independent values per sample, over the variance, halved."""
+        """Weights of the squared residuals: half the independent values per sample over the variance."""
         return 0.5 * self._counts / (self.experiment.samples * self.variances)
 
     @cached_property
     def spectral_weights(self) -> np.ndarray:
-        """Of the squared Fourier sums of the residuals (samples // 2 + 1, channels), zero beyond the harmonics kept."""
+        """Weights of the squared Fourier sums of the residuals (samples // 2 + 1, channels), zero beyond those kept."""
         samples = self.experiment.samples
         twice = 2.0 * self._kept
         twice[[0, -1] if samples % 2 == 0 else [0]] /= 2.0
@@ -109,11 +109,11 @@ class Case:
 
     @cached_property
     def constant(self) -> float:
-        """What does not depend on the outputs."""
+        """Part of the log-likelihood that is independent of the outputs."""
         return -0.5 * float(self._counts @ np.log(self.variances))
 
     def log_likelihood(self, outputs: np.ndarray) -> float:
-        """Return eq. (6)'s part of this experiment, from outputs (samples, channels)."""
+        """Return the log-likelihood of this experiment, eq. (6), from outputs (samples, channels)."""
         if self._whole:
             return self.constant - misfit(self.data, outputs, self.weights)
         return self.constant - float(self.weights @ (self._residuals(outputs) ** 2).sum(axis=0))

@@ -90,10 +90,10 @@ def pool_overhead(repeats: int = 3, pools: tuple[str, ...] = POOLS, seconds: flo
     processes takes seconds whatever the length of a run. A piece, which is what a message carries, is 4 walkers × 25
     steps, an eighth of what the default walkers make it, so that the overhead of a default run is smaller.
 
-    `repeats`: Of each pool, 20 s each. `pools`: "process", "dask"; the latter is left out where it is not installed.
-    `seconds`: What a log-posterior shall take. "ratios": Of wall times to those of the thread, and of the processor
-    times of this process and the worker together, which other load changes little. "milliseconds": Of a log-posterior
-    in the thread.
+    `repeats`: Of each pool, 20 s each. `pools`: "process", "dask"; the latter is omitted if it is not installed.
+    `seconds`: Duration of a log-posterior. The result has the ratios of wall times to those of the thread, those of the
+    processor times of this process and the worker together, which other load changes little, and the milliseconds of a
+    log-posterior in the thread.
     """
     kinds = [name for name in pools if name != "dask" or importlib.util.find_spec("distributed")]
     core, *others = sorted(os.sched_getaffinity(0))
@@ -186,12 +186,9 @@ def _only_on(cores: set[int]) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class SlowPrior(bp.Normal):
-    """A normal prior that takes a plain loop of so many turns for every value: as slow as a large model.
+    """A normal prior that is as slow as a large model, while everything else in a run is quick."""
 
-    With a model that is quick to solve, nothing else takes time in a run, before the walk or after it.
-    """
-
-    turns: int
+    turns: int  # Of a plain loop for every value
 
     def log_prob(self, x: Any) -> Any:
         """Return the log-density, after the loop."""
@@ -200,7 +197,7 @@ class SlowPrior(bp.Normal):
 
 
 def slow_problem(seconds: float) -> tuple[bp.Problem, bp.MapEstimate]:
-    """Return a problem of the Duffing oscillator of which a log-posterior takes so many seconds on one core."""
+    """Return a problem of the Duffing oscillator whose log-posterior takes a given time on one core."""
     plain_loop(10)
     turn = min(timed(partial(plain_loop, TURNS), time.thread_time)[1] for _ in range(10)) / TURNS
     values, samples = {"m": 1.0, "c": 0.5, "k": 1.0, "k3": 0.1}, 40

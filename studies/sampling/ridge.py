@@ -136,7 +136,7 @@ def collect(ridge: Runs) -> dict[str, Any]:
 def _negative_share(posterior: bp.Posterior) -> dict[str, float]:
     """Return the fraction of draws on the second branch and its Monte Carlo error.
 
-    Where all draws have the same sign, the error is the one that so many independent draws would have.
+    If all draws have the same sign, the error is that of as many independent draws as the effective sample size.
     """
     negative, truth = (posterior.draws("a") < 0.0).astype(float), negative_mass()
     error = standard_error(posterior, negative)

@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> None:
         route, results["pendulum"] = follow_pendulum(quick)
     with watch.part("orbits", f"unstable orbits of periods 3 and 5 at {CHAOTIC:g} rad/s"):
         results["orbits"] = measure_orbits(ORBITS[1::4] if quick else ORBITS)
-    with watch.part("cost", "what a solve costs, side by side with LAPACK"):
+    with watch.part("cost", "time of a solve, compared with LAPACK"):
         results["cost"] = cost.run_cost(quick)
     with watch.part("time_integration", "the pendulum integrated in time, for the figure"):
         attractor = integrate_down(INTEGRATED[2:3] if quick else INTEGRATED)
