@@ -9,10 +9,9 @@ from typing import Any
 from studies.benchmark.contenders import GRADIENT, OWN_GRADIENT
 from studies.benchmark.floor import ALL_FREE
 from studies.benchmark.integration import EQUILIBRIUM, ESTIMATE, STEADY
-from studies.benchmark.peers import BALANCE, DIFFRAX_ROWS
+from studies.benchmark.peers import BALANCE, BVP, DIFFRAX_ROWS, INITIAL
 from studies.benchmark.posteriors import NUMPYRO
 from studies.benchmark.problems import DISPLACEMENT, DUFFING, FOLDED, FORCE
-from studies.benchmark.scipy import BVP, INITIAL
 from studies.common import Row, row
 
 

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
 from studies.__main__ import main
-from studies.benchmark import contenders, figures, peers, posteriors, problems, scaling, targets
+from studies.benchmark import contenders, peers, posteriors, problems, scaling, targets
 from studies.benchmark import floor as benchmark_floor
 from studies.benchmark import run as benchmark
 from studies.benchmark.equations import NUMPY, FirstOrder, table
@@ -26,7 +26,6 @@ from studies.benchmark.integration import (
 )
 from studies.benchmark.kernels import dense, eliminate, signals
 from studies.benchmark.problems import DUFFING_TRUTH, Setting, draws
-from studies.benchmark.scipy import add_scipy
 from studies.damper import run as damper
 from studies.gear import measured
 from studies.timing import Action, interleaved, ratio, slope
@@ -165,7 +164,7 @@ def test_every_contender_is_accurate_before_it_is_timed(setting):
     contest = contenders.Contest(reference)
     scheme = contenders.add_own(contest)
     contenders.add_compiled(contest)
-    add_scipy(contest)
+    peers.add_scipy(contest)
     contest.add("wrong", 0.02, Action(lambda: pytest.fail("timed")))
     found = contenders.measured(contest, scheme, 2)
     rows = {row["name"]: row for row in found["rows"]}
@@ -344,4 +343,4 @@ def test_posterior_and_scaling_are_reported_with_verdicts():
     assert [row["met"] for row in targets.rows(found)] == [False, True, None, True, False, *4 * [True], False]
     assert "jax is not installed" in targets.posterior(posterior)
     assert "600 MB" in scaling.account(found["scaling"])
-    assert len(figures.draw(found).axes) == 1
+    assert len(benchmark.draw(found).axes) == 1
