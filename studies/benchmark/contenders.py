@@ -43,18 +43,20 @@ class Contest:
 
         `note`: Its settings, or why it is not timed. `off`: Error of its gradient, relative to the largest component.
         """
-        if action is not None and error > integration.ALLOWED:
+        finite = error if np.isfinite(error) else None
+        if action is not None and finite is None:
+            action, note = None, NEVER
+        elif action is not None and error > integration.ALLOWED:
             action, note = None, f"{note}{'; ' if note else ''}not accurate enough"
         if action is not None:
             self.actions[name] = action
-        finite = error if np.isfinite(error) else None
         self.rows.append({"name": name, "error": finite, "note": note, "gradient_error": off})
 
     def add_methods(self, name: str, methods: Sequence[Any], error: float, label: str, *, slow: bool = True) -> None:
         """Add a method with its settings, one per experiment; a slow one is timed at two draws and three times only."""
         count, repeats = (SLOW_DRAWS, SLOW_REPEATS) if slow else (len(self.setting.theta), 10_000)
         action = Action(partial(self.integrate, methods, count), count, repeats)
-        self._add_accurate(name, methods, error, action, f"{label} {between([m.setting for m in methods])}")
+        self.add(name, error, action, f"{label} {between([m.setting for m in methods])}")
 
     def add_until_steady(self, name: str, methods: Sequence[Any], error: float, label: str) -> None:
         """Add an integrator of another package, its cycles counted by the compiled method."""
@@ -62,14 +64,7 @@ class Contest:
         note += f"; {integration.TIMED_CYCLES} cycles timed, scaled to the number needed"
         for start in (EQUILIBRIUM, ESTIMATE):
             action = Action(partial(self._seconds, methods, start), 1, 1)
-            found = methods if (STEADY, start) in self.compiled else ()
-            self._add_accurate(f"{name} {start}", found, error, action, note)
-
-    def _add_accurate(self, name: str, methods: Sequence[Any], error: float, action: Action, note: str) -> None:
-        if methods:
-            self.add(name, error, action, note)
-        else:
-            self.add(name, note=NEVER)
+            self.add(f"{name} {start}", error if (STEADY, start) in self.compiled else np.inf, action, note)
 
     def integrate(self, methods: Sequence[Callable[[np.ndarray], float]], count: int) -> None:
         """Compute the log-posteriors of the first `count` draws."""
