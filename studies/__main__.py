@@ -3,7 +3,6 @@
 import argparse
 import ast
 import importlib
-import pkgutil
 import sys
 from pathlib import Path
 
@@ -36,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--scaling", action="store_true", help="calibration: measure what two workers gain, only that")
     parser.add_argument("--guard", action="store_true", help="benchmark: a quick run's ratios against those kept")
     options = parser.parse_args(arguments)
-    known = _studies()
+    known = {path.parent.name.replace("_", "-"): path for path in Path(studies.__path__[0]).glob("*/run.py")}
     if options.name is None:
         for name in sorted(known):
             print(f"{name:12s} {_first_line(known[name])}")
@@ -46,28 +45,19 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     matplotlib.use("Agg")
     matplotlib.rcParams["savefig.format"] = options.format
-    options.out = options.out or Path("figures", *(["quick"] if options.quick else []), known[options.name])
+    package = known[options.name].parent.name
+    options.out = options.out or Path("figures", *(["quick"] if options.quick else []), package)
     try:
-        importlib.import_module(f"studies.{known[options.name]}.run").run(options)
+        importlib.import_module(f"studies.{package}.run").run(options)
     except (ValueError, RuntimeError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def _studies() -> dict[str, str]:
-    """Return the package of every study, by the study's name."""
-    packages = [m.name for m in pkgutil.iter_modules(studies.__path__) if m.ispkg]
-    return {package.replace("_", "-"): package for package in packages if _main_file(package).is_file()}
-
-
-def _main_file(package: str) -> Path:
-    return Path(studies.__path__[0], package, "run.py")
-
-
-def _first_line(package: str) -> str:
+def _first_line(main_file: Path) -> str:
     """Return the first line of a study's docstring without importing it, which would load the compiler."""
-    return (ast.get_docstring(ast.parse(_main_file(package).read_text(encoding="utf-8"))) or "").splitlines()[0]
+    return (ast.get_docstring(ast.parse(main_file.read_text(encoding="utf-8"))) or "").splitlines()[0]
 
 
 if __name__ == "__main__":

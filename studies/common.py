@@ -63,14 +63,12 @@ def table_of_rows(rows: list[Row]) -> str:
 
 
 Task = tuple[Any, ...]
-Line = dict[str, Any]
-Part = TypeVar("Part")
 Value = TypeVar("Value")
 
 
 def resumed(
-    path: Path, tasks: Sequence[Task], work: Callable[[Task], Line], task_of: Callable[[Line], Task], source: str
-) -> list[Line]:
+    path: Path, tasks: Sequence[Task], work: Callable[[Task], Row], task_of: Callable[[Row], Task], source: str
+) -> list[Row]:
     """Compute the tasks missing from a file on all cores, and return the lines of all tasks in order.
 
     The file has one JSON line per task; lines of another source are ignored. `work` returns a task's line, with
@@ -80,11 +78,11 @@ def resumed(
         return _parallel.checkpointed_tasks(path, tasks, _do_task, task_of, source, shared=work, executor=pool)
 
 
-def _do_task(work: Callable[[Task], Line], task: Task) -> Line:
+def _do_task(work: Callable[[Task], Row], task: Task) -> Row:
     return work(task)
 
 
-def remembered(path: Path, source: str, make: Callable[[], Part]) -> Part:
+def remembered(path: Path, source: str, make: Callable[[], Value]) -> Value:
     """Return a part of a study from the file of an earlier run with the same `source`, or compute and store it."""
     if path.is_file():
         saved, part = pickle.loads(path.read_bytes())

@@ -28,32 +28,23 @@ FINE = "central4"
 
 
 def measured(
-    model: Any, truth: Mapping[str, float], runs: Any, samples: int, seed: int, scheme: str = FINE
-) -> list[bp.Experiment]:
-    """Return synthetic experiments with independent noise of 0.3 % of the range, a run being (frequency, inputs)."""
-    generator, found = np.random.default_rng(seed), []
-    for frequency, inputs in runs:
-        solved = bp.solve_periodic(model, truth, inputs, frequency=frequency, samples=samples, scheme=scheme)
-        noisy = {c: y + NOISE * np.ptp(y) * generator.standard_normal(samples) for c, y in solved.outputs.items()}
-        found.append(
-            bp.Experiment(f"{frequency} Hz", frequency, noisy, inputs, samples=samples, synthetic=True)
-        )  # fmt: skip
-    return found
+    model: bp.Model, truth: Mapping[str, float], runs: Any, samples: int, seed: int, scheme: str = FINE,
+    harmonics: Mapping[str, int] | None = None,
+) -> list[bp.Experiment]:  # fmt: skip
+    """Return synthetic experiments with independent noise of 0.3 % of the range, a run being (frequency, inputs).
 
-
-def folded(
-    model: bp.Model, truth: Mapping[str, float], runs: Any, harmonics: Mapping[str, int], samples: int, seed: int
-) -> list[bp.Experiment]:
-    """Return synthetic recordings folded into `samples` points with harmonics cut, a run being (frequency, inputs).
-
-    Each has 20 cycles at 353.275 samples per cycle, interpolated in the periodic solution, with independent noise of
-    0.3 % of the range on outputs and of 0.02 % on inputs.
+    With `harmonics` by channel they are recordings folded into `samples` points: 20 cycles at 353.275 samples per
+    cycle, interpolated in the periodic solution, with noise of 0.02 % on inputs too.
     """
     generator, found = np.random.default_rng(seed), []
     cycle = np.arange(round(CYCLES * SAMPLES_PER_CYCLE)) / SAMPLES_PER_CYCLE
     for frequency, inputs in runs:
-        points = len(next(iter(inputs.values())))
-        solved = bp.solve_periodic(model, truth, inputs, frequency=frequency, samples=points, scheme="central4")
+        points, name = len(next(iter(inputs.values()))), f"{frequency} Hz"
+        solved = bp.solve_periodic(model, truth, inputs, frequency=frequency, samples=points, scheme=scheme)
+        if harmonics is None:
+            noisy = {c: y + NOISE * np.ptp(y) * generator.standard_normal(samples) for c, y in solved.outputs.items()}
+            found.append(bp.Experiment(name, frequency, noisy, inputs, samples=samples, synthetic=True))
+            continue
         noise = dict.fromkeys(inputs, INPUT_NOISE) | dict.fromkeys(solved.outputs, NOISE)
         signals = {
             name: CubicSpline(np.arange(points + 1) / points, np.append(values, values[0]), bc_type="periodic")(cycle)
@@ -61,7 +52,7 @@ def folded(
             for name, values in {**inputs, **solved.outputs}.items()
         }
         outputs, given = ({name: signals[name] for name in names} for names in (solved.outputs, inputs))
-        recording = bp.Recording(cycle / frequency, outputs, given, name=f"{frequency} Hz", synthetic=True)
+        recording = bp.Recording(cycle / frequency, outputs, given, name=name, synthetic=True)
         found.append(recording.fold(samples, harmonics=dict(harmonics)))
     return found
 
@@ -99,10 +90,7 @@ def gear_problem(
     The experiments are mean periods with all harmonics, or with `cut` folded recordings with some.
     """
     model, inputs = bp.models.landing_gear(drive), gear_runs(drive, samples)[:runs]
-    if cut:
-        experiments = folded(model, GEAR, inputs, HARMONICS, samples, seed)
-    else:
-        experiments = measured(model, GEAR, inputs, samples, seed, scheme)
+    experiments = measured(model, GEAR, inputs, samples, seed, scheme, HARMONICS if cut else None)
     return bp.Problem(model, experiments, **gear_priors(free), scheme=scheme)
 
 

@@ -40,27 +40,13 @@ class Known(NamedTuple):
 
 
 class Orbit(NamedTuple):
-    """A periodic orbit as a chain of segments.
+    """A periodic orbit as a chain of segments."""
 
-    Attributes
-    ----------
-    times : numpy.ndarray
-        Starts of the segments and the end of the last one.
-    states : numpy.ndarray
-        State at the start of every segment.
-    transfer : numpy.ndarray
-        Derivative of each segment's end by its start.
-    multipliers : numpy.ndarray
-        Floquet multipliers, largest modulus first.
-    correction : float
-        Largest component of the last Newton step.
-    """
-
-    times: np.ndarray
-    states: np.ndarray
-    transfer: np.ndarray
-    multipliers: np.ndarray
-    correction: float
+    times: np.ndarray  # Starts of the segments and the end of the last one
+    states: np.ndarray  # At the start of every segment
+    transfer: np.ndarray  # Derivative of each segment's end by its start
+    multipliers: np.ndarray  # Floquet multipliers, largest modulus first
+    correction: float  # Largest component of the last Newton step
 
 
 def pendulum(omega: float, **changes: float) -> tuple[Field, Field, float]:
@@ -68,16 +54,18 @@ def pendulum(omega: float, **changes: float) -> tuple[Field, Field, float]:
     p = PENDULUM | changes
     c1, c2, c3, width = p["c1"], p["c2"], p["c3"], p["width"]
 
+    def stiffness(t: float) -> float:
+        return (p["g"] + p["lift"] * omega**2 * np.cos(omega * t)) / p["length"]
+
     def slope(t: float, y: np.ndarray) -> np.ndarray:
         angle, rate = y
-        stiffness = (p["g"] + p["lift"] * omega**2 * np.cos(omega * t)) / p["length"]
-        return np.array([rate, -c1 * np.tanh(rate / width) - (c2 + c3 * abs(rate)) * rate - stiffness * np.sin(angle)])
+        friction = c1 * np.tanh(rate / width) + (c2 + c3 * abs(rate)) * rate
+        return np.array([rate, -friction - stiffness(t) * np.sin(angle)])
 
     def jacobian(t: float, y: np.ndarray) -> np.ndarray:
         angle, rate = y
-        stiffness = (p["g"] + p["lift"] * omega**2 * np.cos(omega * t)) / p["length"]
         friction = c1 / width * (1.0 - np.tanh(rate / width) ** 2) + c2 + 2.0 * c3 * abs(rate)
-        return np.array([[0.0, 1.0], [-stiffness * np.cos(angle), -friction]])
+        return np.array([[0.0, 1.0], [-stiffness(t) * np.cos(angle), -friction]])
 
     return slope, jacobian, TURN / omega
 
@@ -99,14 +87,9 @@ def van_der_pol(mu: float) -> tuple[Field, Field]:
 
 
 def flow(
-    slope: Field,
-    jacobian: Field,
-    start: float,
-    end: float,
-    state: np.ndarray,
-    tolerance: float = 3e-14,
+    slope: Field, jacobian: Field, start: float, end: float, state: np.ndarray, tolerance: float = 3e-14,
     method: Any = "DOP853",
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return the state at the end of one segment and its derivative by the state at the start."""
     count = len(state)
 
@@ -151,37 +134,16 @@ def multipliers(transfer: np.ndarray) -> np.ndarray:
 
 
 def shoot(
-    slope: Field,
-    jacobian: Field,
-    times: ArrayLike,
-    states: ArrayLike,
-    jump: ArrayLike,
-    pin: int | None = None,
-    tolerance: float = 3e-14,
-    method: Any = "DOP853",
-    accuracy: float = 1e-12,
-) -> Orbit:
+    slope: Field, jacobian: Field, times: ArrayLike, states: ArrayLike, jump: ArrayLike, pin: int | None = None,
+    tolerance: float = 3e-14, method: Any = "DOP853", accuracy: float = 1e-12,
+) -> Orbit:  # fmt: skip
     """Return the periodic orbit near the given states by one damped Newton iteration over all segments.
 
-    Parameters
-    ----------
-    slope, jacobian : callable
-        y' and its derivative by y, as functions of (t, y).
-    times : numpy.ndarray
-        Starts of the segments and the end of the last one.
-    states : numpy.ndarray
-        Guess, one row per segment.
-    jump : array_like
-        State at the end minus state at the start, such as (2π·winding, 0).
-    pin : int, optional
-        State that keeps its value at the first start. The last state is then an unknown constant, and the multipliers
-        are those of the other states.
-    tolerance : float
-        Relative and absolute tolerance of the integration.
-    method : str
-        Method of `scipy.integrate.solve_ivp`.
-    accuracy : float
-        Largest component of the last Newton step, relative to the largest state if that exceeds 1.
+    `slope`, `jacobian`: y' and its derivative by y, as functions of (t, y). `times`: Starts of the segments and the end
+    of the last one. `states`: Guess, one row per segment. `jump`: State at the end minus state at the start, such as
+    (2π·winding, 0). `pin`: State that keeps its value at the first start; the last state is then an unknown constant,
+    and the multipliers are those of the other states. `tolerance`, `method`: Of `scipy.integrate.solve_ivp`.
+    `accuracy`: Largest component of the last Newton step, relative to the largest state if that exceeds 1.
     """
     times, x = np.asarray(times, dtype=float), np.array(states, dtype=float)
     segments, count = x.shape
@@ -233,14 +195,9 @@ def trajectory(slope: Field, times: np.ndarray, states: np.ndarray, at: np.ndarr
 
 
 def pendulum_orbit(
-    omega: float,
-    section: ArrayLike,
-    winding: int,
-    parts: int = 4,
-    tolerance: float = 3e-14,
-    method: Any = "DOP853",
+    omega: float, section: ArrayLike, winding: int, parts: int = 4, tolerance: float = 3e-14, method: Any = "DOP853",
     **changes: float,
-) -> Orbit:
+) -> Orbit:  # fmt: skip
     """Return the orbit near section points at t = 0, T, 2T, … (one per forcing period), `parts` segments per period."""
     slope, jacobian, period = pendulum(omega, **changes)
     section = np.atleast_2d(np.asarray(section, dtype=float))
@@ -278,7 +235,7 @@ def van_der_pol_cycle(
         slope, (0.0, 60.0), [2.0, 0.0, 1.0], method="DOP853", rtol=1e-10, atol=1e-10, events=lambda t, y: y[1]
     )
     assert done.t_events is not None and done.y_events is not None
-    turns, points = done.t_events[0], done.y_events[0]
+    (turns,), (points,) = done.t_events, done.y_events
     start = np.array([[abs(points[-1, 0]), 0.0, turns[-1] - turns[-3]]])
     times, states = divided(slope, jacobian, np.array([0.0, 1.0]), start, parts)
     orbit = shoot(slope, jacobian, times, states, np.zeros(3), pin=1, tolerance=tolerance, method=method)

@@ -57,12 +57,17 @@ def interleaved(actions: Mapping[str, Action], repeats: int) -> dict[str, np.nda
         for name, action in actions.items():
             if repeat >= action.most or (repeat < 0 and action.most == 1):
                 continue
-            before = time.perf_counter()
-            own = action.run()
-            seconds = own if isinstance(own, float) else time.perf_counter() - before
+            own, seconds = timed(action.run)
             if repeat >= 0:
-                found[name][repeat] = seconds / action.of
+                found[name][repeat] = (own if isinstance(own, float) else seconds) / action.of
     return found
+
+
+def timed(action: Callable[[], Any], clock: Callable[[], float] = time.perf_counter) -> tuple[Any, float]:
+    """Return the result of an action and its seconds."""
+    before = clock()
+    result = action()
+    return result, clock() - before
 
 
 def spread(values: np.ndarray) -> dict[str, float]:

@@ -7,6 +7,7 @@ y holds the states, each of second order followed by its rate; u the inputs and 
 the model's parameters, then the frequency.
 """
 
+import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,8 +20,8 @@ from sympy.printing.pycode import PythonCodePrinter
 
 import bayesperiodic as bp
 
-NUMBA, NUMPY, JAX = "numba", "numpy", "jax"
-PRINTERS: dict[str, Any] = {NUMBA: PythonCodePrinter, NUMPY: NumPyPrinter, JAX: JaxPrinter}
+# Evaluators of the text: SymPy's printer and the module that the text refers to.
+NUMBA, NUMPY, JAX = (PythonCodePrinter, "math"), (NumPyPrinter, "numpy"), (JaxPrinter, "jax")
 
 
 @dataclass(frozen=True)
@@ -42,27 +43,23 @@ class FirstOrder:
         return len(self.states)
 
     @cached_property
-    def rates(self) -> list[sp.Expr]:
-        """The expressions of f: the equations solved for the highest derivatives, in which they are linear."""
-        symbols = self.model.state_symbols
-        tops = [symbols["d" * order + name] for name, order in self.model.orders.items()]
+    def _highest(self) -> dict[sp.Symbol, sp.Expr]:
+        """The equations solved for the highest derivatives, in which they are linear."""
+        tops = [self.model.state_symbols["d" * order + name] for name, order in self.model.orders.items()]
         matrix, right = sp.linear_eq_to_matrix(list(self.model.equations), tops)
-        found = dict(zip(tops, matrix.LUsolve(right), strict=True))
-        every = []
-        for name, order in self.model.orders.items():
-            every += [symbols["d" + name]] if order == 2 else []
-            every.append(found[symbols["d" * order + name]])
-        return every
+        return dict(zip(tops, matrix.LUsolve(right), strict=True))
 
-    @cached_property
+    @property
+    def rates(self) -> list[sp.Expr]:
+        """The expressions of f."""
+        symbols = self.model.state_symbols
+        rates = [symbols["d" * k + name] for name, order in self.model.orders.items() for k in range(1, order + 1)]
+        return [self._highest.get(rate, rate) for rate in rates]
+
+    @property
     def outputs(self) -> list[sp.Expr]:
         """The expressions of the outputs in y, u and p."""
-        symbols = self.model.state_symbols
-        highest = {
-            symbols["d" * order + name]: self.rates[self.states.index(symbols["d" * (order - 1) + name])]
-            for name, order in self.model.orders.items()
-        }
-        return [expression.xreplace(highest) for expression in self.model.output_expressions]
+        return [expression.xreplace(self._highest) for expression in self.model.output_expressions]
 
     def by_states(self, expressions: Sequence[sp.Expr]) -> list[list[sp.Expr]]:
         """Return the derivatives of expressions by y, a row an expression."""
@@ -73,14 +70,14 @@ class FirstOrder:
         symbols = self.model.parameter_symbols
         return [[sp.diff(e, symbols[name]) for name in self.moving] for e in expressions]
 
-    def function(self, kind: str, expressions: Any) -> Callable[..., Any]:
+    def function(self, kind: tuple[Any, str], expressions: Any) -> Callable[..., Any]:
         """Return a function of y, u, p and, but for JAX, an array to fill, in the shape of the nested expressions."""
         rows = [entry if isinstance(entry, list) else [entry] for entry in expressions]
         nested = isinstance(expressions[0], list)
         flat = [entry for row in rows for entry in row]
         places = [f"{i}, {j}" if nested else f"{i}" for i, row in enumerate(rows) for j in range(len(row))]
         common, reduced = sp.cse(flat, symbols=sp.numbered_symbols("common"), order="none")
-        printer = PRINTERS[kind]({"fully_qualified_modules": True})
+        printer, module = kind[0]({"fully_qualified_modules": True}), kind[1]
         used = set().union(*(e.free_symbols for e in reduced), *(e.free_symbols for _, e in common))
         lines = [f"{symbol} = {place}" for symbol, place in self._arguments.items() if symbol in used]
         lines += [f"{symbol} = {printer.doprint(e)}" for symbol, e in common]
@@ -91,8 +88,8 @@ class FirstOrder:
         else:
             lines += [f"out[{place}] = {printer.doprint(e)}" for place, e in zip(places, reduced, strict=True)]
         text = f"def function(y, u, p{'' if kind == JAX else ', out'}):\n    " + "\n    ".join(lines) + "\n"
-        space: dict[str, Any] = _modules(kind)
-        exec(compile(text, f"<{self.model.name}, {kind}>", "exec"), space)  # of the model's own expressions
+        space: dict[str, Any] = {module: importlib.import_module(module)}
+        exec(compile(text, f"<{self.model.name}, {module}>", "exec"), space)  # of the model's own expressions
         return space["function"]
 
     @property
@@ -105,19 +102,6 @@ class FirstOrder:
             for vector, symbols in (("y", self.states), ("u", signals), ("p", parameters))
             for k, symbol in enumerate(symbols)
         }
-
-
-def _modules(kind: str) -> dict[str, Any]:
-    """Return the modules that generated text refers to."""
-    if kind == JAX:
-        import jax
-
-        return {"jax": jax}
-    if kind == NUMPY:
-        return {"numpy": np}
-    import math
-
-    return {"math": math}
 
 
 def table(experiment: bp.Experiment, inputs: Sequence[str], points: int) -> np.ndarray:

@@ -5,7 +5,7 @@ matrix, for each experiment with its own matrix. Restoring the matrices between 
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -24,57 +24,7 @@ COPIED = 64 * 2**20
 EMCEE_STEPS = 200
 SWEEP, FACTOR, SOLVE = "sweep", "dgbtrf", "dgbtrs"
 ALL_FREE = "gradient, 15 parameters"
-FOLDED_ROWS = ("near", "call", "batched", "gradient")
 STAGES = ("priors", "periodic solves, sums of squares", "likelihood", "the rest of the call")
-
-
-class Floor:
-    """The matrices of all experiments at the estimate.
-
-    `warm`: Anchored at θ. `theta` (names,).
-    """
-
-    def __init__(self, warm: bp.Problem, theta: np.ndarray):
-        self._sweeps: list[Callable[[], Any]] = []
-        self._bands: list[np.ndarray] = []
-        generator, solutions = np.random.default_rng(1), warm.solve(theta)
-        for name, equations in warm.equations.items():
-            p = warm.parameters(theta[None], name)[0]
-            z = np.stack(list(solutions[name].states.values()), axis=-1)
-            columns = equations.residual_jacobian(z, p)
-            arguments = equations.states(z), equations.inputs, p, equations.grid.tau, equations.frequency, columns
-            self._sweeps.append(partial(equations.model.kernels.residual_jacobian, *arguments))
-            band, self._lower = lapack_band(equations, columns)
-            self._bands.append(band)
-        self._right = [generator.standard_normal((1, band.shape[1]))[0] for band in self._bands]
-        self._work = [np.array(band, order="F") for band in self._bands]
-        self._pivots: list[np.ndarray] = []
-
-    @property
-    def bytes(self) -> int:
-        """Bytes that a factorisation reads and writes, and a solve reads, over all matrices."""
-        return 3 * sum(band.nbytes for band in self._bands)
-
-    def sweep(self) -> None:
-        """Fill residuals and Jacobians."""
-        for one in self._sweeps:
-            one()
-
-    def factor(self) -> float:
-        """Return the seconds of the factorisations."""
-        for work, band in zip(self._work, self._bands, strict=True):
-            work[:] = band
-        before = time.perf_counter()
-        self._pivots = [lapack.dgbtrf(w, self._lower, self._lower, overwrite_ab=True)[1] for w in self._work]
-        return time.perf_counter() - before
-
-    def solve(self) -> float:
-        """Return the seconds of the solves with the last factors."""
-        rights = [np.array(right) for right in self._right]
-        before = time.perf_counter()
-        for work, pivots, right in zip(self._work, self._pivots, rights, strict=True):
-            lapack.dgbtrs(work, self._lower, self._lower, right, pivots, overwrite_b=True)
-        return time.perf_counter() - before
 
 
 def measure(setting: Setting, repeats: int) -> dict[str, Any]:
@@ -85,56 +35,95 @@ def measure(setting: Setting, repeats: int) -> dict[str, Any]:
 
 def measure_folded(setting: Setting, repeats: int) -> dict[str, Any]:
     """Return floor and ratios with folded recordings, by scheme."""
-    return {"schemes": {scheme: _of_folded(setting, scheme, repeats) for scheme in SCHEMES}}
-
-
-def _of_folded(setting: Setting, scheme: str, repeats: int) -> dict[str, Any]:
-    warm, noise, theta = setting.schemed(scheme), setting.noise, setting.theta[: len(setting.theta) // 2]
-    times = interleaved(_floor_actions(Floor(warm, setting.estimate)) | _call_actions(warm, theta, noise), repeats)
-    return _ratios(times, FOLDED_ROWS)
-
-
-def _floor_actions(floor: Floor) -> dict[str, Action]:
-    return {SWEEP: Action(floor.sweep), FACTOR: Action(floor.factor), SOLVE: Action(floor.solve)}
-
-
-def _call_actions(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> dict[str, Action]:
-    many = np.resize(theta, (WALKERS, theta.shape[1]))
-    return {
-        "near": Action(partial(_walk, warm, theta, noise), len(theta)),
-        "call": Action(partial(_calls, warm, theta, noise), len(theta)),
-        "batched": Action(partial(warm.log_posterior, many, noise), WALKERS),
-        "gradient": Action(partial(_gradient, warm, theta[0], noise)),
-    }
-
-
-def _ratios(times: Mapping[str, np.ndarray], names: Sequence[str]) -> dict[str, Any]:
-    under = times[SWEEP] + times[FACTOR] + times[SOLVE]
-    return {
-        "floor_us": {name: spread(1e6 * times[name]) for name in (SWEEP, FACTOR, SOLVE)} | {"sum": spread(1e6 * under)},
-        "us": {name: spread(1e6 * times[name]) for name in names},
-        "ratio": {name: ratio(times[name], under) for name in names},
-    }
+    found = {}
+    for scheme in SCHEMES:
+        warm = setting.schemed(scheme)
+        actions, _ = floor_actions(warm, setting.estimate)
+        calls = _call_actions(warm, setting.near, setting.noise)
+        found[scheme] = _ratios(interleaved(actions | calls, repeats), calls)
+    return {"schemes": found}
 
 
 def _of_scheme(setting: Setting, scheme: str, repeats: int) -> dict[str, Any]:
-    warm, noise, theta = setting.schemed(scheme), setting.noise, setting.theta
-    floor, half = Floor(warm, setting.estimate), len(theta) // 2
+    warm, noise, theta, near = setting.schemed(scheme), setting.noise, setting.theta, setting.near
+    actions, size = floor_actions(warm, setting.estimate)
     all_free, at = with_all_free(setting, scheme)
-    stages = _stages(setting, warm, theta[:half])
-    actions = _floor_actions(floor) | _call_actions(warm, theta[:half], noise)
-    actions["far"] = Action(partial(_walk, warm, theta[half:], noise), len(theta) - half)
-    actions[ALL_FREE] = Action(partial(_gradient, all_free, at, noise))
-    actions |= {f"stage {name}": Action(run, half) for name, run in stages.items()}
-    times = interleaved(actions, repeats)
-    return _ratios(times, ("near", "far", "call", "batched", "gradient", ALL_FREE)) | {
-        "stages_us": _differences({name: float(np.nanmedian(times[f"stage {name}"])) * 1e6 for name in stages}),
-        "bytes": floor.bytes,
+    stages = _stages(warm, near, noise)
+    calls = _call_actions(warm, near, noise)
+    calls["far"] = Action(partial(walk, warm, theta[len(near) :], noise), len(theta) - len(near))
+    calls[ALL_FREE] = Action(partial(gradients, all_free, at[None], noise))
+    times = interleaved(actions | calls | stages, repeats)
+    *parts, whole = (float(np.nanmedian(times[name])) * 1e6 for name in stages)
+    return _ratios(times, calls) | {
+        "stages_us": dict(zip(STAGES, [*parts, whole - sum(parts)], strict=True)),
+        "bytes": size,
         "same_grid_error": same_grid_error(setting, warm),
         "gradient_error": {
             "gradient": gradient_error(warm, theta[0], noise), ALL_FREE: gradient_error(all_free, at, noise)
         },
     }  # fmt: skip
+
+
+def floor_actions(warm: bp.Problem, theta: np.ndarray) -> tuple[dict[str, Action], int]:
+    """Return the parts of the floor with the matrices of all experiments at θ, and the bytes that they move.
+
+    A factorisation reads and writes the matrices, a solve reads them.
+    """
+    sweeps: list[Callable[[], Any]] = []
+    bands: list[np.ndarray] = []
+    solutions = warm.solve(theta)
+    for name, equations in warm.equations.items():
+        p = warm.parameters(theta[None], name)[0]
+        z = np.stack(list(solutions[name].states.values()), axis=-1)
+        columns = equations.residual_jacobian(z, p)
+        arguments = equations.states(z), equations.inputs, p, equations.grid.tau, equations.frequency, columns
+        sweeps.append(partial(equations.model.kernels.residual_jacobian, *arguments))
+        band, lower = lapack_band(equations, columns)
+        bands.append(band)
+    generator = np.random.default_rng(1)
+    rights = [generator.standard_normal(band.shape[1]) for band in bands]
+    work = [np.array(band, order="F") for band in bands]
+    pivots: list[np.ndarray] = []
+
+    def sweep() -> None:
+        for one in sweeps:
+            one()
+
+    def factor() -> float:
+        for target, band in zip(work, bands, strict=True):
+            target[:] = band
+        before = time.perf_counter()
+        pivots[:] = [lapack.dgbtrf(one, lower, lower, overwrite_ab=True)[1] for one in work]
+        return time.perf_counter() - before
+
+    def solve() -> float:
+        copies = [np.array(right) for right in rights]
+        before = time.perf_counter()
+        for factors, own, right in zip(work, pivots, copies, strict=True):
+            lapack.dgbtrs(factors, lower, lower, right, own, overwrite_b=True)
+        return time.perf_counter() - before
+
+    return {SWEEP: Action(sweep), FACTOR: Action(factor), SOLVE: Action(solve)}, 3 * sum(band.nbytes for band in bands)
+
+
+def _call_actions(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> dict[str, Action]:
+    many = np.resize(theta, (WALKERS, theta.shape[1]))
+    return {
+        "near": Action(partial(walk, warm, theta, noise), len(theta)),
+        "call": Action(partial(call, warm, theta, noise), len(theta)),
+        "batched": Action(partial(warm.log_posterior, many, noise), WALKERS),
+        "gradient": Action(partial(gradients, warm, theta[:1], noise)),
+    }
+
+
+def _ratios(times: Mapping[str, np.ndarray], names: Iterable[str]) -> dict[str, Any]:
+    parts = {name: times[name] for name in (SWEEP, FACTOR, SOLVE)}
+    under = np.sum(list(parts.values()), axis=0)
+    return {
+        "floor_us": {name: spread(1e6 * values) for name, values in (parts | {"sum": under}).items()},
+        "us": {name: spread(1e6 * times[name]) for name in names},
+        "ratio": {name: ratio(times[name], under) for name in names},
+    }
 
 
 def with_all_free(setting: Setting, scheme: str) -> tuple[bp.Problem, np.ndarray]:
@@ -146,42 +135,39 @@ def with_all_free(setting: Setting, scheme: str) -> tuple[bp.Problem, np.ndarray
     return other.anchored(estimate), at
 
 
-def _walk(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
+def walk(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
     """Compute log-posteriors one by one on one core."""
     for one in theta:
         warm.log_prior(one) + warm.log_likelihood(one, noise, 1)
 
 
-def _calls(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
+def call(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
+    """Compute log-posteriors one by one on all cores."""
     for one in theta:
         warm.log_posterior(one, noise)
 
 
-def _gradient(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
-    warm.value_and_gradient(theta, noise)
+def gradients(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
+    """Compute values and gradients one by one."""
+    for one in theta:
+        warm.value_and_gradient(one, noise)
 
 
-def _stages(setting: Setting, warm: bp.Problem, theta: np.ndarray) -> dict[str, Callable[[], Any]]:
-    """Return the cumulative stages of a call."""
-    noise, points = setting.noise, [one[None] for one in theta]
-    density = warm.density()
+def _stages(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> dict[str, Action]:
+    """Return the first three of the stages of a call, and the whole call."""
+    density, points = warm.density(), [one[None] for one in theta]
 
     def compared(one: np.ndarray) -> Any:
         return density.comparisons.residuals(density.simulator.solve(one, 1))
 
     residuals = [compared(one) for one in points]
-    return {
-        "priors": lambda: [warm.log_prior(one) for one in theta],
-        "solves": lambda: [compared(one) for one in points],
-        "likelihood": lambda: [warm.likelihood(one, noise[None]) for one in residuals],
-        "whole": lambda: _walk(warm, theta, noise),
-    }
-
-
-def _differences(times: dict[str, float]) -> dict[str, float]:
-    parts = [times["priors"], times["solves"], times["likelihood"]]
-    parts.append(times["whole"] - sum(parts))
-    return dict(zip(STAGES, parts, strict=True))
+    runs: tuple[Callable[[], Any], ...] = (
+        lambda: [warm.log_prior(one) for one in theta],
+        lambda: [compared(one) for one in points],
+        lambda: [warm.likelihood(one, noise[None]) for one in residuals],
+        lambda: walk(warm, theta, noise),
+    )
+    return {f"stage {number}": Action(run, len(theta)) for number, run in enumerate(runs)}
 
 
 def same_grid_error(setting: Setting, warm: bp.Problem) -> float:

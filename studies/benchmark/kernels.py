@@ -21,21 +21,18 @@ compiled = numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "ns
 
 
 class Integrators(NamedTuple):
-    """Compiled functions of one model; all take p, the table of u at half steps, the seconds of a period, and y.
+    """Compiled functions of one model; all take p, the table of u at half steps, the seconds of a period, and y."""
 
-    `steady`: (p, u, period, y, scale, tolerance, path, rates) -> cycles until a cycle changes y by less than the
-    tolerance, 0 for never. `chord`: (p, u, period, y, inverse, scale, tolerance, most, path, rates) -> sweeps of
-    shooting with a fixed matrix. `newton`: (p, u, period, y, scale, tolerance, most, path, rates, wide, wide_rates) ->
-    sweeps of shooting with the variational equations, whose last one leaves the derivatives by y(0) and by p in `wide`.
-    `pulled`: (p, u, states, changes, weights, out): Σ weights · d outputs / dp, from the derivatives of the states by
-    p.
-    """
-
+    # (p, u, period, y, scale, tolerance, path, rates) -> cycles until one changes y by less than the tolerance, or 0
     steady: Callable[..., int]
+    # (p, u, period, y, inverse, scale, tolerance, most, path, rates) -> sweeps of shooting with a fixed matrix, or 0
     chord: Callable[..., int]
+    # (p, u, period, y, scale, tolerance, most, path, rates, wide, wide_rates) -> sweeps of shooting with the
+    # variational equations, or 0; the last one leaves the derivatives by y(0) and by p in `wide`
     newton: Callable[..., int]
     dense: Callable[..., None]  # (path, rates, step, out): cubic Hermite interpolation at equidistant points
     outputs: Callable[..., None]  # (p, u, states, out)
+    # (p, u, states, changes, weights, out): Σ weights · d outputs / dp, from the derivatives of the states by p
     pulled: Callable[..., None]
     rates_in_time: Callable[..., np.ndarray]  # (t, y, p, u, period) -> rates, the inputs interpolated in a fine table
     jacobian_in_time: Callable[..., np.ndarray]  # The same for the derivatives by y
@@ -45,27 +42,21 @@ class Integrators(NamedTuple):
 def integrators(model: Any, moving: tuple[str, ...]) -> Integrators:
     """Return the compiled functions of a model, with derivatives by some of its parameters."""
     first = FirstOrder(model, moving)
-    f = _compiled_from(first, first.rates)
-    a = _compiled_from(first, first.by_states(first.rates))
-    b = _compiled_from(first, first.by_parameters(first.rates))
-    g = _compiled_from(first, first.outputs)
-    c = _compiled_from(first, first.by_states(first.outputs))
-    d = _compiled_from(first, first.by_parameters(first.outputs))
-    size, channels = first.size, len(first.outputs)
+    size, channels, count = first.size, len(first.outputs), len(moving)
+    (f, a, b), (g, c, d) = (
+        [compiled(first.function(NUMBA, e)) for e in (values, first.by_states(values), first.by_parameters(values))]
+        for values in (first.rates, first.outputs)
+    )
     cycle = _cycle(f, size)
     return Integrators(
         _steady(cycle, size),
         _chord(cycle, size),
-        _newton(_wide_cycle(f, a, b, size, len(moving)), size, len(moving)),
+        _newton(_wide_cycle(f, a, b, size, count), size, count),
         dense,
-        _outputs(g, channels),
-        _pulled(c, d, size, channels, len(moving)),
+        _outputs(g),
+        _pulled(c, d, size, channels, count),
         *_in_time(f, a, size),
     )
-
-
-def _compiled_from(first: FirstOrder, expressions: Any) -> Any:
-    return compiled(first.function(NUMBA, expressions))
 
 
 # Loops, because Numba takes seconds to compile an assignment to a part of an array.
@@ -276,7 +267,7 @@ def dense(path, rates, step, out):
             out[k, j] = a * path[i, j] + b * rates[i, j] + c * path[i + 1, j] + d * rates[i + 1, j]
 
 
-def _outputs(g: Any, channels: int) -> Any:
+def _outputs(g: Any) -> Any:
     @compiled
     def outputs(p, u, states, out):
         for k in range(out.shape[0]):

@@ -5,10 +5,9 @@ in natural coordinates runs once, with the fastest log-posterior. With the other
 the densities agree, so that its effective samples per log-posterior are divided by their time.
 """
 
-import importlib.util
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import emcee
@@ -18,24 +17,20 @@ import bayesperiodic as bp
 from studies.benchmark import peers
 from studies.benchmark.integration import LOOSE, Method
 from studies.benchmark.problems import Setting
+from studies.timing import timed
 
 WALKERS, STEPS = 16, 1500
 PINTS_SAMPLERS = ("HaarioBardenetACMC", "DreamMCMC")
 PINTS_CHAINS, PINTS_STEPS = 4, 4000
 WARMUP, DRAWS = 30, 60
+COLLAPSED = {"variances": "collapsed", "max_steps": 750}
 OWN: dict[str, dict[str, Any]] = {
     "sample, default": {"max_steps": 750},
-    "sample, variances integrated out": {"variances": "collapsed", "max_steps": 750},
-    "sample, variances integrated out, 2 × 64 walkers": {
-        "variances": "collapsed",
-        "max_steps": 750,
-        "ensembles": 2,
-        "walkers": 64,
-    },  # fmt: skip
+    "sample, variances integrated out": COLLAPSED,
+    "sample, variances integrated out, 2 × 64 walkers": COLLAPSED | {"ensembles": 2, "walkers": 64},
     "sample, NUTS": {"sampler": "nuts", "ensembles": 2, "max_steps": 250},
 }
-EMCEE, NUMPYRO = "emcee", "numpyro NUTS around diffrax"
-MISSING = 'not installed (pip install "bayesperiodic[benchmark]")'
+NUMPYRO = "numpyro NUTS around diffrax"
 
 Density = Callable[[np.ndarray], float]
 
@@ -43,41 +38,39 @@ Density = Callable[[np.ndarray], float]
 def measure(setting: Setting, contest: Mapping[str, Any], methods: Sequence[Method], seed: int) -> dict[str, Any]:
     """Return the samplers, and emcee with every timed method.
 
-    `setting`: With one channel, all harmonics, and positive parameters that are the model's own. `contest`: What
-    `contenders.measured` returned. `methods`: Those of the fastest method, one per experiment.
+    `setting`: Has one channel, all harmonics, and positive parameters that are the model's own. `contest`: Result of
+    `contenders.measured`. `methods`: Those of the fastest method, one per experiment.
     """
     walked = _emcee(setting, methods, seed)
     found = {name: _own(setting, seed, options) for name, options in OWN.items()}
     found |= {f"PINTS {name}, this package's density": _pints(setting, name, seed) for name in PINTS_SAMPLERS}
     found[NUMPYRO] = _numpyro(setting, methods, seed)
-    around = {
-        row["name"]: {
-            "ess_per_second": 1e3 * walked["ess_per_log_posterior"] / row["milliseconds"]["median"],
-            "milliseconds": row["milliseconds"]["median"],
-        }
+    times = {
+        row["name"]: row["milliseconds"]["median"]
         for row in contest["rows"]
         if row["milliseconds"] and "gradient" not in row["name"] and "batched" not in row["name"]
+    }
+    around = {
+        name: {"ess_per_second": 1e3 * walked["ess_per_log_posterior"] / milliseconds, "milliseconds": milliseconds}
+        for name, milliseconds in times.items()
     }
     return {"samplers": found, "emcee": walked, "emcee_around": around, "split": _split(found, walked, around)}
 
 
 def _split(found: Mapping[str, Any], walked: Mapping[str, Any], around: Mapping[str, Any]) -> dict[str, Any]:
     """Return the ratio of this package's best sampler to emcee with each method, split into sampler and solver."""
-    best = max(
-        (name for name in OWN if "ess_per_second" in found.get(name, {})), key=lambda n: found[n]["ess_per_second"]
-    )
+    measured = [name for name in OWN if "ess_per_second" in found.get(name, {})]
+    best = max(measured, key=lambda name: found[name]["ess_per_second"])
     own = found[best]
-    return {
-        "best": best,
-        "against": {
-            name: {
-                "ratio": own["ess_per_second"] / entry["ess_per_second"],
-                "sampler": own["ess_per_log_posterior"] / walked["ess_per_log_posterior"],
-                "solver": 1e-3 * entry["milliseconds"] / (own["seconds"] / own["log_posteriors"]),
-            }
-            for name, entry in around.items()
-        },
+    against = {
+        name: {
+            "ratio": own["ess_per_second"] / entry["ess_per_second"],
+            "sampler": own["ess_per_log_posterior"] / walked["ess_per_log_posterior"],
+            "solver": 1e-3 * entry["milliseconds"] / (own["seconds"] / own["log_posteriors"]),
+        }
+        for name, entry in around.items()
     }
+    return {"best": best, "against": against}
 
 
 def effective(chains: np.ndarray) -> float:
@@ -86,11 +79,9 @@ def effective(chains: np.ndarray) -> float:
     return float(chains.shape[0] * chains.shape[1] / np.max(tau))
 
 
-def _account(ess: float, seconds: float, calls: int) -> dict[str, float]:
-    return {
-        "ess": ess, "seconds": seconds, "log_posteriors": calls, "ess_per_second": ess / seconds,
-        "ess_per_log_posterior": ess / calls,
-    }  # fmt: skip
+def _account(ess: float, seconds: float, calls: int) -> dict[str, Any]:
+    per = {"ess_per_second": ess / seconds, "ess_per_log_posterior": ess / calls}
+    return {"ess": ess, "seconds": seconds, "log_posteriors": calls} | per
 
 
 def collapsed(setting: Setting, ways: Sequence[Density]) -> Density:
@@ -109,34 +100,30 @@ def collapsed(setting: Setting, ways: Sequence[Density]) -> Density:
     return density
 
 
-def _emcee(setting: Setting, methods: Sequence[Method], seed: int) -> dict[str, float]:
+def _emcee(setting: Setting, methods: Sequence[Method], seed: int) -> dict[str, Any]:
     """Run emcee in natural coordinates as in its tutorial; a quarter of the steps is burn-in."""
-    exact = [replace(method, tolerance=LOOSE) for method in methods]  # Walkers move further out than the draws.
+    exact = [replace(method, setting=LOOSE) for method in methods]  # Walkers move further out than the draws.
     density, generator = collapsed(setting, exact), np.random.default_rng(seed)
     sd = np.array(list(setting.fit.sd.values()))
     start = setting.estimate + 0.1 * sd * generator.standard_normal((WALKERS, sd.size))
     sampler = emcee.EnsembleSampler(WALKERS, sd.size, density)
     sampler.random_state = np.random.RandomState(seed).get_state()
-    before = time.perf_counter()
-    sampler.run_mcmc(start, STEPS)
-    seconds = time.perf_counter() - before
+    _, seconds = timed(partial(sampler.run_mcmc, start, STEPS))
     return _account(effective(sampler.get_chain(discard=STEPS // 4)), seconds, WALKERS * STEPS)
 
 
 def _own(setting: Setting, seed: int, options: Mapping[str, Any]) -> dict[str, Any]:
-    if options.get("sampler") == "nuts" and importlib.util.find_spec("nutpie") is None:
-        return {"note": f"nutpie is {MISSING}"}
-    before = time.perf_counter()
-    posterior = bp.sample(setting.problem, setting.fit, seed=seed, progress=False, **options)
-    seconds = time.perf_counter() - before
+    if options.get("sampler") == "nuts" and (note := peers.missing("nutpie")):
+        return {"note": note}
+    posterior, seconds = timed(partial(bp.sample, setting.problem, setting.fit, seed=seed, progress=False, **options))
     ess = min(posterior.ess[name] for name in setting.problem.names)
     return _account(ess, seconds, posterior.log_posterior_calls) | {"note": posterior.reason}
 
 
 def _pints(setting: Setting, name: str, seed: int) -> dict[str, Any]:
     """Run a sampler of PINTS on this package's density over θ and the logarithm of the variance."""
-    if importlib.util.find_spec("pints") is None:
-        return {"note": f"pints is {MISSING}"}
+    if note := peers.missing("pints"):
+        return {"note": note}
     import pints
 
     warm, size = setting.problem.anchored(setting.fit.theta), len(setting.problem.names)
@@ -159,18 +146,15 @@ def _pints(setting: Setting, name: str, seed: int) -> dict[str, Any]:
     controller = pints.MCMCController(Posterior(), PINTS_CHAINS, list(starts), sd, method=getattr(pints, name))
     controller.set_max_iterations(PINTS_STEPS)
     controller.set_log_to_screen(False)
-    before = time.perf_counter()
-    chains = controller.run()
-    seconds = time.perf_counter() - before
+    chains, seconds = timed(controller.run)
     kept = np.moveaxis(np.asarray(chains)[:, PINTS_STEPS // 4 :, :size], 0, 1)
     return _account(effective(kept), seconds, calls)
 
 
 def _numpyro(setting: Setting, methods: Sequence[Method], seed: int) -> dict[str, Any]:
     """Run numpyro's NUTS along the axes of the Laplace approximation; neither compilation nor tuning is timed."""
-    lacking = [name for name in (*peers.NEEDED, "numpyro") if importlib.util.find_spec(name) is None]
-    if lacking:
-        return {"note": f"{lacking[0]} is {MISSING}"}
+    if note := peers.missing(*peers.NEEDED, "numpyro"):
+        return {"note": note}
     import jax
     from numpyro.infer import MCMC, NUTS
 
@@ -180,10 +164,12 @@ def _numpyro(setting: Setting, methods: Sequence[Method], seed: int) -> dict[str
     run = MCMC(kernel, num_warmup=WARMUP, num_samples=DRAWS, progress_bar=False)
     start = np.zeros(centre.size)
     run.warmup(jax.random.PRNGKey(seed), init_params=start, extra_fields=("num_steps",), collect_warmup=False)
-    before = time.perf_counter()
-    run.run(run.post_warmup_state.rng_key, init_params=start, extra_fields=("num_steps",))
-    draws = np.exp(centre + np.asarray(run.get_samples()) @ factor.T)
-    seconds = time.perf_counter() - before
+
+    def sample() -> np.ndarray:
+        run.run(run.post_warmup_state.rng_key, init_params=start, extra_fields=("num_steps",))
+        return np.exp(centre + np.asarray(run.get_samples()) @ factor.T)
+
+    draws, seconds = timed(sample)
     calls = int(np.sum(run.get_extra_fields()["num_steps"]))
     return _account(effective(draws[:, None, :]), seconds, calls) | {"note": "without compilation and tuning"}
 
@@ -204,7 +190,7 @@ def _potential(
     priors = [setting.problem.priors[name] for name in setting.problem.names]
     centre = np.log([prior.median for prior in priors])
     spread = np.array([prior.spread for prior in priors])
-    value = peers.log_likelihood(setting.problem.model)
+    value = peers.traced(setting.problem.model).log_likelihood
     count = sum(case.experiment.samples for case in setting.cases)
 
     def potential(z: Any) -> Any:

@@ -5,7 +5,7 @@ deviations. Variances are fixed at their estimates, so that log-posteriors diffe
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import bayesperiodic as bp
 from studies.benchmark.equations import table
 from studies.benchmark.kernels import Integrators, integrators, misfit
 from studies.damper import run as damper
-from studies.gear import FINE, GEAR, SAMPLES, folded, gear_at_rest, gear_problem, measured
+from studies.gear import FINE, GEAR, SAMPLES, gear_at_rest, gear_problem, measured
 from studies.silverbox import run as silverbox_data
 
 FORCE, DISPLACEMENT, DUFFING, DAMPER, SILVERBOX = (
@@ -52,7 +52,7 @@ class Case:
 
     @property
     def period(self) -> float:
-        """Of the orbit [s]."""
+        """Period of the orbit [s]."""
         return self.experiment.periods / self.experiment.frequency
 
     @property
@@ -61,7 +61,7 @@ class Case:
         return integrators(self.model, self.moving)
 
     def table(self, points: int) -> np.ndarray:
-        """Return the inputs at so many points of a period."""
+        """Return the inputs at equidistant points of a period."""
         return table(self.experiment, self.model.inputs, points)
 
     @cached_property
@@ -70,16 +70,25 @@ class Case:
         return self.table(self.experiment.samples)
 
     @cached_property
-    def _data(self) -> np.ndarray:
+    def times(self) -> np.ndarray:
+        """The times of the samples [s]."""
+        return np.arange(self.experiment.samples) * (self.period / self.experiment.samples)
+
+    @cached_property
+    def data(self) -> np.ndarray:
+        """The outputs measured (samples, channels)."""
         return np.ascontiguousarray(np.stack([self.experiment.outputs[c] for c in self.model.outputs], axis=-1))
 
     @cached_property
-    def _kept(self) -> list[int | None]:
-        """The harmonics of each channel that are compared, None for all."""
-        harmonics = self.experiment.harmonics or {}
-        whole = self.experiment.samples // 2
-        kept = [harmonics.get(channel) for channel in self.model.outputs]
-        return [None if count is None or count >= whole else count for count in kept]
+    def _kept(self) -> np.ndarray:
+        """Which harmonics of each channel are compared (samples // 2 + 1, channels)."""
+        samples = self.experiment.samples
+        counts = [self.experiment.harmonics.get(channel, samples) for channel in self.model.outputs]
+        return np.arange(samples // 2 + 1)[:, None] <= counts
+
+    @cached_property
+    def _whole(self) -> bool:
+        return bool(self._kept.all())
 
     @cached_property
     def _counts(self) -> np.ndarray:
@@ -87,67 +96,63 @@ class Case:
 
     @cached_property
     def weights(self) -> np.ndarray:
-        """Of the squared residuals: independent values per sample, over the variance, halved."""
+        """Weights of the squared residuals: half the independent values per sample over the variance."""
         return 0.5 * self._counts / (self.experiment.samples * self.variances)
-
-    def log_likelihood(self, outputs: np.ndarray) -> float:
-        """Return eq. (6)'s part of this experiment, from outputs (samples, channels)."""
-        if self.whole:
-            return self.constant - misfit(self._data, outputs, self.weights)
-        return self.constant - float(self.weights @ (self._residuals(outputs) ** 2).sum(axis=0))
 
     @cached_property
     def spectral_weights(self) -> np.ndarray:
-        """Of the squared Fourier sums of the residuals (samples // 2 + 1, channels), zero beyond the harmonics kept."""
+        """Weights of the squared Fourier sums of the residuals (samples // 2 + 1, channels), zero beyond those kept."""
         samples = self.experiment.samples
-        twice = np.full((samples // 2 + 1, len(self._kept)), 2.0)
-        twice[[0, -1] if samples % 2 == 0 else [0]] = 1.0
-        for i, kept in enumerate(self._kept):
-            twice[samples if kept is None else kept + 1 :, i] = 0.0
+        twice = 2.0 * self._kept
+        twice[[0, -1] if samples % 2 == 0 else [0]] /= 2.0
         return twice * self.weights / samples
 
     @cached_property
     def constant(self) -> float:
-        """What does not depend on the outputs."""
+        """Part of the log-likelihood that is independent of the outputs."""
         return -0.5 * float(self._counts @ np.log(self.variances))
 
-    @cached_property
-    def whole(self) -> bool:
-        """Whether all harmonics are compared."""
-        return all(kept is None for kept in self._kept)
+    def log_likelihood(self, outputs: np.ndarray) -> float:
+        """Return the log-likelihood of this experiment, eq. (6), from outputs (samples, channels)."""
+        if self._whole:
+            return self.constant - misfit(self.data, outputs, self.weights)
+        return self.constant - float(self.weights @ (self._residuals(outputs) ** 2).sum(axis=0))
 
-    def _residuals(self, outputs: np.ndarray) -> np.ndarray:
-        """Return data minus outputs within the harmonics kept."""
-        amplitudes = np.fft.rfft(self._data - outputs, axis=0)
-        for i, kept in enumerate(self._kept):
-            if kept is not None:
-                amplitudes[kept + 1 :, i] = 0.0
-        return np.fft.irfft(amplitudes, len(outputs), axis=0)
+    def log_likelihood_of(self, p: np.ndarray, states: np.ndarray) -> float:
+        """Return the same from states (samples, size)."""
+        outputs = np.empty_like(self.data)
+        self.compiled.outputs(p, self.signals, np.ascontiguousarray(states), outputs)
+        return self.log_likelihood(outputs)
 
     def weighted_residuals(self, outputs: np.ndarray) -> np.ndarray:
         """Return the derivatives of the log-likelihood by the outputs (samples, channels)."""
-        residuals = self._data - outputs if self.whole else self._residuals(outputs)
-        return 2.0 * residuals * self.weights
+        return 2.0 * (self.data - outputs if self._whole else self._residuals(outputs)) * self.weights
+
+    def _residuals(self, outputs: np.ndarray) -> np.ndarray:
+        """Return data minus outputs within the harmonics kept."""
+        return np.fft.irfft(np.fft.rfft(self.data - outputs, axis=0) * self._kept, len(outputs), axis=0)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """A posterior density and the points at which methods must be accurate.
-
-    `theta` (draws, names): The first half at the posterior's standard deviations, the second at three times these.
-    `start`: Static equilibrium of an experiment: from it and its parameters to y.
-    """
+    """A posterior density and the points at which methods must be accurate."""
 
     name: str
     problem: bp.Problem  # With the scheme `FINE`
     fit: bp.MapEstimate
-    theta: np.ndarray
+    theta: np.ndarray  # (draws, names): Half at the posterior's standard deviations, then half at three times these
     synthetic: bool
-    start: Callable[[bp.Experiment, Mapping[str, float]], np.ndarray]
-    cases: tuple[Case, ...] = field(init=False)
+    start: Callable[[bp.Experiment, Mapping[str, float]], np.ndarray]  # Static equilibrium y of an experiment with p
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "cases", tuple(self._case(e) for e in self.problem.experiments))
+    @cached_property
+    def cases(self) -> tuple[Case, ...]:
+        """The experiments."""
+        return tuple(self._case(experiment) for experiment in self.problem.experiments)
+
+    @property
+    def near(self) -> np.ndarray:
+        """The draws at the posterior's standard deviations."""
+        return self.theta[: len(self.theta) // 2]
 
     @property
     def noise(self) -> np.ndarray:
@@ -216,12 +221,11 @@ def _setting(
     return Setting(name, problem, fit, draws(problem, fit, count, seed), synthetic, start)
 
 
-def gear(drive: str, count: int, seed: int, **other: Any) -> Setting:
+def gear(drive: str, count: int, seed: int, *, cut: bool = False) -> Setting:
     """Return the landing gear with one direction given."""
-    problem = gear_problem(drive, seed, **other)
+    problem = gear_problem(drive, seed, cut=cut)
     start = {name: GEAR[name] for name in problem.names}
-    name = FORCE if drive == "force" else DISPLACEMENT
-    name += FOLDED if other.get("cut") else ""
+    name = (FORCE if drive == "force" else DISPLACEMENT) + FOLDED * cut
     return _setting(name, problem, count, seed, gear_at_rest, start)
 
 
@@ -233,15 +237,12 @@ def duffing(count: int, seed: int, *, cut: bool = False) -> Setting:
     samples = SAMPLES if cut else DUFFING_SAMPLES
     wave, model = np.cos(2 * np.pi * np.arange(samples) / samples), bp.models.duffing
     runs = [(frequency, {"force": amplitude * wave}) for frequency, amplitude in DUFFING_RUNS]
-    if cut:
-        harmonics = dict.fromkeys(("force", "displacement"), DUFFING_HARMONICS)
-        experiments = folded(model, DUFFING_TRUTH, runs, harmonics, samples, seed)
-    else:
-        experiments = measured(model, DUFFING_TRUTH, runs, samples, seed)
+    harmonics = dict.fromkeys(("force", "displacement"), DUFFING_HARMONICS) if cut else None
+    experiments = measured(model, DUFFING_TRUTH, runs, samples, seed, harmonics=harmonics)
     priors = {name: bp.LogNormal(DUFFING_TRUTH[name], 0.5) for name in ("c", "k", "k3")}
     problem = bp.Problem(model, experiments, priors=priors, fixed={"m": 1.0}, scheme=FINE)
-    name = DUFFING + (FOLDED if cut else "")
-    return _setting(name, problem, count, seed, lambda *_: np.zeros(2), {n: DUFFING_TRUTH[n] for n in priors})
+    guess = {name: DUFFING_TRUTH[name] for name in priors}
+    return _setting(DUFFING + FOLDED * cut, problem, count, seed, lambda *_: np.zeros(2), guess)
 
 
 def damped(data: Path | None, count: int, seed: int) -> Setting:

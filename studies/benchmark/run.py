@@ -10,26 +10,28 @@ import argparse
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 from threadpoolctl import threadpool_limits
 
 import bayesperiodic as bp
 from studies import common
-from studies.benchmark import contenders, figures, peers, posteriors, scaling, targets
+from studies.benchmark import contenders, peers, posteriors, scaling, targets
 from studies.benchmark import floor as floors
 from studies.benchmark import problems as made
 from studies.benchmark.equations import NUMPY, FirstOrder
 from studies.benchmark.integration import PREDICTED, SHOOTING, refer
-from studies.common import table_of_rows
-from studies.pendulum.orbits import shoot
+from studies.benchmark.problems import Setting
+from studies.pendulum.orbits import distance, shoot
 from studies.pendulum.recording import FREQUENCY, OMEGA, QUICK_PERIODS, TRUTH, section_of, simulate
-from studies.shooting import TURN
 
 # Results that the guard compares with.
 KEPT = Path("figures/benchmark/results.json")
@@ -39,6 +41,7 @@ PERIOD, SAMPLES = 3, 800
 ORBITS, TOLERANCE = 12, 1e-12
 # Distance at which the orbit counts as left [rad], with 5 rad/s counted as 1 rad.
 LEFT = 0.1
+SIZE, MARKERS, COLOURS = (18.0, 10.0), "osD^vP*X", [colormaps["tab20"](k) for k in range(20)]
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
@@ -47,7 +50,6 @@ def run(options: argparse.Namespace) -> None:
     before = read_kept(KEPT) if options.guard else None
     if options.guard:
         options.quick, options.out = True, KEPT.parent.parent / "quick" / "benchmark"
-
     watch, kept = common.Stopwatch(), options.out / PARTS
     found: dict[str, Any] = {"seed": options.seed, "quick": options.quick, "cores": os.cpu_count()}
     found["load_average"] = [*os.getloadavg()] if hasattr(os, "getloadavg") else None
@@ -69,11 +71,16 @@ def run(options: argparse.Namespace) -> None:
             found["floor"][name] = one["floor"]
             print(targets.floor(name, one["floor"]), flush=True)
     if not options.quick:
-        _rest(found, options, watch)
+        with watch.part("pendulum", "an unstable orbit of the pendulum, by time integration"):
+            found["pendulum"] = measure(options.seed)
+        print(account(found["pendulum"]), flush=True)
+        with watch.part("scaling", "growth of time and memory"):
+            found["scaling"] = scaling.measure(options.seed)
+        print(scaling.account(found["scaling"]), flush=True)
     found["checks"] = targets.rows(found)
-    print("\nTargets\n" + table_of_rows(found["checks"]) + "\n")
+    print("\nTargets\n" + common.table_of_rows(found["checks"]) + "\n")
     with watch.part("figure", "drawing"):
-        paths = common.save_figures(options.out, {"benchmark": figures.draw(found)})
+        paths = common.save_figures(options.out, {"benchmark": draw(found)})
     path = common.write_results(options.out, found | {"seconds": watch.total(), "versions": common.versions()})
     print(f"figures: {', '.join(map(str, paths))}\nresults: {path}")
     shutil.rmtree(kept, ignore_errors=True)
@@ -81,36 +88,33 @@ def run(options: argparse.Namespace) -> None:
         guard(found, before)
 
 
-def _of_problem(name: str, make: Callable[[], Any], options: argparse.Namespace) -> dict[str, Any]:
-    """Return the results of one problem, and the measurements made on this problem only."""
-    setting = make()
+def _of_problem(name: str, make: Callable[[], Setting], options: argparse.Namespace) -> dict[str, Any]:
+    """Return the results of one problem, and the measurements made on this problem only.
+
+    A quick run omits other packages and SciPy's integrators.
+    """
+    setting, quick = make(), options.quick
     result: dict[str, Any] = {}
     if name.startswith("landing gear"):
-        result["floor"] = floors.measure(
-            setting, 5 if options.quick else 31
-        )  # before other packages start their threads
-    result["contest"], methods = contest(setting, options.quick)
-    if name == made.DUFFING and not options.quick:
+        result["floor"] = floors.measure(setting, 5 if quick else 31)  # before other packages start their threads
+    contest = contenders.Contest(refer(setting))
+    scheme = contenders.add_own(contest)
+    contenders.add_compiled(contest)
+    peers.add_scipy(contest, quick=quick)
+    if not quick:
+        peers.add_peers(contest)
+    result["contest"] = contenders.measured(contest, scheme, 3 if quick else 15)
+    if name == made.DUFFING and not quick:
+        methods = contest.compiled[SHOOTING, PREDICTED]
         result["posterior"] = posteriors.measure(setting, result["contest"], methods, options.seed)
     return result
 
 
 def _source(options: argparse.Namespace, name: str) -> str:
     """Return a key that identifies version and settings of kept parts."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
-    own = [common.sha256(path) for path in files]
+    own = [common.sha256(path) for path in sorted(Path(__file__).parent.glob("*.py"))]
     settings = map(str, (options.seed, options.quick, options.guard))
     return " ".join([common.versions()["bayesperiodic"], name, *settings, *own])
-
-
-def _rest(found: dict[str, Any], options: argparse.Namespace, watch: common.Stopwatch) -> None:
-    """Measure the pendulum's unstable orbit and how time and memory grow."""
-    with watch.part("pendulum", "an unstable orbit of the pendulum, by time integration"):
-        found["pendulum"] = measure(options.seed)
-    print(account(found["pendulum"]), flush=True)
-    with watch.part("scaling", "growth of time and memory"):
-        found["scaling"] = scaling.measure(options.seed)
-    print(scaling.account(found["scaling"]), flush=True)
 
 
 def read_kept(path: Path) -> dict[str, Any]:
@@ -123,50 +127,33 @@ def read_kept(path: Path) -> dict[str, Any]:
 def guard(found: dict[str, Any], before: dict[str, Any]) -> None:
     """Compare ratios, never seconds, with those kept; raise a RuntimeError if any is worse."""
     lines = targets.worse(found, before)
-    print(f"guard: {targets.compared(found, before)} ratios compared, tolerance {targets.TOLERANCE:g}")
+    print(f"guard: {len(targets.pairs(found, before))} ratios compared, tolerance {targets.TOLERANCE:g}")
     if lines:
         raise RuntimeError("ratios are worse than the kept ones:\n" + "\n".join(lines))
 
 
-def problems(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
+def problems(options: argparse.Namespace) -> dict[str, Callable[[], Setting]]:
     """Return the functions that make the problems, by name; a quick run takes the first three.
 
     The guard uses the draws of the full run, because the time of a method depends on them.
     """
     count, seed = (2, options.seed) if options.quick and not options.guard else (5, options.seed)
-    every: dict[str, Callable[[], Any]] = {
+    every: dict[str, Callable[[], Setting]] = {
         made.FORCE: lambda: made.gear("force", count, seed),
         made.DISPLACEMENT: lambda: made.gear("displacement", count, seed),
         made.DUFFING: lambda: made.duffing(count, seed),
-    }
-    if options.quick:
-        return every
-    return every | {
         made.DAMPER: lambda: made.damped(options.data, count, seed),
         made.SILVERBOX: lambda: made.silverbox(None, count, seed),
     }
+    return dict(list(every.items())[: 3 if options.quick else None])
 
 
-def folded(options: argparse.Namespace) -> dict[str, Callable[[], Any]]:
+def folded(options: argparse.Namespace) -> dict[str, Callable[[], Setting]]:
     """Return the functions that make the problems with folded recordings and cut harmonics, by name."""
     return {
         made.FORCE + made.FOLDED: lambda: made.gear("force", 5, options.seed, cut=True),
         made.DUFFING + made.FOLDED: lambda: made.duffing(5, options.seed, cut=True),
     }
-
-
-def contest(setting: Any, quick: bool) -> tuple[dict[str, Any], Any]:
-    """Return the times of all methods on one problem, and the methods of shooting from the predicted orbit.
-
-    A quick run omits other packages and SciPy's integrators.
-    """
-    contest = contenders.Contest(refer(setting))
-    scheme = contenders.add_own(contest)
-    compiled = contenders.add_compiled(contest)
-    contenders.add_scipy(contest, compiled, quick=quick)
-    if not quick:
-        peers.add_peers(contest, compiled)
-    return contenders.measured(contest, scheme, 3 if quick else 15), compiled.get((SHOOTING, PREDICTED), [])
 
 
 def measure(seed: int) -> dict[str, Any]:
@@ -200,13 +187,9 @@ def distances(start: np.ndarray) -> list[float]:
         function(y, [t * FREQUENCY], p, out)
         return out
 
-    span = PERIOD / FREQUENCY
-    path = solve_ivp(
-        slope, (0.0, ORBITS * span), start, "DOP853", span * np.arange(1, ORBITS + 1), rtol=TOLERANCE, atol=TOLERANCE
-    )
-    angle, rate = path.y - start[:, None]
-    turned = np.abs((angle + np.pi) % TURN - np.pi)
-    return np.maximum(turned, np.abs(rate) / 5.0).tolist()
+    at = PERIOD / FREQUENCY * np.arange(1, ORBITS + 1)
+    path = solve_ivp(slope, (0.0, at[-1]), start, "DOP853", at, rtol=TOLERANCE, atol=TOLERANCE).y
+    return [distance(point[None], start[None]) for point in path.T]
 
 
 def account(found: dict[str, Any]) -> str:
@@ -218,3 +201,66 @@ def account(found: dict[str, Any]) -> str:
         f"started on the orbit, deviates by {steps} rad after each period; it leaves the orbit after "
         f"{found['left_after_periods']} periods"
     )
+
+
+def draw(found: Mapping[str, Any]) -> Figure:
+    """Return the figure: methods relative to one warm log-posterior, and its stages relative to the floor."""
+    figure = Figure(SIZE, layout="constrained")
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.15, 1.0])[0]
+    if found["problems"]:
+        _contenders(left.subplots(), found["problems"])
+    drawn = [part for part in ("floor", "posterior") if found.get(part)]
+    places = dict(zip(drawn, right.subplots(max(len(drawn), 1), 1, squeeze=False)[:, 0], strict=False))
+    if made.FORCE in found["floor"]:
+        _floor(places["floor"], found["floor"][made.FORCE])
+    if "posterior" in places:
+        _posterior(places["posterior"], found["posterior"])
+    return figure
+
+
+def _contenders(ax: Axes, problems: Mapping[str, Any]) -> None:
+    timed = {problem: [e for e in found["rows"] if e["ratio"]] for problem, found in problems.items()}
+    names = list(dict.fromkeys(e["name"] for entries in timed.values() for e in entries))
+    for marker, (problem, entries) in zip(MARKERS, timed.items(), strict=False):
+        if not entries:
+            continue
+        y = [names.index(e["name"]) for e in entries]
+        x = np.array([[e["ratio"][key] for key in ("median", "least", "largest")] for e in entries]).T
+        kind = " (synthetic)" if problems[problem]["synthetic"] else ""
+        ax.errorbar(x[0], y, xerr=[x[0] - x[1], x[2] - x[0]], fmt=marker, markersize=5, label=f"{problem}{kind}")
+    ax.axvline(1.0, color="0.6", linewidth=1.0, zorder=0)
+    ax.set(xscale="log", xlabel="time / one warm log-posterior of this package [1]")
+    ax.set_yticks(range(len(names)), names, fontsize=8)
+    ax.invert_yaxis()
+    ax.grid(axis="x", alpha=0.3)
+    ax.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=2)
+    ax.set_title("One log-posterior at equal accuracy: median and range over the repeats")
+
+
+def _floor(ax: Axes, found: Mapping[str, Any]) -> None:
+    bars: dict[str, dict[str, float]] = {}
+    for scheme, entry in found["schemes"].items():
+        bars[f"floor\n{scheme}"] = {k: v["median"] for k, v in entry["floor_us"].items() if k != "sum"}
+        bars[f"warm\n{scheme}"] = dict(entry["stages_us"])
+        bars[f"64 walkers\n{scheme}"] = {
+            "batched, all stages": entry["us"]["batched"]["median"], "emcee itself": found["emcee_us"]["median"]
+        }  # fmt: skip
+    parts = list(dict.fromkeys(part for bar in bars.values() for part in bar))
+    below = np.zeros(len(bars))
+    for part, colour in zip(sorted(parts, key=lambda p: p in floors.STAGES), COLOURS, strict=False):
+        height = np.array([max(bar.get(part, 0.0), 0.0) for bar in bars.values()])
+        ax.bar(range(len(bars)), height, bottom=below, label=part, color=colour)
+        below += height
+    ax.set_xticks(range(len(bars)), list(bars), fontsize=8)
+    ax.set(ylabel="time of one log-posterior [µs]", title=f"{made.FORCE}: stages")
+    ax.set_ylim(0.0, 1.05 * below.max())
+    ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+
+def _posterior(ax: Axes, found: Mapping[str, Any]) -> None:
+    values = {name: e["ess_per_second"] for name, e in found["samplers"].items() if "ess_per_second" in e}
+    values |= {f"emcee, {name}": entry["ess_per_second"] for name, entry in found["emcee_around"].items()}
+    names = sorted(values, key=lambda name: values[name])
+    ax.barh(range(len(names)), [values[name] for name in names])
+    ax.set_yticks(range(len(names)), names, fontsize=6)
+    ax.set(xscale="log", xlabel="effective samples per second [1/s]", title="Duffing (synthetic): posterior")

@@ -19,7 +19,6 @@ from studies.timing import Action, interleaved, slope
 SIZES = {"samples": (800, 1600, 3200), "experiments": (2, 4, 7, 14), "walkers": (16, 32, 64, 128)}
 FREE = (1, 3, 7, 15)
 WALKERS = 64
-REPEATS = 15
 
 IMPORT = "import time; t = time.perf_counter(); import bayesperiodic; print(time.perf_counter() - t)"
 # Names are loaded where they are first used.
@@ -35,26 +34,24 @@ bp.solve_periodic(model, {"c": 0.1, "k3": 0.5}, force, frequency=0.1, samples=10
 print(time.perf_counter() - t)
 """
 MEMORY = """
-from studies.benchmark.scaling import at_truth
-problem, theta, noise = at_truth("force", 800, 14)
 import numpy as np
+from studies.benchmark.scaling import at_truth, peak
+problem, theta, noise = at_truth("force", 800, 14)
 assert np.isfinite(problem.log_posterior(np.tile(theta, (64, 1)), noise)).all()
-from studies.benchmark.scaling import peak
 print(peak())
 """
 
 
 def measure(seed: int) -> dict[str, Any]:
     """Return times and peaks of the batched call of the force-driven landing gear, with their exponents."""
-    found = {}
-    for axis, sizes in SIZES.items():
-        calls = [_batched(**{axis: size}, seed=seed) for size in sizes]
-        found[axis] = _fitted(sizes, calls, REPEATS)
-    found["parameters"] = _fitted(FREE, [_gradient(free, seed) for free in FREE], REPEATS)
+    found = {
+        axis: _fitted(sizes, [_batched(**{axis: size}, seed=seed) for size in sizes]) for axis, sizes in SIZES.items()
+    }
+    found["parameters"] = _fitted(FREE, [_gradient(free, seed) for free in FREE])
     return {"growth": found, "start": start()}
 
 
-def _fitted(sizes: tuple[int, ...], calls: list[Callable[[], Any]], repeats: int) -> dict[str, Any]:
+def _fitted(sizes: tuple[int, ...], calls: list[Callable[[], Any]], repeats: int = 15) -> dict[str, Any]:
     times = interleaved({str(size): Action(call) for size, call in zip(sizes, calls, strict=True)}, repeats)
     exponents = [slope(sizes, repeat) for repeat in zip(*times.values(), strict=True)]  # as a machine's speed drifts
     peaks = [_peak(call) for call in calls]
@@ -69,7 +66,7 @@ def _peak(call: Callable[[], Any]) -> int:
     call()
     tracemalloc.start()
     call()
-    peak = tracemalloc.get_traced_memory()[1]
+    _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return peak
 
@@ -91,7 +88,7 @@ def _batched(samples: int = 800, experiments: int = 14, walkers: int = WALKERS, 
 
 
 def _gradient(free: int, seed: int) -> Callable[[], Any]:
-    """Return a gradient by so many parameters."""
+    """Return a gradient by some of the parameters."""
     problem, _, noise = at_truth("force", 800, 14, free=15, seed=seed)
     kept = dict(list(problem.priors.items())[:free])
     fixed = {name: GEAR[name] for name in problem.names if name not in kept}
@@ -106,14 +103,17 @@ def start() -> dict[str, float]:
     First solve with an empty cache, first solve of a new model with the generic kernels cached, and the same solve from
     the cache.
     """
+    fifth, third = (FIRST.replace("POWER", power) for power in "53")
     with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | {"BAYESPERIODIC_CACHE": cache}
-        found = {"import_s": min(_run(IMPORT, environment) for _ in range(3))}
-        found["names_s"] = min(_run(NAMES, environment) for _ in range(3))
-        found["empty_cache_s"] = _run(FIRST.replace("POWER", "5"), environment)
-        found["first_solve_s"] = _run(FIRST.replace("POWER", "3"), environment)
-        found["from_cache_s"] = min(_run(FIRST.replace("POWER", "3"), environment) for _ in range(3))
-    return found | {"peak_mb": _run(MEMORY, dict(os.environ))}
+        run = partial(_run, environment=os.environ | {"BAYESPERIODIC_CACHE": cache})
+        return {
+            "import_s": min(run(IMPORT) for _ in range(3)),
+            "names_s": min(run(NAMES) for _ in range(3)),
+            "empty_cache_s": run(fifth),
+            "first_solve_s": run(third),
+            "from_cache_s": min(run(third) for _ in range(3)),
+            "peak_mb": _run(MEMORY, dict(os.environ)),
+        }
 
 
 def peak() -> float:
@@ -138,11 +138,10 @@ def account(found: dict[str, Any]) -> str:
         f"  {axis}: time ∝ {axis}^{one['time_exponent']:.2f}, memory ∝ {axis}^{one['memory_exponent']:.2f}"
         for axis, one in found["growth"].items()
     ]
-    began = found["start"]
-    return "\n".join([
-        *lines,
-        f"  import {began['import_s']:.2f} s, with all that an identification uses {began['names_s']:.2f} s",
-        f"  first solve of a new model {began['first_solve_s']:.1f} s, from the cache {began['from_cache_s']:.2f} s",
-        f"  first solve of all {began['empty_cache_s']:.1f} s",
-        f"  64 walkers × 14 experiments: {began['peak_mb']:.0f} MB at the peak",
-    ])  # fmt: skip
+    text = (
+        "  import {import_s:.2f} s, with all that an identification uses {names_s:.2f} s\n"
+        "  first solve of a new model {first_solve_s:.1f} s, from the cache {from_cache_s:.2f} s\n"
+        "  first solve of all {empty_cache_s:.1f} s\n"
+        "  64 walkers × 14 experiments: {peak_mb:.0f} MB at the peak"
+    )
+    return "\n".join([*lines, text.format(**found["start"])])

@@ -9,15 +9,14 @@ from typing import Any
 from studies.benchmark.contenders import GRADIENT, OWN_GRADIENT
 from studies.benchmark.floor import ALL_FREE
 from studies.benchmark.integration import EQUILIBRIUM, ESTIMATE, STEADY
-from studies.benchmark.peers import BALANCE, DIFFRAX_ROWS
+from studies.benchmark.peers import BALANCE, BVP, DIFFRAX_ROWS, INITIAL
 from studies.benchmark.posteriors import NUMPYRO
 from studies.benchmark.problems import DISPLACEMENT, DUFFING, FOLDED, FORCE
-from studies.benchmark.scipy import BVP, INITIAL
 from studies.common import Row, row
 
 
 def problem(name: str, found: Mapping[str, Any]) -> str:
-    """Return the methods of one problem."""
+    """Return the methods of one problem as text."""
     kind = "SYNTHETIC data" if found["synthetic"] else "measured data"
     experiments = "1 experiment" if found["experiments"] == 1 else f"{found['experiments']} experiments"
     lines = [
@@ -25,13 +24,11 @@ def problem(name: str, found: Mapping[str, Any]) -> str:
         f"{found['draws']} draws, reference uncertain by {found['reference_uncertainty']:.0e})",
         f"  {'method':52s}{'ms':>10s}{'/ warm (least … largest)':>34s}{'error':>9s}  settings",
     ]
-    return "\n".join([*lines, *(_row(entry) for entry in found["rows"])])
-
-
-def _row(entry: Mapping[str, Any]) -> str:
-    error = "-" if entry["error"] is None else f"{entry['error']:.0e}"
-    time = "-" if entry["milliseconds"] is None else f"{entry['milliseconds']['median']:.3g}"
-    return f"  {entry['name']:52s}{time:>10s}{between(entry['ratio']):>34s}{error:>9s}  {entry['note']}"
+    for entry in found["rows"]:
+        error = "-" if entry["error"] is None else f"{entry['error']:.0e}"
+        time = "-" if entry["milliseconds"] is None else f"{entry['milliseconds']['median']:.3g}"
+        lines.append(f"  {entry['name']:52s}{time:>10s}{between(entry['ratio']):>34s}{error:>9s}  {entry['note']}")
+    return "\n".join(lines)
 
 
 def between(values: Mapping[str, float] | None) -> str:
@@ -40,7 +37,7 @@ def between(values: Mapping[str, float] | None) -> str:
 
 
 def posterior(found: Mapping[str, Any]) -> str:
-    """Return the samplers, and emcee with the methods."""
+    """Return the samplers, and emcee with the methods, as text."""
     lines = ["Effective samples per second, Duffing (SYNTHETIC data), the smallest of any parameter"]
     for name, entry in found["samplers"].items():
         value = f"{entry['ess_per_second']:.3g}" if "ess_per_second" in entry else "-"
@@ -52,7 +49,7 @@ def posterior(found: Mapping[str, Any]) -> str:
 
 
 def floor(name: str, found: Mapping[str, Any]) -> str:
-    """Return floor and stages of one problem."""
+    """Return floor and stages of one problem as text."""
     lines = [f"{name}: floor and time of a warm log-posterior on one core [µs]"]
     for scheme, entry in found["schemes"].items():
         parts = ", ".join(f"{part} {value['median']:.0f}" for part, value in entry["floor_us"].items() if part != "sum")
@@ -81,7 +78,7 @@ def worse(now: Mapping[str, Any], kept: Mapping[str, Any], tolerance: float = TO
     relative to the floor, which must not increase.
     """
     lines = []
-    for name, (new, old) in _pairs(now, kept).items():
+    for name, (new, old) in pairs(now, kept).items():
         rises = "/ floor" in name
         factor = new["median"] / old["median"] if rises else old["median"] / new["median"]
         apart = new["least"] > old["largest"] if rises else new["largest"] < old["least"]
@@ -90,7 +87,8 @@ def worse(now: Mapping[str, Any], kept: Mapping[str, Any], tolerance: float = TO
     return lines
 
 
-def _pairs(now: Mapping[str, Any], kept: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+def pairs(now: Mapping[str, Any], kept: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Return the ratios that both runs have, with their medians and ranges in each."""
     new, old = _ratios(now), _ratios(kept)
     return {name: (value, old[name]) for name, value in new.items() if name in old}
 
@@ -108,11 +106,6 @@ def _ratios(found: Mapping[str, Any]) -> dict[str, Mapping[str, float]]:
     return result
 
 
-def compared(now: Mapping[str, Any], kept: Mapping[str, Any]) -> int:
-    """Return how many ratios both runs have."""
-    return len(_pairs(now, kept))
-
-
 # Least ratios to one warm log-posterior.
 LEAST = (
     (f"{STEADY} {EQUILIBRIUM}", 20.0, (DUFFING, FORCE)),
@@ -122,9 +115,14 @@ LEAST = (
     *((name, 50.0, None) for name in DIFFRAX_ROWS[:3]),
     (BALANCE, 10.0, None),
 )
-GRADIENT_LEAST, GRADIENT_ERROR = 2.0, 1e-6
+GRADIENT_LEAST, GRADIENT_ERROR, DIFFERENCES = 2.0, 1e-6, "against central differences"
 # Largest ratios to the floor.
-NEAR, WITH_GRADIENT = 0.35, 1.0
+TIMED = {
+    "near": "warm, one core", "far": "warm, one core, at three times their spread", "call": "warm, all cores",
+    "batched": "64 walkers, all cores", "gradient": "value and gradient, 3 parameters",
+    ALL_FREE: "value and gradient, 15 parameters",
+}  # fmt: skip
+GEAR_LIMITS = {"far": 0.35, ALL_FREE: 1.0}
 FOLDED_LIMITS = {
     FORCE + FOLDED: {"near": 0.35, "call": 0.35, "batched": 0.18, "gradient": 1.0},
     DUFFING + FOLDED: {"near": 1.0, "call": 1.0, "batched": 1.0, "gradient": 3.5},
@@ -141,13 +139,9 @@ START = (
 
 def rows(found: Mapping[str, Any]) -> list[Row]:
     """Return all targets whose measurements are there."""
-    result = []
-    for name, problem in found["problems"].items():
-        result += _of_problem(name, problem)
-    if FORCE in found["floor"]:
-        result += _of_floor(found["floor"][FORCE])
-    for name in FOLDED_LIMITS:
-        result += _of_folded(name, found["floor"][name]) if name in found["floor"] else []
+    result = [row for name, problem in found["problems"].items() for row in _of_problem(name, problem)]
+    for name, limits in {FORCE: GEAR_LIMITS, **FOLDED_LIMITS}.items():
+        result += _of_floor(name, found["floor"][name], limits) if name in found["floor"] else []
     if "posterior" in found:
         result += _of_posterior(found["posterior"])
     if "scaling" in found:
@@ -165,58 +159,40 @@ def _of_problem(name: str, problem: Mapping[str, Any]) -> list[Row]:
             result.append(row(what, entry["ratio"] and entry["ratio"]["median"], least, None, note))
     if name in (FORCE, DISPLACEMENT):
         given = problem["gradient_ratio"]
-        what = f"{name}: {GRADIENT} / this package"
-        result.append(row(what, given and given["median"], GRADIENT_LEAST, None))
-        own = by_name.get(f"{OWN_GRADIENT}, {problem['scheme']}")
-        if own:
+        result.append(row(f"{name}: {GRADIENT} / {OWN}", given and given["median"], GRADIENT_LEAST, None))
+        if own := by_name.get(f"{OWN_GRADIENT}, {problem['scheme']}"):
             what = f"{name}: error of this package's gradient, of its largest component"
-            result.append(row(what, own["gradient_error"], 0.0, GRADIENT_ERROR, "against central differences"))
+            result.append(row(what, own["gradient_error"], 0.0, GRADIENT_ERROR, DIFFERENCES))
     return result
 
 
-def _of_floor(floor: Mapping[str, Any]) -> list[Row]:
-    """Return the targets of the exact mean periods of the landing gear: errors, and the gradient by 15 parameters."""
+def _of_floor(name: str, floor: Mapping[str, Any], limits: Mapping[str, float]) -> list[Row]:
+    """Return the speed targets, which are those of folded recordings, and those of the gear's exact mean periods."""
     result = []
     for scheme, entry in floor["schemes"].items():
-        for key, limit, what in (
-            ("far", NEAR, "warm, one core, at three times their spread"),
-            (ALL_FREE, WITH_GRADIENT, "value and gradient, 15 parameters"),
-        ):
-            result.append(row(f"{FORCE}, {scheme}: {what} / floor", entry["ratio"][key]["median"], 0.0, limit))
-        what = f"{FORCE}, {scheme}: error of the gradient by 15 parameters, of its largest component"
-        result.append(row(what, entry["gradient_error"][ALL_FREE], 0.0, GRADIENT_ERROR, "against central differences"))
-        what = f"{FORCE}, {scheme}: |Δ log-posterior| against solves anchored at the draw"
-        result.append(row(what, entry["same_grid_error"], 0.0, SAME_GRID))
+        for key, limit in limits.items():
+            what = f"{name}, {scheme}: {TIMED[key]} / floor"
+            result.append(row(what, entry["ratio"][key]["median"], 0.0, limit))
+        if "gradient_error" in entry:
+            what = f"{name}, {scheme}: error of the gradient by 15 parameters, of its largest component"
+            result.append(row(what, entry["gradient_error"][ALL_FREE], 0.0, GRADIENT_ERROR, DIFFERENCES))
+            what = f"{name}, {scheme}: |Δ log-posterior| against solves anchored at the draw"
+            result.append(row(what, entry["same_grid_error"], 0.0, SAME_GRID))
     return result
-
-
-def _of_folded(name: str, floor: Mapping[str, Any]) -> list[Row]:
-    """Return the speed targets, which are those of folded recordings with cut harmonics."""
-    return [
-        row(f"{name}, {scheme}: {what} / floor", entry["ratio"][key]["median"], 0.0, FOLDED_LIMITS[name][key])
-        for scheme, entry in floor["schemes"].items()
-        for key, what in (
-            ("near", "warm, one core"), ("call", "warm, all cores"), ("batched", "64 walkers, all cores"),
-            ("gradient", "value and gradient, 3 parameters"),
-        )
-    ]  # fmt: skip
 
 
 def _of_posterior(found: Mapping[str, Any]) -> list[Row]:
-    against, best = found["split"]["against"], found["split"]["best"]
-    others = {name: entry["ratio"] for name, entry in against.items() if not name.startswith("this package")}
+    best, what = found["split"]["best"], f"effective samples per second: {found['split']['best']} /"
+    others = {name: e["ratio"] for name, e in found["split"]["against"].items() if not name.startswith(OWN)}
     scipy = {name: ratio for name, ratio in others.items() if name.startswith(INITIAL)}
     result = []
-    for what, ratios, least in (("the fastest", others, FASTEST), ("SciPy's integrators", scipy, AROUND_SCIPY)):
+    for kind, ratios, least in (("the fastest", others, FASTEST), ("SciPy's integrators", scipy, AROUND_SCIPY)):
         if ratios:
             name = min(ratios, key=lambda n: ratios[n])
-            text = f"effective samples per second: {best} / emcee around {what} ({name})"
-            result.append(row(text, ratios[name], least, None))
+            result.append(row(f"{what} emcee around {kind} ({name})", ratios[name], least, None))
     numpyro, own = found["samplers"][NUMPYRO], found["samplers"][best]
-    there = "ess_per_second" in numpyro
-    value = own["ess_per_second"] / numpyro["ess_per_second"] if there else None
-    text = f"effective samples per second: {best} / {NUMPYRO}"
-    return [*result, row(text, value, FASTEST, None, numpyro.get("note", ""))]
+    value = own["ess_per_second"] / numpyro["ess_per_second"] if "ess_per_second" in numpyro else None
+    return [*result, row(f"{what} {NUMPYRO}", value, FASTEST, None, numpyro.get("note", ""))]
 
 
 def _of_scaling(found: Mapping[str, Any]) -> list[Row]:

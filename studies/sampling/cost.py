@@ -18,14 +18,13 @@ import numpy as np
 import bayesperiodic as bp
 from studies.common import Row, available_cores, row, unjudged
 from studies.gear import GEAR, RIG, gear_problem
-from studies.timing import gain_of_cores, plain_loop
+from studies.timing import gain_of_cores, plain_loop, timed
 
 LOG_POSTERIOR, SHORT = 5e-3, 1e-5
 WALKERS, ENSEMBLES, STEPS, PIECE = 4, 2, 250, 25
 POOLS = ("process", "dask")
 POINTS = 64
 TURNS = 100_000
-PRIOR = bp.Normal(1.0, 1.0)
 POOL_LIMIT, GAIN_LIMIT = 1.05, 0.9
 LEAST_GAIN = 1.5
 QUIET = 0.5
@@ -75,11 +74,6 @@ def loaded(cost: dict[str, Any]) -> str:
     return f"the machine was busy (load {load[0]:.1f} on {cost['cores']} cores): times are not for quoting"
 
 
-def estimate(problem: bp.Problem) -> bp.MapEstimate:
-    """Return the MAP estimate of a landing-gear problem, started from the truth."""
-    return bp.map_estimate(problem, start={name: GEAR[name] for name in problem.names}, progress=False)
-
-
 class Pool(NamedTuple):
     """An executor with one worker held on a core."""
 
@@ -88,7 +82,7 @@ class Pool(NamedTuple):
 
 
 def pool_overhead(repeats: int = 3, pools: tuple[str, ...] = POOLS, seconds: float = LOG_POSTERIOR) -> dict[str, Any]:
-    """Compare a sampling run on one thread with the same run handed to one worker, log-posteriors taking 5 ms.
+    """Compare a sampling run on one thread with the same run handed to one worker.
 
     Both compute on the same core, the worker while this process waits on another one: then neither the cores' speeds
     nor other load on them affects the comparison. Runs alternate, thread, processes, thread, Dask, thread, and so on,
@@ -96,44 +90,39 @@ def pool_overhead(repeats: int = 3, pools: tuple[str, ...] = POOLS, seconds: flo
     processes takes seconds whatever the length of a run. A piece, which is what a message carries, is 4 walkers × 25
     steps, an eighth of what the default walkers make it, so that the overhead of a default run is smaller.
 
-    `repeats`: Of each pool, 20 s each. `pools`: "process", "dask"; the latter is left out where it is not installed.
-    `seconds`: What a log-posterior shall take. "ratios" by pool: "median" and "quartiles" of wall times over those of
-    the thread, and the median ratio of "processor_time", this process and the worker together, which other load changes
-    little; "milliseconds" a log-posterior takes in the thread, by the wall clock and the processor's; "walkers";
-    "log_posteriors" a run and a piece.
+    `repeats`: Of each pool, 20 s each. `pools`: "process", "dask"; the latter is omitted if it is not installed.
+    `seconds`: Duration of a log-posterior. The result has the ratios of wall times to those of the thread, those of the
+    processor times of this process and the worker together, which other load changes little, and the milliseconds of a
+    log-posterior in the thread.
     """
     kinds = [name for name in pools if name != "dask" or importlib.util.find_spec("distributed")]
     core, *others = sorted(os.sched_getaffinity(0))
     with _only_on({core}):
         problem, fit = slow_problem(seconds)
     times: dict[str, list[np.ndarray]] = {name: [] for name in ("thread", *kinds)}
+    chains: dict[str, bp.Posterior] = {}
     with ExitStack() as stack:
         workers = {"thread": Pool(None, float)} | {name: stack.enter_context(_POOLS[name](core)) for name in kinds}
         for name in kinds:
             _timed_run(*slow_problem(SHORT), workers[name], core, others)
-        order = ["thread", *(name for _ in range(repeats) for kind in kinds for name in (kind, "thread"))]
-        chains = {}
-        for name in order:
+        for name in ["thread", *(name for _ in range(repeats) for kind in kinds for name in (kind, "thread"))]:
             used, chains[name] = _timed_run(problem, fit, workers[name], core, others)
             times[name].append(used)
-    reference = chains["thread"].draws("k")
     for name, chain in chains.items():
-        if not np.array_equal(chain.draws("k"), reference):
+        if not np.array_equal(chain.draws("k"), chains["thread"].draws("k")):
             raise RuntimeError(f"The chain of {name!r} is not that of the thread.")
-    thread = np.array(times["thread"])
+    thread, count = np.array(times["thread"]), chains["thread"].log_posterior_calls
     between = 0.5 * (thread[1:] + thread[:-1])
-    count = chains["thread"].log_posterior_calls
     wall, processor = np.median(thread, axis=0) / count * 1e3
-    ratios = {name: np.array(times[name]) / between[i :: len(kinds)] for i, name in enumerate(kinds)}
+    ratios = {}
+    for i, name in enumerate(kinds):
+        walls, processors = np.transpose(np.array(times[name]) / between[i :: len(kinds)])
+        quartiles = np.quantile(walls, [0.25, 0.5, 0.75]).tolist()
+        ratios[name] = {
+            "median": quartiles[1], "quartiles": quartiles[::2], "processor_time": float(np.median(processors))
+        }  # fmt: skip
     return {
-        "ratios": {
-            name: {
-                "median": float(np.median(values[:, 0])),
-                "quartiles": np.quantile(values[:, 0], [0.25, 0.75]).tolist(),
-                "processor_time": float(np.median(values[:, 1])),
-            }
-            for name, values in ratios.items()
-        },
+        "ratios": ratios,
         "milliseconds": {"wall": float(wall), "processor": float(processor)},
         "walkers": WALKERS,
         "log_posteriors": {"run": count, "piece": WALKERS * PIECE},
@@ -196,45 +185,21 @@ def _only_on(cores: set[int]) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class SlowPrior:
-    """A normal prior, N(1, 1), that takes a plain loop of so many turns for every value: as slow as a large model.
+class SlowPrior(bp.Normal):
+    """A normal prior that is as slow as a large model, while everything else in a run is quick."""
 
-    With a model that is quick to solve, nothing else takes time in a run, before the walk or after it.
-    """
-
-    turns: int
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """The interval outside of which the density is zero."""
-        return PRIOR.support
+    turns: int  # Of a plain loop for every value
 
     def log_prob(self, x: Any) -> Any:
         """Return the log-density, after the loop."""
         plain_loop(self.turns * np.size(x))
-        return PRIOR.log_prob(x)
-
-    def gradient(self, x: Any) -> Any:
-        """Return the derivative of the log-density."""
-        return PRIOR.gradient(x)
-
-    def curvature(self, x: Any) -> Any:
-        """Return minus its second derivative."""
-        return PRIOR.curvature(x)
-
-    def quantile(self, p: Any) -> Any:
-        """Return quantiles."""
-        return PRIOR.quantile(p)
-
-    def sample(self, size: int, generator: np.random.Generator) -> np.ndarray:
-        """Return independent draws, (size,)."""
-        return PRIOR.sample(size, generator)
+        return super().log_prob(x)
 
 
 def slow_problem(seconds: float) -> tuple[bp.Problem, bp.MapEstimate]:
-    """Return a problem of the Duffing oscillator of which a log-posterior takes so many seconds on one core."""
+    """Return a problem of the Duffing oscillator whose log-posterior takes a given time on one core."""
     plain_loop(10)
-    turn = min(_seconds(partial(plain_loop, TURNS), 1, time.thread_time) for _ in range(10)) / TURNS
+    turn = min(timed(partial(plain_loop, TURNS), time.thread_time)[1] for _ in range(10)) / TURNS
     values, samples = {"m": 1.0, "c": 0.5, "k": 1.0, "k3": 0.1}, 40
     force = {"force": np.cos(2 * np.pi * np.arange(samples) / samples)}
     truth = bp.solve_periodic(bp.models.duffing, values, force, frequency=0.1, samples=samples, scheme="fourier")
@@ -242,7 +207,7 @@ def slow_problem(seconds: float) -> tuple[bp.Problem, bp.MapEstimate]:
     outputs = {"displacement": truth.outputs["displacement"] + noise}
     run = bp.Experiment("run", 0.1, outputs, force, samples=samples, synthetic=True)
     fixed = {name: value for name, value in values.items() if name != "k"}
-    prior = SlowPrior(round(seconds / turn))
+    prior = SlowPrior(1.0, 1.0, round(seconds / turn))
     problem = bp.Problem(bp.models.duffing, [run], priors={"k": prior}, fixed=fixed, scheme="fourier")
     return problem, bp.map_estimate(problem, progress=False)
 
@@ -250,32 +215,15 @@ def slow_problem(seconds: float) -> tuple[bp.Problem, bp.MapEstimate]:
 def vectorised_gain(repeats: int = 15) -> dict[str, Any]:
     """Compare the gain of all cores on one call of 64 walkers × 14 experiments with that on a plain loop.
 
-    The call is `Problem.log_likelihood`, on one thread and on as many as there are cores.
-
-    "cores", and by drive: "gain" of the call, "plain" (gain of the plain loop), "ratio" (median of their ratios),
-    "ratio_quartiles", "milliseconds" on one core.
+    The call is `Problem.log_likelihood`, on one thread and on as many as there are cores. The result has an entry of
+    `gain_of_cores` for each drive.
     """
     cores, result = available_cores(), {}
     for drive in ("force", "displacement"):
         problem = gear_problem(drive, 4, scheme="central2")
-        fit = estimate(problem)
-        anchored, noise = problem.anchored(fit.theta), np.array(list(fit.noise.values()))
-        theta = _draws(fit, POINTS)
-        result[drive] = gain_of_cores(partial(anchored.log_likelihood, theta, noise), cores, repeats)
+        fit = bp.map_estimate(problem, start={name: GEAR[name] for name in problem.names}, progress=False)
+        mean, sd, noise = (np.array(list(values.values())) for values in (fit.theta, fit.sd, fit.noise))
+        theta = mean + sd * np.random.default_rng(5).standard_normal((POINTS, mean.size))
+        call = partial(problem.anchored(fit.theta).log_likelihood, theta, noise)
+        result[drive] = gain_of_cores(call, cores, repeats)
     return {"cores": cores, "walkers": POINTS, "experiments": len(RIG), **result}
-
-
-def _draws(fit: bp.MapEstimate, size: int) -> np.ndarray:
-    """Return θ (size, names) around an estimate, scattered by its standard deviations."""
-    mean, sd = np.array(list(fit.theta.values())), np.array(list(fit.sd.values()))
-    return mean + sd * np.random.default_rng(5).standard_normal((size, mean.size))
-
-
-def _seconds(action: Callable[[], Any], calls: int, clock: Callable[[], float] = time.perf_counter) -> float:
-    """Return the median time of a call."""
-    times = []
-    for _ in range(calls):
-        before = clock()
-        action()
-        times.append(clock() - before)
-    return float(np.median(times))

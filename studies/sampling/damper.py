@@ -2,18 +2,19 @@
 
 import argparse
 import importlib.util
-import time
-from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy import stats
 
 import bayesperiodic as bp
 from studies.common import Row, row, unjudged
 from studies.damper import run as damper
-from studies.sampling.ridge import BATCHES, standard_error
+from studies.sampling.ridge import BATCHES, Runs, standard_error
+from studies.timing import timed
 
 SAMPLERS: dict[str, dict[str, Any]] = {
     "emcee": {},
@@ -24,31 +25,20 @@ FALSE_ALARM = 0.01
 MISSING = 'nutpie is not installed (pip install "bayesperiodic[nuts]")'
 
 
-@dataclass(frozen=True)
-class Sampled:
-    """The damper's posterior by several samplers."""
-
-    problem: bp.Problem
-    data: dict[str, Any]  # Path, digest and whether synthetic
-    posteriors: dict[str, bp.Posterior]  # By name of the sampler
-    seconds: dict[str, float]
-
-
-def sample_damper(options: argparse.Namespace) -> Sampled:
-    """Sample the damper with every sampler that is installed."""
+def sample_damper(options: argparse.Namespace) -> tuple[Runs, dict[str, Any]]:
+    """Return the posterior by every sampler that is installed, and the data's path, digest and whether synthetic."""
     recording, data = damper.read_recording(options.data, options.seed)
     problem = bp.Problem(bp.models.dahl, [recording.fold()], priors=damper.PRIORS)
     fit = bp.map_estimate(problem, progress=False)
-    posteriors, seconds = {}, {}
+    found: Runs = {}
     for name, settings in SAMPLERS.items():
         if name == "NUTS" and importlib.util.find_spec("nutpie") is None:
             continue
         shorter: dict[str, Any] = {"max_steps": 250, "ensembles": 2} if options.quick else {}
-        before = time.perf_counter()
-        posteriors[name] = bp.sample(problem, fit, seed=options.seed, progress=False, **shorter, **settings)
-        seconds[name] = time.perf_counter() - before
-        print(f"  {name}: {posteriors[name].reason}, {seconds[name]:.0f} s")
-    return Sampled(problem, data, posteriors, seconds)
+        run = partial(bp.sample, problem, fit, seed=options.seed, progress=False, **shorter, **settings)
+        found[name] = timed(run)
+        print(f"  {name}: {found[name][0].reason}, {found[name][1]:.0f} s")
+    return found, data
 
 
 def moments(posterior: bp.Posterior) -> dict[str, dict[str, float]]:
@@ -93,14 +83,14 @@ def limit(count: int, ensembles: int) -> float:
     return float(stats.t.isf(0.5 * FALSE_ALARM / count, ensembles * BATCHES - 1))
 
 
-def collect(sampled: Sampled) -> dict[str, Any]:
+def collect(sampled: Runs, data: dict[str, Any]) -> dict[str, Any]:
     """Return the entries of results.json on the damper."""
-    differences = compare_all(sampled.posteriors)
-    ensembles = [np.unique(p.data["posterior"]["ensemble"]).size for p in sampled.posteriors.values()]
+    differences = compare_all({name: posterior for name, (posterior, _) in sampled.items()})
+    ensembles = [np.unique(posterior.data["posterior"]["ensemble"]).size for posterior, _ in sampled.values()]
     return {
-        "data": sampled.data,
-        "units": {name: bp.models.dahl.units[name] for name in sampled.problem.names} | {"variance[force]": "N²"},
-        "samplers": {name: _account(p, sampled.seconds[name]) for name, p in sampled.posteriors.items()},
+        "data": data,
+        "units": {name: bp.models.dahl.units[name] for name in bp.models.dahl.parameters} | {"variance[force]": "N²"},
+        "samplers": {name: _account(posterior, seconds) for name, (posterior, seconds) in sampled.items()},
         "differences": differences,
         "limit": limit(len(differences), min(ensembles)),
         "false_alarm_rate": FALSE_ALARM,
@@ -145,8 +135,6 @@ def rows(found: dict[str, Any], quick: bool) -> list[Row]:
 
 def table(found: dict[str, Any]) -> str:
     """Return the samplers' costs as text."""
-    import pandas as pd
-
     columns = {
         "steps": "reason", "ESS, smallest": "ess_min", "log-posteriors": "log_posteriors", "seconds": "seconds",
         "ESS/s": "ess_per_second", "ESS per 1000 log-posteriors": "ess_per_1000_log_posteriors",

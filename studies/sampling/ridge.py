@@ -5,8 +5,7 @@ zero, and uncut, which leaves 1.2 % of the mass on a second branch where both ar
 the means of batches of draws.
 """
 
-import time
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from scipy.special import log_ndtr
 
 import bayesperiodic as bp
 from studies.common import Row, row
+from studies.timing import timed
 
 BATCHES = 5
 
@@ -44,43 +44,31 @@ LARGEST = 8.0
 CELLS = 400_000
 # A normal value lies beyond four of its standard errors once in 16,000 times.
 ERRORS = 4.0
+# Posteriors with their seconds, by name.
+Runs = dict[str, tuple[bp.Posterior, float]]
 
 
-@dataclass(frozen=True)
-class Ridge:
-    """Posteriors of the ridge.
+def sample_ridge(seed: int, quick: bool) -> Runs:
+    """Sample both ridges; a quick run gives the uncut one few steps, and the natural chain a third.
 
-    `default, natural`: Priors cut at zero: the default settings, and a short chain in natural coordinates. `uncut,
-    uncut_prior`: Priors over both signs: the default settings but for fewer steps at most, and as many from draws of
+    Priors cut at zero: "default", the default settings, and "natural", a short chain in natural coordinates. Priors
+    over both signs: "uncut", the default settings but for fewer steps at most, and "uncut_prior", as many from draws of
     the priors, which lie on both branches.
     """
-
-    default: bp.Posterior
-    natural: bp.Posterior
-    uncut: bp.Posterior
-    uncut_prior: bp.Posterior
-    seconds: dict[str, float]  # Of the four, by name
-
-
-def sample_ridge(seed: int, quick: bool) -> Ridge:
-    """Sample both ridges; a quick run gives the uncut one few steps, and the natural chain a third."""
-    cut = bp.TruncatedNormal(1.0, 1.0, 0.0, np.inf)
-    positive, both = _problem(cut), _problem(bp.Normal(1.0, 1.0))
-    fits = [bp.map_estimate(problem, progress=False) for problem in (positive, both)]
-    few = {"max_steps": 250, "ensembles": 2}
-    runs: dict[str, tuple[bp.Problem, bp.MapEstimate, dict[str, Any]]] = {
-        "default": (positive, fits[0], {}),
-        "natural": (positive, fits[0], {"coordinates": "natural", "max_steps": 500 if quick else SHORT}),
-        "uncut": (both, fits[1], few if quick else {"max_steps": LONG}),
-        "uncut_prior": (both, fits[1], {"start": "prior"} | (few if quick else {"max_steps": LONG})),
+    positive, both = _problem(bp.TruncatedNormal(1.0, 1.0, 0.0, np.inf)), _problem(bp.Normal(1.0, 1.0))
+    few = {"max_steps": 250, "ensembles": 2} if quick else {"max_steps": LONG}
+    runs: dict[str, tuple[bp.Problem, dict[str, Any]]] = {
+        "default": (positive, {}),
+        "natural": (positive, {"coordinates": "natural", "max_steps": 500 if quick else SHORT}),
+        "uncut": (both, few),
+        "uncut_prior": (both, {"start": "prior"} | few),
     }
-    found, seconds = {}, {}
-    for name, (problem, fit, settings) in runs.items():
-        before = time.perf_counter()
-        found[name] = bp.sample(problem, fit, seed=seed, progress=False, **settings)
-        seconds[name] = time.perf_counter() - before
-        print(f"  {name}: sd(a) = {found[name].draws('a').std():.4f}; {found[name].reason}")
-    return Ridge(**found, seconds=seconds)
+    found: Runs = {}
+    for name, (problem, settings) in runs.items():
+        fit = bp.map_estimate(problem, progress=False)
+        found[name] = timed(partial(bp.sample, problem, fit, seed=seed, progress=False, **settings))
+        print(f"  {name}: sd(a) = {found[name][0].draws('a').std():.4f}; {found[name][0].reason}")
+    return found
 
 
 def _problem(prior: Any) -> bp.Problem:
@@ -133,30 +121,22 @@ def negative_mass() -> float:
     return float(density[a < 0.0].sum() / density.sum())
 
 
-def collect(ridge: Ridge) -> dict[str, Any]:
+def collect(ridge: Runs) -> dict[str, Any]:
     """Return the entries of results.json on the ridge."""
     table: dict[str, Any] = {"width": WIDTH, "sd_by_quadrature": {"cut": spread(cut=True), "uncut": spread(cut=False)}}
-    for name in ("default", "natural", *UNCUT):
-        posterior: bp.Posterior = getattr(ridge, name)
-        table[name] = {
-            "sd": float(posterior.draws("a").std()),
-            "converged": posterior.converged,
-            "reason": posterior.reason,
-            "tau": posterior.tau,
-            "ess": posterior.ess,
-            "rhat": posterior.rhat,
-            "log_posteriors": posterior.log_posterior_calls,
-            "seconds": ridge.seconds[name],
-        }
-    for name in UNCUT:
-        table[name]["negative_mass"] = _negative_share(getattr(ridge, name))
+    for name, (posterior, seconds) in ridge.items():
+        judged = {key: getattr(posterior, key) for key in ("converged", "reason", "tau", "ess", "rhat")}
+        cost = {"log_posteriors": posterior.log_posterior_calls, "seconds": seconds}
+        table[name] = {"sd": float(posterior.draws("a").std())} | judged | cost
+        if name in UNCUT:
+            table[name]["negative_mass"] = _negative_share(posterior)
     return table
 
 
 def _negative_share(posterior: bp.Posterior) -> dict[str, float]:
     """Return the fraction of draws on the second branch and its Monte Carlo error.
 
-    Where all draws have the same sign, the error is the one that so many independent draws would have.
+    If all draws have the same sign, the error is that of as many independent draws as the effective sample size.
     """
     negative, truth = (posterior.draws("a") < 0.0).astype(float), negative_mass()
     error = standard_error(posterior, negative)

@@ -6,16 +6,29 @@ The ridge is computed; the damper is measured or synthetic, see studies/damper/r
 import argparse
 from typing import Any
 
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
 from studies import common
+from studies.sampling import cost as sampling_cost
 from studies.sampling import damper
-from studies.sampling import figures as sampling_figures
 from studies.sampling import ridge as sampling_ridge
+
+TRUTH, DRAWS, HISTOGRAM = "#000000", "#0072B2", "#56B4E9"
+SAMPLERS: dict[str, dict[str, Any]] = {
+    "emcee": {"color": "#BBD7EA"},
+    "emcee, collapsed": {"histtype": "step", "color": "#0072B2", "lw": 1.6},
+    "NUTS": {"histtype": "step", "color": "#D55E00", "lw": 1.6, "ls": "--"},
+}
+BINS = 41
+SHOWN = 1500
+FARTHEST = 4.0
+BAR, NEUTRAL, LIMIT = "#56B4E9", "#BBBBBB", "#D55E00"
 
 
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
-    from studies.sampling import cost as sampling_cost  # compiles
-
     watch = common.Stopwatch()
     with watch.part("cost", "overhead of a pool of workers, and gain of several cores"):
         cost = sampling_cost.run_cost(options.quick)
@@ -25,10 +38,10 @@ def run(options: argparse.Namespace) -> None:
     with watch.part("ridge", "the ridge a·b = 1, with known spread"):
         ridge = sampling_ridge.sample_ridge(options.seed, options.quick)
     with watch.part("damper", "the damper by three samplers"):
-        sampled = damper.sample_damper(options)
+        sampled, data = damper.sample_damper(options)
     found: dict[str, Any] = {
         "ridge": sampling_ridge.collect(ridge),
-        "damper": damper.collect(sampled),
+        "damper": damper.collect(sampled, data),
         "cost": cost | {"note": busy},
     }
     found["checks"] = [
@@ -38,15 +51,15 @@ def run(options: argparse.Namespace) -> None:
     ]
     with watch.part("figures", "drawing"):
         figures = {
-            "ridge": sampling_figures.draw_ridge(ridge),
-            "samplers": sampling_figures.draw_samplers(sampled, found["damper"]),
-            "costs": sampling_figures.draw_costs(cost, busy),
+            "ridge": draw_ridge(ridge),
+            "samplers": draw_samplers(sampled, found["damper"]),
+            "costs": draw_costs(cost, busy),
         }
         paths = common.save_figures(options.out, figures)
     print("\n" + tables(found) + "\n")
     results = {"seed": options.seed, "quick": options.quick} | found
     path = common.write_results(options.out, results | {"seconds": watch.total(), "versions": common.versions()})
-    what = " (synthetic data)" if sampled.data["synthetic"] else ""
+    what = " (synthetic data)" if data["synthetic"] else ""
     print(f"figures{what}: {', '.join(map(str, paths))}\nresults: {path}")
 
 
@@ -68,3 +81,111 @@ def tables(found: dict[str, Any]) -> str:
         ]
     lines += ["Targets", common.table_of_rows(found["checks"])]
     return "\n".join([*lines, *([f"Note: {found['cost']['note']}."] if found["cost"]["note"] else [])])
+
+
+def draw_ridge(ridge: sampling_ridge.Runs) -> Figure:
+    """Draw a and b of the short natural chain and of the default run, over the marginal densities of a."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(10.0, 7.0), layout="constrained")
+    above, below = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(1.0, 0.9))
+    a, density = sampling_ridge.marginal(cut=True)
+    inside = (a > 0.0) & (a < FARTHEST)
+    truth = sampling_ridge.spread(cut=True)
+    titles = {"natural": "natural coordinates, short chain", "default": "default coordinates"}
+    for top, bottom, (name, title) in zip(above, below, titles.items(), strict=True):
+        posterior, _ = ridge[name]
+        draws = {n: posterior.draws(n) for n in ("a", "b")}
+        some = np.linspace(0, draws["a"].size - 1, SHOWN).astype(int)
+        curve = np.linspace(1.0 / FARTHEST, FARTHEST, 400)
+        top.plot(curve, 1.0 / curve, color="0.6", lw=6.0, alpha=0.5, label="a·b = 1", zorder=1)
+        top.plot(draws["a"][some], draws["b"][some], ".", color=DRAWS, ms=2.5, label=f"{SHOWN} of the draws")
+        verdict = "converged" if posterior.converged else "NOT converged by the stop rule"
+        top.set_title(f"{title}:\n{verdict}", fontsize=11)
+        bins = np.linspace(0.0, FARTHEST, 81)
+        bottom.hist(draws["a"], bins, density=True, color=HISTOGRAM, alpha=0.7, label="draws")
+        bottom.plot(a[inside], density[inside], color=TRUTH, lw=1.4, label="by quadrature")
+        spread = f"sd(a) of the draws {draws['a'].std():.3f}\nby quadrature {truth:.3f}"
+        bottom.text(0.97, 0.55, spread, transform=bottom.transAxes, ha="right", va="top")
+        bottom.set_xlabel("a [1]")
+        for axes in (top, bottom):
+            axes.legend(frameon=False, loc="upper right", markerscale=3)
+    above[0].set(xlim=(0.0, FARTHEST), ylim=(0.0, FARTHEST), ylabel="b [1]")
+    below[0].set_ylabel("density of a [1]")
+    figure.suptitle("The ridge a·b = 1 ± 2 %, priors N(1, 1) cut at zero")
+    return figure
+
+
+def draw_samplers(sampled: sampling_ridge.Runs, found: dict[str, Any]) -> Figure:
+    """Draw the marginals of every parameter by every sampler, one over the other."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(10.0, 6.2), layout="constrained")
+    for axes, name in zip(figure.subplots(2, 3).flat, found["units"], strict=False):
+        draws = {sampler: posterior.draws(name) for sampler, (posterior, _) in sampled.items()}
+        low, high = np.quantile(np.concatenate(list(draws.values())), [0.0005, 0.9995])
+        bins = np.linspace(low, high, BINS)
+        for sampler, values in draws.items():
+            entry = found["samplers"][sampler]
+            label = f"{sampler}: {entry['ess_per_second']:.0f} independent draws/s"
+            axes.hist(values, bins, density=True, label=label, **SAMPLERS[sampler])
+        axes.set(xlabel=f"{name} [{found['units'][name]}]", yticks=[], ylim=(0.0, None))
+    for axes in figure.axes[::3]:
+        axes.set_ylabel("density")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, ncols=len(labels), loc="outside lower center")
+    worst = max((d["errors"] for d in found["differences"]), default=np.nan)
+    figure.suptitle(
+        f"The damper, {'synthetic data' if found['data']['synthetic'] else 'measured'}: of all differences in means "
+        f"and sds the largest is {worst:.1f} Monte Carlo errors (limit {found['limit']:.1f})",
+        fontsize=11,
+    )
+    return figure
+
+
+def draw_costs(cost: dict[str, Any], busy: str) -> Figure:
+    """Draw the overhead of pools and the gain of cores, with the limits; grey without a verdict."""
+    from matplotlib import pyplot as plt
+
+    figure = plt.figure(figsize=(10.0, 4.8), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    pools, gains = cost["pools"], cost["vectorised"]
+    if pools is None:
+        left.text(0.5, 0.4, "not measured", ha="center", va="center", transform=left.transAxes)
+        left.set(xticks=[], ylim=(0.0, 8.0))
+    else:
+        values = 1e2 * (np.array([[e["median"], *e["quartiles"]] for e in pools["ratios"].values()]) - 1.0)
+        names = [f"one {name}\nworker" for name in pools["ratios"]]
+        _draw_bars(left, names, values, [NEUTRAL if busy else BAR] * len(names))
+        left.axhline(0.0, color="black", lw=0.8)
+        left.set_ylim(min(-1.0, 1.2 * values.min()), max(8.0, 1.5 * values.max()))
+    _draw_limit(left, 1e2 * (sampling_cost.POOL_LIMIT - 1.0), "limit: at most {:g} %")
+    title = f"A pool of one worker, log-posteriors of {1e3 * sampling_cost.LOG_POSTERIOR:g} ms"
+    left.set(ylabel="wall time beyond that of one thread [%]", title=title)
+    drives = {f"landing gear,\n{drive}-driven": gains[drive] for drive in ("force", "displacement")}
+    colours = [NEUTRAL if busy or e["plain"] < sampling_cost.LEAST_GAIN else BAR for e in drives.values()]
+    values = np.array([[e["ratio"], *e["ratio_quartiles"]] for e in drives.values()])
+    _draw_bars(right, list(drives), values, colours)
+    for at, entry in enumerate(drives.values()):
+        right.text(at, 0.05, f"call × {entry['gain']:.2f}\nloop × {entry['plain']:.2f}", ha="center", va="bottom")
+    right.set_ylim(0.0, max(1.35, 1.3 * values.max()))
+    _draw_limit(right, sampling_cost.GAIN_LIMIT, "limit: at least {:g}")
+    title = f"{gains['cores']} cores on a call of {gains['walkers']} walkers × {gains['experiments']} experiments"
+    right.set(ylabel="gain of the call / gain of a plain loop [1]", title=title)
+    figure.suptitle("Cost of sampling" + (f": {busy}" if busy else ""), fontsize=11)
+    return figure
+
+
+def _draw_bars(axes: Axes, names: list[str], values: np.ndarray, colours: list[str]) -> None:
+    """Draw medians and quartiles, (bars, 3)."""
+    at, ranges = np.arange(len(names)), np.abs(values[:, 1:] - values[:, :1]).T
+    axes.bar(at, values[:, 0], width=0.5, color=colours, edgecolor="black")
+    label = "quartiles of the repeats"
+    axes.errorbar(at, values[:, 0], ranges, fmt="none", ecolor="black", capsize=5, label=label)
+    axes.set_xticks(at, names)
+    axes.set_xlim(-0.6, len(names) - 0.4)
+
+
+def _draw_limit(axes: Axes, limit: float, what: str) -> None:
+    axes.axhline(limit, color=LIMIT, lw=1.8, ls="--", label=what.format(round(limit, 6)))
+    axes.legend(frameon=False, loc="upper right", ncols=2, fontsize=9)

@@ -1,9 +1,9 @@
 """Time of a periodic solve: relative to LAPACK on the same matrices, after a small change, with size, on several cores.
 
-This is the one study module that imports the solver's internals, because it times single Newton iterations.
+This is the one study module that imports the solver's internals, because it times single Newton iterations. Times in
+microseconds are medians of interleaved repeats.
 """
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -17,7 +17,7 @@ from bayesperiodic.periodic.compiled import MAX_HALVINGS, MAX_ITERATIONS, NO_BOR
 from bayesperiodic.periodic.equations import PeriodicEquations, workspace
 from studies.common import available_cores
 from studies.gear import GEAR, RIG, gear_problem, gear_runs
-from studies.timing import Action, gain_of_cores, interleaved, slope
+from studies.timing import Action, gain_of_cores, interleaved, slope, timed
 
 SAMPLES = 800
 CHANGE = 0.01
@@ -26,14 +26,16 @@ REPEATS = 15
 CALLS = 20
 LINEAR_SIZES = (200, 400, 800, 1600, 3200, 6400, 12800, 25600, 51200)
 MASSES = (1, 2, 5, 10, 20, 30, 40, 50)
+VARIANTS = [(drive, scheme) for drive in ("force", "displacement") for scheme in ("backward2", "central2")]
+THETA = np.array(list(GEAR.values()))
 
 
 def run_cost(quick: bool = False) -> dict[str, Any]:
-    """Return everything measured, as plain data; times in microseconds are medians of interleaved repeats."""
+    """Return everything measured, as plain data."""
     repeats = 5 if quick else REPEATS
     return {
-        "newton_iteration": [newton_iteration(drive, scheme, repeats) for drive, scheme in _variants()],
-        "warm_solve": [warm_solve(drive, scheme, repeats) for drive, scheme in _variants()],
+        "newton_iteration": [newton_iteration(drive, scheme, repeats) for drive, scheme in VARIANTS],
+        "warm_solve": [warm_solve(drive, scheme, repeats) for drive, scheme in VARIANTS],
         "with_samples": with_samples(LINEAR_SIZES[:5] if quick else LINEAR_SIZES, repeats),
         "with_systems": with_systems(repeats),
         "with_masses": with_masses(MASSES[:4] if quick else MASSES),
@@ -59,19 +61,19 @@ def checks(cost: dict[str, Any]) -> list[tuple[str, float, float, float]]:
     return rows
 
 
-def _variants() -> list[tuple[str, str]]:
-    return [(drive, scheme) for drive in ("force", "displacement") for scheme in ("backward2", "central2")]
+def equations_of(
+    model: bp.Model, inputs: dict[str, np.ndarray], frequency: float, samples: int, scheme: str
+) -> PeriodicEquations:
+    """Return the equations of one experiment."""
+    return PeriodicEquations.build(
+        model, inputs, frequency=frequency, samples=samples, scheme=scheme, periods=1, winding=0
+    )
 
 
 def gear_equations(drive: str, scheme: str) -> list[PeriodicEquations]:
     """Return the equations of the 14 experiments (synthetic inputs, pure sines)."""
-    return [
-        PeriodicEquations.build(
-            bp.models.landing_gear(drive), inputs, frequency=frequency, samples=SAMPLES, scheme=scheme, periods=1,
-            winding=0,
-        )
-        for frequency, inputs in gear_runs(drive)
-    ]  # fmt: skip
+    model = bp.models.landing_gear(drive)
+    return [equations_of(model, inputs, frequency, SAMPLES, scheme) for frequency, inputs in gear_runs(drive)]
 
 
 def newton_iteration(drive: str, scheme: str, repeats: int) -> dict[str, Any]:
@@ -80,22 +82,14 @@ def newton_iteration(drive: str, scheme: str, repeats: int) -> dict[str, Any]:
     The iteration is the time of a solve from a guess 0.1 % off over its iterations, so it includes its share of the
     set-up of a solve. The copy that gbtrf needs, because it overwrites the band, is timed alone and subtracted.
     """
-    theta = np.array(list(GEAR.values()))
     measured = []
     for equations in gear_equations(drive, scheme):
-        z = equations.solve(theta, equations.static_guess(theta)).z
-        newton, iterations = _prepared(equations, theta, z * (1.0 + OFF))
-        band, lower = lapack_band(equations, equations.residual_jacobian(z, theta))
-        working = band.copy(order="F")
-        right = np.random.default_rng(1).standard_normal(band.shape[1])
+        newton, iterations, z = _prepared(equations, THETA)
+        columns = equations.residual_jacobian(z, THETA)
+        band, lower = lapack_band(equations, columns)
+        working, right = band.copy(order="F"), np.random.default_rng(1).standard_normal(band.shape[1])
         factored, pivots, _ = lapack.dgbtrf(band, lower, lower)
-        columns = equations.residual_jacobian(z, theta)
-        sweep = (
-            equations.states(z), equations.inputs, theta, equations.grid.tau, equations.frequency, columns
-        )  # fmt: skip
-
-        def copy(working: np.ndarray = working, band: np.ndarray = band) -> None:
-            working[:] = band
+        sweep = equations.states(z), equations.inputs, THETA, equations.grid.tau, equations.frequency, columns
 
         def factor(working: np.ndarray = working, band: np.ndarray = band, lower: int = lower) -> None:
             working[:] = band
@@ -105,33 +99,29 @@ def newton_iteration(drive: str, scheme: str, repeats: int) -> dict[str, Any]:
             repeats,
             newton=newton,
             sweep=partial(equations.model.kernels.residual_jacobian, *sweep),
-            copy=copy,
+            copy=partial(np.copyto, working, band),
             factor=factor,
             gbtrs=partial(lapack.dgbtrs, factored, lower, lower, right, pivots),
         )
-        measured.append(
-            {
-                "newton": times["newton"] / iterations,
-                "sweep": times["sweep"],
-                "gbtrf": times["factor"] - times["copy"],
-                "gbtrs": times["gbtrs"],
-            }
-        )
-    floors = [m["sweep"] + m["gbtrf"] + m["gbtrs"] for m in measured]
-    ratios = [m["newton"] / floor for m, floor in zip(measured, floors, strict=True)]
+        gbtrf = times["factor"] - times["copy"]
+        parts = times["newton"] / iterations, times["sweep"], gbtrf, times["gbtrs"]
+        measured.append((sum(parts[1:]), *parts))
+    floor, newton_us, *_ = np.transpose(measured)
+    names = ("sweep_gbtrf_gbtrs_us", "newton_us", "sweep_us", "gbtrf_us", "gbtrs_us")
     return {
         "drive": drive,
         "scheme": scheme,
-        "sweep_gbtrf_gbtrs_us": float(np.median(floors)),
-        **{f"{part}_us": float(np.median([m[part] for m in measured])) for part in measured[0]},
-        "ratio_median": float(np.median(ratios)),
-        "ratio_worst": max(ratios),
+        **dict(zip(names, np.median(measured, axis=0).tolist(), strict=True)),
+        "ratio_median": float(np.median(newton_us / floor)),
+        "ratio_worst": float(np.max(newton_us / floor)),
         "target": 0.6 if (drive, scheme) == ("force", "backward2") else 1.0,
     }
 
 
-def _prepared(equations: PeriodicEquations, theta: np.ndarray, guess: np.ndarray) -> tuple[Callable[[], Any], int]:
-    """Return a solve from a guess with preallocated work arrays, and its number of Newton iterations."""
+def _prepared(equations: PeriodicEquations, theta: np.ndarray) -> tuple[Callable[[], Any], int, np.ndarray]:
+    """Return a solve from a guess 0.1 % off with preallocated work arrays, its Newton iterations, and the solution."""
+    solution = equations.solve(theta, equations.static_guess(theta)).z
+    guess = solution * (1.0 + OFF)
     z, history = guess.copy(), np.empty((MAX_ITERATIONS, 3))
     before = equations.functions, equations.grid.packed, equations.setting(theta), NO_UNKNOWNS, NO_BORDER, MAX_HALVINGS
     work = workspace(equations, bordered=False)
@@ -140,7 +130,13 @@ def _prepared(equations: PeriodicEquations, theta: np.ndarray, guess: np.ndarray
         z[:] = guess
         return equations.kernels.newton(*before, z, history, work)
 
-    return solve, solve()[1]
+    return solve, solve()[1], solution
+
+
+def _iteration(equations: PeriodicEquations, theta: np.ndarray, repeats: int, calls: int) -> float:
+    """Return the microseconds of a Newton iteration."""
+    newton, iterations, _ = _prepared(equations, theta)
+    return _interleaved(repeats, calls, newton=newton)["newton"] / iterations
 
 
 def warm_solve(drive: str, scheme: str, repeats: int, changes: int = 20) -> dict[str, Any]:
@@ -148,17 +144,15 @@ def warm_solve(drive: str, scheme: str, repeats: int, changes: int = 20) -> dict
 
     They end when the next step expected is below 1e-9 of the state.
     """
-    theta = np.array(list(GEAR.values()))
-    changed = theta * (1.0 + CHANGE * np.random.default_rng(2).choice([-1.0, 1.0], (changes, theta.size)))
+    changed = THETA * (1.0 + CHANGE * np.random.default_rng(2).choice([-1.0, 1.0], (changes, THETA.size)))
     costs, steps = [], []
     for equations in gear_equations(drive, scheme):
-        z = equations.solve(theta, equations.static_guess(theta)).z
-        batch = Batch([equations], [Anchor.at(equations, theta, z)])
+        newton, iterations, z = _prepared(equations, THETA)
+        batch = Batch([equations], [Anchor.at(equations, THETA, z)])
         solved = batch.solve(changed, threads=1)
         if solved.status.any():
             raise RuntimeError(f"A warm solve failed at {equations.frequency} Hz.")
-        newton, iterations = _prepared(equations, theta, z * (1.0 + OFF))
-        times = _interleaved(repeats, calls=3, warm=partial(batch.solve, changed, threads=1), newton=newton)
+        times = _interleaved(repeats, 3, warm=partial(batch.solve, changed, threads=1), newton=newton)
         costs.append(times["warm"] / changes / (times["newton"] / iterations))
         steps.append(float(solved.iterations.mean()))
     return {
@@ -180,54 +174,37 @@ def map_of_the_gear(repeats: int) -> dict[str, Any]:
     """
     problem = gear_problem("force", 4, scheme="backward2")
     start = {name: GEAR[name] * (1.3 if name == "theta4" else 0.7) for name in problem.names}
-    times = []
-    for _ in range(repeats + 1):
-        before = time.perf_counter()
-        fit = bp.map_estimate(problem, start=start, progress=False)
-        times.append(time.perf_counter() - before)
+    estimate = partial(bp.map_estimate, problem, start=start, progress=False)
+    fit, times = estimate(), [timed(estimate)[1] for _ in range(repeats)]
     return {
         "status": fit.status,
         "iterations": len(fit.history) - 1,
-        "seconds_median": float(np.median(times[1:])),
-        "seconds_range": [min(times[1:]), max(times[1:])],
+        "seconds_median": float(np.median(times)),
+        "seconds_range": [min(times), max(times)],
         "off_in_sds": {name: (fit.theta[name] - GEAR[name]) / fit.sd[name] for name in problem.names},
     }
 
 
 def with_samples(sizes: tuple[int, ...], repeats: int) -> dict[str, Any]:
     """Time a Newton iteration of the force-driven gear at 1 Hz for growing n; fit the log-log slope from n = 800."""
-    theta, result = np.array(list(GEAR.values())), {}
+    model, result = bp.models.landing_gear(), {}
     for scheme in ("backward2", "central2"):
         times = []
         for samples in sizes:
-            wave = np.cos(2 * np.pi * np.arange(samples) / samples)
-            equations = PeriodicEquations.build(
-                bp.models.landing_gear(), {"force": 4500.0 + 700.0 * wave}, frequency=1.0, samples=samples,
-                scheme=scheme, periods=1, winding=0,
-            )  # fmt: skip
-            z = equations.solve(theta, equations.static_guess(theta)).z
-            newton, iterations = _prepared(equations, theta, z * (1.0 + OFF))
-            times.append(_interleaved(repeats, calls=3, newton=newton)["newton"] / iterations)
-        result[scheme] = {
-            "samples": list(sizes),
-            "us": times,
-            "slope": slope(sizes[2:], times[2:]),
-        }
+            force = 4500.0 + 700.0 * np.cos(2 * np.pi * np.arange(samples) / samples)
+            times.append(_iteration(equations_of(model, {"force": force}, 1.0, samples, scheme), THETA, repeats, 3))
+        result[scheme] = {"samples": list(sizes), "us": times, "slope": slope(sizes[2:], times[2:])}
     return result
 
 
 def with_systems(repeats: int, systems: int = 512) -> dict[str, Any]:
     """Compare the gain of both cores on a batch of solves with that on a plain loop in the same run."""
-    theta = np.array(list(GEAR.values()))
-    (equations,) = gear_equations("force", "backward2")[8:9]
-    z = equations.solve(theta, equations.static_guess(theta)).z
-    batch = Batch([equations], [Anchor.at(equations, theta, z)])
-    changed = theta * (1.0 + CHANGE * np.random.default_rng(3).standard_normal((systems, theta.size)))
-    cores = available_cores()
-    counts = (64, 128, 256, systems)
-    times = [
-        _interleaved(repeats, calls=1, solves=partial(batch.solve, changed[:c], threads=1))["solves"] for c in counts
-    ]
+    equations = gear_equations("force", "backward2")[8]
+    z = equations.solve(THETA, equations.static_guess(THETA)).z
+    batch = Batch([equations], [Anchor.at(equations, THETA, z)])
+    changed = THETA * (1.0 + CHANGE * np.random.default_rng(3).standard_normal((systems, THETA.size)))
+    cores, counts = available_cores(), (64, 128, 256, systems)
+    times = [_interleaved(repeats, 1, solves=partial(batch.solve, changed[:c], threads=1))["solves"] for c in counts]
     gains = gain_of_cores(lambda threads: batch.solve(changed, threads=threads), cores, 2 * repeats + 1)
     return {
         "systems": list(counts),
@@ -247,17 +224,11 @@ def with_masses(masses: tuple[int, ...], samples: int = 100) -> dict[str, Any]:
 
     The slope is fitted from 10 masses on, where the blocks begin to outweigh the sweep over them.
     """
-    times = []
+    times, force = [], np.cos(2 * np.pi * np.arange(samples) / samples)
     for count in masses:
         model = bp.models.chain(count)
-        wave = np.cos(2 * np.pi * np.arange(samples) / samples)
-        equations = PeriodicEquations.build(
-            model, {"force": wave}, frequency=0.3, samples=samples, scheme="central2", periods=1, winding=0
-        )
         theta = np.array([{"m": 1.0, "c": 0.2, "k": 50.0, "k3": 10.0}[name] for name in model.parameters])
-        z = equations.solve(theta, equations.static_guess(theta)).z
-        newton, iterations = _prepared(equations, theta, z * (1.0 + OFF))
-        times.append(_interleaved(5, calls=1, newton=newton)["newton"] / iterations)
+        times.append(_iteration(equations_of(model, {"force": force}, 0.3, samples, "central2"), theta, 5, 1))
     large = [m for m in masses if m >= 10] or list(masses[-2:])
     return {
         "masses": list(masses),
@@ -271,8 +242,7 @@ def with_masses(masses: tuple[int, ...], samples: int = 100) -> dict[str, Any]:
 def _interleaved(repeats: int, calls: int = CALLS, **actions: Callable[[], Any]) -> dict[str, float]:
     """Return the median of microseconds a call of each action, all timed in turn within every repeat."""
     repeated = {name: Action(partial(_repeat, action, calls), calls) for name, action in actions.items()}
-    times = interleaved(repeated, repeats)
-    return {name: 1e6 * float(np.median(seconds)) for name, seconds in times.items()}
+    return {name: 1e6 * float(np.median(seconds)) for name, seconds in interleaved(repeated, repeats).items()}
 
 
 def _repeat(action: Callable[[], Any], calls: int) -> None:

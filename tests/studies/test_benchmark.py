@@ -9,11 +9,21 @@ from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
 from studies.__main__ import main
-from studies.benchmark import contenders, figures, peers, posteriors, problems, scaling, targets
+from studies.benchmark import contenders, peers, posteriors, problems, scaling, targets
 from studies.benchmark import floor as benchmark_floor
 from studies.benchmark import run as benchmark
 from studies.benchmark.equations import NUMPY, FirstOrder, table
-from studies.benchmark.integration import EQUILIBRIUM, PREDICTED, SHOOTING, STARTS, STEADY, Discretised, Method, refer
+from studies.benchmark.integration import (
+    EQUILIBRIUM,
+    PREDICTED,
+    SHOOTING,
+    STARTS,
+    STEADY,
+    Discretised,
+    Method,
+    loosest,
+    refer,
+)
 from studies.benchmark.kernels import dense, eliminate, signals
 from studies.benchmark.problems import DUFFING_TRUTH, Setting, draws
 from studies.damper import run as damper
@@ -100,7 +110,7 @@ def test_integration_shooting_and_scipy_agree_on_the_orbit(setting):
     ends = []
     for kind in (STEADY, SHOOTING):
         for start in STARTS:
-            assert Method(one, kind, start, 1e-10).run(p) > 0
+            assert Method(one, 1e-10, kind, start).run(p) > 0
             ends.append(one.orbit)
     assert np.ptp(ends, axis=0) == pytest.approx(0.0, abs=1e-8)
     found = solve_ivp(
@@ -141,7 +151,7 @@ def test_gradient_by_shooting_equals_differences_of_its_value(setting):
     case, sd = setting.cases[0], np.array(list(setting.fit.sd.values()))
     one, theta = Discretised(case, 200), setting.theta[0]
     _, gradient = one.value_and_gradient(setting.parameters(theta, case)[0], 1e-11)
-    method = Method(one, SHOOTING, PREDICTED, 1e-11)
+    method = Method(one, 1e-11)
     for k in range(theta.size):
         step = 0.01 * sd[k] * np.eye(theta.size)[k]
         up, down = (method(setting.parameters(theta + sign * step, case)[0]) for sign in (1.0, -1.0))
@@ -153,8 +163,8 @@ def test_every_contender_is_accurate_before_it_is_timed(setting):
     assert reference.uncertainty < 1e-6
     contest = contenders.Contest(reference)
     scheme = contenders.add_own(contest)
-    compiled = contenders.add_compiled(contest)
-    contenders.add_scipy(contest, compiled)
+    contenders.add_compiled(contest)
+    peers.add_scipy(contest)
     contest.add("wrong", 0.02, Action(lambda: pytest.fail("timed")))
     found = contenders.measured(contest, scheme, 2)
     rows = {row["name"]: row for row in found["rows"]}
@@ -211,9 +221,7 @@ def test_a_quick_run_writes_table_and_figure(tmp_path, capsys, setting, monkeypa
 def test_missing_peer_has_a_row_with_the_reason(setting, monkeypatch):
     monkeypatch.setattr(peers.importlib.util, "find_spec", lambda name: None)
     contest = contenders.Contest(refer(replace(setting, name=problems.DUFFING)))
-    compiled = contenders.add_compiled(contest)
-    contest.rows.clear()
-    peers.add_peers(contest, compiled)
+    peers.add_peers(contest)
     rows = contenders.measured(contest, None, 1)["rows"]
     assert [row["name"] for row in rows] == [*peers.DIFFRAX_ROWS, peers.BALANCE]
     for row in rows:
@@ -225,15 +233,17 @@ def test_peers_give_accurate_results(setting, peer):
     pytest.importorskip(peer)
     case = setting.cases[0]
     one, p = Discretised(case, 800), setting.parameters(setting.theta, case)
-    exact = np.array([Method(one, SHOOTING, PREDICTED, 1e-10)(row) for row in p])
-    tune = {"diffrax": peers.tune_diffrax, "harmonicbalance": peers.tune_balanced}
-    found = tune[peer](one, p, exact, 1e-3)
+    exact = np.array([Method(one, 1e-10)(row) for row in p])
+    make, settings = {
+        "diffrax": (peers.Integrated, peers.RELATIVE), "harmonicbalance": (peers.Balanced, peers.HARMONICS)
+    }[peer]  # fmt: skip
+    found = loosest(partial(make, one), settings, p, exact, 1e-3)
     assert found is not None and [found(row) for row in p] == pytest.approx(exact, abs=2e-3)
 
 
 def test_the_density_of_the_peers_is_the_posterior_with_the_variance_integrated_out(setting):
     """∫ p(θ, log v) d log v is proportional to p(θ) M^(−n/2): compared by quadrature of the package's density."""
-    methods = [Method(Discretised(case, 400), SHOOTING, PREDICTED, 1e-9) for case in setting.cases]
+    methods = [Method(Discretised(case, 400), 1e-9) for case in setting.cases]
     density, warm = posteriors.collapsed(setting, methods), setting.problem.anchored(setting.fit.theta)
     logs = np.log(setting.noise) + np.linspace(-1.5, 1.5, 301)[:, None]
     found = []
@@ -247,7 +257,7 @@ def test_the_density_of_the_peers_is_the_posterior_with_the_variance_integrated_
 def test_potential_in_jax_equals_the_density(setting):
     jax = pytest.importorskip("jax")
     pytest.importorskip("diffrax")
-    methods = [Method(Discretised(case, 800), SHOOTING, PREDICTED, 1e-9) for case in setting.cases]
+    methods = [Method(Discretised(case, 800), 1e-9) for case in setting.cases]
     tuned = [peers.Integrated(method.discretised, 1e-9) for method in methods]
     density = posteriors.collapsed(setting, methods)
     middle, factor = np.log(setting.estimate), posteriors._axes(setting)
@@ -333,4 +343,4 @@ def test_posterior_and_scaling_are_reported_with_verdicts():
     assert [row["met"] for row in targets.rows(found)] == [False, True, None, True, False, *4 * [True], False]
     assert "jax is not installed" in targets.posterior(posterior)
     assert "600 MB" in scaling.account(found["scaling"])
-    assert len(figures.draw(found).axes) == 1
+    assert len(benchmark.draw(found).axes) == 1
