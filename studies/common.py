@@ -214,14 +214,14 @@ def source_key(*files: str | None) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def described(found: tuple[Path, str] | None) -> Line:
+def described(found: tuple[Path, str] | None) -> Row:
     """Return the entry of results.json on a file from `find_data`, or on generated data."""
     if found is None:
         return {"path": "generated", "sha256": None, "synthetic": True}
     return {"path": found[1], "sha256": sha256(found[0]), "synthetic": False}
 
 
-def finish(folder: Path, results: Line, watch: Stopwatch, paths: Sequence[Path] = (), *, synthetic: bool) -> None:
+def finish(folder: Path, results: Row, watch: Stopwatch, paths: Sequence[Path] = (), *, synthetic: bool) -> None:
     """Write results.json with the times and versions, and print the paths of figures and results."""
     path = write_results(folder, results | {"seconds": watch.total(), "versions": versions()})
     kind = " (synthetic data)" if synthetic else ""
