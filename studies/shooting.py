@@ -161,8 +161,8 @@ def _tables() -> tuple[dict[float, tuple[float, float, float]], dict[str, list[K
 
 
 # Limit cycle of x'' − μ (1 − x²) x' + x = 0: μ → (period, x > 0 where x' = 0, nontrivial multiplier), from a Taylor
-# series of order 40 with 36 digits. `van_der_pol_cycle` of tests/shooting.py agrees to 5e-15 in period and x, and in the
-# multiplier to 5e-14 up to μ = 2, then to 5e-13 (μ = 3) and 2e-11 (μ = 5).
+# series of order 40 with 36 digits. `van_der_pol_cycle` of tests/shooting.py agrees to 5e-15 in period and x, and to
+# 5e-14 in the multiplier up to μ = 2, then to 5e-13 (μ = 3) and 2e-11 (μ = 5).
 VAN_DER_POL, _orbits = _tables()
 
 # The orbits of the pendulum: DOP853 with rtol = atol = 3e-14 and variational equations, one Newton over all segments,

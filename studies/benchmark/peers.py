@@ -18,8 +18,8 @@ from scipy.integrate import solve_bvp, solve_ivp
 from scipy.interpolate import CubicSpline
 
 from studies.benchmark.contenders import SLOW_DRAWS, SLOW_REPEATS, Contest
-from studies.benchmark.equations import JAX, NUMPY, FirstOrder
 from studies.benchmark.integration import EQUILIBRIUM, ESTIMATE, LOOSE, PREDICTED, TABLE, TIMED_CYCLES, Peer
+from studies.benchmark.kernels import JAX, NUMPY, FirstOrder
 from studies.benchmark.problems import DUFFING
 from studies.timing import Action
 

@@ -27,8 +27,8 @@ from studies import common
 from studies.benchmark import contenders, peers, posteriors, scaling, targets
 from studies.benchmark import floor as floors
 from studies.benchmark import problems as made
-from studies.benchmark.equations import NUMPY, FirstOrder
 from studies.benchmark.integration import PREDICTED, SHOOTING, refer
+from studies.benchmark.kernels import NUMPY, FirstOrder
 from studies.benchmark.problems import Setting
 from studies.pendulum.orbits import distance, shoot
 from studies.pendulum.recording import FREQUENCY, OMEGA, QUICK_PERIODS, TRUTH, section_of, simulate

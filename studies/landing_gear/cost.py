@@ -19,8 +19,8 @@ from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
 from studies import common
-from studies.benchmark.equations import table as input_table
 from studies.benchmark.kernels import MAX_CYCLES
+from studies.benchmark.kernels import table as input_table
 from studies.gear import gear_at_rest
 from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, FORCE, SAMPLES, Identified, problem
 from studies.landing_gear.integrators import NAMES, methods
@@ -74,12 +74,15 @@ class Gear:
     def integrator(self, kind: str, fineness: float, tolerance: float) -> Integrate:
         """Return a compiled method; `fineness` is the number of steps per cycle, or the relative error of a step."""
         steps, frequency = int(fineness) if kind == FIXED else TABLE // 2, self.experiment.frequency
-        inputs, points = self._table(2 * steps), min(steps, SAMPLES)
+        inputs, every = self._table(2 * steps), max(steps // SAMPLES, 1)
 
         def integrate(parameters: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, int]:
-            path, given = np.empty((points, start.size)), (parameters, inputs, frequency, start.copy())
+            given = parameters, inputs, frequency, start.copy()
             if kind == FIXED:
-                return path, self._methods.fixed(*given, tolerance, path)
+                path, slopes = np.empty((2, steps + 1, start.size))
+                cycles = self._methods.fixed(*given, tolerance, path, slopes)
+                return path[:-1:every], cycles
+            path = np.empty((SAMPLES, start.size))
             return path, self._methods.controlled(*given, self._scale(parameters), fineness, tolerance, path)
 
         return integrate

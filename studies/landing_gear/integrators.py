@@ -16,8 +16,7 @@ import numpy as np
 from scipy.integrate import RK45
 
 import bayesperiodic as bp
-from studies.benchmark.equations import NUMBA, FirstOrder
-from studies.benchmark.kernels import MAX_CYCLES, compiled, integrators, signals
+from studies.benchmark.kernels import MAX_CYCLES, NUMBA, FirstOrder, compiled, integrators, runge_kutta, signals
 from studies.gear import GEAR
 
 NAMES = tuple(GEAR)
@@ -40,37 +39,19 @@ def settled(before, now, change, tolerance):
 
 def _fixed_steps(rates, size):
     """Return the classical Runge-Kutta method for a direction."""
+    one_cycle = runge_kutta(rates, size)
 
     @compiled
-    def integrate(g, inputs, frequency, y, tolerance, path):
-        """Integrate until steady and fill the states (samples, size) of the last cycle.
+    def integrate(g, inputs, frequency, y, tolerance, path, slopes):
+        """Integrate until steady and fill the states and their rates (steps + 1, size) of the last cycle.
 
         Return the number of cycles, 0 if it never becomes steady. `inputs` holds a cycle at half steps (2·steps,
-        signals); `y` is the start, and the end. The steps are a multiple of the samples.
+        signals); `y` is the start, and the end.
         """
-        steps, samples = inputs.shape[0] // 2, path.shape[0]
-        h, each, change = 1.0 / (frequency * steps), steps // samples, 0.0
-        k1, k2, k3, k4, trial = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+        change = 0.0
         for cycle in range(MAX_CYCLES):
-            before = y[size - 1]
-            for k in range(steps):
-                here, middle = inputs[2 * k], inputs[2 * k + 1]
-                after = inputs[2 * k + 2] if k + 1 < steps else inputs[0]
-                if k % each == 0:
-                    path[k // each] = y
-                rates(y, here, g, k1)
-                for i in range(size):
-                    trial[i] = y[i] + 0.5 * h * k1[i]
-                rates(trial, middle, g, k2)
-                for i in range(size):
-                    trial[i] = y[i] + 0.5 * h * k2[i]
-                rates(trial, middle, g, k3)
-                for i in range(size):
-                    trial[i] = y[i] + h * k3[i]
-                rates(trial, after, g, k4)
-                for i in range(size):
-                    y[i] += h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
-            done, change = settled(before, y[size - 1], change, tolerance)
+            one_cycle(g, inputs, 1.0 / frequency, y, path, slopes)
+            done, change = settled(path[0, size - 1], y[size - 1], change, tolerance)
             if done:
                 return cycle + 1
             if not abs(y[size - 1]) < 1e6:

@@ -12,7 +12,6 @@ from studies.__main__ import main
 from studies.benchmark import contenders, peers, posteriors, problems, scaling, targets
 from studies.benchmark import floor as benchmark_floor
 from studies.benchmark import run as benchmark
-from studies.benchmark.equations import NUMPY, FirstOrder, table
 from studies.benchmark.integration import (
     EQUILIBRIUM,
     PREDICTED,
@@ -24,7 +23,7 @@ from studies.benchmark.integration import (
     loosest,
     refer,
 )
-from studies.benchmark.kernels import dense, eliminate, signals
+from studies.benchmark.kernels import NUMPY, FirstOrder, dense, eliminate, signals, table
 from studies.benchmark.problems import DUFFING_TRUTH, Setting, draws
 from studies.damper import run as damper
 from studies.gear import measured
