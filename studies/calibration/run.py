@@ -15,10 +15,10 @@ machine can gain at that moment.
 """
 
 import argparse
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from multiprocessing import get_context
 from typing import Any
 
@@ -29,6 +29,7 @@ import bayesperiodic as bp
 from studies import common
 from studies.common import TaskPool
 from studies.gear import GEAR
+from studies.timing import timed
 
 CYCLES = 10
 OVERCOUNT = 1.25
@@ -194,8 +195,8 @@ def scaling(seed: int) -> dict[str, Any]:
         times: dict[str, list[float]] = {"farm 1": [], "farm 2": [], "loop 1": [], "loop 2": []}
         for number in range(ROUNDS):
             for workers in (1, 2):
-                times[f"loop {workers}"].append(_seconds(lambda w=workers: loops(w)))  # type: ignore[misc]
-                times[f"farm {workers}"].append(_seconds(lambda w=workers, n=number: farm(w, EACH, n)))  # type: ignore[misc]
+                times[f"loop {workers}"].append(timed(partial(loops, workers))[1])
+                times[f"farm {workers}"].append(timed(partial(farm, workers, EACH, number))[1])
         overhead = _overhead(clients[2])
     gain, plain = (2.0 * np.array(times[f"{what} 1"]) / np.array(times[f"{what} 2"]) for what in ("farm", "loop"))
     replicate = float(np.median(times["farm 1"])) / EACH
@@ -222,14 +223,8 @@ def _overhead(client: Any) -> float:
                 pass
 
     empty()
-    return float(np.median([_seconds(empty) for _ in range(3)])) / EMPTY
+    return float(np.median([timed(empty)[1] for _ in range(3)])) / EMPTY
 
 
 def _nothing(_: None, task: int) -> int:
     return task
-
-
-def _seconds(action: Callable[[], Any]) -> float:
-    before = time.perf_counter()
-    action()
-    return time.perf_counter() - before

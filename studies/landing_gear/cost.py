@@ -8,7 +8,6 @@ compared with the finest integration.
 """
 
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -24,7 +23,7 @@ from studies.benchmark.kernels import table as input_table
 from studies.gear import gear_at_rest
 from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, FORCE, SAMPLES, Identified, problem
 from studies.landing_gear.integrators import NAMES, methods
-from studies.timing import Action, interleaved, spread
+from studies.timing import Action, interleaved, spread, timed
 
 DRAWS, QUICK_DRAWS = 10, 2
 REPEATS, QUICK_REPEATS = 9, 1
@@ -244,7 +243,7 @@ def _by_scheme(
     own = _own_errors(warm, theta, gears)
     chosen = [{k: choose(gear, k, allowed) for k in COMPILED} for gear, allowed in zip(gears, own, strict=True)]
     noise = np.array(list(fit.noise.values()))
-    times = interleaved(_actions(warm, scheme, noise, theta, gears, chosen), QUICK_REPEATS if quick else REPEATS)
+    times = interleaved(_actions(warm, noise, theta, gears, chosen), QUICK_REPEATS if quick else REPEATS)
     scipy = {method: _scipy(gears, own, chosen, method) for method in SCIPY}
     settings = "fineness", "tolerance", "error", "cycles"
     return {
@@ -272,20 +271,16 @@ def _own_errors(warm: bp.Problem, theta: np.ndarray, gears: Sequence[Gear]) -> l
 
 
 def _actions(
-    warm: bp.Problem,
-    scheme: str,
-    noise: np.ndarray,
-    theta: np.ndarray,
-    gears: Sequence[Gear],
+    warm: bp.Problem, noise: np.ndarray, theta: np.ndarray, gears: Sequence[Gear],
     chosen: Sequence[Mapping[str, Contender]],
-) -> dict[str, Action]:
+) -> dict[str, Action]:  # fmt: skip
     """Return the timed actions, with the number of log-posteriors of each call."""
     many = np.resize(theta, (WALKERS, theta.shape[1]))
 
     def cold(gear: Gear) -> bp.PeriodicSolution:
         values, e = dict(zip(NAMES, gear.parameters[0], strict=True)), gear.experiment
         model = bp.models.landing_gear(gear.drive)
-        return bp.solve_periodic(model, values, e.inputs, frequency=e.frequency, samples=SAMPLES, scheme=scheme)
+        return bp.solve_periodic(model, values, e.inputs, frequency=e.frequency, samples=SAMPLES, scheme=warm.scheme)
 
     def steady(gear: Gear, contender: Contender) -> np.ndarray:
         # Static equilibrium if theta16 ≤ 0 at the estimate, without a steady state.
@@ -323,13 +318,10 @@ def _scipy(
     for gear, tolerance, by_kind in zip(gears, relative, chosen, strict=True):
         if tolerance is None:
             return None
-        integrate, parameters = gear.scipy(method, tolerance, TIMED_CYCLES), gear.parameters[0]
-        start, times = gear.still(parameters), []
-        for _ in range(2):
-            before = time.perf_counter()
-            integrate(parameters, start)
-            times.append(time.perf_counter() - before)
-        total += min(times) * min(contender.cycles for contender in by_kind.values()) / TIMED_CYCLES
+        parameters = gear.parameters[0]
+        run = partial(gear.scipy(method, tolerance, TIMED_CYCLES), parameters, gear.still(parameters))
+        seconds = min(timed(run)[1] for _ in range(2))
+        total += seconds * min(contender.cycles for contender in by_kind.values()) / TIMED_CYCLES
     return total
 
 

@@ -7,6 +7,7 @@ import argparse
 from typing import Any
 
 import numpy as np
+from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -58,9 +59,7 @@ def run(options: argparse.Namespace) -> None:
         paths = common.save_figures(options.out, figures)
     print("\n" + tables(found) + "\n")
     results = {"seed": options.seed, "quick": options.quick} | found
-    path = common.write_results(options.out, results | {"seconds": watch.total(), "versions": common.versions()})
-    what = " (synthetic data)" if data["synthetic"] else ""
-    print(f"figures{what}: {', '.join(map(str, paths))}\nresults: {path}")
+    common.finish(options.out, results, watch, paths, synthetic=data["synthetic"])
 
 
 def tables(found: dict[str, Any]) -> str:
@@ -85,8 +84,6 @@ def tables(found: dict[str, Any]) -> str:
 
 def draw_ridge(ridge: sampling_ridge.Runs) -> Figure:
     """Draw a and b of the short natural chain and of the default run, over the marginal densities of a."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(10.0, 7.0), layout="constrained")
     above, below = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(1.0, 0.9))
     a, density = sampling_ridge.marginal(cut=True)
@@ -118,8 +115,6 @@ def draw_ridge(ridge: sampling_ridge.Runs) -> Figure:
 
 def draw_samplers(sampled: sampling_ridge.Runs, found: dict[str, Any]) -> Figure:
     """Draw the marginals of every parameter by every sampler, one over the other."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(10.0, 6.2), layout="constrained")
     for axes, name in zip(figure.subplots(2, 3).flat, found["units"], strict=False):
         draws = {sampler: posterior.draws(name) for sampler, (posterior, _) in sampled.items()}
@@ -132,8 +127,7 @@ def draw_samplers(sampled: sampling_ridge.Runs, found: dict[str, Any]) -> Figure
         axes.set(xlabel=f"{name} [{found['units'][name]}]", yticks=[], ylim=(0.0, None))
     for axes in figure.axes[::3]:
         axes.set_ylabel("density")
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, frameon=False, ncols=len(labels), loc="outside lower center")
+    common.shared_legend(figure, len(sampled))
     worst = max((d["errors"] for d in found["differences"]), default=np.nan)
     figure.suptitle(
         f"The damper, {'synthetic data' if found['data']['synthetic'] else 'measured'}: of all differences in means "
@@ -145,8 +139,6 @@ def draw_samplers(sampled: sampling_ridge.Runs, found: dict[str, Any]) -> Figure
 
 def draw_costs(cost: dict[str, Any], busy: str) -> Figure:
     """Draw the overhead of pools and the gain of cores, with the limits; grey without a verdict."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(10.0, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     pools, gains = cost["pools"], cost["vectorised"]

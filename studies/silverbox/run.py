@@ -7,8 +7,8 @@ The estimates are checked on a finer grid, from another start, and with a second
 """
 
 import argparse
-import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 
 import bayesperiodic as bp
 from studies import common
+from studies.timing import timed
 
 FILE = "silverbox/Schroeder80mV.csv"
 ADDRESS = "nonlinearbenchmark.org (Silverbox), copy in github.com/biaslab/nsi-silverbox (commit 728f07e4)"
@@ -228,9 +229,8 @@ def _from_rest(experiment: bp.Experiment, theta: Mapping[str, float]) -> tuple[l
     }
     found, seconds = [], []
     for at, values in points.items():
-        start = time.perf_counter()
-        s = solve(values, experiment)
-        seconds.append(time.perf_counter() - start)
+        s, taken = timed(partial(solve, values, experiment))
+        seconds.append(taken)
         found.append({"at": at, "status": s.status, "found_by": s.found_by, "iterations": s.iterations})
     return found, seconds
 

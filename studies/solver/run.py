@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -76,8 +77,7 @@ def run(options: argparse.Namespace) -> None:
     results["checks"] = checks(results)
     results["cost"]["checks"] = [verdict(*row) for row in cost.checks(results["cost"])]
     print("\n" + tables(results) + "\n")
-    path = common.write_results(options.out, results | {"seconds": watch.total(), "versions": common.versions()})
-    print(f"figures: {', '.join(map(str, paths))}\nresults: {path}")
+    common.finish(options.out, results, watch, paths, synthetic=False)
 
 
 def measure_orders() -> dict[str, Any]:
@@ -335,8 +335,6 @@ def draw_duffing(branches: dict[float, bp.Branch]) -> Figure:
 
 def draw_pendulum(branches: dict[int, bp.Branch], attractor: dict[float, np.ndarray]) -> Figure:
     """Draw the cascade of the pendulum's rotation, whole and enlarged, with the motion found by time integration."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(10.0, 5.0), layout="constrained")
     whole, enlarged = figure.subplots(1, 2)
     for axes, most in ((whole, 4), (enlarged, 8)):
@@ -361,8 +359,6 @@ def draw_pendulum(branches: dict[int, bp.Branch], attractor: dict[float, np.ndar
 
 def draw_orders(forced: dict[str, Any], periods: dict[str, Any]) -> Figure:
     """Draw errors against the number of points: every scheme on Duffing, two of them on van der Pol's period."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(10.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
 
