@@ -38,11 +38,6 @@ def row(what: str, value: float | None, low: float, high: float | None, note: st
     return {"what": what, "value": value, "low": low, "high": high, "met": met, "note": note}
 
 
-def unjudged(entry: Row, why: str) -> Row:
-    """Return a row without its verdict."""
-    return entry | {"met": None, "note": why}
-
-
 def table_of_rows(rows: list[Row]) -> str:
     """Return rows as text, with notes below."""
     verdicts, lines = {True: "yes", False: "NO", None: "-"}, []

@@ -15,8 +15,8 @@ import pandas as pd
 
 import bayesperiodic as bp
 from studies import common
-from studies.flutter import campaigns, questions, rig
 from studies.flutter import figures as flutter_figures
+from studies.flutter import questions, rig
 from studies.flutter.reference import hopf, settled
 
 SAMPLING: dict[str, Any] = {
@@ -33,7 +33,7 @@ CURVE = 4000
 def run(options: argparse.Namespace) -> None:
     """Run the study, or the campaigns that count coverage."""
     if options.replicates:
-        campaigns.run(options)
+        questions.campaigns(options)
         return
     watch, draws = common.Stopwatch(), 20 if options.quick else 200
     with watch.part("read", "reading the records and folding them without an input"):

@@ -1,28 +1,33 @@
 """Time of a log-posterior of the landing gear: the periodic solver against time integration until steady.
 
 All fourteen experiments at draws of their joint posterior, interleaved in one run. The periodic solver is timed with
-the whole log-posterior, by scheme; the compiled methods of `studies.landing_gear.integrators`, and SciPy's LSODA and
-Radau on the same compiled right-hand side, with the integration alone. For each experiment the largest steps and
-loosest tolerances are chosen with which the outputs of all draws are as accurate as those of the periodic solver,
-compared with the finest integration.
+the whole log-posterior, by scheme; compiled methods, and SciPy's LSODA and Radau on the same compiled right-hand side,
+with the integration alone. For each experiment the largest steps and loosest tolerances are chosen with which the
+outputs of all draws are as accurate as those of the periodic solver, compared with the finest integration.
+
+The compiled methods are the classical Runge-Kutta method with fixed steps, and the pair of orders 5 and 4 of Dormand
+and Prince with error control (Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, 1993, table 5.2).
+They stop when the gas is within `tolerance` of its steady temperature, estimated from two successive changes over a
+cycle, which decrease geometrically. States are the gas temperature T [K], preceded by compression q [m] and velocity
+[m/s] if the force is given.
 """
 
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from scipy.integrate import RK45, solve_ivp
 
 import bayesperiodic as bp
 from studies import common
-from studies.benchmark.kernels import MAX_CYCLES
+from studies.benchmark.kernels import MAX_CYCLES, NUMBA, FirstOrder, compiled, integrators, runge_kutta, signals
 from studies.benchmark.kernels import table as input_table
-from studies.gear import gear_at_rest
+from studies.gear import GEAR, gear_at_rest
 from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, FORCE, SAMPLES, Identified, problem
-from studies.landing_gear.integrators import NAMES, methods
 from studies.timing import Action, interleaved, spread, timed
 
 DRAWS, QUICK_DRAWS = 10, 2
@@ -45,6 +50,118 @@ FINEST = 1e-11, 1e-9
 TABLE = 16_384
 SCALE = (0.1, 0.1)
 
+# The order of the parameters.
+NAMES = tuple(GEAR)
+# Nodes, stage weights and the difference of the two results of Dormand and Prince.
+NODES, DIFFERENCE = np.append(RK45.C, 1.0), RK45.E
+STAGES = np.vstack([np.pad(RK45.A, ((0, 0), (0, 1))), RK45.B])
+
+
+@compiled
+def settled(before, now, change, tolerance):
+    """Return whether the temperature is steady, and its change over the last cycle."""
+    new = now - before
+    if new == 0.0:
+        return True, new
+    factor = new / change if change != 0.0 else 1.0
+    # Not before the changes fall like those of a single exponential.
+    near = 0.0 < factor < 1.0 and abs(new) * factor / (1.0 - factor) < tolerance
+    return near or (abs(factor) < 0.1 and abs(new) < tolerance), new
+
+
+def _fixed_steps(rates, size):
+    """Return the classical Runge-Kutta method for a direction."""
+    one_cycle = runge_kutta(rates, size)
+
+    @compiled
+    def integrate(g, inputs, frequency, y, tolerance, path, slopes):
+        """Integrate until steady and fill the states and their rates (steps + 1, size) of the last cycle.
+
+        Return the number of cycles, 0 if it never becomes steady. `inputs` holds a cycle at half steps (2·steps,
+        signals); `y` is the start, and the end.
+        """
+        change = 0.0
+        for cycle in range(MAX_CYCLES):
+            one_cycle(g, inputs, 1.0 / frequency, y, path, slopes)
+            done, change = settled(path[0, size - 1], y[size - 1], change, tolerance)
+            if done:
+                return cycle + 1
+            if not abs(y[size - 1]) < 1e6:
+                return 0
+        return 0
+
+    return integrate
+
+
+def _controlled_steps(rates, size):
+    """Return the pair of Dormand and Prince for a direction."""
+
+    @compiled
+    def integrate(g, inputs, frequency, y, scale, relative, tolerance, path):
+        """Integrate until steady, then through one more cycle for the states (samples, size).
+
+        Return the number of cycles, 0 if it never becomes steady. `inputs` holds a cycle (points, signals), `scale`
+        (size,) the scales of the errors.
+        """
+        rate, trial, u = np.empty((7, size)), np.empty(size), np.empty(inputs.shape[1])
+        samples, change, step, done = path.shape[0], 0.0, 1e-3, False
+        for cycle in range(MAX_CYCLES):
+            before = y[size - 1]
+            last = done
+            for k in range(samples if last else 1):
+                now, end = k / samples if last else 0.0, (k + 1) / samples if last else 1.0
+                signals(inputs, now, u)
+                if last:
+                    path[k] = y
+                rates(y, u, g, rate[0])
+                while now < end:
+                    used = min(step, end - now)
+                    for stage in range(1, 7):
+                        for i in range(size):
+                            total = 0.0
+                            for j in range(stage):
+                                total += STAGES[stage, j] * rate[j, i]
+                            trial[i] = y[i] + used / frequency * total
+                        signals(inputs, now + NODES[stage] * used, u)
+                        rates(trial, u, g, rate[stage])
+                    error = 0.0
+                    for i in range(size):
+                        total = 0.0
+                        for j in range(7):
+                            total += DIFFERENCE[j] * rate[j, i]
+                        error = max(error, abs(used / frequency * total) / (relative * scale[i]))
+                    if error <= 1.0:
+                        now = end if used == end - now else now + used
+                        for i in range(size):
+                            y[i], rate[0, i] = trial[i], rate[6, i]
+                    elif used < 1e-12:
+                        return 0
+                    growth = min(5.0, max(0.2, 0.9 * error ** (-0.2))) if error > 0.0 else 5.0
+                    step = max(step, used * growth) if error <= 1.0 and used < step else used * growth
+            if last:
+                return cycle + 1
+            done, change = settled(before, y[size - 1], change, tolerance)
+            if not abs(y[size - 1]) < 1e6:
+                return 0
+        return 0
+
+    return integrate
+
+
+@cache
+def methods(drive: str) -> SimpleNamespace:
+    """Return the compiled functions fixed, controlled, outputs and rates_in_time of one direction."""
+    model = bp.models.landing_gear(drive)
+    first, generic = FirstOrder(model, ()), integrators(model, NAMES[:1])
+    rates = compiled(first.function(NUMBA, first.rates))
+    return SimpleNamespace(
+        fixed=_fixed_steps(rates, first.size),
+        controlled=_controlled_steps(rates, first.size),
+        outputs=generic.outputs,
+        rates_in_time=generic.rates_in_time,
+    )
+
+
 # From parameters and start to the states of a cycle (samples, size) and the number of cycles integrated, 0 for never.
 Integrate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]
 
@@ -55,7 +172,7 @@ class Gear:
 
     drive: str
     experiment: bp.Experiment
-    parameters: np.ndarray  # (draws, parameters): In the order of `integrators.NAMES`
+    parameters: np.ndarray  # (draws, parameters): In the order of `NAMES`
     estimate: np.ndarray  # (parameters,): The MAP estimate
 
     def still(self, parameters: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import pandas as pd
 from scipy import stats
 
 import bayesperiodic as bp
-from studies.common import Row, row, unjudged
+from studies.common import Row, row
 from studies.damper import run as damper
 from studies.sampling.ridge import BATCHES, Runs, standard_error
 from studies.timing import timed
@@ -123,7 +123,7 @@ def rows(found: dict[str, Any], quick: bool) -> list[Row]:
             result.append(row(what, None, 1.0, 1.0, MISSING))
         else:
             judged = row(what, entry["converged"], 1.0, 1.0, "" if entry["converged"] else entry["reason"])
-            result.append(unjudged(judged, f"a quick run: {entry['reason']}") if quick else judged)
+            result.append(judged | ({"met": None, "note": f"a quick run: {entry['reason']}"} if quick else {}))
     for one, other in combinations(SAMPLERS, 2):
         pair = [d for d in found["differences"] if d["samplers"] == [one, other]]
         worst = max(pair, key=lambda d: d["errors"], default=None)

@@ -20,9 +20,7 @@ from matplotlib.figure import Figure
 import bayesperiodic as bp
 from studies import common
 from studies.verdicts import cases
-from studies.verdicts import outcome as verdicts_outcome
-from studies.verdicts.cases import CASES, COMPARE, FINE, IDENTIFIABILITY, PREDICT
-from studies.verdicts.outcome import Outcome, examine
+from studies.verdicts.cases import CASES, COMPARE, FINE, IDENTIFIABILITY, PREDICT, Outcome, examine
 
 DATA, SAMPLER = "data", "sampler"
 MOST_SAMPLER_SEEDS = 20
@@ -54,7 +52,7 @@ def replicate(task: Task) -> dict[str, Any]:
 
 def source() -> str:
     """Return a key that identifies version and cases of the replicates."""
-    return common.source_key(cases.__file__, verdicts_outcome.__file__)
+    return common.source_key(cases.__file__)
 
 
 def replicates(folder: Path, names: Sequence[str], count: int, seed: int) -> list[dict[str, Any]]:
