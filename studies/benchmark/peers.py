@@ -176,7 +176,6 @@ class Balanced(Peer):
         return self._series(self.discretised.states(self.case.times)[0])
 
     def _series(self, values: np.ndarray) -> Any:
-        """Return the Fourier series of samples over a period."""
         from harmonicbalance.fourier import Fourier
 
         amplitudes, count = np.fft.rfft(values) / len(values), self.setting

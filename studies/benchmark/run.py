@@ -110,7 +110,6 @@ def _of_problem(name: str, make: Callable[[], Setting], options: argparse.Namesp
 
 
 def _source(options: argparse.Namespace, name: str) -> str:
-    """Return a key that identifies version and settings of kept parts."""
     key = common.source_key(*map(str, sorted(Path(__file__).parent.glob("*.py"))))
     return f"{key} {name} {options.seed} {options.quick} {options.guard}"
 

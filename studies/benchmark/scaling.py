@@ -88,7 +88,6 @@ def _batched(samples: int = 800, experiments: int = 14, walkers: int = WALKERS, 
 
 
 def _gradient(free: int, seed: int) -> Callable[[], Any]:
-    """Return a gradient by some of the parameters."""
     problem, _, noise = at_truth("force", 800, 14, free=15, seed=seed)
     kept = dict(list(problem.priors.items())[:free])
     fixed = {name: GEAR[name] for name in problem.names if name not in kept}

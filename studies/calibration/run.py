@@ -105,8 +105,6 @@ BINS = 20
 
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
-    if options.replicates < 0:
-        raise ValueError(f"--replicates: must be at least 0, got {options.replicates}.")
     if options.scaling:
         print(f"scaling: {common.write_results(options.out / 'scaling', scaling(options.seed))}")
         return

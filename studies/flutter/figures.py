@@ -17,13 +17,9 @@ GRID, COARSE = np.linspace(13.0, 19.0, 241), np.linspace(13.0, 19.0, 41)
 
 
 def all_of(
-    experiments: Experiments,
-    speeds: Speeds,
-    fits: Mapping[str, Fitted],
-    fit: bp.MapEstimate,
-    posterior: bp.Posterior | None,
-    draws: int,
-) -> dict[str, Figure]:
+    experiments: Experiments, speeds: Speeds, fits: Mapping[str, Fitted], fit: bp.MapEstimate,
+    posterior: bp.Posterior | None, draws: int,
+) -> dict[str, Figure]:  # fmt: skip
     """Return every figure by its name; without a posterior the bands are Laplace's, and there is no corner plot."""
     if posterior is None:
         chosen = laplace_draws(fit, draws)

@@ -173,9 +173,9 @@ def drawn_sizes(
     return {c: np.array([np.nan if one is None else one[c] for one in found]) for c in CHANNELS}
 
 
-# Campaigns have the eight kinds of cycles of the true model, with their own noise of the measured records' size, and are
-# fitted in the same way except for the noise: with a true model the scatter of the cycles estimates the noise of each
-# record. The sensors' scales are fixed, since they and the stiffnesses are not separately identifiable.
+# A campaign has the eight kinds of cycles of the true model, with its own noise of the measured records' size. Its fit
+# differs in the noise: with a true model the scatter of the cycles estimates the noise of each record. The sensors'
+# scales are fixed, since they and the stiffnesses are not separately identifiable.
 FILE = "campaigns.jsonl"
 FIRST_SEED = 100_000
 STIFFNESSES = ("k_alpha2", "k_alpha3")

@@ -391,7 +391,6 @@ def _actions(
     warm: bp.Problem, noise: np.ndarray, theta: np.ndarray, gears: Sequence[Gear],
     chosen: Sequence[Mapping[str, Contender]],
 ) -> dict[str, Action]:  # fmt: skip
-    """Return the timed actions, with the number of log-posteriors of each call."""
     many = np.resize(theta, (WALKERS, theta.shape[1]))
 
     def cold(gear: Gear) -> bp.PeriodicSolution:

@@ -44,8 +44,6 @@ class OfTruth:
 
 def run(options: argparse.Namespace) -> None:
     """Run the study, or with ``--replicates`` campaigns of truth A alone."""
-    if options.replicates < 0:
-        raise ValueError(f"--replicates: must be at least 0, got {options.replicates}.")
     watch, runs = common.Stopwatch(), QUICK if options.quick else RUNS
     if options.replicates:
         with watch.part("campaigns", f"{options.replicates} SYNTHETIC campaigns of truth A"):
@@ -88,7 +86,6 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _source(options: argparse.Namespace, truth: str) -> str:
-    """Return a key that identifies version and settings of stored results."""
     key = common.source_key(*(module.__file__ for module in (drop, force, identification, rig)), __file__)
     return f"{key} {truth} {options.seed} {options.quick}"
 
@@ -131,12 +128,9 @@ def _judged(
 
 
 def _of_all(
-    runs: Sequence[Run],
-    truths: Sequence[str],
-    options: argparse.Namespace,
-    watch: common.Stopwatch,
+    runs: Sequence[Run], truths: Sequence[str], options: argparse.Namespace, watch: common.Stopwatch,
     results: dict[str, Any],
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Run the parts common to all truths, add their results, and return the figures by name."""
     drawn: dict[str, Any] = {}
     if "B" in truths:

@@ -7,11 +7,10 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from scipy import stats
 
 import bayesperiodic as bp
-from studies.common import Row, row
+from studies.common import Row, row, shown
 from studies.damper import run as damper
 from studies.sampling.ridge import BATCHES, Runs, standard_error
 from studies.timing import timed
@@ -135,10 +134,6 @@ def rows(found: dict[str, Any], quick: bool) -> list[Row]:
 
 def table(found: dict[str, Any]) -> str:
     """Return the samplers' costs as text."""
-    columns = {
-        "steps": "reason", "ESS, smallest": "ess_min", "log-posteriors": "log_posteriors", "seconds": "seconds",
-        "ESS/s": "ess_per_second", "ESS per 1000 log-posteriors": "ess_per_1000_log_posteriors",
-    }  # fmt: skip
-    return pd.DataFrame(
-        {name: {title: entry[key] for title, key in columns.items()} for name, entry in found["samplers"].items()}
-    ).T.to_string(float_format="{:.4g}".format)
+    kind = "SYNTHETIC data" if found["data"]["synthetic"] else "measured data"
+    columns = ["reason", "ess_min", "log_posteriors", "seconds", "ess_per_second", "ess_per_1000_log_posteriors"]
+    return shown(f"The damper by three samplers, {kind}", found["samplers"], columns)

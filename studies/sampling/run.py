@@ -64,8 +64,7 @@ def run(options: argparse.Namespace) -> None:
 
 def tables(found: dict[str, Any]) -> str:
     """Return the text to print."""
-    kind = "SYNTHETIC data" if found["damper"]["data"]["synthetic"] else "measured data"
-    lines = [f"The damper by three samplers, {kind}", damper.table(found["damper"]), ""]
+    lines = [damper.table(found["damper"]), ""]
     pools = found["cost"]["pools"]
     if pools is not None:
         lines += [

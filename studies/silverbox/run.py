@@ -272,7 +272,6 @@ def _shift(fit: bp.MapEstimate, other: bp.MapEstimate) -> dict[str, float]:
 
 
 def _collect(experiment: bp.Experiment, fits: dict[str, bp.MapEstimate], grid: Discretisation) -> dict[str, Any]:
-    """Return the content of results.json that comes from the fits with all harmonics and from the grid."""
     fit, split = fits["independent"], fits["measured"].noise_split["response"]
     return {
         "units": {name: bp.models.silverbox.units[name] for name in ("w0", *fit.theta)},
@@ -311,7 +310,6 @@ def _by_noise(experiment: bp.Experiment, fits: dict[str, bp.MapEstimate]) -> dic
 
 
 def _fits_lines(fits: dict[str, bp.MapEstimate]) -> list[str]:
-    """Return the estimates side by side, and the test of the whitened residuals."""
     names = list(fits["independent"].theta)
     columns = {"unit": [bp.models.silverbox.units[name] for name in names]} | {
         noise: [f"{f.theta[p]:.6g} ± {f.sd[p]:.2g} ({f.robust_sd[p]:.2g})" for p in names] for noise, f in fits.items()
@@ -332,7 +330,6 @@ def _fits_lines(fits: dict[str, bp.MapEstimate]) -> list[str]:
 
 
 def _check_lines(results: dict[str, Any]) -> list[str]:
-    """Return the residual, the grid's error and the starts, with their interpretation."""
     split, repeat, beyond = results["noise_split"], results["repetition"], results["beyond_drive"]
     error, allowed = results["discretisation_error_fraction"], results["discretisation_allowed"]
     other, doubled = results["other_start"], results["doubling_shift"].values()

@@ -183,7 +183,6 @@ def _words(axes: Axes, outcome: Outcome) -> None:
 
 
 def _grouped(verdicts: Mapping[str, str]) -> str:
-    """Return verdicts as text, grouped by verdict."""
     members: dict[str, list[str]] = {}
     for name, verdict in verdicts.items():
         members.setdefault(verdict, []).append(name)
@@ -195,8 +194,6 @@ QUICK = ("product_ridge", "linear", "prior_dominated", "misspecified")
 
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
-    if options.replicates < 0:
-        raise ValueError(f"--replicates: must be at least 0, got {options.replicates}.")
     watch = common.Stopwatch()
     print("All data are SYNTHETIC: simulated from the stated truths, with noise.")
     outcomes: dict[str, Outcome] = {}
