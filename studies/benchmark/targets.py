@@ -6,6 +6,8 @@ The guard compares the ratios of a quick run with those kept, never absolute tim
 from collections.abc import Mapping
 from typing import Any
 
+import pandas as pd
+
 from studies import common
 from studies.benchmark.contenders import GRADIENT, OWN_GRADIENT
 from studies.benchmark.floor import ALL_FREE
@@ -49,12 +51,14 @@ def posterior(found: Mapping[str, Any]) -> str:
 
 def floor(name: str, found: Mapping[str, Any]) -> str:
     """Return floor and stages of one problem as text."""
-    lines = []
-    for scheme, entry in found["schemes"].items():
-        parts = {f"floor, {part}": value["median"] for part, value in entry["floor_us"].items()}
-        title = f"{name}, {scheme}: floor and stages of a warm log-posterior on one core [µs], and ratios to the floor"
-        lines.append(common.shown(title, {"": parts | entry.get("stages_us", {})}))
-        lines += [f"  {what} / floor: {between(value)}" for what, value in entry["ratio"].items()]
+    by_scheme = {
+        scheme: {f"floor, {part} [µs]": value["median"] for part, value in entry["floor_us"].items()}
+        | {f"{stage} [µs]": value for stage, value in entry.get("stages_us", {}).items()}
+        | {f"{what} / floor": between(value) for what, value in entry["ratio"].items()}
+        for scheme, entry in found["schemes"].items()
+    }
+    title = f"{name}: floor and stages of a warm log-posterior on one core, and times over the floor"
+    lines = [common.shown(title, pd.DataFrame(by_scheme).to_dict("index"))]
     if "emcee_us" in found:
         memory, own = between(found["bandwidth_gb_per_s"]), between(found["emcee_us"])
         lines.append(f"  memory bandwidth of one core {memory} GB/s; emcee's own time {own} µs per log-posterior")

@@ -184,7 +184,7 @@ class Gear:
         if len(path) != SAMPLES:
             path = np.fft.irfft(np.fft.rfft(path, axis=0) * (SAMPLES / len(path)), SAMPLES, axis=0)
         out = np.empty((SAMPLES, 2))
-        self._methods.outputs(parameters, self._inputs, np.ascontiguousarray(path), out)
+        methods(self.drive).outputs(parameters, self._inputs, np.ascontiguousarray(path), out)
         return out
 
     def integrator(self, kind: str, fineness: float, tolerance: float) -> Integrate:
@@ -196,10 +196,10 @@ class Gear:
             given = parameters, inputs, frequency, start.copy()
             if kind == FIXED:
                 path, slopes = np.empty((2, steps + 1, start.size))
-                cycles = self._methods.fixed(*given, tolerance, path, slopes)
+                cycles = methods(self.drive).fixed(*given, tolerance, path, slopes)
                 return path[:-1:every], cycles
             path = np.empty((SAMPLES, start.size))
-            return path, self._methods.controlled(*given, self._scale(parameters), fineness, tolerance, path)
+            return path, methods(self.drive).controlled(*given, self._scale(parameters), fineness, tolerance, path)
 
         return integrate
 
@@ -210,7 +210,7 @@ class Gear:
 
         def integrate(parameters: np.ndarray, start: np.ndarray) -> np.ndarray:
             solved = solve_ivp(  # type: ignore[call-overload]
-                self._methods.rates_in_time, (0.0, cycles / frequency), start, method, times, rtol=relative,
+                methods(self.drive).rates_in_time, (0.0, cycles / frequency), start, method, times, rtol=relative,
                 atol=relative * self._scale(parameters), args=(parameters, inputs, 1.0 / frequency),
             )  # fmt: skip
             return solved.y.T if solved.success else np.full((SAMPLES, start.size), np.nan)
@@ -233,10 +233,6 @@ class Gear:
         """Whether the finest integration becomes steady at every draw."""
         integrate = self.integrator(CONTROLLED, *FINEST)
         return all(integrate(parameters, self.still(parameters))[1] for parameters in self.parameters)
-
-    @property
-    def _methods(self) -> Any:
-        return methods(self.drive)
 
     @cached_property
     def _inputs(self) -> np.ndarray:
