@@ -8,6 +8,7 @@ import importlib.metadata
 import json
 import math
 import multiprocessing
+import operator
 import os
 import pickle
 import platform
@@ -70,11 +71,7 @@ def resumed(
     "source" in it; `task_of` returns the task of a line; `source` identifies the version.
     """
     with workers() as pool:
-        return _parallel.checkpointed_tasks(path, tasks, _do_task, task_of, source, shared=work, executor=pool)
-
-
-def _do_task(work: Callable[[Task], Row], task: Task) -> Row:
-    return work(task)
+        return _parallel.checkpointed_tasks(path, tasks, operator.call, task_of, source, shared=work, executor=pool)
 
 
 def remembered(path: Path, source: str, make: Callable[[], Value]) -> Value:

@@ -63,11 +63,7 @@ def landing_gear() -> bp.Problem:
     Both variances have the same prior, one in N², the other in Pa²: about 50 N of 10 kN and 50 Pa of 2 MPa.
     """
     run = _run("0.2 Hz 80 mm", 0.2, {"displacement": (0.12, 0.08)}, {"force": 30, "pressure": 15}, 128)
-    priors = {
-        "theta4": bp.LogNormal(5.2e-3, 0.1),
-        "theta6": bp.Normal(-2.3, 0.15),
-        "theta16": bp.LogNormal(2.0, 0.5),
-    }
+    priors = {"theta4": bp.LogNormal(5.2e-3, 0.1), "theta6": bp.Normal(-2.3, 0.15), "theta16": bp.LogNormal(2.0, 0.5)}
     tied = {"theta11": "-1e5*theta4"}
     fixed = {name: value for name, value in GEAR.items() if name not in (*priors, *tied)}
     return _problem(bp.models.landing_gear("displacement"), run, priors, fixed, 50.0**2, tied)

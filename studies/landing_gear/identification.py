@@ -220,11 +220,9 @@ def with_others_free(run: Run, truth: str, seed: int, quick: bool) -> dict[str, 
         # The warning on the wall's temperature, which the priors determine.
         warnings.filterwarnings("ignore", "The data do not change under")
         found = estimate(
-            [fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)],
-            DISPLACEMENT,
-            priors=PRIORS | OTHERS,
+            [fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)], DISPLACEMENT, priors=PRIORS | OTHERS,
             fixed={name: value for name, value in FIXED.items() if name not in OTHERS},
-        )
+        )  # fmt: skip
     fit = found.fit
     posterior = bp.sample(found.problem, fit, seed=seed, max_steps=QUICK_STEPS if quick else STEPS, **SAMPLING)
     table = identifiability(Identified(found.problem, fit, posterior)).table

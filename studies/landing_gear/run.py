@@ -264,9 +264,8 @@ def campaign(task: tuple[str, int]) -> dict[str, Any]:
 
 
 def _examine(run: Run, truth: str, seed: int) -> dict[str, Any]:
-    fitted = identification.estimate(
-        [identification.fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)], DISPLACEMENT
-    )
+    experiment = identification.fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)
+    fitted = identification.estimate([experiment], DISPLACEMENT)
     stated, fit = fitted.problem, fitted.fit
     posterior = bp.sample(stated, fit, seed=seed, **SAMPLING)
     verdict = identification.judge(Identified(stated, fit, posterior))

@@ -9,7 +9,7 @@ recordings.
 import argparse
 import time
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -259,8 +259,10 @@ def _summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
             "median_error": float(np.median(size)),
             "range_90": [float(q) for q in np.quantile(size, [0.05, 0.95])],
             "paper": paper,
-            "covered": _covering(line["covers"][name] for line in whole),
-            "covered_with_eigenvalues": _covering(line["eigenvalue_covers"][name] for line in whole),
+            "covered": orbits.covered([0.0 if line["covers"][name] else np.inf for line in whole]),
+            "covered_with_eigenvalues": orbits.covered(
+                [0.0 if line["eigenvalue_covers"][name] else np.inf for line in whole]
+            ),
             "sd_with_eigenvalues_over_without": float(
                 np.median([line["eigenvalue_sd"][name] / line["sd"][name] for line in whole])
             ),
@@ -268,10 +270,6 @@ def _summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for kind in ("eigenvalue", "point"):
         found[f"{kind}_bars"] = orbits.covered([p for line in whole for p in line["pulls"][kind]])
     return found
-
-
-def _covering(intervals: Iterable[bool]) -> dict[str, float]:
-    return orbits.covered([0.0 if covers else np.inf for covers in intervals])
 
 
 def _account(table: dict[str, Any]) -> str:
@@ -298,10 +296,7 @@ SYNTHETIC = "synthetic data"
 
 
 def figures(
-    section: bp.PoincareSection,
-    found: Identified,
-    ridge: Ridge,
-    table: Mapping[str, Any],
+    section: bp.PoincareSection, found: Identified, ridge: Ridge, table: Mapping[str, Any]
 ) -> dict[str, Figure]:
     """Return every figure of a run."""
     drawn = {

@@ -197,16 +197,12 @@ def tables(found: dict[str, Any]) -> str:
     lines = [table(found["damper"]), ""]
     pools = found["cost"]["pools"]
     if pools is not None:
-        lines += [
-            f"Pools of one worker against a thread: {pools['walkers']} walkers, {pools['log_posteriors']['piece']} "
-            f"log-posteriors a message; each {pools['milliseconds']['wall']:.2f} ms by the clock, "
-            f"{pools['milliseconds']['processor']:.2f} ms of processor time",
-            *(
-                f"  {name}: wall time × {ratio['median']:.3f}, processor time × {ratio['processor_time']:.3f}"
-                for name, ratio in pools["ratios"].items()
-            ),
-            "",
-        ]
+        title = (
+            f"Wall and processor time of a pool of one worker over a thread: {pools['walkers']} walkers, "
+            f"{pools['log_posteriors']['piece']} log-posteriors a message; each {pools['milliseconds']['wall']:.2f} ms "
+            f"by the clock, {pools['milliseconds']['processor']:.2f} ms of processor time"
+        )
+        lines += [common.shown(title, pools["ratios"], ["median", "processor_time"]), ""]
     lines += ["Targets", common.table_of_rows(found["checks"])]
     return "\n".join([*lines, *([f"Note: {found['cost']['note']}."] if found["cost"]["note"] else [])])
 

@@ -121,12 +121,9 @@ def read_steady_parts(given: Path | None, seed: int) -> tuple[tuple[bp.Recording
     if found is None:
         return generate(seed), common.described(found)
     whole = bp.Recording.from_csv(
-        found[0],
-        sampling_rate=SAMPLING_RATE,
-        inputs={"drive": "V1"},
-        outputs={"response": "V2"},
+        found[0], sampling_rate=SAMPLING_RATE, inputs={"drive": "V1"}, outputs={"response": "V2"},
         name="Silverbox, Schroeder multisine",
-    )
+    )  # fmt: skip
     first, second = (
         whole.between((row - 0.5) / SAMPLING_RATE, (row + PERIODS * PERIOD - 0.5) / SAMPLING_RATE) for row in FIRST_ROWS
     )

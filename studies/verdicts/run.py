@@ -131,7 +131,6 @@ def _figures(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
 
 
 def _gallery(outcomes: Mapping[str, Outcome]) -> Figure:
-    """Draw for every case the marginal of one parameter and its verdicts."""
     figure = plt.figure(figsize=(11.0, 1.55 * len(outcomes) + 0.7), layout="constrained")
     grid = figure.subplots(len(outcomes), 2, squeeze=False, width_ratios=[1.0, 1.35])
     for (left, right), outcome in zip(grid, outcomes.values(), strict=True):
@@ -165,7 +164,6 @@ def _marginal(axes: Axes, outcome: Outcome) -> None:
 
 
 def _words(axes: Axes, outcome: Outcome) -> None:
-    """Write the fault and the verdicts, with the verdict that names the fault in bold."""
     case, verdicts = outcome.case, outcome.verdicts
     axes.set_axis_off()
     axes.text(0.0, 1.0, textwrap.fill(f"wrong: {case.title}", WIDTH), va="top", fontsize=11, weight="bold")
