@@ -6,8 +6,6 @@ The guard compares the ratios of a quick run with those kept, never absolute tim
 from collections.abc import Mapping
 from typing import Any
 
-import pandas as pd
-
 from studies import common
 from studies.benchmark.contenders import GRADIENT, OWN_GRADIENT
 from studies.benchmark.floor import ALL_FREE
@@ -58,7 +56,8 @@ def floor(name: str, found: Mapping[str, Any]) -> str:
         for scheme, entry in found["schemes"].items()
     }
     title = f"{name}: floor and stages of a warm log-posterior on one core, and times over the floor"
-    lines = [common.shown(title, pd.DataFrame(by_scheme).to_dict("index"))]
+    names = next(iter(by_scheme.values()))
+    lines = [common.shown(title, {name: {scheme: one[name] for scheme, one in by_scheme.items()} for name in names})]
     if "emcee_us" in found:
         memory, own = between(found["bandwidth_gb_per_s"]), between(found["emcee_us"])
         lines.append(f"  memory bandwidth of one core {memory} GB/s; emcee's own time {own} µs per log-posterior")
