@@ -153,7 +153,6 @@ def gradients(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> None:
 
 
 def _stages(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> dict[str, Action]:
-    """Return the first three of the stages of a call, and the whole call."""
     density, points = warm.density(), [one[None] for one in theta]
 
     def compared(one: np.ndarray) -> Any:

@@ -155,7 +155,7 @@ def integrators(model: Any, moving: tuple[str, ...]) -> Integrators:
         [compiled(first.function(NUMBA, e)) for e in (values, first.by_states(values), first.by_parameters(values))]
         for values in (first.rates, first.outputs)
     )
-    cycle = runge_kutta(f, size)
+    cycle = _cycle(f, size)
     return Integrators(
         _steady(cycle, size),
         _chord(cycle, size),
@@ -183,7 +183,7 @@ def keep_all(s, wide, k):
             wide[k, i, j] = s[i, j]
 
 
-def runge_kutta(f: Any, size: int) -> Any:
+def _cycle(f: Any, size: int) -> Any:
     """Return one cycle of the classical Runge-Kutta method; states and rates at every step are kept."""
 
     @compiled

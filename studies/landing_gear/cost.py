@@ -24,7 +24,7 @@ from scipy.integrate import RK45, solve_ivp
 
 import bayesperiodic as bp
 from studies import common
-from studies.benchmark.kernels import MAX_CYCLES, NUMBA, FirstOrder, compiled, integrators, runge_kutta, signals
+from studies.benchmark.kernels import MAX_CYCLES, NUMBA, FirstOrder, compiled, integrators, signals
 from studies.benchmark.kernels import table as input_table
 from studies.gear import GEAR, gear_at_rest
 from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, FORCE, SAMPLES, Identified, problem
@@ -70,20 +70,36 @@ def settled(before, now, change, tolerance):
 
 
 def _fixed_steps(rates, size):
-    """Return the classical Runge-Kutta method for a direction."""
-    one_cycle = runge_kutta(rates, size)
-
     @compiled
-    def integrate(g, inputs, frequency, y, tolerance, path, slopes):
-        """Integrate until steady and fill the states and their rates (steps + 1, size) of the last cycle.
+    def integrate(g, inputs, frequency, y, tolerance, path):
+        """Integrate until steady and fill the states (samples, size) of the last cycle.
 
         Return the number of cycles, 0 if it never becomes steady. `inputs` holds a cycle at half steps (2·steps,
-        signals); `y` is the start, and the end.
+        signals); `y` is the start, and the end. The steps are a multiple of the samples.
         """
-        change = 0.0
+        steps, samples = inputs.shape[0] // 2, path.shape[0]
+        h, each, change = 1.0 / (frequency * steps), steps // samples, 0.0
+        k1, k2, k3, k4, trial = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
         for cycle in range(MAX_CYCLES):
-            one_cycle(g, inputs, 1.0 / frequency, y, path, slopes)
-            done, change = settled(path[0, size - 1], y[size - 1], change, tolerance)
+            before = y[size - 1]
+            for k in range(steps):
+                here, middle = inputs[2 * k], inputs[2 * k + 1]
+                after = inputs[2 * k + 2] if k + 1 < steps else inputs[0]
+                if k % each == 0:
+                    path[k // each] = y
+                rates(y, here, g, k1)
+                for i in range(size):
+                    trial[i] = y[i] + 0.5 * h * k1[i]
+                rates(trial, middle, g, k2)
+                for i in range(size):
+                    trial[i] = y[i] + 0.5 * h * k2[i]
+                rates(trial, middle, g, k3)
+                for i in range(size):
+                    trial[i] = y[i] + h * k3[i]
+                rates(trial, after, g, k4)
+                for i in range(size):
+                    y[i] += h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
+            done, change = settled(before, y[size - 1], change, tolerance)
             if done:
                 return cycle + 1
             if not abs(y[size - 1]) < 1e6:
@@ -94,8 +110,6 @@ def _fixed_steps(rates, size):
 
 
 def _controlled_steps(rates, size):
-    """Return the pair of Dormand and Prince for a direction."""
-
     @compiled
     def integrate(g, inputs, frequency, y, scale, relative, tolerance, path):
         """Integrate until steady, then through one more cycle for the states (samples, size).
@@ -190,15 +204,12 @@ class Gear:
     def integrator(self, kind: str, fineness: float, tolerance: float) -> Integrate:
         """Return a compiled method; `fineness` is the number of steps per cycle, or the relative error of a step."""
         steps, frequency = int(fineness) if kind == FIXED else TABLE // 2, self.experiment.frequency
-        inputs, every = self._table(2 * steps), max(steps // SAMPLES, 1)
+        inputs, points = self._table(2 * steps), min(steps, SAMPLES)
 
         def integrate(parameters: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, int]:
-            given = parameters, inputs, frequency, start.copy()
+            path, given = np.empty((points, start.size)), (parameters, inputs, frequency, start.copy())
             if kind == FIXED:
-                path, slopes = np.empty((2, steps + 1, start.size))
-                cycles = methods(self.drive).fixed(*given, tolerance, path, slopes)
-                return path[:-1:every], cycles
-            path = np.empty((SAMPLES, start.size))
+                return path, methods(self.drive).fixed(*given, tolerance, path)
             return path, methods(self.drive).controlled(*given, self._scale(parameters), fineness, tolerance, path)
 
         return integrate
@@ -372,7 +383,6 @@ def _by_scheme(
 
 
 def _own_errors(warm: bp.Problem, theta: np.ndarray, gears: Sequence[Gear]) -> list[float]:
-    """Return the periodic solver's largest error at any draw, by experiment."""
     outputs, converged = warm.outputs(theta)
     if not converged.all():
         raise RuntimeError("A periodic solve at a draw of the posterior did not converge.")

@@ -96,7 +96,6 @@ def _source(options: argparse.Namespace, truth: str) -> str:
 
 
 def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace) -> tuple[OfTruth, dict[str, float]]:
-    """Return the results of one truth, and the seconds of its parts."""
     seed, quick, watch = options.seed, options.quick, common.Stopwatch()
     with watch.part(f"rig {truth}", f"truth {truth}: simulating and recording {len(runs)} experiments"):
         recordings = {r.name: measure(r, TRUTHS[truth], seed) for r in runs}
@@ -123,7 +122,6 @@ def _of_truth(truth: str, runs: Sequence[Run], options: argparse.Namespace) -> t
 def _judged(
     work: Callable[..., Verdict], recordings: Mapping[str, bp.Recording], options: argparse.Namespace
 ) -> dict[str, Verdict]:
-    """Return the verdict on every experiment, and print each as it comes."""
     found = {}
     tasks = [(recording, options.seed, options.quick) for recording in recordings.values()]
     for name, verdict in zip(recordings, common.each(work, tasks, here=options.quick), strict=True):

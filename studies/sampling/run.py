@@ -51,11 +51,8 @@ def run(options: argparse.Namespace) -> None:
         "damper": collect(sampled, data),
         "cost": cost | {"note": busy},
     }
-    found["checks"] = [
-        *sampling_ridge.rows(found["ridge"]),
-        *rows(found["damper"], options.quick),
-        *sampling_cost.rows(cost),
-    ]
+    found["checks"] = sampling_ridge.rows(found["ridge"]) + rows(found["damper"], options.quick)
+    found["checks"] += sampling_cost.rows(cost)
     with watch.part("figures", "drawing"):
         figures = {
             "ridge": draw_ridge(ridge),
