@@ -171,7 +171,7 @@ class Experiment(Result):
         if matrix.shape != (size, size):
             further = f" and {logarithms} multipliers" if size > values else ""
             raise ValueError(
-                f"covariance: must have shape {(size, size)}, for {values} values{further}, got {matrix.shape}."
+                f"covariance: must have shape {(size, size)}, for {values} measured values{further}, got {matrix.shape}."
             )
         if bad := np.count_nonzero(~np.isfinite(matrix)):
             raise ValueError(f"covariance: must be finite and symmetric, got {bad} entries that are not finite.")
