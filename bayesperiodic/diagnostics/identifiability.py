@@ -213,6 +213,9 @@ def identifiability(
     5. "determined": with the other parameters unknown, the data alone leave less than a third of the prior sd.
     6. "only in combination" if the other parameters increase its sd at least fivefold, otherwise "only with the prior".
 
+    "not determined" replaces "determined" if an orbit of the estimate is not the measured one
+    (`MapEstimate.other_orbits`).
+
     Parameters
     ----------
     problem : Problem
@@ -269,6 +272,10 @@ def identifiability(
         both = row["verdict"] == SIGN and abs(fit.theta[name]) > 2.0 * fit.sd[name]
         row["evidence"] = _evidence(row)
         row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments, structure)
+        if advice := fit.orbit_advice:
+            row["verdict"] = NOTHING if row["verdict"] == DETERMINED else row["verdict"]
+            row["evidence"] += f", at another orbit than the measured one in {', '.join(map(repr, fit.other_orbits))}"
+            row["remedy"] = advice
     return Identifiability(
         pd.DataFrame.from_dict(rows, orient="index"),
         directions,
