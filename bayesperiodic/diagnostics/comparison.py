@@ -16,7 +16,7 @@ from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics import verdicts
 from bayesperiodic.diagnostics.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, USABLE_K, WIDE, Sample
-from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.posterior.density import COLLAPSED, NATURAL, LogPosterior, SamplingCoordinates
 from bayesperiodic.posterior.parameters import unit
 from bayesperiodic.posterior.problem import Problem
@@ -183,7 +183,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     group, draws = posterior.data["posterior"].to_dataset(), {n: s.whole for n, s in scored.samples.items()}
     shares, errors = scored.inside(PROBABILITIES)
     table, joint = _table(scored, cured), _joint(scored, cured)
-    if advice := fit.orbit_advice:
+    if advice := orbit_advice(fit):
         table[["verdict", "recommendation"]] = MODE, advice
         joint |= {"verdict": MODE, "recommendation": advice}
     histograms = {name: np.histogram(x, BINS, tuple(np.quantile(x, SHOWN))) for name, x in draws.items()}

@@ -16,7 +16,7 @@ from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
 from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
-from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
 from bayesperiodic.posterior.parameters import local_names
 from bayesperiodic.posterior.problem import Problem
@@ -272,7 +272,7 @@ def identifiability(
         both = row["verdict"] == SIGN and abs(fit.theta[name]) > 2.0 * fit.sd[name]
         row["evidence"] = _evidence(row)
         row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments, structure)
-        if advice := fit.orbit_advice:
+        if advice := orbit_advice(fit):
             row["verdict"] = NOTHING if row["verdict"] == DETERMINED else row["verdict"]
             row["evidence"] += f", at another orbit than the measured one in {', '.join(map(repr, fit.other_orbits))}"
             row["remedy"] = advice

@@ -210,12 +210,6 @@ class MapEstimate(Result):
         return self.status == "converged"
 
     @property
-    def orbit_advice(self) -> str:
-        """What to do first if orbits of the fit are not the measured ones; empty otherwise."""
-        runs = ", ".join(map(repr, self.other_orbits))
-        return f"first fit the measured orbit of {runs}, see fit.other_orbits" if runs else ""
-
-    @property
     def correlations(self) -> pd.DataFrame:
         """Correlations of the parameters, from `covariance`."""
         sd = np.sqrt(np.diag(self.covariance))
@@ -389,6 +383,12 @@ class MapEstimate(Result):
         ]
         lines += [f"  not determined by the data: {text}" for text in self.undetermined]
         return "\n".join(lines)
+
+
+def orbit_advice(fit: MapEstimate) -> str:
+    """Return what to do first if orbits of a fit are not the measured ones; empty otherwise."""
+    runs = ", ".join(map(repr, fit.other_orbits))
+    return f"first fit the measured orbit of {runs}, see fit.other_orbits" if runs else ""
 
 
 def _carried(matrix: np.ndarray, gradients: list[np.ndarray]) -> np.ndarray:
