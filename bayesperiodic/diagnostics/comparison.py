@@ -16,7 +16,7 @@ from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics import verdicts
 from bayesperiodic.diagnostics.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, USABLE_K, WIDE, Sample
-from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.posterior.density import COLLAPSED, NATURAL, LogPosterior, SamplingCoordinates
 from bayesperiodic.posterior.parameters import unit
 from bayesperiodic.posterior.problem import Problem
@@ -133,8 +133,9 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     quarter of the posterior sd, and so does the distribution as a whole; "too narrow" or "too wide" if both ends are
     off in opposite directions; "wrong shape" if the posterior is shifted, skewed, or accumulates at an end of the
     prior's support; "wrong mode" if more than 5 % of the draws lie in another mode, or almost none near the
-    approximation. All deviations must exceed three Monte Carlo errors. The verdict is "not converged" for draws that
-    have not converged, unless every ensemble by itself shows another mode.
+    approximation, or if an orbit of the estimate is not the measured one (`MapEstimate.other_orbits`). All deviations
+    must exceed three Monte Carlo errors. The verdict is "not converged" for draws that have not converged, unless every
+    ensemble by itself shows another mode.
 
     The joint verdict rests on the fraction of draws inside the Laplace ellipsoids and on the Pareto k̂ of the importance
     weights of 8000 draws from Laplace (Vehtari, Simpson, Gelman, Yao, Gabry, Pareto smoothed importance sampling, J.
@@ -181,10 +182,14 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     cured = _scores(problem, fit, posterior, SAMPLING) if doubtful else None
     group, draws = posterior.data["posterior"].to_dataset(), {n: s.whole for n, s in scored.samples.items()}
     shares, errors = scored.inside(PROBABILITIES)
+    table, joint = _table(scored, cured), _joint(scored, cured)
+    if advice := orbit_advice(fit):
+        table[["verdict", "recommendation"]] = MODE, advice
+        joint |= {"verdict": MODE, "recommendation": advice}
     histograms = {name: np.histogram(x, BINS, tuple(np.quantile(x, SHOWN))) for name, x in draws.items()}
     return Comparison(
-        table=_table(scored, cured),
-        joint=_joint(scored, cured),
+        table=table,
+        joint=joint,
         coordinates=coordinates,
         probabilities=PROBABILITIES,
         quantiles={name: np.quantile(x, PROBABILITIES) for name, x in draws.items()},

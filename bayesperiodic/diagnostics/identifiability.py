@@ -16,7 +16,7 @@ from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
 from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
-from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
 from bayesperiodic.posterior.parameters import local_names
 from bayesperiodic.posterior.problem import Problem
@@ -213,6 +213,9 @@ def identifiability(
     5. "determined": with the other parameters unknown, the data alone leave less than a third of the prior sd.
     6. "only in combination" if the other parameters increase its sd at least fivefold, otherwise "only with the prior".
 
+    "not determined" replaces "determined" if an orbit of the estimate is not the measured one
+    (`MapEstimate.other_orbits`).
+
     Parameters
     ----------
     problem : Problem
@@ -269,6 +272,10 @@ def identifiability(
         both = row["verdict"] == SIGN and abs(fit.theta[name]) > 2.0 * fit.sd[name]
         row["evidence"] = _evidence(row)
         row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments, structure)
+        if advice := orbit_advice(fit):
+            row["verdict"] = NOTHING if row["verdict"] == DETERMINED else row["verdict"]
+            row["evidence"] += f", at another orbit than the measured one in {', '.join(map(repr, fit.other_orbits))}"
+            row["remedy"] = advice
     return Identifiability(
         pd.DataFrame.from_dict(rows, orient="index"),
         directions,

@@ -15,7 +15,7 @@ from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
-from bayesperiodic.diagnostics.adequacy import ALL, LEVEL, TESTS, UNTESTED, adequacy, adjusted_p
+from bayesperiodic.diagnostics.adequacy import ALL, LEVEL, MISSPECIFIED, TESTS, UNTESTED, adequacy, adjusted_p
 from bayesperiodic.periodic import arclength
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 from bayesperiodic.posterior.parameters import CHAIN, DRAW
@@ -193,6 +193,9 @@ class Prediction(Bands):
         Bands of the recordings of `run`.
     note : str
         Limitations: misfit that the noise model absorbs, draws that have not converged; "" without any.
+    other_orbits : dict of str to str
+        Experiments in which the model's orbit is not the measured one, with the reason, see `MapEstimate`; their
+        verdict is "misspecified", whatever the tests say.
 
     Examples
     --------
@@ -204,6 +207,7 @@ class Prediction(Bands):
     table: pd.DataFrame
     transient: Transient | None
     note: str
+    other_orbits: dict[str, str]
 
     @property
     def verdict(self) -> str:
@@ -212,8 +216,8 @@ class Prediction(Bands):
 
     @property
     def findings(self) -> dict[str, str]:
-        """Rejections in words, by row of the table."""
-        found = {}
+        """Rejections in words, by row of the table, and other orbits by experiment."""
+        found = {f"experiment {name}": reason for name, reason in self.other_orbits.items()}
         for (label, row), small in zip(self.table.iterrows(), adjusted_p(self.table) < LEVEL, strict=True):
             if reasons := [f"{REJECTIONS[test]} (p = {row[test]:.2g})" for test in compress(TESTS, small)]:
                 error = row["model_error_share"]
@@ -312,8 +316,11 @@ def predict(
             "posterior: its draw of highest density has no periodic solution. Give draws of this problem."
         )
     table = adequacy(problem, here, noise, replicates)
+    others = here.other_orbits
+    table.loc[table["experiment"].isin([*others, *([ALL] if others else [])]), "verdict"] = MISSPECIFIED
     recorded = None if run is None else _transient(problem, points, run, experiment)
-    return Prediction(**vars(predicted), table=table, transient=recorded, note=_note(problem, posterior, table))
+    note = _note(problem, posterior, table)
+    return Prediction(**vars(predicted), table=table, transient=recorded, note=note, other_orbits=others)
 
 
 def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:

@@ -23,8 +23,9 @@ from bayesperiodic.estimation.gauss_newton import (
 )
 from bayesperiodic.estimation.laplace import SILENT, joint_laplace, undetermined
 from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, noise_split
+from bayesperiodic.periodic.compiled import OTHER_ORBIT, STATUSES
 from bayesperiodic.posterior.density import NATURAL, RIDGE, Linearisation, LogPosterior
-from bayesperiodic.posterior.initial import InitialEstimate, simultaneous_fit
+from bayesperiodic.posterior.initial import InitialEstimate, measured_orbits, simultaneous_fit
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import Simulator
 
@@ -32,6 +33,8 @@ NOISE_SHARE = 0.1
 LARGEST_SHIFT = 0.1
 SHOWN = 3
 LOST = 1e-6
+# Last iterate, status and objective at each iterate.
+Climb = tuple[Iterate, str, np.ndarray]
 # Value of a field of MapEstimate that is computed at its first use.
 deferred: Any = partial
 
@@ -56,6 +59,10 @@ def map_estimate(
 
     Where every experiment of a forced model has a guess of its orbit, orbits and parameters are first estimated
     together, from these guesses and `start`: the orbits need not exist at the start, and none is lost or exchanged.
+
+    Prime period, turns of angles and order of the forcing periods of every fitted orbit are compared with those of the
+    recording. If they differ, the fit is repeated from orbits that the measured outputs show; if an orbit remains
+    another one, the status is "other orbit".
 
     Parameters
     ----------
@@ -83,7 +90,8 @@ def map_estimate(
     UserWarning
         If the noise of the measured inputs causes more than a tenth of an output's residual, if twice as many points
         would move an estimate by more than a tenth of its standard deviation, if an estimate lies at the end of its
-        prior's support, and if the data do not determine a parameter or a combination of parameters.
+        prior's support, if the data do not determine a parameter or a combination of parameters, and if the orbit of an
+        experiment is not the measured one.
 
     References
     ----------
@@ -115,6 +123,7 @@ def map_estimate(
         found.append(_outcome(problem, end))
         if end.objective > best.objective:
             best, status, history = end, other_status, other_history
+    best, status, history = _on_measured_orbits(problem, theta, (best, status, history), progress)
     result = _describe(problem, objective, best, status, history, tuple(found))
     for text in estimation_warnings(problem, result):
         warnings.warn(text, UserWarning, stacklevel=3)
@@ -148,7 +157,7 @@ def _linearised(problem: Problem, theta: np.ndarray, found: InitialEstimate | No
     return LogPosterior(problem, Simulator.start(problem, found.theta, found.states)).linearise(found.theta)
 
 
-def _climb(objective: Objective, first: Iterate, progress: bool) -> tuple[Iterate, str, np.ndarray]:
+def _climb(objective: Objective, first: Iterate, progress: bool) -> Climb:
     with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress) as bar:
 
         def report(iterate: Iterate, size: float) -> None:
@@ -156,6 +165,37 @@ def _climb(objective: Objective, first: Iterate, progress: bool) -> tuple[Iterat
             bar.set_postfix_str(f"objective {iterate.objective:.6g}, step {size:.2g} sd")
 
         return climb(objective, first, report=report)
+
+
+def _on_measured_orbits(problem: Problem, start: np.ndarray, end: Climb, progress: bool) -> Climb:
+    """Return the end of a climb, or that of one from the measured orbits if fewer of its orbits are others."""
+    others = end[0].here.other_orbits
+    for near in _near_measured_orbits(problem, end[0], start) if others else ():
+        objective = _objective(problem, near)
+        first = objective.iterate(near, problem.likelihood.guess())
+        if first is None:
+            continue
+        again = _climb(objective, first, progress)
+        if len(again[0].here.other_orbits) < len(others):
+            end, others = again, again[0].here.other_orbits
+        if not others:
+            return end
+    return (end[0], STATUSES[OTHER_ORBIT], end[2]) if others else end
+
+
+def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> Iterator[Linearisation]:
+    """Yield where to start again: near orbits that give the measured outputs, and where simultaneous fits of them end.
+
+    Orbits and parameters are looked for from the start and from the estimate.
+    """
+    if problem.model.autonomous:
+        return
+    solutions = {name: solution.states for name, solution in end.here.simulator.solutions(end.theta).items()}
+    for theta in (start, end.theta):
+        guessed, measured = measured_orbits(problem, theta, solutions)
+        for found in (measured, simultaneous_fit(guessed, measured.theta)):
+            if found is not None and found.states:
+                yield _linearised(problem, found.theta, found)
 
 
 def _outcome(problem: Problem, iterate: Iterate) -> dict[str, float]:
@@ -206,6 +246,7 @@ def _describe(
         input_noise=input_noise(problem, best.theta, solutions),
         doubling_shift=dict(zip(names, shift.tolist(), strict=True)),
         at_ends=tuple(name for name, end in zip(names, at_ends(objective, best), strict=True) if end),
+        other_orbits=best.here.other_orbits,
         undetermined=undetermined(data, best.theta, names, problem.logarithmic),
         history=history,
         starts=starts,
@@ -235,6 +276,12 @@ def _inverse(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
     """Yield the warnings about an estimate."""
+    for name, reason in fit.other_orbits.items():
+        yield (
+            f"Experiment {name!r} was fitted by another orbit than the recorded one: {reason}. The estimate is not "
+            "valid. Give the experiment a guess of its states (Experiment.guess), start={…} nearer to the truth, or "
+            "another model."
+        )
     for channel, noise in fit.input_noise.items():
         if noise > NOISE_SHARE * fit.rms[channel]:
             yield (

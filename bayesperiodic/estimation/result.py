@@ -100,7 +100,8 @@ class MapEstimate(Result):
     Attributes
     ----------
     status : str
-        "converged", "stalled" (no step increased the objective), "iterations" (their limit was reached) or "singular".
+        "converged", "stalled" (no step increased the objective), "iterations" (their limit was reached), "singular" or
+        "other orbit" (see `other_orbits`).
     theta, sd : dict of str to float
         Estimates and their standard deviations, in natural values and the parameters' units.
     robust_sd : dict of str to float
@@ -140,6 +141,9 @@ class MapEstimate(Result):
         Change of each estimate on twice as many points, in standard deviations; NaN if those solves fail.
     at_ends : tuple of str
         Parameters whose estimate lies at the end of their prior's support.
+    other_orbits : dict of str to str
+        Experiments whose fitted orbit is not the measured one (prime period, turns of angles, or order of the forcing
+        periods), with the reason in words.
     undetermined : tuple of str
         Changes of parameters, in words, that change no output; in these directions the posterior equals the prior.
     history : array (iterations,)
@@ -182,6 +186,7 @@ class MapEstimate(Result):
     input_noise: dict[str, float]
     doubling_shift: dict[str, float]
     at_ends: tuple[str, ...]
+    other_orbits: dict[str, str]
     undetermined: tuple[str, ...]
     history: np.ndarray
     starts: tuple[dict[str, float], ...]
@@ -373,8 +378,17 @@ class MapEstimate(Result):
             if np.isfinite(self.whiteness[channel].p):
                 line += f", whiteness p = {self.whiteness[channel].p:.2g}"
             lines.append(line)
+        lines += [
+            f"  other orbit than the recorded one in {name!r}: {text}" for name, text in self.other_orbits.items()
+        ]
         lines += [f"  not determined by the data: {text}" for text in self.undetermined]
         return "\n".join(lines)
+
+
+def orbit_advice(fit: MapEstimate) -> str:
+    """Return what to do first if orbits of a fit are not the measured ones; empty otherwise."""
+    runs = ", ".join(map(repr, fit.other_orbits))
+    return f"first fit the measured orbit of {runs}, see fit.other_orbits" if runs else ""
 
 
 def _carried(matrix: np.ndarray, gradients: list[np.ndarray]) -> np.ndarray:

@@ -14,6 +14,7 @@ from bayesperiodic.posterior.initial import simultaneous_fit
 from bayesperiodic.posterior.likelihood import Residuals
 from bayesperiodic.posterior.noise import FLAT, JEFFREYS, KNOWN, SPECTRAL, Circulant, Independent
 from bayesperiodic.posterior.observation import Comparisons, Response, Simulation
+from bayesperiodic.posterior.orbit_check import other_orbit
 from bayesperiodic.posterior.simulator import Guesses, Simulator
 
 RIDGE, NATURAL = "ridge", "natural"
@@ -84,6 +85,12 @@ class Linearisation:
     def compared(self) -> dict[str, dict[str, np.ndarray]]:
         """Return y − ŷ (points,) by experiment and channel, within the harmonics kept."""
         return {name: o.compared(self._responses[name]) for name, o in self._observations.items()}
+
+    @cached_property
+    def other_orbits(self) -> dict[str, str]:
+        """Why the model's orbit is not the measured one, by experiment, see `other_orbit`; without the others."""
+        reasons = {name: other_orbit(o, self._responses[name]) for name, o in self._observations.items()}
+        return {name: reason for name, reason in reasons.items() if reason}
 
     def vjp(self, by_residual: Sequence[np.ndarray], *, adjoint: bool) -> dict[str, np.ndarray]:
         """Return Σ by_residual · ∂residual/∂θ, (names,) by experiment; NaN where the derivatives do not exist.

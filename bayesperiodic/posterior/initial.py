@@ -29,6 +29,8 @@ MAX_ITERATIONS = 60
 LARGEST_STEP = 0.7
 NONLINEAR, SMALLEST_SHARE = 0.5, 1e-3
 ON_ORBIT, SMALL_STEP = 1e-6, 1e-2
+# Of the orbits that outputs show: harmonics of the forcing, weight of the equations, iterations; turns with θ.
+SEEN, EQUATIONS, ROUNDS, TURNS = 8, 0.03, 5, 100
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,25 @@ def simultaneous_fit(problem: Description, theta: np.ndarray) -> InitialEstimate
     return fit.iterate(fit.parameters_along_guesses(theta))
 
 
+def measured_orbits(
+    problem: Description, theta: np.ndarray, near: dict[str, dict[str, np.ndarray]]
+) -> tuple[Description, InitialEstimate]:
+    """Return orbits of a driven model that give the measured outputs, and the θ that fits them, in turns from a θ.
+
+    The orbits solve the equations only as far as the outputs leave them free; `near` are the states of other orbits
+    from which they start. Returned with them is the problem whose experiments have these orbits as their guesses.
+    """
+    fit = _SimultaneousFit(problem.with_experiments(replace(e, guess=near[e.name]) for e in problem.experiments))
+    misfit, before, turns = np.inf, np.inf, 0
+    while turns < TURNS and not before - misfit < SMALL_STEP:
+        fit.guess = {name: fit.measured_orbit(name, theta) for name in fit.guess}
+        theta = fit.parameters_along_guesses(theta)
+        misfit, before, turns = fit._misfit(theta), misfit, turns + 1
+    states = {name: fit._states(name, z) for name, z in fit.guess.items()}
+    guessed = problem.with_experiments(replace(e, guess=states[e.name]) for e in problem.experiments)
+    return guessed, InitialEstimate(theta, states, "")
+
+
 class _SimultaneousFit:
     def __init__(self, problem: Description):
         self.problem, self.maps = problem, problem.parameter_maps
@@ -91,7 +112,9 @@ class _SimultaneousFit:
                 by = by.reshape(g.size, theta.size)
                 hessian, gradient = hessian + by.T @ by, gradient - by.T @ g
                 total, count = total + g @ g, count + g.size
-            weight = self.problem.counted / max(total, np.finfo(float).tiny)
+            if total == 0.0:
+                break
+            weight = self.problem.counted / total
             step, size = self._step(weight * hessian, weight * gradient, theta)
             if size < SMALL_STEP:
                 break
@@ -106,6 +129,40 @@ class _SimultaneousFit:
                 break
             theta, now = there, trial
         return theta
+
+    def measured_orbit(self, name: str, theta: np.ndarray) -> np.ndarray:
+        """Return the orbit (points, states) near the guess that fits the outputs and, as far as it can, the equations.
+
+        Least squares over the low harmonics, in which each block of outputs and each equation is divided by the size
+        of its derivatives.
+        """
+        equations, observation, z = self.equations[name], self.observations[name], self.guess[name]
+        parameters = np.ascontiguousarray(self.maps[name].values(theta[None])[0])
+        at, (points, count) = parameters[:-1], z.shape
+        phase = 2 * np.pi * np.outer(np.arange(SEEN * equations.grid.periods + 1), np.arange(points) / points)
+        waves = np.concatenate([np.cos(phase), np.sin(phase[1:])])[: points - 1]
+        sizes = np.ptp(z, axis=0) + SMALL_STEP * np.abs(z).max()
+        basis = np.einsum("hn,st->hsnt", waves, np.diag(np.where(sizes > 0.0, sizes, 1.0)))
+        basis = basis.reshape(-1, points, count)
+        changes, none = equations.changes(basis), np.zeros(len(basis))
+        for _ in range(ROUNDS):
+            d, columns = equations.derivatives(z, at), equations.residual_jacobian(z, at)
+            by_q = columns[:, count:].reshape(points, count, -1)
+            here = Response(equations.outputs(z, at), np.array(equations.frequency), none[:0], parameters[-1])
+            moved = Response(np.einsum("ncq,dnq->dnc", d.f_q, changes), none, none[:, None][:, :0], none)
+            g = _weighed(equations, columns[:, :count, None])[..., 0]
+            dg = _weighed(equations, np.einsum("neq,dnq->ned", by_q, changes))
+            parts = [
+                (1.0, *pair) for pair in zip(observation.changes(here, moved), observation.residuals(here), strict=True)
+            ]
+            parts += [(EQUATIONS, dg[:, e].T, -g[:, e]) for e in range(count)]
+            scales = [weight / (float(np.linalg.norm(j)) or np.inf) for weight, j, _ in parts]
+            rows = np.concatenate([scale * j.T for scale, (_, j, _) in zip(scales, parts, strict=True)])
+            right = np.concatenate([scale * r for scale, (_, _, r) in zip(scales, parts, strict=True)])
+            if not (np.isfinite(rows).all() and np.isfinite(right).all()):
+                break
+            z = z + np.tensordot(np.linalg.lstsq(rows, right, rcond=1e-9)[0], basis, 1)
+        return z
 
     def _misfit(self, theta: np.ndarray) -> float:
         """Return −log of the prior's density and of that of the equations' errors along the guesses."""

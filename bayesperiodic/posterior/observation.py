@@ -99,6 +99,8 @@ class Observation:
         Those measured, in the order of the model's outputs.
     columns : list of int
         Their indices among the model's outputs.
+    angles : list of bool
+        Which of the channels are angles.
     data : array (points, channels)
     """
 
@@ -106,7 +108,7 @@ class Observation:
         self.experiment = experiment
         self.channels = tuple(channel for channel in model.outputs if channel in experiment.outputs)
         self.columns = [model.outputs.index(channel) for channel in self.channels]
-        self._angles = [channel in model.angles for channel in self.channels]
+        self.angles = [channel in model.angles for channel in self.channels]
         self._free_phase = model.autonomous
         self._shifted = delayed or model.autonomous
         self.data = np.stack([experiment.outputs[channel] for channel in self.channels], axis=-1)
@@ -199,11 +201,7 @@ class Observation:
     def layout(self) -> tuple[Any, ...] | None:
         """What experiments have in common that are compared all at once; None where there is more to compare."""
         e = self.experiment
-        if (
-            self._shifted
-            or any(self._angles)
-            or not (e.mask is None and e.covariance is None and e.multipliers is None)
-        ):
+        if self._shifted or any(self.angles) or not (e.mask is None and e.covariance is None and e.multipliers is None):
             return None
         return self._points, self.channels, *(self._harmonics[channel].size for channel in self.channels)
 
@@ -263,20 +261,26 @@ class Observation:
                     noise[:, e.mask, c] = components[c]
         values = self._predicted(response) + noise
         turned = self.data - (np.mod(self.data - values + np.pi, 2 * np.pi) - np.pi)
-        return {n: (turned if self._angles[c] else values)[..., c] for c, n in enumerate(self.channels)}
+        return {n: (turned if self.angles[c] else values)[..., c] for c, n in enumerate(self.channels)}
 
-    def compared(self, response: Response) -> dict[str, np.ndarray]:
-        """Return y − ŷ (points,) of each channel, within the harmonics kept and zero where nothing was measured."""
-        difference, mask, result = self._difference(response), self.experiment.mask, {}
+    def compared(self, response: Response, ahead: int = 0) -> dict[str, np.ndarray]:
+        """Return y − ŷ (points,) of each channel, within the harmonics kept and zero where nothing was measured.
+
+        ŷ is taken a number of forcing periods `ahead`.
+        """
+        difference, mask, result = self._difference(response, ahead), self.experiment.mask, {}
         for c, channel in enumerate(self.channels):
             e = difference[:, c]
             result[channel] = self.experiment.project(channel, e) if mask is None else np.where(mask, e, 0.0)
         return result
 
-    def _difference(self, response: Response) -> np.ndarray:
-        """Return y − ŷ (…, points, channels), angles within half a turn."""
-        difference = self.data - self._predicted(response)
-        for c in np.flatnonzero(self._angles):
+    def _difference(self, response: Response, ahead: int = 0) -> np.ndarray:
+        """Return y − ŷ (…, points, channels), ŷ some forcing periods ahead, angles within half a turn."""
+        predicted = self._predicted(response)
+        if ahead:
+            predicted = np.roll(predicted, -ahead * self.experiment.samples, axis=-2)
+        difference = self.data - predicted
+        for c in np.flatnonzero(self.angles):
             difference[..., c] = np.mod(difference[..., c] + np.pi, 2 * np.pi) - np.pi
         return difference
 
@@ -375,7 +379,7 @@ class Observation:
         noise = np.array([_measured_variance(self.experiment, channel) for channel in self.channels])
         known = bool(np.all(np.isfinite(noise) & (noise > 0.0)))
         weights = 1.0 / (noise if known else self.data.var(axis=0))
-        angles = np.array(self._angles)
+        angles = np.array(self.angles)
         weights[angles & ~angles.all()] = 0.0
         return weights * np.conj(_fourier.coefficients(self.data.T, 1)[:, 1])
 
@@ -409,7 +413,7 @@ class Observation:
         """Return what angles advance in a response period, (…, 1, channels), whole turns; zero for other channels."""
         ahead = 2.0 * signals[..., -1:, :] - signals[..., -2:-1, :]
         turns = np.rint((ahead - signals[..., :1, :]) / (2 * np.pi))
-        return 2 * np.pi * np.where(self._angles, turns, 0.0)
+        return 2 * np.pi * np.where(self.angles, turns, 0.0)
 
     def _rate(self, response: Response) -> np.ndarray:
         """Return the derivative (points, channels) of the predicted outputs by their phase [per response period]."""
