@@ -140,6 +140,7 @@ class Observation:
             self._harmonics[channel] if kind == SPECTRAL else np.empty(0),
             np.flatnonzero(mask) / self._points if kind == POINTS and mask is not None else np.empty(0),
             self._points,
+            float(self.experiment.averaged or 1),
             _measured_variance(self.experiment, channel),
         )
 

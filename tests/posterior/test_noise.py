@@ -67,7 +67,8 @@ def block(kind: str = SPECTRAL, size: int = 9, count: float | None = None, **cha
         "size": size,
         "harmonic": np.array([0, *half, *half]) if kind == SPECTRAL else np.empty(0),
         "position": positions if kind == POINTS else np.empty(0),
-        "points": 20,
+        "points": max(20, size),
+        "averaged": 50.0,
         "measured": 0.7,
     }
     return Block(**(given | changes))
