@@ -16,6 +16,11 @@ REASONS = {
 }
 
 
+def test_the_package_stays_small():
+    counts = layout.lines("bayesperiodic")
+    assert len(counts) <= 100 and sum(counts.values()) <= 25_000 and max(counts.values()) <= 600
+
+
 def test_the_median_file_has_one_idea():
     assert 120 <= median(layout.lines("bayesperiodic").values()) <= 320
 
