@@ -48,6 +48,8 @@ def main(arguments: list[str] | None = None) -> int:
     package = known[options.name].parent.name
     options.out = options.out or Path("figures", *(["quick"] if options.quick else []), package)
     try:
+        if options.replicates < 0:
+            raise ValueError(f"--replicates: must be at least 0, got {options.replicates}.")
         importlib.import_module(f"studies.{package}.run").run(options)
     except (ValueError, RuntimeError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -8,6 +8,7 @@ import importlib.metadata
 import json
 import math
 import multiprocessing
+import operator
 import os
 import pickle
 import platform
@@ -36,11 +37,6 @@ def row(what: str, value: float | None, low: float, high: float | None, note: st
     value = None if value is None or math.isnan(value) else float(value)
     met = None if value is None else value >= low and (high is None or value <= high)
     return {"what": what, "value": value, "low": low, "high": high, "met": met, "note": note}
-
-
-def unjudged(entry: Row, why: str) -> Row:
-    """Return a row without its verdict."""
-    return entry | {"met": None, "note": why}
 
 
 def table_of_rows(rows: list[Row]) -> str:
@@ -75,11 +71,7 @@ def resumed(
     "source" in it; `task_of` returns the task of a line; `source` identifies the version.
     """
     with workers() as pool:
-        return _parallel.checkpointed_tasks(path, tasks, _do_task, task_of, source, shared=work, executor=pool)
-
-
-def _do_task(work: Callable[[Task], Row], task: Task) -> Row:
-    return work(task)
+        return _parallel.checkpointed_tasks(path, tasks, operator.call, task_of, source, shared=work, executor=pool)
 
 
 def remembered(path: Path, source: str, make: Callable[[], Value]) -> Value:

@@ -20,10 +20,8 @@ LOOP = 5_000_000
 def gradient_error(warm: bp.Problem, theta: np.ndarray, noise: np.ndarray) -> float:
     """Return the error of the gradient relative to its largest component, against five-point differences.
 
-    Components and steps are in standard deviations of one parameter given the others.
-
-    `warm`: The one that the gradient is of; the differences are of the problem anchored at θ. `theta` (names,). `noise`
-    (noise_names,).
+    Components and steps are in standard deviations of one parameter given the others; the differences are of the
+    problem anchored at θ.
     """
     sd = _conditional_sd(warm, theta, noise)
     given = warm.gradient(theta, noise)[: theta.size] * sd
@@ -74,11 +72,6 @@ def spread(values: np.ndarray) -> dict[str, float]:
     """Return median, least and largest of the finite values."""
     there = values[np.isfinite(values)]
     return {"median": float(np.median(there)), "least": float(there.min()), "largest": float(there.max())}
-
-
-def ratio(over: np.ndarray, under: np.ndarray) -> dict[str, float]:
-    """Return the ratio of two actions repeat by repeat."""
-    return spread(over / under)
 
 
 def slope(sizes: Any, values: Any) -> float:

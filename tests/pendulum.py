@@ -8,6 +8,7 @@ import numpy as np
 import bayesperiodic as bp
 from bayesperiodic.orbits.orbit import Orbit
 from studies import shooting
+from tests.shooting import pendulum_grid
 
 TURN = 2 * np.pi
 # The torques of shooting.PENDULUM for m = 0.1 kg: k = c m l².
@@ -23,7 +24,7 @@ GENTLE = [k for k in shooting.UNSTABLE if abs(k.multipliers[0]) < 50]
 def rates_and_angles(known: shooting.Known, samples: int) -> np.ndarray:
     """Return (φ, φ') of a tabulated orbit on a grid, integrated period by period."""
     points = samples * len(known.section)
-    path = shooting.pendulum_grid(known.omega, known.section, np.arange(points) / samples)
+    path = pendulum_grid(known.omega, known.section, np.arange(points) / samples)
     path.flags.writeable = False
     return path
 

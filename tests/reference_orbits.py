@@ -17,13 +17,10 @@ from studies.shooting import (
     Field,
     Known,
     Orbit,
-    divided,
     pendulum,
-    pendulum_doubling,
-    pendulum_orbit,
     shoot,
-    van_der_pol_cycle,
 )
+from tests.shooting import divided, pendulum_doubling, pendulum_orbit, van_der_pol_cycle
 
 
 def pendulum_with_omega(**changes: float) -> tuple[Field, Field]:

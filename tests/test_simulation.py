@@ -5,6 +5,7 @@ import sympy as sp
 import bayesperiodic as bp
 from studies import shooting
 from tests.known import grid
+from tests.shooting import trajectory
 
 OSCILLATOR = {"m": 1.3, "c": 0.4, "k": 20.0, "k3": 0.0}
 
@@ -92,7 +93,7 @@ def test_driven_pendulum_agrees_with_another_integrator(rate):
         sampling_rate=rate / period,
         start={"phi": start[0], "dphi": start[1]},
     )
-    exact = shooting.trajectory(slope, np.array([0.0, 6 * period]), np.array([start]), run.time)
+    exact = trajectory(slope, np.array([0.0, 6 * period]), np.array([start]), run.time)
     assert np.ptp(exact[:, 0]) > 2 * np.pi
     assert run.outputs["angle"] == pytest.approx(exact[:, 0], abs=1e-6)
     assert run.outputs["rate"] == pytest.approx(exact[:, 1], abs=1e-5)

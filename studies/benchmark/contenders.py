@@ -14,7 +14,7 @@ from studies.benchmark.floor import WALKERS, call, gradients, walk
 from studies.benchmark.integration import EQUILIBRIUM, ESTIMATE, PREDICTED, SHOOTING, STEADY, Method, Reference
 from studies.benchmark.kernels import MAX_CYCLES
 from studies.benchmark.problems import SCHEMES, Setting
-from studies.timing import Action, gradient_error, interleaved, ratio, spread
+from studies.timing import Action, gradient_error, interleaved, spread
 
 OWN_WARM = "this package, warm"
 GRADIENT, OWN_GRADIENT = "shooting, value and gradient", "this package, value and gradient"
@@ -166,7 +166,7 @@ def measured(contest: Contest, scheme: str | None, repeats: int) -> dict[str, An
 
     def over(name: str, own: str) -> dict[str, float] | None:
         own = f"{own}, {scheme}"
-        return ratio(times[name], times[own]) if name in times and own in times else None
+        return spread(times[name] / times[own]) if name in times and own in times else None
 
     rows = []
     for row in contest.rows:

@@ -3,7 +3,6 @@
 The reference of a problem is its log-posterior at the draws by fully converged shooting with small steps.
 """
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from studies.benchmark.problems import Case, Setting
+from studies.timing import timed
 
 STEADY, SHOOTING = "Runge-Kutta until steady", "shooting"
 EQUILIBRIUM, ESTIMATE, PREDICTED = "from equilibrium", "from the estimate's orbit", "from the predicted orbit"
@@ -185,10 +185,8 @@ class Peer:
 
     def seconds(self, p: np.ndarray, start: str, count: float) -> float:
         """Return the seconds until steady, scaled from a few cycles to the number needed."""
-        run = self.prepared(p, self.discretised.start(p, start))
-        before = time.perf_counter()
-        run()
-        return (time.perf_counter() - before) * max(count, 1.0) / TIMED_CYCLES
+        _, seconds = timed(self.prepared(p, self.discretised.start(p, start)))
+        return seconds * max(count, 1.0) / TIMED_CYCLES
 
 
 def exact(case: Case, parameters: np.ndarray) -> tuple[np.ndarray, float]:

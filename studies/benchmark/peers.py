@@ -18,8 +18,8 @@ from scipy.integrate import solve_bvp, solve_ivp
 from scipy.interpolate import CubicSpline
 
 from studies.benchmark.contenders import SLOW_DRAWS, SLOW_REPEATS, Contest
-from studies.benchmark.equations import JAX, NUMPY, FirstOrder
 from studies.benchmark.integration import EQUILIBRIUM, ESTIMATE, LOOSE, PREDICTED, TABLE, TIMED_CYCLES, Peer
+from studies.benchmark.kernels import JAX, NUMPY, FirstOrder
 from studies.benchmark.problems import DUFFING
 from studies.timing import Action
 
@@ -176,7 +176,6 @@ class Balanced(Peer):
         return self._series(self.discretised.states(self.case.times)[0])
 
     def _series(self, values: np.ndarray) -> Any:
-        """Return the Fourier series of samples over a period."""
         from harmonicbalance.fourier import Fourier
 
         amplitudes, count = np.fft.rfft(values) / len(values), self.setting

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 import bayesperiodic as bp
-from studies.benchmark.equations import table
-from studies.benchmark.kernels import Integrators, integrators, misfit
+from studies.benchmark.kernels import Integrators, integrators, misfit, table
 from studies.damper import run as damper
 from studies.gear import FINE, GEAR, SAMPLES, gear_at_rest, gear_problem, measured
 from studies.silverbox import run as silverbox_data

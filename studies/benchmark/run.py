@@ -27,8 +27,8 @@ from studies import common
 from studies.benchmark import contenders, peers, posteriors, scaling, targets
 from studies.benchmark import floor as floors
 from studies.benchmark import problems as made
-from studies.benchmark.equations import NUMPY, FirstOrder
 from studies.benchmark.integration import PREDICTED, SHOOTING, refer
+from studies.benchmark.kernels import NUMPY, FirstOrder
 from studies.benchmark.problems import Setting
 from studies.pendulum.orbits import distance, shoot
 from studies.pendulum.recording import FREQUENCY, OMEGA, QUICK_PERIODS, TRUTH, section_of, simulate
@@ -81,8 +81,7 @@ def run(options: argparse.Namespace) -> None:
     print("\nTargets\n" + common.table_of_rows(found["checks"]) + "\n")
     with watch.part("figure", "drawing"):
         paths = common.save_figures(options.out, {"benchmark": draw(found)})
-    path = common.write_results(options.out, found | {"seconds": watch.total(), "versions": common.versions()})
-    print(f"figures: {', '.join(map(str, paths))}\nresults: {path}")
+    common.finish(options.out, found, watch, paths, synthetic=False)
     shutil.rmtree(kept, ignore_errors=True)
     if before is not None:
         guard(found, before)
@@ -111,10 +110,8 @@ def _of_problem(name: str, make: Callable[[], Setting], options: argparse.Namesp
 
 
 def _source(options: argparse.Namespace, name: str) -> str:
-    """Return a key that identifies version and settings of kept parts."""
-    own = [common.sha256(path) for path in sorted(Path(__file__).parent.glob("*.py"))]
-    settings = map(str, (options.seed, options.quick, options.guard))
-    return " ".join([common.versions()["bayesperiodic"], name, *settings, *own])
+    key = common.source_key(*map(str, sorted(Path(__file__).parent.glob("*.py"))))
+    return f"{key} {name} {options.seed} {options.quick} {options.guard}"
 
 
 def read_kept(path: Path) -> dict[str, Any]:

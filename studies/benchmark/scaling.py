@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 import bayesperiodic as bp
+from studies import common
 from studies.gear import GEAR, NOISE, gear_problem
 from studies.timing import Action, interleaved, slope
 
@@ -88,7 +89,6 @@ def _batched(samples: int = 800, experiments: int = 14, walkers: int = WALKERS, 
 
 
 def _gradient(free: int, seed: int) -> Callable[[], Any]:
-    """Return a gradient by some of the parameters."""
     problem, _, noise = at_truth("force", 800, 14, free=15, seed=seed)
     kept = dict(list(problem.priors.items())[:free])
     fixed = {name: GEAR[name] for name in problem.names if name not in kept}
@@ -134,14 +134,6 @@ def _run(text: str, environment: dict[str, str]) -> float:
 
 def account(found: dict[str, Any]) -> str:
     """Return the text to print."""
-    lines = [
-        f"  {axis}: time ∝ {axis}^{one['time_exponent']:.2f}, memory ∝ {axis}^{one['memory_exponent']:.2f}"
-        for axis, one in found["growth"].items()
-    ]
-    text = (
-        "  import {import_s:.2f} s, with all that an identification uses {names_s:.2f} s\n"
-        "  first solve of a new model {first_solve_s:.1f} s, from the cache {from_cache_s:.2f} s\n"
-        "  first solve of all {empty_cache_s:.1f} s\n"
-        "  64 walkers × 14 experiments: {peak_mb:.0f} MB at the peak"
-    )
-    return "\n".join([*lines, text.format(**found["start"])])
+    exponents = common.shown("growth with size", found["growth"], ["time_exponent", "memory_exponent"])
+    first = common.shown("start-up times [s] and peak memory [MB]", {"": found["start"]})
+    return f"{exponents}\n{first}"

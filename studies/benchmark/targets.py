@@ -6,6 +6,7 @@ The guard compares the ratios of a quick run with those kept, never absolute tim
 from collections.abc import Mapping
 from typing import Any
 
+from studies import common
 from studies.benchmark.contenders import GRADIENT, OWN_GRADIENT
 from studies.benchmark.floor import ALL_FREE
 from studies.benchmark.integration import EQUILIBRIUM, ESTIMATE, STEADY
@@ -19,16 +20,18 @@ def problem(name: str, found: Mapping[str, Any]) -> str:
     """Return the methods of one problem as text."""
     kind = "SYNTHETIC data" if found["synthetic"] else "measured data"
     experiments = "1 experiment" if found["experiments"] == 1 else f"{found['experiments']} experiments"
-    lines = [
+    title = (
         f"{name} ({kind}, {experiments}, {found['samples']} samples; |Δ log-posterior| ≤ {found['allowed']:g} at "
-        f"{found['draws']} draws, reference uncertain by {found['reference_uncertainty']:.0e})",
-        f"  {'method':52s}{'ms':>10s}{'/ warm (least … largest)':>34s}{'error':>9s}  settings",
-    ]
-    for entry in found["rows"]:
-        error = "-" if entry["error"] is None else f"{entry['error']:.0e}"
-        time = "-" if entry["milliseconds"] is None else f"{entry['milliseconds']['median']:.3g}"
-        lines.append(f"  {entry['name']:52s}{time:>10s}{between(entry['ratio']):>34s}{error:>9s}  {entry['note']}")
-    return "\n".join(lines)
+        f"{found['draws']} draws, reference uncertain by {found['reference_uncertainty']:.0e})"
+    )
+    methods = {
+        entry["name"]: {
+            "ms": entry["milliseconds"] and entry["milliseconds"]["median"],
+            "/ warm (least … largest)": between(entry["ratio"]), "error": entry["error"], "settings": entry["note"],
+        }
+        for entry in found["rows"]
+    }  # fmt: skip
+    return common.shown(title, methods)
 
 
 def between(values: Mapping[str, float] | None) -> str:
@@ -38,27 +41,23 @@ def between(values: Mapping[str, float] | None) -> str:
 
 def posterior(found: Mapping[str, Any]) -> str:
     """Return the samplers, and emcee with the methods, as text."""
-    lines = ["Effective samples per second, Duffing (SYNTHETIC data), the smallest of any parameter"]
-    for name, entry in found["samplers"].items():
-        value = f"{entry['ess_per_second']:.3g}" if "ess_per_second" in entry else "-"
-        lines.append(f"  {name:60s}{value:>10s}  {entry.get('note', '')}")
-    lines.append(f"  {found['split']['best']} over emcee with:  ratio = sampler × solver")
-    for name, entry in found["split"]["against"].items():
-        lines.append(f"    {name:58s}{entry['ratio']:>10.3g} = {entry['sampler']:.3g} × {entry['solver']:.3g}")
-    return "\n".join(lines)
+    title = "Effective samples per second, Duffing (SYNTHETIC data), the smallest of any parameter"
+    against = f"{found['split']['best']} over emcee with these methods: ratio = sampler × solver"
+    samplers = common.shown(title, found["samplers"], ["ess_per_second", "note"])
+    return f"{samplers}\n{common.shown(against, found['split']['against'])}"
 
 
 def floor(name: str, found: Mapping[str, Any]) -> str:
     """Return floor and stages of one problem as text."""
-    lines = [f"{name}: floor and time of a warm log-posterior on one core [µs]"]
-    for scheme, entry in found["schemes"].items():
-        parts = ", ".join(f"{part} {value['median']:.0f}" for part, value in entry["floor_us"].items() if part != "sum")
-        lines.append(f"  {scheme}: floor {entry['floor_us']['sum']['median']:.0f} ({parts})")
-        if "stages_us" in entry:
-            stages = ", ".join(f"{stage} {value:.0f}" for stage, value in entry["stages_us"].items())
-            lines.append(f"    stages: {stages}")
-        ratios = "; ".join(f"{what} {between(value)}" for what, value in entry["ratio"].items())
-        lines.append(f"    over the floor: {ratios}")
+    by_scheme = {
+        scheme: {f"floor, {part} [µs]": value["median"] for part, value in entry["floor_us"].items()}
+        | {f"{stage} [µs]": value for stage, value in entry.get("stages_us", {}).items()}
+        | {f"{what} / floor": between(value) for what, value in entry["ratio"].items()}
+        for scheme, entry in found["schemes"].items()
+    }
+    title = f"{name}: floor and stages of a warm log-posterior on one core, and times over the floor"
+    names = next(iter(by_scheme.values()))
+    lines = [common.shown(title, {name: {scheme: one[name] for scheme, one in by_scheme.items()} for name in names})]
     if "emcee_us" in found:
         memory, own = between(found["bandwidth_gb_per_s"]), between(found["emcee_us"])
         lines.append(f"  memory bandwidth of one core {memory} GB/s; emcee's own time {own} µs per log-posterior")

@@ -15,10 +15,10 @@ machine can gain at that moment.
 """
 
 import argparse
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from multiprocessing import get_context
 from typing import Any
 
@@ -29,6 +29,7 @@ import bayesperiodic as bp
 from studies import common
 from studies.common import TaskPool
 from studies.gear import GEAR
+from studies.timing import timed
 
 CYCLES = 10
 OVERCOUNT = 1.25
@@ -62,11 +63,7 @@ def landing_gear() -> bp.Problem:
     Both variances have the same prior, one in N², the other in Pa²: about 50 N of 10 kN and 50 Pa of 2 MPa.
     """
     run = _run("0.2 Hz 80 mm", 0.2, {"displacement": (0.12, 0.08)}, {"force": 30, "pressure": 15}, 128)
-    priors = {
-        "theta4": bp.LogNormal(5.2e-3, 0.1),
-        "theta6": bp.Normal(-2.3, 0.15),
-        "theta16": bp.LogNormal(2.0, 0.5),
-    }
+    priors = {"theta4": bp.LogNormal(5.2e-3, 0.1), "theta6": bp.Normal(-2.3, 0.15), "theta16": bp.LogNormal(2.0, 0.5)}
     tied = {"theta11": "-1e5*theta4"}
     fixed = {name: value for name, value in GEAR.items() if name not in (*priors, *tied)}
     return _problem(bp.models.landing_gear("displacement"), run, priors, fixed, 50.0**2, tied)
@@ -104,8 +101,6 @@ BINS = 20
 
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
-    if options.replicates < 0:
-        raise ValueError(f"--replicates: must be at least 0, got {options.replicates}.")
     if options.scaling:
         print(f"scaling: {common.write_results(options.out / 'scaling', scaling(options.seed))}")
         return
@@ -194,8 +189,8 @@ def scaling(seed: int) -> dict[str, Any]:
         times: dict[str, list[float]] = {"farm 1": [], "farm 2": [], "loop 1": [], "loop 2": []}
         for number in range(ROUNDS):
             for workers in (1, 2):
-                times[f"loop {workers}"].append(_seconds(lambda w=workers: loops(w)))  # type: ignore[misc]
-                times[f"farm {workers}"].append(_seconds(lambda w=workers, n=number: farm(w, EACH, n)))  # type: ignore[misc]
+                times[f"loop {workers}"].append(timed(partial(loops, workers))[1])
+                times[f"farm {workers}"].append(timed(partial(farm, workers, EACH, number))[1])
         overhead = _overhead(clients[2])
     gain, plain = (2.0 * np.array(times[f"{what} 1"]) / np.array(times[f"{what} 2"]) for what in ("farm", "loop"))
     replicate = float(np.median(times["farm 1"])) / EACH
@@ -222,14 +217,8 @@ def _overhead(client: Any) -> float:
                 pass
 
     empty()
-    return float(np.median([_seconds(empty) for _ in range(3)])) / EMPTY
+    return float(np.median([timed(empty)[1] for _ in range(3)])) / EMPTY
 
 
 def _nothing(_: None, task: int) -> int:
     return task
-
-
-def _seconds(action: Callable[[], Any]) -> float:
-    before = time.perf_counter()
-    action()
-    return time.perf_counter() - before

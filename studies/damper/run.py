@@ -120,12 +120,9 @@ def _summary(experiment: bp.Experiment, fit: bp.MapEstimate) -> dict[str, Any]:
 
 
 def _collect(
-    experiment: bp.Experiment,
-    fit: bp.MapEstimate,
-    posterior: bp.Posterior,
-    comparison: bp.Comparison,
+    experiment: bp.Experiment, fit: bp.MapEstimate, posterior: bp.Posterior, comparison: bp.Comparison,
     choices: list[dict[str, Any]],
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     return _summary(experiment, fit) | {
         "units": {name: bp.models.dahl.units[name] for name in fit.theta} | {"variance[force]": "N²"},
         "frequency": {"value": experiment.frequency, "se": experiment.frequency_se},

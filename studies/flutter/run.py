@@ -8,16 +8,20 @@ authors' values, by continuation, are compared with eigenvalues and with a long 
 """
 
 import argparse
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
 
 import bayesperiodic as bp
 from studies import common
-from studies.flutter import campaigns, questions, rig
-from studies.flutter import figures as flutter_figures
+from studies.flutter import questions, rig
+from studies.flutter.questions import CHANNELS, closed, contraction, drawn_sizes, laplace_draws, sizes
 from studies.flutter.reference import hopf, settled
+from studies.flutter.rig import AUTHORS, RIG, SENSORS, Experiments, Fitted, Speeds, cycles
 
 SAMPLING: dict[str, Any] = {
     "ensembles": 2, "walkers": 20, "max_steps": 12_000, "variances": "collapsed", "progress": False,
@@ -33,7 +37,7 @@ CURVE = 4000
 def run(options: argparse.Namespace) -> None:
     """Run the study, or the campaigns that count coverage."""
     if options.replicates:
-        campaigns.run(options)
+        questions.campaigns(options)
         return
     watch, draws = common.Stopwatch(), 20 if options.quick else 200
     with watch.part("read", "reading the records and folding them without an input"):
@@ -52,15 +56,15 @@ def run(options: argparse.Namespace) -> None:
         authors = questions.authors_errors(experiments, speeds)
     checked = dict(results["checks"])
     by_grid = checked.pop("stable_cycles")
-    cycles = {f"{grid}, {at}": row for grid, rows in by_grid.items() for at, row in rows.items()}
+    stable = {f"{grid}, {at}": row for grid, rows in by_grid.items() for at, row in rows.items()}
     print(common.shown("Hopf point of the authors' values", checked))
-    print(common.shown("relative difference of stable cycles from time integration", cycles), flush=True)
+    print(common.shown("relative difference of stable cycles from time integration", stable), flush=True)
     with watch.part("map", "estimating from all cycles"):
         both = rig.estimate(experiments, speeds)
     with watch.part("parts", "estimating from stable or unstable cycles alone, and with wind speeds left out"):
         fits, results["predictions"] = _parts(experiments, speeds, both, options.quick, draws)
     with watch.part("structure", "structural identifiability"):
-        known = (*rig.RIG, "U", "c_h", "c_alpha")
+        known = (*RIG, "U", "c_h", "c_alpha")
         structure = bp.structure(rig.MODEL, fixed=[name for name in rig.MODEL.parameters if name in known])
     with watch.part("known noise", "estimating with the noise's shape known"):
         stated = _with_known_noise(both, experiments, speeds)
@@ -73,7 +77,7 @@ def run(options: argparse.Namespace) -> None:
             verdict = bp.identifiability(stated, fit, posterior, profile=False, candidates=[])
             compared = bp.compare(stated, fit, posterior)
     with watch.part("figures", "drawing"):
-        figures = flutter_figures.all_of(experiments, speeds, fits, fit, posterior, draws)
+        figures = all_of(experiments, speeds, fits, fit, posterior, draws)
         paths = common.save_figures(options.out, figures)
 
     results |= _of_fits(fits, experiments, authors) | {
@@ -86,8 +90,8 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _parts(
-    experiments: rig.Experiments, speeds: dict[str, float], both: rig.Fitted, quick: bool, draws: int
-) -> tuple[dict[str, rig.Fitted], dict[str, Any]]:
+    experiments: Experiments, speeds: dict[str, float], both: Fitted, quick: bool, draws: int
+) -> tuple[dict[str, Fitted], dict[str, Any]]:
     """Return the fits by kind of cycle, and how cycles that were not fitted are predicted: by speed and by kind."""
     kinds = {kind: [name for name in experiments if questions.kind_of(name) != kind] for kind in KINDS}
     left_out = {f"{other} from {kind}": kinds[kind] for kind, other in zip(KINDS, KINDS[::-1], strict=True)}
@@ -100,7 +104,7 @@ def _parts(
     return fits, {label: predicted for label, (_, predicted) in found.items()}
 
 
-def _with_known_noise(both: rig.Fitted, experiments: rig.Experiments, speeds: dict[str, float]) -> bp.Problem:
+def _with_known_noise(both: Fitted, experiments: Experiments, speeds: dict[str, float]) -> bp.Problem:
     """Return the problem whose noise has the shape found at the MAP point; the variances stay free."""
     shape = {name: value for name, value in both.fit.noise.items() if not name.startswith("variance")}
     stated = rig.problem(both.problem.experiments, speeds, frequency_error=both.frequency_error, known=shape)
@@ -109,7 +113,7 @@ def _with_known_noise(both: rig.Fitted, experiments: rig.Experiments, speeds: di
 
 def _authors_cycles() -> dict[str, Any]:
     """Return the branch of the authors' values, and how it differs from eigenvalues and time integration."""
-    by_grid = {points: rig.cycles(rig.RIG | rig.AUTHORS | rig.SENSORS, points) for points in GRIDS}
+    by_grid = {points: cycles(RIG | AUTHORS | SENSORS, points) for points in GRIDS}
     point, (speed, frequency) = by_grid[rig.SAMPLES].hopf, hopf()
     fold = by_grid[rig.SAMPLES].branches[0].folds[0]
     checks = {
@@ -134,7 +138,7 @@ def _differences(orbit: bp.PeriodicSolution, speed: float) -> dict[str, float]:
     }
 
 
-def _of_records(records: list[rig.Record], experiments: rig.Experiments) -> dict[str, Any]:
+def _of_records(records: list[rig.Record], experiments: Experiments) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for record in records:
         name = record.recording.name
@@ -150,12 +154,12 @@ def _of_records(records: list[rig.Record], experiments: rig.Experiments) -> dict
                 "drift": dict(e.drift),
                 "largest_drift": rig.LARGEST_DRIFT,
                 "scatter_of_one_cycle": dict(e.scatter),
-                "amplitude": questions.sizes(e.outputs),
+                "amplitude": sizes(e.outputs),
             }
     return found
 
 
-def _of_fits(fits: dict[str, rig.Fitted], experiments: rig.Experiments, authors: dict[str, Any]) -> dict[str, Any]:
+def _of_fits(fits: dict[str, Fitted], experiments: Experiments, authors: dict[str, Any]) -> dict[str, Any]:
     fit, found = fits["both"].fit, questions.errors(fits["both"], experiments)
     return {
         "units": {name: rig.MODEL.units[name] for name in fit.theta},
@@ -179,7 +183,7 @@ def _of_fits(fits: dict[str, rig.Fitted], experiments: rig.Experiments, authors:
         "branches_kept_apart": all(one["as_measured"] for one in found.values()),
         "authors_errors": authors,
         "authors_errors_rms_where_a_cycle_exists": questions.mean_size(authors),
-        "contraction": questions.contraction(fits),
+        "contraction": contraction(fits),
     }
 
 
@@ -201,8 +205,8 @@ def _of_draws(posterior: bp.Posterior, fit: bp.MapEstimate, compared: bp.Compari
 
 def _tables(results: dict[str, Any]) -> str:
     kind = "SYNTHETIC data" if results["data"]["synthetic"] else "measured data"
-    columns = [*(f"amplitude_error.{channel}" for channel in questions.CHANNELS), "frequency_error"]
-    missed = [f"{c}.{k}" for c in questions.CHANNELS for k in ("error", "posterior_sds", "sds_with_model_error")]
+    columns = [*(f"amplitude_error.{channel}" for channel in CHANNELS), "frequency_error"]
+    missed = [f"{c}.{k}" for c in CHANNELS for k in ("error", "posterior_sds", "sds_with_model_error")]
     gained = [f"{kind}.{key}" for kind in (*KINDS, "both") for key in ("estimate", "over_prior")]
     return "\n".join([
         f"Flutter rig, {kind}",
@@ -218,3 +222,136 @@ def _tables(results: dict[str, Any]) -> str:
             for case, one in results["predictions"].items()
         ),
     ])  # fmt: skip
+
+
+MEASURED, MODEL, THEIRS = "black", {True: "#0072B2", False: "#D55E00"}, "#999999"
+KIND = {True: "stable", False: "unstable"}
+GRID, COARSE = np.linspace(13.0, 19.0, 241), np.linspace(13.0, 19.0, 41)
+
+
+def all_of(
+    experiments: Experiments, speeds: Speeds, fits: Mapping[str, Fitted], fit: bp.MapEstimate,
+    posterior: bp.Posterior | None, draws: int,
+) -> dict[str, Figure]:  # fmt: skip
+    """Return every figure by its name; without a posterior the bands are Laplace's, and there is no corner plot."""
+    if posterior is None:
+        chosen = laplace_draws(fit, draws)
+    else:
+        every = {name: posterior.draws(name).ravel() for name in fit.theta}
+        chosen = {name: v[np.linspace(0, v.size - 1, draws).astype(int)] for name, v in every.items()}
+    figures = {
+        "bifurcation": bifurcation(experiments, speeds, fit, chosen),
+        "portraits": portraits(experiments, speeds, fit),
+        "contraction": contractions(fits, _kind(experiments)),
+    }
+    return figures if posterior is None else figures | {"corner": bp.plot.corner(posterior, laplace=fit)}
+
+
+def amplitudes(values: Mapping[str, float]) -> dict[tuple[str, bool], np.ndarray]:
+    """Return the amplitude of each channel over the grid of wind speeds, by branch; NaN where there is no cycle."""
+    found = {(channel, kind): np.full(GRID.size, np.nan) for channel in CHANNELS for kind in KIND}
+    try:
+        branches = cycles(values).branches
+    except ValueError:
+        return found
+    orbits = [orbit for along in branches for orbit in along]
+    for kind in KIND:
+        own = sorted((o for o in orbits if o.stable == kind), key=lambda orbit: orbit.parameters["U"])
+        if len(own) > 1:
+            speed = [orbit.parameters["U"] for orbit in own]
+            for channel in CHANNELS:
+                size = [sizes(orbit.outputs)[channel] for orbit in own]
+                found[channel, kind] = np.interp(GRID, speed, size, left=np.nan, right=np.nan)
+    return found
+
+
+def bands(theta: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> dict[tuple[str, bool], np.ndarray]:
+    """Return wind speeds and the 5 and 95 % quantiles of the draws' amplitudes (3, speeds), by channel and branch.
+
+    Where fewer than half of the draws have the cycle, or θ itself has none, there is no band.
+    """
+    along = cycles(RIG | dict(theta))
+    found: dict[tuple[str, bool], list[tuple[float, float, float]]] = {(c, k): [] for c in CHANNELS for k in KIND}
+    for speed in COARSE:
+        for kind in KIND:
+            try:
+                orbit = along.at(KIND[kind], speed)
+            except ValueError:
+                continue
+            for channel, size in drawn_sizes(orbit, theta, draws).items():
+                if np.mean(np.isfinite(size)) > 0.5:
+                    found[channel, kind].append((speed, *np.nanquantile(size, [0.05, 0.95])))
+    return {key: np.array(rows).reshape(-1, 3).T for key, rows in found.items()}
+
+
+def bifurcation(
+    experiments: Experiments, speeds: Speeds, fit: bp.MapEstimate, draws: Mapping[str, np.ndarray]
+) -> Figure:
+    """Draw amplitudes over wind speed: posterior bands of both branches, the authors' values, measurements."""
+    drawn = bands(fit.theta, draws)
+    best, theirs = amplitudes(RIG | fit.theta), amplitudes(RIG | AUTHORS | SENSORS)
+    figure = plt.figure(figsize=(9.0, 8.0), layout="constrained")
+    for axes, channel in zip(figure.subplots(2, 1, sharex=True), CHANNELS, strict=True):
+        for kind in (True, False):
+            colour, style = MODEL[kind], "-" if kind else "--"
+            at, low, high = drawn[channel, kind]
+            axes.fill_between(at, low, high, color=colour, alpha=0.25, lw=0, label=f"{KIND[kind]}, 90 % of draws")
+            axes.plot(GRID, best[channel, kind], color=colour, ls=style, label=f"{KIND[kind]}, MAP")
+            label = "authors' values" if kind else None
+            axes.plot(GRID, theirs[channel, kind], color=THEIRS, lw=1.0, ls=style, label=label)
+        for kind in (True, False):
+            names = [name for name in experiments if name.startswith("unstable") != kind]
+            axes.errorbar(
+                [speeds[name] for name in names],
+                [sizes(experiments[name].outputs)[channel] for name in names],
+                [2.0 * experiments[name].scatter[channel] for name in names],
+                fmt="o" if kind else "s", color=MEASURED, mfc=MODEL[kind], ms=6, capsize=3,
+                label=f"{KIND[kind]}, measured ± 2 sd of one cycle",
+            )  # fmt: skip
+        axes.set_ylabel(f"amplitude of {channel} [sensor units]")
+        axes.set_ylim(bottom=0.0)
+    axes.set_xlabel("wind speed [m/s]")
+    common.shared_legend(figure, 3, fontsize=9)
+    figure.suptitle(f"Flutter rig{_kind(experiments)}: limit cycles")
+    return figure
+
+
+def portraits(experiments: Experiments, speeds: Speeds, fit: bp.MapEstimate) -> Figure:
+    """Draw pitch over heave, measured and fitted, a panel per cycle."""
+    figure = plt.figure(figsize=(11.0, 6.0), layout="constrained")
+    for axes, (name, e) in zip(figure.subplots(2, 4, sharex=True, sharey=True).flat, experiments.items(), strict=False):
+        orbit = fit.solutions[name]
+        kind = not name.startswith("unstable")
+        for values, colour, label in ((e.outputs, MEASURED, "measured"), (orbit.outputs, MODEL[kind], "fitted")):
+            axes.plot(*(closed(values[c]) for c in CHANNELS), color=colour, lw=1.4, label=f"{label}, {KIND[kind]}")
+        axes.set_title(f"{speeds[name]:g} m/s, {KIND[kind]}", fontsize=10)
+        axes.legend(frameon=False, fontsize=7, loc="lower right")
+    for axes in figure.axes[4:]:
+        axes.set_xlabel("heave [sensor units]")
+    for axes in figure.axes[::4]:
+        axes.set_ylabel("pitch [sensor units]")
+    figure.suptitle(f"Flutter rig{_kind(experiments)}: measured and fitted cycles")
+    return figure
+
+
+def contractions(fits: Mapping[str, Fitted], kind_of_data: str) -> Figure:
+    """Draw posterior sd over prior sd of each parameter, from the stable cycles, the unstable ones, and both."""
+    table = contraction(fits)
+    names = list(table)
+    figure = plt.figure(figsize=(8.0, 5.5), layout="constrained")
+    axes = figure.subplots()
+    for number, (kind, colour) in enumerate(zip(fits, (MODEL[True], MODEL[False], MEASURED), strict=True)):
+        at = np.arange(len(names)) + 0.26 * (number - 1)
+        axes.barh(at, [table[name][kind]["over_prior"] for name in names], 0.24, color=colour, label=f"{kind} cycles")
+    axes.axvline(1.0, color=THEIRS, lw=1.0, ls="--", label="prior")
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set_xlabel("Laplace sd over the prior's sd [1]")
+    common.shared_legend(figure, 4)
+    figure.suptitle(f"Flutter rig{kind_of_data}: information on each parameter")
+    return figure
+
+
+def _kind(experiments: Experiments) -> str:
+    return ", synthetic data" if any(e.synthetic for e in experiments.values()) else ""

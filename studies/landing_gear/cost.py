@@ -1,30 +1,34 @@
 """Time of a log-posterior of the landing gear: the periodic solver against time integration until steady.
 
 All fourteen experiments at draws of their joint posterior, interleaved in one run. The periodic solver is timed with
-the whole log-posterior, by scheme; the compiled methods of `studies.landing_gear.integrators`, and SciPy's LSODA and
-Radau on the same compiled right-hand side, with the integration alone. For each experiment the largest steps and
-loosest tolerances are chosen with which the outputs of all draws are as accurate as those of the periodic solver,
-compared with the finest integration.
+the whole log-posterior, by scheme; compiled methods, and SciPy's LSODA and Radau on the same compiled right-hand side,
+with the integration alone. For each experiment the largest steps and loosest tolerances are chosen with which the
+outputs of all draws are as accurate as those of the periodic solver, compared with the finest integration.
+
+The compiled methods are the classical Runge-Kutta method with fixed steps, and the pair of orders 5 and 4 of Dormand
+and Prince with error control (Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, 1993, table 5.2).
+They stop when the gas is within `tolerance` of its steady temperature, estimated from two successive changes over a
+cycle, which decrease geometrically. States are the gas temperature T [K], preceded by compression q [m] and velocity
+[m/s] if the force is given.
 """
 
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from scipy.integrate import solve_ivp
+from scipy.integrate import RK45, solve_ivp
 
 import bayesperiodic as bp
 from studies import common
-from studies.benchmark.equations import table as input_table
-from studies.benchmark.kernels import MAX_CYCLES
-from studies.gear import gear_at_rest
+from studies.benchmark.kernels import MAX_CYCLES, NUMBA, FirstOrder, compiled, integrators, signals
+from studies.benchmark.kernels import table as input_table
+from studies.gear import GEAR, gear_at_rest
 from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, FORCE, SAMPLES, Identified, problem
-from studies.landing_gear.integrators import NAMES, methods
-from studies.timing import Action, interleaved, spread
+from studies.timing import Action, interleaved, spread, timed
 
 DRAWS, QUICK_DRAWS = 10, 2
 REPEATS, QUICK_REPEATS = 9, 1
@@ -46,6 +50,132 @@ FINEST = 1e-11, 1e-9
 TABLE = 16_384
 SCALE = (0.1, 0.1)
 
+# The order of the parameters.
+NAMES = tuple(GEAR)
+# Nodes, stage weights and the difference of the two results of Dormand and Prince.
+NODES, DIFFERENCE = np.append(RK45.C, 1.0), RK45.E
+STAGES = np.vstack([np.pad(RK45.A, ((0, 0), (0, 1))), RK45.B])
+
+
+@compiled
+def settled(before, now, change, tolerance):
+    """Return whether the temperature is steady, and its change over the last cycle."""
+    new = now - before
+    if new == 0.0:
+        return True, new
+    factor = new / change if change != 0.0 else 1.0
+    # Not before the changes fall like those of a single exponential.
+    near = 0.0 < factor < 1.0 and abs(new) * factor / (1.0 - factor) < tolerance
+    return near or (abs(factor) < 0.1 and abs(new) < tolerance), new
+
+
+def _fixed_steps(rates, size):
+    @compiled
+    def integrate(g, inputs, frequency, y, tolerance, path):
+        """Integrate until steady and fill the states (samples, size) of the last cycle.
+
+        Return the number of cycles, 0 if it never becomes steady. `inputs` holds a cycle at half steps (2·steps,
+        signals); `y` is the start, and the end. The steps are a multiple of the samples.
+        """
+        steps, samples = inputs.shape[0] // 2, path.shape[0]
+        h, each, change = 1.0 / (frequency * steps), steps // samples, 0.0
+        k1, k2, k3, k4, trial = np.empty(size), np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+        for cycle in range(MAX_CYCLES):
+            before = y[size - 1]
+            for k in range(steps):
+                here, middle = inputs[2 * k], inputs[2 * k + 1]
+                after = inputs[2 * k + 2] if k + 1 < steps else inputs[0]
+                if k % each == 0:
+                    path[k // each] = y
+                rates(y, here, g, k1)
+                for i in range(size):
+                    trial[i] = y[i] + 0.5 * h * k1[i]
+                rates(trial, middle, g, k2)
+                for i in range(size):
+                    trial[i] = y[i] + 0.5 * h * k2[i]
+                rates(trial, middle, g, k3)
+                for i in range(size):
+                    trial[i] = y[i] + h * k3[i]
+                rates(trial, after, g, k4)
+                for i in range(size):
+                    y[i] += h / 6.0 * (k1[i] + 2.0 * (k2[i] + k3[i]) + k4[i])
+            done, change = settled(before, y[size - 1], change, tolerance)
+            if done:
+                return cycle + 1
+            if not abs(y[size - 1]) < 1e6:
+                return 0
+        return 0
+
+    return integrate
+
+
+def _controlled_steps(rates, size):
+    @compiled
+    def integrate(g, inputs, frequency, y, scale, relative, tolerance, path):
+        """Integrate until steady, then through one more cycle for the states (samples, size).
+
+        Return the number of cycles, 0 if it never becomes steady. `inputs` holds a cycle (points, signals), `scale`
+        (size,) the scales of the errors.
+        """
+        rate, trial, u = np.empty((7, size)), np.empty(size), np.empty(inputs.shape[1])
+        samples, change, step, done = path.shape[0], 0.0, 1e-3, False
+        for cycle in range(MAX_CYCLES):
+            before = y[size - 1]
+            last = done
+            for k in range(samples if last else 1):
+                now, end = k / samples if last else 0.0, (k + 1) / samples if last else 1.0
+                signals(inputs, now, u)
+                if last:
+                    path[k] = y
+                rates(y, u, g, rate[0])
+                while now < end:
+                    used = min(step, end - now)
+                    for stage in range(1, 7):
+                        for i in range(size):
+                            total = 0.0
+                            for j in range(stage):
+                                total += STAGES[stage, j] * rate[j, i]
+                            trial[i] = y[i] + used / frequency * total
+                        signals(inputs, now + NODES[stage] * used, u)
+                        rates(trial, u, g, rate[stage])
+                    error = 0.0
+                    for i in range(size):
+                        total = 0.0
+                        for j in range(7):
+                            total += DIFFERENCE[j] * rate[j, i]
+                        error = max(error, abs(used / frequency * total) / (relative * scale[i]))
+                    if error <= 1.0:
+                        now = end if used == end - now else now + used
+                        for i in range(size):
+                            y[i], rate[0, i] = trial[i], rate[6, i]
+                    elif used < 1e-12:
+                        return 0
+                    growth = min(5.0, max(0.2, 0.9 * error ** (-0.2))) if error > 0.0 else 5.0
+                    step = max(step, used * growth) if error <= 1.0 and used < step else used * growth
+            if last:
+                return cycle + 1
+            done, change = settled(before, y[size - 1], change, tolerance)
+            if not abs(y[size - 1]) < 1e6:
+                return 0
+        return 0
+
+    return integrate
+
+
+@cache
+def methods(drive: str) -> SimpleNamespace:
+    """Return the compiled functions fixed, controlled, outputs and rates_in_time of one direction."""
+    model = bp.models.landing_gear(drive)
+    first, generic = FirstOrder(model, ()), integrators(model, NAMES[:1])
+    rates = compiled(first.function(NUMBA, first.rates))
+    return SimpleNamespace(
+        fixed=_fixed_steps(rates, first.size),
+        controlled=_controlled_steps(rates, first.size),
+        outputs=generic.outputs,
+        rates_in_time=generic.rates_in_time,
+    )
+
+
 # From parameters and start to the states of a cycle (samples, size) and the number of cycles integrated, 0 for never.
 Integrate = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]
 
@@ -56,7 +186,7 @@ class Gear:
 
     drive: str
     experiment: bp.Experiment
-    parameters: np.ndarray  # (draws, parameters): In the order of `integrators.NAMES`
+    parameters: np.ndarray  # (draws, parameters): In the order of `NAMES`
     estimate: np.ndarray  # (parameters,): The MAP estimate
 
     def still(self, parameters: np.ndarray) -> np.ndarray:
@@ -68,7 +198,7 @@ class Gear:
         if len(path) != SAMPLES:
             path = np.fft.irfft(np.fft.rfft(path, axis=0) * (SAMPLES / len(path)), SAMPLES, axis=0)
         out = np.empty((SAMPLES, 2))
-        self._methods.outputs(parameters, self._inputs, np.ascontiguousarray(path), out)
+        methods(self.drive).outputs(parameters, self._inputs, np.ascontiguousarray(path), out)
         return out
 
     def integrator(self, kind: str, fineness: float, tolerance: float) -> Integrate:
@@ -79,8 +209,8 @@ class Gear:
         def integrate(parameters: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, int]:
             path, given = np.empty((points, start.size)), (parameters, inputs, frequency, start.copy())
             if kind == FIXED:
-                return path, self._methods.fixed(*given, tolerance, path)
-            return path, self._methods.controlled(*given, self._scale(parameters), fineness, tolerance, path)
+                return path, methods(self.drive).fixed(*given, tolerance, path)
+            return path, methods(self.drive).controlled(*given, self._scale(parameters), fineness, tolerance, path)
 
         return integrate
 
@@ -91,7 +221,7 @@ class Gear:
 
         def integrate(parameters: np.ndarray, start: np.ndarray) -> np.ndarray:
             solved = solve_ivp(  # type: ignore[call-overload]
-                self._methods.rates_in_time, (0.0, cycles / frequency), start, method, times, rtol=relative,
+                methods(self.drive).rates_in_time, (0.0, cycles / frequency), start, method, times, rtol=relative,
                 atol=relative * self._scale(parameters), args=(parameters, inputs, 1.0 / frequency),
             )  # fmt: skip
             return solved.y.T if solved.success else np.full((SAMPLES, start.size), np.nan)
@@ -114,10 +244,6 @@ class Gear:
         """Whether the finest integration becomes steady at every draw."""
         integrate = self.integrator(CONTROLLED, *FINEST)
         return all(integrate(parameters, self.still(parameters))[1] for parameters in self.parameters)
-
-    @property
-    def _methods(self) -> Any:
-        return methods(self.drive)
 
     @cached_property
     def _inputs(self) -> np.ndarray:
@@ -241,7 +367,7 @@ def _by_scheme(
     own = _own_errors(warm, theta, gears)
     chosen = [{k: choose(gear, k, allowed) for k in COMPILED} for gear, allowed in zip(gears, own, strict=True)]
     noise = np.array(list(fit.noise.values()))
-    times = interleaved(_actions(warm, scheme, noise, theta, gears, chosen), QUICK_REPEATS if quick else REPEATS)
+    times = interleaved(_actions(warm, noise, theta, gears, chosen), QUICK_REPEATS if quick else REPEATS)
     scipy = {method: _scipy(gears, own, chosen, method) for method in SCIPY}
     settings = "fineness", "tolerance", "error", "cycles"
     return {
@@ -257,7 +383,6 @@ def _by_scheme(
 
 
 def _own_errors(warm: bp.Problem, theta: np.ndarray, gears: Sequence[Gear]) -> list[float]:
-    """Return the periodic solver's largest error at any draw, by experiment."""
     outputs, converged = warm.outputs(theta)
     if not converged.all():
         raise RuntimeError("A periodic solve at a draw of the posterior did not converge.")
@@ -269,20 +394,15 @@ def _own_errors(warm: bp.Problem, theta: np.ndarray, gears: Sequence[Gear]) -> l
 
 
 def _actions(
-    warm: bp.Problem,
-    scheme: str,
-    noise: np.ndarray,
-    theta: np.ndarray,
-    gears: Sequence[Gear],
+    warm: bp.Problem, noise: np.ndarray, theta: np.ndarray, gears: Sequence[Gear],
     chosen: Sequence[Mapping[str, Contender]],
-) -> dict[str, Action]:
-    """Return the timed actions, with the number of log-posteriors of each call."""
+) -> dict[str, Action]:  # fmt: skip
     many = np.resize(theta, (WALKERS, theta.shape[1]))
 
     def cold(gear: Gear) -> bp.PeriodicSolution:
         values, e = dict(zip(NAMES, gear.parameters[0], strict=True)), gear.experiment
         model = bp.models.landing_gear(gear.drive)
-        return bp.solve_periodic(model, values, e.inputs, frequency=e.frequency, samples=SAMPLES, scheme=scheme)
+        return bp.solve_periodic(model, values, e.inputs, frequency=e.frequency, samples=SAMPLES, scheme=warm.scheme)
 
     def steady(gear: Gear, contender: Contender) -> np.ndarray:
         # Static equilibrium if theta16 ≤ 0 at the estimate, without a steady state.
@@ -320,13 +440,10 @@ def _scipy(
     for gear, tolerance, by_kind in zip(gears, relative, chosen, strict=True):
         if tolerance is None:
             return None
-        integrate, parameters = gear.scipy(method, tolerance, TIMED_CYCLES), gear.parameters[0]
-        start, times = gear.still(parameters), []
-        for _ in range(2):
-            before = time.perf_counter()
-            integrate(parameters, start)
-            times.append(time.perf_counter() - before)
-        total += min(times) * min(contender.cycles for contender in by_kind.values()) / TIMED_CYCLES
+        parameters = gear.parameters[0]
+        run = partial(gear.scipy(method, tolerance, TIMED_CYCLES), parameters, gear.still(parameters))
+        seconds = min(timed(run)[1] for _ in range(2))
+        total += seconds * min(contender.cycles for contender in by_kind.values()) / TIMED_CYCLES
     return total
 
 

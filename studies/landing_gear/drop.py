@@ -65,14 +65,11 @@ def drop_model(effects: frozenset[str]) -> bp.Model:
         return {"displacement": displacement, "force": at.force, "pressure": pressure}
 
     return bp.Model(
-        "_".join(["landing_gear_drop", *sorted(effects)]),
-        states=["psi", "T"],
-        parameters=(*parameters(effects), "mass"),
+        "_".join(["landing_gear_drop", *sorted(effects)]), states=["psi", "T"],
+        parameters=(*parameters(effects), "mass"), equations=equations, outputs=outputs,
         units={"psi": "rad", "T": "K", "displacement": "m", "force": "N", "pressure": "Pa"},
-        equations=equations,
-        outputs=outputs,
         description="A mass on a pivoting frame, carried by a landing gear; see `studies.landing_gear.drop`.",
-    )
+    )  # fmt: skip
 
 
 def drop(values: Mapping[str, float], effects: Iterable[str] = (), duration: float = LONG) -> bp.Recording:

@@ -195,14 +195,18 @@ def repaired(found: Mapping[str, Any]) -> Figure:
 
 
 def loops(identified: Mapping[str, Sequence[Identified]]) -> Figure:
-    """Draw the friction loops of some experiments, a row per truth, the displacement being given."""
+    """Draw friction loops of some experiments and their residuals, a row per truth, the displacement being given."""
     most = max(map(len, identified.values()))
-    figure = plt.figure(figsize=(7.0 * most, 3.6 * len(identified) + 0.4), layout="constrained")
+    figure = plt.figure(figsize=(7.0 * most, 5.0 * len(identified) + 0.4), layout="constrained")
     parts = figure.subfigures(len(identified), most, squeeze=False)
     for row, (truth, several) in zip(parts, identified.items(), strict=True):
         for part, one in zip(row, several, strict=True):
-            bp.plot.loops(one.problem, one.fit, output="force", figure=part)
-            name = one.problem.experiments[0].name.replace(" Hz ", " Hz, ±")
-            part.suptitle(f"{TRUTH_NAMES[truth]}\n{name}", fontsize=9)
+            above, below = part.subfigures(2, 1, height_ratios=(1.8, 1.0))
+            bp.plot.loops(one.problem, one.fit, output="force", figure=above)
+            experiment, axes = one.problem.experiments[0], below.subplots()
+            residual = one.fit.residuals[experiment.name]["force"]
+            axes.plot(experiment.inputs["displacement"], residual, color=bp.plot.COLOURS["map"], lw=0.9)
+            axes.set(xlabel="displacement [m]", ylabel="residual force [N]")
+            above.suptitle(f"{TRUTH_NAMES[truth]}\n{experiment.name.replace(' Hz ', ' Hz, ±')}", fontsize=9)
     figure.suptitle(f"Friction loops of the landing gear, displacement given, {TITLE}")
     return figure

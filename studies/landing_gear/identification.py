@@ -9,10 +9,10 @@ friction are as uncertain as after a test of the gear without gas, the amount of
 filling by a manometer. theta2, theta7 and theta12, zero in this gear, stay fixed.
 """
 
-import time
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from scipy.special import ndtr
 
 import bayesperiodic as bp
 from studies.landing_gear.rig import GEAR, TRUTHS, Run, measure
+from studies.timing import timed
 
 DISPLACEMENT, FORCE = "displacement", "force"
 DRIVES = (DISPLACEMENT, FORCE)
@@ -86,13 +87,12 @@ def draw(
 ) -> Identified:
     """Return the same with draws of the posterior, the variances integrated out."""
     stated, fit = estimated.problem, estimated.fit
-    before = time.perf_counter()
     walkers = max(QUICK_WALKERS if quick else WALKERS, 2 * len(stated.names))
-    posterior = bp.sample(
-        stated, fit, seed=seed, ensembles=ENSEMBLES, walkers=walkers, max_steps=QUICK_STEPS if quick else max_steps,
-        variances="collapsed", executor=None if quick else executor, progress=False,
+    run = partial(
+        bp.sample, stated, fit, seed=seed, ensembles=ENSEMBLES, walkers=walkers, variances="collapsed",
+        max_steps=QUICK_STEPS if quick else max_steps, executor=None if quick else executor, progress=False,
     )  # fmt: skip
-    return Identified(stated, fit, posterior, time.perf_counter() - before)
+    return Identified(stated, fit, *timed(run))
 
 
 def jointly(recordings: Iterable[bp.Recording], seed: int, *, quick: bool, one_conduction: bool = False) -> Identified:
@@ -220,11 +220,9 @@ def with_others_free(run: Run, truth: str, seed: int, quick: bool) -> dict[str, 
         # The warning on the wall's temperature, which the priors determine.
         warnings.filterwarnings("ignore", "The data do not change under")
         found = estimate(
-            [fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)],
-            DISPLACEMENT,
-            priors=PRIORS | OTHERS,
+            [fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT)], DISPLACEMENT, priors=PRIORS | OTHERS,
             fixed={name: value for name, value in FIXED.items() if name not in OTHERS},
-        )
+        )  # fmt: skip
     fit = found.fit
     posterior = bp.sample(found.problem, fit, seed=seed, max_steps=QUICK_STEPS if quick else STEPS, **SAMPLING)
     table = identifiability(Identified(found.problem, fit, posterior)).table

@@ -111,17 +111,12 @@ def damper(effects: frozenset[str]) -> bp.Model:
 
     states = ("q", "T") if flexure else ("T",)
     return bp.Model(
-        "_".join(["landing_gear_truth", *sorted(effects)]),
-        states=states,
-        inputs=["displacement"],
+        "_".join(["landing_gear_truth", *sorted(effects)]), states=states, inputs=["displacement"],
         parameters={name: UNITS[name] for name in parameters(effects)},
-        units={
-            name: UNITS[name] for name in (*states, "displacement", "force", "pressure", "temperature", "compression")
-        },
-        equations=equations,
-        outputs=outputs,
+        units={n: UNITS[n] for n in (*states, "displacement", "force", "pressure", "temperature", "compression")},
+        equations=equations, outputs=outputs,
         description="A landing gear damper with effects that eq. (9) lacks, see `studies.landing_gear.rig`.",
-    )
+    )  # fmt: skip
 
 
 MEAN_COMPRESSION = 0.12

@@ -68,12 +68,9 @@ def with_eigenvalues(selected: bp.Orbits, free: Sequence[str]) -> bp.MapEstimate
 def problem_of(experiments: Sequence[bp.Experiment], free: Sequence[str]) -> bp.Problem:
     """Return the problem with some parameters free, the other torques and the constants known."""
     return bp.Problem(
-        bp.models.pendulum,
-        list(experiments),
-        priors={name: PRIORS[name] for name in free},
-        fixed={name: value for name, value in TRUTH.items() if name not in free},
-        scheme=SCHEME,
-    )
+        bp.models.pendulum, list(experiments), priors={name: PRIORS[name] for name in free},
+        fixed={name: value for name, value in TRUTH.items() if name not in free}, scheme=SCHEME,
+    )  # fmt: skip
 
 
 def _short(orbits: bp.Orbits) -> bp.Orbits:
@@ -146,14 +143,10 @@ def sample(identified: Identified, seed: int, quick: bool) -> Ridge:
     table = table.join(posterior.derive(COMBINATIONS)[["mean", "sd"]])
     table.loc["l"] = [fit.theta["l"], fit.sd["l"], posterior.draws("l").mean(), posterior.draws("l").std()]
     return Ridge(
-        fit,
-        posterior,
-        bp.structure(bp.models.pendulum, fixed=list(KNOWN)),
-        bp.identifiability(problem, fit, posterior),
-        bp.compare(problem, fit, posterior),
-        bp.compare(problem, fit, posterior, coordinates="sampling"),
-        table.loc[list(DETERMINED)],
-    )
+        fit, posterior, bp.structure(bp.models.pendulum, fixed=list(KNOWN)),
+        bp.identifiability(problem, fit, posterior), bp.compare(problem, fit, posterior),
+        bp.compare(problem, fit, posterior, coordinates="sampling"), table.loc[list(DETERMINED)],
+    )  # fmt: skip
 
 
 def combinations(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import bayesperiodic as bp
-from studies.common import Row, available_cores, row, unjudged
+from studies.common import Row, available_cores, row
 from studies.gear import GEAR, RIG, gear_problem
 from studies.timing import gain_of_cores, plain_loop, timed
 
@@ -57,7 +57,8 @@ def rows(cost: dict[str, Any]) -> list[Row]:
         what = f"gain of {vectorised['cores']} cores on a vectorised call over that of a plain loop, {drive}-driven"
         gain, plain = row(what, entry["ratio"], GAIN_LIMIT, None, _quartiles(entry["ratio_quartiles"])), entry["plain"]
         if plain < LEAST_GAIN:
-            gain = unjudged(gain, f"not measurable on this machine or under this load: a plain loop gains {plain:.2f}")
+            note = f"not measurable on this machine or under this load: a plain loop gains {plain:.2f}"
+            gain |= {"met": None, "note": note}
         result.append(gain)
     return result
 
@@ -90,10 +91,8 @@ def pool_overhead(repeats: int = 3, pools: tuple[str, ...] = POOLS, seconds: flo
     processes takes seconds whatever the length of a run. A piece, which is what a message carries, is 4 walkers × 25
     steps, an eighth of what the default walkers make it, so that the overhead of a default run is smaller.
 
-    `repeats`: Of each pool, 20 s each. `pools`: "process", "dask"; the latter is omitted if it is not installed.
-    `seconds`: Duration of a log-posterior. The result has the ratios of wall times to those of the thread, those of the
-    processor times of this process and the worker together, which other load changes little, and the milliseconds of a
-    log-posterior in the thread.
+    `repeats`: Of each pool, 20 s each. `pools`: "dask" is omitted if it is not installed. `seconds`: Of a
+    log-posterior. Processor times are those of this process and the worker together; other load changes them little.
     """
     kinds = [name for name in pools if name != "dask" or importlib.util.find_spec("distributed")]
     core, *others = sorted(os.sched_getaffinity(0))

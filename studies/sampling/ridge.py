@@ -74,13 +74,9 @@ def sample_ridge(seed: int, quick: bool) -> Runs:
 def _problem(prior: Any) -> bp.Problem:
     """Return the problem of two factors of which the product is measured, the mean square of x being 1."""
     model = bp.Model(
-        "ridge",
-        states=["w"],
-        inputs=["x"],
-        parameters=["a", "b"],
-        equations=lambda s, p, u: [s.dw + s.w - u.x],
-        outputs=lambda s, p, u: {"product": p.a * p.b * u.x},
-    )
+        "ridge", states=["w"], inputs=["x"], parameters=["a", "b"],
+        equations=lambda s, p, u: [s.dw + s.w - u.x], outputs=lambda s, p, u: {"product": p.a * p.b * u.x},
+    )  # fmt: skip
     tau = np.arange(POINTS) / POINTS
     x = np.sqrt(2.0) * np.sin(2 * np.pi * tau)
     # A second harmonic, which the model lacks, makes the residual finite.

@@ -7,8 +7,8 @@ The estimates are checked on a finer grid, from another start, and with a second
 """
 
 import argparse
-import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 
 import bayesperiodic as bp
 from studies import common
+from studies.timing import timed
 
 FILE = "silverbox/Schroeder80mV.csv"
 ADDRESS = "nonlinearbenchmark.org (Silverbox), copy in github.com/biaslab/nsi-silverbox (commit 728f07e4)"
@@ -120,12 +121,9 @@ def read_steady_parts(given: Path | None, seed: int) -> tuple[tuple[bp.Recording
     if found is None:
         return generate(seed), common.described(found)
     whole = bp.Recording.from_csv(
-        found[0],
-        sampling_rate=SAMPLING_RATE,
-        inputs={"drive": "V1"},
-        outputs={"response": "V2"},
+        found[0], sampling_rate=SAMPLING_RATE, inputs={"drive": "V1"}, outputs={"response": "V2"},
         name="Silverbox, Schroeder multisine",
-    )
+    )  # fmt: skip
     first, second = (
         whole.between((row - 0.5) / SAMPLING_RATE, (row + PERIODS * PERIOD - 0.5) / SAMPLING_RATE) for row in FIRST_ROWS
     )
@@ -228,9 +226,8 @@ def _from_rest(experiment: bp.Experiment, theta: Mapping[str, float]) -> tuple[l
     }
     found, seconds = [], []
     for at, values in points.items():
-        start = time.perf_counter()
-        s = solve(values, experiment)
-        seconds.append(time.perf_counter() - start)
+        s, taken = timed(partial(solve, values, experiment))
+        seconds.append(taken)
         found.append({"at": at, "status": s.status, "found_by": s.found_by, "iterations": s.iterations})
     return found, seconds
 
@@ -272,7 +269,6 @@ def _shift(fit: bp.MapEstimate, other: bp.MapEstimate) -> dict[str, float]:
 
 
 def _collect(experiment: bp.Experiment, fits: dict[str, bp.MapEstimate], grid: Discretisation) -> dict[str, Any]:
-    """Return the content of results.json that comes from the fits with all harmonics and from the grid."""
     fit, split = fits["independent"], fits["measured"].noise_split["response"]
     return {
         "units": {name: bp.models.silverbox.units[name] for name in ("w0", *fit.theta)},
@@ -311,7 +307,6 @@ def _by_noise(experiment: bp.Experiment, fits: dict[str, bp.MapEstimate]) -> dic
 
 
 def _fits_lines(fits: dict[str, bp.MapEstimate]) -> list[str]:
-    """Return the estimates side by side, and the test of the whitened residuals."""
     names = list(fits["independent"].theta)
     columns = {"unit": [bp.models.silverbox.units[name] for name in names]} | {
         noise: [f"{f.theta[p]:.6g} ± {f.sd[p]:.2g} ({f.robust_sd[p]:.2g})" for p in names] for noise, f in fits.items()
@@ -332,7 +327,6 @@ def _fits_lines(fits: dict[str, bp.MapEstimate]) -> list[str]:
 
 
 def _check_lines(results: dict[str, Any]) -> list[str]:
-    """Return the residual, the grid's error and the starts, with their interpretation."""
     split, repeat, beyond = results["noise_split"], results["repetition"], results["beyond_drive"]
     error, allowed = results["discretisation_error_fraction"], results["discretisation_allowed"]
     other, doubled = results["other_start"], results["doubling_shift"].values()

@@ -134,7 +134,6 @@ def _prepared(equations: PeriodicEquations, theta: np.ndarray) -> tuple[Callable
 
 
 def _iteration(equations: PeriodicEquations, theta: np.ndarray, repeats: int, calls: int) -> float:
-    """Return the microseconds of a Newton iteration."""
     newton, iterations, _ = _prepared(equations, theta)
     return _interleaved(repeats, calls, newton=newton)["newton"] / iterations
 

@@ -11,7 +11,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import pandas as pd
+from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -76,8 +76,7 @@ def run(options: argparse.Namespace) -> None:
     results["checks"] = checks(results)
     results["cost"]["checks"] = [verdict(*row) for row in cost.checks(results["cost"])]
     print("\n" + tables(results) + "\n")
-    path = common.write_results(options.out, results | {"seconds": watch.total(), "versions": common.versions()})
-    print(f"figures: {', '.join(map(str, paths))}\nresults: {path}")
+    common.finish(options.out, results, watch, paths, synthetic=False)
 
 
 def measure_orders() -> dict[str, Any]:
@@ -335,8 +334,6 @@ def draw_duffing(branches: dict[float, bp.Branch]) -> Figure:
 
 def draw_pendulum(branches: dict[int, bp.Branch], attractor: dict[float, np.ndarray]) -> Figure:
     """Draw the cascade of the pendulum's rotation, whole and enlarged, with the motion found by time integration."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(10.0, 5.0), layout="constrained")
     whole, enlarged = figure.subplots(1, 2)
     for axes, most in ((whole, 4), (enlarged, 8)):
@@ -361,8 +358,6 @@ def draw_pendulum(branches: dict[int, bp.Branch], attractor: dict[float, np.ndar
 
 def draw_orders(forced: dict[str, Any], periods: dict[str, Any]) -> Figure:
     """Draw errors against the number of points: every scheme on Duffing, two of them on van der Pol's period."""
-    from matplotlib import pyplot as plt
-
     figure = plt.figure(figsize=(10.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
 
@@ -431,42 +426,41 @@ def tables(results: dict[str, Any]) -> str:
         f"from period {p} to {2 * int(p)}": {
             "found": f"{e['found'][0]:.9f}" if e["found"] else "-",
             "by shooting": f"{e['reference']:.9f}" if "reference" in e else "-",
-            "difference": f"{e['difference']:.1e}" if "difference" in e else "-",
+            "difference": e.get("difference"),
         }
         for p, e in pendulum["doublings"].items()
     }
-    rotations = [
-        {
-            "rotation": name,
-            "scheme": scheme,
+    rotations = {
+        f"{name}, {scheme}": {
             "points": e["samples"],
             "multipliers": ", ".join(f"{m:.10f}" for m in e["multipliers"]),
-            "relative difference": f"{e['relative_difference']:.1e}",
+            "relative difference": e["relative_difference"],
             "iterations": e["iterations"],
         }
         for name, by_scheme in pendulum["rotations"].items()
         for scheme, e in by_scheme.items()
-    ]
-    orbits = [
-        {"period": e["period"], "winding": e["winding"], "larger multiplier": f"{e['central4']['multipliers'][0]:.6f}"}
-        | {f"difference, {s}": f"{e[s]['relative_difference']:.1e}" for s in ("central2", "central4")}
-        for e in results["orbits"]
-    ]
+    }
+    orbits = {
+        f"period {e['period']}, winding {e['winding']:2d}, {number}": {
+            "larger multiplier": f"{e['central4']['multipliers'][0]:.6f}"
+        }
+        | {f"difference, {s}": e[s]["relative_difference"] for s in ("central2", "central4")}
+        for number, e in enumerate(results["orbits"], 1)
+    }
     folds = [
         f"  force {e['force']:g} N: " + (" and ".join(f"{f:.6f} Hz" for f in sorted(e["folds"])) or "none")
         for e in results["duffing"]
     ]
     below = pendulum["below"]
     return "\n".join([
-        f"The pendulum's period doublings from {LOCKED:g} down to {CHAOTIC:g} rad/s ({pendulum['scheme']}, "
-        f"{pendulum['samples']} points a forcing period) [rad/s]",
-        pd.DataFrame(doublings).T.to_string(),
+        common.shown(
+            f"The pendulum's period doublings from {LOCKED:g} down to {CHAOTIC:g} rad/s ({pendulum['scheme']}, "
+            f"{pendulum['samples']} points a forcing period) [rad/s]", doublings,
+        ),
         f"Further down, the rotation turns in a fold at {below['fold']:.9f} rad/s and comes back as the second "
         f"rotation at {below['back_at']:.2f} rad/s.",
-        f"\nMultipliers of the two period-1 rotations at {CHAOTIC:g} rad/s",
-        pd.DataFrame(rotations).to_string(index=False),
-        f"\nUnstable prime orbits at {CHAOTIC:g} rad/s",
-        pd.DataFrame(orbits).to_string(index=False),
+        common.shown(f"\nMultipliers of the two period-1 rotations at {CHAOTIC:g} rad/s", rotations),
+        common.shown(f"\nUnstable prime orbits at {CHAOTIC:g} rad/s", orbits),
         "\nFolds of the Duffing oscillator",
         *folds,
         "\nTargets",

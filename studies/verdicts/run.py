@@ -20,9 +20,7 @@ from matplotlib.figure import Figure
 import bayesperiodic as bp
 from studies import common
 from studies.verdicts import cases
-from studies.verdicts import outcome as verdicts_outcome
-from studies.verdicts.cases import CASES, COMPARE, FINE, IDENTIFIABILITY, PREDICT
-from studies.verdicts.outcome import Outcome, examine
+from studies.verdicts.cases import CASES, COMPARE, FINE, IDENTIFIABILITY, PREDICT, Outcome, examine
 
 DATA, SAMPLER = "data", "sampler"
 MOST_SAMPLER_SEEDS = 20
@@ -54,7 +52,7 @@ def replicate(task: Task) -> dict[str, Any]:
 
 def source() -> str:
     """Return a key that identifies version and cases of the replicates."""
-    return common.source_key(cases.__file__, verdicts_outcome.__file__)
+    return common.source_key(cases.__file__)
 
 
 def replicates(folder: Path, names: Sequence[str], count: int, seed: int) -> list[dict[str, Any]]:
@@ -133,7 +131,6 @@ def _figures(outcomes: Mapping[str, Outcome]) -> dict[str, Figure]:
 
 
 def _gallery(outcomes: Mapping[str, Outcome]) -> Figure:
-    """Draw for every case the marginal of one parameter and its verdicts."""
     figure = plt.figure(figsize=(11.0, 1.55 * len(outcomes) + 0.7), layout="constrained")
     grid = figure.subplots(len(outcomes), 2, squeeze=False, width_ratios=[1.0, 1.35])
     for (left, right), outcome in zip(grid, outcomes.values(), strict=True):
@@ -167,7 +164,6 @@ def _marginal(axes: Axes, outcome: Outcome) -> None:
 
 
 def _words(axes: Axes, outcome: Outcome) -> None:
-    """Write the fault and the verdicts, with the verdict that names the fault in bold."""
     case, verdicts = outcome.case, outcome.verdicts
     axes.set_axis_off()
     axes.text(0.0, 1.0, textwrap.fill(f"wrong: {case.title}", WIDTH), va="top", fontsize=11, weight="bold")
@@ -185,7 +181,6 @@ def _words(axes: Axes, outcome: Outcome) -> None:
 
 
 def _grouped(verdicts: Mapping[str, str]) -> str:
-    """Return verdicts as text, grouped by verdict."""
     members: dict[str, list[str]] = {}
     for name, verdict in verdicts.items():
         members.setdefault(verdict, []).append(name)
@@ -197,8 +192,6 @@ QUICK = ("product_ridge", "linear", "prior_dominated", "misspecified")
 
 def run(options: argparse.Namespace) -> None:
     """Run the study."""
-    if options.replicates < 0:
-        raise ValueError(f"--replicates: must be at least 0, got {options.replicates}.")
     watch = common.Stopwatch()
     print("All data are SYNTHETIC: simulated from the stated truths, with noise.")
     outcomes: dict[str, Outcome] = {}

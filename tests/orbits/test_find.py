@@ -7,8 +7,9 @@ from scipy.stats import binom, chi2
 import bayesperiodic as bp
 from bayesperiodic.orbits import find
 from bayesperiodic.orbits.cycles import refine
-from studies.shooting import UNSTABLE, pendulum_orbit
+from studies.shooting import UNSTABLE
 from tests.orbits import chaos
+from tests.shooting import pendulum_orbit
 
 KNOWN = [k for k in UNSTABLE if k.omega == chaos.OMEGA]
 SCALE = np.array([6.28, 32.6])

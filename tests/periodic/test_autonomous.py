@@ -5,6 +5,7 @@ from scipy.optimize import minimize_scalar
 import bayesperiodic as bp
 from studies import shooting
 from tests.known import grid
+from tests.shooting import trajectory, van_der_pol_cycle
 
 VAN_DER_POL = bp.models.van_der_pol
 CYCLES = sorted(shooting.VAN_DER_POL.items())
@@ -80,7 +81,7 @@ def test_stability_does_not_depend_on_which_side_of_one_the_trivial_multiplier_i
 
 
 def test_tabulated_cycle_is_again_that_of_shooting():
-    assert shooting.van_der_pol_cycle(0.5, parts=6) == pytest.approx(shooting.VAN_DER_POL[0.5], rel=1e-11)
+    assert van_der_pol_cycle(0.5, parts=6) == pytest.approx(shooting.VAN_DER_POL[0.5], rel=1e-11)
 
 
 def test_omega_only_scales_the_time():
@@ -213,7 +214,7 @@ def test_published_unstable_orbit_of_three_first_order_states():
 
     end, transfer = shooting.flow(slope, jacobian, 0.0, period, start)
     assert end == pytest.approx(start, abs=1e-10)
-    path = shooting.trajectory(slope, np.array([0.0, period]), [start], period * grid(128))
+    path = trajectory(slope, np.array([0.0, period]), [start], period * grid(128))
     disturbance = 0.5 * np.sin(2 * np.pi * 3 * grid(128))
     guess = {name: path[:, k] + disturbance for k, name in enumerate("xyz")}
     parameters = {"sigma": 10.0, "r": 28.0, "b": 8 / 3}

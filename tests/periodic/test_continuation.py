@@ -14,6 +14,7 @@ from bayesperiodic.periodic.solve import solve_free
 from studies import shooting
 from tests.known import CYCLE, SADDLE_NODE, grid
 from tests.pendulum import PENDULUM, TURN, pendulum_solution, rates_and_angles
+from tests.shooting import divided, pendulum_doubling, van_der_pol_cycle
 
 DUFFING = {"m": 1.0, "c": 0.2, "k": 1.0, "k3": 0.5}
 ROESSLER = bp.Model(
@@ -132,7 +133,7 @@ def test_first_period_doubling_of_the_pendulum_agrees_with_shooting(rotation):
 
 def test_tabulated_doubling_is_again_that_of_shooting():
     known = shooting.DOUBLINGS[0]
-    omega, _ = shooting.pendulum_doubling(11.77, 11.79, np.array(known.section), 1, tolerance=1e-11)
+    omega, _ = pendulum_doubling(11.77, 11.79, np.array(known.section), 1, tolerance=1e-11)
     assert omega == pytest.approx(known.omega, abs=1e-8)
 
 
@@ -237,7 +238,7 @@ def test_continuation_of_a_limit_cycle_in_its_parameter_agrees_with_shooting():
     for solution, mu in ((branch[0], 0.5), (branch[-1], 2.0)):
         assert solution.period == pytest.approx(shooting.VAN_DER_POL[mu][0], rel=1e-6)
     middle = branch[len(branch) // 2]
-    period, _, _ = shooting.van_der_pol_cycle(middle.parameters["mu"], parts=6, tolerance=1e-11)
+    period, _, _ = van_der_pol_cycle(middle.parameters["mu"], parts=6, tolerance=1e-11)
     assert middle.period == pytest.approx(period, rel=1e-6)
 
 
@@ -255,7 +256,7 @@ def test_period_doubling_of_a_limit_cycle_agrees_with_shooting():
             inner = y[3] * np.array([[0.0, -1.0, -1.0], [1.0, 0.2, 0.0], [y[2], 0.0, y[0] - c]])
             return np.block([[inner, field[:3, None]], [np.zeros((1, 4))]])
 
-        times, states = shooting.divided(slope, jacobian, np.array([0.0, 1.0]), point[None], parts)
+        times, states = divided(slope, jacobian, np.array([0.0, 1.0]), point[None], parts)
         return shooting.shoot(slope, jacobian, times, states, np.zeros(4), 0, tolerance=1e-11)
 
     def point(solution: bp.PeriodicSolution) -> np.ndarray:

@@ -11,6 +11,7 @@ from studies import shooting
 from tests.known import EIGHTH_ORDER, grid
 from tests.pendulum import ROTATIONS, pendulum_solution
 from tests.periodic.test_autonomous import LORENZ
+from tests.shooting import trajectory, van_der_pol_cycle
 
 DUFFING = {"m": 1.1, "c": 0.1, "k": 1.2, "k3": 0.9}
 MIXED = bp.Model(
@@ -191,7 +192,7 @@ def test_sensitivity_of_a_limit_cycles_multiplier_to_its_parameter_agrees_with_s
         bp.models.van_der_pol, {"mu": 0.5, "omega": 1.0}, frequency=0.15, samples=128, scheme="fourier"
     )
     h = 0.01
-    low, high, lower, higher = (shooting.van_der_pol_cycle(0.5 + k * h, parts=6) for k in (-1, 1, -2, 2))
+    low, high, lower, higher = (van_der_pol_cycle(0.5 + k * h, parts=6) for k in (-1, 1, -2, 2))
     expected = (8 * np.subtract(high, low) - np.subtract(higher, lower)) / (12 * h)
     by_mu = bp.multiplier_sensitivities(bp.models.van_der_pol, solution)["mu"][1]
     assert by_mu == pytest.approx(expected[2], rel=1e-6)
@@ -205,7 +206,7 @@ def test_multiplier_sensitivities_of_an_unstable_cycle_of_three_states_equal_dif
     def slope(t, y):
         return np.array([10 * (y[1] - y[0]), 28 * y[0] - y[1] - y[0] * y[2], y[0] * y[1] - 8 / 3 * y[2]])
 
-    path = shooting.trajectory(slope, np.array([0.0, period]), [start], period * grid(400))
+    path = trajectory(slope, np.array([0.0, period]), [start], period * grid(400))
     arguments = {"frequency": 0.64, "samples": 400, "scheme": "central4"}
     parameters = {"sigma": 10.0, "r": 28.0, "b": 8 / 3}
     solution = bp.solve_periodic(

@@ -11,7 +11,7 @@ import pytest
 import bayesperiodic as bp
 from studies import common
 from studies.__main__ import main
-from studies.flutter import campaigns, questions, rig
+from studies.flutter import questions, rig
 from studies.flutter import run as flutter
 from studies.flutter.reference import hopf
 
@@ -75,10 +75,10 @@ def test_campaigns_are_resumable(tmp_path, monkeypatch):
     """The second time there is none to do."""
     printed = run(tmp_path, "--replicates", "1")
     assert "0 failures" in printed and "kept apart in 1" in printed
-    monkeypatch.setattr(campaigns, "campaign", None)
+    monkeypatch.setattr(questions, "campaign", None)
     assert "1 campaigns, 0 failures" in run(tmp_path, "--replicates", "1")
     (line,) = json.loads((tmp_path / "campaigns" / "results.json").read_text(encoding="utf-8"))["campaigns"]
-    assert max(abs(line["pulls"][name]) for name in campaigns.STIFFNESSES) < 5.0
+    assert max(abs(line["pulls"][name]) for name in questions.STIFFNESSES) < 5.0
 
 
 def test_records_that_drift_or_are_too_short_are_excluded_with_a_reason():

@@ -12,7 +12,7 @@ from scipy import integrate, linalg, optimize, stats
 import bayesperiodic as bp
 from studies import common
 from studies.__main__ import main
-from studies.landing_gear import campaigns, force
+from studies.landing_gear import force
 from studies.landing_gear import run as landing_gear
 from studies.landing_gear.drop import MASS, drop
 from studies.landing_gear.identification import FORCE, fold
@@ -297,17 +297,17 @@ def test_campaigns_are_counted_and_resumed(tmp_path, monkeypatch):
         if seed % 2:
             experiments[SMALL.name] = one | {"sign": "negative", "mcmc_covers": one["mcmc_covers"] | {"theta6": False}}
         return {
-            "truth": truth, "seed": seed, "source": campaigns.source(), "experiments": experiments
+            "truth": truth, "seed": seed, "source": landing_gear.source(), "experiments": experiments
         }  # fmt: skip
 
     monkeypatch.setattr(common, "workers", lambda: ThreadPoolExecutor(1))
-    monkeypatch.setattr(campaigns, "campaign", fake)
-    campaigns.campaigns(tmp_path, 2, 1)
-    lines = campaigns.campaigns(tmp_path, 4, 1)
+    monkeypatch.setattr(landing_gear, "campaign", fake)
+    landing_gear.campaigns(tmp_path, 2, 1)
+    lines = landing_gear.campaigns(tmp_path, 4, 1)
     assert len(done) == len(lines) == 4
-    found = campaigns.account(lines)
+    found = landing_gear.account(lines)
     assert found["covered"]["mcmc"] == {"theta4": 56, "theta6": 54, "theta16": 56} and found["called_negative"] == 2
     assert found["covered_by_experiment"][SMALL.name]["theta6"] == 2
     tail = 0.005 / 3
     assert found["band"] == [stats.binom.ppf(tail, 56, 0.9), stats.binom.ppf(1 - tail, 56, 0.9)]
-    assert "called negative 2 times" in campaigns.table(found)
+    assert "called negative 2 times" in landing_gear.table(found)

@@ -13,8 +13,8 @@ from scipy import integrate, stats
 from studies.__main__ import main
 from studies.common import row, table_of_rows
 from studies.sampling import cost as sampling_cost
-from studies.sampling import damper as sampling_damper
 from studies.sampling import ridge as sampling_ridge
+from studies.sampling import run as sampling
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def chain(generator: np.random.Generator, correlation: float, mean: float = 0.0)
 def test_monte_carlo_errors_of_an_autoregressive_chain_agree_with_the_closed_form():
     """Known: tau = (1 + r)/(1 − r), for squares with r². Twenty batches know it to 16 %; allowed is four times that."""
     generator = np.random.default_rng(1)
-    moments = sampling_damper.moments(chain(generator, 0.8))["x"]
+    moments = sampling.moments(chain(generator, 0.8))["x"]
     draws = 32 * 2000
     assert moments["mean_error"] == pytest.approx(np.sqrt(1.8 / 0.2 / draws), rel=0.65)
     assert moments["sd_error"] == pytest.approx(np.sqrt(0.5 * 1.64 / 0.36 / draws), rel=0.65)
@@ -110,9 +110,9 @@ def test_sampler_with_a_bias_of_a_tenth_sd_is_detected():
     """The false-alarm rate of the limit is 1 %; the difference is six Monte Carlo errors of both together or more."""
     generator = np.random.default_rng(2)
     right, same, off = (chain(generator, 0.8, mean) for mean in (0.0, 0.0, 0.1))
-    limit = sampling_damper.limit(2, 4)
-    assert max(d["errors"] for d in sampling_damper.compare_all({"one": right, "other": same})) < limit
-    assert max(d["errors"] for d in sampling_damper.compare_all({"one": right, "other": off})) > limit
+    limit = sampling.limit(2, 4)
+    assert max(d["errors"] for d in sampling.compare_all({"one": right, "other": same})) < limit
+    assert max(d["errors"] for d in sampling.compare_all({"one": right, "other": off})) > limit
 
 
 def test_missed_second_branch_passes_only_without_claimed_convergence():

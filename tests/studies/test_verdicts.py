@@ -8,8 +8,7 @@ import pytest
 from studies import common
 from studies.__main__ import main
 from studies.verdicts import run as verdicts
-from studies.verdicts.cases import CASES
-from studies.verdicts.outcome import examine
+from studies.verdicts.cases import CASES, examine
 
 
 def run(folder, *arguments):
