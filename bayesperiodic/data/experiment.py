@@ -133,9 +133,9 @@ class Experiment(Result):
             for key in given:
                 _checks.one_of(argument, key, (*self.inputs, *self.outputs))
         measured = points if self.mask is None else int(self.mask.sum())
-        cycles = _checks.integer("cycles", self.cycles, 1)
-        averaged = measured * cycles if self.averaged is None else _checks.integer("averaged", self.averaged, 1)
-        object.__setattr__(self, "averaged", averaged)
+        _checks.integer("cycles", self.cycles, 1)
+        if self.averaged is not None:
+            object.__setattr__(self, "averaged", _checks.integer("averaged", self.averaged, 1))
         counts = {key: min(measured, 2 * self.harmonics.get(key, points) + 1) for key in self.outputs}
         counts |= self.independent
         _checks.same_names("independent", counts, self.outputs)

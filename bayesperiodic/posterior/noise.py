@@ -300,8 +300,8 @@ class Independent(Noise):
 
     Each channel has one unknown variance v ([1]_, eq. 6-7), that of the error of one measured sample [channel's unit
     squared]: a property of the sensor, whose noise is white with the spectral density 2·v/sampling rate. Averaged over
-    M samples and kept as N independent values (2·harmonics + 1 with whole periods), the mean period has the variance
-    V = v·N/M at each instant, so that every harmonic has the same variance, whatever the number of harmonics kept. If
+    M samples and kept as N components (2·harmonics + 1 with whole periods), the mean period has the variance V = v·N/M
+    at each instant, so that every harmonic has the same variance, whatever the number of harmonics kept. If
     every sample is an independent value, V = v, and the density is that of eq. (6).
 
     Parameters
@@ -333,10 +333,8 @@ class Independent(Noise):
         return np.broadcast_to(values[..., :1] * self.gain(block), shape), np.ones((*shape, 1))
 
     def gain(self, block: Block) -> float:
-        """Return N/M: independent values over measured samples; for the points of a mask, points over samples."""
-        if block.kind not in (SPECTRAL, POINTS):
-            return 1.0
-        return (block.count if block.kind == SPECTRAL else block.size) / block.averaged
+        """Return N/M, components over measured samples."""
+        return block.size / block.averaged if block.kind in (SPECTRAL, POINTS) else 1.0
 
 
 @dataclass(frozen=True)

@@ -198,7 +198,7 @@ class Setting:
         return Case(
             experiment, stated.model, tuple(names[i] for i in at), slopes[at], np.append(values, experiment.frequency),
             np.array([given[f"variance[{c}]"] * experiment.independent[c] for c in stated.model.outputs])
-            / (experiment.averaged or 1),
+            / (experiment.averaged or experiment.cycles * experiment.samples),
             self.start(experiment, by_name), np.array(first), np.array(scale),
         )  # fmt: skip
 
