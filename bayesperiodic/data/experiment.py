@@ -33,6 +33,9 @@ class Experiment(Result):
         Standard deviation of **one** cycle about the mean, within the kept harmonics, by channel.
     cycles : int
         Number of averaged cycles.
+    averaged : int, optional
+        Number of measured samples of each channel that the period averages; by default `cycles` times the grid points,
+        or the points of the mask.
     independent : mapping of str to int, optional
         Effective number of independent values, by output; by default the number of measured samples, at most
         2·harmonics + 1.
@@ -89,6 +92,7 @@ class Experiment(Result):
     winding: int | Mapping[str, int] = field(default=0, kw_only=True)
     scatter: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     cycles: int = field(default=1, kw_only=True)
+    averaged: int | None = field(default=None, kw_only=True)
     independent: Mapping[str, int] = field(default_factory=dict, kw_only=True)
     harmonics: Mapping[str, int] = field(default_factory=dict, kw_only=True)
     amplitude_variance: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
@@ -129,6 +133,9 @@ class Experiment(Result):
             for key in given:
                 _checks.one_of(argument, key, (*self.inputs, *self.outputs))
         measured = points if self.mask is None else int(self.mask.sum())
+        _checks.integer("cycles", self.cycles, 1)
+        if self.averaged is not None:
+            object.__setattr__(self, "averaged", _checks.integer("averaged", self.averaged, 1))
         counts = {key: min(measured, 2 * self.harmonics.get(key, points) + 1) for key in self.outputs}
         counts |= self.independent
         _checks.same_names("independent", counts, self.outputs)
@@ -171,7 +178,8 @@ class Experiment(Result):
         if matrix.shape != (size, size):
             further = f" and {logarithms} multipliers" if size > values else ""
             raise ValueError(
-                f"covariance: must have shape {(size, size)}, for {values} measured values{further}, got {matrix.shape}."
+                f"covariance: must have shape {(size, size)}, for {values} measured values{further}, "
+                f"got {matrix.shape}."
             )
         if bad := np.count_nonzero(~np.isfinite(matrix)):
             raise ValueError(f"covariance: must be finite and symmetric, got {bad} entries that are not finite.")

@@ -224,6 +224,7 @@ def fold_signals(
         "samples": samples,
         "periods": periods,
         "cycles": cycles,
+        "averaged": steady.time.size,
         "scatter": by_channel(float(np.sqrt(_power(v[own]))) for v, own in zip(one_cycle, used, strict=True)),
         "independent": {channel: min(2 * kept[channel] + 1, steady.time.size) for channel in outputs},
         "harmonics": kept,

@@ -108,7 +108,8 @@ class MapEstimate(Result):
         Standard deviations that are valid for residuals that deviate from the noise model (sandwich covariance with the
         residual's smoothed spectrum); if they differ much from `sd`, the noise model is wrong.
     variances : dict of str to float
-        Variance of the mean period of each channel (or "channel, experiment"), and "scale", by eq. (7) or fixed.
+        Noise variance of each channel (or "channel, experiment") as the noise model defines it, for `Independent` noise
+        that of one measured sample, and "scale"; by eq. (7) or fixed.
     noise : dict of str to float
         All noise parameters by their full names.
     noise_prior : str

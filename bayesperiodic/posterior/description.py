@@ -14,7 +14,7 @@ from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.posterior.joint_priors import JointPrior
 from bayesperiodic.posterior.likelihood import Likelihood
-from bayesperiodic.posterior.noise import Noise, as_noise
+from bayesperiodic.posterior.noise import EXPERIMENT, Noise, as_noise
 from bayesperiodic.posterior.observation import Observation
 from bayesperiodic.posterior.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
 from bayesperiodic.posterior.priors import Uniform
@@ -106,9 +106,10 @@ class Description:
             needed = len(acting) + self.noise.spare
             if group[0] in self.likelihood.free and count <= needed:
                 names = ", ".join(self.names[i] for i in acting)
+                shared = "Share it among experiments (per='channel'), fix" if self.noise.per == EXPERIMENT else "Fix"
                 raise ValueError(
                     f"priors: an unknown {group[0]!r} with the {self.noise.prior_text} must have more than {needed} "
-                    f"independent values for {len(acting)} free parameters ({names}), got only {count:.0f}. Fix "
+                    f"independent values for {len(acting)} free parameters ({names}), got only {count:.0f}. {shared} "
                     f"parameters or {group[0]!r}, give it a proper prior (noise.Independent(prior=…)), keep more "
                     "harmonics, or add experiments."
                 )

@@ -131,10 +131,18 @@ class Likelihood:
     def moments(self, residuals: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
         """Return Σ weight·r²/S (…,) behind each variance (and "scale"), the M of eq. (6), by its name.
 
-        S, the spectrum for a variance of 1, is 1 for errors whose spectrum is flat; all else has to be known.
+        S is the spectrum for a variance of 1; all its other parameters have to be known.
         """
-        squares = Residuals.of(residuals if self.model.flat else self._unit(residuals)).squares
-        return self._summed(block.weight * squares[..., b] for b, block in enumerate(self.blocks))
+        if self.model.flat:
+            squares, gains = Residuals.of(residuals).squares, self._gains
+        else:
+            squares, gains = Residuals.of(self._unit(residuals)).squares, np.ones(len(self.blocks))
+        return self._summed(block.weight / gains[b] * squares[..., b] for b, block in enumerate(self.blocks))
+
+    @cached_property
+    def _gains(self) -> np.ndarray:
+        """Variances (blocks,) of components for variances of 1."""
+        return np.array([self.model.gain(block) for block in self.blocks])
 
     def _unit(self, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the residuals over the square roots of the spectra for variances of 1."""
@@ -155,8 +163,10 @@ class Likelihood:
             if block.kind in (SPECTRAL, POINTS):
                 own, count = values[..., columns], max(block.points, 1)
                 harmonic = np.minimum(np.arange(count), count - np.arange(count))
-                whole = block if block.kind == SPECTRAL else replace(block, harmonic=harmonic, size=count)
-                result[block.experiment, block.channel] = self.model.spectrum(whole, own)[0].mean(axis=-1)
+                if block.kind == POINTS:
+                    averaged = block.averaged * count / block.size
+                    block = replace(block, harmonic=harmonic, size=count, averaged=averaged)
+                result[block.experiment, block.channel] = self.model.spectrum(block, own)[0].mean(axis=-1)
         return result
 
     def complete(self, free: np.ndarray) -> np.ndarray:
@@ -211,7 +221,7 @@ class Likelihood:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, known, columns, sizes, weights, measured = self._levels
         squares = Residuals.of(residuals).squares
-        v = self.model.level(values[..., columns], measured)
+        v = self.model.level(values[..., columns] * self._gains[at], measured)
         # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
         terms = np.ascontiguousarray(weights * (share * sizes * np.log(v) + squares[..., at] / v))
         total = np.add.reduce(terms, axis=-1)
@@ -314,11 +324,12 @@ class Likelihood:
         """Return the gradients by each block's residual and by ln φ (names,) under errors whose spectrum is flat."""
         by_value, squares = self._log_prior(values)[1], residuals.squares
         at, _, columns, sizes, weights, measured = self._levels
-        v = self.model.level(values[columns], measured)
+        raised = values[columns] * self._gains[at]
+        v = self.model.level(raised, measured)
         by_square = np.full(len(self.blocks), -0.5)
         by_square[at] = -0.5 * weights / v
-        # V is v plus what is measured, so that ∂ ln V/∂ ln v = v/V.
-        by_level = 0.5 * weights * (squares[at] / v - share * sizes) * values[columns] / v
+        # V is proportional to v, or to v plus what is measured.
+        by_level = 0.5 * weights * (squares[at] / v - share * sizes) * raised / v
         np.add.at(by_value, columns, by_level)
         return residuals.scaled(2.0 * by_square), by_value
 
@@ -392,7 +403,9 @@ def estimate_noise(
             continue
         blocks = [likelihood.blocks[b] for b in members]
         chosen = [residuals[b] for b in members]
-        total = sum(block.weight * float(r @ r) for block, r in zip(blocks, chosen, strict=True))
+        total = sum(
+            block.weight / likelihood.model.gain(block) * float(r @ r) for block, r in zip(blocks, chosen, strict=True)
+        )
         count = sum(block.count for block in blocks)
         plain = isinstance(likelihood.model, Independent) or all(block.kind == CORRELATED for block in blocks)
         corrected = count * share - {JEFFREYS: 0.0, FLAT: 2.0}.get(str(likelihood.model.prior), np.inf)

@@ -39,6 +39,7 @@ class Block:
     harmonic: np.ndarray  # (size,), of the response period, of each spectral component
     position: np.ndarray  # (size,), of each point, in response periods
     points: int  # grid points of the response period
+    averaged: float  # measured samples behind the components
     measured: float  # variance of one value that the scatter of the cycles explains; NaN if unknown
 
     @property
@@ -183,13 +184,26 @@ class Noise(ABC):
             return (SCALE if self.per == CHANNEL else f"{SCALE}[{block.experiment}]",)
         return tuple(f"{kind}[{self.label(block)}]" for kind in (VARIANCE, *self.shape_priors))
 
+    def gain(self, block: Block) -> float:
+        """Return the variance V that a variance v of 1 gives to the components of a block, if the spectrum is flat.
+
+        Parameters
+        ----------
+        block : Block
+
+        Returns
+        -------
+        float
+        """
+        return 1.0
+
     def level(self, value: np.ndarray, measured: Any) -> np.ndarray:
         """Return V of errors whose spectrum is flat.
 
         Parameters
         ----------
         value : array (…)
-            The variance v [channel's unit squared].
+            The variance v [channel's unit squared], times `gain`.
         measured : float or array (…)
             What the scatter of the cycles explains of the variance of the mean period.
 
@@ -284,8 +298,11 @@ class Noise(ABC):
 class Independent(Noise):
     """Independent, identically distributed errors of unknown variance, the paper's model.
 
-    Each channel has one unknown variance v ([1]_, eq. 6-7), that of one independent value of the mean period. With
-    whole periods the independent values are 2·harmonics + 1, not the grid points.
+    Each channel has one unknown variance v ([1]_, eq. 6-7), that of the error of one measured sample [channel's unit
+    squared]: a property of the sensor, whose noise is white with the spectral density 2·v/sampling rate. Averaged over
+    M samples and kept as N components (2·harmonics + 1 with whole periods), the mean period has the variance V = v·N/M
+    at each instant, so that every harmonic has the same variance, whatever the number of harmonics kept. If
+    every sample is an independent value, V = v, and the density is that of eq. (6).
 
     Parameters
     ----------
@@ -311,9 +328,13 @@ class Independent(Noise):
     name: ClassVar[str] = "independent"
 
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return V = v."""
+        """Return V = v·N/M."""
         shape = (*values.shape[:-1], block.size)
-        return np.broadcast_to(values[..., :1], shape), np.ones((*shape, 1))
+        return np.broadcast_to(values[..., :1] * self.gain(block), shape), np.ones((*shape, 1))
+
+    def gain(self, block: Block) -> float:
+        """Return N/M, components over measured samples."""
+        return block.size / block.averaged if block.kind in (SPECTRAL, POINTS) else 1.0
 
 
 @dataclass(frozen=True)
@@ -321,7 +342,8 @@ class Measured(Noise):
     """Measurement noise known from the scatter of the cycles, plus an independent model error of unknown variance.
 
     V = scatter²/cycles + v, with the variance of the mean period that the fold found where there is one (corrected for
-    correlation between cycles). Jeffreys' prior means 1/(V) here, which is 1/v for large model errors and proper
+    correlation between cycles); v is the mean square of the model error over the period, which does not depend on the
+    numbers of samples and cycles. Jeffreys' prior means 1/(V) here, which is 1/v for large model errors and proper
     towards v = 0.
 
     Parameters
@@ -371,9 +393,11 @@ class Circulant(Noise):
     """Errors that are correlated along the period and stationary on the circle.
 
     Their covariance depends on the distance of two points alone, so that Fourier components are independent, with
-    V_h = v·S_h: v is the variance of one value, S the spectrum of the kernel with mean 1. Both kernels become white
-    noise as the correlation length goes to zero. This is exact for noise that repeats with the period, and to O(1/K)
-    for the mean of K cycles of a stationary process. Values at the points of a mask take the dense covariance.
+    V_h = v·S_h·N/n: v is the variance of the error at each instant, all harmonics included, S the spectrum of the
+    kernel with mean 1 over all harmonics of the grid of n points, and N the number of components that are kept. Both
+    kernels become white noise as the correlation length goes to zero. This is exact for noise that repeats with the
+    period, and to O(1/K) for the mean of K cycles of a stationary process. Values at the points of a mask take the
+    dense covariance.
 
     Parameters
     ----------
@@ -417,32 +441,41 @@ class Circulant(Noise):
         return shape | ({"floor": FLOOR} if self.kernel == "matern" else {})
 
     def spectrum(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return V = v·S_h, S with mean 1 over the components."""
-        return self._spectrum(block.harmonic, values)
+        """Return V = v·S_h·N/n, S with mean 1 over the harmonics of the grid."""
+        variances, slopes = self._spectrum(block.harmonic, block.points, values)
+        return variances * (block.size / block.points), slopes
 
     def covariance(self, block: Block, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return v·Σ_h S_h cos(2πh(t_i − t_j))/n at the points of a mask."""
         harmonic = np.minimum(np.arange(block.points), block.points - np.arange(block.points))
-        variances, slopes = self._spectrum(harmonic, values)
+        variances, slopes = self._spectrum(harmonic, block.points, values)
         point = np.rint(block.position * block.points).astype(int)
         by_lag = np.fft.ifft(np.vstack([variances, slopes.T * variances])).real
         found = by_lag[:, np.abs(point[:, None] - point[None, :])]
         return found[0], found[1:]
 
-    def _spectrum(self, harmonic: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = 2 * np.pi * harmonic * values[..., 1:2]
-        if self.kernel == "exponential":
-            power, slope = 1.0 / (1.0 + x**2), -2.0 * x**2 / (1.0 + x**2)
-        else:
-            power, slope = (3.0 + x**2) ** -2, -4.0 * x**2 / (3.0 + x**2)
-        mean = power.mean(axis=-1, keepdims=True)
-        power, slope = power / mean, slope - np.mean(power * slope, axis=-1, keepdims=True) / mean
+    def _spectrum(self, harmonic: np.ndarray, points: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return v·S at harmonics and its logarithmic slopes, S with mean 1 over a grid of points."""
+        on_grid = np.arange(points // 2 + 1)
+        repeated = np.where((on_grid == 0) | (2 * on_grid == points), 1.0, 2.0) / points
+        power, slope = self._kernel_spectrum(on_grid, values)
+        mean = np.sum(repeated * power, axis=-1, keepdims=True)
+        mean_slope = np.sum(repeated * power * slope, axis=-1, keepdims=True) / mean
+        power, slope = self._kernel_spectrum(harmonic, values)
+        power, slope = power / mean, slope - mean_slope
         if self.kernel == "exponential":
             return values[..., :1] * power, np.stack([np.ones_like(slope), slope], axis=-1)
         floor = values[..., 2:3]
         total = power + floor
         slopes = [np.ones_like(slope), slope * power / total, floor / total - floor / (1.0 + floor)]
         return values[..., :1] * total / (1.0 + floor), np.stack(slopes, axis=-1)
+
+    def _kernel_spectrum(self, harmonic: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the kernel's spectrum up to a factor, and its logarithmic slope by the correlation length."""
+        square = (2 * np.pi * harmonic * values[..., 1:2]) ** 2
+        if self.kernel == "exponential":
+            return 1.0 / (1.0 + square), -2.0 * square / (1.0 + square)
+        return (3.0 + square) ** -2, -4.0 * square / (3.0 + square)
 
 
 NAMED: dict[str, type[Noise]] = {model.name: model for model in (Independent, Measured, Circulant)}

@@ -132,9 +132,10 @@ class Observation:
         return tuple(found)
 
     def _block(self, channel: str, kind: str, count: float, size: int) -> Block:
-        mask = self.experiment.mask
+        e, mask = self.experiment, self.experiment.mask
+        averaged = e.averaged or e.cycles * (self._points if mask is None else int(mask.sum()))
         return Block(
-            self.experiment.name,
+            e.name,
             channel,
             kind,
             count,
@@ -142,7 +143,8 @@ class Observation:
             self._harmonics[channel] if kind == SPECTRAL else np.empty(0),
             np.flatnonzero(mask) / self._points if kind == POINTS and mask is not None else np.empty(0),
             self._points,
-            _measured_variance(self.experiment, channel),
+            float(averaged),
+            _measured_variance(e, channel),
         )
 
     @property

@@ -136,7 +136,9 @@ def fingerprint(problem: Description) -> str:
     digest = hashlib.sha256(problem.model.symbolic.kernel_source().encode())
     for experiment in problem.experiments:
         names = ("name", "frequency", "samples", "periods", "winding", "independent", "harmonics", "frequency_se")
-        blocks = [(b.channel, b.kind, b.count, b.measured) for b in problem.observations[experiment.name].blocks]
+        blocks = [
+            (b.channel, b.kind, b.count, b.averaged, b.measured) for b in problem.observations[experiment.name].blocks
+        ]
         digest.update(repr((*(getattr(experiment, name) for name in names), blocks)).encode())
         for signals in (experiment.outputs, experiment.inputs):
             for name, values in signals.items():

@@ -197,7 +197,8 @@ class Setting:
             first += [x[0], (x[1] - x[-1]) * experiment.frequency * experiment.samples / 2][:order]
         return Case(
             experiment, stated.model, tuple(names[i] for i in at), slopes[at], np.append(values, experiment.frequency),
-            np.array([given[f"variance[{channel}]"] for channel in stated.model.outputs]),
+            np.array([given[f"variance[{c}]"] * experiment.independent[c] for c in stated.model.outputs])
+            / (experiment.averaged or experiment.cycles * experiment.samples),
             self.start(experiment, by_name), np.array(first), np.array(scale),
         )  # fmt: skip
 

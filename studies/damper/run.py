@@ -159,8 +159,8 @@ def _tables(results: dict[str, Any], fit: bp.MapEstimate, comparison: bp.Compari
     lines = [
         f"Dahl model of the damper, {kind}, SI units (the source has mm): Laplace against MCMC",
         rows.to_string(float_format="{:.4g}".format, na_rep="-"),
-        f"variance of the mean period (prior 1/v): {fit.variances['force']:.3g} N² (eq. 7), posterior mean "
-        f"{results['posterior']['variance[force]']['mean']:.3g} N²",
+        f"variance of one sample, the residual taken as white noise (prior 1/v): {fit.variances['force']:.3g} N² "
+        f"(eq. 7), posterior mean {results['posterior']['variance[force]']['mean']:.3g} N²",
         f"residual {fit.rms['force']:.2f} N rms, {fit.fvu['force']:.2%} of the force's variance",
     ]
     if white.p < 0.01:

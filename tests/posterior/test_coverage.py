@@ -99,9 +99,9 @@ def stationary_on_the_circle(lengthscale: float, seed: int) -> bp.Experiment:
     """Return an experiment whose kept harmonics have errors with the exponential kernel's spectrum."""
     tau, generator = grid(200), np.random.default_rng(seed)
     harmonic = np.arange(HARMONICS + 1)
-    power = 1.0 / (1.0 + (2 * np.pi * harmonic * lengthscale) ** 2)
-    power /= (power[0] + 2.0 * power[1:].sum()) / COUNT
-    cosine, sine = generator.standard_normal((2, harmonic.size)) * np.sqrt(power * np.where(harmonic, 2.0, 1.0) / COUNT)
+    power = 1.0 / (1.0 + (2 * np.pi * np.minimum(np.arange(200), 200 - np.arange(200)) * lengthscale) ** 2)
+    power = power[: HARMONICS + 1] / power.sum()
+    cosine, sine = generator.standard_normal((2, harmonic.size)) * np.sqrt(power * np.where(harmonic, 2.0, 1.0))
     waves = 2 * np.pi * np.outer(tau, harmonic)
     clean = linear_regressors(AMPLITUDE, FREQUENCY, tau) @ THETA
     return bp.Experiment(
