@@ -67,13 +67,13 @@ def test_residual_ignores_harmonics_that_the_fold_removed():
         independent={"force": 7},
     )
     problem = bp.Problem(LINEAR, [experiment], priors=PRIORS)
-    assert problem.log_likelihood(TRUTH, {"force": 1.0}) == pytest.approx(0.0, abs=1e-15)
+    assert problem.log_likelihood(TRUTH, {"force": 200 / 7}) == pytest.approx(0.0, abs=1e-14)
     assert np.sum((clean - kept) ** 2) > 1.0
 
 
 @pytest.mark.parametrize("kept", [{40: [None, None]}, {40: [3, None, 19]}, {41: [5, 20]}, {40: [None, 4], 63: [8]}])
 def test_each_experiment_counts_with_the_harmonics_that_it_keeps(kept):
-    """The squares of eq. (6), against least-squares projections onto cosines and sines."""
+    """The squares of eq. (6), against least-squares projections onto cosines and sines; v is that of one sample."""
     generator, experiments, expected = np.random.default_rng(4), [], 0.0
     theta, v = np.array([870.0, 37.0, 22.0]), 7.0
     for samples, highest in kept.items():
@@ -85,7 +85,8 @@ def test_each_experiment_counts_with_the_harmonics_that_it_keeps(kept):
             difference = values - linear_regressors(0.05, 2.0, tau) @ theta
             projected = basis @ np.linalg.lstsq(basis, difference, rcond=None)[0]
             independent = samples if count is None else 2 * count + 1
-            expected -= 0.5 * independent * (np.log(v) + np.mean(projected**2) / v)
+            own = v * independent / samples
+            expected -= 0.5 * independent * (np.log(own) + np.mean(projected**2) / own)
             harmonics = {} if count is None else {"force": count}
             x, name = 0.05 * np.sin(2 * np.pi * tau), f"run {len(experiments)}"
             experiments.append(
