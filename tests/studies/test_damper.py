@@ -15,7 +15,7 @@ from studies.damper import run as damper
 
 REAL = common.find_data(None, damper.FILE)
 real_data = pytest.mark.skipif(
-    REAL is None, reason="the measured file is not to be had here, see studies/damper/run.py"
+    REAL is None, reason="the measured file is missing, see studies/damper/run.py"
 )
 
 

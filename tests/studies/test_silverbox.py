@@ -12,7 +12,7 @@ from studies.silverbox import run as silverbox
 
 REAL = common.find_data(None, silverbox.FILE)
 real_data = pytest.mark.skipif(
-    REAL is None, reason="the measured file is not to be had here, see studies/silverbox/run.py"
+    REAL is None, reason="the measured file is missing, see studies/silverbox/run.py"
 )
 NAMES = ("c", "k1", "k2", "k3", "g", "u0")
 
