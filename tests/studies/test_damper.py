@@ -14,9 +14,7 @@ from studies.__main__ import main
 from studies.damper import run as damper
 
 REAL = common.find_data(None, damper.FILE)
-real_data = pytest.mark.skipif(
-    REAL is None, reason="the measured file is missing, see studies/damper/run.py"
-)
+real_data = pytest.mark.skipif(REAL is None, reason="the measured file is missing, see studies/damper/run.py")
 
 
 def run(folder: Path, *arguments: str) -> dict:

@@ -16,9 +16,7 @@ from studies.flutter import run as flutter
 from studies.flutter.reference import hopf
 
 REAL = common.find_data(None, rig.FILE)
-real_data = pytest.mark.skipif(
-    REAL is None, reason="the measured file is missing, see studies/flutter/rig.py"
-)
+real_data = pytest.mark.skipif(REAL is None, reason="the measured file is missing, see studies/flutter/rig.py")
 FOUR = ("stable_v15_6", "stable_v17_3", "unstable_v14_9", "unstable_v16_5")
 
 

@@ -11,9 +11,7 @@ from studies.__main__ import main
 from studies.silverbox import run as silverbox
 
 REAL = common.find_data(None, silverbox.FILE)
-real_data = pytest.mark.skipif(
-    REAL is None, reason="the measured file is missing, see studies/silverbox/run.py"
-)
+real_data = pytest.mark.skipif(REAL is None, reason="the measured file is missing, see studies/silverbox/run.py")
 NAMES = ("c", "k1", "k2", "k3", "g", "u0")
 
 
