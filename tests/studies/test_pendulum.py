@@ -91,6 +91,6 @@ def test_measured_recording_is_not_labelled_synthetic(tmp_path):
 
 def test_error_names_the_bad_argument(tmp_path, capsys):
     assert main(["pendulum", "--noise", "2", "--out", str(tmp_path)]) == 1
-    assert "fraction from 0 to 1, got 0 and 2.0" in capsys.readouterr().err
+    assert "--noise: must be a fraction from 0 to 1, got 2.0" in capsys.readouterr().err
     assert main(["pendulum", "--data", str(tmp_path / "none.csv"), "--out", str(tmp_path)]) == 1
     assert "--data: must be an existing file" in capsys.readouterr().err
