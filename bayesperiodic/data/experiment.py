@@ -34,7 +34,7 @@ class Experiment(Result):
     cycles : int
         Number of averaged cycles.
     averaged : int, optional
-        Number of measured samples of each channel that the period averages; by default `cycles` times the grid points,
+        Number of measured samples of each channel that the period averages; by default ``cycles`` times the grid points,
         or the points of the mask.
     independent : mapping of str to int, optional
         Effective number of independent values, by output; by default the number of measured samples, at most

@@ -216,7 +216,7 @@ class Orbits(Result):
 
     @property
     def table(self) -> pd.DataFrame:
-        """One row per orbit, followed by the rejected candidates with the reason in the column `rejected`.
+        """One row per orbit, followed by the rejected candidates with the reason in the column ``rejected``.
 
         `winding` is missing if unknown; `multiplier` and `contraction` are the two eigenvalues, whose standard
         deviations are NaN if not estimated; `sd_first` and `sd_second` are the largest standard deviations of a point

@@ -211,7 +211,7 @@ def solve_periodic(
     >>> response.status, response.stable
     ('converged', True)
 
-    This spring is linear, so the amplitude is 1/|1 − ω² + 0.2iω|:
+    This spring is linear, so the amplitude is 1/abs(1 − ω² + 0.2iω):
 
     >>> omega, amplitude = 0.2 * np.pi, np.sqrt(2) * response.states["x"].std()
     >>> round(float(amplitude * np.hypot(1 - omega**2, 0.2 * omega)), 9)
