@@ -34,8 +34,8 @@ class Experiment(Result):
     cycles : int
         Number of averaged cycles.
     averaged : int, optional
-        Number of measured samples of each channel that the period averages; by default ``cycles`` times the grid points,
-        or the points of the mask.
+        Number of measured samples of each channel that the period averages; by default the grid points, or
+        the points of the mask, times ``cycles``.
     independent : mapping of str to int, optional
         Effective number of independent values, by output; by default the number of measured samples, at most
         2·harmonics + 1.
