@@ -362,22 +362,14 @@ def replicate(campaign: Campaign, number: int) -> dict[str, Any]:
             return line | {"status": NO_STEADY_STATE}
         except ValueError as error:
             return line | {"status": "fold failed", "error": str(error)}
-        truth = theta | _folded_variances(problem, variances, [fraction for _, fraction in measured])
-        return line | {"truth": truth} | _ranks(campaign, [again for again, _ in measured], truth, chain, ties)
-
-
-def _variance_name(problem: Problem, channel: str, experiment: str) -> str:
-    inside = f"{channel}, {experiment}" if problem.noise.per == EXPERIMENT else channel
-    return f"{VARIANCE}[{inside}]"
+        truth = theta | drawn
+        return line | {"truth": truth} | _ranks(campaign, measured, truth, chain, ties)
 
 
 def _measured(
     problem: Problem, e: Experiment, theta: dict[str, float], variances: dict[str, float], generator: Generator
-) -> tuple[Experiment, float]:
-    """Return a simulated repetition of an experiment, and the fraction of its cycles that the fold used.
-
-    The variance of the samples is that of the folded mean times the samples per independent value of that mean.
-    """
+) -> Experiment:
+    """Return a simulated repetition of an experiment."""
     model, (row,) = problem.model, problem.parameters(problem.vector(theta)[None], e.name).tolist()
     values, start = dict(zip(model.parameters, row, strict=True)), _first_state(problem, e)
     cycle = steady_cycle(model, values, e.inputs, frequency=e.frequency, samples=e.samples, start=start)
@@ -386,13 +378,13 @@ def _measured(
     kept = {channel: e.harmonics.get(channel, limit) for channel in (*e.inputs, *e.outputs)}
     inputs, outputs = {channel: np.tile(signal, cycles) for channel, signal in e.inputs.items()}, {}
     for channel in e.outputs:
-        mean_variance = variances[_variance_name(problem, channel, e.name)]
-        sd = np.sqrt(mean_variance * size / (2 * kept[channel] + 1))
-        outputs[channel] = np.tile(cycle[channel], cycles) + sd * generator.standard_normal(size)
+        place = f"{channel}, {e.name}" if problem.noise.per == EXPERIMENT else channel
+        noise = np.sqrt(variances[f"{VARIANCE}[{place}]"]) * generator.standard_normal(size)
+        outputs[channel] = np.tile(cycle[channel], cycles) + noise
     time = np.arange(size) / (e.samples * e.frequency)
     recording = Recording(time, outputs, inputs, name=e.name, synthetic=True)
     again = recording.fold(e.samples, frequency=e.frequency, harmonics=kept)
-    return replace(again, independent=e.independent, guess=e.guess), again.cycles / cycles
+    return replace(again, independent=e.independent, guess=e.guess)
 
 
 def _first_state(problem: Problem, e: Experiment) -> dict[str, float]:
@@ -404,15 +396,6 @@ def _first_state(problem: Problem, e: Experiment) -> dict[str, float]:
             rate = _fourier.derivative(_fourier.coefficients(values), e.frequency)
             found[f"d{state}"] = float(_fourier.on_grid(rate, values.size)[0])
     return found
-
-
-def _folded_variances(problem: Problem, variances: dict[str, float], used: list[float]) -> dict[str, float]:
-    """Return the free variances of the folded means, which are larger if the fold left out cycles."""
-    fractions: dict[str, list[float]] = {name: [] for name in (*problem.likelihood.fixed, *problem.free_noise)}
-    for e, fraction in zip(problem.experiments, used, strict=True):
-        for channel in e.outputs:
-            fractions[_variance_name(problem, channel, e.name)].append(fraction)
-    return {name: variances[name] / float(np.mean(fractions[name])) for name in problem.free_noise}
 
 
 def _ranks(

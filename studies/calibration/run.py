@@ -36,22 +36,22 @@ OVERCOUNT = 1.25
 
 
 def damper() -> bp.Problem:
-    """Return the problem of the damper: Dahl friction, 0.5 mm at 8 Hz, force measured to some newtons."""
+    """Return the problem of the damper: Dahl friction, 0.5 mm at 8 Hz, noise of 24 N in each sample of the force."""
     run = _run("8 Hz 0.5 mm", 8.0, {"displacement": (0.0, 5e-4)}, {"force": 20}, 256)
     priors = {"Kx": bp.LogNormal(800.0, 0.2), "Kw": bp.LogNormal(60.0, 0.2), "rho": bp.LogNormal(2.8e4, 0.3)}
-    return _problem(bp.models.dahl, run, priors, {"K": 0.0, "F0": 0.0}, 3.0**2)
+    return _problem(bp.models.dahl, run, priors, {"K": 0.0, "F0": 0.0}, 24.0**2)
 
 
 def miscounted() -> bp.Problem:
     """Return that of the Duffing oscillator with a likelihood that counts a quarter more independent values.
 
-    The displacement is measured so well, to 0.02 mm, that the priors hardly matter.
+    The displacement is measured so well, with noise of 0.11 mm in each sample, that the priors hardly matter.
     """
-    return duffing(2e-5, OVERCOUNT)
+    return duffing(1.1e-4, OVERCOUNT)
 
 
-def duffing(sd: float = 1e-4, overcount: float = 1.0) -> bp.Problem:
-    """Return the problem of the Duffing oscillator: 10 N at 5 Hz, displacement measured to a tenth of a millimetre."""
+def duffing(sd: float = 5.5e-4, overcount: float = 1.0) -> bp.Problem:
+    """Return the problem of the Duffing oscillator: 10 N at 5 Hz, noise of 0.55 mm in each sample."""
     run = _run("5 Hz 10 N", 5.0, {"force": (0.0, 10.0)}, {"displacement": 10}, 64, overcount)
     priors = {"c": bp.LogNormal(1.2, 0.3), "k": bp.LogNormal(900.0, 0.1), "k3": bp.LogNormal(4e5, 0.4)}
     return _problem(bp.models.duffing, run, priors, {"m": 0.45}, sd**2)
@@ -60,13 +60,13 @@ def duffing(sd: float = 1e-4, overcount: float = 1.0) -> bp.Problem:
 def landing_gear() -> bp.Problem:
     """Return the problem of the landing gear: 80 mm about 120 mm at 0.2 Hz, force and pressure measured.
 
-    Both variances have the same prior, one in N², the other in Pa²: about 50 N of 10 kN and 50 Pa of 2 MPa.
+    Both variances have the same prior, one in N², the other in Pa²: about 230 N of 10 kN and 230 Pa of 2 MPa in each sample.
     """
     run = _run("0.2 Hz 80 mm", 0.2, {"displacement": (0.12, 0.08)}, {"force": 30, "pressure": 15}, 128)
     priors = {"theta4": bp.LogNormal(5.2e-3, 0.1), "theta6": bp.Normal(-2.3, 0.15), "theta16": bp.LogNormal(2.0, 0.5)}
     tied = {"theta11": "-1e5*theta4"}
     fixed = {name: value for name, value in GEAR.items() if name not in (*priors, *tied)}
-    return _problem(bp.models.landing_gear("displacement"), run, priors, fixed, 50.0**2, tied)
+    return _problem(bp.models.landing_gear("displacement"), run, priors, fixed, 230.0**2, tied)
 
 
 def _problem(
