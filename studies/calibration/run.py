@@ -60,7 +60,7 @@ def duffing(sd: float = 5.5e-4, overcount: float = 1.0) -> bp.Problem:
 def landing_gear() -> bp.Problem:
     """Return the problem of the landing gear: 80 mm about 120 mm at 0.2 Hz, force and pressure measured.
 
-    Both variances have the same prior, one in N², the other in Pa²: about 230 N of 10 kN and 230 Pa of 2 MPa in each sample.
+    Both variances have the same prior, one in N², the other in Pa²: about 230 N and 230 Pa in each sample.
     """
     run = _run("0.2 Hz 80 mm", 0.2, {"displacement": (0.12, 0.08)}, {"force": 30, "pressure": 15}, 128)
     priors = {"theta4": bp.LogNormal(5.2e-3, 0.1), "theta6": bp.Normal(-2.3, 0.15), "theta16": bp.LogNormal(2.0, 0.5)}
