@@ -32,12 +32,12 @@ class Iterate:
 class Objective:
     """Density that the iteration maximises over θ, with the best noise parameters at every θ.
 
-    `share` is a factor of the logarithms of the variances: their best values are those of eq. (7) for 1 − l/Σn, and
-    those of eq. (6) for 1.
+    The logarithms of the variances are multiplied by `log_variance_factor`: their best values are those of eq. (7) for
+    1 − l/Σn, and those of eq. (6) for 1.
     """
 
     density: LogPosterior
-    share: float
+    log_variance_factor: float
 
     def at(self, theta: np.ndarray, near: Linearisation, noise: np.ndarray) -> Iterate | None:
         """Return the iterate at θ, solved from the anchors of a near one; None if the log-posterior is not finite."""
@@ -49,8 +49,8 @@ class Objective:
         """Return the iterate of solved residuals; None if the log-posterior is not finite."""
         if not here.converged or not all(np.isfinite(r).all() for r in here.residuals):
             return None
-        noise = estimate_noise(self.density.problem.likelihood, here.residuals, noise, self.share)
-        value = self.density.objective(here, noise, self.share)
+        noise = estimate_noise(self.density.problem.likelihood, here.residuals, noise, self.log_variance_factor)
+        value = self.density.objective(here, noise, self.log_variance_factor)
         return Iterate(here.theta, here, noise, value) if np.isfinite(value) else None
 
     def anchored(self, iterate: Iterate) -> Iterate:
@@ -83,8 +83,8 @@ def information(problem: Description, iterate: Iterate) -> tuple[np.ndarray, np.
 
 def bias_correction(problem: Description) -> float:
     """Return 1 − l/Σn, for which the variances of the first stage are those of eq. (7); 1 if that is not positive."""
-    share = 1.0 - len(problem.names) / problem.counted if problem.counted else 1.0
-    return share if share > 0.0 else 1.0
+    factor = 1.0 - len(problem.names) / problem.counted if problem.counted else 1.0
+    return factor if factor > 0.0 else 1.0
 
 
 def climb(

@@ -210,7 +210,7 @@ def _describe(
     history: np.ndarray,
     starts: tuple[dict[str, float], ...],
 ) -> MapEstimate:
-    share, names, likelihood = objective.share, problem.names, problem.likelihood
+    names, likelihood = problem.names, problem.likelihood
     data, _ = information(problem, best)
     solutions = best.here.simulator.solutions(best.theta)
     inverse, lost = _inverse(data + problem.joint_prior.curvature(best.theta))
@@ -242,7 +242,7 @@ def _describe(
         rms=rms,
         fvu={c: rms[c] ** 2 / max(_pooled(problem, c, measured) ** 2, np.finfo(float).tiny) for c in problem.channels},
         whiteness=channel_whiteness(problem, best),
-        noise_split=noise_split(problem, best, share),
+        noise_split=noise_split(problem, best, objective.log_variance_factor),
         input_noise=input_noise(problem, best.theta, solutions),
         doubling_shift=dict(zip(names, shift.tolist(), strict=True)),
         at_ends=tuple(name for name, end in zip(names, at_ends(objective, best), strict=True) if end),

@@ -63,8 +63,8 @@ class NoiseSplit:
     total: float
 
 
-def noise_split(problem: Problem, estimate: Iterate, share: float) -> dict[str, NoiseSplit]:
-    """Return the split of every channel with compared time histories; `share` is 1 − l/Σn of eq. (7)."""
+def noise_split(problem: Problem, estimate: Iterate, log_variance_factor: float) -> dict[str, NoiseSplit]:
+    """Return the split of every channel with compared time histories; `log_variance_factor` is 1 − l/Σn of eq. (7)."""
     sums = {channel: np.zeros(3) for channel in problem.channels}
     for block, r in zip(problem.likelihood.blocks, estimate.here.residuals, strict=True):
         if block.kind in (SPECTRAL, POINTS):
@@ -72,7 +72,7 @@ def noise_split(problem: Problem, estimate: Iterate, share: float) -> dict[str, 
     result = {}
     for channel, (count, square, measured) in sums.items():
         if count:
-            total, measurement = square / (count * share), measured / count
+            total, measurement = square / (count * log_variance_factor), measured / count
             result[channel] = NoiseSplit(*np.sqrt([measurement, max(total - measurement, 0.0), total]).tolist())
     return result
 

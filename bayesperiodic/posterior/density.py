@@ -335,14 +335,14 @@ class LogPosterior(SamplingCoordinates):
         """Solve at one θ (names,) from the present anchors, and return residuals and Jacobian there."""
         return Linearisation(theta, self.simulator.anchored(theta), self.comparisons)
 
-    def objective(self, here: Linearisation, noise: np.ndarray, share: float) -> float:
+    def objective(self, here: Linearisation, noise: np.ndarray, log_variance_factor: float) -> float:
         """Return the log-density over the coordinates where all solves have converged.
 
-        The logarithms of the variances in the likelihood are multiplied by `share`, see `Likelihood.__call__`.
+        For `log_variance_factor` see `Likelihood.__call__`.
         """
         prior = self.problem.joint_prior.log_prob(here.theta) + np.sum(np.log(here.theta[self.logarithmic]))
         likelihood = self.problem.likelihood
-        return float((likelihood(here.residuals, noise, share) + likelihood.log_prior(noise)) + prior)
+        return float((likelihood(here.residuals, noise, log_variance_factor) + likelihood.log_prior(noise)) + prior)
 
     def solve(self, theta: np.ndarray) -> dict[str, PeriodicSolution]:
         """Return the periodic solution of every experiment at one θ (names,), with its sensitivities."""

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bayesperiodic._linalg import hessian_eigh, scaled
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.periodic.equations import CyclicFactors, PeriodicEquations
 from bayesperiodic.posterior.description import Description
@@ -232,11 +233,10 @@ class _SimultaneousFit:
         prior = self.problem.joint_prior
         by_prior = prior.gradient(theta)
         unit = np.where(self.problem.logarithmic, theta, 1.0)
-        hessian = (hessian + prior.curvature(theta)) * np.outer(unit, unit)
+        hessian = scaled(hessian + prior.curvature(theta), unit)
         hessian -= np.diag(np.where(self.problem.logarithmic, theta * by_prior, 0.0))
         gradient = (gradient + by_prior) * unit
-        scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(hessian)), np.finfo(float).tiny))
-        values, vectors = np.linalg.eigh(hessian * np.outer(scale, scale))
+        values, vectors, scale = hessian_eigh(hessian)
         values = np.maximum(np.abs(values), 1e-13 * np.abs(values).max())
         along = vectors.T @ (scale * gradient) / values
         step = scale * (vectors @ along)

@@ -12,6 +12,7 @@ from scipy.linalg import solve_triangular
 from scipy.stats.distributions import rv_frozen
 
 from bayesperiodic import _checks
+from bayesperiodic._linalg import covariance_cholesky
 from bayesperiodic.posterior.priors import LOG_ROOT_TWO_PI, Density, Normal, Prior, Univariate
 
 
@@ -58,8 +59,7 @@ class MultivariateNormal(Density):
 
     @cached_property
     def _cholesky(self) -> np.ndarray:
-        sd = np.sqrt(np.diag(self.covariance))
-        return sd[:, None] * np.linalg.cholesky(self.covariance / np.outer(sd, sd))
+        return covariance_cholesky(self.covariance)
 
     @cached_property
     def _whitening(self) -> np.ndarray:

@@ -200,30 +200,34 @@ class Likelihood:
             if not self.model.has_constant_prior(kind)
         ]
 
-    def __call__(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float = 1.0) -> np.ndarray:
+    def __call__(
+        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float = 1.0
+    ) -> np.ndarray:
         """Return the log-likelihood (…,) of residuals, one (…, size) a block, at values (…, names).
 
-        The logarithms of the variances are multiplied by `share`: 1 − l/Σn for the bias correction of eq. (7).
+        The logarithms of the variances are multiplied by `log_variance_factor`, 1 − l/Σn for the correction of eq. (7).
         """
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            total = (self._flat if self.model.flat else self._by_kind)(residuals, values, share)
+            total = (self._flat if self.model.flat else self._by_kind)(residuals, values, log_variance_factor)
         return np.where(np.isfinite(total), total, -np.inf)
 
-    def _by_kind(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
+    def _by_kind(self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float) -> np.ndarray:
         """Return the log-likelihood (…,) of errors whose spectrum is not flat, alike blocks together."""
         total = np.zeros(values.shape[:-1])
         for members in self._alike:
             own = values[..., self._columns[members[0]]]
-            total = total + self._together([residuals[b] for b in members], self.blocks[members[0]], own, share)
+            total = total + self._together(
+                [residuals[b] for b in members], self.blocks[members[0]], own, log_variance_factor
+            )
         return total
 
-    def _flat(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
+    def _flat(self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float) -> np.ndarray:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, known, columns, sizes, weights, measured = self._levels
         squares = Residuals.of(residuals).squares
         v = self.model.level(values[..., columns] * self._gains[at], measured)
         # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
-        terms = np.ascontiguousarray(weights * (share * sizes * np.log(v) + squares[..., at] / v))
+        terms = np.ascontiguousarray(weights * (log_variance_factor * sizes * np.log(v) + squares[..., at] / v))
         total = np.add.reduce(terms, axis=-1)
         if known.size:
             total = total + np.add.reduce(np.ascontiguousarray(squares[..., known]), axis=-1)
@@ -253,21 +257,23 @@ class Likelihood:
             groups.setdefault(key if block.kind == SPECTRAL else b, []).append(b)
         return list(groups.values())
 
-    def _together(self, residuals: list[np.ndarray], block: Block, values: np.ndarray, share: float) -> np.ndarray:
-        """Return the log-likelihood (…,) of blocks like this one, the logarithms multiplied by `share`."""
+    def _together(
+        self, residuals: list[np.ndarray], block: Block, values: np.ndarray, log_variance_factor: float
+    ) -> np.ndarray:
+        """Return the log-likelihood (…,) of blocks like this one."""
         r = residuals[0]
         if block.kind == KNOWN:
             return -0.5 * _square(r)
         if self._is_dense(block):
             flat, rows = values.reshape(-1, values.shape[-1]), r.reshape(-1, r.shape[-1])
-            each = [self._dense(block, row, v, share)[0] for row, v in zip(rows, flat, strict=True)]
+            each = [self._dense(block, row, v, log_variance_factor)[0] for row, v in zip(rows, flat, strict=True)]
             return np.array(each).reshape(values.shape[:-1])
         if block.kind == CORRELATED:
             v = values[..., 0]
-            return -0.5 * block.weight * (share * block.size * np.log(v) + _square(r) / v)
+            return -0.5 * block.weight * (log_variance_factor * block.size * np.log(v) + _square(r) / v)
         variances = self._variances(block, values)[0]
         squares = sum(r**2 for r in residuals)
-        terms = len(residuals) * share * np.log(variances) + squares / variances
+        terms = len(residuals) * log_variance_factor * np.log(variances) + squares / variances
         return -0.5 * block.weight * np.sum(terms, axis=-1)
 
     def _is_dense(self, block: Block) -> bool:
@@ -281,7 +287,7 @@ class Likelihood:
         return self.model.spectrum(block, values)
 
     def _dense(
-        self, block: Block, r: np.ndarray, values: np.ndarray, share: float
+        self, block: Block, r: np.ndarray, values: np.ndarray, log_variance_factor: float
     ) -> tuple[float, np.ndarray, np.ndarray]:
         """Return the log-likelihood of one residual with a dense covariance, and its gradients by r and ln φ."""
         covariance, slopes = self.model.covariance(block, values)
@@ -293,15 +299,19 @@ class Likelihood:
         solved = solve_triangular(factor, half, lower=True, trans=1)
         inverse = solve_triangular(factor, np.eye(block.size), lower=True)
         traces = np.einsum("ki,kj,pij->p", inverse, inverse, slopes)
-        value = -0.5 * block.weight * (2 * share * np.sum(np.log(np.diag(factor))) + half @ half)
-        return value, -block.weight * solved, 0.5 * block.weight * (solved @ slopes @ solved - share * traces)
+        value = -0.5 * block.weight * (2 * log_variance_factor * np.sum(np.log(np.diag(factor))) + half @ half)
+        return (
+            value,
+            -block.weight * solved,
+            0.5 * block.weight * (solved @ slopes @ solved - log_variance_factor * traces),
+        )
 
     def gradients(
-        self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float = 1.0
+        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float = 1.0
     ) -> tuple[Sequence[np.ndarray], np.ndarray]:
         """Return the gradients of log-likelihood plus log-prior of φ, by each block's residual and by ln φ (names,)."""
         if self.model.flat:
-            return self._flat_gradients(Residuals.of(residuals), values, share)
+            return self._flat_gradients(Residuals.of(residuals), values, log_variance_factor)
         slopes = self._log_prior(values)[1]
         by_residual: list[np.ndarray] = [np.empty(0)] * len(self.blocks)
         for members in self._alike:
@@ -311,16 +321,18 @@ class Likelihood:
                 by_residual[members[0]] = -own[0]
                 continue
             if self._is_dense(block):
-                _, by_residual[members[0]], by_phi = self._dense(block, own[0], values[columns], share)
+                _, by_residual[members[0]], by_phi = self._dense(block, own[0], values[columns], log_variance_factor)
             else:
                 variances, change = self._variances(block, values[columns])
                 for b, r in zip(members, own, strict=True):
                     by_residual[b] = -block.weight * r / variances
-                by_phi = 0.5 * block.weight * np.sum(own**2 / variances - share, axis=0) @ change
+                by_phi = 0.5 * block.weight * np.sum(own**2 / variances - log_variance_factor, axis=0) @ change
             slopes[columns] += by_phi
         return by_residual, slopes
 
-    def _flat_gradients(self, residuals: Residuals, values: np.ndarray, share: float) -> tuple[Residuals, np.ndarray]:
+    def _flat_gradients(
+        self, residuals: Residuals, values: np.ndarray, log_variance_factor: float
+    ) -> tuple[Residuals, np.ndarray]:
         """Return the gradients by each block's residual and by ln φ (names,) under errors whose spectrum is flat."""
         by_value, squares = self._log_prior(values)[1], residuals.squares
         at, _, columns, sizes, weights, measured = self._levels
@@ -329,7 +341,7 @@ class Likelihood:
         by_square = np.full(len(self.blocks), -0.5)
         by_square[at] = -0.5 * weights / v
         # V is proportional to v, or to v plus what is measured.
-        by_level = 0.5 * weights * (squares[at] / v - share * sizes) * raised / v
+        by_level = 0.5 * weights * (squares[at] / v - log_variance_factor * sizes) * raised / v
         np.add.at(by_value, columns, by_level)
         return residuals.scaled(2.0 * by_square), by_value
 
@@ -385,12 +397,12 @@ TINY = np.finfo(float).tiny
 
 
 def estimate_noise(
-    likelihood: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, share: float
+    likelihood: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, log_variance_factor: float
 ) -> np.ndarray:
     """Return the noise parameters (names,) that fit residuals best, one array (size,) a block, from a start.
 
-    For independent errors with the prior 1/v this is eq. (7) of [1]_, v = Σe²/(n·share); otherwise it maximises the
-    log-likelihood, its logarithms multiplied by `share`, plus the log-prior.
+    For independent errors with the prior 1/v this is eq. (7) of [1]_, v = Σe²/(n·f) with f = `log_variance_factor`;
+    otherwise it maximises the log-likelihood, its logarithms multiplied by f, plus the log-prior.
 
     References
     ----------
@@ -408,19 +420,19 @@ def estimate_noise(
         )
         count = sum(block.count for block in blocks)
         plain = isinstance(likelihood.model, Independent) or all(block.kind == CORRELATED for block in blocks)
-        corrected = count * share - {JEFFREYS: 0.0, FLAT: 2.0}.get(str(likelihood.model.prior), np.inf)
+        corrected = count * log_variance_factor - {JEFFREYS: 0.0, FLAT: 2.0}.get(str(likelihood.model.prior), np.inf)
         columns = [likelihood.names.index(name) for name in group]
         if plain and corrected > 0.0:
             values[columns[0]] = max(total / corrected, TINY)
             continue
         held = {name: values[i] for name, i in zip(group, columns, strict=True) if name in likelihood.fixed}
         part = Likelihood(likelihood.model, blocks, held)
-        values[columns] = _maximise(part, chosen, values[columns], max(total / count, TINY), share)
+        values[columns] = _maximise(part, chosen, values[columns], max(total / count, TINY), log_variance_factor)
     return values
 
 
 def _maximise(
-    part: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, size: float, share: float
+    part: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, size: float, log_variance_factor: float
 ) -> np.ndarray:
     """Return the best values of one group's noise parameters, from a start and from variances of the given size."""
     free = [part.names.index(name) for name in part.free]
@@ -432,10 +444,10 @@ def _maximise(
 
     def negative(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
         values = complete(logarithms)
-        value = float(part(residuals, values, share) + part.log_prior(values))
+        value = float(part(residuals, values, log_variance_factor) + part.log_prior(values))
         if not np.isfinite(value):
             return 1e300, np.zeros(len(free))
-        return -value, -part.gradients(residuals, values, share)[1][free]
+        return -value, -part.gradients(residuals, values, log_variance_factor)[1][free]
 
     variances = [part.names[i].startswith((VARIANCE, SCALE)) for i in free]
     centre = np.where(variances, np.log(size), np.log(part.guess()[free]))
