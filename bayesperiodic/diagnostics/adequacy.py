@@ -236,8 +236,7 @@ def _size(problem: Problem, here: Linearisation, index: int, white: _Whitened) -
         unexplained, measured = Unexplained(r, j, harmonic), block.measured
         e = next(e for e in problem.experiments if e.name == block.experiment)
         # Unequal variances reduce the degrees of freedom of a sum of squares.
-        evenness = _evenness(e, block)
-        behind = (e.cycles - 1) * block.count * evenness if e.cycles > 1 else np.inf
+        evenness, behind = _evenness(e, block), measured_freedom(e, block.channel)
     else:
         unexplained, measured, evenness, behind = Unexplained(*white.parts[index]), 1.0, 1.0, np.inf
     if not unexplained.freedom:
@@ -254,6 +253,19 @@ def _evenness(experiment: Experiment, block: Block) -> float:
     variance = experiment.amplitude_variance[block.channel]
     each = np.concatenate([variance[:1], np.repeat(0.25 * variance[1:], 2)])
     return float(each.sum() ** 2 / (each.size * np.sum(each**2)))
+
+
+def measured_freedom(experiment: Experiment, channel: str) -> float:
+    """Return the degrees of freedom of the measured variance of one value (Satterthwaite); infinite for one cycle."""
+    if experiment.cycles < 2:
+        return np.inf
+    if channel not in experiment.amplitude_variance:
+        return (experiment.cycles - 1) * experiment.independent[channel]
+    variance = experiment.amplitude_variance[channel]
+    values = np.where(np.arange(variance.size) == 0, 1.0, 2.0)
+    each = variance / values
+    by_cycles = (experiment.cycles - 1) * values
+    return float(each.sum() ** 2 / np.sum(each**2 / experiment.amplitude_freedom.get(channel, by_cycles)))
 
 
 def _amplitude(problem: Problem, block: Block, replicates: Mapping[tuple[str, str], np.ndarray]) -> float:
