@@ -1,11 +1,10 @@
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.signal import lfilter
 
 import bayesperiodic as bp
 from bayesperiodic.data import folding
-from tests.known import grid
+from tests.known import NOISES, autoregressive, grid
 
 FREQUENCY = 2.317
 
@@ -101,38 +100,6 @@ def test_variance_of_the_mean_amplitudes_is_the_observed_one():
     stated = np.mean([e.amplitude_variance["y"][1:] for e in experiments], axis=0)
     actual = np.mean(np.abs(amplitudes - amplitudes.mean(axis=0)) ** 2, axis=0)
     assert stated.mean() == pytest.approx(actual.mean(), rel=0.12)
-
-
-def autoregressive(correlation):
-    def noise(time, generator):
-        white = generator.standard_normal(time.size + 6000) * np.sqrt(1 - correlation**2)
-        return lfilter([1], [1, -correlation], white)[6000:]
-
-    return noise
-
-
-def one_over_f(time, generator):
-    """Noise with a spectrum 1/f down to a quarter of a line of the recording."""
-    frequency = np.fft.rfftfreq(4 * time.size)
-    frequency[0] = frequency[1]
-    white = generator.standard_normal(frequency.size) + 1j * generator.standard_normal(frequency.size)
-    noise = np.fft.irfft(white / np.sqrt(frequency), 4 * time.size)
-    return noise[: time.size] / noise.std()
-
-
-def hum(time, generator):
-    tone = np.cos(2 * np.pi * 5.0371 * time + generator.uniform(0, 2 * np.pi))
-    return tone + 0.1 * generator.standard_normal(time.size)
-
-
-NOISES = {
-    "white": lambda time, generator: generator.standard_normal(time.size),
-    "autoregressive, 0.9": autoregressive(0.9),
-    "autoregressive, 0.99": autoregressive(0.99),
-    "autoregressive, 0.999": autoregressive(0.999),
-    "1/f": one_over_f,
-    "hum": hum,
-}
 
 
 @pytest.mark.slow
