@@ -228,7 +228,7 @@ def folded(noise, seed: int, coulomb: float) -> bp.Problem:
     return bp.Problem(LINEAR, [run], priors={n: FLAT[n] for n in "kc"}, fixed={"coulomb": 0.0})
 
 
-def tested(problem: bp.Problem):
+def judged(problem: bp.Problem):
     """Return the table of the tests at the MAP estimate, without replicates."""
     fit = bp.map_estimate(problem, progress=False)
     here = problem.density().linearise(problem.vector(fit.theta))
@@ -239,14 +239,14 @@ def tested(problem: bp.Problem):
 @pytest.mark.parametrize("noise", NOISES.values(), ids=[*NOISES])
 def test_coloured_noise_is_no_model_error(noise):
     """100 data sets of the right model; the level is 1 %, and 6 alarms or more have a probability of 0.05 %."""
-    alarms = sum(tested(folded(noise, seed, 0.0)).loc["all", "verdict"] == "misspecified" for seed in range(100))
+    alarms = sum(judged(folded(noise, seed, 0.0)).loc["all", "verdict"] == "misspecified" for seed in range(100))
     assert alarms <= 5
 
 
 @pytest.mark.parametrize("noise", ["white", "autoregressive, 0.99", "1/f"])
 def test_missing_friction_is_found_under_noise_of_any_spectrum(noise):
     """Friction of 25 N has harmonics of 11 N and less in the force, the mean of 40 cycles noise below 1 N."""
-    table = tested(folded(NOISES[noise], 1, 25.0))
+    table = judged(folded(NOISES[noise], 1, 25.0))
     assert table.loc["all", "verdict"] == "misspecified"
     assert table["spectrum"].tolist() == ["measured", ""]
 
