@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import sympy as sp
+from scipy.signal import lfilter
 
 import bayesperiodic as bp
 
@@ -188,3 +189,38 @@ def complex_step_sensitivities(
         for channel, f in zip(model.outputs, outputs, strict=True):
             result[channel][name] = np.broadcast_to(f(*a), samples).imag / 1e-30
     return result
+
+
+def autoregressive(correlation):
+    """Return a function of times and a generator that returns noise with this correlation of successive samples."""
+
+    def noise(time, generator):
+        white = generator.standard_normal(time.size + 6000) * np.sqrt(1 - correlation**2)
+        return lfilter([1], [1, -correlation], white)[6000:]
+
+    return noise
+
+
+def one_over_f(time, generator):
+    """Return noise with a spectrum 1/f down to a quarter of a line of the recording."""
+    frequency = np.fft.rfftfreq(4 * time.size)
+    frequency[0] = frequency[1]
+    white = generator.standard_normal(frequency.size) + 1j * generator.standard_normal(frequency.size)
+    noise = np.fft.irfft(white / np.sqrt(frequency), 4 * time.size)
+    return noise[: time.size] / noise.std()
+
+
+def hum(time, generator):
+    """Return a tone of 5.0371 Hz over weak white noise."""
+    tone = np.cos(2 * np.pi * 5.0371 * time + generator.uniform(0, 2 * np.pi))
+    return tone + 0.1 * generator.standard_normal(time.size)
+
+
+NOISES = {
+    "white": lambda time, generator: generator.standard_normal(time.size),
+    "autoregressive, 0.9": autoregressive(0.9),
+    "autoregressive, 0.99": autoregressive(0.99),
+    "autoregressive, 0.999": autoregressive(0.999),
+    "1/f": one_over_f,
+    "hum": hum,
+}

@@ -44,6 +44,8 @@ class Experiment(Result):
         same harmonics before the comparison. By default all harmonics are kept.
     amplitude_variance : mapping of str to array (harmonics + 1,), optional
         Variance of the mean's complex Fourier amplitudes.
+    amplitude_freedom : mapping of str to array (harmonics + 1,), optional
+        Degrees of freedom of ``amplitude_variance``; by default 2(cycles − 1), and cycles − 1 for harmonic 0.
     frequency_se, periodicity, origin : float
         Standard error of the frequency [Hz], zero if it is known; fraction of the variance that the mean period
         explains, of the channel with the smallest one; time [s] of the recording at which τ = 0.
@@ -96,6 +98,7 @@ class Experiment(Result):
     independent: Mapping[str, int] = field(default_factory=dict, kw_only=True)
     harmonics: Mapping[str, int] = field(default_factory=dict, kw_only=True)
     amplitude_variance: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+    amplitude_freedom: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
     frequency_se: float = field(default=0.0, kw_only=True)
     periodicity: float = field(default=1.0, kw_only=True)
     drift: Mapping[str, float] = field(default_factory=dict, kw_only=True)
@@ -127,7 +130,7 @@ class Experiment(Result):
             for key, values in (self.guess or {}).items()
         }
         object.__setattr__(self, "guess", guess)
-        for argument in ("scatter", "independent", "harmonics", "amplitude_variance", "drift"):
+        for argument in ("scatter", "independent", "harmonics", "amplitude_variance", "amplitude_freedom", "drift"):
             given = dict(getattr(self, argument) or {})
             object.__setattr__(self, argument, given)
             for key in given:

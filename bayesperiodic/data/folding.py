@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
-from scipy.ndimage import uniform_filter1d
-from scipy.special import fdtrc
+from scipy.special import fdtrc, softmax
 
 from bayesperiodic import _checks, _fourier
 
@@ -17,6 +16,14 @@ MINIMUM_CYCLES = 3
 MINIMUM_PERIODICITY = 0.5
 FALSE_ALARM_RATE = 0.01
 CROSSING = "crossing"
+
+# The spectrum of the noise: grid points a sample, and neighbouring lines on each side of a harmonic.
+FINENESS, NEIGHBOURS = 4, 16
+# Lines from which frequency zero is extrapolated: for the kind of noise, and for the level of white and slow noise.
+LINES, WHITE_LINES, SLOW_LINES = 40, 8, 2
+# Correlation times in recording lengths, white floors relative to line 1, and line 0 of 1/f noise relative to line 1
+# if its spectrum is flat below a quarter of a line.
+CORRELATION_TIMES, FLOORS, ZERO_OF_PINK = (0.45, 0.1, 0.05, 0.025), (0.0, 0.01, 0.1), 2.75
 
 
 @dataclass(frozen=True)
@@ -200,8 +207,8 @@ def fold_signals(
         fit, fundamental_se = fit_harmonics(steady.time, steady.values, fundamental, limit), 0.0
     periodicity = _periodicity(steady, fit)
     cycles = round(np.ptp(steady.time) * fit.frequency)
-    one_cycle, mean = zip(*(_cycle_scatter(steady.time, fit, own, cycles) for own in fit.residuals), strict=True)
-    significant = [_last_significant(a, variance, cycles) for a, variance in zip(fit.amplitudes, mean, strict=True)]
+    one_cycle, noise = zip(*(_noise(steady.time, fit, own, cycles) for own in fit.residuals), strict=True)
+    significant = [_last_significant(a, own) for a, own in zip(fit.amplitudes, noise, strict=True)]
     kept = dict(zip(signals.channels, significant, strict=True)) | _chosen(harmonics, signals.channels, limit)
     amplitudes = fit.amplitudes
     if origin == CROSSING:
@@ -228,7 +235,8 @@ def fold_signals(
         "scatter": by_channel(float(np.sqrt(_power(v[own]))) for v, own in zip(one_cycle, used, strict=True)),
         "independent": {channel: min(2 * kept[channel] + 1, steady.time.size) for channel in outputs},
         "harmonics": kept,
-        "amplitude_variance": by_channel(v[own] for v, own in zip(mean, used, strict=True)),
+        "amplitude_variance": by_channel(v.variance[own] for v, own in zip(noise, used, strict=True)),
+        "amplitude_freedom": by_channel(v.freedom[own] for v, own in zip(noise, used, strict=True)),
         "periodicity": periodicity,
         "drift": drift,
         "origin": start,
@@ -294,7 +302,9 @@ def _cycles_apart(signals: Signals, fundamental: float) -> tuple[np.ndarray, np.
     back = np.minimum(((time[-1] - time) / period + 1e-9).astype(int), total)
     harmonics = min(5, _resolved(time, fundamental, time.size))
     scale = values.std(axis=1)[:, None]
-    fits = [fit_harmonics(time[back == k], values[:, back == k] / scale, fundamental, harmonics) for k in range(total)]
+    ends = np.searchsorted(-back, np.arange(1 - total, 2))[::-1]
+    parts = [slice(first, last) for first, last in zip(ends[1:], ends[:-1], strict=True)]
+    fits = [fit_harmonics(time[part], values[:, part] / scale, fundamental, harmonics) for part in parts]
     return back, np.array([fit.amplitudes for fit in fits])
 
 
@@ -342,42 +352,74 @@ def _periodicity(signals: Signals, fit: HarmonicFit) -> float:
     return float(explained[worst])
 
 
-def _cycle_scatter(
-    time: np.ndarray, fit: HarmonicFit, residuals: np.ndarray, cycles: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the variances of one cycle's complex amplitudes and of the mean's, (harmonics + 1,) each.
+@dataclass(frozen=True)
+class AmplitudeNoise:
+    """Variances of the mean period's complex amplitudes, and their degrees of freedom, (harmonics + 1,) each."""
 
-    The latter are corrected for correlation between successive cycles.
+    variance: np.ndarray
+    freedom: np.ndarray
+
+
+def _noise(time: np.ndarray, fit: HarmonicFit, residuals: np.ndarray, cycles: int) -> tuple[np.ndarray, AmplitudeNoise]:
+    """Return the variances of one cycle's complex amplitudes, (harmonics + 1,), and the noise of the mean's.
+
+    The spectrum of the K cycles has lines at multiples of 1/K of the fundamental, and those between the harmonics
+    contain noise only. The variance at a harmonic is the mean over the nearest of these lines on both sides.
     """
-    count = fit.amplitudes.shape[1]
-    cycle = np.minimum(((time - time[0]) * fit.frequency).astype(int), cycles - 1)
-    size = np.bincount(cycle, minlength=cycles)
-    turn, power = np.exp(-2j * np.pi * fit.frequency * time), np.ones(time.size, dtype=complex)
-    deviation = np.empty((cycles, count), dtype=complex)
-    for h in range(count):
-        wave = residuals * power
-        total = np.bincount(cycle, wave.real, cycles) + 1j * np.bincount(cycle, wave.imag, cycles)
-        deviation[:, h] = total / size * (1.0 if h == 0 else 2.0)
-        power *= turn
-    squared = np.sum(np.abs(deviation) ** 2, axis=0)
-    one_cycle = squared / (cycles - 1)
-    follow = np.sum((deviation[1:] * np.conj(deviation[:-1])).real, axis=0)
-    return one_cycle, one_cycle / cycles * _inflation(follow, squared)
+    per_cycle = (time.size - 1) / (np.ptp(time) * fit.frequency)
+    # On a grid in phase, finer than the samples, the lines are those of a discrete Fourier transform at any sampling.
+    points = FINENESS * int(np.ceil(per_cycle - 1e-6))
+    place = np.minimum(np.rint((time - time[0]) * fit.frequency * points).astype(int), points * cycles - 1)
+    signal = np.bincount(place, residuals, points * cycles)
+    harmonic = np.arange(fit.amplitudes.shape[1])
+    size = np.bincount(place // points, minlength=cycles)[:, None]
+    deviation = np.fft.rfft(signal.reshape(cycles, points), axis=1)[:, harmonic] / size
+    power = np.abs(np.fft.rfft(signal) / time.size) ** 2
+    side = np.arange(1, np.clip(cycles // 4, min(4, cycles // 2), NEIGHBOURS) + 1)
+    near = power[np.abs(harmonic[:, None] * cycles + np.concatenate([side, -side]))].mean(axis=1)
+    freedom = np.full(harmonic.size, 4.0 * side.size)
+    lines = np.arange(1, power.size)
+    near[0], freedom[0] = _at_zero(power[lines[lines % cycles > 0][:LINES]])
+    scale = np.where(harmonic == 0, 1.0, 4.0)
+    one_cycle = scale * np.sum(np.abs(deviation) ** 2, axis=0) / (cycles - 1)
+    return one_cycle, AmplitudeNoise(scale * near, freedom)
 
 
-def _inflation(follow: np.ndarray, total: np.ndarray) -> np.ndarray:
-    """Return (1 + r) / (1 − r), where r is the lag-one correlation between cycles, pooled over five harmonics."""
-    pooled = uniform_filter1d(total, 5)
-    r = np.divide(uniform_filter1d(follow, 5), pooled, out=np.zeros_like(pooled), where=pooled > 0)
-    r = np.clip(r, 0.0, 0.9)
-    return (1.0 + r) / (1.0 - r)
+def _at_zero(power: np.ndarray) -> tuple[float, float]:
+    """Return the expected power of the noise at frequency zero, and its degrees of freedom, from lines 1, 2, ….
+
+    Noise that is slower than the recording is in the mean, and hardly in the lines, which have to be extrapolated.
+    White noise, 1/f noise, and noise of exponential correlation over a part of the recording, each with white floors,
+    are weighted by their likelihoods (P. Whittle, Ark. Mat. 2 (1953) 423-434), their levels integrated out, and their
+    extrapolations averaged geometrically.
+    """
+    if not power.sum() > 0.0:
+        return 0.0, 2.0 * WHITE_LINES
+    line = np.arange(1.0, power.size + 1)
+    coloured = [np.concatenate([[ZERO_OF_PINK], 1.0 / line]), *(_exponential(t, power.size) for t in CORRELATION_TIMES)]
+    slow = np.array([shape / shape[1] + floor for shape in coloured for floor in FLOORS])
+    shapes = np.concatenate([np.ones((1, power.size + 1)), slow])
+    prior = np.log(np.where(np.arange(len(shapes)) == 0, 1.0, 1.0 / len(slow)))
+    level = np.mean(power / shapes[:, 1:], axis=1)
+    weight = softmax(prior - np.log(shapes[:, 1:]).sum(axis=1) - power.size * np.log(level))
+    nearest = power[:SLOW_LINES].sum() / shapes[:, 1 : SLOW_LINES + 1].sum(axis=1)
+    nearest[0] = power[:WHITE_LINES].mean()
+    expected = np.exp(weight @ np.log(np.maximum(nearest * shapes[:, 0], np.finfo(float).tiny)))
+    # Extrapolated slow noise is as uncertain as one line.
+    return float(expected), float(1.0 / (weight[0] / (2.0 * WHITE_LINES) + (1.0 - weight[0]) / 2.0))
 
 
-def _last_significant(amplitudes: np.ndarray, variance: np.ndarray, cycles: int) -> int:
+def _exponential(time: float, lines: int) -> np.ndarray:
+    """Return the expected power (lines + 1,) of lines 0, 1, … of noise with a correlation time in recording lengths."""
+    rate = 1.0 / time + 2j * np.pi * np.arange(lines + 1)
+    return (1.0 / rate + np.expm1(-1.0 / time) / rate**2).real
+
+
+def _last_significant(amplitudes: np.ndarray, noise: AmplitudeNoise) -> int:
     tested = amplitudes.size - 1
     floor = (1e-12 * np.abs(amplitudes).max()) ** 2
-    ratio = np.abs(amplitudes[1:]) ** 2 / np.maximum(variance[1:], floor)
-    significant = fdtrc(2, 2 * (cycles - 1), ratio) < FALSE_ALARM_RATE / tested
+    ratio = np.abs(amplitudes[1:]) ** 2 / np.maximum(noise.variance[1:], floor)
+    significant = fdtrc(2, noise.freedom[1:], ratio) < FALSE_ALARM_RATE / tested
     return int(np.flatnonzero(significant)[-1]) + 1 if significant.any() else 1
 
 

@@ -410,6 +410,12 @@ class Recording(Result):
         The whole cycles after the transient are used. The fundamental frequency is estimated by least squares over all
         of them. The mean period is a least-squares Fourier series, so that the sampling rate may be arbitrary.
 
+        The variance of the mean's amplitudes is measured harmonic by harmonic. The spectrum of K cycles has lines at
+        multiples of 1/K of the fundamental, and those between the harmonics contain noise only; the variance at a
+        harmonic is the mean power of the nearest K/4 lines (from 4 to 16, at most K/2) on each side. The variance of
+        harmonic 0 is extrapolated from the lines above it, as that of white, exponentially correlated or 1/f noise,
+        whichever explains them. Noise that lasts longer than the recording cannot be told from the mean value.
+
         Parameters
         ----------
         samples : int
@@ -420,7 +426,7 @@ class Recording(Result):
             Forcing periods per response period.
         harmonics : int or mapping of str to int, optional
             Harmonics of the response period to keep, for all channels or by channel. By default each channel keeps all
-            harmonics up to the last one that is significant relative to the cycle-to-cycle scatter: an F-test on the
+            harmonics up to the last one that is significant relative to the noise around it: an F-test on the
             squared amplitude, with a false-alarm rate of 1 % over all harmonics tested.
         origin : float or "crossing"
             Time [s] at which τ = 0. "crossing", for autonomous systems, whose phase is arbitrary: the first time >= 0

@@ -35,6 +35,22 @@ class Unexplained:
         self.freedom = components.size - self._basis.shape[1]
         self.harmonics, self._group = np.unique(harmonic, return_inverse=True)
 
+    @classmethod
+    def of_measured_noise(
+        cls, components: np.ndarray, changes: np.ndarray, harmonic: np.ndarray, behind: np.ndarray
+    ) -> "Unexplained":
+        """Return what is unexplained in units of measured standard deviations with degrees of freedom (harmonics,).
+
+        The square of each harmonic is F distributed. It is weighted so that it is the χ² quantile of its probability.
+        """
+        first = cls(components, changes, harmonic)
+        square, freedom = first.explained(np.eye(first.harmonics.size, dtype=bool))
+        free = np.maximum(freedom, 1)
+        p = np.maximum(stats.f.sf(square / free, free, behind), np.finfo(float).tiny)
+        known = np.where((freedom > 0) & (square > 0.0), stats.chi2.isf(p, free), square)
+        factor = np.sqrt(np.divide(known, square, out=np.ones_like(square), where=known > 0.0))[first._group]
+        return cls(components * factor, changes * factor, harmonic)
+
     @cached_property
     def _sums(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Sums over each harmonic: b bᵀ of the basis, b·e, e² of the residual e, and the number of components."""
@@ -134,6 +150,7 @@ LEVEL = 0.01
 SHAPES = 20
 TESTS = ("whiteness", "harmonics", "size", "amplitude", "consistency")
 ADEQUATE, MISSPECIFIED, UNTESTED = "adequate", "misspecified", "not tested"
+MEASURED, ASSUMED = "measured", "assumed"
 ALL = "all"
 
 
@@ -162,10 +179,16 @@ def adequacy(
             "harmonic": harmonic[0],
             "size": size,
             "model_error_share": share,
+            "spectrum": ASSUMED if white[0].spectrum(i) is None else MEASURED,
             "amplitude": _amplitude(problem, block, replicates),
         }
-    rows[ALL] = {"experiment": ALL, "channel": ALL, "consistency": np.mean([w.consistency() for w in white])}
-    columns = ["experiment", "channel", *TESTS, "harmonic", "model_error_share"]
+    rows[ALL] = {
+        "experiment": ALL,
+        "channel": ALL,
+        "spectrum": "",
+        "consistency": np.mean([w.consistency() for w in white]),
+    }
+    columns = ["experiment", "channel", *TESTS, "harmonic", "model_error_share", "spectrum"]
     table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
     adjusted = adjusted_p(table)
     smallest = np.min(np.where(np.isnan(adjusted), np.inf, adjusted), axis=1)
@@ -196,14 +219,35 @@ class _Whitened:
         self.known = frozenset(group for group, own in each if set(own) <= set(likelihood.fixed))
         white = zip(*(likelihood.whitened(part, noise) for part in (here.residuals, here.changes)), strict=True)
         self.parts = [_used(block, *both) for block, both in zip(self.blocks, white, strict=True)]
+        self._plain = [
+            _used(block, *both) for block, *both in zip(self.blocks, here.residuals, here.changes, strict=True)
+        ]
+        self._experiments = {e.name: e for e in problem.experiments}
+
+    def spectrum(self, index: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the measured variances of the components of a block, see `measured_spectrum`."""
+        block = self.blocks[index]
+        return measured_spectrum(self._experiments[block.experiment], block)
 
     def spectral_tests(self, index: int) -> tuple[float, float, float]:
-        """Return p of whiteness and of the harmonic content of a block, and the strongest harmonic."""
+        """Return p of whiteness and of the harmonic content of a block, and the strongest harmonic.
+
+        Where the spectrum of the noise was measured between the harmonics, the components are in its units.
+        """
         r, j, harmonic = self.parts[index]
         if self.blocks[index].kind == CORRELATED or not _testable(r, j):
             return NOT_TESTED, NOT_TESTED, NOT_TESTED
-        unexplained = Unexplained(r, j, harmonic)
+        unexplained = self.in_measured_units(index) or Unexplained(r, j, harmonic)
         return unexplained.whiteness(), *unexplained.harmonic_content()
+
+    def in_measured_units(self, index: int) -> Unexplained | None:
+        """Return what is unexplained of a block in units of the measured spectrum; None if that is not known."""
+        spectrum = self.spectrum(index)
+        if spectrum is None:
+            return None
+        r, j, harmonic = self._plain[index]
+        sd = np.sqrt(spectrum[0][harmonic])
+        return Unexplained.of_measured_noise(r / sd, j / sd, harmonic, spectrum[1])
 
     def consistency(self) -> float:
         """Return p of the test of common parameters."""
@@ -236,14 +280,15 @@ def _size(problem: Problem, here: Linearisation, index: int, white: _Whitened) -
         unexplained, measured = Unexplained(r, j, harmonic), block.measured
         e = next(e for e in problem.experiments if e.name == block.experiment)
         # Unequal variances reduce the degrees of freedom of a sum of squares.
-        evenness = _evenness(e, block)
-        behind = (e.cycles - 1) * block.count * evenness if e.cycles > 1 else np.inf
+        evenness, behind = _evenness(e, block), measured_freedom(e, block.channel)
     else:
         unexplained, measured, evenness, behind = Unexplained(*white.parts[index]), 1.0, 1.0, np.inf
     if not unexplained.freedom:
         return NOT_TESTED, NOT_TESTED
     variance = unexplained.square / unexplained.freedom
     share = max(0.0, 1.0 - measured / variance) if variance > 0.0 else 0.0
+    if (relative := white.in_measured_units(index)) is not None:
+        return float(stats.chi2.sf(relative.square, relative.freedom)), share
     return excess(variance, unexplained.freedom * evenness, measured, behind), share
 
 
@@ -254,6 +299,33 @@ def _evenness(experiment: Experiment, block: Block) -> float:
     variance = experiment.amplitude_variance[block.channel]
     each = np.concatenate([variance[:1], np.repeat(0.25 * variance[1:], 2)])
     return float(each.sum() ** 2 / (each.size * np.sum(each**2)))
+
+
+def measured_spectrum(experiment: Experiment, block: Block) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the measured variances of a block's components and their degrees of freedom, (harmonics + 1,) each.
+
+    None where the spectrum of the noise was not measured in all harmonics of the block.
+    """
+    variance = experiment.amplitude_variance.get(block.channel)
+    freedom = experiment.amplitude_freedom.get(block.channel)
+    if block.kind != SPECTRAL or variance is None or freedom is None or block.size != 2 * variance.size - 1:
+        return None
+    if not np.all(variance > 0.0):
+        return None
+    return block.size * variance * np.where(np.arange(variance.size) == 0, 1.0, 0.25), freedom
+
+
+def measured_freedom(experiment: Experiment, channel: str) -> float:
+    """Return the degrees of freedom of the measured variance of one value (Satterthwaite); infinite for one cycle."""
+    if experiment.cycles < 2:
+        return np.inf
+    if channel not in experiment.amplitude_variance:
+        return (experiment.cycles - 1) * experiment.independent[channel]
+    variance = experiment.amplitude_variance[channel]
+    values = np.where(np.arange(variance.size) == 0, 1.0, 2.0)
+    each = variance / values
+    by_cycles = (experiment.cycles - 1) * values
+    return float(each.sum() ** 2 / np.sum(each**2 / experiment.amplitude_freedom.get(channel, by_cycles)))
 
 
 def _amplitude(problem: Problem, block: Block, replicates: Mapping[tuple[str, str], np.ndarray]) -> float:

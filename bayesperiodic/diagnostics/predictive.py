@@ -15,7 +15,16 @@ from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
-from bayesperiodic.diagnostics.adequacy import ALL, LEVEL, MISSPECIFIED, TESTS, UNTESTED, adequacy, adjusted_p
+from bayesperiodic.diagnostics.adequacy import (
+    ALL,
+    LEVEL,
+    MEASURED,
+    MISSPECIFIED,
+    TESTS,
+    UNTESTED,
+    adequacy,
+    adjusted_p,
+)
 from bayesperiodic.periodic import arclength
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 from bayesperiodic.posterior.parameters import CHAIN, DRAW
@@ -182,13 +191,15 @@ class Prediction(Bands):
         Number of draws, and of those without a periodic solution.
     table : DataFrame
         One row per experiment and channel, and the row "all". p-values, NaN if a test is not possible: ``whiteness``
-        and ``harmonics`` of the residual along the period, in units of the noise model; ``size``, the residual variance
+        and ``harmonics`` of the residual along the period, in units of the noise; ``size``, the residual variance
         against the measured scatter of the cycles (assumed exact for one cycle) or a given variance; ``amplitude``, the
         rms of the period against replicates; ``consistency`` (row "all"), common parameters against separate ones for
         each experiment and channel. ``harmonic``: the one with the largest residual power in units of the noise (the
         index of the cosine wave for masked data). ``model_error_share``: the fraction of the residual variance beyond
-        that of ``size``, NaN if unknown. ``p``: the smallest of the row, adjusted by Holm's method for all tests of the
-        table; ``verdict``: "misspecified" if it is below 1 %, "adequate", or "not tested".
+        that of ``size``, NaN if unknown. ``spectrum``: "measured" if whiteness and harmonics are tested in units of the
+        noise that was measured between the harmonics, "assumed" if in those of the noise model. ``p``: the smallest of
+        the row, adjusted by Holm's method for all tests of the table; ``verdict``: "misspecified" if it is below 1 %,
+        "adequate", or "not tested".
     transient : Transient or None
         Bands of the recordings of `run`.
     note : str
@@ -225,8 +236,19 @@ class Prediction(Bands):
                 found[str(label)] = f"{', '.join(reasons)}{text}"
         return found
 
+    @property
+    def concerns_noise(self) -> bool:
+        """Whether a wrong noise model would explain the rejections as well as a wrong model.
+
+        A measured spectrum of the noise, or a residual larger than the measured noise, tells the two apart.
+        """
+        rejected = pd.DataFrame(adjusted_p(self.table) < LEVEL, self.table.index, TESTS)
+        measured = rejected[["whiteness", "harmonics"]][self.table["spectrum"] == MEASURED]
+        return self.verdict == MISSPECIFIED and not (rejected["size"].any() or measured.any(axis=None))
+
     def __repr__(self) -> str:
-        verdict = f"The model is {self.verdict} (overall false alarm rate {LEVEL:.0%})."
+        subject = "model or the noise model" if self.concerns_noise else "model"
+        verdict = f"The {subject} is {self.verdict} (overall false alarm rate {LEVEL:.0%})."
         lines = [
             f"Tests of the model from {self.draws} draws, {self.failed} without a periodic solution",
             self.table.to_string(float_format="{:.2g}".format, na_rep="-"),
@@ -249,6 +271,11 @@ def predict(
     linear in the parameters, for any prior, and independent of the identifiability of the parameters. The amplitude is
     compared with replicates whose parameters were fitted to the data (Gelman, Meng, Stern, Statistica Sinica 6 (1996)
     733-807): its p is conservative (Meng, Annals of Statistics 22 (1994) 1142-1160).
+
+    Whiteness and harmonics are tested against the spectrum of the noise that `Recording.fold` measured between the
+    harmonics, under every noise model, so that slow noise, 1/f noise and hum are no misfit. Other experiments are
+    tested against the spectrum that the noise model assumes; a rejection may then mean a wrong noise model. Errors that
+    repeat in every cycle, as those of a coarse quantisation with a commensurate clock, are taken for model errors.
 
     The noise model determines which misfit is detectable. With unknown variance, misfit of any size is taken as noise,
     and only its shape along the period or the scatter of the measured cycles reveals it; circulant noise also absorbs

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesperiodic.diagnostics.adequacy import Unexplained, consistency, excess, holm
+import bayesperiodic as bp
+from bayesperiodic.diagnostics.adequacy import Unexplained, consistency, excess, holm, measured_freedom
 
 HARMONIC = np.array([0, *range(1, 21), *range(1, 21)])
 TRIALS = 1000
@@ -135,3 +136,35 @@ def test_holm_adjusts_step_by_step():
     assert adjusted[[0, 1, 3, 4]] == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert np.isnan(adjusted[2])
     assert np.isnan(holm(np.array([np.nan]))).all()
+
+
+def test_freedom_of_a_measured_variance_is_that_of_its_harmonics_together():
+    """Three equal parts with 4, 8 and 8 degrees of freedom: 9/(1/4 + 1/8 + 1/8) = 18 (Satterthwaite)."""
+    variance = {"x": np.array([1.0, 2.0, 2.0])}
+    given = {"outputs": {"x": np.zeros(8)}, "samples": 8, "cycles": 5, "harmonics": {"x": 2}}
+    freedom = {"x": np.array([4.0, 8.0, 8.0])}
+    measured = bp.Experiment("run", 1.0, amplitude_variance=variance, amplitude_freedom=freedom, **given)
+    assert measured_freedom(measured, "x") == pytest.approx(18.0)
+    by_cycles = bp.Experiment("run", 1.0, amplitude_variance=variance, **given)
+    assert measured_freedom(by_cycles, "x") == pytest.approx(18.0)
+    assert measured_freedom(bp.Experiment("run", 1.0, scatter={"x": 0.1}, **given), "x") == 20
+
+
+@pytest.mark.parametrize("behind", [4.0, 20.0])
+def test_p_values_in_units_of_measured_noise_are_uniform(behind):
+    """500 trials at 21 harmonics, the mean with 2 degrees of freedom: KS of whiteness and binomial limits at 0.1 %."""
+    generator, changes = np.random.default_rng(3), sensitivities(np.random.default_rng(2))
+    freedom = np.full(21, behind)
+    freedom[0] = 2.0
+    spectrum = 1.0 / (1.0 + np.arange(21.0) ** 2)
+    whiteness, harmonics = np.empty(500), np.empty(500)
+    for i in range(500):
+        noise = np.sqrt(spectrum)[HARMONIC] * generator.standard_normal(HARMONIC.size)
+        sd = np.sqrt(spectrum * generator.chisquare(freedom) / freedom)[HARMONIC]
+        misfit = changes.T @ generator.normal(0.0, 50.0, 3)
+        tested = Unexplained.of_measured_noise((noise + misfit) / sd, changes / sd, HARMONIC, freedom)
+        whiteness[i], harmonics[i] = tested.whiteness(), tested.harmonic_content()[0]
+    assert stats.kstest(whiteness, "uniform").pvalue > 1e-3
+    for level in (0.1, 0.05, 0.01):
+        assert np.sum(whiteness <= level) <= stats.binom.ppf(0.999, 500, level)
+        assert np.sum(harmonics <= level) <= stats.binom.ppf(0.999, 500, level)

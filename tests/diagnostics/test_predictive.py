@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics.adequacy import TESTS
+from bayesperiodic.diagnostics.adequacy import TESTS, adequacy
 from bayesperiodic.sampling.posterior import tree
-from tests.known import LINEAR, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors
+from tests.known import LINEAR, NOISES, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors
 from tests.problems import CASES, DUFFING, DUFFING_PRIORS, SAMPLES
 
 TRUTH = np.array([900.0, 40.0, 25.0])
@@ -219,6 +219,38 @@ def product_posterior(damping: float):
     return problem, posterior_of(problem, np.stack([a, b], axis=-1), variance[:, None])
 
 
+def folded(noise, seed: int, coulomb: float) -> bp.Problem:
+    """Return the linear problem of a recording of 40 cycles at 0.5 Hz with noise of 3 N, without Coulomb friction."""
+    time = np.arange(4000) / 50.0
+    x, v = 0.05 * np.cos(np.pi * time), -0.05 * np.pi * np.sin(np.pi * time)
+    force = 900.0 * x + 40.0 * v + coulomb * np.sign(v) + 3.0 * noise(time, np.random.default_rng(seed))
+    run = bp.Recording.from_arrays(time, {"force": force}, {"x": x}).fold(128, frequency=0.5, harmonics=15)
+    return bp.Problem(LINEAR, [run], priors={n: FLAT[n] for n in "kc"}, fixed={"coulomb": 0.0})
+
+
+def judged(problem: bp.Problem):
+    """Return the table of the tests at the MAP estimate, without replicates."""
+    fit = bp.map_estimate(problem, progress=False)
+    here = problem.density().linearise(problem.vector(fit.theta))
+    return adequacy(problem, here, problem.noise_values(fit.noise)[None], {})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", NOISES.values(), ids=[*NOISES])
+def test_coloured_noise_is_no_model_error(noise):
+    """100 data sets of the right model; the level is 1 %, and 6 alarms or more have a probability of 0.05 %."""
+    alarms = sum(judged(folded(noise, seed, 0.0)).loc["all", "verdict"] == "misspecified" for seed in range(100))
+    assert alarms <= 5
+
+
+@pytest.mark.parametrize("noise", ["white", "autoregressive, 0.99", "1/f"])
+def test_missing_friction_is_found_under_noise_of_any_spectrum(noise):
+    """Friction of 25 N has harmonics of 11 N and less in the force, the mean of 40 cycles noise below 1 N."""
+    table = judged(folded(NOISES[noise], 1, 25.0))
+    assert table.loc["all", "verdict"] == "misspecified"
+    assert table["spectrum"].tolist() == ["measured", ""]
+
+
 def test_undetermined_parameters_do_not_make_the_model_inadequate():
     """On the ridge of an exact symmetry a varies by a factor of 100 between draws, and the model is adequate."""
     problem, posterior = product_posterior(0.0)
@@ -233,6 +265,7 @@ def test_undetermined_and_misspecified_is_misspecified():
     prediction = bp.predict(*product_posterior(40.0))
     assert prediction.verdict == "misspecified"
     assert prediction.table.loc["run force", "harmonic"] == 1.0
+    assert prediction.concerns_noise and "The model or the noise model is misspecified" in repr(prediction)
 
 
 def test_a_parameter_fixed_at_a_wrong_value_is_misspecified_and_a_strong_prior_is_not():
