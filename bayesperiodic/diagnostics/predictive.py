@@ -16,8 +16,11 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.diagnostics.adequacy import ALL, LEVEL, TESTS, UNTESTED, adequacy, adjusted_p
+from bayesperiodic.estimation.conflict import prior_conflict
+from bayesperiodic.estimation.gauss_newton import Objective, bias_correction
 from bayesperiodic.periodic import arclength
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
+from bayesperiodic.posterior.density import NATURAL
 from bayesperiodic.posterior.parameters import CHAIN, DRAW
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
@@ -191,6 +194,9 @@ class Prediction(Bands):
         table; ``verdict``: "misspecified" if it is below 1 %, "adequate", or "not tested".
     transient : Transient or None
         Bands of the recordings of `run`.
+    prior_conflict : str
+        Conflict of the prior with the data, in words; "" if there is none. The model is then tested where the data alone
+        are fitted best, and the amplitude is not tested.
     note : str
         Limitations: misfit that the noise model absorbs, draws that have not converged; "" without any.
 
@@ -204,6 +210,7 @@ class Prediction(Bands):
     table: pd.DataFrame
     transient: Transient | None
     note: str
+    prior_conflict: str
 
     @property
     def verdict(self) -> str:
@@ -212,14 +219,14 @@ class Prediction(Bands):
 
     @property
     def findings(self) -> dict[str, str]:
-        """Rejections in words, by row of the table."""
+        """Rejections in words, by row of the table, and the conflict of prior and data, which is none of the model."""
         found = {}
         for (label, row), small in zip(self.table.iterrows(), adjusted_p(self.table) < LEVEL, strict=True):
             if reasons := [f"{REJECTIONS[test]} (p = {row[test]:.2g})" for test in compress(TESTS, small)]:
                 error = row["model_error_share"]
                 text = "" if np.isnan(error) else f"; {error:.1%} of the residual variance is model error"
                 found[str(label)] = f"{', '.join(reasons)}{text}"
-        return found
+        return found | ({"prior conflict": self.prior_conflict} if self.prior_conflict else {})
 
     def __repr__(self) -> str:
         verdict = f"The model is {self.verdict} (overall false alarm rate {LEVEL:.0%})."
@@ -248,7 +255,7 @@ def predict(
 
     The noise model determines which misfit is detectable. With unknown variance, misfit of any size is taken as noise,
     and only its shape along the period or the scatter of the measured cycles reveals it; circulant noise also absorbs
-    correlated misfit. Only the test of the amplitude can detect a wrong prior.
+    correlated misfit. A conflict of the prior with the data is reported by itself, not as a misfit of the model.
 
     Parameters
     ----------
@@ -311,9 +318,18 @@ def predict(
         raise RuntimeError(
             "posterior: its draw of highest density has no periodic solution. Give draws of this problem."
         )
+    objective = Objective(anchored.with_settings(coordinates=NATURAL), bias_correction(problem))
+    estimate, conflict = objective.iterate(here, np.median(noise, axis=0)), ""
+    if estimate is not None:
+        found, alone = prior_conflict(problem, estimate)
+        conflict = found.text
+        if conflict:
+            # The prior must not count as misfit of the model, which is tested where the data alone are fitted best.
+            here, noise, replicates = alone.here, alone.noise[None], {}
     table = adequacy(problem, here, noise, replicates)
     recorded = None if run is None else _transient(problem, points, run, experiment)
-    return Prediction(**vars(predicted), table=table, transient=recorded, note=_note(problem, posterior, table))
+    note = _note(problem, posterior, table)
+    return Prediction(**vars(predicted), table=table, transient=recorded, note=note, prior_conflict=conflict)
 
 
 def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:
