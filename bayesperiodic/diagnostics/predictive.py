@@ -195,8 +195,8 @@ class Prediction(Bands):
     transient : Transient or None
         Bands of the recordings of `run`.
     prior_conflict : str
-        Conflict of the prior with the data, in words; "" if there is none. The model is then tested where the data alone
-        are fitted best, and the amplitude is not tested.
+        Conflict of the prior with the data, in words, "" if there is none. If there is one, the model is tested where
+        the data alone are fitted best, and the amplitude is not tested.
     note : str
         Limitations: misfit that the noise model absorbs, draws that have not converged; "" without any.
 

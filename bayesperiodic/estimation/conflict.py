@@ -1,7 +1,8 @@
 """Conflict between prior and data: the prior predictive distribution of the estimate by the data alone."""
 
+from collections.abc import Iterator
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,24 +11,28 @@ from scipy.special import chdtrc, chdtri, ndtr, ndtri, stdtrit
 
 from bayesperiodic._linalg import column_space
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, bias_correction, climb
-from bayesperiodic.posterior.density import NATURAL, LogPosterior
+from bayesperiodic.posterior.density import RIDGE, LogPosterior
 from bayesperiodic.posterior.joint_priors import JointPrior, MultivariateNormal
 from bayesperiodic.posterior.priors import LogNormal, TruncatedNormal
 from bayesperiodic.posterior.problem import Problem
 
 LEVEL = 0.01
-# Largest error, in widths of the prior, of a direction that is tested: the data have 1 % of the information of the prior.
+# Largest error, in widths of the prior, of a direction that is tested: the data have 1 % of the prior's information.
 WIDENING = 10.0
 # Factor by which the priors are widened where the data estimate alone.
 ALMOST_FLAT = 100.0
 # Expected gain in 2 ln L by a step without the prior, below which the MAP estimate is that of the data.
 NEAR = 0.5
 PRECISION = 1e-12
+# Widths of the priors of parameters in conflict from which further starts of the estimate by the data are drawn.
+SCALES = (3.0, 10.0, 30.0, 100.0, 30.0, 10.0)
 # Midpoints of the normal scores of a prior, and their probabilities.
-EDGES = np.linspace(-7.5, 7.5, 121)
+EDGES = np.linspace(-7.5, 7.5, 241)
 SCORES, MASSES = 0.5 * (EDGES[1:] + EDGES[:-1]), np.diff(ndtr(EDGES))
 # Of these the densities are compared, to find their maximum.
-PEAKS = slice(2, -2, 5)
+PEAKS = slice(5, -5, 10)
+# Width of each part of a prior, in its spacing, for a density without ripples.
+SMOOTHING = 0.75
 VARIANCES = (np.arange(32) + 0.5) / 32
 TAILS = np.array([0.05, 0.95])
 SMALLEST = 1e-300
@@ -83,8 +88,15 @@ def prior_conflict(problem: Problem, estimate: Iterate) -> tuple[PriorConflict, 
     the unknown size of the variances given the residual, which makes it that of Student's t and of F where the prior is
     exact.
     """
-    found = _by_the_data(problem, estimate)
-    return _tested(problem, found), found
+    # The estimate by the data may pass points of no meaning.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        found = _by_the_data(problem, estimate)
+        tested = _tested(problem, found)
+        if tested.members:
+            # The maximum next to the prior may be a local one.
+            found = max(_from_elsewhere(problem, found, tested.members), key=lambda iterate: iterate.objective)
+            tested = _tested(problem, found)
+        return tested, found
 
 
 def _by_the_data(problem: Problem, estimate: Iterate) -> Iterate:
@@ -102,34 +114,60 @@ def _by_the_data(problem: Problem, estimate: Iterate) -> Iterate:
     freedom = max(residuals.size - basis.shape[1], 1)
     share = rest @ rest / freedom * residuals.size / (residuals @ residuals) if problem.free_noise else 1.0
     changes, residuals = (part / np.sqrt(np.clip(share, PRECISION, 1.0)) for part in (changes, residuals))
-    gradient = changes @ residuals
-    if gradient @ np.linalg.solve(changes @ changes.T + np.eye(len(units)) / WIDENING**2, gradient) < NEAR:
+    vectors, sizes, components = np.linalg.svd(changes, full_matrices=False)
+    along = sizes * (components @ residuals)
+    step = vectors @ (along / (sizes**2 + WIDENING**-2))
+    if np.sum(along**2 / (sizes**2 + WIDENING**-2)) < NEAR:
         return estimate
-    wide = copy(problem)
-    wide.joint_prior = _widened(problem, np.sum(changes**2, axis=1) > 1.0)
-    if not np.isfinite(wide.joint_prior.log_prob(estimate.theta)):
-        return estimate
-    density = LogPosterior(wide, estimate.here.simulator, coordinates=NATURAL)
-    objective = Objective(density, bias_correction(problem))
+    factor = np.where(np.sum(changes**2, axis=1) > WIDENING**-2, np.maximum(ALMOST_FLAT, WIDENING * np.abs(step)), 1.0)
+    objective = _almost_flat(problem, estimate, factor)
     first = objective.at(estimate.theta, estimate.here, estimate.noise)
     return estimate if first is None else climb(objective, objective.anchored(first))[0]
 
 
-def _widened(problem: Problem, informed: np.ndarray) -> JointPrior:
-    """Return normal priors, of the logarithm if positive, ALMOST_FLAT times as wide for the parameters (names,) known.
+def _from_elsewhere(problem: Problem, found: Iterate, members: tuple[str, ...]) -> Iterator[Iterate]:
+    """Yield the estimate found, and those from draws of the prior, which is widened for parameters in conflict."""
+    inside = np.isin(problem.names, members)
+    objective = _almost_flat(problem, found, np.where(inside, ALMOST_FLAT, 1.0))
+    yield replace(found, objective=objective.density.objective(found.here, found.noise, objective.share))
+    generator, median = np.random.default_rng(0), problem.joint_prior.median()
+    wide = objective.density.problem.joint_prior
+    for scale, theta in zip(SCALES, problem.joint_prior.sample(len(SCALES), generator), strict=True):
+        factor = scale / ALMOST_FLAT
+        drawn = wide.sample(1, generator)[0]
+        logs = problem.logarithmic & inside
+        theta[inside] = median[inside] + factor * (drawn[inside] - median[inside])
+        theta[logs] = median[logs] * (drawn[logs] / median[logs]) ** factor
+        here = objective.density.linearise(theta)
+        first = objective.iterate(here, found.noise)
+        if first is not None:
+            yield climb(objective, first)[0]
+
+
+def _almost_flat(problem: Problem, near: Iterate, factor: np.ndarray) -> Objective:
+    """Return the objective with the priors widened by factors (names,)."""
+    wide = copy(problem)
+    wide.joint_prior = _widened(problem, factor)
+    density = LogPosterior(wide, near.here.simulator, coordinates=RIDGE)
+    return Objective(density, bias_correction(problem))
+
+
+def _widened(problem: Problem, factor: np.ndarray) -> JointPrior:
+    """Return normal priors, of the logarithm if positive, that are wider by factors (names,); the same where it is 1.
 
     The supports of other parameters than positive ones do not change. A joint prior is widened as a whole.
     """
     prior, blocks = problem.joint_prior, dict[Any, Any]()
     for key, block in prior.blocks.items():
         blocks[key] = block
-        if isinstance(key, tuple):
-            blocks[key] = MultivariateNormal(block.mean, ALMOST_FLAT**2 * block.covariance)
-        elif informed[i := problem.names.index(key)]:
-            centre, width = float(prior.median()[i]), float(ALMOST_FLAT * prior.widths[i])
-            blocks[key] = TruncatedNormal(centre, width, *block.support)
-            if problem.logarithmic[i]:
-                blocks[key] = LogNormal(centre, float(ALMOST_FLAT * prior.log_widths[i]))
+        columns = [problem.names.index(name) for name in (key if isinstance(key, tuple) else (key,))]
+        i, wider = columns[0], float(factor[columns].max())
+        if wider > 1.0 and isinstance(key, tuple):
+            blocks[key] = MultivariateNormal(block.mean, wider**2 * block.covariance)
+        elif wider > 1.0 and problem.logarithmic[i]:
+            blocks[key] = LogNormal(float(prior.median()[i]), float(wider * prior.log_widths[i]))
+        elif wider > 1.0:
+            blocks[key] = TruncatedNormal(float(prior.median()[i]), float(wider * prior.widths[i]), *block.support)
     return JointPrior(prior.names, blocks)
 
 
@@ -165,8 +203,8 @@ def _tested(problem: Problem, estimate: Iterate) -> PriorConflict:
     data = np.where(
         logs, np.where(logs, centre, 1.0) * np.exp(np.where(logs, alone + reach, 0.0)), centre + alone + reach
     )
-    ends = np.array([marginal.quantile(TAILS) for marginal in prior.marginals.values()]).T
-    columns = {"data_low": data[0], "data_high": data[1], "prior_low": ends[0], "prior_high": ends[1], "p": p}
+    given = np.array([marginal.quantile(TAILS) for marginal in prior.marginals.values()]).T
+    columns = {"data_low": data[0], "data_high": data[1], "prior_low": given[0], "prior_high": given[1], "p": p}
     loads = np.abs(vectors[:, tested][:, np.argmax(parts.mean(axis=1))]) if tested.any() else np.zeros(len(p))
     return _summary(pd.DataFrame(columns, index=[*problem.names]), joint, loads)
 
@@ -193,17 +231,19 @@ def _white(problem: Problem, components: Any, estimate: Iterate) -> list[np.ndar
 def _scores(prior: np.ndarray, value: float, sd: np.ndarray) -> np.ndarray:
     """Return the normal scores (n,) of an estimate with the standard deviations (n,) of its error.
 
-    The prior is given by its quantiles at SCORES. The score is that of the tail probability, but not larger than that
-    of the density relative to its maximum: no value within the support of a uniform prior is in conflict with it.
+    The prior is given by its quantiles at SCORES, relative to its median. The score is that of the tail probability,
+    but not larger than that of the density relative to its maximum: no value within the support of a uniform prior is
+    in conflict with it.
     """
-    spread = np.sqrt(sd[:, None] ** 2 + np.gradient(prior) ** 2 / 12.0)
+    spacing = np.gradient(prior)
+    spread, smooth = (np.sqrt(sd[:, None] ** 2 + (share * spacing) ** 2) for share in (12**-0.5, SMOOTHING))
 
     def density(at: float) -> np.ndarray:
-        return np.exp(-0.5 * ((at - prior) / spread) ** 2) / spread @ MASSES
+        return np.exp(-0.5 * ((at - prior) / smooth) ** 2) / smooth @ MASSES
 
     each = (value - prior) / spread
     below, above = (np.maximum(ndtr(sign * each) @ MASSES, SMALLEST) for sign in (1.0, -1.0))
     tail = np.where(below < above, ndtri(below), -ndtri(above))
-    highest = np.max([density(at) for at in prior[PEAKS]], axis=0)
+    highest = np.max([density(at) for at in (0.0, *prior[PEAKS])], axis=0)
     drop = np.sqrt(2.0 * np.log(np.maximum(highest / np.maximum(density(value), SMALLEST * highest), 1.0)))
     return np.sign(tail) * np.minimum(np.abs(tail), drop)

@@ -33,7 +33,7 @@ NOISE_SHARE = 0.1
 LARGEST_SHIFT = 0.1
 SHOWN = 3
 LOST = 1e-6
-# Information of the data, relative to the prior's, below which an estimate at the end of a support is that of the prior.
+# Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
 MOST_UNEXPLAINED = 0.5
 # Value of a field of MapEstimate that is computed at its first use.
@@ -265,8 +265,8 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
         )
     if fit.prior_conflict.text:
         yield (
-            f"{fit.prior_conflict.text}. The estimate is a compromise that neither supports, and the standard deviations "
-            "do not show it. Check the units, the prior and the data, try map_estimate(starts=8), or widen the prior."
+            f"{fit.prior_conflict.text}. The estimate is a compromise that neither supports; its standard deviation "
+            "does not show it. Check units, prior and data, try map_estimate(starts=8), or widen the prior."
         )
     yield from _unexplained(fit)
     silent = [text for text in fit.undetermined if text.endswith(SILENT)]
@@ -284,13 +284,13 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
 
 
 def _unexplained(fit: MapEstimate) -> Iterator[str]:
-    """Yield a warning about channels that the estimate does not explain, unless their noise is measured to be as large."""
+    """Yield a warning about channels that the estimate does not explain, unless most of it is measured noise."""
     for channel, fraction in fit.fvu.items():
         split = fit.noise_split.get(channel)
         if fraction > MOST_UNEXPLAINED and not (split is not None and split.measurement > split.model):
             yield (
-                f"The estimate leaves {fraction:.1%} of the variance of {channel!r} unexplained. If this is not noise, try "
-                "other starts (starts=8) and check the units and the priors."
+                f"The estimate leaves {fraction:.1%} of the variance of {channel!r} unexplained. If this is not noise, "
+                "try other starts (starts=8) and check the units and the priors."
             )
 
 

@@ -74,8 +74,8 @@ def _twice_the_points(equations: PeriodicEquations, z: np.ndarray, theta: np.nda
     states[0] += equations.drift * tau[:, None]
     states[1] += equations.drift * frequency
     inputs = _fourier.on_grid(_fourier.coefficients(equations.inputs.T), points).T
-    columns = (np.ascontiguousarray(c) for c in (np.concatenate(states, axis=1), inputs))
-    return equations.model.kernels.evaluate("residual_jacobian", *columns, theta, tau, frequency)
+    q, u = np.ascontiguousarray(np.concatenate(states, axis=1)), np.ascontiguousarray(inputs)
+    return equations.model.kernels.evaluate("residual_jacobian", q, u, theta, tau, frequency)
 
 
 def _step_on_twice_the_points(solution: PeriodicSolution, z: np.ndarray) -> list[float]:
@@ -258,8 +258,9 @@ class PeriodicSolution(Result):
 
         Richardson extrapolation of the scheme's derivatives, from steps h and 2h on the same grid, is propagated to the
         states by the linearised equations. For the fourier scheme it is the change by a Newton step on twice as many
-        points, a dense system of 2·points·states unknowns. An autonomous model has the error of the frequency [Hz] too. Where smooth signs change within
-        one or two steps, the grid does not resolve the error, and the estimate is far too small.
+        points, a dense system of 2·points·states unknowns. An autonomous model has the error of the frequency [Hz] too.
+        Where smooth signs change within one or two steps, the grid does not resolve the error, and the estimate is far
+        too small.
         """
         if not self.converged:
             return dict.fromkeys(self.states, np.nan)
