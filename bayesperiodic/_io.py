@@ -33,6 +33,7 @@ MODULES = {
     "PoincareSection": "bayesperiodic.orbits.section",
     "Posterior": "bayesperiodic.sampling.posterior",
     "Prediction": "bayesperiodic.diagnostics.predictive",
+    "PriorConflict": "bayesperiodic.estimation.conflict",
     "PriorPredictive": "bayesperiodic.diagnostics.predictive",
     "Profile": "bayesperiodic.estimation.profile",
     "Recording": "bayesperiodic.data.recording",

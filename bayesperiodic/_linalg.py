@@ -9,12 +9,14 @@ from functools import wraps
 from typing import ParamSpec, TypeVar
 
 import numpy as np
+from scipy.linalg import orth
 from threadpoolctl import threadpool_limits
 
 Arguments = ParamSpec("Arguments")
 Value = TypeVar("Value")
 
 TINY = np.finfo(float).tiny
+RANK = 1e-6
 
 
 def scaled(matrix: np.ndarray, units: np.ndarray) -> np.ndarray:
@@ -43,6 +45,15 @@ def covariance_cholesky(covariance: np.ndarray) -> np.ndarray:
     """Return the lower Cholesky factor of a covariance; raise a LinAlgError unless it is positive definite."""
     sd = _standard_deviations(covariance)
     return sd[:, None] * np.linalg.cholesky(covariance / np.outer(sd, sd))
+
+
+def column_space(changes: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis (size, rank) of the span of rows (parameters, size), normalised to unit length."""
+    length = np.linalg.norm(changes, axis=1)
+    rows = changes[length > 0.0] / length[length > 0.0, None]
+    if not rows.size:
+        return np.empty((changes.shape[1], 0))
+    return orth(rows.T, rcond=RANK)
 
 
 def _standard_deviations(covariance: np.ndarray) -> np.ndarray:

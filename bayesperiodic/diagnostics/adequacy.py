@@ -8,15 +8,14 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 from scipy.fft import dct
-from scipy.linalg import orth
 
+from bayesperiodic._linalg import column_space
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.estimation.result import of_periodogram
 from bayesperiodic.posterior.density import Linearisation
 from bayesperiodic.posterior.noise import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
 from bayesperiodic.posterior.problem import Problem
 
-RANK = 1e-6
 ABSORBED = 1e-3
 NOT_TESTED = float("nan")
 
@@ -93,15 +92,6 @@ class Unexplained:
         p = np.where(tested, stats.f.sf(np.nan_to_num(ratio, nan=0.0, posinf=np.inf), freedom, rest), 1.0)
         _, _, power, size = self._sums
         return min(1.0, float(p.min() * tested.sum())), float(self.harmonics[np.argmax(power / size)])
-
-
-def column_space(changes: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (size, rank) of the span of rows (parameters, size), normalised to unit length."""
-    length = np.linalg.norm(changes, axis=1)
-    rows = changes[length > 0.0] / length[length > 0.0, None]
-    if not rows.size:
-        return np.empty((changes.shape[1], 0))
-    return orth(rows.T, rcond=RANK)
 
 
 def excess(variance: float, freedom: float, known: float, known_freedom: float) -> float:

@@ -68,6 +68,8 @@ class Comparison(Result):
         Of the natural values.
     synthetic, converged : bool
         Whether the data are synthetic, and whether the draws have converged.
+    prior_conflict : str
+        Conflict of the prior with the data, in words, which the verdicts on Laplace do not show; "" if there is none.
 
     Examples
     --------
@@ -90,6 +92,7 @@ class Comparison(Result):
     units: dict[str, str]
     synthetic: bool
     converged: bool
+    prior_conflict: str
 
     def __repr__(self) -> str:
         title, short, joint = self._parts(str, str)
@@ -116,7 +119,8 @@ class Comparison(Result):
             pd.DataFrame(columns).set_axis(table["coordinate"].map(text).tolist()),
             f"The 50, 90 and 95% Laplace ellipsoids contain {inside} of the draws; Pareto k̂ is {joint['pareto_k']:.2f} "
             f"± {joint['pareto_k_mcse']:.2f}. Joint verdict: {mark(str(joint['verdict']))}; "
-            f"{text(str(joint['recommendation']))}.",
+            f"{text(str(joint['recommendation']))}."
+            + (f" {text(self.prior_conflict)}." if self.prior_conflict else ""),
         )
 
 
@@ -200,6 +204,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
         units={name: unit(group, name) for name in draws},
         synthetic=bool(posterior.data.attrs.get("synthetic")),
         converged=posterior.converged,
+        prior_conflict=fit.prior_conflict.text,
     )
 
 

@@ -56,7 +56,7 @@ def _structure(
     return analyse_structure(model.name, system.given(known, values | ties), known)
 
 
-POWER = 1.25
+POWER, NOTICEABLE = 1.25, 0.05
 MOST_DRAWS = 20_000
 
 
@@ -118,6 +118,7 @@ def _one_sided(x: np.ndarray, weighted: np.ndarray) -> float:
 
 DETERMINED, PRIOR_ONLY = "determined", "only with the prior"
 COMBINATION, SIGN, NOTHING = "only in combination", "sign undetermined", "not determined"
+CONFLICT = "prior conflict"
 # Standard deviations left by the data alone, in prior sds: the largest one of determined parameters (a contraction of
 # 0.9), and the smallest one of undetermined parameters (1 % of the information of the prior).
 DETERMINED_SD, UNINFORMED_SD = 1.0 / 3.0, 10.0
@@ -204,14 +205,16 @@ def identifiability(
     Widths are those of the draws, or of the Laplace approximation without draws, relative to the prior. The first
     criterion that applies determines the verdict:
 
-    1. "sign undetermined": the size of a signed parameter is determined, but both signs have a probability above 2.5 %
+    1. "prior conflict": the data alone contradict the prior, see `MapEstimate.prior_conflict`; the estimate is a
+       compromise, and its contraction means nothing. With draws, power-scaling confirms it or not.
+    2. "sign undetermined": the size of a signed parameter is determined, but both signs have a probability above 2.5 %
        (by more than three Monte Carlo errors).
-    2. "only with the prior": the profile (Raue et al., Bioinformatics 25 (2009) 1923-1929) ends at the support of the
+    3. "only with the prior": the profile (Raue et al., Bioinformatics 25 (2009) 1923-1929) ends at the support of the
        prior on one side, although the parameter is not collinear with others.
-    3. "not determined": with all other parameters known, the data have less than 1 % of the information of the prior.
-    4. "only in combination": a structural symmetry of the equations contains the parameter, see `structure`.
-    5. "determined": with the other parameters unknown, the data alone leave less than a third of the prior sd.
-    6. "only in combination" if the other parameters increase its sd at least fivefold, otherwise "only with the prior".
+    4. "not determined": with all other parameters known, the data have less than 1 % of the information of the prior.
+    5. "only in combination": a structural symmetry of the equations contains the parameter, see `structure`.
+    6. "determined": with the other parameters unknown, the data alone leave less than a third of the prior sd.
+    7. "only in combination" if the other parameters increase its sd at least fivefold, otherwise "only with the prior".
 
     "not determined" replaces "determined" if an orbit of the estimate is not the measured one
     (`MapEstimate.other_orbits`).
@@ -268,9 +271,10 @@ def identifiability(
     rows = table.to_dict("index")
     for name, row in zip(problem.names, rows.values(), strict=True):
         signed = np.isfinite(row["p_negative"])
-        row["verdict"] = _verdict(row, signed and _size_known(problem, fit, posterior, name))
+        conflict = name in fit.prior_conflict.members
+        row["verdict"] = CONFLICT if conflict else _verdict(row, signed and _size_known(problem, fit, posterior, name))
         both = row["verdict"] == SIGN and abs(fit.theta[name]) > 2.0 * fit.sd[name]
-        row["evidence"] = _evidence(row)
+        row["evidence"] = (_against_the_prior(fit, row) + ", " if conflict else "") + _evidence(row)
         row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments, structure)
         if advice := orbit_advice(fit):
             row["verdict"] = NOTHING if row["verdict"] == DETERMINED else row["verdict"]
@@ -355,6 +359,17 @@ def _verdict(row: dict, size_known: bool) -> str:
     return COMBINATION if row["collinearity"] >= COLLINEAR and row["alone"] < 1.0 else PRIOR_ONLY
 
 
+def _against_the_prior(fit: MapEstimate, row: dict) -> str:
+    text = fit.prior_conflict.text.replace("Prior and data disagree", "prior and data disagree")
+    prior, likelihood = row["prior_sensitivity"], row["likelihood_sensitivity"]
+    if not np.isfinite(prior):
+        return f"{text}, without draws to confirm it"
+    confirmed = "confirmed" if min(prior, likelihood) > NOTICEABLE else "not confirmed"
+    return (
+        f"{text}, {confirmed} by power-scaling ({prior:.2g} and {likelihood:.2g} per doubling of prior and likelihood)"
+    )
+
+
 def _evidence(row: dict) -> str:
     text = f"contraction {row['contraction']:.3g}"
     text += f" ± {row['contraction_mcse']:.2g}" if row["contraction_mcse"] else ""
@@ -370,7 +385,7 @@ def _evidence(row: dict) -> str:
     if np.isfinite(row["p_negative"]):
         text += f", P(negative) = {row['p_negative']:.3g}"
         text += f" ± {row['p_negative_mcse']:.2g}" if row["p_negative_mcse"] else ""
-    if np.isfinite(row["prior_sensitivity"]) and row["prior_sensitivity"] > 0.05:
+    if np.isfinite(row["prior_sensitivity"]) and row["prior_sensitivity"] > NOTICEABLE:
         text += f", sensitive to the prior ({row['prior_sensitivity']:.2g} per doubling)"
     return text
 
@@ -378,6 +393,8 @@ def _evidence(row: dict) -> str:
 def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame, structure: Structure) -> str:
     if row["verdict"] == DETERMINED:
         return ""
+    if row["verdict"] == CONFLICT:
+        return "check units, prior and data, try map_estimate(starts=8), or widen the prior"
     if row["verdict"] == COMBINATION:
         own = directions[[name in members.split(", ") for members in directions["parameters"]]]
         own = own[own["gain"] < UNDETERMINED_GAIN]

@@ -25,8 +25,11 @@ from bayesperiodic.diagnostics.adequacy import (
     adequacy,
     adjusted_p,
 )
+from bayesperiodic.estimation.conflict import prior_conflict
+from bayesperiodic.estimation.gauss_newton import Objective, bias_correction
 from bayesperiodic.periodic import arclength
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
+from bayesperiodic.posterior.density import NATURAL
 from bayesperiodic.posterior.parameters import CHAIN, DRAW
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
@@ -202,6 +205,9 @@ class Prediction(Bands):
         "adequate", or "not tested".
     transient : Transient or None
         Bands of the recordings of `run`.
+    prior_conflict : str
+        Conflict of the prior with the data, in words, "" if there is none. If there is one, the model is tested where
+        the data alone are fitted best, and the amplitude is not tested.
     note : str
         Limitations: misfit that the noise model absorbs, draws that have not converged; "" without any.
     other_orbits : dict of str to str
@@ -219,6 +225,7 @@ class Prediction(Bands):
     transient: Transient | None
     note: str
     other_orbits: dict[str, str]
+    prior_conflict: str
 
     @property
     def verdict(self) -> str:
@@ -227,14 +234,14 @@ class Prediction(Bands):
 
     @property
     def findings(self) -> dict[str, str]:
-        """Rejections in words, by row of the table, and other orbits by experiment."""
+        """Rejections in words, by row of the table; other orbits by experiment; the conflict of prior and data."""
         found = {f"experiment {name}": reason for name, reason in self.other_orbits.items()}
         for (label, row), small in zip(self.table.iterrows(), adjusted_p(self.table) < LEVEL, strict=True):
             if reasons := [f"{REJECTIONS[test]} (p = {row[test]:.2g})" for test in compress(TESTS, small)]:
                 error = row["model_error_share"]
                 text = "" if np.isnan(error) else f"; {error:.1%} of the residual variance is model error"
                 found[str(label)] = f"{', '.join(reasons)}{text}"
-        return found
+        return found | ({"prior conflict": self.prior_conflict} if self.prior_conflict else {})
 
     @property
     def concerns_noise(self) -> bool:
@@ -279,7 +286,7 @@ def predict(
 
     The noise model determines which misfit is detectable. With unknown variance, misfit of any size is taken as noise,
     and only its shape along the period or the scatter of the measured cycles reveals it; circulant noise also absorbs
-    correlated misfit. Only the test of the amplitude can detect a wrong prior.
+    correlated misfit. A conflict of the prior with the data is reported by itself, not as a misfit of the model.
 
     Parameters
     ----------
@@ -342,12 +349,27 @@ def predict(
         raise RuntimeError(
             "posterior: its draw of highest density has no periodic solution. Give draws of this problem."
         )
+    objective = Objective(anchored.with_settings(coordinates=NATURAL), bias_correction(problem))
+    estimate, conflict = objective.iterate(here, np.median(noise, axis=0)), ""
+    if estimate is not None:
+        found, alone = prior_conflict(problem, estimate)
+        conflict = found.text
+        if conflict:
+            # The prior must not count as misfit of the model, which is tested where the data alone are fitted best.
+            here, noise, replicates = alone.here, alone.noise[None], {}
     table = adequacy(problem, here, noise, replicates)
     others = here.other_orbits
     table.loc[table["experiment"].isin([*others, *([ALL] if others else [])]), "verdict"] = MISSPECIFIED
     recorded = None if run is None else _transient(problem, points, run, experiment)
     note = _note(problem, posterior, table)
-    return Prediction(**vars(predicted), table=table, transient=recorded, note=note, other_orbits=others)
+    return Prediction(
+        **vars(predicted),
+        table=table,
+        transient=recorded,
+        note=note,
+        other_orbits=others,
+        prior_conflict=conflict,
+    )
 
 
 def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:

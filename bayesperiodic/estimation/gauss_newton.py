@@ -15,7 +15,7 @@ MAX_HALVINGS = 30
 SCALED_STEP = 1e-8
 SMALL_STEP, SMALL_GAIN = 1e-4, 1e-12
 SINGULAR = 1e-13
-MAX_ROUNDS, PRESSED = 10, 1e-3
+MAX_ROUNDS, PRESSED, LONGEST = 10, 1e-3, 3.0
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def at_ends(objective: Objective, iterate: Iterate) -> np.ndarray:
     """Return −1 or 1 for parameters next to the lower or upper end of their support, 0 for others, (names,)."""
     hessian, _ = objective.hessian_and_gradient(iterate)
     low, high = np.transpose(list(objective.density.problem.joint_prior.supports.values()))
-    near = PRESSED * hessian_scale(hessian)
+    near = PRESSED * np.minimum(hessian_scale(hessian), objective.density.problem.joint_prior.widths)
     return 1.0 * (high - iterate.theta < near) - (iterate.theta - low < near)
 
 
@@ -135,7 +135,7 @@ def _ascend(
         hessian, gradient = objective.hessian_and_gradient(now)
         if not np.isfinite(hessian).all() or not np.isfinite(gradient).all():
             return now, "singular", history
-        step, size = _step(hessian, gradient, held)
+        step, size = _step(_curved(objective, now, hessian), gradient, held)
         if size < SCALED_STEP:
             return now, "converged", history
         damping = 1.0
@@ -155,6 +155,18 @@ def _ascend(
         if size < SMALL_STEP and gain < SMALL_GAIN:
             return now, "converged", history
     return now, "iterations", history
+
+
+def _curved(objective: Objective, iterate: Iterate, hessian: np.ndarray) -> np.ndarray:
+    """Return H, with the curvature of a wide normal prior for parameters that have less.
+
+    Without curvature (a log-normal prior has none at one point) a step would be left out or lead far away. The sd of
+    this prior is three widths of the parameter's own prior, or the distance to its median.
+    """
+    prior = objective.density.problem.joint_prior
+    longest = np.maximum(LONGEST * prior.widths, np.abs(iterate.theta - prior.median()))
+    weak = np.abs(np.diag(hessian)) * longest**2 < 1.0
+    return np.where(np.diag(weak), np.diag(longest**-2.0), hessian) if weak.any() else hessian
 
 
 def _step(hessian: np.ndarray, gradient: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, float]:

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import hessian_eigh, in_one_thread, scaled
+from bayesperiodic.estimation.conflict import prior_conflict
 from bayesperiodic.estimation.covariance import doubling_shift, input_noise, robust_covariance, with_uncertain_noise
 from bayesperiodic.estimation.gauss_newton import (
     SINGULAR,
@@ -35,6 +36,9 @@ SHOWN = 3
 LOST = 1e-6
 # Last iterate, status and objective at each iterate.
 Climb = tuple[Iterate, str, np.ndarray]
+# Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
+INFORMED = 0.01
+MOST_UNEXPLAINED = 0.5
 # Value of a field of MapEstimate that is computed at its first use.
 deferred: Any = partial
 
@@ -90,7 +94,8 @@ def map_estimate(
     UserWarning
         If the noise of the measured inputs causes more than a tenth of an output's residual, if twice as many points
         would move an estimate by more than a tenth of its standard deviation, if an estimate lies at the end of its
-        prior's support, if the data do not determine a parameter or a combination of parameters, and if the orbit of an
+        prior's support, if the prior and the data are in conflict, if more than half of a channel's variance is
+        unexplained, if the data do not determine a parameter or a combination of parameters, and if the orbit of an
         experiment is not the measured one.
 
     References
@@ -213,6 +218,8 @@ def _describe(
     names, likelihood = problem.names, problem.likelihood
     data, _ = information(problem, best)
     solutions = best.here.simulator.solutions(best.theta)
+    acting = np.diag(data) * problem.joint_prior.widths**2 > INFORMED
+    conflict, _ = prior_conflict(problem, best)
     inverse, lost = _inverse(data + problem.joint_prior.curvature(best.theta))
     covariance = with_uncertain_noise(problem, best, inverse).copy()
     shift = doubling_shift(problem, best, solutions, covariance)
@@ -245,8 +252,9 @@ def _describe(
         noise_split=noise_split(problem, best, objective.log_variance_factor),
         input_noise=input_noise(problem, best.theta, solutions),
         doubling_shift=dict(zip(names, shift.tolist(), strict=True)),
-        at_ends=tuple(name for name, end in zip(names, at_ends(objective, best), strict=True) if end),
         other_orbits=best.here.other_orbits,
+        at_ends=tuple(np.array(names)[acting & (at_ends(objective, best) != 0.0)].tolist()),
+        prior_conflict=conflict,
         undetermined=undetermined(data, best.theta, names, problem.logarithmic),
         history=history,
         starts=starts,
@@ -302,6 +310,12 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             f"The estimate of {name!r}, {fit.theta[name]:.6g}, lies at the end of its prior's support ({low:g}, "
             f"{high:g}); standard deviations do not describe the posterior there. Sample it, or widen the prior."
         )
+    if fit.prior_conflict.text:
+        yield (
+            f"{fit.prior_conflict.text}. The estimate is a compromise that neither supports; its standard deviation "
+            "does not show it. Check units, prior and data, try map_estimate(starts=8), or widen the prior."
+        )
+    yield from _unexplained(fit)
     silent = [text for text in fit.undetermined if text.endswith(SILENT)]
     if silent:
         named = ", ".join(repr(text.removesuffix(f": {SILENT}")) for text in silent)
@@ -314,6 +328,17 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             f"The data do not change under {shown}, for any t. In these directions the posterior equals the prior; fix "
             "one of the parameters, or report the combination that does not change."
         )
+
+
+def _unexplained(fit: MapEstimate) -> Iterator[str]:
+    """Yield a warning about channels that the estimate does not explain, unless most of it is measured noise."""
+    for channel, fraction in fit.fvu.items():
+        split = fit.noise_split.get(channel)
+        if fraction > MOST_UNEXPLAINED and not (split is not None and split.measurement > split.model):
+            yield (
+                f"The estimate leaves {fraction:.1%} of the variance of {channel!r} unexplained. If this is not noise, "
+                "try other starts (starts=8) and check the units and the priors."
+            )
 
 
 def _short(name: str) -> str:

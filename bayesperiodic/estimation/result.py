@@ -14,6 +14,7 @@ from scipy.special import stdtrit
 from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse_all
 from bayesperiodic._io import Result
+from bayesperiodic.estimation.conflict import PriorConflict
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.posterior.joint_priors import MultivariateNormal
@@ -141,10 +142,13 @@ class MapEstimate(Result):
     doubling_shift : dict of str to float
         Change of each estimate on twice as many points, in standard deviations; NaN if those solves fail.
     at_ends : tuple of str
-        Parameters whose estimate lies at the end of their prior's support.
+        Parameters that the data act upon and whose estimate lies at the end of their prior's support.
     other_orbits : dict of str to str
         Experiments whose fitted orbit is not the measured one (prime period, turns of angles, or order of the forcing
         periods), with the reason in words.
+    prior_conflict : PriorConflict
+        Test of the prior against the estimate by the data alone, with its p-values and, if there is one, the conflict
+        in words (``text``).
     undetermined : tuple of str
         Changes of parameters, in words, that change no output; in these directions the posterior equals the prior.
     history : array (iterations,)
@@ -188,6 +192,7 @@ class MapEstimate(Result):
     doubling_shift: dict[str, float]
     at_ends: tuple[str, ...]
     other_orbits: dict[str, str]
+    prior_conflict: PriorConflict
     undetermined: tuple[str, ...]
     history: np.ndarray
     starts: tuple[dict[str, float], ...]
@@ -382,6 +387,7 @@ class MapEstimate(Result):
         lines += [
             f"  other orbit than the recorded one in {name!r}: {text}" for name, text in self.other_orbits.items()
         ]
+        lines += [f"  {self.prior_conflict.text}"] if self.prior_conflict.text else []
         lines += [f"  not determined by the data: {text}" for text in self.undetermined]
         return "\n".join(lines)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import circulant
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
@@ -28,7 +29,7 @@ from bayesperiodic.periodic.schemes import CyclicGrid, Scheme
 def estimate_error(solution: PeriodicSolution, z: np.ndarray) -> dict[str, float]:
     """Return `PeriodicSolution.error_estimate` of a converged solution with the periodic part z (points, states)."""
     if np.isinf(solution.scheme.order):
-        return _upper_spectrum(solution, z)
+        return dict(zip([*solution.states, FREQUENCY], _step_on_twice_the_points(solution, z), strict=False))
     grid, frequency = CyclicGrid(solution.scheme, solution.samples, solution.periods), solution.frequency
     defect, slope, derivatives = np.zeros_like(z), np.zeros_like(z), {}
     for order, weights in ((1, grid.first), (2, grid.second)):
@@ -64,14 +65,44 @@ def _respond(
     return [*np.abs(solved[0][0]).max(axis=0).tolist(), abs(float(solved[1][0, 0]))]
 
 
-def _upper_spectrum(solution: PeriodicSolution, z: np.ndarray) -> dict[str, float]:
-    amplitudes = np.abs(_fourier.coefficients(z.T))
-    tails = amplitudes[:, 3 * amplitudes.shape[1] // 4 :].sum(axis=1)
-    result = dict(zip(solution.states, tails.tolist(), strict=True))
-    if solution.autonomous:
-        relative = np.max(tails / np.maximum(np.ptp(z, axis=0), np.finfo(float).tiny))
-        result[FREQUENCY] = solution.frequency * float(relative)
-    return result
+def _twice_the_points(equations: PeriodicEquations, z: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """Return g and ∂g/∂(q, q̇, q̈) of the trigonometric interpolation, (2·points, states·(1 + 3·states))."""
+    grid, frequency, points = equations.grid, equations.frequency, 2 * equations.grid.points
+    amplitudes, tau = _fourier.coefficients(z.T), np.arange(points) / (2 * grid.samples)
+    rates = [_fourier.derivative(amplitudes, frequency / grid.periods, order) for order in range(3)]
+    states = [_fourier.on_grid(rate, points).T for rate in rates]
+    states[0] += equations.drift * tau[:, None]
+    states[1] += equations.drift * frequency
+    inputs = _fourier.on_grid(_fourier.coefficients(equations.inputs.T), points).T
+    q, u = np.ascontiguousarray(np.concatenate(states, axis=1)), np.ascontiguousarray(inputs)
+    return equations.model.kernels.evaluate("residual_jacobian", q, u, theta, tau, frequency)
+
+
+def _step_on_twice_the_points(solution: PeriodicSolution, z: np.ndarray) -> list[float]:
+    """Return the largest change of each state, and of an autonomous model's frequency, by a Newton step there."""
+    (points, count), frequency, autonomous = (2 * len(z), z.shape[1]), solution.frequency, int(solution.autonomous)
+    size = points * count
+    defect, blocks = np.split(solution.twice_the_points, [count], axis=1)
+    fine = _fourier.on_grid(_fourier.coefficients(z.T), points).T
+    harmonics = 2j * np.pi * np.fft.rfftfreq(points, 1.0 / points) / solution.periods
+    square, matrix = np.zeros((points, count, points, count)), np.zeros((size + autonomous, size + autonomous))
+    for order, block in enumerate(np.split(blocks.reshape(points, count, -1), 3, axis=2)):
+        multiplier = harmonics**order * np.where(order == 1, np.arange(points // 2 + 1) < points // 2, 1.0)
+        weights = circulant(np.fft.irfft(multiplier, n=points))
+        square += frequency**order * block[:, :, None] * weights[:, None, :, None]
+        if autonomous and order:
+            rate = weights @ fine
+            matrix[:size, -1] += (order * frequency ** (order - 1) * np.einsum("nes,ns->ne", block, rate)).ravel()
+            matrix[-1, :size] = (rate / np.ptp(fine, axis=0) ** 2).ravel() if order == 1 else matrix[-1, :size]
+    matrix[:size, :size], right = square.reshape(size, size), np.append(-defect, np.zeros(autonomous))
+    largest = np.abs(matrix).max(axis=1)
+    try:
+        step = np.linalg.solve(matrix / largest[:, None], right / largest)
+    except np.linalg.LinAlgError:
+        return [np.nan] * (count + 1)
+    # The interpolation lacks the highest harmonic of an even grid.
+    on_grid = np.abs((fine + step[:size].reshape(points, count))[::2] - z).max(axis=0).tolist()
+    return [*on_grid, abs(float(step[-1]))] if autonomous else on_grid
 
 
 NEWTON = "newton"
@@ -115,6 +146,9 @@ class PeriodicSolution(Result):
         ∂frequency/∂parameter of an autonomous model's orbit; zero for a driven one.
     linearisation : array (points, states, 3·states)
         ∂g/∂(q, q̇, q̈) on the orbit.
+    twice_the_points : array (2·points, states·(1 + 3·states))
+        g and ∂g/∂(q, q̇, q̈) of the trigonometric interpolation of a solution by the fourier scheme, for
+        `error_estimate`; empty for other schemes and unless converged.
     iterations : int
         Newton iterations of the last solve.
     residual : float
@@ -157,6 +191,7 @@ class PeriodicSolution(Result):
     state_sensitivities: dict[str, dict[str, np.ndarray]]
     frequency_sensitivities: dict[str, float]
     linearisation: np.ndarray
+    twice_the_points: np.ndarray
     iterations: int
     residual: float
     history: np.ndarray
@@ -222,9 +257,10 @@ class PeriodicSolution(Result):
         """Return the estimated discretisation error of each state, the largest on the grid.
 
         Richardson extrapolation of the scheme's derivatives, from steps h and 2h on the same grid, is propagated to the
-        states by the linearised equations. For the fourier scheme it is the sum of the amplitudes in the upper quarter
-        of the spectrum. An autonomous model has the error of the frequency [Hz] too. Where smooth signs change within
-        one or two steps, the grid does not resolve the error, and the estimate is far too small.
+        states by the linearised equations. For the fourier scheme it is the change by a Newton step on twice as many
+        points, a dense system of 2·points·states unknowns. An autonomous model has the error of the frequency [Hz] too.
+        Where smooth signs change within one or two steps, the grid does not resolve the error, and the estimate is far
+        too small.
         """
         if not self.converged:
             return dict.fromkeys(self.states, np.nan)
@@ -257,7 +293,7 @@ def describe(
             by_state = _by_name(derivative.states, model.states, names)
             by_parameter = dict(zip(model.parameters, derivative.frequency.tolist(), strict=False))
     states, outputs = equations.states(solved.z), equations.outputs(solved.z, theta)
-    columns = equations.residual_jacobian(solved.z, theta)
+    columns, spectral = equations.residual_jacobian(solved.z, theta), code == CONVERGED and np.isinf(grid.scheme.order)
     return PeriodicSolution(
         model=model.name,
         autonomous=model.autonomous,
@@ -278,6 +314,7 @@ def describe(
         state_sensitivities=by_state,
         frequency_sensitivities=by_parameter,
         linearisation=columns[:, equations.count :].reshape(grid.points, equations.count, -1),
+        twice_the_points=_twice_the_points(equations, solved.z, theta) if spectral else np.empty((0, 0)),
         iterations=len(solved.history),
         residual=equations.scaled_residual(solved.z, theta),
         history=solved.history,

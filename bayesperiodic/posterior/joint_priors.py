@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 from scipy.linalg import solve_triangular
 from scipy.stats.distributions import rv_frozen
 
@@ -305,6 +305,34 @@ class JointPrior:
     def median(self) -> np.ndarray:
         """Return the median of each parameter by itself, (names,)."""
         return np.array([float(prior.quantile(np.array(0.5))) for prior in self.marginals.values()])
+
+    @cached_property
+    def _central(self) -> np.ndarray:
+        """Ends of the central 68 % interval of each parameter by itself, (2, names)."""
+        ends = special.ndtr(np.array([-1.0, 1.0]))
+        return np.array([prior.quantile(ends) for prior in self.marginals.values()]).T
+
+    @property
+    def widths(self) -> np.ndarray:
+        """Half the central 68 % interval of each parameter by itself, (names,)."""
+        return 0.5 * (self._central[1] - self._central[0])
+
+    @property
+    def log_widths(self) -> np.ndarray:
+        """The same of the logarithm, (names,); NaN if parameters may be negative."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return 0.5 * np.log(self._central[1] / self._central[0])
+
+    @cached_property
+    def correlation_root(self) -> np.ndarray:
+        """Lower Cholesky factor of the prior's correlations, (names, names)."""
+        result = np.eye(len(self.names))
+        for key, prior in self.blocks.items():
+            if isinstance(key, tuple):
+                columns = np.array(self._columns[key])
+                root = prior._cholesky / np.sqrt(np.diag(prior.covariance))[:, None]
+                result[columns[:, None], columns] = root
+        return result
 
     def log_prob(self, theta: np.ndarray) -> np.ndarray:
         """Return Σ ln p over the blocks at θ (…, names), shape (…); −inf outside the support."""

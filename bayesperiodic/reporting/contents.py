@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from bayesperiodic import _checks
 from bayesperiodic.diagnostics.adequacy import ADEQUATE, MISSPECIFIED, TESTS, UNTESTED
 from bayesperiodic.diagnostics.comparison import Comparison, compare
-from bayesperiodic.diagnostics.identifiability import DETERMINED, NOTHING, Identifiability, identifiability
+from bayesperiodic.diagnostics.identifiability import CONFLICT, DETERMINED, NOTHING, Identifiability, identifiability
 from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction, predict
 from bayesperiodic.diagnostics.verdicts import FINE, MODE, UNCONVERGED
 from bayesperiodic.estimation.map_estimate import estimation_warnings
@@ -35,7 +35,7 @@ NOT_WHITE, LARGE_RATIO = 0.01, 1.5
 LONGEST, MOST_PANELS = 120, 7
 PACKAGES = ("bayesperiodic", "numpy", "scipy", "sympy", "numba", "emcee", "arviz", "xarray", "matplotlib")
 TONES = dict.fromkeys((FINE, DETERMINED, ADEQUATE), html.GOOD) | {UNTESTED: html.NEUTRAL}
-TONES |= dict.fromkeys((MISSPECIFIED, MODE, UNCONVERGED, NOTHING), html.BAD)
+TONES |= dict.fromkeys((MISSPECIFIED, MODE, UNCONVERGED, NOTHING, CONFLICT), html.BAD)
 
 
 @dataclass(frozen=True)

@@ -305,3 +305,23 @@ def test_estimate_is_read_back_from_its_file(tmp_path):
     assert again.theta == fit.theta and again.noise == fit.noise
     assert again.joint_covariance.equals(fit.joint_covariance)
     assert repr(again) == repr(fit)
+
+
+def test_a_parameter_without_influence_is_at_the_mode_of_its_prior_and_at_no_end():
+    """LogNormal(1, 1) has no curvature at its median, where the iteration starts; its mode is exp(−1)."""
+    tau = np.arange(32) / 32
+    model = bp.Model(
+        "mute",
+        states=["w"],
+        inputs=["x"],
+        parameters=["a", "b"],
+        equations=lambda s, p, u: [s.dw + s.w - u.x],
+        outputs=lambda s, p, u: {"y": p.a * u.x + 1e-9 * p.b * s.w},
+    )
+    x, noise = np.cos(2 * np.pi * tau), 0.02 * np.random.default_rng(1).standard_normal(32)
+    run = bp.Experiment("run", 0.2, {"y": x + noise}, {"x": x}, samples=32)
+    for prior, mode in ((bp.LogNormal(1.0, 1.0), np.exp(-1.0)), (bp.HalfNormal(1.0), 0.0)):
+        priors = {"a": bp.LogNormal(1.0, 1.0), "b": prior}
+        fit = bp.map_estimate(bp.Problem(model, [run], priors=priors, scheme="fourier"), progress=False)
+        assert fit.converged and fit.at_ends == ()
+        assert fit.theta["b"] == pytest.approx(mode, abs=1e-5)

@@ -63,7 +63,9 @@ def test_orbits_of_periods_three_and_five_converge_with_the_backward_scheme(know
     assert solution.multipliers == pytest.approx(np.array(known.multipliers), rel=1e-3)
 
 
-@pytest.mark.parametrize(("scheme", "samples"), [("central2", 200), ("backward2", 400), ("central4", 200)])
+@pytest.mark.parametrize(
+    ("scheme", "samples"), [("central2", 200), ("backward2", 400), ("central4", 200), ("fourier", 12)]
+)
 @pytest.mark.parametrize("known", ROTATIONS, ids=lambda k: f"multiplier {k.multipliers[0]:.3f}")
 def test_error_estimate_is_the_error_of_an_unstable_rotation(known, scheme, samples):
     solution = pendulum_solution(known, samples, scheme)

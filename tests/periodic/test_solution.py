@@ -87,6 +87,20 @@ def test_error_estimate_is_the_error(scheme, samples):
     assert solution.error_estimate()["x"] == pytest.approx(error, rel=0.1)
 
 
+@pytest.mark.parametrize("samples", [10, 13])
+def test_fourier_error_estimate_is_the_error_of_states_of_both_orders(samples):
+    """Two response periods a grid, even and odd numbers of points, against 128 points a forcing period."""
+    force = lambda n: {"force": 20.0 * np.cos(2 * np.pi * np.arange(2 * n) / n)}  # noqa: E731
+    exact, solution = (
+        bp.solve_periodic(COUPLED, COUPLED_AT, force(n), frequency=1.0, samples=n, periods=2, scheme="fourier")
+        for n in (16 * samples, samples)
+    )
+    assert exact.converged and solution.converged
+    for state, estimate in solution.error_estimate().items():
+        error = np.abs(solution.states[state] - exact.states[state][::16]).max()
+        assert 1e-7 < error and estimate == pytest.approx(error, rel=0.1)
+
+
 def test_error_estimate_of_a_failed_solve_is_not_a_number():
     solution = bp.solve_periodic(RUNAWAY, {"a": 1.0}, {"u": np.cos(2 * np.pi * grid(100))}, frequency=1.0, samples=100)
     assert not solution.converged and np.isnan(solution.error_estimate()["x"])
