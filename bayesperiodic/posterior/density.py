@@ -328,7 +328,7 @@ class LogPosterior(SamplingCoordinates):
         """Solve at one θ (names,) from the present anchors, and return residuals and Jacobian there."""
         return Linearisation(theta, self.simulator.anchored(theta), self.comparisons)
 
-    def objective(self, here: Linearisation, noise: np.ndarray, share: float) -> float:
+    def objective(self, here: Linearisation, noise: np.ndarray, share: float | np.ndarray) -> float:
         """Return the log-density over the coordinates where all solves have converged.
 
         The logarithms of the variances in the likelihood are multiplied by `share`, see `Likelihood.__call__`.

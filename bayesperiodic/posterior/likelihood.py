@@ -190,30 +190,37 @@ class Likelihood:
             if not self.model.has_constant_prior(kind)
         ]
 
-    def __call__(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float = 1.0) -> np.ndarray:
+    def __call__(
+        self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float | np.ndarray = 1.0
+    ) -> np.ndarray:
         """Return the log-likelihood (…,) of residuals, one (…, size) a block, at values (…, names).
 
-        The logarithms of the variances are multiplied by `share`: 1 − l/Σn for the bias correction of eq. (7).
+        The logarithms of the variances are multiplied by `share`, one for all blocks or one each: the bias correction
+        of eq. (7), see `gauss_newton.bias_correction`.
         """
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             total = (self._flat if self.model.flat else self._by_kind)(residuals, values, share)
         return np.where(np.isfinite(total), total, -np.inf)
 
-    def _by_kind(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
+    def _by_kind(
+        self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float | np.ndarray
+    ) -> np.ndarray:
         """Return the log-likelihood (…,) of errors whose spectrum is not flat, alike blocks together."""
         total = np.zeros(values.shape[:-1])
         for members in self._alike:
             own = values[..., self._columns[members[0]]]
-            total = total + self._together([residuals[b] for b in members], self.blocks[members[0]], own, share)
+            factor = share if isinstance(share, float) else float(share[members[0]])
+            total = total + self._together([residuals[b] for b in members], self.blocks[members[0]], own, factor)
         return total
 
-    def _flat(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float) -> np.ndarray:
+    def _flat(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float | np.ndarray) -> np.ndarray:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, known, columns, sizes, weights, measured = self._levels
         squares = Residuals.of(residuals).squares
         v = self.model.level(values[..., columns], measured)
         # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
-        terms = np.ascontiguousarray(weights * (share * sizes * np.log(v) + squares[..., at] / v))
+        own = share if isinstance(share, float) else share[at]
+        terms = np.ascontiguousarray(weights * (own * sizes * np.log(v) + squares[..., at] / v))
         total = np.add.reduce(terms, axis=-1)
         if known.size:
             total = total + np.add.reduce(np.ascontiguousarray(squares[..., known]), axis=-1)
@@ -374,12 +381,12 @@ TINY = np.finfo(float).tiny
 
 
 def estimate_noise(
-    likelihood: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, share: float
+    likelihood: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, shares: float | np.ndarray
 ) -> np.ndarray:
     """Return the noise parameters (names,) that fit residuals best, one array (size,) a block, from a start.
 
     For independent errors with the prior 1/v this is eq. (7) of [1]_, v = Σe²/(n·share); otherwise it maximises the
-    log-likelihood, its logarithms multiplied by `share`, plus the log-prior.
+    log-likelihood, its logarithms multiplied by the shares as in `Likelihood.__call__`, plus the log-prior.
 
     References
     ----------
@@ -390,7 +397,7 @@ def estimate_noise(
     for group, members in likelihood.groups():
         if not set(group) & set(likelihood.free):
             continue
-        blocks = [likelihood.blocks[b] for b in members]
+        blocks, share = [likelihood.blocks[b] for b in members], np.broadcast_to(shares, len(residuals))[members[0]]
         chosen = [residuals[b] for b in members]
         total = sum(block.weight * float(r @ r) for block, r in zip(blocks, chosen, strict=True))
         count = sum(block.count for block in blocks)
@@ -402,7 +409,7 @@ def estimate_noise(
             continue
         held = {name: values[i] for name, i in zip(group, columns, strict=True) if name in likelihood.fixed}
         part = Likelihood(likelihood.model, blocks, held)
-        values[columns] = _maximise(part, chosen, values[columns], max(total / count, TINY), share)
+        values[columns] = _maximise(part, chosen, values[columns], max(total / count, TINY), float(share))
     return values
 
 
