@@ -144,7 +144,7 @@ def rank_candidates(
     now, rows = np.sqrt(np.diag(np.linalg.inv(before))), []
     for candidate in candidates:
         _checks.one_of("candidates", candidate.run, runs)
-        after = before + _added(problem, fit, information, runs[candidate.run], candidate) * unit
+        after = before + _added(problem, fit, runs[candidate.run], candidate) * unit
         row: dict[str, object] = {**candidate._asdict(), "gain": np.nan}
         if np.isfinite(after).all():
             row["gain"] = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1])
@@ -154,10 +154,8 @@ def rank_candidates(
     return table.sort_values("gain", ascending=False, na_position="last", ignore_index=True)
 
 
-def _added(
-    problem: Problem, fit: MapEstimate, information: Information, run: Experiment, candidate: Candidate
-) -> np.ndarray:
-    """Return the information of a candidate in the coordinates of `information`; NaN without an orbit."""
+def _added(problem: Problem, fit: MapEstimate, run: Experiment, candidate: Candidate) -> np.ndarray:
+    """Return the information of a candidate in the coordinates of `Information`; NaN without an orbit."""
     inputs = {name: u.mean() + candidate.scale * (u - u.mean()) for name, u in run.inputs.items()}
     planned = problem.planned(replace(run, frequency=candidate.frequency, inputs=inputs), fit.noise)
     with warnings.catch_warnings():

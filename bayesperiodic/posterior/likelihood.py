@@ -202,9 +202,7 @@ class Likelihood:
             total = (self._flat if self.model.flat else self._by_kind)(residuals, values, share)
         return np.where(np.isfinite(total), total, -np.inf)
 
-    def _by_kind(
-        self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float | np.ndarray
-    ) -> np.ndarray:
+    def _by_kind(self, residuals: Sequence[np.ndarray], values: np.ndarray, share: float | np.ndarray) -> np.ndarray:
         """Return the log-likelihood (…,) of errors whose spectrum is not flat, alike blocks together."""
         total = np.zeros(values.shape[:-1])
         for members in self._alike:

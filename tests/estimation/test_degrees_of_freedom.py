@@ -51,7 +51,7 @@ def fitted(model: bp.Model, run: bp.Experiment, priors=FLAT, **changes) -> tuple
 
 
 def parts(model: bp.Model, fit: bp.MapEstimate, harmonics: tuple[int, int]) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return the information of each channel from its regressors, and the covariance of the parameters without prior."""
+    """Return the information of each channel from its regressors, and the covariance without priors."""
     found = []
     for channel, highest, design in zip("AB", harmonics, DESIGNS[model], strict=True):
         columns = within(design, highest) * np.sqrt((2 * highest + 1) / POINTS)
