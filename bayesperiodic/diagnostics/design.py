@@ -40,7 +40,8 @@ class Information:
         theta, logs = problem.vector(fit.theta), problem.logarithmic
         guesses = {e.name: fit.solutions[e.name].states for e in problem.experiments}
         here = problem.anchored(theta, guesses).density().linearise(theta)
-        changes = problem.likelihood.whitened(here.changes, problem.noise_values(fit.noise))
+        noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
+        changes = problem.likelihood.whitened(here.changes, noise)
         slopes = np.where(logs, theta, 1.0)
         design = np.concatenate(changes, axis=1) * slopes[:, None]
         ends = [

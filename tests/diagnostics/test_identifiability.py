@@ -154,7 +154,9 @@ def test_candidate_experiment_adds_the_information_of_a_real_one(linear):
     assert louder["scale"] == 2.0 and louder["k"] < again["k"] and louder["c"] < again["c"]
 
 
-@pytest.mark.parametrize("noise", ["independent", "circulant"])
+@pytest.mark.parametrize(
+    "noise", ["independent", "circulant", bp.noise.Independent(per="experiment", prior=bp.InverseGamma(2, 1e-4))]
+)
 @pytest.mark.parametrize("harmonics", [1, 3, 9])
 def test_repeated_runs_add_exactly_their_present_information(harmonics, noise):
     """Duffing's third harmonic tells much about k3, but nothing where only the first is kept."""
