@@ -451,7 +451,7 @@ def _laplace_cdf(fit: MapEstimate, truth: dict[str, float]) -> dict[str, float]:
         for name, value in truth.items():
             if name in fit.theta:
                 distance = (value - fit.theta[name]) / fit.sd[name]
-                found[name] = float(stdtr(min(fit.degrees_of_freedom, 1e9), distance))
+                found[name] = float(stdtr(min(fit.degrees_of_freedom[name], 1e9), distance))
             else:
                 sd = np.sqrt(fit.joint_covariance[name].to_dict()[name])
                 found[name] = float(ndtr(np.log(value / fit.joint_mode[name]) / sd))

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -14,7 +14,6 @@ from bayesperiodic import _checks
 from bayesperiodic._linalg import hessian_eigh
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.estimation.result import MapEstimate
-from bayesperiodic.periodic.solve import solve_periodic
 from bayesperiodic.posterior.problem import Problem
 
 ONE_SD = float(ndtr(1.0))
@@ -39,9 +38,10 @@ class Information:
     def of(cls, problem: Problem, fit: MapEstimate) -> "Information":
         """Compute the information at an estimate with known noise parameters."""
         theta, logs = problem.vector(fit.theta), problem.logarithmic
-        guesses = {name: solution.states for name, solution in fit.solutions.items()}
+        guesses = {e.name: fit.solutions[e.name].states for e in problem.experiments}
         here = problem.anchored(theta, guesses).density().linearise(theta)
-        changes = problem.likelihood.whitened(here.changes, problem.noise_values(fit.noise))
+        noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
+        changes = problem.likelihood.whitened(here.changes, noise)
         slopes = np.where(logs, theta, 1.0)
         design = np.concatenate(changes, axis=1) * slopes[:, None]
         ends = [
@@ -135,16 +135,17 @@ def rank_candidates(
 ) -> pd.DataFrame:
     """Return the expected gain [nats] of each candidate and the ratio of each sd after it to the present one.
 
-    The noise is assumed white with the estimated variances, with as many independent values as in the run; the orbit is
-    the one found from that of the run as the initial guess. Candidates without an orbit have NaN. Columns: run,
-    frequency, scale, gain and one per parameter; the most informative first.
+    A candidate is compared as its run is, within the same harmonics, with the same noise and as many independent
+    values, so that a repeated run adds its present information; the orbit is the one found from that of the run as the
+    initial guess. Candidates without an orbit have NaN. Columns: run, frequency, scale, gain and one per parameter; the
+    most informative first.
     """
     runs, unit = {e.name: e for e in problem.experiments}, np.outer(information.prior_sd, information.prior_sd)
     before = information.matrix * unit + np.eye(len(unit))
     now, rows = np.sqrt(np.diag(np.linalg.inv(before))), []
     for candidate in candidates:
         _checks.one_of("candidates", candidate.run, runs)
-        after = before + _added(problem, fit, information, runs[candidate.run], candidate) * unit
+        after = before + _added(problem, fit, runs[candidate.run], candidate) * unit
         row: dict[str, object] = {**candidate._asdict(), "gain": np.nan}
         if np.isfinite(after).all():
             row["gain"] = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1])
@@ -154,35 +155,11 @@ def rank_candidates(
     return table.sort_values("gain", ascending=False, na_position="last", ignore_index=True)
 
 
-def _added(
-    problem: Problem, fit: MapEstimate, information: Information, run: Experiment, candidate: Candidate
-) -> np.ndarray:
-    """Return the information of a candidate in the coordinates of `information`; NaN without an orbit."""
-    theta, parameter_map = problem.vector(fit.theta), problem.parameter_maps[run.name]
-    values = parameter_map.values(theta[None])[0]
+def _added(problem: Problem, fit: MapEstimate, run: Experiment, candidate: Candidate) -> np.ndarray:
+    """Return the information of a candidate in the coordinates of `Information`; NaN without an orbit."""
     inputs = {name: u.mean() + candidate.scale * (u - u.mean()) for name, u in run.inputs.items()}
+    planned = problem.planned(replace(run, frequency=candidate.frequency, inputs=inputs), fit.noise)
     with warnings.catch_warnings():
         # The estimate has already warned about a coarse grid.
         warnings.simplefilter("ignore", UserWarning)
-        solution = solve_periodic(
-            problem.model,
-            dict(zip(problem.model.parameters, values.tolist(), strict=False)),
-            inputs,
-            frequency=candidate.frequency,
-            samples=run.samples,
-            scheme=problem.scheme,
-            periods=run.periods,
-            winding=run.winding,
-            guess=fit.solutions[run.name].states,
-        )
-    if not solution.converged:
-        return np.full((theta.size, theta.size), np.nan)
-    slopes = parameter_map.slopes(theta)[:-1] * np.where(information.logarithmic, information.theta, 1.0)
-    variances = problem.likelihood.value_variances(problem.noise_values(fit.noise)[None])
-    total = np.zeros((theta.size, theta.size))
-    for channel in run.outputs:
-        if (run.name, channel) in variances:
-            changes = slopes.T @ np.stack([solution.sensitivities[channel][n] for n in problem.model.parameters])
-            weight = run.independent[channel] / changes.shape[1] / float(variances[run.name, channel][0])
-            total += weight * changes @ changes.T
-    return total
+        return Information.of(planned, fit).matrix

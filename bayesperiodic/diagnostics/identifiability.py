@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 import pandas as pd
 import sympy as sp
-from scipy.special import ndtr, softmax
+from scipy.special import ndtr, softmax, stdtr
 
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
@@ -326,7 +326,7 @@ def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, n
     if not low < 0.0 < high:
         return np.nan, np.nan
     if posterior is None:
-        return float(ndtr(-fit.theta[name] / fit.sd[name])), 0.0
+        return float(stdtr(min(fit.degrees_of_freedom[name], 1e9), -fit.theta[name] / fit.sd[name])), 0.0
     share = float(np.mean(posterior.draws(name) < 0.0))
     size = posterior.ess[name]
     bounded = np.clip(share, 1.0 / (size + 2.0), 1.0 - 1.0 / (size + 2.0))

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import compress, islice
 
 import numpy as np
@@ -349,8 +349,11 @@ def predict(
         raise RuntimeError(
             "posterior: its draw of highest density has no periodic solution. Give draws of this problem."
         )
-    objective = Objective(anchored.with_settings(coordinates=NATURAL), bias_correction(problem))
-    estimate, conflict = objective.iterate(here, np.median(noise, axis=0)), ""
+    objective, conflict = Objective(anchored.with_settings(coordinates=NATURAL)), ""
+    estimate = objective.iterate(here, np.median(noise, axis=0))
+    if estimate is not None:
+        objective = replace(objective, log_variance_factor=bias_correction(problem, estimate))
+        estimate = objective.iterate(here, estimate.noise)
     if estimate is not None:
         found, alone = prior_conflict(problem, estimate)
         conflict = found.text

@@ -149,7 +149,7 @@ def _almost_flat(problem: Problem, near: Iterate, factor: np.ndarray) -> Objecti
     wide = copy(problem)
     wide.joint_prior = _widened(problem, factor)
     density = LogPosterior(wide, near.here.simulator, coordinates=RIDGE)
-    return Objective(density, bias_correction(problem))
+    return Objective(density, bias_correction(wide, near))
 
 
 def _widened(problem: Problem, factor: np.ndarray) -> JointPrior:

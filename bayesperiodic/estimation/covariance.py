@@ -1,18 +1,19 @@
 """Diagnostics of an estimate: robust covariance, uncertain noise parameters, discretisation, noise of the inputs."""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from bayesperiodic import _fourier
 from bayesperiodic._linalg import TINY, covariance_eigh, hessian_scale, scaled
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.estimation.gauss_newton import Iterate, information
+from bayesperiodic.estimation.gauss_newton import Iterate, changes_by_variance, information
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.equations import PeriodicEquations, input_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 from bayesperiodic.periodic.solve import solve_driven, solve_free
-from bayesperiodic.posterior.noise import LENGTHSCALE, SPECTRAL, Block
+from bayesperiodic.posterior.noise import LENGTHSCALE, SPECTRAL, VARIANCE, Block
 from bayesperiodic.posterior.observation import Response
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import orbit_multipliers
@@ -22,6 +23,8 @@ LENGTHSCALES = np.geomspace(1e-3, 3.0, 40)
 WHITE = 0.5
 ROUNDS, SETTLED = 10, 1e-3
 RIDGE = 1e-12
+# Change of the logarithm of a variance in a difference.
+STEP = 1e-4
 
 
 def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarray) -> np.ndarray:
@@ -126,28 +129,105 @@ def _excess(freedom: np.ndarray) -> np.ndarray:
     return np.maximum(freedom, 1.0) / np.maximum(freedom - 2.0, 1.0)
 
 
+class VariancePart(NamedTuple):
+    """Part of the covariance C of θ (names, names) that an unknown variance is responsible for.
+
+    With F the information of the values behind it, `once` is C F C, `twice` C F C F C; `left` are the values that the
+    estimate of θ does not take up, `freedom` these and what the prior of the variance is worth.
+    """
+
+    once: np.ndarray
+    twice: np.ndarray
+    left: float
+    freedom: float
+
+
+def variance_parts(
+    problem: Problem, estimate: Iterate, inverse: np.ndarray, log_variance_factor: float | np.ndarray
+) -> dict[str, VariancePart]:
+    """Return the part of each unknown variance; `inverse` is C, the factor what `bias_correction` returns."""
+    likelihood, parts = problem.likelihood, {}
+    changes = changes_by_variance(problem, estimate)
+    factors = np.broadcast_to(log_variance_factor, len(likelihood.blocks))
+    for (name, *_), members in likelihood.groups():
+        if (own := changes.get(name)) is not None:
+            moved, left = inverse @ own, likelihood.counts[name] * float(factors[members[0]])
+            once, freedom = moved @ moved.T, max(left + _worth(problem, estimate, name), 1.0)
+            parts[name] = VariancePart(once, (once @ own) @ moved.T, max(left, 1.0), freedom)
+    return parts
+
+
+def degrees_of_freedom(inverse: np.ndarray, parts: Mapping[str, VariancePart]) -> np.ndarray:
+    """Return the degrees of freedom of Student's t of each parameter (names,), by Satterthwaite's approximation [1]_.
+
+    The variance of θ_i, the diagonal of C, is the sum of the parts of all unknown variances, and of what known
+    variances and the prior are responsible for. An estimate from ν values has its relative uncertainty √(2/ν).
+
+    References
+    ----------
+    .. [1] F. E. Satterthwaite, An approximate distribution of estimates of variance components, Biometrics Bulletin 2
+       (1946) 110-114.
+    """
+    uncertain = np.zeros(len(inverse))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for part in parts.values():
+            uncertain += np.nan_to_num(np.diag(part.once) / np.diag(inverse)) ** 2 / part.freedom
+        return 1.0 / uncertain
+
+
+def _worth(problem: Problem, estimate: Iterate, variance: str) -> float:
+    """Return how many values the prior of a variance is worth: 2a for InverseGamma(a, b), −2 for the flat one.
+
+    It is −2 ∂²/∂(ln v)² of −½(n − p) ln v − ½ M/v + ln p(v) at its maximum, less n − p.
+    """
+    likelihood, noise = problem.likelihood, problem.noise
+    if not noise.proper:
+        return -float(noise.spare)
+    ends = estimate.noise[likelihood.names.index(variance)] * np.exp(np.array([-STEP, STEP]))
+    slopes = noise.log_prior(VARIANCE, ends, likelihood.measured[variance])[1]
+    return -float(slopes.sum() + (slopes[1] - slopes[0]) / STEP)
+
+
 # Values tried of the first parameter of a spectrum's shape and of any other, between these quantiles of their priors.
 MANY, FEW = 60, 9
 TAIL = 0.005
 UPDATES, JITTER = 3, 1e-12
 
 
-def with_uncertain_noise(problem: Problem, estimate: Iterate, covariance: np.ndarray) -> np.ndarray:
-    """Return the covariance of θ (names, names) with the shape of the noise spectrum integrated out.
+def with_uncertain_noise(
+    problem: Problem, estimate: Iterate, covariance: np.ndarray, parts: Mapping[str, VariancePart]
+) -> np.ndarray:
+    """Return the covariance of θ (names, names) with uncertain noise parameters, `parts` those of the variances.
 
-    If variances alone are unknown, the covariance is kept: Student's t accounts for them. Otherwise θ is estimated
-    again by linear least squares for shapes from the whole support of their prior. Their posterior is that of the
-    restricted likelihood (Harville, see `robust_covariance`), with θ integrated out; the covariance is that of the
-    mixture about the estimate. The changes of the covariance by several channels are added.
+    Unknown variances make the weights of the channels and of the prior uncertain, which increases the covariance by
+    4 (C F C − C F C F C)/ν each [1]_, nothing where the values behind one variance determine θ alone; Student's t
+    accounts for the rest. For unknown shapes of the spectrum θ is estimated again by linear least squares for shapes
+    from the whole support of their prior. Their posterior is that of the restricted likelihood (Harville, see
+    `robust_covariance`), with θ integrated out; the covariance is that of the mixture about the estimate. The changes
+    of the covariance by several channels are added.
+
+    References
+    ----------
+    .. [1] M. G. Kenward, J. H. Roger, Small sample inference for fixed effects from restricted maximum likelihood,
+       Biometrics 53 (1997) 983-997.
     """
     shaped = [group for group in problem.likelihood.groups() if _is_shaped(problem, *group)]
-    if not shaped or not np.all(np.diag(covariance) > 0.0):
+    if not np.all(np.diag(covariance) > 0.0):
         return covariance
-    total = information(problem, estimate)[0] + problem.joint_prior.curvature(estimate.theta)
     result = covariance.copy()
+    for part in parts.values():
+        result += 4.0 / part.freedom * _without_negative(part.once - part.twice, covariance)
+    if not shaped:
+        return result
+    total = information(problem, estimate)[0] + problem.joint_prior.curvature(estimate.theta)
     for group, members in shaped:
-        result += _mixture(problem, estimate, total, covariance, group, members) - covariance
-    values, vectors, sd = covariance_eigh(result, np.sqrt(np.diag(covariance)))
+        result += _mixture(problem, estimate, total, covariance, (group, members, parts[group[0]].left)) - covariance
+    return _without_negative(result, covariance)
+
+
+def _without_negative(matrix: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return a symmetric matrix (names, names) in units of a covariance without its negative eigenvalues."""
+    values, vectors, sd = covariance_eigh(matrix, np.sqrt(np.diag(covariance)))
     return scaled((vectors * np.maximum(values, 0.0)) @ vectors.T, sd)
 
 
@@ -163,10 +243,13 @@ def _mixture(
     estimate: Iterate,
     hessian: np.ndarray,
     covariance: np.ndarray,
-    group: tuple[str, ...],
-    members: list[int],
+    shaped: tuple[tuple[str, ...], list[int], float],
 ) -> np.ndarray:
-    """Return the covariance of the mixture over the noise parameters of one group, the others fixed."""
+    """Return the covariance of the mixture over the noise parameters of one group, the others fixed.
+
+    `shaped` are these parameters, the indices of their blocks, and the values that determine the variance.
+    """
+    group, members, freedom = shaped
     likelihood, blocks = problem.likelihood, [problem.likelihood.blocks[b] for b in members]
     scale = np.sqrt(np.diag(covariance))
     s = np.concatenate([estimate.here.changes[b] for b in members], axis=1) * scale[:, None]
@@ -175,7 +258,7 @@ def _mixture(
     here = estimate.noise[[likelihood.names.index(name) for name in group]]
     now = weight / _spectra(problem, blocks, here)
     others = scaled(hessian, scale) - (s * now) @ s.T + JITTER * np.eye(scale.size)
-    pull, freedom = -(s * now) @ r, max(float(weight.sum()) - len(problem.names), 1.0)
+    pull = -(s * now) @ r
     points, log_prior = _points(problem)
     log_posterior, found = np.empty(len(points)), np.empty((len(points), *covariance.shape))
     for i, shape in enumerate(_spectra(problem, blocks, np.column_stack([np.ones(len(points)), points]))):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesperiodic._linalg import hessian_eigh, hessian_scale
+from bayesperiodic._linalg import hessian_eigh, hessian_scale, scaled
 from bayesperiodic.posterior.density import Linearisation, LogPosterior
 from bayesperiodic.posterior.description import Description
 from bayesperiodic.posterior.likelihood import estimate_noise
@@ -16,6 +16,9 @@ SCALED_STEP = 1e-8
 SMALL_STEP, SMALL_GAIN = 1e-4, 1e-12
 SINGULAR = 1e-13
 MAX_ROUNDS, PRESSED, LONGEST = 10, 1e-3, 3.0
+LOST = 1e-6
+# Change of the factors that ends the correction, and the largest part of its values that parameters may take up.
+SETTLED, MOST_TAKEN = 1e-6, 0.99
 
 
 @dataclass(frozen=True)
@@ -32,12 +35,12 @@ class Iterate:
 class Objective:
     """Density that the iteration maximises over θ, with the best noise parameters at every θ.
 
-    The logarithms of the variances are multiplied by `log_variance_factor`: their best values are those of eq. (7) for
-    1 − l/Σn, and those of eq. (6) for 1.
+    The logarithms of the variances are multiplied by `log_variance_factor`, one or (blocks,): their best values are
+    those of eq. (6) for 1, and those of eq. (7) for `bias_correction`.
     """
 
     density: LogPosterior
-    log_variance_factor: float
+    log_variance_factor: float | np.ndarray = 1.0
 
     def at(self, theta: np.ndarray, near: Linearisation, noise: np.ndarray) -> Iterate | None:
         """Return the iterate at θ, solved from the anchors of a near one; None if the log-posterior is not finite."""
@@ -81,10 +84,74 @@ def information(problem: Description, iterate: Iterate) -> tuple[np.ndarray, np.
     return changes @ changes.T, changes @ residuals
 
 
-def bias_correction(problem: Description) -> float:
-    """Return 1 − l/Σn, for which the variances of the first stage are those of eq. (7); 1 if that is not positive."""
-    factor = 1.0 - len(problem.names) / problem.counted if problem.counted else 1.0
-    return factor if factor > 0.0 else 1.0
+def inverse_hessian(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inverse of H without its directions of no curvature, and which parameters belong to these."""
+    values, vectors, scale = hessian_eigh(hessian)
+    curved = np.abs(values) > SINGULAR * np.abs(values).max()
+    inverse = scaled((vectors[:, curved] / values[curved]) @ vectors[:, curved].T, scale)
+    return inverse, np.any(np.abs(vectors[:, ~curved]) > LOST, axis=1)
+
+
+def changes_by_variance(problem: Description, iterate: Iterate) -> dict[str, np.ndarray]:
+    """Return the whitened Jacobian (names, components) of the values behind each unknown variance, by its name."""
+    changes = problem.likelihood.whitened(iterate.here.changes, iterate.noise)
+    return {
+        group[0]: np.concatenate([changes[b] for b in members], axis=1)
+        for group, members in problem.likelihood.groups()
+        if group[0] in problem.free_noise
+    }
+
+
+def bias_correction(problem: Description, iterate: Iterate) -> np.ndarray:
+    """Return 1 − p/n of each block's variance (blocks,), for which the variances are those of eq. (7).
+
+    Of the n values behind a variance the estimate of θ takes up p = tr(F C), with F their part of the information and
+    C the inverse of H of eq. (8). Without priors the p of all variances sum to the number of parameters l; they are
+    l/s each, as in eq. (7), where all s channels tell the same. The maximum over the variances is then that of the
+    density with θ integrated out [1]_.
+
+    References
+    ----------
+    .. [1] D. A. Harville, Maximum likelihood approaches to variance component estimation and to related problems,
+       Journal of the American Statistical Association 72 (1977) 320-338.
+    """
+    likelihood = problem.likelihood
+    result = np.ones(len(likelihood.blocks))
+    hessian = information(problem, iterate)[0] + problem.joint_prior.curvature(iterate.theta)
+    if not np.isfinite(hessian).all():
+        return result
+    inverse, _ = inverse_hessian(hessian)
+    changes = changes_by_variance(problem, iterate)
+    for group, members in likelihood.groups():
+        if (own := changes.get(group[0])) is not None:
+            taken = float(np.sum(own * (inverse @ own))) / likelihood.counts[group[0]]
+            result[members] = 1.0 - np.clip(taken, 0.0, MOST_TAKEN)
+    return result
+
+
+def corrected(
+    objective: Objective,
+    found: tuple[Iterate, str, np.ndarray],
+    report: Callable[[Iterate, float], None] | None = None,
+) -> tuple[Objective, tuple[Iterate, str, np.ndarray]]:
+    """Climb again from the end of a climb with `bias_correction` at each new end, until its factors settle.
+
+    Returns the last objective, and what `climb` returns; earlier values in the history are shifted so that it goes on
+    where the objective changes.
+    """
+    now, status, history = found
+    for _ in range(MAX_ROUNDS):
+        factor = bias_correction(objective.density.problem, now)
+        if np.all(np.abs(factor - objective.log_variance_factor) < SETTLED):
+            break
+        other = replace(objective, log_variance_factor=factor)
+        start = other.iterate(now.here, now.noise)
+        if start is None:
+            break
+        objective = other
+        now, status, more = climb(objective, start, report=report)
+        history = np.concatenate([history + (start.objective - history[-1]), more[1:]])
+    return objective, (now, status, history)
 
 
 def climb(

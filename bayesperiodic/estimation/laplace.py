@@ -22,7 +22,7 @@ def joint_laplace(density: LogPosterior, start: Iterate) -> tuple[dict[str, floa
     together, because each experiment depends on its own only. Returns the mode (natural values) and the covariance of
     the sampling coordinates, see `MapEstimate.joint_covariance`.
     """
-    problem, objective = density.problem, Objective(density, 1.0)
+    problem, objective = density.problem, Objective(density)
     first = objective.at(start.theta, start.here, start.noise)
     labels = [*problem.names, *problem.free_noise]
     covariance = pd.DataFrame(np.full((len(labels), len(labels)), np.nan), index=labels, columns=labels)

@@ -10,17 +10,24 @@ import pandas as pd
 from tqdm import tqdm
 
 from bayesperiodic import _checks
-from bayesperiodic._linalg import hessian_eigh, in_one_thread, scaled
+from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.estimation.conflict import prior_conflict
-from bayesperiodic.estimation.covariance import doubling_shift, input_noise, robust_covariance, with_uncertain_noise
+from bayesperiodic.estimation.covariance import (
+    degrees_of_freedom,
+    doubling_shift,
+    input_noise,
+    robust_covariance,
+    variance_parts,
+    with_uncertain_noise,
+)
 from bayesperiodic.estimation.gauss_newton import (
-    SINGULAR,
     Iterate,
     Objective,
     at_ends,
-    bias_correction,
     climb,
+    corrected,
     information,
+    inverse_hessian,
 )
 from bayesperiodic.estimation.laplace import SILENT, joint_laplace, undetermined
 from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, noise_split
@@ -33,7 +40,6 @@ from bayesperiodic.posterior.simulator import Simulator
 NOISE_SHARE = 0.1
 LARGEST_SHIFT = 0.1
 SHOWN = 3
-LOST = 1e-6
 # Last iterate, status and objective at each iterate.
 Climb = tuple[Iterate, str, np.ndarray]
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
@@ -53,13 +59,16 @@ def map_estimate(
 
     .. math::
 
-        v_\beta = \frac{M_\beta}{n_\beta \, (1 - l / \sum_\beta n_\beta)},
+        v_\beta = \frac{M_\beta}{n_\beta - p_\beta}, \qquad p_\beta = \mathrm{tr}(F_\beta C),
 
-    for l parameters, which is s·Σe²/(nNs − l) for equal counts, and then updates θ by eq. (8). As printed, its
-    right-hand side lacks the prior's gradient (θ̄ − θ)/σ², without which the iteration would not end at a maximum of
-    eq. (6); it is added. The parameters of other noise models are found by maximising the same objective. Steps are
-    halved until the objective, eq. (6) with nN replaced by nN − l/s, increases. Where convex log-priors outweigh the
-    data, steps (not the covariance) take their curvature with the opposite sign.
+    with p the values that the estimate of θ takes up: F is the channel's part of the information, C the covariance of
+    θ. Without priors Σp is the number of parameters l, and this is eq. (7), s·Σe²/(nNs − l), where all s channels have
+    as many values and tell the same; a parameter that the prior determines takes up none. Then θ is updated by eq. (8).
+    As printed, its right-hand side lacks the prior's gradient (θ̄ − θ)/σ², without which the iteration would not end at
+    a maximum of eq. (6); it is added. The parameters of other noise models are found by maximising the same objective.
+    Steps are halved until the objective, eq. (6) with n − p for n, increases; p is zero at first, and the iteration is
+    repeated with the p of its end until they settle. Where convex log-priors outweigh the data, steps (not the
+    covariance) take their curvature with the opposite sign.
 
     Where every experiment of a forced model has a guess of its orbit, orbits and parameters are first estimated
     together, from these guesses and `start`: the orbits need not exist at the start, and none is lost or exchanged.
@@ -117,26 +126,25 @@ def map_estimate(
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
     objective = _objective(problem, first.here)
-    best, status, history = _climb(objective, first, progress)
-    found = [_outcome(problem, best)]
+    found: list[tuple[Iterate, str, np.ndarray] | None] = [_climb(objective, first, progress)]
     for draw in problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0))):
         other = _first_iterate(problem, draw)
-        if other is None:
-            found.append({"objective": -np.inf} | dict.fromkeys(problem.names, np.nan))
-            continue
-        end, other_status, other_history = _climb(objective, other, progress)
-        found.append(_outcome(problem, end))
-        if end.objective > best.objective:
-            best, status, history = end, other_status, other_history
-    best, status, history = _on_measured_orbits(problem, theta, (best, status, history), progress)
-    result = _describe(problem, objective, best, status, history, tuple(found))
+        found.append(None if other is None else _climb(objective, other, progress))
+    reached = [-np.inf if end is None else end[0].objective for end in found]
+    chosen = int(np.argmax(reached))
+    best = found[chosen]
+    assert best is not None
+    objective, best = corrected(objective, _on_measured_orbits(problem, theta, best, progress))
+    ends = [end and objective.iterate(end[0].here, end[0].noise) for end in found]
+    ends[chosen] = best[0]
+    result = _describe(problem, objective, *best, tuple(_outcome(problem, end) for end in ends))
     for text in estimation_warnings(problem, result):
         warnings.warn(text, UserWarning, stacklevel=3)
     return result
 
 
 def _objective(problem: Problem, near: Linearisation) -> Objective:
-    return Objective(LogPosterior(problem, near.simulator, coordinates=NATURAL), bias_correction(problem))
+    return Objective(LogPosterior(problem, near.simulator, coordinates=NATURAL))
 
 
 def _first_iterate(problem: Problem, theta: np.ndarray) -> Iterate | None:
@@ -185,7 +193,7 @@ def _on_measured_orbits(problem: Problem, start: np.ndarray, end: Climb, progres
             end, others = again, again[0].here.other_orbits
         if not others:
             return end
-    return (end[0], STATUSES[OTHER_ORBIT], end[2]) if others else end
+    return end
 
 
 def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> Iterator[Linearisation]:
@@ -203,7 +211,9 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
                 yield _linearised(problem, found.theta, found)
 
 
-def _outcome(problem: Problem, iterate: Iterate) -> dict[str, float]:
+def _outcome(problem: Problem, iterate: Iterate | None) -> dict[str, float]:
+    if iterate is None:
+        return {"objective": -np.inf} | dict.fromkeys(problem.names, np.nan)
     return {"objective": iterate.objective} | dict(zip(problem.names, iterate.theta.tolist(), strict=True))
 
 
@@ -220,8 +230,9 @@ def _describe(
     solutions = best.here.simulator.solutions(best.theta)
     acting = np.diag(data) * problem.joint_prior.widths**2 > INFORMED
     conflict, _ = prior_conflict(problem, best)
-    inverse, lost = _inverse(data + problem.joint_prior.curvature(best.theta))
-    covariance = with_uncertain_noise(problem, best, inverse).copy()
+    inverse, lost = inverse_hessian(data + problem.joint_prior.curvature(best.theta))
+    parts = variance_parts(problem, best, inverse, objective.log_variance_factor)
+    covariance = with_uncertain_noise(problem, best, inverse, parts).copy()
     shift = doubling_shift(problem, best, solutions, covariance)
     shift[lost] = np.nan
     covariance[lost], covariance[:, lost] = np.nan, np.nan
@@ -232,7 +243,7 @@ def _describe(
     rms = {c: _pooled(problem, c, residuals) for c in problem.channels}
     measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} for e in problem.experiments}
     return MapEstimate(
-        status=status,
+        status=STATUSES[OTHER_ORBIT] if best.here.other_orbits else status,
         theta=dict(zip(names, best.theta.tolist(), strict=True)),
         sd=_sd(problem, covariance),
         robust_sd=deferred(_robust_sd, problem, best, inverse, lost),
@@ -242,7 +253,7 @@ def _describe(
         covariance=pd.DataFrame(covariance, index=list(names), columns=list(names)),
         joint_mode=deferred(lambda: joint()[0]),
         joint_covariance=deferred(lambda: joint()[1]),
-        degrees_of_freedom=max(float(problem.counted - len(names)), 1.0) if problem.free_noise else np.inf,
+        degrees_of_freedom=dict(zip(names, degrees_of_freedom(inverse, parts).tolist(), strict=True)),
         independent={_short(name): count for name, count in likelihood.counts.items()},
         solutions=solutions,
         residuals=residuals,
@@ -272,14 +283,6 @@ def _robust_sd(problem: Problem, estimate: Iterate, inverse: np.ndarray, lost: n
     robust = robust_covariance(problem, estimate, inverse)
     robust[lost, lost] = np.inf
     return _sd(problem, robust)
-
-
-def _inverse(hessian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inverse of H without its directions of no curvature, and which parameters belong to these."""
-    values, vectors, scale = hessian_eigh(hessian)
-    curved = np.abs(values) > SINGULAR * np.abs(values).max()
-    inverse = scaled((vectors[:, curved] / values[curved]) @ vectors[:, curved].T, scale)
-    return inverse, np.any(np.abs(vectors[:, ~curved]) > LOST, axis=1)
 
 
 def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:

@@ -414,8 +414,10 @@ def _at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate
     theta, noise = problem.vector(fit.theta), np.array([fit.noise[name] for name in problem.noise_names])
     guesses = {name: s.states for name, s in fit.solutions.items()}
     density = LogPosterior(problem, Simulator.start(problem, theta, guesses), coordinates=NATURAL)
-    objective = Objective(density, bias_correction(problem))
-    peak = objective.iterate(Linearisation(theta, density.simulator, density.comparisons), noise)
+    here = Linearisation(theta, density.simulator, density.comparisons)
+    factor = bias_correction(problem, Iterate(theta, here, noise, np.nan)) if here.converged else 1.0
+    objective = Objective(density, factor)
+    peak = objective.iterate(here, noise)
     if peak is None:
         raise ValueError(
             f"fit: must have a finite log-posterior, got {_written(fit.theta)}, where it is not. Give an estimate of "

@@ -64,16 +64,19 @@ class NoiseSplit:
     total: float
 
 
-def noise_split(problem: Problem, estimate: Iterate, log_variance_factor: float) -> dict[str, NoiseSplit]:
-    """Return the split of every channel with compared time histories; `log_variance_factor` is 1 − l/Σn of eq. (7)."""
-    sums = {channel: np.zeros(3) for channel in problem.channels}
-    for block, r in zip(problem.likelihood.blocks, estimate.here.residuals, strict=True):
+def noise_split(problem: Problem, estimate: Iterate, log_variance_factor: float | np.ndarray) -> dict[str, NoiseSplit]:
+    """Return the split of every channel with compared time histories; the factor is 1 − p/n of eq. (7)."""
+    sums = {channel: np.zeros(4) for channel in problem.channels}
+    blocks = problem.likelihood.blocks
+    factors = np.broadcast_to(log_variance_factor, len(blocks))
+    for block, r, one in zip(blocks, estimate.here.residuals, factors, strict=True):
         if block.kind in (SPECTRAL, POINTS):
-            sums[block.channel] += [block.count, block.weight * float(r @ r), block.count * block.measured]
+            square = block.weight * float(r @ r)
+            sums[block.channel] += [block.count, block.count * one, square, block.count * block.measured]
     result = {}
-    for channel, (count, square, measured) in sums.items():
+    for channel, (count, left, square, measured) in sums.items():
         if count:
-            total, measurement = square / (count * log_variance_factor), measured / count
+            total, measurement = square / left, measured / count
             result[channel] = NoiseSplit(*np.sqrt([measurement, max(total - measurement, 0.0), total]).tolist())
     return result
 
@@ -116,14 +119,16 @@ class MapEstimate(Result):
     noise_prior : str
         Prior of the variances, in words.
     covariance : DataFrame (names × names)
-        Inverse of H of eq. (8) at these variances; for `Circulant` noise, with its unknown correlation integrated out.
+        Inverse of H of eq. (8) at these variances, increased where unknown ones make the weights of channels and priors
+        uncertain (Kenward and Roger); for `Circulant` noise, with its unknown correlation integrated out.
     joint_mode : dict of str to float
         Mode of the density in sampling coordinates: natural values of parameters and free noise parameters.
     joint_covariance : DataFrame
         Inverse of the exact Hessian there; NaN if it is no maximum. Sampling coordinates are the logarithms of noise
         parameters and of parameters whose prior's support is (0, ∞), and the other parameters.
-    degrees_of_freedom : float
-        Independent values less free parameters; infinite where all variances are fixed.
+    degrees_of_freedom : dict of str to float
+        Of Student's t of each parameter: the values that determine the variances its standard deviation rests on, less
+        what the estimate takes up of them (Satterthwaite); infinite if that rests on known variances and the prior.
     independent : dict of str to float
         Independent values behind each variance.
     solutions : dict of str to PeriodicSolution
@@ -180,7 +185,7 @@ class MapEstimate(Result):
     covariance: pd.DataFrame
     joint_mode: dict[str, float]
     joint_covariance: pd.DataFrame
-    degrees_of_freedom: float
+    degrees_of_freedom: dict[str, float]
     independent: dict[str, float]
     solutions: dict[str, PeriodicSolution]
     residuals: dict[str, dict[str, np.ndarray]]
@@ -243,9 +248,11 @@ class MapEstimate(Result):
         """
         if not 0.0 < _checks.finite_number("probability", probability) < 1.0:
             raise ValueError(f"probability: must be between 0 and 1, got {probability!r}.")
-        width = float(stdtrit(min(self.degrees_of_freedom, 1e9), 0.5 + 0.5 * probability))
-        sd = self.robust_sd if robust else self.sd
-        return {name: (value - width * sd[name], value + width * sd[name]) for name, value in self.theta.items()}
+        sd, result = self.robust_sd if robust else self.sd, {}
+        for name, value in self.theta.items():
+            half = float(stdtrit(min(self.degrees_of_freedom[name], 1e9), 0.5 + 0.5 * probability)) * sd[name]
+            result[name] = value - half, value + half
+        return result
 
     def derive(self, expressions: Mapping[str, str], *, experiment: str | None = None) -> pd.DataFrame:
         """Return quantities derived from the parameters, with standard deviations by the delta method.

@@ -335,7 +335,7 @@ class LogPosterior(SamplingCoordinates):
         """Solve at one θ (names,) from the present anchors, and return residuals and Jacobian there."""
         return Linearisation(theta, self.simulator.anchored(theta), self.comparisons)
 
-    def objective(self, here: Linearisation, noise: np.ndarray, log_variance_factor: float) -> float:
+    def objective(self, here: Linearisation, noise: np.ndarray, log_variance_factor: float | np.ndarray) -> float:
         """Return the log-density over the coordinates where all solves have converged.
 
         For `log_variance_factor` see `Likelihood.__call__`.

@@ -201,33 +201,38 @@ class Likelihood:
         ]
 
     def __call__(
-        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float = 1.0
+        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray = 1.0
     ) -> np.ndarray:
         """Return the log-likelihood (…,) of residuals, one (…, size) a block, at values (…, names).
 
-        The logarithms of the variances are multiplied by `log_variance_factor`, 1 − l/Σn for the correction of eq. (7).
+        The logarithms of the variances are multiplied by `log_variance_factor`, one for all blocks or one each: the
+        bias correction of eq. (7), see `gauss_newton.bias_correction`.
         """
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             total = (self._flat if self.model.flat else self._by_kind)(residuals, values, log_variance_factor)
         return np.where(np.isfinite(total), total, -np.inf)
 
-    def _by_kind(self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float) -> np.ndarray:
+    def _by_kind(
+        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
+    ) -> np.ndarray:
         """Return the log-likelihood (…,) of errors whose spectrum is not flat, alike blocks together."""
         total = np.zeros(values.shape[:-1])
         for members in self._alike:
             own = values[..., self._columns[members[0]]]
-            total = total + self._together(
-                [residuals[b] for b in members], self.blocks[members[0]], own, log_variance_factor
-            )
+            factor = float(np.broadcast_to(log_variance_factor, len(residuals))[members[0]])
+            total = total + self._together([residuals[b] for b in members], self.blocks[members[0]], own, factor)
         return total
 
-    def _flat(self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float) -> np.ndarray:
+    def _flat(
+        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
+    ) -> np.ndarray:
         """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
         at, known, columns, sizes, weights, measured = self._levels
         squares = Residuals.of(residuals).squares
         v = self.model.level(values[..., columns] * self._gains[at], measured)
         # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
-        terms = np.ascontiguousarray(weights * (log_variance_factor * sizes * np.log(v) + squares[..., at] / v))
+        factor = log_variance_factor if isinstance(log_variance_factor, float) else log_variance_factor[at]
+        terms = np.ascontiguousarray(weights * (factor * sizes * np.log(v) + squares[..., at] / v))
         total = np.add.reduce(terms, axis=-1)
         if known.size:
             total = total + np.add.reduce(np.ascontiguousarray(squares[..., known]), axis=-1)
@@ -397,12 +402,12 @@ TINY = np.finfo(float).tiny
 
 
 def estimate_noise(
-    likelihood: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, log_variance_factor: float
+    likelihood: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, log_variance_factor: float | np.ndarray
 ) -> np.ndarray:
     """Return the noise parameters (names,) that fit residuals best, one array (size,) a block, from a start.
 
-    For independent errors with the prior 1/v this is eq. (7) of [1]_, v = Σe²/(n·f) with f = `log_variance_factor`;
-    otherwise it maximises the log-likelihood, its logarithms multiplied by f, plus the log-prior.
+    For independent errors with the prior 1/v this is eq. (7) of [1]_, v = Σe²/(n·f) with the factor f; otherwise it
+    maximises the log-likelihood, its logarithms multiplied by f as in `Likelihood.__call__`, plus the log-prior.
 
     References
     ----------
@@ -414,20 +419,21 @@ def estimate_noise(
         if not set(group) & set(likelihood.free):
             continue
         blocks = [likelihood.blocks[b] for b in members]
+        factor = float(np.broadcast_to(log_variance_factor, len(residuals))[members[0]])
         chosen = [residuals[b] for b in members]
         total = sum(
             block.weight / likelihood.model.gain(block) * float(r @ r) for block, r in zip(blocks, chosen, strict=True)
         )
         count = sum(block.count for block in blocks)
         plain = isinstance(likelihood.model, Independent) or all(block.kind == CORRELATED for block in blocks)
-        corrected = count * log_variance_factor - {JEFFREYS: 0.0, FLAT: 2.0}.get(str(likelihood.model.prior), np.inf)
+        corrected = count * factor - {JEFFREYS: 0.0, FLAT: 2.0}.get(str(likelihood.model.prior), np.inf)
         columns = [likelihood.names.index(name) for name in group]
         if plain and corrected > 0.0:
             values[columns[0]] = max(total / corrected, TINY)
             continue
         held = {name: values[i] for name, i in zip(group, columns, strict=True) if name in likelihood.fixed}
         part = Likelihood(likelihood.model, blocks, held)
-        values[columns] = _maximise(part, chosen, values[columns], max(total / count, TINY), log_variance_factor)
+        values[columns] = _maximise(part, chosen, values[columns], max(total / count, TINY), factor)
     return values
 
 

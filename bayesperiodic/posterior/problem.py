@@ -8,9 +8,12 @@ from typing import Any
 import numpy as np
 
 from bayesperiodic import _checks
+from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.posterior.density import NATURAL, RIDGE, SAMPLED, Evaluation, LogPosterior
 from bayesperiodic.posterior.description import Description
+from bayesperiodic.posterior.likelihood import Likelihood
+from bayesperiodic.posterior.observation import Observation
 from bayesperiodic.posterior.simulator import Guesses, Simulator
 
 METHODS = ("adjoint", "forward")
@@ -129,6 +132,27 @@ class Problem(Description):
         else:
             density = LogPosterior(self, Simulator.start(self, values, guesses))
         other._densities = {(density.coordinates, SAMPLED): density}
+        return other
+
+    def planned(self, experiment: Experiment, noise: Mapping[str, float]) -> "Problem":
+        """Return the problem of an experiment that may be made, alone, with all parameters of this problem.
+
+        Parameters
+        ----------
+        experiment : Experiment
+            With the name of one of this problem's experiments, whose parameters are its own.
+        noise : mapping of str to float
+            The noise parameters by their full names, known.
+
+        Returns
+        -------
+        Problem
+        """
+        other, seen = copy(self), Observation(experiment, self.model, self.parameter_maps[experiment.name].delayed)
+        names = {name for block in seen.blocks for name in self.noise.parameter_names(block)}
+        other.experiments, other.observations = (experiment,), {experiment.name: seen}
+        other.likelihood = Likelihood(self.noise, seen.blocks, {name: noise[name] for name in names})
+        other._densities = {}
         return other
 
     def _evaluated(self, evaluate: str, theta: Any, variances: Any, threads: int | None = None) -> np.ndarray:

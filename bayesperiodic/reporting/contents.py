@@ -285,6 +285,7 @@ def estimates(given: ReportInputs) -> Rows:
             "MAP": rounding.text(fit.theta[name]),
             "Laplace: sd": rounding.sd(fit.sd[name]),
             "Laplace: 90 % interval": rounding.interval(*intervals[name]),
+            "Degrees of freedom": number(fit.degrees_of_freedom[name], 3),
             "Laplace: robust sd": rounding.sd(fit.robust_sd[name]),
             **_mcmc_cells(given, name, rounding),
         }
@@ -408,7 +409,6 @@ def settings(given: ReportInputs) -> Rows:
         "Largest shift of an estimate with twice as many points": (
             f"{number(shifts[worst], 2)} sd ({worst})" if worst else "not known"
         ),
-        "Degrees of freedom": number(fit.degrees_of_freedom, 5),
     }
     if posterior is not None:
         group, attributes = posterior.data["posterior"], posterior.data.attrs

@@ -3,7 +3,7 @@ import pytest
 from scipy import integrate, stats
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics.design import Candidate, Information, rank_candidates
+from bayesperiodic.diagnostics.design import Candidate, Information, _added, rank_candidates
 from bayesperiodic.diagnostics.identifiability import cumulative_jensen_shannon, structure_of
 from tests.known import GEAR, LINEAR, grid, linear_experiment, linear_regressors
 from tests.pendulum import PENDULUM
@@ -152,6 +152,29 @@ def test_candidate_experiment_adds_the_information_of_a_real_one(linear):
     assert again[list(problem.names)].astype(float).to_numpy() == pytest.approx(ratio, rel=1e-6)
     louder = found.iloc[0]
     assert louder["scale"] == 2.0 and louder["k"] < again["k"] and louder["c"] < again["c"]
+
+
+@pytest.mark.parametrize(
+    "noise", ["independent", "circulant", bp.noise.Independent(per="experiment", prior=bp.InverseGamma(2, 1e-4))]
+)
+@pytest.mark.parametrize("harmonics", [1, 3, 9])
+def test_repeated_runs_add_exactly_their_present_information(harmonics, noise):
+    """Duffing's third harmonic tells much about k3, but nothing where only the first is kept."""
+    inputs, runs = {"force": 2.0 * np.cos(2 * np.pi * grid(64))}, []
+    for name, frequency in (("slow", 0.07), ("fast", 0.11)):
+        made = bp.solve_periodic(
+            bp.models.duffing, {"m": 1.0, "c": 0.2, "k": 1.0, "k3": 1.0}, inputs, frequency=frequency, samples=64,
+            scheme="fourier",
+        )  # fmt: skip
+        noisy = made.outputs["displacement"] + 0.01 * np.random.default_rng(len(runs)).standard_normal(64)
+        kept = {"displacement": harmonics, "force": 1}
+        runs.append(bp.Experiment(name, frequency, {"displacement": noisy}, inputs, samples=64, harmonics=kept))
+    priors = {"c": bp.LogNormal(0.2, 1.0), "k": bp.LogNormal(1.0, 1.0), "k3": bp.LogNormal(1.0, 1.0)}
+    problem = bp.Problem(bp.models.duffing, runs, priors=priors, fixed={"m": 1.0}, scheme="fourier", noise=noise)
+    fit = bp.map_estimate(problem, start={"c": 0.2, "k": 1.0, "k3": 1.0}, **QUIET)
+    information = Information.of(problem, fit)
+    added = sum(_added(problem, fit, run, Candidate(run.name, run.frequency, 1.0)) for run in runs)
+    assert added == pytest.approx(information.matrix, rel=1e-6)
 
 
 def test_without_candidates_the_verdicts_are_the_same(linear):

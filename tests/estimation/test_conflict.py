@@ -52,11 +52,6 @@ def estimate(problem: bp.Problem) -> bp.MapEstimate:
         return bp.map_estimate(problem, progress=False)
 
 
-def variance(sd: float) -> float:
-    """Return the variance of the projected noise."""
-    return sd**2 * (2 * HARMONICS + 1) / POINTS
-
-
 JOINT = {("a", "b"): bp.MultivariateNormal([1.0, 2.0], [[0.01, 0.008], [0.008, 0.02]])}
 ALONE = {"a": bp.Normal(1.0, 0.1), "b": bp.Normal(2.0, 0.2)}
 
@@ -66,7 +61,7 @@ ALONE = {"a": bp.Normal(1.0, 0.1), "b": bp.Normal(2.0, 0.2)}
 @pytest.mark.parametrize("theta", [(1.05, 1.9), (1.3, 1.8)])
 def test_p_values_of_normal_priors_are_those_of_the_closed_form(priors, sd, theta):
     """Least squares with covariance σ²(XᵀX)⁻¹, and the prior: χ² with two degrees of freedom, and normal."""
-    problem = problem_of(priors, theta, sd, np.random.default_rng(3), fixed={"variance[y]": variance(sd)})
+    problem = problem_of(priors, theta, sd, np.random.default_rng(3), fixed={"variance[y]": sd**2})
     found = estimate(problem).prior_conflict
     block = next(iter(priors.values()))
     prior = block.covariance if priors is JOINT else np.diag([0.1**2, 0.2**2])
@@ -197,7 +192,7 @@ def test_false_alarms_under_the_prior(case):
     """
     priors, sd = CALIBRATED[case]
     generator, p, alarms = np.random.default_rng(9), [], 0
-    known = {"variance[y]": variance(sd)} if case == "correlated prior" else {}
+    known = {"variance[y]": sd**2} if case == "correlated prior" else {}
     for _ in range(400):
         theta = np.concatenate([np.ravel(prior.sample(1, generator)) for prior in priors.values()])
         found = estimate(problem_of(priors, theta, sd, generator, fixed=known)).prior_conflict

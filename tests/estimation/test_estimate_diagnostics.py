@@ -264,12 +264,17 @@ def test_noise_is_split_into_measurement_noise_and_model_error():
     """A scatter of 6 N in 4 cycles gives 3 N in the mean; with a residual of 5 N (eq. 7) the model error is 4 N."""
     run = linear_experiment(TRUTH, 5.0, seed=4)
     fit = bp.map_estimate(bp.Problem(LINEAR, [replace(run, scatter={"force": 6.0}, cycles=4)], priors=PRIORS))
-    residual = run.outputs["force"] - linear_regressors(0.05, 2.0, grid(40)) @ list(fit.theta.values())
-    total = np.sum(residual**2) / 37
+    x = linear_regressors(0.05, 2.0, grid(40))
+    # The variance is that of one sample; four cycles are averaged.
+    residual, information = run.outputs["force"] - x @ list(fit.theta.values()), x.T @ x / (fit.variances["force"] / 4)
+    c, spread = fit.theta["c"], 0.5
+    of_c = ((1.0 - np.log(c / 30.0)) / spread**2 - 1.0) / c**2  # −d²/dc² of the density of LogNormal(30, 0.5)
+    precision = np.diag([60.0**-2, of_c, 10.0**-2])
+    total = np.sum(residual**2) / (40 - np.trace(np.linalg.solve(information + precision, information)))
     split = fit.noise_split["force"]
     assert split.measurement == pytest.approx(3.0)
-    assert split.total == pytest.approx(np.sqrt(total), rel=1e-9)
-    assert split.model == pytest.approx(np.sqrt(total - 9.0), rel=1e-9)
+    assert split.total == pytest.approx(np.sqrt(total), rel=1e-6)
+    assert split.model == pytest.approx(np.sqrt(total - 9.0), rel=1e-6)
 
 
 def test_joint_laplace_and_robust_sd_are_computed_at_their_first_use(monkeypatch):

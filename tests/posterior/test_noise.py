@@ -169,6 +169,17 @@ def moments(experiments: list[bp.Experiment], theta: np.ndarray) -> dict[str, fl
     return result
 
 
+def taken(experiments: list[bp.Experiment], variances: dict[str, float]) -> dict[str, float]:
+    """Return tr(F C) of each channel, F = XᵀX/v weighed by independent values per sample, C with the priors' part."""
+    design, information = two_channel_design(grid(30)), dict.fromkeys(variances, np.zeros((2, 2)))
+    for e in experiments:
+        for channel in e.outputs:
+            x, weight = design[channel], e.independent[channel] / 30
+            information[channel] = information[channel] + weight * x.T @ x / variances[channel]
+    covariance = np.linalg.inv(sum(information.values()) + np.diag([2.0**-2, 3.0**-2]))
+    return {channel: float(np.trace(own @ covariance)) for channel, own in information.items()}
+
+
 def unequal_experiments() -> list[bp.Experiment]:
     """Return runs of which one has fewer independent values of one channel, and one a single channel."""
     first, second, third = two_channel_experiments()
@@ -198,8 +209,9 @@ def test_each_experiment_may_have_its_own_variances():
     assert problem.log_likelihood(theta, variances) == pytest.approx(expected, rel=1e-10)
     fit = bp.map_estimate(problem, progress=False)
     each = [moments([e], np.array(list(fit.theta.values()))) for e in experiments]
-    m = [each[0]["force"], each[0]["moment"], each[1]["force"], each[1]["moment"]]
-    assert list(fit.noise.values()) == pytest.approx(np.array(m) / (30 * (1 - 2 / 120)), rel=1e-9)
+    m = np.array([each[0]["force"], each[0]["moment"], each[1]["force"], each[1]["moment"]])
+    p = 30 - m / np.array(list(fit.noise.values()))
+    assert np.all(p > 0.0) and 1.9 < p.sum() < 2.0
 
 
 def test_measured_noise_adds_the_scatter_of_the_mean():
@@ -367,31 +379,28 @@ def estimate(experiments: list[bp.Experiment], model="independent") -> tuple[bp.
     return fit, np.array(list(fit.theta.values()))
 
 
-def test_two_channels_with_equal_counts_have_the_variances_of_equation_7():
-    """Eq. (7), v = s Σe²/(nNs − l) with s = 2 channels, N = 3 experiments, n = 30 samples, l = 2 parameters."""
-    fit, theta = estimate(two_channel_experiments())
-    m = moments(two_channel_experiments(), theta)
+@pytest.mark.parametrize(
+    ("experiments", "counts"), [(two_channel_experiments, (90, 90)), (unequal_experiments, (90, 42))]
+)
+def test_each_channel_counts_the_parameters_that_its_values_take_up(experiments, counts):
+    """Eq. (7) as v_β = M_β/(n_β − p_β), with p = tr(F C) from the regressors."""
+    fit, theta = estimate(experiments())
+    m, p = moments(experiments(), theta), taken(experiments(), fit.variances)
+    assert fit.independent == dict(zip(("force", "moment"), counts, strict=True))
+    assert 1.9 < sum(p.values()) < 2.0 and p["force"] > 1.5 * p["moment"]
     for channel, variance in fit.variances.items():
-        assert variance == pytest.approx(2 * m[channel] / (30 * 3 * 2 - 2), rel=1e-9)
-
-
-def test_unequal_counts_share_the_free_parameters_evenly():
-    """Eq. (7) as v_β = M_β/[n_β (1 − l/Σn)], with n = 90 and 42."""
-    fit, theta = estimate(unequal_experiments())
-    m = moments(unequal_experiments(), theta)
-    assert fit.independent == {"force": 90, "moment": 42}
-    assert fit.variances["force"] == pytest.approx(m["force"] / (90 * (1 - 2 / 132)), rel=1e-9)
-    assert fit.variances["moment"] == pytest.approx(m["moment"] / (42 * (1 - 2 / 132)), rel=1e-9)
+        assert variance == pytest.approx(m[channel] / (fit.independent[channel] - p[channel]), rel=1e-6)
 
 
 def test_with_equation_7_the_estimate_maximises_equation_6_with_fewer_values():
-    """With nN − l/s = 89 for nN; the variances at their best leave −½ · 89 Σ ln M_β + ln p(θ)."""
-    _, theta = estimate(two_channel_experiments())
+    """With n − p for n; the variances at their best leave −½ Σ (n − p)_β ln M_β + ln p(θ)."""
+    fit, theta = estimate(two_channel_experiments())
+    left = {channel: 90 - p for channel, p in taken(two_channel_experiments(), fit.variances).items()}
 
     def objective(at):
         m = moments(two_channel_experiments(), at)
         prior = sum(float(p.log_prob(x)) for p, x in zip(TWO_PRIORS.values(), at, strict=True))
-        return 0.5 * 89 * (np.log(m["force"]) + np.log(m["moment"])) - prior
+        return 0.5 * (left["force"] * np.log(m["force"]) + left["moment"] * np.log(m["moment"])) - prior
 
     best = optimize.minimize(objective, theta + 0.1, method="BFGS", options={"gtol": 1e-9})
     assert theta == pytest.approx(best.x, rel=1e-6)

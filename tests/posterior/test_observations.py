@@ -95,15 +95,19 @@ def test_a_tie_to_a_local_parameter_is_local():
 
 
 def test_variances_of_each_run_follow_equation_7():
-    """V = M/[n (1 − l/Σn)] with n = 40, l = 3, Σn = 80, in each run."""
+    """V = M/(n − p) with n = 40 in each run, p = tr(F C) of its regressors."""
     runs = [linear_experiment(TRUTH, sd, seed=seed, name=f"run {seed}") for seed, sd in ((1, 1.0), (2, 9.0))]
     fit = bp.map_estimate(
         bp.Problem(LINEAR, runs, priors=PRIORS, noise=bp.noise.Independent(per="experiment")), progress=False
     )
+    x = linear_regressors(0.05, 2.0, grid(40))
+    information = {name: x.T @ x / variance for name, variance in fit.variances.items()}
+    covariance = np.linalg.inv(sum(information.values()) + np.diag(SD**-2.0))
     for run in runs:
-        residual = run.outputs["force"] - linear_regressors(0.05, 2.0, grid(40)) @ list(fit.theta.values())
-        expected = np.sum(residual**2) / (40 * (1 - 3 / 80))
-        assert fit.variances[f"force, {run.name}"] == pytest.approx(expected, rel=1e-9)
+        name = f"force, {run.name}"
+        square = np.sum((run.outputs["force"] - x @ list(fit.theta.values())) ** 2)
+        expected = square / (40 - np.trace(information[name] @ covariance))
+        assert fit.variances[name] == pytest.approx(expected, rel=1e-6)
 
 
 def test_mask_excludes_unmeasured_points():

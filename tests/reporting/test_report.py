@@ -16,7 +16,8 @@ def test_estimates_are_those_of_fit_and_posterior(solved, page):
     _, fit, posterior = solved
     rows, summary, intervals = page.rows("table-estimates"), posterior.summary(), fit.interval(0.9)
     assert list(rows) == list(fit.theta)
-    for name, (unit, at, sd, interval, robust, mean, spread, drawn) in rows.items():
+    for name, (unit, at, sd, interval, freedom, robust, mean, spread, drawn) in rows.items():
+        assert value(freedom) == pytest.approx(fit.degrees_of_freedom[name], rel=0.005)
         assert unit == LINEAR.units[name]
         low, high = interval.split(" … ")
         shown = [value(cell) for cell in (at, sd, low, high, robust, mean, spread, *drawn.split(" … "))]
@@ -79,7 +80,7 @@ def test_given_verdicts_are_not_recomputed(solved, scored, tmp_path, monkeypatch
 def test_report_of_a_fit_alone_states_that_there_are_no_draws(solved, tmp_path):
     problem, fit, _ = solved
     written = Page(bp.report(problem, fit, None, tmp_path / "r.html").read_text(encoding="utf-8"))
-    assert len(written.rows("table-estimates")["k"]) == 5
+    assert len(written.rows("table-estimates")["k"]) == 6
     assert "There are no draws (MCMC)" in written.text and "table-sampling" not in written.tables
     assert {e.attributes["id"] for e in written.all("figure")} == {"figure-fit-1", "figure-loops"}
 
@@ -98,7 +99,7 @@ def test_fit_with_warnings_is_marked(solved, tmp_path):
     problem, fit, _ = solved
     problem = problem.with_experiments([replace(problem.experiments[0], synthetic=True)])
     white = {"force": replace(fit.whiteness["force"], p=1e-5)}
-    wider = {name: 3.0 * sd for name, sd in fit.sd.items()}
+    wider = {name: (3.01 if name == "k" else 3.0) * sd for name, sd in fit.sd.items()}
     fit = replace(fit, status="stalled", at_ends=("k",), whiteness=white, robust_sd=wider)
     text = Page(bp.report(problem, fit, None, tmp_path / "r.html").read_text(encoding="utf-8")).text
     for words in ("! synthetic data", "✕ stalled", "lies at the end of its prior's support", "3 times as large (k)"):
