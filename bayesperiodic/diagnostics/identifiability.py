@@ -14,6 +14,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics.design import Candidate, Information, default_candidates, rank_candidates
 from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
+from bayesperiodic.estimation.modes import notable
 from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate
@@ -118,6 +119,7 @@ def _one_sided(x: np.ndarray, weighted: np.ndarray) -> float:
 
 DETERMINED, PRIOR_ONLY = "determined", "only with the prior"
 COMBINATION, SIGN, NOTHING = "only in combination", "sign undetermined", "not determined"
+SEVERAL = "several values"
 # Standard deviations left by the data alone, in prior sds: the largest one of determined parameters (a contraction of
 # 0.9), and the smallest one of undetermined parameters (1 % of the information of the prior).
 DETERMINED_SD, UNINFORMED_SD = 1.0 / 3.0, 10.0
@@ -128,6 +130,7 @@ MONTE_CARLO_ERRORS = 3.0
 UNINFORMED_GAIN = 1e-13
 PRIOR_DRAWS = 20_000
 BOTH_SIGNS = "both signs fit the data: use a prior of one sign, or measure an output that is odd in it"
+OTHER_VALUES = "give a prior that excludes the other value, or measure an output that differs between them"
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,8 @@ class Identifiability(Result):
         ``together``: the sd left by the data alone, in prior sds, if the other parameters are known and if they are
         unknown; ``collinearity``: their ratio. ``profile``: its shape. ``structural``: the parameters of a structural
         symmetry that contains it, if any. ``p_negative`` and ``p_negative_mcse``: probability of a value below zero;
-        NaN for positive parameters. ``prior_sensitivity`` and ``likelihood_sensitivity``: distance per doubling of the
+        NaN for positive parameters. ``other_values``: values at other optima with more than 1 % of the mass, see
+        `MapEstimate.modes`, if they are further away than a standard deviation. ``prior_sensitivity`` and ``likelihood_sensitivity``: distance per doubling of the
         prior or the likelihood (power-scaling). ``evidence`` and ``remedy``: summary and recommendation.
     directions : DataFrame
         One row per direction in parameter space, in ascending order of information: information of the data over that
@@ -159,6 +163,8 @@ class Identifiability(Result):
         Of the free parameters, from the measured channels.
     converged : bool
         False if there are draws that have not converged.
+    basis : str
+        What the verdicts rest on.
 
     Examples
     --------
@@ -174,6 +180,7 @@ class Identifiability(Result):
     experiments: pd.DataFrame
     structure: Structure
     converged: bool
+    basis: str
 
     @property
     def verdicts(self) -> dict[str, str]:
@@ -186,6 +193,7 @@ class Identifiability(Result):
             lines.append(f"{name}: {row['verdict']}; {row['evidence']}.")
             lines += [f"    Recommendation: {row['remedy']}."] if row["remedy"] else []
         lines.append(f"The condition number of the Fisher information is {self.condition:.3g}.")
+        lines.append(self.basis)
         lines += [] if self.converged else ["The draws have NOT CONVERGED; these results are provisional."]
         return "\n".join(lines)
 
@@ -201,17 +209,19 @@ def identifiability(
 ) -> Identifiability:
     """Classify the identifiability of each parameter, with evidence and a recommendation.
 
-    Widths are those of the draws, or of the Laplace approximation without draws, relative to the prior. The first
-    criterion that applies determines the verdict:
+    Widths are those of the draws, or of the Laplace approximations at all optima of the estimate without draws, relative
+    to the prior. The first criterion that applies determines the verdict:
 
     1. "sign undetermined": the size of a signed parameter is determined, but both signs have a probability above 2.5 %
        (by more than three Monte Carlo errors).
-    2. "only with the prior": the profile (Raue et al., Bioinformatics 25 (2009) 1923-1929) ends at the support of the
+    2. "several values": it would be "determined", but has another value, further away than a standard deviation, at
+       another optimum with more than 1 % of the mass.
+    3. "only with the prior": the profile (Raue et al., Bioinformatics 25 (2009) 1923-1929) ends at the support of the
        prior on one side, although the parameter is not collinear with others.
-    3. "not determined": with all other parameters known, the data have less than 1 % of the information of the prior.
-    4. "only in combination": a structural symmetry of the equations contains the parameter, see `structure`.
-    5. "determined": with the other parameters unknown, the data alone leave less than a third of the prior sd.
-    6. "only in combination" if the other parameters increase its sd at least fivefold, otherwise "only with the prior".
+    4. "not determined": with all other parameters known, the data have less than 1 % of the information of the prior.
+    5. "only in combination": a structural symmetry of the equations contains the parameter, see `structure`.
+    6. "determined": with the other parameters unknown, the data alone leave less than a third of the prior sd.
+    7. "only in combination" if the other parameters increase its sd at least fivefold, otherwise "only with the prior".
 
     Parameters
     ----------
@@ -257,15 +267,16 @@ def identifiability(
         },
         index=[*problem.names],
     )
+    table["other_values"] = [", ".join(f"{v:.4g}" for v in _other_values(fit, name)) for name in problem.names]
     signs = [_negative(problem, fit, posterior, name) for name in problem.names]
     table[["p_negative", "p_negative_mcse"]] = np.array(signs)
     scaling = {} if posterior is None else power_scaling(problem, posterior)
     sensitivities = [scaling.get(name, (np.nan, np.nan)) for name in problem.names]
     table[["prior_sensitivity", "likelihood_sensitivity"]] = np.array(sensitivities)
     rows = table.to_dict("index")
-    for name, row in zip(problem.names, rows.values(), strict=True):
+    for name, within, row in zip(problem.names, information.together, rows.values(), strict=True):
         signed = np.isfinite(row["p_negative"])
-        row["verdict"] = _verdict(row, signed and _size_known(problem, fit, posterior, name))
+        row["verdict"] = _verdict(row, signed and _size_known(problem, fit, posterior, name), within)
         both = row["verdict"] == SIGN and abs(fit.theta[name]) > 2.0 * fit.sd[name]
         row["evidence"] = _evidence(row)
         row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments, structure)
@@ -277,7 +288,26 @@ def identifiability(
         experiments,
         structure,
         converged=posterior is None or posterior.converged,
+        basis=_basis(fit, posterior),
     )
+
+
+def _basis(fit: MapEstimate, posterior: Posterior | None) -> str:
+    """Return a sentence on what the verdicts rest on."""
+    count, optima = sum(np.isfinite(one["objective"]) for one in fit.starts), 1 + len(notable(fit.other_modes))
+    if posterior is not None:
+        fewest = min(posterior.ess[name] for name in fit.theta)
+        return f"The verdicts rest on {fewest:.0f} or more effective draws of each parameter."
+    if optima > 1:
+        return f"No draws: the verdicts rest on the Laplace approximations at {optima} optima of {count} starts."
+    searched = "one mode was looked at, from one start" if count < 2 else f"no other optimum was found from {count} starts"
+    return f"No draws: the verdicts rest on the Laplace approximation at the estimate; {searched}."
+
+
+def _other_values(fit: MapEstimate, name: str) -> list[float]:
+    """Return the values of a parameter at other optima with more than 1 % of the mass, where they differ."""
+    value, sd = fit.theta[name], fit.sd[name]
+    return [mode.theta[name] for mode in notable(fit.other_modes) if mode.differs(name, value, sd)]
 
 
 def _partners(structure: Structure, name: str) -> str:
@@ -292,9 +322,11 @@ def _widths(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ratio of posterior to prior sd of each coordinate, and the Monte Carlo error of the contraction."""
     if posterior is None:
-        labels = list(problem.names)
-        variances = np.diag(fit.joint_covariance.loc[labels, labels])
-        return np.sqrt(variances) / information.prior_sd, np.zeros(len(labels))
+        names, modes, masses = list(problem.names), [fit, *fit.other_modes], fit.modes["mass"].to_numpy()
+        variances = np.array([np.diag(mode.joint_covariance.loc[names, names]) for mode in modes])
+        means = information.coordinates(np.array([list(mode.theta.values()) for mode in modes]))
+        variances += (means - masses @ means) ** 2
+        return np.sqrt(masses @ variances) / information.prior_sd, np.zeros(len(names))
     prior = problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))
     draws = np.stack([posterior.draws(name) for name in problem.names], axis=-1)
     widths = _half_width(information.coordinates(draws)) / _half_width(information.coordinates(prior))
@@ -315,7 +347,8 @@ def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, n
     if not low < 0.0 < high:
         return np.nan, np.nan
     if posterior is None:
-        return float(ndtr(-fit.theta[name] / fit.sd[name])), 0.0
+        own = [float(ndtr(-mode.theta[name] / mode.sd[name])) for mode in (fit, *fit.other_modes)]
+        return float(fit.modes["mass"] @ own), 0.0
     share = float(np.mean(posterior.draws(name) < 0.0))
     size = posterior.ess[name]
     bounded = np.clip(share, 1.0 / (size + 2.0), 1.0 - 1.0 / (size + 2.0))
@@ -327,16 +360,22 @@ def _size_known(problem: Problem, fit: MapEstimate, posterior: Posterior | None,
     column = problem.names.index(name)
     prior = np.abs(problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))[:, column])
     if posterior is None:
-        values = fit.theta[name] + fit.sd[name] * np.random.default_rng(1).standard_normal(PRIOR_DRAWS)
+        generator, modes = np.random.default_rng(1), [fit, *fit.other_modes]
+        chosen = generator.choice(len(modes), PRIOR_DRAWS, p=fit.modes["mass"])
+        centres, widths = np.array([(mode.theta[name], mode.sd[name]) for mode in modes]).T
+        values = centres[chosen] + widths[chosen] * generator.standard_normal(PRIOR_DRAWS)
     else:
         values = posterior.draws(name)
     return bool(_half_width(np.abs(values)) < 0.5 * _half_width(prior))
 
 
-def _verdict(row: dict, size_known: bool) -> str:
+def _verdict(row: dict, size_known: bool, within: float) -> str:
+    """Return the verdict; `within` is the sd that the data alone leave at one optimum, in prior sds."""
     margin = MONTE_CARLO_ERRORS * row["p_negative_mcse"]
     if size_known and max(row["p_negative"], 1.0 - row["p_negative"]) < SIGN_PROBABILITY - margin:
         return SIGN
+    if row["other_values"] and min(within, row["together"]) <= DETERMINED_SD:
+        return SEVERAL
     if row["profile"] == ONE_SIDED and row["collinearity"] < COLLINEAR:
         return PRIOR_ONLY
     if row["alone"] > UNINFORMED_SD:
@@ -360,6 +399,8 @@ def _evidence(row: dict) -> str:
         text += f", the data alone would leave {row['alone']:.3g} prior sds with all other parameters known"
     if row["profile"] and row["profile"] != "closed":
         text += f", profile {row['profile']}"
+    if row["other_values"]:
+        text += f", {row['other_values']} at another optimum with more than 1 % of the mass"
     if np.isfinite(row["p_negative"]):
         text += f", P(negative) = {row['p_negative']:.3g}"
         text += f" ± {row['p_negative_mcse']:.2g}" if row["p_negative_mcse"] else ""
@@ -369,8 +410,8 @@ def _evidence(row: dict) -> str:
 
 
 def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame, structure: Structure) -> str:
-    if row["verdict"] == DETERMINED:
-        return ""
+    if row["verdict"] in (DETERMINED, SEVERAL):
+        return "" if row["verdict"] == DETERMINED else OTHER_VALUES
     if row["verdict"] == COMBINATION:
         own = directions[[name in members.split(", ") for members in directions["parameters"]]]
         own = own[own["gain"] < UNDETERMINED_GAIN]

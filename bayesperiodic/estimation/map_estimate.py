@@ -1,7 +1,7 @@
 """Bayesian estimator of the paper: staged Gauss-Newton to the MAP point, and its Laplace covariance."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
 from typing import Any
 
@@ -22,6 +22,7 @@ from bayesperiodic.estimation.gauss_newton import (
     information,
 )
 from bayesperiodic.estimation.laplace import SILENT, joint_laplace, undetermined
+from bayesperiodic.estimation.modes import End, default_starts, notable, weighed, with_images
 from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, noise_split
 from bayesperiodic.posterior.density import NATURAL, RIDGE, Linearisation, LogPosterior
 from bayesperiodic.posterior.initial import InitialEstimate, simultaneous_fit
@@ -38,7 +39,12 @@ deferred: Any = partial
 
 @in_one_thread
 def map_estimate(
-    problem: Problem, *, start: Mapping[str, float] | None = None, starts: int = 1, seed: int = 0, progress: bool = True
+    problem: Problem,
+    *,
+    start: Mapping[str, float] | None = None,
+    starts: int | None = None,
+    seed: int = 0,
+    progress: bool = True,
 ) -> MapEstimate:
     r"""Find the MAP point by staged Gauss-Newton, and the Laplace covariance there.
 
@@ -57,13 +63,19 @@ def map_estimate(
     Where every experiment of a forced model has a guess of its orbit, orbits and parameters are first estimated
     together, from these guesses and `start`: the orbits need not exist at the start, and none is lost or exchanged.
 
+    The iteration starts at several points where its solves are cheap, and at the images of an optimum under changes of
+    signs and exchanges of two parameters, if their density is at least a thousandth of the optimum's. Ends further
+    apart than a standard deviation are separate optima, see `MapEstimate.modes`; the estimate is the highest.
+
     Parameters
     ----------
     problem : Problem
     start : mapping of str to float, optional
         First guess of every free parameter; by default the medians of the priors.
-    starts : int
-        Number of starts; those after the first are draws from the priors. The best estimate is returned.
+    starts : int, optional
+        Number of starts; those after the first are draws from the priors, solved from the orbits of the first. By
+        default one if `start` is given, and otherwise up to eight, with at most 16 000 unknowns of all periodic solves
+        together: eight for 2000 (states × points × experiments) or fewer, one for more than 8000.
     seed : int
         Of these draws.
     progress : bool
@@ -83,7 +95,7 @@ def map_estimate(
     UserWarning
         If the noise of the measured inputs causes more than a tenth of an output's residual, if twice as many points
         would move an estimate by more than a tenth of its standard deviation, if an estimate lies at the end of its
-        prior's support, and if the data do not determine a parameter or a combination of parameters.
+        prior's support, if another optimum has more than 1 % of the posterior mass by its Laplace approximation, and if the data do not determine a parameter or a combination of parameters.
 
     References
     ----------
@@ -99,23 +111,18 @@ def map_estimate(
     if isinstance(start, Mapping):
         _checks.same_names("start", start, problem.names)
     theta = problem.median() if start is None else problem.vector(start)
+    if starts is None:
+        starts = default_starts(problem) if start is None else 1
     _checks.integer("starts", starts, 1)
     first = _first_iterate(problem, theta)
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
     objective = _objective(problem, first.here)
-    best, status, history = _climb(objective, first, progress)
-    found = [_outcome(problem, best)]
+    ends: list[End | None] = [_climb(objective, first, progress)]
     for draw in problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0))):
-        other = _first_iterate(problem, draw)
-        if other is None:
-            found.append({"objective": -np.inf} | dict.fromkeys(problem.names, np.nan))
-            continue
-        end, other_status, other_history = _climb(objective, other, progress)
-        found.append(_outcome(problem, end))
-        if end.objective > best.objective:
-            best, status, history = end, other_status, other_history
-    result = _describe(problem, objective, best, status, history, tuple(found))
+        ends.append(_from_draw(objective, first, draw, progress))
+    modes = with_images(objective, [end for end in ends if end], partial(_climb, objective, progress=progress))
+    result = _describe(problem, objective, modes, tuple(_outcome(problem, end) for end in ends))
     for text in estimation_warnings(problem, result):
         warnings.warn(text, UserWarning, stacklevel=3)
     return result
@@ -148,28 +155,34 @@ def _linearised(problem: Problem, theta: np.ndarray, found: InitialEstimate | No
     return LogPosterior(problem, Simulator.start(problem, found.theta, found.states)).linearise(found.theta)
 
 
-def _climb(objective: Objective, first: Iterate, progress: bool) -> tuple[Iterate, str, np.ndarray]:
+def _from_draw(objective: Objective, first: Iterate, theta: np.ndarray, progress: bool) -> End | None:
+    """Return the end of the iteration from a draw of the prior; None if there is no orbit or no finite density."""
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        other = objective.at(theta, first.here, objective.density.problem.likelihood.guess())
+        return None if other is None else _climb(objective, objective.anchored(other), progress)
+
+
+def _climb(objective: Objective, first: Iterate, progress: bool) -> End:
     with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress) as bar:
 
         def report(iterate: Iterate, size: float) -> None:
             bar.update()
             bar.set_postfix_str(f"objective {iterate.objective:.6g}, step {size:.2g} sd")
 
-        return climb(objective, first, report=report)
+        return End(*climb(objective, first, report=report))
 
 
-def _outcome(problem: Problem, iterate: Iterate) -> dict[str, float]:
-    return {"objective": iterate.objective} | dict(zip(problem.names, iterate.theta.tolist(), strict=True))
+def _outcome(problem: Problem, end: End | None) -> dict[str, float]:
+    if end is None:
+        return {"objective": -np.inf} | dict.fromkeys(problem.names, np.nan)
+    return {"objective": end.iterate.objective} | dict(zip(problem.names, end.iterate.theta.tolist(), strict=True))
 
 
 def _describe(
-    problem: Problem,
-    objective: Objective,
-    best: Iterate,
-    status: str,
-    history: np.ndarray,
-    starts: tuple[dict[str, float], ...],
+    problem: Problem, objective: Objective, modes: Sequence[End], starts: tuple[dict[str, float], ...]
 ) -> MapEstimate:
+    best, status, history = modes[0]
     share, names, likelihood = objective.share, problem.names, problem.likelihood
     data, _ = information(problem, best)
     solutions = best.here.simulator.solutions(best.theta)
@@ -180,7 +193,9 @@ def _describe(
     covariance[lost], covariance[:, lost] = np.nan, np.nan
     covariance[lost, lost] = np.inf
     residuals = best.here.compared()
-    joint = cache(partial(in_one_thread(joint_laplace), objective.density.with_settings(coordinates=RIDGE), best))
+    sampled = objective.density.with_settings(coordinates=RIDGE)
+    joint = cache(partial(in_one_thread(joint_laplace), sampled, best))
+    others = [joint_laplace(sampled, end.iterate) for end in modes[1:]]
     noise = dict(zip(problem.noise_names, best.noise.tolist(), strict=True))
     rms = {c: _pooled(problem, c, residuals) for c in problem.channels}
     measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} for e in problem.experiments}
@@ -193,8 +208,8 @@ def _describe(
         noise=noise,
         noise_prior=problem.noise.prior_text,
         covariance=pd.DataFrame(covariance, index=list(names), columns=list(names)),
-        joint_mode=deferred(lambda: joint()[0]),
-        joint_covariance=deferred(lambda: joint()[1]),
+        joint_mode=deferred(lambda: joint().mode),
+        joint_covariance=deferred(lambda: joint().covariance),
         degrees_of_freedom=max(float(problem.counted - len(names)), 1.0) if problem.free_noise else np.inf,
         independent={_short(name): count for name, count in likelihood.counts.items()},
         solutions=solutions,
@@ -209,6 +224,7 @@ def _describe(
         undetermined=undetermined(data, best.theta, names, problem.logarithmic),
         history=history,
         starts=starts,
+        other_modes=weighed(problem, modes, [joint(), *others]) if others else (),
         tied=_tied_slopes(problem, best.theta),
     )
 
@@ -254,6 +270,12 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
         yield (
             f"The estimate of {name!r}, {fit.theta[name]:.6g}, lies at the end of its prior's support ({low:g}, "
             f"{high:g}); standard deviations do not describe the posterior there. Sample it, or widen the prior."
+        )
+    if others := notable(fit.other_modes):
+        yield (
+            f"{len(others) + 1} separate optima fit the data: the estimate, with {fit.modes['mass'].iloc[0]:.0%} of the "
+            f"posterior mass by Laplace, and {'; '.join(map(repr, others[:SHOWN]))}. Standard deviations describe the "
+            "first one only. Sample the posterior, or give priors that exclude the others."
         )
     silent = [text for text in fit.undetermined if text.endswith(SILENT)]
     if silent:

@@ -15,6 +15,7 @@ from bayesperiodic import _checks
 from bayesperiodic._expressions import Expression, parse_all
 from bayesperiodic._io import Result
 from bayesperiodic.estimation.gauss_newton import Iterate
+from bayesperiodic.estimation.modes import Mode, notable
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.posterior.joint_priors import MultivariateNormal
 from bayesperiodic.posterior.noise import POINTS, SPECTRAL
@@ -146,6 +147,8 @@ class MapEstimate(Result):
         The objective before each step and at the end.
     starts : tuple of dict of str to float
         Of every start, the objective reached (−inf: none) under "objective", and the estimates.
+    other_modes : tuple of Mode
+        Separate optima other than the estimate whose objective is lower by less than 30, see `modes`.
     tied : dict of str to dict of str to float
         Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
 
@@ -185,6 +188,7 @@ class MapEstimate(Result):
     undetermined: tuple[str, ...]
     history: np.ndarray
     starts: tuple[dict[str, float], ...]
+    other_modes: tuple[Mode, ...]
     tied: dict[str, dict[str, float]]
 
     if not TYPE_CHECKING:
@@ -203,6 +207,13 @@ class MapEstimate(Result):
     def converged(self) -> bool:
         """True if the status is "converged"."""
         return self.status == "converged"
+
+    @property
+    def modes(self) -> pd.DataFrame:
+        """Separate optima, the estimate first: objective, fraction of the mass by Laplace, and parameters."""
+        own = {"objective": float(self.history[-1]), "mass": 1.0 - sum(mode.mass for mode in self.other_modes)}
+        rows = [{"objective": mode.objective, "mass": mode.mass} | mode.theta for mode in self.other_modes]
+        return pd.DataFrame([own | self.theta, *rows])
 
     @property
     def correlations(self) -> pd.DataFrame:
@@ -374,6 +385,7 @@ class MapEstimate(Result):
                 line += f", whiteness p = {self.whiteness[channel].p:.2g}"
             lines.append(line)
         lines += [f"  not determined by the data: {text}" for text in self.undetermined]
+        lines += [f"  another optimum: {mode!r}" for mode in notable(self.other_modes)]
         return "\n".join(lines)
 
 
