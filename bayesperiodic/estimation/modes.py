@@ -132,7 +132,11 @@ def images(problem: Description, theta: np.ndarray) -> np.ndarray:
     supports = problem.joint_prior.supports
     signed = [i for i, (low, high) in enumerate(supports.values()) if low < 0.0 < high]
     sizes = range(1, len(signed) + 1) if len(signed) <= MOST_SIGNS else (1, len(signed))
-    found = [theta * np.where(np.isin(np.arange(theta.size), c), -1.0, 1.0) for n in sizes for c in combinations(signed, n)]
+    found = []
+    for columns in (list(c) for n in sizes for c in combinations(signed, n)):
+        image = theta.copy()
+        image[columns] *= -1.0
+        found.append(image)
     for i, j in combinations([i for i, name in enumerate(supports) if "[" not in name], 2):
         image = theta.copy()
         image[[i, j]] = theta[[j, i]]
