@@ -134,9 +134,9 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     quarter of the posterior sd, and so does the distribution as a whole; "too narrow" or "too wide" if both ends are
     off in opposite directions; "wrong shape" if the posterior is shifted, skewed, or accumulates at an end of the
     prior's support; "wrong mode" if more than 5 % of the draws lie in another mode, or almost none near the
-    approximation, or if an optimum in `MapEstimate.modes` with another value, further away than a standard deviation,
-    has more than 1 % of the mass. All deviations must exceed three Monte Carlo errors. The verdict is "not converged" for draws that
-    have not converged, unless every ensemble by itself shows another mode.
+    approximation, or if another optimum in `MapEstimate.modes`, further away than a standard deviation, has more than 1
+    % of the mass. All deviations of the draws must exceed three Monte Carlo errors. The verdict is "not converged" for
+    draws that have not converged, unless every ensemble by itself shows another mode.
 
     The joint verdict rests on the fraction of draws inside the Laplace ellipsoids and on the Pareto k̂ of the importance
     weights of 8000 draws from Laplace (Vehtari, Simpson, Gelman, Yao, Gabry, Pareto smoothed importance sampling, J.
@@ -332,9 +332,8 @@ def _scores(problem: Problem, fit: MapEstimate, posterior: Posterior, coordinate
     *k, efficiency = importance_k(problem, fit, coordinates)
     tail = NO_TAIL if efficiency > EVEN else (k[0], k[1])
     joint = verdicts.joint_verdict(points, laplace.mean, laplace.covariance, sampled, tail, posterior.converged)
-    if others := notable(fit.other_modes):
-        own = problem.names, list(fit.theta.values()), list(fit.sd.values())
-        marginal |= {name: MODE for name, v, sd in zip(*own, strict=True) if any(m.differs(name, v, sd) for m in others)}
+    if posterior.converged and notable(fit.other_modes):
+        marginal |= {name: MODE for name in problem.names if fit.other_values(name)}
         joint = MODE
     joint = _consistent(joint, set(marginal.values()))
     return Scores(laplace, samples, sampled(distances), marginal, (k[0], k[1]), efficiency, joint)

@@ -14,7 +14,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics.design import Candidate, Information, default_candidates, rank_candidates
 from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
-from bayesperiodic.estimation.modes import notable
+from bayesperiodic.estimation.modes import Mode, notable
 from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate
@@ -146,8 +146,9 @@ class Identifiability(Result):
         unknown; ``collinearity``: their ratio. ``profile``: its shape. ``structural``: the parameters of a structural
         symmetry that contains it, if any. ``p_negative`` and ``p_negative_mcse``: probability of a value below zero;
         NaN for positive parameters. ``other_values``: values at other optima with more than 1 % of the mass, see
-        `MapEstimate.modes`, if they are further away than a standard deviation. ``prior_sensitivity`` and ``likelihood_sensitivity``: distance per doubling of the
-        prior or the likelihood (power-scaling). ``evidence`` and ``remedy``: summary and recommendation.
+        `MapEstimate.modes`, if they are further away than a standard deviation. ``prior_sensitivity`` and
+        ``likelihood_sensitivity``: distance per doubling of the prior or the likelihood (power-scaling). ``evidence``
+        and ``remedy``: summary and recommendation.
     directions : DataFrame
         One row per direction in parameter space, in ascending order of information: information of the data over that
         of the prior, contraction, the direction in words, its parameters, and combinations invariant along it.
@@ -209,8 +210,8 @@ def identifiability(
 ) -> Identifiability:
     """Classify the identifiability of each parameter, with evidence and a recommendation.
 
-    Widths are those of the draws, or of the Laplace approximations at all optima of the estimate without draws, relative
-    to the prior. The first criterion that applies determines the verdict:
+    Widths are those of the draws, or without draws of the Laplace approximations at all optima of the estimate, see
+    `MapEstimate.modes`, relative to the prior. The first criterion that applies determines the verdict:
 
     1. "sign undetermined": the size of a signed parameter is determined, but both signs have a probability above 2.5 %
        (by more than three Monte Carlo errors).
@@ -267,7 +268,7 @@ def identifiability(
         },
         index=[*problem.names],
     )
-    table["other_values"] = [", ".join(f"{v:.4g}" for v in _other_values(fit, name)) for name in problem.names]
+    table["other_values"] = [", ".join(f"{v:.4g}" for v in fit.other_values(name)) for name in problem.names]
     signs = [_negative(problem, fit, posterior, name) for name in problem.names]
     table[["p_negative", "p_negative_mcse"]] = np.array(signs)
     scaling = {} if posterior is None else power_scaling(problem, posterior)
@@ -300,14 +301,10 @@ def _basis(fit: MapEstimate, posterior: Posterior | None) -> str:
         return f"The verdicts rest on {fewest:.0f} or more effective draws of each parameter."
     if optima > 1:
         return f"No draws: the verdicts rest on the Laplace approximations at {optima} optima of {count} starts."
-    searched = "one mode was looked at, from one start" if count < 2 else f"no other optimum was found from {count} starts"
+    searched = (
+        f"no other optimum was found from {count} starts" if count > 1 else "one mode was looked at, from one start"
+    )
     return f"No draws: the verdicts rest on the Laplace approximation at the estimate; {searched}."
-
-
-def _other_values(fit: MapEstimate, name: str) -> list[float]:
-    """Return the values of a parameter at other optima with more than 1 % of the mass, where they differ."""
-    value, sd = fit.theta[name], fit.sd[name]
-    return [mode.theta[name] for mode in notable(fit.other_modes) if mode.differs(name, value, sd)]
 
 
 def _partners(structure: Structure, name: str) -> str:
@@ -322,7 +319,7 @@ def _widths(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ratio of posterior to prior sd of each coordinate, and the Monte Carlo error of the contraction."""
     if posterior is None:
-        names, modes, masses = list(problem.names), [fit, *fit.other_modes], fit.modes["mass"].to_numpy()
+        names, modes, masses = list(problem.names), _optima(fit), fit.modes["mass"].to_numpy()
         variances = np.array([np.diag(mode.joint_covariance.loc[names, names]) for mode in modes])
         means = information.coordinates(np.array([list(mode.theta.values()) for mode in modes]))
         variances += (means - masses @ means) ** 2
@@ -333,6 +330,10 @@ def _widths(
     # The standard error of half the central 68 % interval of a normal sample is 1.1 times that of its sd.
     size = np.array([posterior.ess[name] for name in problem.names])
     return widths, 2.0 * widths**2 * 1.1 / np.sqrt(2.0 * size)
+
+
+def _optima(fit: MapEstimate) -> list[MapEstimate | Mode]:
+    return [fit, *fit.other_modes]
 
 
 def _half_width(values: np.ndarray) -> np.ndarray:
@@ -347,8 +348,8 @@ def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, n
     if not low < 0.0 < high:
         return np.nan, np.nan
     if posterior is None:
-        own = [float(ndtr(-mode.theta[name] / mode.sd[name])) for mode in (fit, *fit.other_modes)]
-        return float(fit.modes["mass"] @ own), 0.0
+        own = [float(ndtr(-mode.theta[name] / mode.sd[name])) for mode in _optima(fit)]
+        return float(fit.modes["mass"].to_numpy() @ own), 0.0
     share = float(np.mean(posterior.draws(name) < 0.0))
     size = posterior.ess[name]
     bounded = np.clip(share, 1.0 / (size + 2.0), 1.0 - 1.0 / (size + 2.0))
@@ -360,7 +361,7 @@ def _size_known(problem: Problem, fit: MapEstimate, posterior: Posterior | None,
     column = problem.names.index(name)
     prior = np.abs(problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))[:, column])
     if posterior is None:
-        generator, modes = np.random.default_rng(1), [fit, *fit.other_modes]
+        generator, modes = np.random.default_rng(1), _optima(fit)
         chosen = generator.choice(len(modes), PRIOR_DRAWS, p=fit.modes["mass"])
         centres, widths = np.array([(mode.theta[name], mode.sd[name]) for mode in modes]).T
         values = centres[chosen] + widths[chosen] * generator.standard_normal(PRIOR_DRAWS)

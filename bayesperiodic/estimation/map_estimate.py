@@ -95,7 +95,8 @@ def map_estimate(
     UserWarning
         If the noise of the measured inputs causes more than a tenth of an output's residual, if twice as many points
         would move an estimate by more than a tenth of its standard deviation, if an estimate lies at the end of its
-        prior's support, if another optimum has more than 1 % of the posterior mass by its Laplace approximation, and if the data do not determine a parameter or a combination of parameters.
+        prior's support, if another optimum has more than 1 % of the posterior mass by its Laplace approximation, and if
+        the data do not determine a parameter or a combination of parameters.
 
     References
     ----------
@@ -273,9 +274,9 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
         )
     if others := notable(fit.other_modes):
         yield (
-            f"{len(others) + 1} separate optima fit the data: the estimate, with {fit.modes['mass'].iloc[0]:.0%} of the "
-            f"posterior mass by Laplace, and {'; '.join(map(repr, others[:SHOWN]))}. Standard deviations describe the "
-            "first one only. Sample the posterior, or give priors that exclude the others."
+            f"{len(others) + 1} separate optima fit the data: the estimate, with {fit.modes['mass'].iloc[0]:.0%} of "
+            f"the posterior mass by Laplace, and {'; '.join(map(repr, others[:SHOWN]))}. Standard deviations describe "
+            "the first one only. Sample the posterior, or give priors that exclude the others."
         )
     silent = [text for text in fit.undetermined if text.endswith(SILENT)]
     if silent:

@@ -88,8 +88,10 @@ def with_images(objective: Objective, ends: Sequence[End], climbed: Callable[[It
         here = waiting.pop(0).iterate
         for image in _credible_images(objective, here):
             start = objective.at(image, here.here, here.noise) if _is_separate(objective, image, found) else None
-            end = None if start is None else climbed(objective.anchored(start))
-            if end is not None and end.status == "converged" and _is_separate(objective, end.iterate.theta, found):
+            if start is None:
+                continue
+            end = climbed(objective.anchored(start))
+            if end.status == "converged" and _is_separate(objective, end.iterate.theta, found):
                 found.append(end)
                 waiting.append(end)
     found.sort(key=lambda end: -end.iterate.objective)

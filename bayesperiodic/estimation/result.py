@@ -215,6 +215,21 @@ class MapEstimate(Result):
         rows = [{"objective": mode.objective, "mass": mode.mass} | mode.theta for mode in self.other_modes]
         return pd.DataFrame([own | self.theta, *rows])
 
+    def other_values(self, name: str) -> list[float]:
+        """Return the values of a parameter at other optima with more than 1 % of the mass, where they differ.
+
+        Parameters
+        ----------
+        name : str
+
+        Returns
+        -------
+        list of float
+            Those further from the estimate than the smaller one of the two standard deviations.
+        """
+        value, sd = self.theta[name], self.sd[name]
+        return [mode.theta[name] for mode in notable(self.other_modes) if mode.differs(name, value, sd)]
+
     @property
     def correlations(self) -> pd.DataFrame:
         """Correlations of the parameters, from `covariance`."""

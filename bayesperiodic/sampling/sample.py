@@ -63,7 +63,8 @@ def sample(
 ) -> Posterior:
     """Sample the posterior of θ and the free noise parameters with emcee's affine-invariant ensembles.
 
-    Several independent ensembles [1]_ start from draws of the Laplace approximation with doubled standard deviations.
+    Several independent ensembles [1]_ start from draws of the Laplace approximation with doubled standard deviations, at
+    every optimum of `MapEstimate.modes` in proportion to its mass.
     Parameters with positive support and the noise parameters are sampled in their logarithms, where ridges of products
     are straight; Jeffreys' prior 1/v is constant there. The eigenvectors of the Laplace approximation in these
     coordinates are the axes. Seven steps in ten are differential-evolution moves [2]_, which mix three times faster

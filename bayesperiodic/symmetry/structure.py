@@ -20,7 +20,8 @@ class Symmetry:
     """Transformation of parameters, and of states that are not measured, that leaves all measured outputs unchanged.
 
     Its kind is "scaling", "shift" (which adds a constant to a parameter or a state, and may also transform others) or
-    "other"; of discrete ones "sign change" or "exchange", without generator and amount. The finite transformation is confirmed by exact substitution in the equations.
+    "other"; of discrete ones "sign change" or "exchange", without generator and amount. The finite transformation is
+    confirmed by exact substitution in the equations.
     """
 
     kind: str

@@ -157,8 +157,8 @@ def test_parameter_with_two_values_is_not_determined():
     assert found.verdicts == {"a": "several values", "b": "determined"}
     assert "at another optimum with more than 1 % of the mass" in found.table.loc["a", "evidence"]
     assert found.table.loc["b", "other_values"] == ""
-    # A uniform prior has half of its central 68 % at 1.71, the mixture an sd of 1.
-    assert found.table.loc["a", "contraction"] == pytest.approx(1.0 - 12 * 1.0**2 / 4.999**2, abs=0.01)
+    # Half the central 68 % of the prior is 1.71, and the sd of the mixture is 1.
+    assert found.table.loc["a", "contraction"] == pytest.approx(1.0 - 1.0 / (0.5 * 0.6827 * 4.999) ** 2, abs=1e-3)
     posterior = bp.sample(problem, fit, **SHORT)
     assert 0.2 < np.mean(posterior.draws("a") > 2.0) < 0.8
     drawn = bp.identifiability(problem, fit, posterior, profile=False)

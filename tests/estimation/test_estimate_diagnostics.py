@@ -21,9 +21,7 @@ PRODUCT = formula_model(
     ["a", "b", "shift_a", "shift_b", "idle"],
     lambda p, u, s: {"force": p.a * p.b**2 * u.x + (p.shift_a + 2 * p.shift_b) * u.dx},
 )
-WELLS = formula_model(
-    "wells", ["a"], lambda p, u, s: {"force": (p.a - 3) ** 2 * u.x + 0.05 * (p.a - 3) * u.dx}
-)
+WELLS = formula_model("wells", ["a"], lambda p, u, s: {"force": (p.a - 3) ** 2 * u.x + 0.05 * (p.a - 3) * u.dx})
 
 
 def sine_run(force) -> bp.Experiment:

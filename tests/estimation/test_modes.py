@@ -58,7 +58,12 @@ def test_masses_are_those_of_quadrature():
     [
         (lambda p: p.a**2, 1.0, {"a": bp.Normal(0.5, 2.0)}, {(1,), (-1,)}),
         (lambda p: p.a**2 * p.b, 2.0, {"a": bp.Normal(0.5, 2.0), "b": bp.Normal(2.0, 0.01)}, {(1, 2), (-1, 2)}),
-        (lambda p: (p.a - p.b) ** 2, 1.0, {"a": bp.Normal(1.0, 0.1), "b": bp.Normal(1.0, 0.1)}, {(1.5, 0.5), (0.5, 1.5)}),
+        (
+            lambda p: (p.a - p.b) ** 2,
+            1.0,
+            {"a": bp.Normal(1.0, 0.1), "b": bp.Normal(1.0, 0.1)},
+            {(1.5, 0.5), (0.5, 1.5)},
+        ),
     ],
     ids=["sign", "sign of one of two", "exchange"],
 )

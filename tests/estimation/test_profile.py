@@ -160,9 +160,7 @@ def test_profile_is_extended_where_another_branch_raises_its_end():
     model = formula_model(
         "unlike_wells",
         ["a", "b"],
-        lambda p, u, s: {
-            "y": ((p.b - 3) ** 2 + 0.6 * p.a) * u.x + p.a * (1.5 * p.b - 2.5) * u.dx / (2 * np.pi)
-        },
+        lambda p, u, s: {"y": ((p.b - 3) ** 2 + 0.6 * p.a) * u.x + p.a * (1.5 * p.b - 2.5) * u.dx / (2 * np.pi)},
     )
     wave, priors = WAVE * np.sqrt(2 / 40), {"a": bp.Normal(0.0, 5.0), "b": bp.Normal(2.0, 2.0)}
     problem = posed(model, wave, 0.3, priors, wave=wave)
@@ -180,9 +178,7 @@ def test_profile_is_extended_where_another_branch_raises_its_end():
 def test_point_better_than_the_estimate_is_reported_and_can_be_the_start():
     problem = double_well(0.5)
     fit = fitted(problem, {"a": -1.0, "b": 4.0})
-    with pytest.warns(
-        UserWarning, match=r"higher by 0.17 than .* b = 1.9.*start there, map_estimate\(problem, start="
-    ):
+    with pytest.warns(UserWarning, match=r"higher by 0.17 than .* b = 1.9.*start there, map_estimate\(problem, start="):
         profile = bp.profile(problem, fit, ["a"])
     assert profile.improvement == pytest.approx(0.1699, abs=1e-3)
     at_map = profile.log_density["a"][profile.values["a"] == fit.theta["a"]]
