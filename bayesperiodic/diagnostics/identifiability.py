@@ -14,7 +14,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics.design import Candidate, Information, default_candidates, rank_candidates
 from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
-from bayesperiodic.estimation.modes import Mode, notable
+from bayesperiodic.estimation.modes import NOTABLE, Mode, notable
 from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate
@@ -145,10 +145,10 @@ class Identifiability(Result):
         ``together``: the sd left by the data alone, in prior sds, if the other parameters are known and if they are
         unknown; ``collinearity``: their ratio. ``profile``: its shape. ``structural``: the parameters of a structural
         symmetry that contains it, if any. ``p_negative`` and ``p_negative_mcse``: probability of a value below zero;
-        NaN for positive parameters. ``other_values``: values at other optima with more than 1 % of the mass, see
-        `MapEstimate.modes`, if they are further away than a standard deviation. ``prior_sensitivity`` and
-        ``likelihood_sensitivity``: distance per doubling of the prior or the likelihood (power-scaling). ``evidence``
-        and ``remedy``: summary and recommendation.
+        NaN for positive parameters. ``other_values``: values at other optima, or at images under discrete symmetries,
+        with more than 1 % of the mass, see `MapEstimate.modes`, if they are further away than a standard deviation.
+        ``prior_sensitivity`` and ``likelihood_sensitivity``: distance per doubling of the prior or the likelihood
+        (power-scaling). ``evidence`` and ``remedy``: summary and recommendation.
     directions : DataFrame
         One row per direction in parameter space, in ascending order of information: information of the data over that
         of the prior, contraction, the direction in words, its parameters, and combinations invariant along it.
@@ -268,7 +268,9 @@ def identifiability(
         },
         index=[*problem.names],
     )
-    table["other_values"] = [", ".join(f"{v:.4g}" for v in fit.other_values(name)) for name in problem.names]
+    images = _structural_images(problem, fit, structure)
+    others = {name: fit.other_values(name) or images.get(name, []) for name in problem.names}
+    table["other_values"] = [", ".join(f"{value:.4g}" for value in values) for values in others.values()]
     signs = [_negative(problem, fit, posterior, name) for name in problem.names]
     table[["p_negative", "p_negative_mcse"]] = np.array(signs)
     scaling = {} if posterior is None else power_scaling(problem, posterior)
@@ -299,12 +301,30 @@ def _basis(fit: MapEstimate, posterior: Posterior | None) -> str:
     if posterior is not None:
         fewest = min(posterior.ess[name] for name in fit.theta)
         return f"The verdicts rest on {fewest:.0f} or more effective draws of each parameter."
+    starts = f"{count} starts" if count > 1 else "one start"
     if optima > 1:
-        return f"No draws: the verdicts rest on the Laplace approximations at {optima} optima of {count} starts."
-    searched = (
-        f"no other optimum was found from {count} starts" if count > 1 else "one mode was looked at, from one start"
-    )
+        return f"No draws: the verdicts rest on the Laplace approximations at {optima} optima, found from {starts}."
+    searched = f"no other optimum was found from {starts}" if count > 1 else f"one mode was looked at, from {starts}"
     return f"No draws: the verdicts rest on the Laplace approximation at the estimate; {searched}."
+
+
+def _structural_images(problem: Problem, fit: MapEstimate, structure: Structure) -> dict[str, list[float]]:
+    """Return the values of parameters at images of the estimate under discrete symmetries that the prior allows.
+
+    There the likelihood is the same; the prior density must be more than 1 % of that at the estimate.
+    """
+    found: dict[str, list[float]] = {}
+    for change in structure.discrete:
+        moves = {name: image for name, image in change.transformation.items() if name in change.parameters}
+        if moves.keys() <= fit.theta.keys():
+            values = {
+                n: (-1.0 if image[0] == "-" else 1.0) * fit.theta[image.lstrip("-")] for n, image in moves.items()
+            }
+            if problem.log_prior(fit.theta | values) > problem.log_prior(fit.theta) + np.log(NOTABLE):
+                for name, value in values.items():
+                    if abs(value - fit.theta[name]) > fit.sd[name]:
+                        found.setdefault(name, []).append(value)
+    return found
 
 
 def _partners(structure: Structure, name: str) -> str:

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import sympy as sp
 from scipy import integrate, stats
 
 import bayesperiodic as bp
@@ -166,6 +167,22 @@ def test_parameter_with_two_values_is_not_determined():
     single = bp.identifiability(problem, bp.map_estimate(problem, start={"a": 2.9, "b": 2.0}, **QUIET), profile=False)
     assert single.verdicts["a"] == "determined"
     assert "one mode was looked at, from one start" in repr(single)
+
+
+def test_discrete_symmetry_of_the_equations_counts_where_the_search_has_missed_it():
+    """Signs of five or more parameters are not changed in pairs; a·tanh(b) is the same for −a and −b."""
+    names = ["a", "b", "c", "d", "e"]
+    several = model(
+        "several", names, lambda p: {"force": p.a * sp.tanh(p.b), "other": p.b**2, "c": p.c, "d": p.d, "e": p.e}
+    )
+    sizes = {"force": np.tanh(1.0), "other": 1.0, "c": 1.0, "d": 1.0, "e": 1.0}
+    problem = bp.Problem(
+        several, [run(**sizes)], priors=dict.fromkeys(names, WIDE), fixed=known(**dict.fromkeys(sizes, 0.01))
+    )
+    fit = bp.map_estimate(problem, start=dict.fromkeys(names, 0.9), **QUIET)
+    found = bp.identifiability(problem, fit, profile=False)
+    assert fit.other_modes == ()
+    assert found.verdicts == {"a": "several values", "b": "several values"} | dict.fromkeys("cde", "determined")
 
 
 def test_parameter_without_effect_is_not_determined():
