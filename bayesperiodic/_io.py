@@ -26,6 +26,7 @@ MODULES = {
     "HopfPoint": "bayesperiodic.periodic.hopf",
     "Identifiability": "bayesperiodic.diagnostics.identifiability",
     "MapEstimate": "bayesperiodic.estimation.result",
+    "Mode": "bayesperiodic.estimation.modes",
     "NoiseSplit": "bayesperiodic.estimation.result",
     "Orbit": "bayesperiodic.orbits.orbit",
     "Orbits": "bayesperiodic.orbits.orbit",

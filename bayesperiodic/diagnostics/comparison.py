@@ -16,6 +16,7 @@ from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics import verdicts
 from bayesperiodic.diagnostics.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, USABLE_K, WIDE, Sample
+from bayesperiodic.estimation.modes import notable
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.posterior.density import COLLAPSED, NATURAL, LogPosterior, SamplingCoordinates
 from bayesperiodic.posterior.parameters import unit
@@ -137,9 +138,10 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     quarter of the posterior sd, and so does the distribution as a whole; "too narrow" or "too wide" if both ends are
     off in opposite directions; "wrong shape" if the posterior is shifted, skewed, or accumulates at an end of the
     prior's support; "wrong mode" if more than 5 % of the draws lie in another mode, or almost none near the
-    approximation, or if an orbit of the estimate is not the measured one (`MapEstimate.other_orbits`). All deviations
-    must exceed three Monte Carlo errors. The verdict is "not converged" for draws that have not converged, unless every
-    ensemble by itself shows another mode.
+    approximation, if another optimum in `MapEstimate.modes`, further away than a standard deviation, has more than 1 %
+    of the mass, or if an orbit of the estimate is not the measured one (`MapEstimate.other_orbits`). All deviations of
+    the draws must exceed three Monte Carlo errors. The verdict is "not converged" for draws that have not converged,
+    unless every ensemble by itself shows another mode.
 
     The joint verdict rests on the fraction of draws inside the Laplace ellipsoids and on the Pareto k̂ of the importance
     weights of 8000 draws from Laplace (Vehtari, Simpson, Gelman, Yao, Gabry, Pareto smoothed importance sampling, J.
@@ -340,6 +342,9 @@ def _scores(problem: Problem, fit: MapEstimate, posterior: Posterior, coordinate
     *k, efficiency = importance_k(problem, fit, coordinates)
     tail = NO_TAIL if efficiency > EVEN else (k[0], k[1])
     joint = verdicts.joint_verdict(points, laplace.mean, laplace.covariance, sampled, tail, posterior.converged)
+    if posterior.converged and notable(fit.other_modes):
+        marginal |= {name: MODE for name in problem.names if fit.other_values(name)}
+        joint = MODE
     joint = _consistent(joint, set(marginal.values()))
     return Scores(laplace, samples, sampled(distances), marginal, (k[0], k[1]), efficiency, joint)
 
@@ -410,7 +415,7 @@ def _recommendation(verdict: str, cure: bool, logarithm: bool, determined: bool)
     if verdict == UNCONVERGED:
         return "sample longer"
     if verdict == MODE:
-        return "report each mode by itself; try map_estimate(starts=…)"
+        return "report each mode by itself; see fit.modes, map_estimate(starts=…)"
     if cure:
         return ("logarithms cure it: " if logarithm else "") + "use Laplace in sampling coordinates"
     return "report the MCMC quantiles" if determined else "report a combination that the data determine"

@@ -14,6 +14,7 @@ from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics.design import Candidate, Information, default_candidates, rank_candidates
 from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
+from bayesperiodic.estimation.modes import NOTABLE, Mode, notable
 from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
@@ -118,7 +119,7 @@ def _one_sided(x: np.ndarray, weighted: np.ndarray) -> float:
 
 DETERMINED, PRIOR_ONLY = "determined", "only with the prior"
 COMBINATION, SIGN, NOTHING = "only in combination", "sign undetermined", "not determined"
-CONFLICT = "prior conflict"
+CONFLICT, SEVERAL = "prior conflict", "several values"
 # Standard deviations left by the data alone, in prior sds: the largest one of determined parameters (a contraction of
 # 0.9), and the smallest one of undetermined parameters (1 % of the information of the prior).
 DETERMINED_SD, UNINFORMED_SD = 1.0 / 3.0, 10.0
@@ -129,6 +130,7 @@ MONTE_CARLO_ERRORS = 3.0
 UNINFORMED_GAIN = 1e-13
 PRIOR_DRAWS = 20_000
 BOTH_SIGNS = "both signs fit the data: use a prior of one sign, or measure an output that is odd in it"
+OTHER_VALUES = "give a prior that excludes the other value, or measure an output that differs between them"
 
 
 @dataclass(frozen=True)
@@ -143,8 +145,10 @@ class Identifiability(Result):
         ``together``: the sd left by the data alone, in prior sds, if the other parameters are known and if they are
         unknown; ``collinearity``: their ratio. ``profile``: its shape. ``structural``: the parameters of a structural
         symmetry that contains it, if any. ``p_negative`` and ``p_negative_mcse``: probability of a value below zero;
-        NaN for positive parameters. ``prior_sensitivity`` and ``likelihood_sensitivity``: distance per doubling of the
-        prior or the likelihood (power-scaling). ``evidence`` and ``remedy``: summary and recommendation.
+        NaN for positive parameters. ``other_values``: values at other optima, or at images under discrete symmetries,
+        with more than 1 % of the mass, see `MapEstimate.modes`, if they are further away than a standard deviation.
+        ``prior_sensitivity`` and ``likelihood_sensitivity``: distance per doubling of the prior or the likelihood
+        (power-scaling). ``evidence`` and ``remedy``: summary and recommendation.
     directions : DataFrame
         One row per direction in parameter space, in ascending order of information: information of the data over that
         of the prior, contraction, the direction in words, its parameters, and combinations invariant along it.
@@ -160,6 +164,8 @@ class Identifiability(Result):
         Of the free parameters, from the measured channels.
     converged : bool
         False if there are draws that have not converged.
+    basis : str
+        What the verdicts rest on.
 
     Examples
     --------
@@ -175,6 +181,7 @@ class Identifiability(Result):
     experiments: pd.DataFrame
     structure: Structure
     converged: bool
+    basis: str
 
     @property
     def verdicts(self) -> dict[str, str]:
@@ -187,6 +194,7 @@ class Identifiability(Result):
             lines.append(f"{name}: {row['verdict']}; {row['evidence']}.")
             lines += [f"    Recommendation: {row['remedy']}."] if row["remedy"] else []
         lines.append(f"The condition number of the Fisher information is {self.condition:.3g}.")
+        lines.append(self.basis)
         lines += [] if self.converged else ["The draws have NOT CONVERGED; these results are provisional."]
         return "\n".join(lines)
 
@@ -202,13 +210,15 @@ def identifiability(
 ) -> Identifiability:
     """Classify the identifiability of each parameter, with evidence and a recommendation.
 
-    Widths are those of the draws, or of the Laplace approximation without draws, relative to the prior. The first
-    criterion that applies determines the verdict:
+    Widths are those of the draws, or without draws of the Laplace approximations at all optima of the estimate, see
+    `MapEstimate.modes`, relative to the prior. The first criterion that applies determines the verdict:
 
     1. "prior conflict": the data alone contradict the prior, see `MapEstimate.prior_conflict`; the estimate is a
        compromise, and its contraction means nothing. With draws, power-scaling confirms it or not.
     2. "sign undetermined": the size of a signed parameter is determined, but both signs have a probability above 2.5 %
        (by more than three Monte Carlo errors).
+    2. "several values": it would be "determined", but has another value, further away than a standard deviation, at
+       another optimum with more than 1 % of the mass.
     3. "only with the prior": the profile (Raue et al., Bioinformatics 25 (2009) 1923-1929) ends at the support of the
        prior on one side, although the parameter is not collinear with others.
     4. "not determined": with all other parameters known, the data have less than 1 % of the information of the prior.
@@ -263,16 +273,19 @@ def identifiability(
         },
         index=[*problem.names],
     )
+    images = _structural_images(problem, fit, structure)
+    others = {name: fit.other_values(name) or images.get(name, []) for name in problem.names}
+    table["other_values"] = [", ".join(f"{value:.4g}" for value in values) for values in others.values()]
     signs = [_negative(problem, fit, posterior, name) for name in problem.names]
     table[["p_negative", "p_negative_mcse"]] = np.array(signs)
     scaling = {} if posterior is None else power_scaling(problem, posterior)
     sensitivities = [scaling.get(name, (np.nan, np.nan)) for name in problem.names]
     table[["prior_sensitivity", "likelihood_sensitivity"]] = np.array(sensitivities)
     rows = table.to_dict("index")
-    for name, row in zip(problem.names, rows.values(), strict=True):
+    for name, within, row in zip(problem.names, information.together, rows.values(), strict=True):
         signed = np.isfinite(row["p_negative"])
-        conflict = name in fit.prior_conflict.members
-        row["verdict"] = CONFLICT if conflict else _verdict(row, signed and _size_known(problem, fit, posterior, name))
+        conflict, size_known = name in fit.prior_conflict.members, signed and _size_known(problem, fit, posterior, name)
+        row["verdict"] = CONFLICT if conflict else _verdict(row, size_known, within)
         both = row["verdict"] == SIGN and abs(fit.theta[name]) > 2.0 * fit.sd[name]
         row["evidence"] = (_against_the_prior(fit, row) + ", " if conflict else "") + _evidence(row)
         row["remedy"] = BOTH_SIGNS if both else _remedy(row, name, directions, experiments, structure)
@@ -288,7 +301,40 @@ def identifiability(
         experiments,
         structure,
         converged=posterior is None or posterior.converged,
+        basis=_basis(fit, posterior),
     )
+
+
+def _basis(fit: MapEstimate, posterior: Posterior | None) -> str:
+    """Return a sentence on what the verdicts rest on."""
+    count, optima = sum(np.isfinite(one["objective"]) for one in fit.starts), 1 + len(notable(fit.other_modes))
+    if posterior is not None:
+        fewest = min(posterior.ess[name] for name in fit.theta)
+        return f"The verdicts rest on {fewest:.0f} or more effective draws of each parameter."
+    starts = f"{count} starts" if count > 1 else "one start"
+    if optima > 1:
+        return f"No draws: the verdicts rest on the Laplace approximations at {optima} optima, found from {starts}."
+    searched = f"no other optimum was found from {starts}" if count > 1 else f"one mode was looked at, from {starts}"
+    return f"No draws: the verdicts rest on the Laplace approximation at the estimate; {searched}."
+
+
+def _structural_images(problem: Problem, fit: MapEstimate, structure: Structure) -> dict[str, list[float]]:
+    """Return the values of parameters at images of the estimate under discrete symmetries that the prior allows.
+
+    There the likelihood is the same; the prior density must be more than 1 % of that at the estimate.
+    """
+    found: dict[str, list[float]] = {}
+    for change in structure.discrete:
+        moves = {name: image for name, image in change.transformation.items() if name in change.parameters}
+        if moves.keys() <= fit.theta.keys():
+            values = {
+                n: (-1.0 if image[0] == "-" else 1.0) * fit.theta[image.lstrip("-")] for n, image in moves.items()
+            }
+            if problem.log_prior(fit.theta | values) > problem.log_prior(fit.theta) + np.log(NOTABLE):
+                for name, value in values.items():
+                    if abs(value - fit.theta[name]) > fit.sd[name]:
+                        found.setdefault(name, []).append(value)
+    return found
 
 
 def _partners(structure: Structure, name: str) -> str:
@@ -303,15 +349,21 @@ def _widths(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ratio of posterior to prior sd of each coordinate, and the Monte Carlo error of the contraction."""
     if posterior is None:
-        labels = list(problem.names)
-        variances = np.diag(fit.joint_covariance.loc[labels, labels])
-        return np.sqrt(variances) / information.prior_sd, np.zeros(len(labels))
+        names, modes, masses = list(problem.names), _optima(fit), fit.modes["mass"].to_numpy()
+        variances = np.array([np.diag(mode.joint_covariance.loc[names, names]) for mode in modes])
+        means = information.coordinates(np.array([list(mode.theta.values()) for mode in modes]))
+        variances += (means - masses @ means) ** 2
+        return np.sqrt(masses @ variances) / information.prior_sd, np.zeros(len(names))
     prior = problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))
     draws = np.stack([posterior.draws(name) for name in problem.names], axis=-1)
     widths = _half_width(information.coordinates(draws)) / _half_width(information.coordinates(prior))
     # The standard error of half the central 68 % interval of a normal sample is 1.1 times that of its sd.
     size = np.array([posterior.ess[name] for name in problem.names])
     return widths, 2.0 * widths**2 * 1.1 / np.sqrt(2.0 * size)
+
+
+def _optima(fit: MapEstimate) -> list[MapEstimate | Mode]:
+    return [fit, *fit.other_modes]
 
 
 def _half_width(values: np.ndarray) -> np.ndarray:
@@ -326,7 +378,9 @@ def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, n
     if not low < 0.0 < high:
         return np.nan, np.nan
     if posterior is None:
-        return float(stdtr(min(fit.degrees_of_freedom[name], 1e9), -fit.theta[name] / fit.sd[name])), 0.0
+        freedom = min(fit.degrees_of_freedom[name], 1e9)
+        own = [float(stdtr(freedom, -mode.theta[name] / mode.sd[name])) for mode in _optima(fit)]
+        return float(fit.modes["mass"].to_numpy() @ own), 0.0
     share = float(np.mean(posterior.draws(name) < 0.0))
     size = posterior.ess[name]
     bounded = np.clip(share, 1.0 / (size + 2.0), 1.0 - 1.0 / (size + 2.0))
@@ -338,16 +392,22 @@ def _size_known(problem: Problem, fit: MapEstimate, posterior: Posterior | None,
     column = problem.names.index(name)
     prior = np.abs(problem.joint_prior.sample(PRIOR_DRAWS, np.random.default_rng(0))[:, column])
     if posterior is None:
-        values = fit.theta[name] + fit.sd[name] * np.random.default_rng(1).standard_normal(PRIOR_DRAWS)
+        generator, modes = np.random.default_rng(1), _optima(fit)
+        chosen = generator.choice(len(modes), PRIOR_DRAWS, p=fit.modes["mass"])
+        centres, widths = np.array([(mode.theta[name], mode.sd[name]) for mode in modes]).T
+        values = centres[chosen] + widths[chosen] * generator.standard_normal(PRIOR_DRAWS)
     else:
         values = posterior.draws(name)
     return bool(_half_width(np.abs(values)) < 0.5 * _half_width(prior))
 
 
-def _verdict(row: dict, size_known: bool) -> str:
+def _verdict(row: dict, size_known: bool, within: float) -> str:
+    """Return the verdict; `within` is the sd that the data alone leave at one optimum, in prior sds."""
     margin = MONTE_CARLO_ERRORS * row["p_negative_mcse"]
     if size_known and max(row["p_negative"], 1.0 - row["p_negative"]) < SIGN_PROBABILITY - margin:
         return SIGN
+    if row["other_values"] and min(within, row["together"]) <= DETERMINED_SD:
+        return SEVERAL
     if row["profile"] == ONE_SIDED and row["collinearity"] < COLLINEAR:
         return PRIOR_ONLY
     if row["alone"] > UNINFORMED_SD:
@@ -382,6 +442,8 @@ def _evidence(row: dict) -> str:
         text += f", the data alone would leave {row['alone']:.3g} prior sds with all other parameters known"
     if row["profile"] and row["profile"] != "closed":
         text += f", profile {row['profile']}"
+    if row["other_values"]:
+        text += f", {row['other_values']} at another optimum with more than 1 % of the mass"
     if np.isfinite(row["p_negative"]):
         text += f", P(negative) = {row['p_negative']:.3g}"
         text += f" ± {row['p_negative_mcse']:.2g}" if row["p_negative_mcse"] else ""
@@ -391,8 +453,8 @@ def _evidence(row: dict) -> str:
 
 
 def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.DataFrame, structure: Structure) -> str:
-    if row["verdict"] == DETERMINED:
-        return ""
+    if row["verdict"] in (DETERMINED, SEVERAL):
+        return "" if row["verdict"] == DETERMINED else OTHER_VALUES
     if row["verdict"] == CONFLICT:
         return "check units, prior and data, try map_estimate(starts=8), or widen the prior"
     if row["verdict"] == COMBINATION:

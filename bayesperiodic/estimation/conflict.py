@@ -122,7 +122,7 @@ def _by_the_data(problem: Problem, estimate: Iterate) -> Iterate:
     factor = np.where(np.sum(changes**2, axis=1) > WIDENING**-2, np.maximum(ALMOST_FLAT, WIDENING * np.abs(step)), 1.0)
     objective = _almost_flat(problem, estimate, factor)
     first = objective.at(estimate.theta, estimate.here, estimate.noise)
-    return estimate if first is None else climb(objective, objective.anchored(first))[0]
+    return estimate if first is None else climb(objective, objective.anchored(first)).iterate
 
 
 def _from_elsewhere(problem: Problem, found: Iterate, members: tuple[str, ...]) -> Iterator[Iterate]:
@@ -141,7 +141,7 @@ def _from_elsewhere(problem: Problem, found: Iterate, members: tuple[str, ...]) 
         here = objective.density.linearise(theta)
         first = objective.iterate(here, found.noise)
         if first is not None:
-            yield climb(objective, first)[0]
+            yield climb(objective, first).iterate
 
 
 def _almost_flat(problem: Problem, near: Iterate, factor: np.ndarray) -> Objective:

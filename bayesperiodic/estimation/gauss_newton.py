@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,19 @@ class Iterate:
     here: Linearisation
     noise: np.ndarray
     objective: float
+
+
+class End(NamedTuple):
+    """End of an iteration, its status, as in `MapEstimate`, and the objective at each iterate."""
+
+    iterate: Iterate
+    status: str
+    history: np.ndarray
+
+
+def preference(end: End) -> tuple[int, float]:
+    """Return the key of the end to choose: on as few orbits other than the measured ones as possible, and highest."""
+    return -len(end.iterate.here.other_orbits), end.iterate.objective
 
 
 @dataclass(frozen=True)
@@ -130,28 +144,34 @@ def bias_correction(problem: Description, iterate: Iterate) -> np.ndarray:
 
 
 def corrected(
-    objective: Objective,
-    found: tuple[Iterate, str, np.ndarray],
-    report: Callable[[Iterate, float], None] | None = None,
-) -> tuple[Objective, tuple[Iterate, str, np.ndarray]]:
+    objective: Objective, found: End, report: Callable[[Iterate, float], None] | None = None
+) -> tuple[Objective, End]:
     """Climb again from the end of a climb with `bias_correction` at each new end, until its factors settle.
 
-    Returns the last objective, and what `climb` returns; earlier values in the history are shifted so that it goes on
-    where the objective changes.
+    Returns the last objective and end.
     """
-    now, status, history = found
     for _ in range(MAX_ROUNDS):
-        factor = bias_correction(objective.density.problem, now)
+        factor = bias_correction(objective.density.problem, found.iterate)
         if np.all(np.abs(factor - objective.log_variance_factor) < SETTLED):
             break
         other = replace(objective, log_variance_factor=factor)
-        start = other.iterate(now.here, now.noise)
-        if start is None:
+        again = resumed(other, found, report)
+        if again is None:
             break
-        objective = other
-        now, status, more = climb(objective, start, report=report)
-        history = np.concatenate([history + (start.objective - history[-1]), more[1:]])
-    return objective, (now, status, history)
+        objective, found = other, again
+    return objective, found
+
+
+def resumed(objective: Objective, end: End, report: Callable[[Iterate, float], None] | None = None) -> End | None:
+    """Climb on from the end of a climb with another objective; None if that is not finite there.
+
+    Earlier values in the history are shifted so that it goes on where the objective changes.
+    """
+    start = objective.iterate(end.iterate.here, end.iterate.noise)
+    if start is None:
+        return None
+    now, status, more = climb(objective, start, report=report)
+    return End(now, status, np.concatenate([end.history + (start.objective - end.history[-1]), more[1:]]))
 
 
 def climb(
@@ -159,7 +179,7 @@ def climb(
     start: Iterate,
     held: np.ndarray | None = None,
     report: Callable[[Iterate, float], None] | None = None,
-) -> tuple[Iterate, str, np.ndarray]:
+) -> End:
     """Increase the objective from an anchored start until the steps are small.
 
     Where H is not positive definite (convex log-priors that outweigh the data) steps take its negative curvature with
@@ -168,7 +188,6 @@ def climb(
     fails are halved. A parameter at the end of its prior's support is fixed while the gradient points outwards.
 
     Parameters `held` (names,) are fixed; report(iterate, step in standard deviations) is called for every new iterate.
-    Returns the last iterate, the status, as in `MapEstimate`, and the objective at each iterate.
     """
     always = np.zeros(start.theta.size, dtype=bool) if held is None else held
     now, resting, history = start, always, [start.objective]
@@ -181,7 +200,7 @@ def climb(
         if np.array_equal(wanted, resting):
             break
         resting = wanted
-    return now, status, np.array(history)
+    return End(now, status, np.array(history))
 
 
 def at_ends(objective: Objective, iterate: Iterate) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -15,19 +16,26 @@ STEP = 1e-3
 NOISE_STEP = 1e-4
 
 
-def joint_laplace(density: LogPosterior, start: Iterate) -> tuple[dict[str, float], pd.DataFrame]:
+class JointLaplace(NamedTuple):
+    """Mode of a density in sampling coordinates, see `MapEstimate.joint_mode`, and its log-density."""
+
+    mode: dict[str, float]
+    covariance: pd.DataFrame
+    log_density: float
+
+
+def joint_laplace(density: LogPosterior, start: Iterate) -> JointLaplace:
     """Climb from the estimate to the mode in sampling coordinates and invert the exact Hessian there.
 
     The Hessian over θ comes from central differences of the exact gradient; parameters local to experiments are changed
-    together, because each experiment depends on its own only. Returns the mode (natural values) and the covariance of
-    the sampling coordinates, see `MapEstimate.joint_covariance`.
+    together, because each experiment depends on its own only.
     """
     problem, objective = density.problem, Objective(density)
     first = objective.at(start.theta, start.here, start.noise)
     labels = [*problem.names, *problem.free_noise]
     covariance = pd.DataFrame(np.full((len(labels), len(labels)), np.nan), index=labels, columns=labels)
     if first is None:
-        return {}, covariance
+        return JointLaplace({}, covariance, np.nan)
     mode, _, _ = climb(objective, objective.anchored(first))
     free = [problem.noise_names.index(name) for name in problem.free_noise]
     hessian = _hessian(objective, mode, free)
@@ -35,7 +43,8 @@ def joint_laplace(density: LogPosterior, start: Iterate) -> tuple[dict[str, floa
         curvatures, vectors, scale = hessian_eigh(hessian)
         if curvatures.min() >= SINGULAR * curvatures.max():
             covariance.iloc[:, :] = scaled((vectors / curvatures) @ vectors.T, scale)
-    return dict(zip(labels, [*mode.theta.tolist(), *mode.noise[free].tolist()], strict=True)), covariance
+    values = [*mode.theta.tolist(), *mode.noise[free].tolist()]
+    return JointLaplace(dict(zip(labels, values, strict=True)), covariance, mode.objective)
 
 
 def _hessian(objective: Objective, mode: Iterate, free: list[int]) -> np.ndarray:

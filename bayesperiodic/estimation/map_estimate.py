@@ -1,7 +1,7 @@
 """Bayesian estimator of the paper: staged Gauss-Newton to the MAP point, and its Laplace covariance."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
 from typing import Any
 
@@ -21,6 +21,7 @@ from bayesperiodic.estimation.covariance import (
     with_uncertain_noise,
 )
 from bayesperiodic.estimation.gauss_newton import (
+    End,
     Iterate,
     Objective,
     at_ends,
@@ -28,8 +29,11 @@ from bayesperiodic.estimation.gauss_newton import (
     corrected,
     information,
     inverse_hessian,
+    preference,
+    resumed,
 )
 from bayesperiodic.estimation.laplace import SILENT, joint_laplace, undetermined
+from bayesperiodic.estimation.modes import default_starts, notable, weighed, with_images
 from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, noise_split
 from bayesperiodic.periodic.compiled import OTHER_ORBIT, STATUSES
 from bayesperiodic.posterior.density import NATURAL, RIDGE, Linearisation, LogPosterior
@@ -40,8 +44,6 @@ from bayesperiodic.posterior.simulator import Simulator
 NOISE_SHARE = 0.1
 LARGEST_SHIFT = 0.1
 SHOWN = 3
-# Last iterate, status and objective at each iterate.
-Climb = tuple[Iterate, str, np.ndarray]
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
 MOST_UNEXPLAINED = 0.5
@@ -51,7 +53,12 @@ deferred: Any = partial
 
 @in_one_thread
 def map_estimate(
-    problem: Problem, *, start: Mapping[str, float] | None = None, starts: int = 1, seed: int = 0, progress: bool = True
+    problem: Problem,
+    *,
+    start: Mapping[str, float] | None = None,
+    starts: int | None = None,
+    seed: int = 0,
+    progress: bool = True,
 ) -> MapEstimate:
     r"""Find the MAP point by staged Gauss-Newton, and the Laplace covariance there.
 
@@ -77,13 +84,19 @@ def map_estimate(
     recording. If they differ, the fit is repeated from orbits that the measured outputs show; if an orbit remains
     another one, the status is "other orbit".
 
+    The iteration starts at several points where its solves are cheap, and at the images of an optimum under changes of
+    signs and exchanges of two parameters, if their density is at least a thousandth of the optimum's. Ends further
+    apart than a standard deviation are separate optima, see `MapEstimate.modes`; the estimate is the highest.
+
     Parameters
     ----------
     problem : Problem
     start : mapping of str to float, optional
         First guess of every free parameter; by default the medians of the priors.
-    starts : int
-        Number of starts; those after the first are draws from the priors. The best estimate is returned.
+    starts : int, optional
+        Number of starts; those after the first are draws from the priors, solved from the orbits of the first. By
+        default one if `start` is given, and otherwise up to eight, with at most 16 000 unknowns of all periodic solves
+        together: eight for 2000 (states × points × experiments) or fewer, one for more than 8000.
     seed : int
         Of these draws.
     progress : bool
@@ -103,9 +116,10 @@ def map_estimate(
     UserWarning
         If the noise of the measured inputs causes more than a tenth of an output's residual, if twice as many points
         would move an estimate by more than a tenth of its standard deviation, if an estimate lies at the end of its
-        prior's support, if the prior and the data are in conflict, if more than half of a channel's variance is
-        unexplained, if the data do not determine a parameter or a combination of parameters, and if the orbit of an
-        experiment is not the measured one.
+        prior's support, if the prior and the data are in conflict, if another optimum has more than 1 % of the
+        posterior mass by its Laplace approximation, if more than half of a channel's variance is unexplained, if the
+        data do not determine a parameter or a combination of parameters, and if the orbit of an experiment is not the
+        measured one.
 
     References
     ----------
@@ -121,23 +135,21 @@ def map_estimate(
     if isinstance(start, Mapping):
         _checks.same_names("start", start, problem.names)
     theta = problem.median() if start is None else problem.vector(start)
+    if starts is None:
+        starts = default_starts(problem) if start is None else 1
     _checks.integer("starts", starts, 1)
     first = _first_iterate(problem, theta)
     if first is None:
         raise ValueError(_not_finite(problem, theta, start is not None))
     objective = _objective(problem, first.here)
-    found: list[tuple[Iterate, str, np.ndarray] | None] = [_climb(objective, first, progress)]
+    end = _on_measured_orbits(problem, theta, _climb(objective, first, progress), progress)
+    ends: list[End | None] = [end]
     for draw in problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0))):
-        other = _first_iterate(problem, draw)
-        found.append(None if other is None else _climb(objective, other, progress))
-    reached = [-np.inf if end is None else end[0].objective for end in found]
-    chosen = int(np.argmax(reached))
-    best = found[chosen]
-    assert best is not None
-    objective, best = corrected(objective, _on_measured_orbits(problem, theta, best, progress))
-    ends = [end and objective.iterate(end[0].here, end[0].noise) for end in found]
-    ends[chosen] = best[0]
-    result = _describe(problem, objective, *best, tuple(_outcome(problem, end) for end in ends))
+        ends.append(_from_draw(objective, end.iterate, draw, progress))
+    objective, _ = corrected(objective, max((end for end in ends if end), key=preference))
+    ends = [end and resumed(objective, end) for end in ends]
+    modes = with_images(objective, [end for end in ends if end], partial(_climb, objective, progress=progress))
+    result = _describe(problem, objective, modes, tuple(_outcome(problem, end) for end in ends))
     for text in estimation_warnings(problem, result):
         warnings.warn(text, UserWarning, stacklevel=3)
     return result
@@ -170,7 +182,15 @@ def _linearised(problem: Problem, theta: np.ndarray, found: InitialEstimate | No
     return LogPosterior(problem, Simulator.start(problem, found.theta, found.states)).linearise(found.theta)
 
 
-def _climb(objective: Objective, first: Iterate, progress: bool) -> Climb:
+def _from_draw(objective: Objective, first: Iterate, theta: np.ndarray, progress: bool) -> End | None:
+    """Return the end of the iteration from a draw of the prior; None if there is no orbit or no finite density."""
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        other = objective.at(theta, first.here, objective.density.problem.likelihood.guess())
+        return None if other is None else _climb(objective, objective.anchored(other), progress)
+
+
+def _climb(objective: Objective, first: Iterate, progress: bool) -> End:
     with tqdm(desc="MAP", unit="iteration", leave=False, disable=not progress) as bar:
 
         def report(iterate: Iterate, size: float) -> None:
@@ -180,17 +200,17 @@ def _climb(objective: Objective, first: Iterate, progress: bool) -> Climb:
         return climb(objective, first, report=report)
 
 
-def _on_measured_orbits(problem: Problem, start: np.ndarray, end: Climb, progress: bool) -> Climb:
+def _on_measured_orbits(problem: Problem, start: np.ndarray, end: End, progress: bool) -> End:
     """Return the end of a climb, or that of one from the measured orbits if fewer of its orbits are others."""
-    others = end[0].here.other_orbits
-    for near in _near_measured_orbits(problem, end[0], start) if others else ():
+    others = end.iterate.here.other_orbits
+    for near in _near_measured_orbits(problem, end.iterate, start) if others else ():
         objective = _objective(problem, near)
         first = objective.iterate(near, problem.likelihood.guess())
         if first is None:
             continue
         again = _climb(objective, first, progress)
-        if len(again[0].here.other_orbits) < len(others):
-            end, others = again, again[0].here.other_orbits
+        if len(again.iterate.here.other_orbits) < len(others):
+            end, others = again, again.iterate.here.other_orbits
         if not others:
             return end
     return end
@@ -211,20 +231,16 @@ def _near_measured_orbits(problem: Problem, end: Iterate, start: np.ndarray) -> 
                 yield _linearised(problem, found.theta, found)
 
 
-def _outcome(problem: Problem, iterate: Iterate | None) -> dict[str, float]:
-    if iterate is None:
+def _outcome(problem: Problem, end: End | None) -> dict[str, float]:
+    if end is None:
         return {"objective": -np.inf} | dict.fromkeys(problem.names, np.nan)
-    return {"objective": iterate.objective} | dict(zip(problem.names, iterate.theta.tolist(), strict=True))
+    return {"objective": end.iterate.objective} | dict(zip(problem.names, end.iterate.theta.tolist(), strict=True))
 
 
 def _describe(
-    problem: Problem,
-    objective: Objective,
-    best: Iterate,
-    status: str,
-    history: np.ndarray,
-    starts: tuple[dict[str, float], ...],
+    problem: Problem, objective: Objective, modes: Sequence[End], starts: tuple[dict[str, float], ...]
 ) -> MapEstimate:
+    best, status, history = modes[0]
     names, likelihood = problem.names, problem.likelihood
     data, _ = information(problem, best)
     solutions = best.here.simulator.solutions(best.theta)
@@ -238,7 +254,9 @@ def _describe(
     covariance[lost], covariance[:, lost] = np.nan, np.nan
     covariance[lost, lost] = np.inf
     residuals = best.here.compared()
-    joint = cache(partial(in_one_thread(joint_laplace), objective.density.with_settings(coordinates=RIDGE), best))
+    sampled = objective.density.with_settings(coordinates=RIDGE)
+    joint = cache(partial(in_one_thread(joint_laplace), sampled, best))
+    others = [joint_laplace(sampled, end.iterate) for end in modes[1:]]
     noise = dict(zip(problem.noise_names, best.noise.tolist(), strict=True))
     rms = {c: _pooled(problem, c, residuals) for c in problem.channels}
     measured = {e.name: {c: y - y.mean() for c, y in e.outputs.items()} for e in problem.experiments}
@@ -251,8 +269,8 @@ def _describe(
         noise=noise,
         noise_prior=problem.noise.prior_text,
         covariance=pd.DataFrame(covariance, index=list(names), columns=list(names)),
-        joint_mode=deferred(lambda: joint()[0]),
-        joint_covariance=deferred(lambda: joint()[1]),
+        joint_mode=deferred(lambda: joint().mode),
+        joint_covariance=deferred(lambda: joint().covariance),
         degrees_of_freedom=dict(zip(names, degrees_of_freedom(inverse, parts).tolist(), strict=True)),
         independent={_short(name): count for name, count in likelihood.counts.items()},
         solutions=solutions,
@@ -269,6 +287,7 @@ def _describe(
         undetermined=undetermined(data, best.theta, names, problem.logarithmic),
         history=history,
         starts=starts,
+        other_modes=weighed(problem, modes, [joint(), *others]) if others else (),
         tied=_tied_slopes(problem, best.theta),
     )
 
@@ -319,6 +338,12 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             "does not show it. Check units, prior and data, try map_estimate(starts=8), or widen the prior."
         )
     yield from _unexplained(fit)
+    if others := notable(fit.other_modes):
+        yield (
+            f"{len(others) + 1} separate optima fit the data: the estimate, with {fit.modes['mass'].iloc[0]:.0%} of "
+            f"the posterior mass by Laplace, and {'; '.join(map(repr, others[:SHOWN]))}. Standard deviations describe "
+            "the first one only. Sample the posterior, or give priors that exclude the others."
+        )
     silent = [text for text in fit.undetermined if text.endswith(SILENT)]
     if silent:
         named = ", ".join(repr(text.removesuffix(f": {SILENT}")) for text in silent)

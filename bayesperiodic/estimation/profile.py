@@ -147,7 +147,7 @@ class Ridge:
         tangent = start.theta + (value - start.theta[self.column]) * self._tangent(start)[0]
         found = [self.objective.at(theta, start.here, start.noise) for theta in (tangent, plain)]
         first = max(filter(None, found), key=lambda iterate: iterate.objective, default=None)
-        return None if first is None else climb(self.objective, self.objective.anchored(first), self._held)[0]
+        return None if first is None else climb(self.objective, self.objective.anchored(first), self._held).iterate
 
     @property
     def _held(self) -> np.ndarray:

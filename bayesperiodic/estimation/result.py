@@ -16,6 +16,7 @@ from bayesperiodic._expressions import Expression, parse_all
 from bayesperiodic._io import Result
 from bayesperiodic.estimation.conflict import PriorConflict
 from bayesperiodic.estimation.gauss_newton import Iterate
+from bayesperiodic.estimation.modes import Mode, notable
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.posterior.joint_priors import MultivariateNormal
 from bayesperiodic.posterior.noise import POINTS, SPECTRAL
@@ -160,6 +161,8 @@ class MapEstimate(Result):
         The objective before each step and at the end.
     starts : tuple of dict of str to float
         Of every start, the objective reached (−inf: none) under "objective", and the estimates.
+    other_modes : tuple of Mode
+        Separate optima other than the estimate whose objective is lower by less than 30, see `modes`.
     tied : dict of str to dict of str to float
         Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
 
@@ -201,6 +204,7 @@ class MapEstimate(Result):
     undetermined: tuple[str, ...]
     history: np.ndarray
     starts: tuple[dict[str, float], ...]
+    other_modes: tuple[Mode, ...]
     tied: dict[str, dict[str, float]]
 
     if not TYPE_CHECKING:
@@ -219,6 +223,28 @@ class MapEstimate(Result):
     def converged(self) -> bool:
         """True if the status is "converged"."""
         return self.status == "converged"
+
+    @property
+    def modes(self) -> pd.DataFrame:
+        """Separate optima, the estimate first: objective, fraction of the mass by Laplace, and parameters."""
+        own = {"objective": float(self.history[-1]), "mass": 1.0 - sum(mode.mass for mode in self.other_modes)}
+        rows = [{"objective": mode.objective, "mass": mode.mass} | mode.theta for mode in self.other_modes]
+        return pd.DataFrame([own | self.theta, *rows])
+
+    def other_values(self, name: str) -> list[float]:
+        """Return the values of a parameter at other optima with more than 1 % of the mass, where they differ.
+
+        Parameters
+        ----------
+        name : str
+
+        Returns
+        -------
+        list of float
+            Those further from the estimate than the smaller one of the two standard deviations.
+        """
+        value, sd = self.theta[name], self.sd[name]
+        return [mode.theta[name] for mode in notable(self.other_modes) if mode.differs(name, value, sd)]
 
     @property
     def correlations(self) -> pd.DataFrame:
@@ -396,6 +422,7 @@ class MapEstimate(Result):
         ]
         lines += [f"  {self.prior_conflict.text}"] if self.prior_conflict.text else []
         lines += [f"  not determined by the data: {text}" for text in self.undetermined]
+        lines += [f"  another optimum: {mode!r}" for mode in notable(self.other_modes)]
         return "\n".join(lines)
 
 

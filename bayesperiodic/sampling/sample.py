@@ -63,12 +63,13 @@ def sample(
 ) -> Posterior:
     """Sample the posterior of θ and the free noise parameters with emcee's affine-invariant ensembles.
 
-    Several independent ensembles [1]_ start from draws of the Laplace approximation with doubled standard deviations.
-    Parameters with positive support and the noise parameters are sampled in their logarithms, where ridges of products
-    are straight; Jeffreys' prior 1/v is constant there. The eigenvectors of the Laplace approximation in these
-    coordinates are the axes. Seven steps in ten are differential-evolution moves [2]_, which mix three times faster
-    than stretch moves on a normal target of six dimensions (tau 21 against 67), two are stretch moves, and one is a
-    differential-evolution move of full length, which can jump between modes.
+    Several independent ensembles [1]_ start from draws of the Laplace approximation with doubled standard deviations,
+    at every optimum of `MapEstimate.modes` in proportion to its mass. Parameters with positive support and the noise
+    parameters are sampled in their logarithms, where ridges of products are straight; Jeffreys' prior 1/v is constant
+    there. The eigenvectors of the Laplace approximation in these coordinates are the axes. Seven steps in ten are
+    differential-evolution moves [2]_, which mix three times faster than stretch moves on a normal target of six
+    dimensions (tau 21 against 67), two are stretch moves, and one is a differential-evolution move of full length,
+    which can jump between modes.
 
     Sampling stops if, twice in succession, the chain is 50 autocorrelation times long after its first fifth was
     removed, that time has changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and 95

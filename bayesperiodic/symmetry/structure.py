@@ -11,6 +11,7 @@ from bayesperiodic._io import Result
 from bayesperiodic.models.model import Model
 from bayesperiodic.symmetry import invariants
 from bayesperiodic.symmetry.determining import Generator, System, determining_equations, generators_of, system_of
+from bayesperiodic.symmetry.discrete import discrete_flows
 from bayesperiodic.symmetry.invariants import Directions, Flow
 
 
@@ -19,7 +20,8 @@ class Symmetry:
     """Transformation of parameters, and of states that are not measured, that leaves all measured outputs unchanged.
 
     Its kind is "scaling", "shift" (which adds a constant to a parameter or a state, and may also transform others) or
-    "other". The finite transformation is confirmed by exact substitution in the equations.
+    "other"; of discrete ones "sign change" or "exchange", without generator and amount. The finite transformation is
+    confirmed by exact substitution in the equations.
     """
 
     kind: str
@@ -57,6 +59,8 @@ class Structure(Result):
         `unexplained` directions they are confirmed at random values only.
     symmetries : tuple of Symmetry
         Independent ones.
+    discrete : tuple of Symmetry
+        Independent sign changes that are no scaling by −1, and exchanges of two determined parameters.
     to_fix : tuple of str
         The first parameters, in the model's order, that remove all symmetries if they are fixed.
     rank, points : int or None, int
@@ -81,6 +85,7 @@ class Structure(Result):
     table: pd.DataFrame
     combinations: tuple[str, ...]
     symmetries: tuple[Symmetry, ...]
+    discrete: tuple[Symmetry, ...]
     to_fix: tuple[str, ...]
     rank: int | None
     points: int
@@ -94,7 +99,7 @@ class Structure(Result):
     def __repr__(self) -> str:
         known = f"; known: {', '.join(self.known)}" if self.known else ""
         lines = [f"Structure of {self.model}, measured: {', '.join(self.outputs)}{known}"]
-        lines += self._verdicts() + self._changes()
+        lines += self._verdicts() + self._changes() + self._discrete_changes()
         return "\n".join([*lines, f"  {self._confirmation()}"])
 
     def _verdicts(self) -> list[str]:
@@ -136,6 +141,12 @@ class Structure(Result):
             lines.append(f"  Knowing one of a group determines the rest of it: {'; '.join(listed)}.")
         return lines
 
+    def _discrete_changes(self) -> list[str]:
+        if not self.discrete:
+            return []
+        lines = ["  Discrete changes that do the same; priors have to decide between the values:"]
+        return lines + [f"    {change!r}" for change in self.discrete]
+
     def _confirmation(self) -> str:
         if self.rank is None:
             return "The rank of exact sensitivities is not available, so further symmetries are not ruled out."
@@ -145,7 +156,7 @@ class Structure(Result):
         said = f"Rank of exact sensitivities at {self.points} random parameter values: {self.rank} of {appearing}"
         if self.unexplained:
             return f"{said}; further changes, for which no form was found, involve {', '.join(self.unexplained)}."
-        return f"{said}, so no other change leaves the outputs as they are."
+        return f"{said}, so no other continuous change leaves the outputs as they are."
 
 
 def _listed(names: Sequence[str], conjunction: str) -> str:
@@ -210,8 +221,8 @@ def structure(
 
     The analysis assumes unlimited data without noise, arbitrary inputs, frequencies and motions, and generic parameter
     values. A parameter that is not determined here cannot be determined by any experiment; the converse depends on the
-    data. "Determined" means locally: discrete ambiguities, such as the common sign of two factors, are not searched
-    for.
+    data. "Determined" means up to discrete changes. Of these, changes of signs are found, and exchanges of two
+    parameters, alone or with two states; others, such as the order of three masses, are not searched for.
 
     Two methods are combined. The first finds Lie symmetries [1]_ [2]_, affine in states and inputs: transformations of
     parameters and states that map solutions to solutions and leave outputs, inputs and time unchanged. They satisfy
@@ -287,6 +298,8 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
     coefficients = invariants.coefficients_of(system)
     found = invariants.combinations_of(system, generators, [f for f in flows if f], directions, coefficients)
     combinations = {c: written(c, names).removeprefix("-") for c in found}
+    settled = [n for n in system.parameters if n not in directions.moved]
+    discrete = discrete_flows(system, generators, settled) if system.parameters else []
     return Structure(
         model=name,
         outputs=tuple(system.outputs),
@@ -297,6 +310,7 @@ def analyse_structure(name: str, whole: System, known: tuple[str, ...]) -> Struc
             _symmetry(system, _kind(symmetry), generator, flow, combinations, names)
             for symmetry, generator, flow in zip(symmetries, generators, flows, strict=True)
         ),
+        discrete=tuple(_discrete(system, flow, names) for flow in discrete),
         to_fix=directions.smallest_set(),
         rank=len(system.parameters) - len(directions.rows) if directions.points or not system.parameters else None,
         points=directions.points,
@@ -373,4 +387,19 @@ def _symmetry(
         amount=amount,
         factor=tuple(tuple(written(e, texts) for e in row) for row in rows),
         no_help=tuple(n for n, s in others.items() if any(s in c for c in shared)),
+    )
+
+
+def _discrete(system: System, flow: Flow, names: Mapping[sp.Symbol, str]) -> Symmetry:
+    texts = {**names, **{symbol: name for name, symbol in system.symbols.items()}}
+    states = {n: system.symbols[n] for n in system.orders}
+    moved = {n: written(flow.images[s], texts) for n, s in (system.parameters | states).items() if s in flow.images}
+    return Symmetry(
+        kind="sign change" if all(image == f"-{n}" for n, image in moved.items()) else "exchange",
+        parameters=tuple(n for n in moved if n in system.parameters),
+        generator={},
+        transformation=moved,
+        amount="",
+        factor=tuple(tuple(written(e, texts) for e in row) for row in flow.factor.tolist()) if flow.factor else (),
+        no_help=(),
     )

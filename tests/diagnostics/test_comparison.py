@@ -143,6 +143,9 @@ CASES = {
 }
 
 
+MODES = "report each mode by itself; see fit.modes, map_estimate(starts=…)"
+
+
 @cache
 def case(name):
     """Return problem, estimate, posterior of exact draws, and a function that draws again."""
@@ -157,7 +160,21 @@ def case(name):
     return problem, fit, posterior_of(problem, draw(np.random.default_rng(100))), draw
 
 
-pytestmark = pytest.mark.filterwarnings("ignore:The data do not change under", "ignore:The estimate of 'a', 0.9")
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:The data do not change under", "ignore:The estimate of 'a', 0.9", "ignore:2 separate optima"
+)
+
+
+def test_optimum_without_draws_is_not_called_fine():
+    """All draws are near a = 3, where the only start of one estimate ended; a = 1 has half of the mass."""
+    two = model("two", ["a"], lambda p: {"force": (p.a - 2) ** 2})
+    problem = bp.Problem(two, [run(force=1.0)], priors={"a": bp.Uniform(0.001, 5.0)}, fixed=known(force=0.02))
+    posterior = posterior_of(problem, 3.0 + 0.01 * np.random.default_rng(1).standard_normal((*SHAPE, 1)))
+    one = bp.map_estimate(problem, start={"a": 2.9}, **QUIET)
+    assert set(bp.compare(problem, one, posterior).table["verdict"]) == {"fine"}
+    found = bp.compare(problem, bp.map_estimate(problem, **QUIET), posterior)
+    assert set(found.table["verdict"]) == {found.joint["verdict"]} == {"wrong mode"}
+    assert set(found.table["recommendation"]) == {MODES}
 
 
 @pytest.mark.parametrize(
@@ -165,7 +182,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:The data do not change under", "
     [
         ("ridge", "natural", "wrong shape", "wrong shape", "logarithms cure it: use Laplace in sampling coordinates"),
         ("ridge", "sampling", "fine", "fine", "use Laplace"),
-        ("square", "natural", "wrong mode", "wrong mode", "report each mode by itself; try map_estimate(starts=…)"),
+        ("square", "natural", "wrong mode", "wrong mode", MODES),
         ("edge", "natural", "wrong shape", "wrong shape", "report the MCMC quantiles"),
     ],
 )

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import sympy as sp
 from scipy import integrate, stats
 
 import bayesperiodic as bp
@@ -131,6 +132,57 @@ def test_sign_that_the_data_do_not_determine_is_reported():
     assert found.verdicts == {"a": "sign undetermined"}
     assert "both signs fit the data" in found.table.loc["a", "remedy"]
     assert not found.converged and "NOT CONVERGED" in repr(found)
+
+
+@pytest.mark.filterwarnings("ignore:2 separate optima")
+def test_sign_is_undetermined_without_draws_too():
+    """a² = 1 ± 0.02 with the prior N(0.5, 2): the odds of the negative sign are exp(−(1.5² − 0.5²)/8)."""
+    problem, fit = one(lambda p: p.a**2, 1.0, 0.02, a=bp.Normal(0.5, 2.0))
+    found = bp.identifiability(problem, fit, profile=False)
+    odds = np.exp(-0.25)
+    assert found.verdicts == {"a": "sign undetermined"}
+    assert found.table.loc["a", "p_negative"] == pytest.approx(odds / (1 + odds), abs=1e-3)
+    assert "both signs fit the data" in found.table.loc["a", "remedy"]
+    assert "No draws: the verdicts rest on the Laplace approximations at 2 optima" in repr(found)
+
+
+@pytest.mark.filterwarnings("ignore:2 separate optima")
+def test_parameter_with_two_values_is_not_determined():
+    """(a − 2)² = 1: with draws from both optima and without, unless a single start has found one of them only."""
+    two = model("two", ["a", "b"], lambda p: {"force": (p.a - 2) ** 2, "other": p.b})
+    priors = {"a": bp.Uniform(0.001, 5.0), "b": bp.Normal(0.0, 5.0)}
+    sds = known(force=0.02, other=0.02)
+    problem = bp.Problem(two, [run(force=1.0, other=2.0)], priors=priors, fixed=sds)
+    fit = bp.map_estimate(problem, **QUIET)
+    found = bp.identifiability(problem, fit)
+    assert found.verdicts == {"a": "several values", "b": "determined"}
+    assert "at another optimum with more than 1 % of the mass" in found.table.loc["a", "evidence"]
+    assert found.table.loc["b", "other_values"] == ""
+    # Half the central 68 % of the prior is 1.71, and the sd of the mixture is 1.
+    assert found.table.loc["a", "contraction"] == pytest.approx(1.0 - 1.0 / (0.5 * 0.6827 * 4.999) ** 2, abs=1e-3)
+    posterior = bp.sample(problem, fit, **SHORT)
+    assert 0.2 < np.mean(posterior.draws("a") > 2.0) < 0.8
+    drawn = bp.identifiability(problem, fit, posterior, profile=False)
+    assert drawn.verdicts == found.verdicts and "effective draws" in drawn.basis
+    single = bp.identifiability(problem, bp.map_estimate(problem, start={"a": 2.9, "b": 2.0}, **QUIET), profile=False)
+    assert single.verdicts["a"] == "determined"
+    assert "one mode was looked at, from one start" in repr(single)
+
+
+def test_discrete_symmetry_of_the_equations_counts_where_the_search_has_missed_it():
+    """Signs of five or more parameters are not changed in pairs; a·tanh(b) is the same for −a and −b."""
+    names = ["a", "b", "c", "d", "e"]
+    several = model(
+        "several", names, lambda p: {"force": p.a * sp.tanh(p.b), "other": p.b**2, "c": p.c, "d": p.d, "e": p.e}
+    )
+    sizes = {"force": np.tanh(1.0), "other": 1.0, "c": 1.0, "d": 1.0, "e": 1.0}
+    problem = bp.Problem(
+        several, [run(**sizes)], priors=dict.fromkeys(names, WIDE), fixed=known(**dict.fromkeys(sizes, 0.01))
+    )
+    fit = bp.map_estimate(problem, start=dict.fromkeys(names, 0.9), **QUIET)
+    found = bp.identifiability(problem, fit, profile=False)
+    assert fit.other_modes == ()
+    assert found.verdicts == {"a": "several values", "b": "several values"} | dict.fromkeys("cde", "determined")
 
 
 def test_parameter_without_effect_is_not_determined():

@@ -21,7 +21,7 @@ PRODUCT = formula_model(
     ["a", "b", "shift_a", "shift_b", "idle"],
     lambda p, u, s: {"force": p.a * p.b**2 * u.x + (p.shift_a + 2 * p.shift_b) * u.dx},
 )
-SIGNED = formula_model("signed", ["a"], lambda p, u, s: {"force": p.a**2 * u.x + 0.05 * p.a * u.dx})
+WELLS = formula_model("wells", ["a"], lambda p, u, s: {"force": (p.a - 3) ** 2 * u.x + 0.05 * (p.a - 3) * u.dx})
 
 
 def sine_run(force) -> bp.Experiment:
@@ -222,12 +222,12 @@ def test_objective_increases_in_every_iteration():
 
 
 def test_further_starts_find_the_better_mode():
-    """Force = a²·x + 0.05·a·ẋ: a start on the wrong side of zero ends near −2, one of eight draws finds +2."""
-    problem = bp.Problem(SIGNED, [sine_run(lambda x, rate: 4.0 * x + 0.1 * rate)], priors={"a": bp.Normal(0.0, 3.0)})
-    one = bp.map_estimate(problem, start={"a": -1.5}, progress=False)
-    many = bp.map_estimate(problem, start={"a": -1.5}, starts=8, seed=1, progress=False)
-    assert one.converged and one.theta["a"] < -1.0
-    assert many.theta["a"] == pytest.approx(2.0, rel=0.01)
+    """With d = a − 3, force = d²·x + 0.05·d·ẋ: a start at d = −1.5 ends near −2, one of eight draws finds 2."""
+    problem = bp.Problem(WELLS, [sine_run(lambda x, rate: 4.0 * x + 0.1 * rate)], priors={"a": bp.Normal(3.0, 3.0)})
+    one = bp.map_estimate(problem, start={"a": 1.5}, progress=False)
+    many = bp.map_estimate(problem, start={"a": 1.5}, starts=8, seed=1, progress=False)
+    assert one.converged and one.theta["a"] < 2.0
+    assert many.theta["a"] == pytest.approx(5.0, rel=0.01)
     assert len(many.starts) == 8
     assert many.starts[0]["objective"] == pytest.approx(one.history[-1])
     assert max(s["objective"] for s in many.starts) == many.history[-1]

@@ -131,16 +131,18 @@ def test_skewed_profile_agrees_with_brute_force_maximisation():
 
 
 def double_well(mean):
-    """Return a problem where b jumps from near 1 to near −1 as a grows, later on the way up than on the way down."""
-    model = formula_model("wells", ["a", "b"], lambda p, u, s: {"y": p.b**2 * u.x + (p.a + p.b) * u.dx / (2 * np.pi)})
+    """Return a problem where b jumps from near 4 to near 2 as a grows, later on the way up than on the way down."""
+    model = formula_model(
+        "wells", ["a", "b"], lambda p, u, s: {"y": (p.b - 3) ** 2 * u.x + (p.a + p.b - 3) * u.dx / (2 * np.pi)}
+    )
     wave = WAVE * np.sqrt(2 / 40)
-    priors = {"a": bp.Normal(mean, 2.0), "b": bp.Normal(0.0, 5.0)}
+    priors = {"a": bp.Normal(mean, 2.0), "b": bp.Normal(3.0, 5.0)}
     return posed(model, wave, 0.3, priors, wave=wave)
 
 
 def test_return_sweep_finds_the_branch_that_the_first_sweep_misses(monkeypatch):
     problem = double_well(-0.5)
-    fit = fitted(problem, {"a": -1.0, "b": 1.0})
+    fit = fitted(problem, {"a": -1.0, "b": 4.0})
     both = bp.profile(problem, fit, ["a"])
     monkeypatch.setattr(Ridge, "_swept", lambda self, points: points)
     out = bp.profile(problem, fit, ["a"])
@@ -148,7 +150,7 @@ def test_return_sweep_finds_the_branch_that_the_first_sweep_misses(monkeypatch):
     gain = both.log_density["a"] - out.log_density["a"]
     assert gain.min() > -1e-9
     assert gain.max() > 1.0
-    b = np.linspace(-3.0, 3.0, 20_001)
+    b = np.linspace(0.0, 6.0, 20_001)
     every = [problem.log_posterior({"a": a, "b": b}, {}).max() for a in both.values["a"]]
     assert both.log_density["a"] == pytest.approx(every - problem.log_posterior(fit.theta, {}), abs=1e-6)
 
@@ -158,16 +160,16 @@ def test_profile_is_extended_where_another_branch_raises_its_end():
     model = formula_model(
         "unlike_wells",
         ["a", "b"],
-        lambda p, u, s: {"y": (p.b**2 + 0.6 * p.a) * u.x + p.a * (2 + 1.5 * p.b) * u.dx / (2 * np.pi)},
+        lambda p, u, s: {"y": ((p.b - 3) ** 2 + 0.6 * p.a) * u.x + p.a * (1.5 * p.b - 2.5) * u.dx / (2 * np.pi)},
     )
-    wave, priors = WAVE * np.sqrt(2 / 40), {"a": bp.Normal(0.0, 5.0), "b": bp.Normal(-1.0, 2.0)}
+    wave, priors = WAVE * np.sqrt(2 / 40), {"a": bp.Normal(0.0, 5.0), "b": bp.Normal(2.0, 2.0)}
     problem = posed(model, wave, 0.3, priors, wave=wave)
-    fit = fitted(problem, {"a": 0.0, "b": 1.0})
+    fit = fitted(problem, {"a": 0.0, "b": 4.0})
     with pytest.warns(UserWarning, match="The log-density is higher by 0.49") as caught:
         profile = bp.profile(problem, fit, ["a"])
     assert caught[0].filename == __file__
     assert profile.values["a"][0] < -3.0 < -0.5 < fit.theta["a"] - 3 * fit.sd["a"]
-    b = np.linspace(-4.0, 4.0, 20_001)
+    b = np.linspace(-1.0, 7.0, 20_001)
     every = np.array([problem.log_posterior({"a": a, "b": b}, {}).max() for a in profile.values["a"]])
     assert profile.log_density["a"] == pytest.approx(every - problem.log_posterior(profile.best, {}), abs=1e-5)
     assert profile.shape == {"a": "closed"}
@@ -175,17 +177,15 @@ def test_profile_is_extended_where_another_branch_raises_its_end():
 
 def test_point_better_than_the_estimate_is_reported_and_can_be_the_start():
     problem = double_well(0.5)
-    fit = fitted(problem, {"a": -1.0, "b": 1.0})
-    with pytest.warns(
-        UserWarning, match=r"higher by 0.17 than .* b = -1.0.*start there, map_estimate\(problem, start="
-    ):
+    fit = fitted(problem, {"a": -1.0, "b": 4.0})
+    with pytest.warns(UserWarning, match=r"higher by 0.17 than .* b = 1.9.*start there, map_estimate\(problem, start="):
         profile = bp.profile(problem, fit, ["a"])
     assert profile.improvement == pytest.approx(0.1699, abs=1e-3)
     at_map = profile.log_density["a"][profile.values["a"] == fit.theta["a"]]
     assert at_map == pytest.approx(-profile.improvement)
     assert "higher by 0.17 at a = 1.15" in repr(profile)
     again = bp.profile(problem, fitted(problem, profile.best), ["a"])
-    assert again.map["b"] < 0.0
+    assert again.map["b"] < 3.0
     assert again.improvement == 0.0
 
 

@@ -5,45 +5,35 @@ import pytest
 
 import bayesperiodic as bp
 from bayesperiodic.sampling.convergence import unmet_criteria
-from bayesperiodic.sampling.starts import laplace_approximation, mirrored_modes, start_points
+from bayesperiodic.sampling.starts import start_points
 from tests.sampling.test_targets import known, model, ridge, run
 
 QUIET = {"progress": False}
 UNCUT = bp.Normal(1.0, 1.0)
 
 
-@pytest.mark.filterwarnings("ignore:The data do not change under")
-def test_the_product_of_two_signed_numbers_has_a_mirrored_mode():
+@pytest.mark.filterwarnings("ignore:The data do not change under", "ignore:2 separate optima")
+def test_walkers_start_at_both_optima_of_a_product():
     """With both signs negative the likelihood is the same and the prior density lower by e^-4 at the mode."""
     problem, fit = ridge({"a": UNCUT, "b": UNCUT})
-    density = problem.density()
-    mean, covariance = laplace_approximation(density, fit)
-    ((signs, share),) = mirrored_modes(density, mean, covariance)
-    assert signs.tolist() == [-1.0, -1.0]
-    assert share == pytest.approx(np.exp(-2.0 * mean.sum()), rel=1e-6) and share == pytest.approx(np.exp(-4.0), rel=0.1)
-    points = start_points(density, fit, "laplace", 32, np.random.default_rng(1))
+    assert fit.modes["a"][1] < 0.0 and fit.modes["b"][1] < 0.0
+    points = start_points(problem.density(), fit, "laplace", 32, np.random.default_rng(1))
     product = points.prod(axis=1)
     assert np.sum(np.all(points < 0.0, axis=1) & (product > 0.0)) >= 2
 
 
-def test_modes_that_are_close_or_improbable_are_not_reported():
-    """A parameter measured near zero has one mode that covers both signs; one at 1 ± 0.1 has no mode at -1."""
-    for value in (0.05, 1.0):
-        problem = bp.Problem(
-            model("number", ["a"], lambda p: {"force": p.a}), [run(force=value)], priors={"a": bp.Normal(0.0, 2.0)},
-            fixed=known(force=0.1),
-        )  # fmt: skip
-        density = problem.density()
-        assert mirrored_modes(density, *laplace_approximation(density, bp.map_estimate(problem, **QUIET))) == []
-
-
-def test_positive_parameters_have_no_mirrored_modes():
-    cut = bp.TruncatedNormal(1.0, 1.0, 0.0, np.inf)
-    problem = bp.Problem(
-        model("number", ["a"], lambda p: {"force": p.a}), [run(force=1.0)], priors={"a": cut}, fixed=known(force=0.1)
-    )
-    density = problem.density()
-    assert mirrored_modes(density, *laplace_approximation(density, bp.map_estimate(problem, **QUIET))) == []
+@pytest.mark.filterwarnings("ignore:. separate optima")
+@pytest.mark.parametrize("start", ["laplace", "overdispersed"])
+def test_walkers_start_in_proportion_to_the_masses(start):
+    """a³ − 3a = 1 ± 0.001 at −1.53, −0.35 and 1.88, with masses in proportion to 1/|3a² − 3| and the prior."""
+    cubic = model("cubic", ["a"], lambda p: {"force": p.a**3 - 3 * p.a})
+    problem = bp.Problem(cubic, [run(force=1.0)], priors={"a": bp.Normal(0.0, 3.0)}, fixed=known(force=0.001))
+    fit = bp.map_estimate(problem, **QUIET)
+    points = start_points(problem.density(), fit, start, 64, np.random.default_rng(1))
+    roots = np.sort(np.roots([1.0, 0.0, -3.0, -1.0]).real)
+    mass = np.exp(-(roots**2) / 18) / np.abs(3 * roots**2 - 3)
+    counts = [np.sum(np.abs(points - root) < 0.1) for root in roots]
+    assert np.array(counts) == pytest.approx(64 * mass / mass.sum(), abs=1.0) and sum(counts) == 64
 
 
 def test_one_separate_walker_prevents_convergence():

@@ -1,0 +1,180 @@
+"""Separate optima of the log-posterior, and their masses by the Laplace approximation."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+from scipy.special import softmax
+
+from bayesperiodic._linalg import covariance_eigh, hessian_eigh
+from bayesperiodic.estimation.gauss_newton import SINGULAR, End, Iterate, Objective, preference
+from bayesperiodic.estimation.laplace import JointLaplace
+from bayesperiodic.periodic.schemes import FourierScheme, find_scheme
+from bayesperiodic.posterior.description import Description
+
+# Default number of starts: at most 8, and at most this number of unknowns of all starts and experiments. A dense
+# scheme counts as many times more as its grid is longer than 50 points.
+MOST_STARTS, UNKNOWNS, DENSE = 8, 16_000, 50
+# Ends of the iteration are separate optima if their distance exceeds one standard deviation of the Laplace
+# approximation at one of them. Optima whose objective is lower than the best one's by more than 30 are left out.
+APART, LOWEST, MOST_MODES = 1.0, 30.0, 16
+# A converged end is preferred to one that has not converged if their objectives differ by less.
+EQUAL = 1e-3
+# Smallest density of an image, relative to the optimum's, and largest number of signs changed in all combinations.
+CREDIBLE, MOST_SIGNS = 1e-3, 4
+# Mass of another optimum above which the estimate alone does not describe the posterior.
+NOTABLE = 0.01
+
+
+@dataclass(frozen=True)
+class Mode:
+    """Optimum of the log-posterior other than the estimate, with the Laplace approximation there.
+
+    `objective` is that of `MapEstimate.history`, `mass` the fraction of the posterior mass; `sd` are natural values,
+    `joint_mode` and `joint_covariance` those of `MapEstimate`, at this optimum.
+    """
+
+    theta: dict[str, float]
+    sd: dict[str, float]
+    objective: float
+    mass: float
+    joint_mode: dict[str, float]
+    joint_covariance: pd.DataFrame
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{name} = {value:.4g}" for name, value in self.theta.items())
+        return f"{values} (objective {self.objective:.6g}, {self.mass:.1%} of the mass)"
+
+    def differs(self, name: str, value: float, sd: float) -> bool:
+        """Return whether a parameter is further than one sd, the smaller one, from its value at the estimate."""
+        widths = [width for width in (sd, self.sd[name]) if np.isfinite(width)]
+        return bool(abs(self.theta[name] - value) > APART * min(widths, default=np.inf))
+
+
+def default_starts(problem: Description) -> int:
+    """Return the number of starts whose iterations are cheap, 1 to 8, from the number of unknowns of the solves."""
+    points = [e.samples * e.periods for e in problem.experiments]
+    dense = isinstance(find_scheme(problem.scheme), FourierScheme)
+    unknowns = len(problem.model.states) * sum(p * (max(1.0, p / DENSE) if dense else 1.0) for p in points)
+    return int(np.clip(UNKNOWNS / unknowns, 1, MOST_STARTS))
+
+
+def with_images(objective: Objective, ends: Sequence[End], climbed: Callable[[Iterate], End]) -> list[End]:
+    """Return the separate optima among the ends and among their images, the best first.
+
+    Images differ from an optimum by signs, or by the exchange of two parameters. Where their density is at least a
+    thousandth of the optimum's, the iteration starts there as well. Ends are left out if more of their orbits are not
+    the measured ones than of the best end's.
+    """
+    ends = sorted(ends, key=preference, reverse=True)
+    fewest = len(ends[0].iterate.here.other_orbits)
+    ends = [end for end in ends if len(end.iterate.here.other_orbits) == fewest]
+    settled = [end for end in ends if end.status == "converged"]
+    equal = [end for end in settled if end.iterate.objective > ends[0].iterate.objective - EQUAL]
+    found = [(equal or ends)[0]]
+    for end in settled:
+        if _is_separate(objective, end.iterate.theta, found):
+            found.append(end)
+    waiting = list(found)
+    while waiting and len(found) < MOST_MODES:
+        here = waiting.pop(0).iterate
+        for image in _credible_images(objective, here):
+            start = objective.at(image, here.here, here.noise) if _is_separate(objective, image, found) else None
+            if start is None:
+                continue
+            end = climbed(objective.anchored(start))
+            if not _is_separate(objective, end.iterate.theta, found):
+                continue
+            if end.status == "converged" and len(end.iterate.here.other_orbits) == fewest:
+                found.append(end)
+                waiting.append(end)
+    found.sort(key=lambda end: -end.iterate.objective)
+    return [end for end in found if end.iterate.objective > found[0].iterate.objective - LOWEST]
+
+
+def _is_separate(objective: Objective, theta: np.ndarray, found: Sequence[End]) -> bool:
+    """Return whether θ (names,) is further than a standard deviation from all optima found."""
+    return all(_distance(objective, theta, end.iterate) > APART for end in found)
+
+
+def _distance(objective: Objective, theta: np.ndarray, mode: Iterate) -> float:
+    """Return the distance in standard deviations, directions without curvature left out."""
+    values, vectors, scale = hessian_eigh(objective.hessian_and_gradient(mode)[0])
+    along = vectors.T @ ((theta - mode.theta) / scale)
+    curved = np.abs(values) > SINGULAR * np.abs(values).max()
+    return float(np.sqrt(np.sum(np.abs(values[curved]) * along[curved] ** 2)))
+
+
+def _credible_images(objective: Objective, mode: Iterate) -> np.ndarray:
+    """Return images of an optimum, (images, names), whose density is at least a thousandth of the optimum's.
+
+    Images with a negligible prior are not solved.
+    """
+    problem = objective.density.problem
+    points = np.concatenate([mode.theta[None], images(problem, mode.theta)])
+    prior = problem.joint_prior.log_prob(points)
+    points = points[prior > prior[0] + np.log(CREDIBLE)]
+    density = objective.density.with_settings(simulator=mode.here.simulator)
+    values = density.at(points, np.tile(mode.noise, (len(points), 1))).log_prob
+    return points[1:][values[1:] > values[0] + np.log(CREDIBLE)]
+
+
+def images(problem: Description, theta: np.ndarray) -> np.ndarray:
+    """Return θ with other signs, or with two values exchanged, (images, names).
+
+    Up to four signs are changed in all combinations, more than four one by one and all together. Parameters local to
+    experiments are not exchanged.
+    """
+    supports = problem.joint_prior.supports
+    signed = [i for i, (low, high) in enumerate(supports.values()) if low < 0.0 < high]
+    sizes = range(1, len(signed) + 1) if len(signed) <= MOST_SIGNS else (1, len(signed))
+    found = []
+    for columns in (list(c) for n in sizes for c in combinations(signed, n)):
+        image = theta.copy()
+        image[columns] *= -1.0
+        found.append(image)
+    for i, j in combinations([i for i, name in enumerate(supports) if "[" not in name], 2):
+        image = theta.copy()
+        image[[i, j]] = theta[[j, i]]
+        found.append(image)
+    return np.array(found).reshape(-1, theta.size)
+
+
+def weighed(problem: Description, ends: Sequence[End], laplaces: Sequence[JointLaplace]) -> tuple[Mode, ...]:
+    """Return the optima after the first with their masses: density times √det(2π C), of all sampling coordinates.
+
+    Where one of them has no joint covariance C, the masses are in proportion to the densities.
+    """
+    labels = [*problem.names]
+    heights = np.array([one.log_density for one in laplaces])
+    if all(one.covariance.notna().all(axis=None) for one in laplaces):
+        heights = heights + [_half_log_determinant(one.covariance.to_numpy()) for one in laplaces]
+    masses = softmax(heights) if np.isfinite(heights).all() else np.full(len(ends), np.nan)
+    modes = []
+    for end, laplace, mass in zip(ends[1:], laplaces[1:], masses[1:], strict=True):
+        theta = end.iterate.theta
+        with np.errstate(invalid="ignore"):
+            sd = np.sqrt(np.diag(laplace.covariance.loc[labels, labels])) * np.where(problem.logarithmic, theta, 1.0)
+        modes.append(
+            Mode(
+                dict(zip(labels, theta.tolist(), strict=True)),
+                dict(zip(labels, sd.tolist(), strict=True)),
+                end.iterate.objective,
+                float(mass),
+                laplace.mode,
+                laplace.covariance,
+            )
+        )
+    return tuple(modes)
+
+
+def _half_log_determinant(covariance: np.ndarray) -> float:
+    values, _, sd = covariance_eigh(covariance)
+    return float(0.5 * np.sum(np.log(np.maximum(values, np.finfo(float).tiny))) + np.sum(np.log(sd)))
+
+
+def notable(modes: Sequence[Mode]) -> list[Mode]:
+    """Return the optima with more than 1 % of the mass, or with a mass that is not known."""
+    return [mode for mode in modes if not mode.mass <= NOTABLE]
