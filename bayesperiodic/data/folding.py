@@ -9,6 +9,7 @@ from scipy.linalg import solve_toeplitz
 from scipy.special import fdtrc, softmax
 
 from bayesperiodic import _checks, _fourier
+from bayesperiodic.data.quantisation import repeated_variance
 
 MAXIMUM_HARMONICS = 600
 SIGNIFICANT_POWER = 10.0
@@ -19,6 +20,8 @@ CROSSING = "crossing"
 
 # The spectrum of the noise: grid points a sample, and neighbouring lines on each side of a harmonic.
 FINENESS, NEIGHBOURS = 4, 16
+# Degrees of freedom of the variance of repeated errors, less than of any measured one.
+REPEATED_FREEDOM = 3.0
 # Lines from which frequency zero is extrapolated: for the kind of noise, and for the level of white and slow noise.
 LINES, WHITE_LINES, SLOW_LINES = 40, 8, 2
 # Correlation times in recording lengths, white floors relative to line 1, and line 0 of 1/f noise relative to line 1
@@ -207,7 +210,7 @@ def fold_signals(
         fit, fundamental_se = fit_harmonics(steady.time, steady.values, fundamental, limit), 0.0
     periodicity = _periodicity(steady, fit)
     cycles = round(np.ptp(steady.time) * fit.frequency)
-    one_cycle, noise = zip(*(_noise(steady.time, fit, own, cycles) for own in fit.residuals), strict=True)
+    one_cycle, noise = zip(*(_noise(steady, fit, row, cycles) for row in range(len(steady.values))), strict=True)
     significant = [_last_significant(a, own) for a, own in zip(fit.amplitudes, noise, strict=True)]
     kept = dict(zip(signals.channels, significant, strict=True)) | _chosen(harmonics, signals.channels, limit)
     amplitudes = fit.amplitudes
@@ -354,18 +357,24 @@ def _periodicity(signals: Signals, fit: HarmonicFit) -> float:
 
 @dataclass(frozen=True)
 class AmplitudeNoise:
-    """Variances of the mean period's complex amplitudes, and their degrees of freedom, (harmonics + 1,) each."""
+    """Variances of the mean period's complex amplitudes, and their degrees of freedom, (harmonics + 1,) each.
+
+    `lines` are those of the part that was measured.
+    """
 
     variance: np.ndarray
     freedom: np.ndarray
+    lines: np.ndarray
 
 
-def _noise(time: np.ndarray, fit: HarmonicFit, residuals: np.ndarray, cycles: int) -> tuple[np.ndarray, AmplitudeNoise]:
+def _noise(signals: Signals, fit: HarmonicFit, row: int, cycles: int) -> tuple[np.ndarray, AmplitudeNoise]:
     """Return the variances of one cycle's complex amplitudes, (harmonics + 1,), and the noise of the mean's.
 
     The spectrum of the K cycles has lines at multiples of 1/K of the fundamental, and those between the harmonics
-    contain noise only. The variance at a harmonic is the mean over the nearest of these lines on both sides.
+    contain noise only. The variance at a harmonic is the mean over the nearest of these lines on both sides, plus that
+    of quantisation errors that repeat in every cycle.
     """
+    time, residuals = signals.time, fit.residuals[row]
     per_cycle = (time.size - 1) / (np.ptp(time) * fit.frequency)
     # On a grid in phase, finer than the samples, the lines are those of a discrete Fourier transform at any sampling.
     points = FINENESS * int(np.ceil(per_cycle - 1e-6))
@@ -380,9 +389,26 @@ def _noise(time: np.ndarray, fit: HarmonicFit, residuals: np.ndarray, cycles: in
     freedom = np.full(harmonic.size, 4.0 * side.size)
     lines = np.arange(1, power.size)
     near[0], freedom[0] = _at_zero(power[lines[lines % cycles > 0][:LINES]])
+    repeated = _repeated_error(signals.values[row], residuals, fit.amplitudes[row], place % points, points)
+    # Satterthwaite; how the repeated error is distributed over the harmonics is hardly known.
+    uncertain = near**2 / freedom + repeated**2 / REPEATED_FREEDOM
+    total = np.divide((near + repeated) ** 2, uncertain, out=freedom.copy(), where=uncertain > 0.0)
+    near += repeated
     scale = np.where(harmonic == 0, 1.0, 4.0)
     one_cycle = scale * np.sum(np.abs(deviation) ** 2, axis=0) / (cycles - 1)
-    return one_cycle, AmplitudeNoise(scale * near, freedom)
+    return one_cycle, AmplitudeNoise(scale * near, total, freedom)
+
+
+def _repeated_error(
+    values: np.ndarray, residuals: np.ndarray, amplitudes: np.ndarray, phase: np.ndarray, points: int
+) -> float:
+    """Return the variance of the mean over a cycle due to repeated quantisation errors; `phase` are grid points."""
+    count = np.bincount(phase, minlength=points)
+    square = np.sum(residuals**2) - np.sum(np.bincount(phase, residuals, points) ** 2 / np.maximum(count, 1))
+    phases = np.count_nonzero(count)
+    again = values.size - phases
+    fitted = _fourier.on_grid(amplitudes, points)
+    return repeated_variance(values, fitted, int(phases), square / again) if again else 0.0
 
 
 def _at_zero(power: np.ndarray) -> tuple[float, float]:
@@ -419,7 +445,7 @@ def _last_significant(amplitudes: np.ndarray, noise: AmplitudeNoise) -> int:
     tested = amplitudes.size - 1
     floor = (1e-12 * np.abs(amplitudes).max()) ** 2
     ratio = np.abs(amplitudes[1:]) ** 2 / np.maximum(noise.variance[1:], floor)
-    significant = fdtrc(2, noise.freedom[1:], ratio) < FALSE_ALARM_RATE / tested
+    significant = fdtrc(2, noise.lines[1:], ratio) < FALSE_ALARM_RATE / tested
     return int(np.flatnonzero(significant)[-1]) + 1 if significant.any() else 1
 
 

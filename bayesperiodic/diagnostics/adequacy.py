@@ -136,6 +136,8 @@ def holm(p: np.ndarray) -> np.ndarray:
     return adjusted
 
 
+# Degrees of freedom of a spectrum, below which it is mostly assumed.
+SHAPE_KNOWN = 4.0
 LEVEL = 0.01
 SHAPES = 20
 TESTS = ("whiteness", "harmonics", "size", "amplitude", "consistency")
@@ -222,13 +224,16 @@ class _Whitened:
     def spectral_tests(self, index: int) -> tuple[float, float, float]:
         """Return p of whiteness and of the harmonic content of a block, and the strongest harmonic.
 
-        Where the spectrum of the noise was measured between the harmonics, the components are in its units.
+        Where the spectrum of the noise was measured between the harmonics, the components are in its units. The shape
+        of the spectrum of repeated quantisation errors is not known, and whiteness is not tested where they prevail.
         """
         r, j, harmonic = self.parts[index]
         if self.blocks[index].kind == CORRELATED or not _testable(r, j):
             return NOT_TESTED, NOT_TESTED, NOT_TESTED
         unexplained = self.in_measured_units(index) or Unexplained(r, j, harmonic)
-        return unexplained.whiteness(), *unexplained.harmonic_content()
+        spectrum = self.spectrum(index)
+        known = spectrum is None or np.median(spectrum[1]) >= SHAPE_KNOWN
+        return unexplained.whiteness() if known else NOT_TESTED, *unexplained.harmonic_content()
 
     def in_measured_units(self, index: int) -> Unexplained | None:
         """Return what is unexplained of a block in units of the measured spectrum; None if that is not known."""

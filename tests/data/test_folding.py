@@ -109,8 +109,9 @@ def test_variance_of_the_mean_is_right_within_half_under_noise_of_any_spectrum(n
     time, generator = np.arange(2000) / 100.0, np.random.default_rng(0)
     stated, actual = np.zeros(3), np.zeros(3)
     for _ in range(2000):
-        fit = folding.fit_harmonics(time, noise(time, generator)[None], 1.0, 3)
-        stated += folding._noise(time, fit, fit.residuals[0], 20)[1].variance[:3]
+        signals = folding.Signals("slow", time, ("y",), noise(time, generator)[None], 0)
+        fit = folding.fit_harmonics(time, signals.values, 1.0, 3)
+        stated += folding._noise(signals, fit, 0, 20)[1].variance[:3]
         actual += np.abs(fit.amplitudes[0, :3]) ** 2
     assert np.all(stated < 1.5 * actual)
     assert np.all(stated > actual / 1.5)

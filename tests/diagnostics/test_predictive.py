@@ -219,11 +219,17 @@ def product_posterior(damping: float):
     return problem, posterior_of(problem, np.stack([a, b], axis=-1), variance[:, None])
 
 
-def folded(noise, seed: int, coulomb: float) -> bp.Problem:
-    """Return the linear problem of a recording of 40 cycles at 0.5 Hz with noise of 3 N, without Coulomb friction."""
+def folded(noise, seed: int, coulomb: float, step: float = 0.0) -> bp.Problem:
+    """Return the linear problem of a recording of 40 cycles at 0.5 Hz with noise of 3 N, without Coulomb friction.
+
+    A force in steps [N] has levels at a random place.
+    """
     time = np.arange(4000) / 50.0
     x, v = 0.05 * np.cos(np.pi * time), -0.05 * np.pi * np.sin(np.pi * time)
     force = 900.0 * x + 40.0 * v + coulomb * np.sign(v) + 3.0 * noise(time, np.random.default_rng(seed))
+    if step:
+        offset = step * np.random.default_rng(seed).uniform()
+        force = np.round((force + offset) / step) * step - offset
     run = bp.Recording.from_arrays(time, {"force": force}, {"x": x}).fold(128, frequency=0.5, harmonics=15)
     return bp.Problem(LINEAR, [run], priors={n: FLAT[n] for n in "kc"}, fixed={"coulomb": 0.0})
 
@@ -241,6 +247,23 @@ def test_coloured_noise_is_no_model_error(noise):
     """100 data sets of the right model; the level is 1 %, and 6 alarms or more have a probability of 0.05 %."""
     alarms = sum(judged(folded(noise, seed, 0.0)).loc["all", "verdict"] == "misspecified" for seed in range(100))
     assert alarms <= 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 0.1, 1.0], ids=["no noise", "0.3 N", "3 N"])
+def test_coarse_quantisation_is_no_model_error(noise):
+    """Steps of 4.5 N, an eighth of the force's sd, with 100 samples in every cycle; level and number as above."""
+
+    def weak(time, generator):
+        return noise * generator.standard_normal(time.size)
+
+    alarms = sum(judged(folded(weak, seed, 0.0, 4.5)).loc["all", "verdict"] == "misspecified" for seed in range(100))
+    assert alarms <= 5
+
+
+def test_missing_friction_is_found_under_coarse_quantisation():
+    table = judged(folded(lambda time, generator: 0.0 * time, 1, 25.0, 4.5))
+    assert table.loc["all", "verdict"] == "misspecified"
 
 
 @pytest.mark.parametrize("noise", ["white", "autoregressive, 0.99", "1/f"])

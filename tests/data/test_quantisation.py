@@ -1,0 +1,70 @@
+"""Quantisation errors that repeat in every cycle: against simulated converters."""
+
+import numpy as np
+import pytest
+
+import bayesperiodic as bp
+from bayesperiodic.data.quantisation import repeated_variance, step_of
+
+
+def quantised(values, step, offset=0.0):
+    return np.round((values + offset) / step) * step - offset
+
+
+def ten_tones(per_cycle: int, noise: float, seed: int, cycles: int = 40):
+    """Return τ, ten tones of random phases, and them with noise (in steps), quantised at an eighth of their sd."""
+    generator, tau = np.random.default_rng(seed), np.arange(per_cycle * cycles) / per_cycle
+    order = np.arange(1, 11)
+    phases = generator.uniform(0, 2 * np.pi, 10)
+    y = np.sum(np.cos(2 * np.pi * order[:, None] * tau + phases[:, None]) / order[:, None], axis=0)
+    step = y.std() / 8
+    noisy = y + noise * step * generator.standard_normal(tau.size)
+    return tau, y, quantised(noisy, step, step * generator.uniform())
+
+
+def test_steps_are_found_and_exact_values_have_none():
+    generator = np.random.default_rng(0)
+    values = np.cumsum(generator.standard_normal(2000))
+    assert step_of(quantised(values, 0.01)) == pytest.approx(0.01)
+    assert step_of(1e5 + quantised(values, 2.5e-3, 1e-3)) == pytest.approx(2.5e-3)
+    assert step_of(values) == 0.0
+    relay = np.where(values > 0.0, 1.0, -1.0)
+    assert step_of(relay) == 0.0
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.1, 0.2, 0.3, 0.5])
+def test_repeated_part_of_the_error_is_that_of_a_simulated_converter(noise):
+    """400 places, 4000 samples each: the mean error of a place repeats, the rest is the scatter of its samples."""
+    generator = np.random.default_rng(1)
+    places = generator.uniform(-5.0, 5.0, 400)
+    error = quantised(places[:, None] + noise * generator.standard_normal((400, 4000)), 1.0) - places[:, None]
+    scatter = error.var(axis=1, ddof=1).mean()
+    expected = np.mean(error.mean(axis=1) ** 2) - scatter / 4000
+    levels = np.arange(10.0)
+    found = repeated_variance(levels, np.array([0.0, 400.0]), phases=1, scatter=scatter)
+    assert found == pytest.approx(expected, abs=0.006)
+    assert repeated_variance(levels, np.array([0.0, 400.0]), phases=20, scatter=scatter) == pytest.approx(found / 20)
+    assert repeated_variance(levels, np.array([0.0, 5.0]), phases=20, scatter=scatter) == pytest.approx(found / 10)
+    assert repeated_variance(levels + 1e-3 * places[:10], np.zeros(2), phases=1, scatter=scatter) == 0.0
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.3])
+def test_variance_of_the_mean_includes_errors_that_repeat(noise):
+    """Harmonics 1 to 10 of 60 recordings with 100 samples a cycle: sampling error 4 %, and the errors are no noise."""
+    stated = actual = 0.0
+    for seed in range(60):
+        tau, y, recorded = ten_tones(100, noise, seed)
+        run = bp.Recording.from_arrays(tau, {"y": recorded}, {"x": y}).fold(64, frequency=1.0, harmonics=10)
+        exact = 2 * np.fft.rfft(y[:100])[1:11] / 100
+        error = 2 * np.fft.rfft(run.outputs["y"])[1:11] / 64 - exact
+        stated += run.amplitude_variance["y"][1:].sum()
+        actual += np.sum(np.abs(error) ** 2)
+    assert stated / actual == pytest.approx(1.0, abs=0.3)
+
+
+def test_harmonics_of_repeated_errors_are_not_kept():
+    kept = [
+        bp.Recording.from_arrays(tau, {"y": recorded}, {"x": y}).fold(128, frequency=1.0).harmonics["y"]
+        for tau, y, recorded in (ten_tones(100, 0.0, seed) for seed in range(20))
+    ]
+    assert kept.count(10) >= 18
