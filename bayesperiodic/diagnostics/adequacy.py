@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.fft import dct
 
 from bayesperiodic._linalg import column_space
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.estimation.result import of_periodogram
+from bayesperiodic.estimation.result import MapEstimate, of_periodogram
 from bayesperiodic.posterior.density import Linearisation
 from bayesperiodic.posterior.noise import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
 from bayesperiodic.posterior.problem import Problem
@@ -188,6 +189,52 @@ def adequacy(
     table["p"] = np.where(np.isinf(smallest), np.nan, smallest)
     table["verdict"] = np.select([np.isinf(smallest), smallest < LEVEL], [UNTESTED, MISSPECIFIED], ADEQUATE)
     return table
+
+
+REJECTIONS = {
+    "whiteness": "the residual is not white",
+    "harmonics": "the residual has excess power in some harmonics",
+    "size": "the residual is larger than the measured noise",
+    "amplitude": "the amplitude differs from the predicted one",
+    "consistency": "the experiments and channels are inconsistent with common parameters",
+}
+
+
+def rejections(table: pd.DataFrame) -> dict[str, str]:
+    """Return the rejections of a table in words, by row."""
+    found = {}
+    for (label, row), small in zip(table.iterrows(), adjusted_p(table) < LEVEL, strict=True):
+        if reasons := [f"{REJECTIONS[test]} (p = {row[test]:.2g})" for test in compress(TESTS, small)]:
+            error, harmonic = row["model_error_share"], row["harmonic"]
+            text = "" if np.isnan(harmonic) else f"; its strongest harmonic is {harmonic:.0f}"
+            text += "" if np.isnan(error) else f"; {error:.1%} of the residual variance is model error"
+            found[str(label)] = f"{', '.join(reasons)}{text}"
+    return found
+
+
+def misfit(problem: Problem, fit: MapEstimate) -> str:
+    """Return why the model is misspecified at an estimate, in words; "" if it is not, or not fitted to the data."""
+    if fit.other_orbits or fit.prior_conflict.members:
+        return ""
+    theta = problem.vector(fit.theta)
+    guesses = {name: solution.states for name, solution in fit.solutions.items()}
+    here = problem.anchored(theta, guesses).density().linearise(theta)
+    noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
+    if not here.converged or not (found := rejections(table := adequacy(problem, here, noise[None], {}))):
+        return ""
+    subject = "model or the noise model" if concerns_noise(table) else "model"
+    reasons = "; ".join(f"{label}: {text}" for label, text in found.items())
+    return f"The {subject} is misspecified, which the verdicts take for right ({reasons})"
+
+
+def concerns_noise(table: pd.DataFrame) -> bool:
+    """Return whether a wrong noise model would explain the rejections as well as a wrong model.
+
+    A measured spectrum of the noise, or a residual larger than the measured noise, tells the two apart.
+    """
+    rejected = pd.DataFrame(adjusted_p(table) < LEVEL, table.index, TESTS)
+    measured = rejected[["whiteness", "harmonics"]][table["spectrum"] == MEASURED]
+    return table.loc[ALL, "verdict"] == MISSPECIFIED and not (rejected["size"].any() or measured.any(axis=None))
 
 
 def adjusted_p(table: pd.DataFrame) -> np.ndarray:

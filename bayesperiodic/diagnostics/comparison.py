@@ -15,6 +15,7 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics import verdicts
+from bayesperiodic.diagnostics.adequacy import misfit
 from bayesperiodic.diagnostics.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE, UNCONVERGED, USABLE_K, WIDE, Sample
 from bayesperiodic.estimation.modes import notable
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
@@ -69,8 +70,8 @@ class Comparison(Result):
         Of the natural values.
     synthetic, converged : bool
         Whether the data are synthetic, and whether the draws have converged.
-    prior_conflict : str
-        Conflict of the prior with the data, in words, which the verdicts on Laplace do not show; "" if there is none.
+    limitations : tuple of str
+        What the verdicts on Laplace do not show, in words: a conflict of prior and data, a misspecified model.
 
     Examples
     --------
@@ -93,7 +94,7 @@ class Comparison(Result):
     units: dict[str, str]
     synthetic: bool
     converged: bool
-    prior_conflict: str
+    limitations: tuple[str, ...]
 
     def __repr__(self) -> str:
         title, short, joint = self._parts(str, str)
@@ -120,8 +121,7 @@ class Comparison(Result):
             pd.DataFrame(columns).set_axis(table["coordinate"].map(text).tolist()),
             f"The 50, 90 and 95% Laplace ellipsoids contain {inside} of the draws; Pareto k̂ is {joint['pareto_k']:.2f} "
             f"± {joint['pareto_k_mcse']:.2f}. Joint verdict: {mark(str(joint['verdict']))}; "
-            f"{text(str(joint['recommendation']))}."
-            + (f" {text(self.prior_conflict)}." if self.prior_conflict else ""),
+            f"{text(str(joint['recommendation']))}." + "".join(f" {text(one)}." for one in self.limitations),
         )
 
 
@@ -206,7 +206,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
         units={name: unit(group, name) for name in draws},
         synthetic=bool(posterior.data.attrs.get("synthetic")),
         converged=posterior.converged,
-        prior_conflict=fit.prior_conflict.text,
+        limitations=tuple(filter(None, [fit.prior_conflict.text, misfit(problem, fit)])),
     )
 
 

@@ -11,6 +11,7 @@ from scipy.special import ndtr, softmax, stdtr
 
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import in_one_thread
+from bayesperiodic.diagnostics.adequacy import misfit
 from bayesperiodic.diagnostics.design import Candidate, Information, default_candidates, rank_candidates
 from bayesperiodic.diagnostics.predictive import draws_of
 from bayesperiodic.estimation.laplace import combinations, in_words, reduced
@@ -165,7 +166,7 @@ class Identifiability(Result):
     converged : bool
         False if there are draws that have not converged.
     basis : str
-        What the verdicts rest on.
+        What the verdicts rest on, and whether the model is misspecified.
 
     Examples
     --------
@@ -301,7 +302,7 @@ def identifiability(
         experiments,
         structure,
         converged=posterior is None or posterior.converged,
-        basis=_basis(fit, posterior),
+        basis="\n".join([_basis(fit, posterior), *([f"{wrong}."] if (wrong := misfit(problem, fit)) else [])]),
     )
 
 

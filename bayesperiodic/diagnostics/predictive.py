@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import compress, islice
+from itertools import islice
 
 import numpy as np
 import pandas as pd
@@ -18,12 +18,11 @@ from bayesperiodic.data.recording import Recording
 from bayesperiodic.diagnostics.adequacy import (
     ALL,
     LEVEL,
-    MEASURED,
     MISSPECIFIED,
-    TESTS,
     UNTESTED,
     adequacy,
-    adjusted_p,
+    concerns_noise,
+    rejections,
 )
 from bayesperiodic.estimation.conflict import prior_conflict
 from bayesperiodic.estimation.gauss_newton import Objective, bias_correction
@@ -166,15 +165,6 @@ def _experiment_of(problem: Problem, experiment: str | None) -> str:
     return names[0]
 
 
-REJECTIONS = {
-    "whiteness": "the residual is not white",
-    "harmonics": "the residual has excess power in some harmonics",
-    "size": "the residual is larger than the measured noise",
-    "amplitude": "the amplitude differs from the predicted one",
-    "consistency": "the experiments and channels are inconsistent with common parameters",
-}
-
-
 @dataclass(frozen=True)
 class Prediction(Bands):
     """Posterior prediction of the mean period of each experiment, and tests of the model.
@@ -236,22 +226,12 @@ class Prediction(Bands):
     def findings(self) -> dict[str, str]:
         """Rejections in words, by row of the table; other orbits by experiment; the conflict of prior and data."""
         found = {f"experiment {name}": reason for name, reason in self.other_orbits.items()}
-        for (label, row), small in zip(self.table.iterrows(), adjusted_p(self.table) < LEVEL, strict=True):
-            if reasons := [f"{REJECTIONS[test]} (p = {row[test]:.2g})" for test in compress(TESTS, small)]:
-                error = row["model_error_share"]
-                text = "" if np.isnan(error) else f"; {error:.1%} of the residual variance is model error"
-                found[str(label)] = f"{', '.join(reasons)}{text}"
-        return found | ({"prior conflict": self.prior_conflict} if self.prior_conflict else {})
+        return found | rejections(self.table) | ({"prior conflict": self.prior_conflict} if self.prior_conflict else {})
 
     @property
     def concerns_noise(self) -> bool:
-        """Whether a wrong noise model would explain the rejections as well as a wrong model.
-
-        A measured spectrum of the noise, or a residual larger than the measured noise, tells the two apart.
-        """
-        rejected = pd.DataFrame(adjusted_p(self.table) < LEVEL, self.table.index, TESTS)
-        measured = rejected[["whiteness", "harmonics"]][self.table["spectrum"] == MEASURED]
-        return self.verdict == MISSPECIFIED and not (rejected["size"].any() or measured.any(axis=None))
+        """Whether a wrong noise model would explain the rejections as well as a wrong model."""
+        return concerns_noise(self.table)
 
     def __repr__(self) -> str:
         subject = "model or the noise model" if self.concerns_noise else "model"

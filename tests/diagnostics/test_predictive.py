@@ -261,6 +261,18 @@ def test_coarse_quantisation_is_no_model_error(noise):
     assert alarms <= 5
 
 
+@pytest.mark.parametrize(("coulomb", "said"), [(0.0, False), (25.0, True)])
+def test_a_misspecified_model_is_named_beside_all_other_verdicts(coulomb, said):
+    """Missing friction at its third harmonic; with the right model nothing is said (fixed seed, 1 % false alarms)."""
+    problem = folded(NOISES["white"], 1, coulomb)
+    fit = bp.map_estimate(problem, progress=False)
+    text = "The model is misspecified, which the verdicts take for right"
+    assert (text in repr(bp.identifiability(problem, fit, profile=False))) is said
+    found = bp.compare(problem, fit, draw(problem, fit, 1, draws=400))
+    assert (text in repr(found)) is said
+    assert all("its strongest harmonic is 3" in one for one in found.limitations) and len(found.limitations) == said
+
+
 def test_missing_friction_is_found_under_coarse_quantisation():
     table = judged(folded(lambda time, generator: 0.0 * time, 1, 25.0, 4.5))
     assert table.loc["all", "verdict"] == "misspecified"
