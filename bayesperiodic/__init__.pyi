@@ -5,6 +5,8 @@ from . import plot as plot
 from ._io import load as load
 from .data.experiment import Experiment as Experiment
 from .data.recording import Recording as Recording
+from .diagnostics.branch_prediction import BranchPrediction as BranchPrediction
+from .diagnostics.branch_prediction import predict_branch as predict_branch
 from .diagnostics.calibration import Calibration as Calibration
 from .diagnostics.calibration import calibrate as calibrate
 from .diagnostics.comparison import Comparison as Comparison

@@ -19,6 +19,7 @@ REMEDY = "load it with the version that saved it, or compute it again"
 MODULES = {
     "Bands": "bayesperiodic.diagnostics.predictive",
     "Branch": "bayesperiodic.periodic.continuation",
+    "BranchPrediction": "bayesperiodic.diagnostics.branch_prediction",
     "Calibration": "bayesperiodic.diagnostics.calibration",
     "Comparison": "bayesperiodic.diagnostics.comparison",
     "Experiment": "bayesperiodic.data.experiment",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, overload
 
@@ -30,6 +31,8 @@ STEPS = 50
 LOCATED = 1e-9
 FOUND_BY = "continuation"
 DOUBLED = 0.005
+# Points whose solutions are kept: both ends of a step, and those located between them.
+REMEMBERED = 4
 
 
 @dataclass(frozen=True)
@@ -230,8 +233,9 @@ def iterate_periodic(
     if until == values[0]:
         raise ValueError(f"until: must differ from the start value of {vary}, got {until!r}.")
     step = abs(until - values[0]) / STEPS if step is None else _checks.positive("step", step)
-    for point in trace(parametrised, z, values, until=until, step=step, refine=_special_points):
-        yield float(point.values[0]), _solution(parametrised, point), point.kind
+    solved = _remembered(parametrised)
+    for point in trace(parametrised, z, values, until=until, step=step, refine=partial(_special_points, solved)):
+        yield float(point.values[0]), solved(point), point.kind
 
 
 def double_period(model: Model, solution: PeriodicSolution, vary: str) -> PeriodicSolution:
@@ -317,18 +321,33 @@ def _solution(parametrised: ParametrisedEquations, point: Point, sensitivities: 
     return describe(equations, parameters, solved, FOUND_BY, sensitivities)
 
 
-def _special_points(tracer: Tracer, before: Point, after: Point) -> list[Point]:
+def _remembered(parametrised: ParametrisedEquations) -> Callable[[Point], PeriodicSolution]:
+    """Return a function that returns the solution at a point; those of the last points are kept."""
+    recent: dict[int, tuple[Point, PeriodicSolution]] = {}
+
+    def solution(point: Point) -> PeriodicSolution:
+        key = id(point.z)
+        if key not in recent:
+            if len(recent) == REMEMBERED:
+                del recent[next(iter(recent))]
+            recent[key] = point, _solution(parametrised, point)
+        return recent[key][1]
+
+    return solution
+
+
+def _special_points(
+    solved: Callable[[Point], PeriodicSolution], tracer: Tracer, before: Point, after: Point
+) -> list[Point]:
     """Return the folds and period doublings between two neighbouring points, in order."""
     found: list[Point] = []
-    for kind, test in ((FOLD, _fold_test), (PERIOD_DOUBLING, _doubling_test)):
-        if test(tracer, before) * test(tracer, after) < 0.0:
+    for kind, test in ((FOLD, _fold_test), (PERIOD_DOUBLING, lambda point: _doubling_test(solved(point)))):
+        if test(before) * test(after) < 0.0:
             found += _locate(tracer, before, after, kind, test)
     return sorted(found, key=lambda point: point.distance)
 
 
-def _locate(
-    tracer: Tracer, before: Point, after: Point, kind: str, test: Callable[[Tracer, Point], float]
-) -> list[Point]:
+def _locate(tracer: Tracer, before: Point, after: Point, kind: str, test: Callable[[Point], float]) -> list[Point]:
     """Return the point where a test function is zero, in a list that is empty if a correction fails."""
     span = after.distance - before.distance
     known: dict[float, Point] = {0.0: before, span: after}
@@ -339,7 +358,7 @@ def _locate(
             if corrected is None:
                 raise _Lost
             known[distance] = corrected[0]
-        return test(tracer, known[distance])
+        return test(known[distance])
 
     try:
         root = brentq(at, 0.0, span, xtol=LOCATED * span, rtol=1e-14)
@@ -353,14 +372,13 @@ class _Lost(Exception):
     """A correction failed."""
 
 
-def _fold_test(tracer: Tracer, point: Point) -> float:
+def _fold_test(point: Point) -> float:
     """Return the slope of the varied quantity along the branch."""
     return float(point.tangent[1][0])
 
 
-def _doubling_test(tracer: Tracer, point: Point) -> float:
+def _doubling_test(solution: PeriodicSolution) -> float:
     """Return a test function that changes its sign where a multiplier passes −1."""
-    solution = _solution(tracer.parametrised, point)
     exponents = solution.floquet.exponents if solution.floquet is not None else np.array([np.nan])
     growth = np.abs(exponents.real)
     parts = np.exp(-growth) + np.exp(exponents - growth)

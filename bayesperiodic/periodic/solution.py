@@ -106,6 +106,8 @@ def _step_on_twice_the_points(solution: PeriodicSolution, z: np.ndarray) -> list
 
 
 NEWTON = "newton"
+# Difference of an output from a state [rad] up to which it is this angle, but for a constant.
+SAME_ANGLE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -227,6 +229,23 @@ class PeriodicSolution(Result):
 
     def _turns(self, state: str) -> np.ndarray:
         return 2 * np.pi * self.winding.get(state, 0) / self.periods * self.tau
+
+    def wave(self, output: str) -> np.ndarray:
+        """Return an output (points,) without the uniform turning of a rotating angle.
+
+        Parameters
+        ----------
+        output : str
+
+        Returns
+        -------
+        array (points,)
+        """
+        values = self.outputs[output]
+        for state, turns in self.winding.items():
+            if turns and np.ptp(values - self.states[state]) < SAME_ANGLE:
+                return values - self._turns(state)
+        return values
 
     @property
     def multipliers(self) -> np.ndarray:

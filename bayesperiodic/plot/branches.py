@@ -6,10 +6,12 @@ from typing import Any, cast
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bayesperiodic import _checks
+from bayesperiodic.diagnostics.branch_prediction import BranchPrediction
 from bayesperiodic.orbits.orbit import Orbit, Orbits
 from bayesperiodic.orbits.section import PoincareSection
 from bayesperiodic.periodic.continuation import FOLD, PERIOD_DOUBLING, Branch
@@ -21,8 +23,8 @@ MARKERS = {FOLD: "o", PERIOD_DOUBLING: "D"}
 
 
 def branch(
-    branch: Branch,
-    *more: Branch,
+    branch: Branch | BranchPrediction,
+    *more: Branch | BranchPrediction,
     measure: str | Callable[[PeriodicSolution], float | np.ndarray] = "amplitude",
     output: str | None = None,
     unit: str | None = None,
@@ -33,10 +35,13 @@ def branch(
 ) -> Figure:
     """Draw branches of periodic solutions: stable parts solid, unstable ones dashed, with folds and period doublings.
 
+    Of a prediction the median and the central 90 % band are drawn between folds, where half of the draws have an orbit,
+    and the folds with their central 90 %.
+
     Parameters
     ----------
-    branch, *more : Branch
-        Continued in the same quantity, one colour per branch.
+    branch, *more : Branch or BranchPrediction
+        Continued in the same quantity, one colour per branch; of a prediction only amplitude and maximum.
     measure : {"amplitude", "maximum", "section", "period"} or callable
         Ordinate: half the range of the output, its maximum, or its values at tau = 0, 1, … (p lines for an orbit of
         period p), without the turns of a rotating angle; or the response period; or a function of the solution that
@@ -76,14 +81,18 @@ def branch(
         raise ValueError(f"more: branches must all vary {branch.vary!r}, got {[b.vary for b in more]}.")
     if labels is not None and len(labels) != len(branches):
         raise ValueError(f"labels: must be {len(branches)}, one per branch, got {len(labels)}.")
-    output = next(iter(branch[0].outputs)) if output is None else output
-    _checks.one_of("output", output, branch[0].outputs)
+    known = branch.outputs if isinstance(branch, BranchPrediction) else [*branch[0].outputs]
+    output = known[0] if output is None else output
+    _checks.one_of("output", output, known)
     if not callable(measure):
         _checks.one_of("measure", measure, MEASURES)
     if ax is None:
         ax = (figure or plt.figure(figsize=(7.0, 4.6), layout="constrained")).add_subplot()
     factor = 2 * np.pi if angular and branch.vary == "frequency" else 1.0
     for b, colour in zip(branches, cycle(ENSEMBLES), strict=False):
+        if isinstance(b, BranchPrediction):
+            _draw_prediction(ax, b, b.band(output, str(measure)), f"{measure}[{output}]", factor, colour)
+            continue
         across, up = factor * b.values, _measures(b, measure, output)
         for stable, part in _runs(b):
             ax.plot(across[part], up[part], color=colour, lw=1.6, ls="-" if stable else "--", zorder=2 + stable)
@@ -98,31 +107,40 @@ def branch(
     return cast(Figure, ax.figure)
 
 
+def _draw_prediction(
+    ax: Axes, prediction: BranchPrediction, band: pd.DataFrame, column: str, factor: float, colour: str
+) -> None:
+    for _, part in band.groupby("part"):
+        value = factor * part["value"].to_numpy()
+        ax.fill_between(value, part["low"], part["high"], color=colour, alpha=0.3, lw=0, zorder=2)
+        stable = part["stable"].to_numpy()
+        starts = [0, *(np.flatnonzero(np.diff(stable)) + 1), len(stable)]
+        for begin, end in pairwise(starts):
+            style = "-" if stable[begin] else "--"
+            ax.plot(value[begin:end], part["median"].iloc[begin:end], color=colour, lw=1.6, ls=style, zorder=3)
+    at = prediction.curves[prediction.curves["kind"] == FOLD].groupby("part")[column].median()
+    folds = factor * prediction.folds[["median", "low", "high"]].to_numpy()
+    for (middle, low, high), height in zip(folds, at, strict=True):
+        reach = [[middle - low], [high - middle]]
+        ax.errorbar([middle], [height], xerr=reach, fmt="o", color=colour, mfc="white", ms=6, mew=1.4, zorder=4)
+
+
 def _measures(branch: Branch, measure: str | Callable, output: str) -> np.ndarray:
     """Return the ordinates of a branch, (points, lines)."""
     if callable(measure):
         return np.array([np.ravel(measure(solution)) for solution in branch])
     if measure == "period":
         return np.array([[solution.period] for solution in branch])
-    waves = np.array([solution.outputs[output] - _turns(solution, output) for solution in branch])
+    waves = np.array([solution.wave(output) for solution in branch])
     if measure == "amplitude":
         return 0.5 * np.ptp(waves, axis=1, keepdims=True)
     if measure == "maximum":
         return waves.max(axis=1, keepdims=True)
     points = np.array([solution.outputs[output][:: solution.samples] for solution in branch])
-    if np.any(_turns(branch[0], output)):
+    if np.any(branch[0].wave(output) != branch[0].outputs[output]):
         points[0] = np.angle(np.exp(1j * points[0]))
         points = np.unwrap(points, axis=0)
     return points
-
-
-def _turns(solution: PeriodicSolution, output: str) -> np.ndarray:
-    """Return the uniform rotation of an output that is a rotating angle, zero for any other."""
-    values = solution.outputs[output]
-    for state, turns in solution.winding.items():
-        if turns and np.ptp(values - solution.states[state]) < 1e-6:
-            return 2 * np.pi * turns / solution.periods * solution.tau
-    return np.zeros_like(values)
 
 
 def _runs(branch: Branch) -> list[tuple[bool, slice]]:
@@ -141,18 +159,24 @@ def _measure_label(measure: str | Callable, output: str, unit: str) -> str:
     return axis_label(f"{output} at tau = 0, 1, …" if measure == "section" else f"{measure} of {output}", unit)
 
 
-def _branch_handles(branches: Sequence[Branch], labels: Sequence[str] | None) -> list[plt.Line2D]:
+def _branch_handles(branches: Sequence[Branch | BranchPrediction], labels: Sequence[str] | None) -> list[plt.Line2D]:
     looks: list[dict[str, Any]] = [
         {"color": colour, "lw": 1.6, "label": label}
         for colour, label in zip(cycle(ENSEMBLES), labels or [], strict=False)
     ]
     for stable, style, name in ((True, "-", "stable"), (False, "--", "unstable")):
-        if any(stable == verdict for b in branches for verdict, _ in _runs(b)):
+        if any(stable in _stabilities(b) for b in branches):
             looks.append({"color": "black", "lw": 1.6, "ls": style, "label": name})
     for kind, marker in MARKERS.items():
-        if any(kind in b.kinds for b in branches):
+        if any(kind in (b.curves["kind"].to_numpy() if isinstance(b, BranchPrediction) else b.kinds) for b in branches):
             looks.append({"color": "black", "marker": marker, "mfc": "white", "mew": 1.4, "ls": "", "label": kind})
     return [plt.Line2D([], [], **look) for look in looks]
+
+
+def _stabilities(branch: Branch | BranchPrediction) -> set[bool]:
+    if isinstance(branch, BranchPrediction):
+        return set(branch.curves["stable"])
+    return {stable for stable, _ in _runs(branch)}
 
 
 MOST_POINTS = 20_000
