@@ -85,6 +85,17 @@ class BranchPrediction(Result):
             ``part``, ``value``, ``median``, ``low`` and ``high`` (central 90 % of the draws that have an orbit there),
             ``stable`` (of most), ``fraction`` of the draws that have one; rows with less than half of them are left
             out.
+
+        Raises
+        ------
+        ValueError
+            For an unknown output or measure.
+
+        Examples
+        --------
+        >>> curves = bp.predict_branch(problem, posterior, "force", until=2.0, draws=5, progress=False)
+        >>> curves.band(measure="maximum").columns.tolist()
+        ['part', 'value', 'median', 'low', 'high', 'stable', 'fraction']
         """
         output = self.outputs[0] if output is None else output
         _checks.one_of("output", output, self.outputs)
@@ -169,6 +180,11 @@ def predict_branch(
         For an unknown experiment or quantity, an end equal to the start value, or draws of another problem.
     RuntimeError
         If no draw has a periodic solution at the start.
+
+    Examples
+    --------
+    >>> curves = bp.predict_branch(problem, posterior, "frequency", until=0.2, draws=5, progress=False)
+    >>> figure = bp.plot.branch(curves)
     """
     count = _checks.integer("draws", draws, 1)
     names = [e.name for e in problem.experiments]
