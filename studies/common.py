@@ -7,6 +7,7 @@ import hashlib
 import importlib.metadata
 import json
 import math
+import math
 import multiprocessing
 import operator
 import os
@@ -168,12 +169,27 @@ def versions() -> dict[str, str]:
 
 
 def write_results(folder: Path, results: dict[str, Any]) -> Path:
-    """Write results.json atomically."""
+    """Write results.json atomically, as strict JSON: null instead of numbers that are not finite, with the reasons."""
     folder.mkdir(parents=True, exist_ok=True)
     target, draft = folder / "results.json", folder / ".results.json.part"
-    draft.write_text(json.dumps(results, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    reasons: dict[str, str] = {}
+    finite = _finite(results, "", reasons)
+    whole = finite | ({"null": reasons} if reasons else {})
+    draft.write_text(json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
     draft.replace(target)
     return target
+
+
+def _finite(value: Any, place: str, reasons: dict[str, str]) -> Any:
+    """Return a value with None for numbers that are not finite; their places and the reasons are added to `reasons`."""
+    if isinstance(value, dict):
+        return {key: _finite(one, f"{place}.{key}" if place else str(key), reasons) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one, f"{place}[{i}]", reasons) for i, one in enumerate(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        reasons[place] = "not known" if math.isnan(value) else "no upper bound" if value > 0.0 else "no lower bound"
+        return None
+    return value
 
 
 def save_figures(folder: Path, figures: dict[str, Figure]) -> list[Path]:

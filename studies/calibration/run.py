@@ -141,14 +141,13 @@ def _executor_of(options: argparse.Namespace) -> Iterator[Any]:
 
 
 def _collect(one: bp.Calibration) -> dict[str, Any]:
-    rows = one.table.to_dict("records")
     return {
         "replicates": one.replicates,
         "failures": one.failures,
         "stop_rule_passed": one.stop_rule,
         "independent_draws": one.draws,
         "failed_solves": one.failed_solves,
-        "table": [{key: None if value != value else value for key, value in row.items()} for row in rows],
+        "table": one.table.to_dict("records"),
         "histograms": {
             method: {name: np.histogram(values, BINS, (0.0, 1.0))[0].tolist() for name, values in by_name.items()}
             for method, by_name in one.positions.items()

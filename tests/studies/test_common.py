@@ -1,3 +1,7 @@
+import json
+import math
+from pathlib import Path
+
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import pytest
@@ -16,3 +20,22 @@ def test_figures_are_saved_as_vectors_on_request_without_time_stamps(tmp_path, w
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in paths)
     assert Image.open(paths[0]).size == tuple(common.DOTS_PER_INCH * figure.get_size_inches())
     assert stamp is None or stamp not in paths[-1].read_bytes()
+
+
+def strict(text: str):
+    """Return what a text of strict JSON contains; a ValueError for NaN and Infinity."""
+    return json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+
+
+def test_results_are_strict_json_with_reasons(tmp_path):
+    given = {"a": {"low": -math.inf, "high": [1.0, math.inf]}, "b": math.nan, "c": 2.5, "d": "NaN"}
+    found = strict(common.write_results(tmp_path, given).read_text("utf-8"))
+    assert found == {
+        "a": {"low": None, "high": [1.0, None]}, "b": None, "c": 2.5, "d": "NaN",
+        "null": {"a.low": "no lower bound", "a.high[1]": "no upper bound", "b": "not known"},
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("path", sorted(Path("figures").rglob("*.json")), ids=str)
+def test_stored_results_are_strict_json(path):
+    assert strict(path.read_text("utf-8"))
