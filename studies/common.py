@@ -7,7 +7,6 @@ import hashlib
 import importlib.metadata
 import json
 import math
-import math
 import multiprocessing
 import operator
 import os
