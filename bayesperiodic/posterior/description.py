@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
+import sympy as sp
 
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
@@ -56,6 +57,7 @@ class Description:
             )
             for run in runs
         }
+        self.ties = self._ties()
         self.observations = {
             e.name: Observation(e, model, self.parameter_maps[e.name].delayed) for e in self.experiments
         }
@@ -173,6 +175,15 @@ class Description:
         """The expressions of the tied parameters."""
         any_map = next(iter(self.parameter_maps.values()))
         return {name: expression.text for name, expression in any_map.tied.items()}
+
+    def _ties(self) -> dict[str, sp.Expr]:
+        """Return the expressions of the model's tied parameters by its symbols, those of others inserted."""
+        symbols: dict[str, sp.Expr] = self.model.parameter_symbols | {SHIFT: sp.Symbol(SHIFT, real=True)}
+        degrees: dict[str, float] = {}
+        tied = next(iter(self.parameter_maps.values())).tied  # each only of those before it
+        for name, tie in tied.items():
+            symbols[name], degrees[name] = tie.symbolic(f"tied[{name!r}]", symbols, degrees)
+        return {name: symbols[name] for name in tied if name != SHIFT}
 
     @property
     def priors(self) -> dict[str | tuple[str, ...], Any]:
