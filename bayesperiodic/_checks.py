@@ -60,7 +60,9 @@ def identifiers(argument: str, names: Iterable[str], reserved: Iterable[str] = (
                 f"{shortened(name)}."
             )
         if len(name) > MOST_LETTERS:
-            raise ValueError(f"{argument}: must have at most {MOST_LETTERS} letters, got {len(name)} in {name[:20]!r}….")
+            raise ValueError(
+                f"{argument}: must have at most {MOST_LETTERS} letters, got {len(name)} in {name[:20]!r}…."
+            )
         if (normal := unicodedata.normalize("NFKC", name)) != name:
             raise ValueError(
                 f"{argument}: must be in Unicode's normal form NFKC, as names in Python's code are, got {name!r} "

@@ -19,6 +19,7 @@ from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
+from bayesperiodic.posterior.description import check_results
 from bayesperiodic.posterior.parameters import local_names
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
@@ -250,6 +251,7 @@ def identifiability(
     >>> bp.identifiability(problem, fit, profile=False).verdicts
     {'c': 'determined', 'k': 'determined'}
     """
+    check_results(problem, fit=fit, posterior=posterior)
     information, structure = Information.of(problem, fit), structure_of(problem)
     shapes = profile_of(problem, fit).shape if profile is True else profile.shape if profile else {}
     options = default_candidates(problem) if candidates is None else [Candidate(*c) for c in candidates]

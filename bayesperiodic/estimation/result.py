@@ -163,6 +163,8 @@ class MapEstimate(Result):
         Of every start, the objective reached (−inf: none) under "objective", and the estimates.
     other_modes : tuple of Mode
         Separate optima other than the estimate whose objective is lower by less than 30, see `modes`.
+    fingerprint : str
+        Digests of the problem, by which results of another problem are refused.
     tied : dict of str to dict of str to float
         Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
 
@@ -205,6 +207,7 @@ class MapEstimate(Result):
     history: np.ndarray
     starts: tuple[dict[str, float], ...]
     other_modes: tuple[Mode, ...]
+    fingerprint: str
     tied: dict[str, dict[str, float]]
 
     if not TYPE_CHECKING:

@@ -181,7 +181,9 @@ class Model:
         parsed = parse(argument, text, symbols)
         for name in parsed.names:
             if sum(name in space for space in spaces) > 1:
-                raise ValueError(f"{argument}: must have a single meaning of {name!r}, got {text!r}; rename one of them.")
+                raise ValueError(
+                    f"{argument}: must have a single meaning of {name!r}, got {text!r}; rename one of them."
+                )
         return parsed.symbolic(argument, symbols)[0]
 
     def _order(self, state: str) -> int:

@@ -1,6 +1,7 @@
 """Diagnostics of an estimate: joint Laplace, discretisation, undetermined directions, starts, orbit identity."""
 
 import pickle
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -151,8 +152,60 @@ def test_fit_ends_on_a_ridge_with_uniform_priors():
 def test_several_undetermined_directions_are_named_separately():
     """Of a sum of four only the sum is known: three directions, each named by one parameter and the last."""
     row = np.ones(4)
-    found = undetermined(np.outer(row, row), np.ones(4), list("abcd"), np.ones(4, dtype=bool))
-    assert found == ("a → a·t, d → d·t^-1", "b → b·t, d → d·t^-1", "c → c·t, d → d·t^-1")
+
+    def found(total):
+        def change(theta):
+            return abs(total(theta) - total(np.ones(4)))
+
+        return undetermined(np.outer(row, row), np.ones(4), list("abcd"), np.ones(4, dtype=bool), change)
+
+    assert found(lambda x: np.log(x).sum()) == ("a → a·t, d → d·t^-1", "b → b·t, d → d·t^-1", "c → c·t, d → d·t^-1")
+    assert found(np.sum) == ("a → a + t, d → d − t", "b → b + t, d → d − t", "c → c + t, d → d − t")
+    assert found(lambda x: np.sum(x**3) / 3) == tuple(f"a combination of {x} and d" for x in "abc")
+
+
+def test_a_scale_that_all_parameters_share_is_named_completely():
+    """Signed and positive parameters of very different size scale together; a part of them alone changes the data."""
+    priors = {
+        "m": bp.LogNormal(1.2, 0.1), "c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1.0, 0.5),
+        "k3": bp.Normal(900.0, 500.0),
+    }  # fmt: skip
+    scale = 1e-2
+    model = bp.Model(
+        "scaled",
+        states=["x"],
+        inputs=["force"],
+        parameters=["m", "c", "k", "k3", "h"],
+        equations=["m*ddx + c*dx + k*x + k3*x**3 - h*force"],
+        outputs={"y": "x"},
+    )
+    tau, truth = grid(64), {"m": 1.2, "c": 0.2, "k": 1.0, "k3": 900.0, "h": 0.1}
+    force = {"force": scale * np.cos(2 * np.pi * tau)}
+    response = bp.solve_periodic(model, truth, force, frequency=0.1, samples=64).outputs["y"]
+    noise = 0.01 * np.std(response) * np.random.default_rng(1).normal(size=64)
+    run = bp.Experiment("run", 0.1, {"y": response + noise}, force, samples=64, harmonics={"y": 9})
+    problem = bp.Problem(model, [run], priors=priors | {"h": bp.Normal(0.1, 0.05)})
+    with pytest.warns(UserWarning, match="The data do not change under .*k3, h: LogNormal priors, if the signs are kn"):
+        fit = bp.map_estimate(problem, progress=False)
+    assert fit.undetermined == ("m → m·t, c → c·t, k → k·t, k3 → k3·t, h → h·t",)
+
+
+def test_a_difference_seen_at_one_frequency_is_named_as_such():
+    """At one frequency only k − m·ω² and c·ω act on a linear oscillator; a power law would be false."""
+    tau, omega = grid(64), 2 * np.pi * 0.2
+    parameters = {"m": 1.0, "c": 0.3, "k": 2.0, "k3": 0.0}
+    force = {"force": np.cos(2 * np.pi * tau)}
+    response = bp.solve_periodic(
+        bp.models.duffing, parameters, force, frequency=0.2, samples=64, scheme="fourier"
+    ).outputs["displacement"]
+    noise = 0.01 * np.random.default_rng(2).normal(size=64)
+    run = bp.Experiment("run", 0.2, {"displacement": response + noise}, force, samples=64, harmonics={"displacement": 3})
+    priors = {name: bp.LogNormal(parameters[name], 0.3) for name in "mck"}
+    problem = bp.Problem(bp.models.duffing, [run], priors=priors, fixed={"k3": 0.0}, scheme="fourier")
+    with pytest.warns(UserWarning, match="The data do not change under"):
+        (text,) = bp.map_estimate(problem, progress=False).undetermined
+    coefficient = float(re.fullmatch(r"m → m \+ t, k → k \+ ([0-9.]+)·t", text)[1])
+    assert coefficient == pytest.approx(omega**2, rel=1e-4)
 
 
 @pytest.mark.filterwarnings("ignore:Twice as many points")

@@ -48,7 +48,7 @@ def test_chains_of_ties_and_nonlinear_ones_have_exact_slopes():
 
 
 def test_ties_are_part_of_the_fingerprint():
-    from bayesperiodic.sampling.checkpoint import fingerprint
+    from bayesperiodic.posterior.description import fingerprint
 
     assert fingerprint(problem({"c": "0.05*k"})) != fingerprint(problem({"c": "0.06*k"}))
 
