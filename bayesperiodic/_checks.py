@@ -49,7 +49,7 @@ def mapping(argument: str, value: Any, example: str) -> Mapping[str, Any]:
 def identifiers(argument: str, names: Iterable[str], reserved: Iterable[str] = ()) -> tuple[str, ...]:
     """Return the names as a tuple; raise a ValueError unless they are different, unreserved identifiers.
 
-    Names are written as Python itself reads them in code, in Unicode's normal form NFKC: there K and the Kelvin sign, or
+    Names must be in Unicode's normal form NFKC, in which Python reads names in code: there K and the Kelvin sign, or
     µ (micro) and μ (mu), are the same name.
     """
     result, taken = tuple(names), tuple(reserved)
@@ -73,7 +73,8 @@ def identifiers(argument: str, names: Iterable[str], reserved: Iterable[str] = (
         if name in taken:
             others = f"{_listed(taken[:SHOWN])}{', …' * (len(taken) > SHOWN)}"
             raise ValueError(
-                f"{argument}: must be neither reserved nor used elsewhere ({others}), got {name!r}; choose another name."
+                f"{argument}: must be neither reserved nor used elsewhere ({others}), got {name!r}; choose another "
+                "name."
             )
     return result
 

@@ -101,8 +101,8 @@ class Expression:
     ) -> tuple["sp.Expr", float]:
         """Return the expression in SymPy, with simple fractions as such, and the largest degree of its polynomials.
 
-        `degrees` are those of the symbols, if they are expressions themselves. A ValueError, which names the `argument`,
-        is raised for a degree above 20.
+        `degrees` are those of the symbols, if they are expressions themselves. A ValueError, which names the
+        `argument`, is raised for a degree above 20.
         """
         import sympy as sp
 

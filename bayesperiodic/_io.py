@@ -215,26 +215,26 @@ def _encode(value: Any, arrays: dict[str, Any], trees: list[Any]) -> Any:
     raise TypeError(f"result: must consist of numbers, texts, arrays, tables and draws, got {type(value).__name__}.")
 
 
-def _decode(value: Any, arrays: dict[str, Any], content: io.BytesIO) -> Any:
+def _decode(value: Any, arrays: dict[str, Any], whole: io.BytesIO) -> Any:
     if not isinstance(value, dict):
         return value
     if "array" in value:
         return arrays[value["array"]]
     if "mapping" in value:
-        return {key: _decode(item, arrays, content) for key, item in value["mapping"]}
+        return {key: _decode(item, arrays, whole) for key, item in value["mapping"]}
     if "sequence" in value:
-        return tuple(_decode(item, arrays, content) for item in value["sequence"])
+        return tuple(_decode(item, arrays, whole) for item in value["sequence"])
     if "table" in value:
         import pandas as pd
 
         return pd.DataFrame(value["table"], index=value["index"])
     if "tree" in value:
-        return _read_tree(content)
+        return _read_tree(whole)
     name = str(value["result"])
     if name not in MODULES:
         raise OtherVersion(f"class {name!r}")
     kind = getattr(import_module(MODULES[name]), name)
-    content = {field: _decode(item, arrays, content) for field, item in value["fields"].items()}
+    content = {field: _decode(item, arrays, whole) for field, item in value["fields"].items()}
     needed = {f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING}
     if not needed <= content.keys() <= {f.name for f in fields(kind)}:
         raise OtherVersion(f"other fields of {name}")

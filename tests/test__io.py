@@ -146,7 +146,9 @@ def test_made_up_files_are_refused_by_one_error(tmp_path, header):
     with changed(path) as file:
         del file.attrs["bayesperiodic_result"]
         file.attrs.create("bayesperiodic_result", header[:60_000])
-    with pytest.raises(ValueError, match=r"path: must (be a file written by save\(\)|contain a result of this version)"):
+    with pytest.raises(
+        ValueError, match=r"path: must (be a file written by save\(\)|contain a result of this version)"
+    ):
         bp.load(path)
 
 

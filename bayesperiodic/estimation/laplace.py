@@ -266,7 +266,7 @@ def undetermined(
 
 
 def by_powers(direction: np.ndarray, theta: np.ndarray, names: Sequence[str]) -> tuple[str, np.ndarray]:
-    """Return a relative direction as powers of a factor, such as "a → a·t, b → b·t^-2", and such a θ; "" if none fit."""
+    """Return a relative direction as powers, such as "a → a·t, b → b·t^-2", and such a θ; "" if none fit."""
     shown = np.flatnonzero(direction)
     simple = exponents(direction[shown]) if np.all(theta[shown]) else None
     if simple is None:

@@ -295,7 +295,7 @@ def _describe(
 
 
 def _data_change(problem: Problem, estimate: Iterate, theta: np.ndarray) -> float:
-    """Return the norm of the change of the residuals, in units of the noise, at another θ; infinite without a solution."""
+    """Return the norm of the residuals' change at another θ, in units of the noise; infinite without a solution."""
     there = estimate.here.moved(theta)
     if problem.model.autonomous:
         there = there.anchored()
@@ -332,7 +332,14 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
                 f"{noise / fit.rms[channel]:.0%} of the residual's {fit.rms[channel]:.3g}; keep fewer input harmonics "
                 "(fold(harmonics=…)) or measure the derivative."
             )
+    for channel in fit.without_noise:
+        yield (
+            f"The data of {channel!r} contain no noise: the residual's rms of {fit.rms[channel]:.2g} is a rounding "
+            "error, and standard deviations that follow from it mean nothing. Add noise to simulated data, or give its "
+            f"variance, fixed={{'variance[{channel}]': …}}."
+        )
     shifts = {name: shift for name, shift in fit.doubling_shift.items() if abs(shift) > LARGEST_SHIFT}
+    shifts = {} if fit.without_noise else shifts
     if shifts:
         worst = max(shifts, key=lambda name: abs(shifts[name]))
         yield (
@@ -369,8 +376,8 @@ def _combined(problem: Problem, found: Sequence[str]) -> Iterator[str]:
     for text in found:
         if text.startswith(COMBINED):
             yield (
-                f"The data do not determine {text}: near the estimate, a joint change of these leaves the outputs as they "
-                "are to first order. Fix one of the parameters, or give priors that determine it."
+                f"The data do not determine {text}: near the estimate, a joint change of these leaves the outputs as "
+                "they are to first order. Fix one of the parameters, or give priors that determine it."
             )
     directions = [text for text in found if not text.startswith(COMBINED)]
     if directions:
@@ -381,7 +388,8 @@ def _combined(problem: Problem, found: Sequence[str]) -> Iterator[str]:
         yield (
             f"The data do not change under {shown}, for any t. In these directions the posterior equals the prior; fix "
             "one of the parameters, or report the combination that does not change."
-            + (f" {', '.join(signed)}: LogNormal priors, if the signs are known, make sampling easier." if signed else "")
+            + f" {', '.join(signed)}: LogNormal priors, if the signs are known, make sampling easier."
+            * bool(signed)
         )
 
 

@@ -2,8 +2,8 @@
 
 An entry is built in a temporary folder and renamed, so that several processes can fill the cache at once. Before an
 entry is executed, the folder must belong to the user and be closed to others, the source must equal the expected one,
-and every compiled file must have the digest recorded when it was written. A damaged entry is removed and built again, with a
-warning; if the folder cannot be used, the kernels are compiled in memory.
+and every compiled file must have the digest recorded when it was written. A damaged entry is removed, with a warning, and
+built again; if the folder cannot be used, the kernels are compiled in memory.
 """
 
 import hashlib
@@ -50,7 +50,8 @@ def load(
     the names of the `shared` module, which this function returned, are defined in the module before its text is
     executed. An entry is compiled again when the text, the constants or the shared module change.
     """
-    if numba.config.DISABLE_JIT:
+    configuration: Any = numba.config
+    if configuration.DISABLE_JIT:
         raise RuntimeError("NUMBA_DISABLE_JIT: must not be set, because the kernels need compiled code; unset it.")
     constants = dict(constants or {})
     source = f"{_header()}# {constants!r}, {shared.__name__ if shared else None}\n{body}"

@@ -310,8 +310,9 @@ def _called(argument: str, given: Any, spaces: tuple[Names, ...]) -> Any:
         if not any(text in str(error) for text in NUMERIC_ONLY):
             raise
         raise ValueError(
-            f"{argument}: must use SymPy's functions of states, parameters and inputs (import sympy as sp; sp.cos(s.x), "
-            f"sp.sign(s.dx), and sp.Piecewise instead of if), got an error of a function of numbers: {error}"
+            f"{argument}: must use SymPy's functions of states, parameters and inputs (import sympy as sp; "
+            "sp.cos(s.x), sp.sign(s.dx), and sp.Piecewise instead of if), got an error of a function of numbers: "
+            f"{error}"
         ) from error
 
 

@@ -112,8 +112,8 @@ class Description:
         for name, width, size in zip(self.names, self.joint_prior.widths, sizes, strict=True):
             if not width > NARROWEST * size:
                 raise ValueError(
-                    f"priors[{name!r}]: must be wider than {NARROWEST:g} of the median, got a width of {width:.3g}; a known "
-                    f"value is given by fixed={{{name!r}: …}}."
+                    f"priors[{name!r}]: must be wider than {NARROWEST:g} of the median, got a width of {width:.3g}; a "
+                    f"known value is given by fixed={{{name!r}: …}}."
                 )
 
     def _check_counts(self) -> None:
@@ -372,10 +372,9 @@ def changed_parts(made_for: str, here: str) -> list[str]:
 
 
 def check_results(problem: Any, **results: Any) -> None:
-    """Raise a ValueError unless an estimate `fit` and draws `posterior` were computed from the problem; None is skipped.
+    """Raise a ValueError unless an estimate `fit` and draws `posterior`, if any, were computed from the problem.
 
-    Parameters, experiments with their data, priors, constants, noise model, scheme and the model's equations must be the
-    same.
+    The model's equations, experiments with their data, priors, constants, noise model and scheme must be the same.
     """
     if not isinstance(problem, Description):
         raise ValueError(f"problem: must be a Problem, got {type(problem).__name__}.")
@@ -457,6 +456,7 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
     if len(set(names)) < len(names):
         raise ValueError(f"experiments: names must differ, got {names}. Name them with fold(name=…).")
     for e in result:
+        _checks.text("name of an experiment", e.name)
         _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
         if not e.outputs:
             raise ValueError(f"outputs of experiment {e.name!r}: must have at least one channel, got {{}}.")

@@ -76,7 +76,8 @@ class Checkpoint:
             saved = Saved([_in_memory(backend) for backend in stored], state)
         except Exception as error:  # whatever HDF5, JSON and emcee raise for damaged files
             raise ValueError(
-                f"checkpoint: must be an intact file, got {str(self._path)!r} ({error}); name another file or delete it."
+                f"checkpoint: must be an intact file, got {str(self._path)!r} ({error}); name another file or delete "
+                "it."
             ) from None
         if found != self._mark:
             (problem, _, settings), (own, _, wanted) = found.partition("; "), self._mark.partition("; ")
@@ -106,8 +107,8 @@ class Checkpoint:
         except OSError as error:
             raise OSError(
                 error.errno,
-                f"checkpoint: cannot be written ({error.strerror}, {len(content.getbuffer()) / 1e6:.3g} MB needed); an earlier one "
-                "is intact, and the same call goes on from it",
+                f"checkpoint: cannot be written ({error.strerror}, {len(content.getbuffer()) / 1e6:.3g} MB needed); an "
+                "earlier one is intact, and the same call goes on from it",
                 str(self._path),
             ) from error
         ended = time.monotonic()

@@ -2,6 +2,7 @@
 
 import pickle
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -199,7 +200,9 @@ def test_a_difference_seen_at_one_frequency_is_named_as_such():
         bp.models.duffing, parameters, force, frequency=0.2, samples=64, scheme="fourier"
     ).outputs["displacement"]
     noise = 0.01 * np.random.default_rng(2).normal(size=64)
-    run = bp.Experiment("run", 0.2, {"displacement": response + noise}, force, samples=64, harmonics={"displacement": 3})
+    run = bp.Experiment(
+        "run", 0.2, {"displacement": response + noise}, force, samples=64, harmonics={"displacement": 3}
+    )
     priors = {name: bp.LogNormal(parameters[name], 0.3) for name in "mck"}
     problem = bp.Problem(bp.models.duffing, [run], priors=priors, fixed={"k3": 0.0}, scheme="fourier")
     with pytest.warns(UserWarning, match="The data do not change under"):
@@ -383,3 +386,22 @@ def test_a_parameter_without_influence_is_at_the_mode_of_its_prior_and_at_no_end
         fit = bp.map_estimate(bp.Problem(model, [run], priors=priors, scheme="fourier"), progress=False)
         assert fit.converged and fit.at_ends == ()
         assert fit.theta["b"] == pytest.approx(mode, abs=1e-5)
+
+
+def test_exact_data_are_named_instead_of_standard_deviations_of_rounding():
+    force, parameters = {"force": np.cos(2 * np.pi * grid(100))}, {"m": 1.0, "c": 0.2, "k": 1.0, "k3": 0.5}
+    exact = bp.solve_periodic(bp.models.duffing, parameters, force, frequency=0.15, samples=100).outputs
+    run = bp.Experiment("run", 0.15, exact, force, samples=100)
+    priors = {"c": bp.LogNormal(0.3, 0.5), "k": bp.LogNormal(1.3, 0.5)}
+    settings = {"priors": priors, "fixed": {"m": 1.0, "k3": 0.5}}
+    problem = bp.Problem(bp.models.duffing, [run], **settings)
+    with pytest.warns(UserWarning, match="The data of 'displacement' contain no noise.*give its variance") as caught:
+        fit = bp.map_estimate(problem, progress=False)
+    assert fit.theta["k"] == pytest.approx(1.0, rel=1e-9) and fit.without_noise == ("displacement",)
+    assert "displacement without noise" in repr(fit)
+    assert not [w for w in caught if "Twice as many points" in str(w.message)]
+    settings["fixed"] |= {"variance[displacement]": 1e-2}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        known = bp.map_estimate(bp.Problem(bp.models.duffing, [run], **settings), progress=False)
+    assert known.without_noise == () and known.converged
