@@ -21,6 +21,7 @@ import numpy as np
 HEADER = "bayesperiodic_result"
 ARRAYS = "arrays"
 SEAL = b"\nbayesperiodic sha256 "
+OTHER = "path: must contain a result of this version of bayesperiodic"
 REMEDY = "load it with the version that saved it, or compute it again"
 # Module of every class in files. Modules are named, not imported: this module is below them.
 MODULES = {
@@ -170,21 +171,15 @@ def load(path: str | Path) -> Any:
         result = _decode(header, arrays, content)
         if type(result).__name__ not in MODULES:
             raise ValueError(f"it contains a {type(result).__name__}")
-    except OtherVersion as error:
-        raise ValueError(
-            f"path: must contain a result of this version of bayesperiodic, got {error}; {REMEDY}."
-        ) from None
     except Exception as error:  # whatever HDF5, JSON, NumPy and xarray raise for files that someone has made up
+        if str(error).startswith(OTHER):
+            raise
         reason = f"{type(error).__name__}: {error}" if not isinstance(error, ValueError) else error
         raise ValueError(
             f"path: must be a file written by save(), got {str(path)!r} ({reason}); a checkpoint is read by "
             "sample(…, checkpoint=path)."
         ) from None
     return result
-
-
-class OtherVersion(ValueError):
-    """A class or its fields are not those of this version."""
 
 
 def _encode(value: Any, arrays: dict[str, Any], trees: list[Any]) -> Any:
@@ -232,12 +227,12 @@ def _decode(value: Any, arrays: dict[str, Any], whole: io.BytesIO) -> Any:
         return _read_tree(whole)
     name = str(value["result"])
     if name not in MODULES:
-        raise OtherVersion(f"class {name!r}")
+        raise ValueError(f"{OTHER}, got class {name!r}; {REMEDY}.")
     kind = getattr(import_module(MODULES[name]), name)
     content = {field: _decode(item, arrays, whole) for field, item in value["fields"].items()}
     needed = {f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING}
     if not needed <= content.keys() <= {f.name for f in fields(kind)}:
-        raise OtherVersion(f"other fields of {name}")
+        raise ValueError(f"{OTHER}, got other fields of {name}; {REMEDY}.")
     return kind(**content)
 
 

@@ -2,8 +2,8 @@
 
 An entry is built in a temporary folder and renamed, so that several processes can fill the cache at once. Before an
 entry is executed, the folder must belong to the user and be closed to others, the source must equal the expected one,
-and every compiled file must have the digest recorded when it was written. A damaged entry is removed, with a warning, and
-built again; if the folder cannot be used, the kernels are compiled in memory.
+and every compiled file must have the digest recorded when it was written. A damaged entry is removed, with a warning,
+and built again; if the folder cannot be used, the kernels are compiled in memory.
 """
 
 import hashlib

@@ -339,11 +339,15 @@ class Description:
 RESULTS = {"MapEstimate": "map_estimate(problem)", "Posterior": "sample(problem, fit)"}
 
 
+# Fields of experiments that no density depends on.
+LABELS = ("synthetic",)
+
+
 def fingerprint(problem: Description) -> str:
     """Return digests of all that the density depends on, part by part: "model:… experiments:… priors:… …"."""
     parts = {
         "model": problem.model.definition,
-        "experiments": [[getattr(e, field.name) for field in fields(e)] for e in problem.experiments],
+        "experiments": [[getattr(e, f.name) for f in fields(e) if f.name not in LABELS] for e in problem.experiments],
         "priors": repr(problem.priors),
         "constants": [problem.fixed, problem.tied, problem.likelihood.fixed],
         "noise": repr(problem.noise),
