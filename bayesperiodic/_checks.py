@@ -19,8 +19,9 @@ def one_of(argument: str, value: Any, allowed: Iterable[str]) -> None:
     near = [name for name in names if isinstance(value, str) and name.casefold() == value.casefold()]
     near = near or difflib.get_close_matches(str(value)[:MOST_LETTERS], names, n=1, cutoff=0.4)
     hint = f" Did you mean {near[0]!r}?" if near else ""
+    shown = repr(value) if isinstance(value, str) and len(value) <= MOST_LETTERS else shortened(value)
     choice = f"{'one of ' if len(names) > 1 else ''}{_listed(names)}" if names else "left out"
-    raise ValueError(f"{argument}: must be {choice}, got {shortened(value)}.{hint}")
+    raise ValueError(f"{argument}: must be {choice}, got {shown}.{hint}")
 
 
 def same_names(argument: str, given: Mapping[str, Any], required: Iterable[str]) -> None:

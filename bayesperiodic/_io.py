@@ -8,9 +8,10 @@ import hashlib
 import io
 import json
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import MISSING, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -79,8 +80,10 @@ class Result:
         arrays: dict[str, Any] = {}
         trees: list[Any] = []
         header, content = json.dumps(_encode(self, arrays, trees)), io.BytesIO()
-        if trees:
-            trees[0].to_netcdf(content, engine="h5netcdf")
+        dask = sys.modules.get("dask")  # With a Client, xarray would lock the content by name on the cluster.
+        with dask.config.set(scheduler="synchronous") if dask else nullcontext():
+            if trees:
+                trees[0].to_netcdf(content, engine="h5netcdf")
         with h5py.File(content, "a" if trees else "w") as file:
             file.attrs[HEADER] = header
             for key, values in arrays.items():

@@ -100,6 +100,14 @@ def changed(path):
     _io.write_sealed(path, content.getbuffer())
 
 
+def test_a_posterior_is_saved_beside_a_dask_client(solved, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+        with distributed.Client(cluster):
+            solved[2].save(tmp_path / "posterior.nc")
+    assert same(bp.load(tmp_path / "posterior.nc"), solved[2])
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs the limits of Unix")
 def test_full_disk_is_an_error_and_leaves_the_old_file_alone(solved, tmp_path):
     import resource
