@@ -102,7 +102,7 @@ def changed(path):
 
 def test_a_posterior_is_saved_beside_a_dask_client(solved, tmp_path):
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
+    with distributed.LocalCluster(1, processes=False, protocol="tcp://", dashboard_address=None) as cluster:
         with distributed.Client(cluster):
             solved[2].save(tmp_path / "posterior.nc")
     assert same(bp.load(tmp_path / "posterior.nc"), solved[2])
