@@ -2,10 +2,13 @@
 
 import difflib
 import reprlib
+import unicodedata
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+
+MOST_LETTERS, SHOWN = 200, 12
 
 
 def one_of(argument: str, value: Any, allowed: Iterable[str]) -> None:
@@ -13,10 +16,12 @@ def one_of(argument: str, value: Any, allowed: Iterable[str]) -> None:
     names = list(allowed)
     if value in names:
         return
-    near = difflib.get_close_matches(str(value), names, n=1, cutoff=0.4)
+    near = [name for name in names if isinstance(value, str) and name.casefold() == value.casefold()]
+    near = near or difflib.get_close_matches(str(value)[:MOST_LETTERS], names, n=1, cutoff=0.4)
     hint = f" Did you mean {near[0]!r}?" if near else ""
+    shown = repr(value) if isinstance(value, str) and len(value) <= MOST_LETTERS else shortened(value)
     choice = f"{'one of ' if len(names) > 1 else ''}{_listed(names)}" if names else "left out"
-    raise ValueError(f"{argument}: must be {choice}, got {value!r}.{hint}")
+    raise ValueError(f"{argument}: must be {choice}, got {shown}.{hint}")
 
 
 def same_names(argument: str, given: Mapping[str, Any], required: Iterable[str]) -> None:
@@ -38,23 +43,50 @@ def contains(argument: str, given: Iterable[str], required: Iterable[str], remed
 def mapping(argument: str, value: Any, example: str) -> Mapping[str, Any]:
     """Return `value`; raise a ValueError unless it is a mapping or a pandas table."""
     if not hasattr(value, "items"):
-        raise ValueError(f"{argument}: must be a mapping, such as {example}, got {_shortened(value)}.")
+        raise ValueError(f"{argument}: must be a mapping, such as {example}, got {shortened(value)}.")
     return value
 
 
 def identifiers(argument: str, names: Iterable[str], reserved: Iterable[str] = ()) -> tuple[str, ...]:
-    """Return the names as a tuple; raise a ValueError unless they are different, unreserved identifiers."""
-    result = tuple(names)
-    taken = set(reserved)
-    for name in result:
+    """Return the names as a tuple; raise a ValueError unless they are different, unreserved identifiers.
+
+    Names must be in Unicode's normal form NFKC, in which Python reads names in code: there K and the Kelvin sign, or
+    µ (micro) and μ (mu), are the same name.
+    """
+    result, taken = tuple(names), tuple(reserved)
+    for place, name in enumerate(result):
         if not isinstance(name, str) or not name.isidentifier() or name.startswith("_"):
             raise ValueError(
-                f"{argument}: must be Python identifiers without a leading underscore, such as 'force', got {name!r}."
+                f"{argument}: must be Python identifiers without a leading underscore, such as 'force', got "
+                f"{shortened(name)}."
             )
+        if len(name) > MOST_LETTERS:
+            raise ValueError(
+                f"{argument}: must have at most {MOST_LETTERS} letters, got {len(name)} in {name[:20]!r}…."
+            )
+        if (normal := unicodedata.normalize("NFKC", name)) != name:
+            raise ValueError(
+                f"{argument}: must be in Unicode's normal form NFKC, as names in Python's code are, got {name!r} "
+                f"({_code_points(name)}); write {normal!r} ({_code_points(normal)})."
+            )
+        if name in result[:place]:
+            raise ValueError(f"{argument}: must differ, got {name!r} twice.")
         if name in taken:
-            raise ValueError(f"{argument}: must be neither reserved nor repeated, got {name!r}; choose another name.")
-        taken.add(name)
+            others = f"{_listed(taken[:SHOWN])}{', …' * (len(taken) > SHOWN)}"
+            raise ValueError(
+                f"{argument}: must be neither reserved nor used elsewhere ({others}), got {name!r}; choose another "
+                "name."
+            )
     return result
+
+
+def text(argument: str, value: Any) -> str:
+    """Return `value`; raise a ValueError unless it is a text that can be written to a file."""
+    try:
+        str.encode(value, "utf-8")
+    except (TypeError, UnicodeEncodeError):
+        raise ValueError(f"{argument}: must be a text of Unicode characters, got {shortened(value)}.") from None
+    return str(value)
 
 
 def positive(argument: str, value: Any) -> float:
@@ -70,7 +102,7 @@ def finite_number(argument: str, value: Any) -> float:
     try:
         number = float(value)
     except (TypeError, ValueError):
-        raise ValueError(f"{argument}: must be a real number, got {_shortened(value)}.") from None
+        raise ValueError(f"{argument}: must be a real number, got {shortened(value)}.") from None
     if not np.isfinite(number):
         raise ValueError(f"{argument}: must be finite, got {value!r}.")
     return number
@@ -83,7 +115,7 @@ def integer(argument: str, value: Any, minimum: int | None = None) -> int:
         bound = "" if minimum is None else f" >= {minimum}"
         whole = isinstance(value, float | np.floating) and float(value).is_integer()
         hint = f"; write {int(value)}, without a decimal point" if whole else ""
-        raise ValueError(f"{argument}: must be an integer{bound}, got {_shortened(value)}{hint}.")
+        raise ValueError(f"{argument}: must be an integer{bound}, got {shortened(value)}{hint}.")
     return int(value)
 
 
@@ -92,7 +124,7 @@ def finite_vector(argument: str, values: Any, length: int | None = None, meaning
     try:
         array = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
-        raise ValueError(f"{argument}: must be an array of real numbers, got {_shortened(values)}.") from None
+        raise ValueError(f"{argument}: must be an array of real numbers, got {shortened(values)}.") from None
     if array.ndim != 1:
         raise ValueError(f"{argument}: must be one-dimensional, got shape {array.shape}.")
     if length is not None and array.size != length:
@@ -107,10 +139,14 @@ def finite_vector(argument: str, values: Any, length: int | None = None, meaning
     return array
 
 
+def _code_points(name: str) -> str:
+    return " ".join(f"U+{ord(letter):04X}" for letter in name[:SHOWN])
+
+
 def _listed(names: Iterable[str]) -> str:
     return ", ".join(map(repr, names))
 
 
-def _shortened(value: Any) -> str:
+def shortened(value: Any) -> str:
     """Return the representation of a value on one line, without the middle part if it is long."""
     return " ".join(reprlib.repr(value).split())

@@ -5,15 +5,22 @@ import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from itertools import chain
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
 from bayesperiodic import _checks
 
+if TYPE_CHECKING:
+    import sympy as sp
+
 MAX_LENGTH = 1000
 MAX_EXPONENT = 1000.0
+# Of the polynomials in an expression that is analysed symbolically; the work grows with the square of the degree.
+MAX_DEGREE = 20.0
+MAX_DENOMINATOR = 1000
 SHOWN = 80
 
 
@@ -23,6 +30,7 @@ class Operation:
 
     value: Callable[..., Any]
     slopes: tuple[Callable[..., Any], ...]  # its derivatives with respect to each operand
+    symbolic: str = ""  # name of a function in SymPy; the `value` of operators takes symbols too
 
 
 def _slope_by_base(a: Any, b: Any) -> Any:
@@ -43,17 +51,17 @@ OPERATORS = {
     ast.UAdd: Operation(np.positive, (lambda a: 1.0,)),
 }
 FUNCTIONS = {
-    "sqrt": Operation(np.sqrt, (lambda a: 0.5 / np.sqrt(a),)),
-    "exp": Operation(np.exp, (np.exp,)),
-    "log": Operation(np.log, (lambda a: 1.0 / a,)),
-    "sin": Operation(np.sin, (np.cos,)),
-    "cos": Operation(np.cos, (lambda a: -np.sin(a),)),
-    "tan": Operation(np.tan, (lambda a: 1.0 / np.cos(a) ** 2,)),
-    "atan": Operation(np.arctan, (lambda a: 1.0 / (1.0 + a * a),)),
-    "sinh": Operation(np.sinh, (np.cosh,)),
-    "cosh": Operation(np.cosh, (np.sinh,)),
-    "tanh": Operation(np.tanh, (lambda a: 1.0 / np.cosh(a) ** 2,)),
-    "abs": Operation(np.abs, (lambda a: np.where(a == 0.0, np.nan, np.sign(a)),)),
+    "sqrt": Operation(np.sqrt, (lambda a: 0.5 / np.sqrt(a),), "sqrt"),
+    "exp": Operation(np.exp, (np.exp,), "exp"),
+    "log": Operation(np.log, (lambda a: 1.0 / a,), "log"),
+    "sin": Operation(np.sin, (np.cos,), "sin"),
+    "cos": Operation(np.cos, (lambda a: -np.sin(a),), "cos"),
+    "tan": Operation(np.tan, (lambda a: 1.0 / np.cos(a) ** 2,), "tan"),
+    "atan": Operation(np.arctan, (lambda a: 1.0 / (1.0 + a * a),), "atan"),
+    "sinh": Operation(np.sinh, (np.cosh,), "sinh"),
+    "cosh": Operation(np.cosh, (np.sinh,), "cosh"),
+    "tanh": Operation(np.tanh, (lambda a: 1.0 / np.cosh(a) ** 2,), "tanh"),
+    "abs": Operation(np.abs, (lambda a: np.where(a == 0.0, np.nan, np.sign(a)),), "Abs"),
 }
 CONSTANTS = {"pi": np.pi}
 DESCRIBED = {
@@ -87,6 +95,39 @@ class Expression:
         A derivative that does not exist is NaN or infinite, such as those of abs and sqrt at 0.
         """
         return self._evaluate(values, self.names if by is None else tuple(by))[1]
+
+    def symbolic(
+        self, argument: str, symbols: Mapping[str, "sp.Expr"], degrees: Mapping[str, float] | None = None
+    ) -> tuple["sp.Expr", float]:
+        """Return the expression in SymPy, with simple fractions as such, and the largest degree of its polynomials.
+
+        `degrees` are those of the symbols, if they are expressions themselves. A ValueError, which names the
+        `argument`, is raised for a degree above 20.
+        """
+        import sympy as sp
+
+        stack: list[tuple[Any, float]] = []
+        for step in self.steps:
+            if isinstance(step, Operation):
+                operands, orders = zip(*_popped(stack, len(step.slopes)), strict=True)
+                degree = sum(orders) if step in (OPERATORS[ast.Mult], OPERATORS[ast.Div]) else max(orders)
+                if step.symbolic:
+                    stack.append((getattr(sp, step.symbolic)(*operands), 1.0))
+                    continue
+                if step is OPERATORS[ast.Pow]:
+                    degree = orders[0] * max(1.0, abs(float(operands[1]))) if operands[1].is_number else 1.0
+                if degree > MAX_DEGREE:
+                    raise ValueError(
+                        f"{argument}: must have powers and products of a degree up to {MAX_DEGREE:g}, got "
+                        f"{self.text[:SHOWN]!r} of degree {degree:g}."
+                    )
+                stack.append((step.value(*operands), degree))
+            elif isinstance(step, str):
+                stack.append((symbols[step], (degrees or {}).get(step, 1.0)))
+            else:
+                exact = Fraction(step).limit_denominator(MAX_DENOMINATOR)
+                stack.append((sp.Rational(exact) if float(exact) == step else sp.Float(step), 0.0))
+        return stack[0]
 
     def _evaluate(self, values: Mapping[str, Any], wanted: tuple[str, ...]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Return the value and the wanted derivatives, by forward differentiation."""
@@ -185,8 +226,12 @@ class _Parser:
         self.text = text.strip()
         self.argument, self.shown = argument, repr(text if len(text) <= SHOWN else f"{text[:SHOWN]}…")
         # Python's parser normalises names, for example µ (micro) to μ (mu).
-        self.names = {unicodedata.normalize("NFKC", name): name for name in names}
+        known = tuple(dict.fromkeys(names))
+        self.names = {unicodedata.normalize("NFKC", name): name for name in known}
         self.note = note
+        if len(self.names) < len(known):
+            same = [name for name in known if self.names[unicodedata.normalize("NFKC", name)] != name]
+            self.refuse(f"where {same[0]!r} is the same name as another one to Python; rename it")
         if len(text) > MAX_LENGTH:
             self.refuse(f"which has {len(text)} characters, more than {MAX_LENGTH}")
 

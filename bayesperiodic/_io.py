@@ -1,10 +1,17 @@
-"""Storage of results in HDF5 files, which are written atomically and read without executing stored code."""
+"""Storage of results in HDF5 files, which are written atomically and read without executing stored code.
 
+A file is composed in memory, because HDF5 itself crashes on a full disk, and ends with a checksum of its content, which
+other readers of HDF5 ignore.
+"""
+
+import hashlib
+import io
 import json
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import MISSING, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,6 +21,8 @@ import numpy as np
 
 HEADER = "bayesperiodic_result"
 ARRAYS = "arrays"
+SEAL = b"\nbayesperiodic sha256 "
+OTHER = "path: must contain a result of this version of bayesperiodic"
 REMEDY = "load it with the version that saved it, or compute it again"
 # Module of every class in files. Modules are named, not imported: this module is below them.
 MODULES = {
@@ -71,14 +80,35 @@ class Result:
 
         arrays: dict[str, Any] = {}
         trees: list[Any] = []
-        header = json.dumps(_encode(self, arrays, trees))
-        with written_whole(path) as draft:
+        header, content = json.dumps(_encode(self, arrays, trees)), io.BytesIO()
+        dask = sys.modules.get("dask")  # With a Client, xarray would lock the content by name on the cluster.
+        with dask.config.set(scheduler="synchronous") if dask else nullcontext():
             if trees:
-                trees[0].to_netcdf(draft, engine="h5netcdf")
-            with h5py.File(draft, "a" if trees else "w") as file:
-                file.attrs[HEADER] = header
-                for key, values in arrays.items():
-                    file.create_dataset(f"{ARRAYS}/{key}", data=values)
+                trees[0].to_netcdf(content, engine="h5netcdf")
+        with h5py.File(content, "a" if trees else "w") as file:
+            file.attrs[HEADER] = header
+            for key, values in arrays.items():
+                file.create_dataset(f"{ARRAYS}/{key}", data=values)
+        write_sealed(path, content.getbuffer())
+
+
+def write_sealed(path: str | Path, content: memoryview) -> None:
+    """Write content and its checksum; an existing file is replaced when the new one is complete, or else stays."""
+    with written_whole(path) as draft, draft.open("wb") as file:
+        file.write(content)
+        file.write(SEAL + hashlib.sha256(content).hexdigest().encode())
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_sealed(path: str | Path) -> bytes:
+    """Return the content of a file; raise a ValueError if its checksum is missing or wrong."""
+    content, found, digest = Path(path).read_bytes().rpartition(SEAL)
+    if not found:
+        raise ValueError("it has no checksum; it was cut off, or not written by this version of bayesperiodic")
+    if hashlib.sha256(content).hexdigest().encode() != digest:
+        raise ValueError("its content has changed since it was written")
+    return content
 
 
 def in_folder(path: str | Path) -> Path:
@@ -89,11 +119,16 @@ def in_folder(path: str | Path) -> Path:
     return target
 
 
+def draft_prefix(path: Path) -> str:
+    """Return how the names of temporary folders of a file begin, which a killed process leaves behind."""
+    return f".{path.name}.draft-"
+
+
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[Path]:
     """Provide a temporary path whose file replaces `path` when the block ends without an error."""
     target = in_folder(path)
-    with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
+    with tempfile.TemporaryDirectory(prefix=draft_prefix(target), dir=target.parent) as folder:
         draft = Path(folder) / target.name
         yield draft
         os.replace(draft, target)
@@ -116,7 +151,8 @@ def load(path: str | Path) -> Any:
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the file contains no saved result, or one of another version of this package.
+        If the file contains no saved result or one of another version of this package, or has changed since it was
+        written.
 
     Examples
     --------
@@ -131,16 +167,23 @@ def load(path: str | Path) -> Any:
     if not Path(path).is_file():
         raise FileNotFoundError(f"path: must be an existing file, got {str(path)!r}.")
     try:
-        with h5py.File(path, "r") as file:
+        content = io.BytesIO(read_sealed(path))
+        with h5py.File(content, "r") as file:
             header = json.loads(file.attrs[HEADER])
             stored = file.get(ARRAYS, {})
             arrays = {key: stored[key][()] for key in stored}
-    except (OSError, KeyError, ValueError) as error:
+        result = _decode(header, arrays, content)
+        if type(result).__name__ not in MODULES:
+            raise ValueError(f"it contains a {type(result).__name__}")
+    except Exception as error:  # whatever HDF5, JSON, NumPy and xarray raise for files that someone has made up
+        if str(error).startswith(OTHER):
+            raise
+        reason = f"{type(error).__name__}: {error}" if not isinstance(error, ValueError) else error
         raise ValueError(
-            f"path: must be a file written by save(), got {str(path)!r} ({error}); a checkpoint is read by "
+            f"path: must be a file written by save(), got {str(path)!r} ({reason}); a checkpoint is read by "
             "sample(…, checkpoint=path)."
         ) from None
-    return _decode(header, arrays, path)
+    return result
 
 
 def _encode(value: Any, arrays: dict[str, Any], trees: list[Any]) -> Any:
@@ -171,39 +214,36 @@ def _encode(value: Any, arrays: dict[str, Any], trees: list[Any]) -> Any:
     raise TypeError(f"result: must consist of numbers, texts, arrays, tables and draws, got {type(value).__name__}.")
 
 
-def _decode(value: Any, arrays: dict[str, Any], path: str | Path) -> Any:
+def _decode(value: Any, arrays: dict[str, Any], whole: io.BytesIO) -> Any:
     if not isinstance(value, dict):
         return value
     if "array" in value:
         return arrays[value["array"]]
     if "mapping" in value:
-        return {key: _decode(item, arrays, path) for key, item in value["mapping"]}
+        return {key: _decode(item, arrays, whole) for key, item in value["mapping"]}
     if "sequence" in value:
-        return tuple(_decode(item, arrays, path) for item in value["sequence"])
+        return tuple(_decode(item, arrays, whole) for item in value["sequence"])
     if "table" in value:
         import pandas as pd
 
         return pd.DataFrame(value["table"], index=value["index"])
     if "tree" in value:
-        return _read_tree(path)
+        return _read_tree(whole)
     name = str(value["result"])
     if name not in MODULES:
-        raise ValueError(f"path: must contain a result of this version of bayesperiodic, got class {name!r}; {REMEDY}.")
+        raise ValueError(f"{OTHER}, got class {name!r}; {REMEDY}.")
     kind = getattr(import_module(MODULES[name]), name)
-    content = {field: _decode(item, arrays, path) for field, item in value["fields"].items()}
+    content = {field: _decode(item, arrays, whole) for field, item in value["fields"].items()}
     needed = {f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING}
     if not needed <= content.keys() <= {f.name for f in fields(kind)}:
-        raise ValueError(
-            f"path: must contain a result of this version of bayesperiodic, got {str(path)!r}, whose {name} has other "
-            f"fields; {REMEDY}."
-        )
+        raise ValueError(f"{OTHER}, got other fields of {name}; {REMEDY}.")
     return kind(**content)
 
 
-def _read_tree(path: str | Path) -> Any:
+def _read_tree(content: io.BytesIO) -> Any:
     import xarray as xr
 
-    with xr.open_datatree(path, engine="h5netcdf") as tree:
+    with xr.open_datatree(content, engine="h5netcdf") as tree:
         loaded = tree.load()
     groups = {name: group.to_dataset() for name, group in loaded.children.items() if name != ARRAYS}
     result = xr.DataTree.from_dict(groups)

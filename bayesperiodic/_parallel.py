@@ -12,7 +12,7 @@ from concurrent.futures import BrokenExecutor, CancelledError, ProcessPoolExecut
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache, partial
 from itertools import islice
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, TypeVar
@@ -85,9 +85,31 @@ def checked_executor(executor: Any) -> Any:
     raise ValueError(f"executor: must be {EXECUTORS}, got {executor!r}.")
 
 
-def _ignore_interrupts() -> None:
-    """Ignore Ctrl-C, which all processes of a terminal receive; the main process handles it and saves the results."""
+def _start_worker() -> None:
+    """Ignore Ctrl-C, which the main process handles, and end with the main process, whatever ends that."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+@contextmanager
+def interrupted_by_termination() -> Iterator[None]:
+    """Let SIGTERM, unless the user's program handles it, raise a KeyboardInterrupt as Ctrl-C does."""
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 class TaskPool:
@@ -117,7 +139,7 @@ class TaskPool:
             if executor is None:
                 executor = stack.enter_context(ThreadPoolExecutor(available_cores()))
             elif isinstance(executor, int):
-                pool = ProcessPoolExecutor(executor, get_context("spawn"), _ignore_interrupts)
+                pool = ProcessPoolExecutor(executor, get_context("spawn"), _start_worker)
                 executor = stack.enter_context(pool)
             stack.callback(self._cancel)
             self._connect(executor)

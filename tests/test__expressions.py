@@ -2,6 +2,7 @@ import time
 
 import numpy as np
 import pytest
+import sympy as sp
 
 from bayesperiodic._expressions import FUNCTIONS, MAX_LENGTH, parse, parse_all
 
@@ -184,9 +185,38 @@ def test_error_names_the_text_and_the_allowed_names():
         parse("c1", "k*m", ["k"], note="Only k.")
 
 
+@pytest.mark.parametrize("text", [*TEXTS, "abs(k - m)", "1/3*k", "k**20", "(k + 1)**-20"], ids=str)
+def test_sympy_expression_has_the_same_value(text):
+    expression = parse("tied", text, VALUES)
+    symbols = {name: sp.Symbol(name, real=True) for name in VALUES}
+    symbolic, _ = expression.symbolic("tied", symbols)
+    numbers = {symbols[name]: value for name, value in VALUES.items()}
+    assert float(symbolic.subs(numbers)) == pytest.approx(float(expression.value(VALUES)), rel=1e-12)
+
+
+@pytest.mark.parametrize("text", ["(1+k)**1000", "(k**5)**5", "k**12*m**12", "(k/(1+m)**11)**2"])
+def test_high_degrees_are_refused_where_they_are_analysed(text):
+    with pytest.raises(ValueError, match="^tied: must have powers and products of a degree up to 20, got .* of degree"):
+        parse("tied", text, VALUES).symbolic("tied", {name: sp.Symbol(name) for name in VALUES})
+
+
+def test_sympy_never_reads_a_text():
+    """Names of SymPy's own objects are ordinary names, and constants that SymPy would expand are floats."""
+    names = ["Float", "exp", "S", "Q", "beta"]
+    symbols = {name: sp.Symbol(name) for name in names}
+    symbolic, _ = parse("tied", "Float + exp(S)*Q/beta", names).symbolic("tied", symbols)
+    assert symbolic == symbols["Float"] + sp.exp(symbols["S"]) * symbols["Q"] / symbols["beta"]
+    assert parse("tied", "((2**-1000)**1000)**1000", names).symbolic("tied", symbols) == (0, 0.0)
+
+
+def test_names_equal_to_python_are_refused():
+    with pytest.raises(ValueError, match="is the same name as another one to Python; rename it"):
+        parse("tied", "2*K", ["K", "\u212a"])
+
+
 def test_new_names_are_unused_identifiers():
     assert list(parse_all("derived", {"a": "k", "b": "k*2"}, ["k"])) == ["a", "b"]
-    with pytest.raises(ValueError, match="derived: must be neither reserved nor repeated, got 'k'"):
+    with pytest.raises(ValueError, match="derived: must be neither reserved nor used elsewhere .*got 'k'"):
         parse_all("derived", {"k": "2*k"}, ["k"])
     with pytest.raises(ValueError, match="derived: must be Python identifiers .*got 'a b'"):
         parse_all("derived", {"a b": "2*k"}, ["k"])

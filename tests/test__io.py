@@ -1,11 +1,13 @@
 import dataclasses
 import importlib
+import io
 import json
 import os
 import pkgutil
 import re
 import sys
 import typing
+from contextlib import contextmanager
 
 import h5py
 import numpy as np
@@ -89,21 +91,90 @@ def test_other_files_are_refused(tmp_path):
         bp.load(tmp_path / "nothing.h5")
 
 
+@contextmanager
+def changed(path):
+    """Provide a saved file for changes, after which its checksum is computed again."""
+    content = io.BytesIO(_io.read_sealed(path))
+    with h5py.File(content, "a") as file:
+        yield file
+    _io.write_sealed(path, content.getbuffer())
+
+
+def test_a_posterior_is_saved_beside_a_dask_client(solved, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(1, processes=False, protocol="tcp://", dashboard_address=None) as cluster:
+        with distributed.Client(cluster):
+            solved[2].save(tmp_path / "posterior.nc")
+    assert same(bp.load(tmp_path / "posterior.nc"), solved[2])
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs the limits of Unix")
+def test_full_disk_is_an_error_and_leaves_the_old_file_alone(solved, tmp_path):
+    import resource
+
+    path = tmp_path / "posterior.h5"
+    for result in solved[1:]:
+        solved[0].experiments[0].save(path)
+        before, (soft, hard) = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+        try:
+            with pytest.raises(OSError, match="File too large"):
+                result.save(path)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert path.read_bytes() == before and os.listdir(tmp_path) == ["posterior.h5"]
+
+
+def test_every_flipped_byte_is_noticed(solved, tmp_path):
+    path, generator = tmp_path / "result.h5", np.random.default_rng(1)
+    for result in solved[1:]:
+        result.save(path)
+        whole = path.read_bytes()
+        for place in generator.integers(len(whole), size=200):
+            damaged = bytearray(whole)
+            damaged[place] ^= 1 << int(generator.integers(8))
+            path.write_bytes(damaged)
+            with pytest.raises(ValueError, match="path: must be a file written by save"):
+                bp.load(path)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "[" * 100_000, "{}", "3", '"text"', "null", '{"array": "7"}', '{"result": "MapEstimate"}', '{"tree": true}',
+        '{"result": "MapEstimate", "fields": {}}', '{"mapping": [[[], 1]]}', '{"mapping": 3}', '{"sequence": 4}',
+        '{"table": 5}', '{"result": {}, "fields": []}', '{"result": "Scheme", "fields": {"name": 1, "order": "x"}}',
+        '{"result": "Experiment", "fields": {"name": "a", "frequency": {}, "outputs": 3, "samples": -1}}',
+        '{"sequence": [{"result": "NoiseSplit", "fields": {"measurement": 1, "model": 2, "total": 3}}]}',
+    ],
+)  # fmt: skip
+def test_made_up_files_are_refused_by_one_error(tmp_path, header):
+    path = tmp_path / "run.h5"
+    bp.Experiment("run", 2.0, {"x": [0.0, 1.0, 0.0, -1.0]}, samples=4).save(path)
+    with changed(path) as file:
+        del file.attrs["bayesperiodic_result"]
+        file.attrs.create("bayesperiodic_result", header[:60_000])
+    with pytest.raises(
+        ValueError, match=r"path: must (be a file written by save\(\)|contain a result of this version)"
+    ):
+        bp.load(path)
+
+
 def test_a_result_of_another_version_is_refused(tmp_path):
     path = tmp_path / "run.h5"
     experiment = bp.Experiment("run", 2.0, {"x": [0.0, 1.0, 0.0, -1.0]}, samples=4)
     experiment.save(path)
-    with h5py.File(path, "a") as file:
+    with changed(path) as file:
         (key,) = [k for k in file.attrs if "frequency_se" in str(file.attrs[k])]
         file.attrs[key] = str(file.attrs[key]).replace('"frequency_se"', '"of_old"')
-    with pytest.raises(ValueError, match="whose Experiment has other fields"):
+    with pytest.raises(ValueError, match="got other fields of Experiment; load it with"):
         bp.load(path)
 
 
 def test_file_without_a_field_that_has_a_default_is_read(tmp_path):
     path = tmp_path / "run.h5"
     bp.Experiment("run", 2.0, {"x": [0.0, 1.0, 0.0, -1.0]}, samples=4).save(path)
-    with h5py.File(path, "a") as file:
+    with changed(path) as file:
         (key,) = file.attrs
         header = json.loads(file.attrs[key])
         del header["fields"]["origin"]
@@ -160,7 +231,7 @@ def test_table_of_classes_contains_every_result_and_no_other_class():
 def test_file_cannot_import_or_create_other_classes(solved, tmp_path, kind):
     solved[1].save(tmp_path / "fit.h5")
     before = set(sys.modules)
-    with h5py.File(tmp_path / "fit.h5", "a") as file:
+    with changed(tmp_path / "fit.h5") as file:
         file.attrs["bayesperiodic_result"] = json.dumps({"result": kind, "fields": {"args": "true"}})
     message = f"path: must contain a result of this version of bayesperiodic, got class {str(kind)!r}; load it with"
     with pytest.raises(ValueError, match=re.escape(message)):

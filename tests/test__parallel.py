@@ -193,3 +193,37 @@ def test_items_shared_by_threads_keep_their_order_and_raise():
     assert in_threads(lambda x: x, [], 3) == []
     with pytest.raises(ZeroDivisionError):
         in_threads(lambda x: 1 / x, [1, 0, 2], 2)
+
+
+ORPHANS = """
+import os, time
+from bayesperiodic._parallel import TaskPool
+
+def busy(shared, task):
+    os.write(1, f"{os.getpid()}\\n".encode())
+    time.sleep(600.0)
+
+if __name__ == "__main__":
+    with TaskPool(2, None) as pool:
+        list(pool.run(busy, [1, 2]))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for processes in /proc")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+def test_workers_end_when_their_parent_is_killed(tmp_path, how):
+    """The tasks would run for ten minutes; the limit of a minute is for slow machines."""
+    (tmp_path / "orphans.py").write_text(ORPHANS)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    parent = subprocess.Popen(
+        [sys.executable, "orphans.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True, env=environment
+    )
+    workers = [int(parent.stdout.readline()) for _ in range(2)]
+    os.kill(parent.pid, how)
+    parent.wait()
+    left, limit = workers, time.monotonic() + 60.0
+    while left and time.monotonic() < limit:
+        time.sleep(0.1)
+        left = [number for number in workers if os.path.exists(f"/proc/{number}")]
+    parent.stdout.close()
+    assert not left

@@ -25,10 +25,10 @@ from bayesperiodic.data.recording import Recording
 from bayesperiodic.diagnostics.adequacy import holm
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.posterior.description import fingerprint
 from bayesperiodic.posterior.joint_priors import as_prior
 from bayesperiodic.posterior.noise import EXPERIMENT, VARIANCE, Independent
 from bayesperiodic.posterior.problem import Problem
-from bayesperiodic.sampling.checkpoint import fingerprint
 from bayesperiodic.sampling.posterior import Posterior
 from bayesperiodic.sampling.sample import sample
 from bayesperiodic.simulation import NotSettled, steady_cycle

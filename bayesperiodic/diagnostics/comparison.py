@@ -20,6 +20,7 @@ from bayesperiodic.diagnostics.verdicts import FINE, LEVELS, MODE, NARROW, SHAPE
 from bayesperiodic.estimation.modes import notable
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.posterior.density import COLLAPSED, NATURAL, LogPosterior, SamplingCoordinates
+from bayesperiodic.posterior.description import check_results
 from bayesperiodic.posterior.parameters import unit
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling import convergence
@@ -176,8 +177,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     ['ln c', 'ln k', 'ln variance[displacement]']
     """
     _checks.one_of("coordinates", coordinates, COORDINATES)
-    every = (*problem.names, *problem.free_noise)
-    _checks.contains("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
+    check_results(problem, fit=fit, posterior=posterior)
     scored = _scores(problem, fit, posterior, coordinates)
     if scored is None:
         raise ValueError(

@@ -20,10 +20,11 @@ from bayesperiodic.estimation.profile import ONE_SIDED, Profile
 from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
+from bayesperiodic.posterior.description import check_results
 from bayesperiodic.posterior.parameters import local_names
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
-from bayesperiodic.symmetry.determining import system_of
+from bayesperiodic.symmetry.determining import system_of, with_signs
 from bayesperiodic.symmetry.structure import Structure, analyse_structure
 
 
@@ -36,8 +37,7 @@ def structure_of(problem: Problem) -> Structure:
     free = {name for name in problem.names if "[" not in name} | set(local_names(problem.names))
     known = tuple(name for name in problem.model.parameters if name in problem.fixed and name not in free)
     zeros = tuple(sorted(name for name in known if set(problem.fixed[name].values()) == {0.0}))
-    tied = tuple((name, text) for name, text in problem.tied.items() if name in problem.model.parameters)
-    return _structure(problem.model, problem.channels, known, zeros, tied)
+    return _structure(problem.model, problem.channels, known, zeros, tuple(problem.ties.items()))
 
 
 @lru_cache(maxsize=64)
@@ -46,14 +46,11 @@ def _structure(
     outputs: tuple[str, ...],
     known: tuple[str, ...],
     zeros: tuple[str, ...],
-    tied: tuple[tuple[str, str], ...],
+    tied: tuple[tuple[str, sp.Expr], ...],
 ) -> Structure:
     symbols = model.parameter_symbols
     values = {symbols[name]: sp.S.Zero for name in zeros}
-    # The text has been validated by `_expressions`.
-    ties = {symbols[n]: sp.nsimplify(sp.parse_expr(text, local_dict=dict(symbols)), rational=True) for n, text in tied}
-    for _ in ties:
-        ties = {symbol: expression.subs(ties | values) for symbol, expression in ties.items()}
+    ties = {symbols[name]: with_signs(expression).subs(values) for name, expression in tied}
     system = system_of(model, outputs)
     return analyse_structure(model.name, system.given(known, values | ties), known)
 
@@ -255,6 +252,7 @@ def identifiability(
     >>> bp.identifiability(problem, fit, profile=False).verdicts
     {'c': 'determined', 'k': 'determined'}
     """
+    check_results(problem, fit=fit, posterior=posterior)
     information, structure = Information.of(problem, fit), structure_of(problem)
     shapes = profile_of(problem, fit).shape if profile is True else profile.shape if profile else {}
     options = default_candidates(problem) if candidates is None else [Candidate(*c) for c in candidates]

@@ -29,6 +29,7 @@ from bayesperiodic.estimation.gauss_newton import Objective, bias_correction
 from bayesperiodic.periodic import arclength
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
 from bayesperiodic.posterior.density import NATURAL
+from bayesperiodic.posterior.description import check_results
 from bayesperiodic.posterior.parameters import CHAIN, DRAW
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
@@ -306,8 +307,7 @@ def predict(
     count = _checks.integer("draws", draws, 20)
     if experiment is not None and run is None:
         raise ValueError(f"experiment: must be given together with `run`, got {experiment!r} without `run`.")
-    every = (*problem.names, *problem.free_noise)
-    _checks.contains("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
+    check_results(problem, posterior=posterior)
     lp = posterior.data["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()
     points, noise = draws_of(problem, posterior, np.linspace(0, lp.size - 1, count).astype(int))
     peak = draws_of(problem, posterior, [int(np.argmax(lp))])[0][0]

@@ -1,6 +1,6 @@
 """Laplace approximation over all sampling coordinates, from the exact Hessian; directions without information."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -213,20 +213,34 @@ def in_words(direction: np.ndarray, names: Sequence[str], logarithmic: np.ndarra
 
 NEARLY_SINGULAR = 1e-10
 SILENT = "no output depends on it"
+# Relative size of the finite change at which a statement is tested, and the largest change of the data, relative to
+# that by one of the parameters alone, that counts as none.
+TESTED, UNCHANGED = 0.1, 1e-4
+# Least relative effect of a parameter that belongs to a direction.
+INVOLVED = 1e-3
+COMBINED = "a combination of "
 
 
 def undetermined(
-    information: np.ndarray, theta: np.ndarray, names: Sequence[str], logarithmic: np.ndarray
+    information: np.ndarray,
+    theta: np.ndarray,
+    names: Sequence[str],
+    logarithmic: np.ndarray,
+    change: Callable[[np.ndarray], float],
 ) -> tuple[str, ...]:
     """Return, in words, the directions in which the data's part of H of eq. (8) (names, names) vanishes.
+
+    change(θ) is the norm of the change of all residuals in units of the noise. A direction is written as a joint change
+    of the parameters by powers of a factor or by sums if a change by 10 % confirms it, otherwise as a combination.
 
     Examples
     --------
     >>> row = np.array([2.0, 1.0]) / [3.0, 5.0]
-    >>> undetermined(np.outer(row, row), np.array([3.0, 5.0]), ["a", "b"], np.array([True, True]))
+    >>> product = lambda theta: abs(np.log((theta[0] / 3) ** 2 * theta[1] / 5))
+    >>> undetermined(np.outer(row, row), np.array([3.0, 5.0]), ["a", "b"], np.array([True, True]), product)
     ('a → a·t, b → b·t^-2',)
     """
-    slopes = np.where(logarithmic, theta, 1.0)
+    slopes = np.where(theta != 0.0, theta, 1.0)
     information = scaled(information, slopes)
     size = np.sqrt(np.diag(information))
     silent = [f"{name}: {SILENT}" for name, own in zip(names, size, strict=True) if own == 0.0]
@@ -234,6 +248,43 @@ def undetermined(
     if not acting.size:
         return tuple(silent)
     values, vectors, _ = covariance_eigh(information[np.ix_(acting, acting)], size[acting])
-    directions = reduced(vectors[:, values < NEARLY_SINGULAR].T / size[acting])
-    own = [names[i] for i in acting.tolist()]
-    return tuple(silent + [in_words(direction, own, logarithmic[acting]) for direction in directions])
+    found = []
+    for effects in reduced(vectors[:, values < NEARLY_SINGULAR].T):
+        involved = np.abs(effects) > INVOLVED * np.abs(effects).max()
+        direction = np.zeros(len(names))
+        direction[acting[involved]] = effects[involved] / size[acting[involved]]
+        shown = np.flatnonzero(direction)
+        forms = [by_powers(direction, theta, names), by_sums(direction * slopes, theta, names)]
+        for text, there in forms if logarithmic[shown].any() else reversed(forms):
+            if text and change(there) <= UNCHANGED * np.max(size * np.abs((there - theta) / slopes)):
+                break
+        else:
+            listed = [names[int(i)] for i in shown]
+            text = COMBINED + " and ".join(filter(None, [", ".join(listed[:-1]), listed[-1]]))
+        found.append(text)
+    return tuple(silent + found)
+
+
+def by_powers(direction: np.ndarray, theta: np.ndarray, names: Sequence[str]) -> tuple[str, np.ndarray]:
+    """Return a relative direction as powers, such as "a → a·t, b → b·t^-2", and such a θ; "" if none fit."""
+    shown = np.flatnonzero(direction)
+    simple = exponents(direction[shown]) if np.all(theta[shown]) else None
+    if simple is None:
+        return "", theta
+    powers = np.zeros(theta.size)
+    powers[shown] = np.array(simple, dtype=float) / float(simple[0])
+    factors = [f"·t^{power:.3g}" if power != 1.0 else "·t" for power in powers[shown]]
+    text = ", ".join(f"{names[int(i)]} → {names[int(i)]}{f}" for i, f in zip(shown, factors, strict=True))
+    return text, theta * (1.0 + TESTED) ** (powers / np.abs(powers).max())
+
+
+def by_sums(direction: np.ndarray, theta: np.ndarray, names: Sequence[str]) -> tuple[str, np.ndarray]:
+    """Return a direction as sums, such as "a → a + t, b → b − 0.5·t", and a θ changed so."""
+    shown = np.flatnonzero(direction)
+    ratios = np.zeros(theta.size)
+    for i in shown:
+        ratios[i] = float(f"{direction[i] / direction[shown[0]]:.6g}")  # the numbers that are written are tested
+    terms = [("" if abs(r) == 1.0 else f"{abs(r):.6g}·", "+" if r > 0.0 else "−") for r in ratios[shown]]
+    text = ", ".join(f"{names[int(i)]} → {names[int(i)]} {b} {a}t" for i, (a, b) in zip(shown, terms, strict=True))
+    scale = np.min(np.where(theta != 0.0, np.abs(theta), 1.0)[shown] / np.abs(ratios[shown]))
+    return text, theta + TESTED * scale * ratios

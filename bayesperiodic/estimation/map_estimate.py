@@ -32,11 +32,12 @@ from bayesperiodic.estimation.gauss_newton import (
     preference,
     resumed,
 )
-from bayesperiodic.estimation.laplace import SILENT, joint_laplace, undetermined
+from bayesperiodic.estimation.laplace import COMBINED, SILENT, joint_laplace, undetermined
 from bayesperiodic.estimation.modes import default_starts, notable, weighed, with_images
 from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, noise_split
 from bayesperiodic.periodic.compiled import OTHER_ORBIT, STATUSES
 from bayesperiodic.posterior.density import NATURAL, RIDGE, Linearisation, LogPosterior
+from bayesperiodic.posterior.description import fingerprint
 from bayesperiodic.posterior.initial import InitialEstimate, measured_orbits, simultaneous_fit
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import Simulator
@@ -284,12 +285,24 @@ def _describe(
         other_orbits=best.here.other_orbits,
         at_ends=tuple(np.array(names)[acting & (at_ends(objective, best) != 0.0)].tolist()),
         prior_conflict=conflict,
-        undetermined=undetermined(data, best.theta, names, problem.logarithmic),
+        undetermined=undetermined(data, best.theta, names, problem.logarithmic, partial(_data_change, problem, best)),
         history=history,
         starts=starts,
         other_modes=weighed(problem, modes, [joint(), *others]) if others else (),
+        fingerprint=fingerprint(problem),
         tied=_tied_slopes(problem, best.theta),
     )
+
+
+def _data_change(problem: Problem, estimate: Iterate, theta: np.ndarray) -> float:
+    """Return the norm of the residuals' change at another θ, in units of the noise; infinite without a solution."""
+    there = estimate.here.moved(theta)
+    if problem.model.autonomous:
+        there = there.anchored()
+    if not there.converged:
+        return np.inf
+    change = [there - here for there, here in zip(there.residuals, estimate.here.residuals, strict=True)]
+    return float(np.linalg.norm(np.concatenate(problem.likelihood.whitened(change, estimate.noise))))
 
 
 def _sd(problem: Problem, covariance: np.ndarray) -> dict[str, float]:
@@ -319,7 +332,14 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
                 f"{noise / fit.rms[channel]:.0%} of the residual's {fit.rms[channel]:.3g}; keep fewer input harmonics "
                 "(fold(harmonics=…)) or measure the derivative."
             )
+    for channel in fit.without_noise:
+        yield (
+            f"The data of {channel!r} contain no noise: the residual's rms of {fit.rms[channel]:.2g} is a rounding "
+            "error, and standard deviations that follow from it mean nothing. Add noise to simulated data, or give its "
+            f"variance, fixed={{'variance[{channel}]': …}}."
+        )
     shifts = {name: shift for name, shift in fit.doubling_shift.items() if abs(shift) > LARGEST_SHIFT}
+    shifts = {} if fit.without_noise else shifts
     if shifts:
         worst = max(shifts, key=lambda name: abs(shifts[name]))
         yield (
@@ -348,13 +368,28 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
     if silent:
         named = ", ".join(repr(text.removesuffix(f": {SILENT}")) for text in silent)
         yield f"The data do not depend on {named}; its posterior equals its prior. Fix it."
-    directions = [text for text in fit.undetermined if text not in silent]
+    yield from _combined(problem, [text for text in fit.undetermined if text not in silent])
+
+
+def _combined(problem: Problem, found: Sequence[str]) -> Iterator[str]:
+    """Yield the warnings about parameters that the data determine only together with others."""
+    for text in found:
+        if text.startswith(COMBINED):
+            yield (
+                f"The data do not determine {text}: near the estimate, a joint change of these leaves the outputs as "
+                "they are to first order. Fix one of the parameters, or give priors that determine it."
+            )
+    directions = [text for text in found if not text.startswith(COMBINED)]
     if directions:
         more = len(directions) - SHOWN
+        scaled = {part.partition(" → ")[0] for text in directions for part in text.split(", ") if "·t" in part}
+        signed = [n for n, log in zip(problem.names, problem.logarithmic, strict=True) if n in scaled and not log]
         shown = "; or under ".join(directions[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
         yield (
             f"The data do not change under {shown}, for any t. In these directions the posterior equals the prior; fix "
             "one of the parameters, or report the combination that does not change."
+            + f" {', '.join(signed)}: LogNormal priors, if the signs are known, make sampling easier."
+            * bool(signed)
         )
 
 

@@ -18,6 +18,7 @@ from bayesperiodic._parallel import TaskPool, checked_executor
 from bayesperiodic.estimation.gauss_newton import PRESSED, Iterate, Objective, bias_correction, climb
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.density import NATURAL, Linearisation, LogPosterior
+from bayesperiodic.posterior.description import check_results
 from bayesperiodic.posterior.parameters import SHIFT
 from bayesperiodic.posterior.priors import Prior
 from bayesperiodic.posterior.problem import Problem
@@ -408,9 +409,7 @@ def _checked_names(problem: Problem, names: Sequence[str] | None) -> tuple[str, 
 
 def _at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate]:
     """Return the objective and its iterate at the estimate, anchored at the estimate's solutions."""
-    _checks.same_names("fit.theta", fit.theta, problem.names)
-    _checks.same_names("fit.noise", fit.noise, problem.noise_names)
-    _checks.same_names("fit.solutions", fit.solutions, [e.name for e in problem.experiments])
+    check_results(problem, fit=fit)
     theta, noise = problem.vector(fit.theta), np.array([fit.noise[name] for name in problem.noise_names])
     guesses = {name: s.states for name, s in fit.solutions.items()}
     density = LogPosterior(problem, Simulator.start(problem, theta, guesses), coordinates=NATURAL)

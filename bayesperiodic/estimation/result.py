@@ -23,6 +23,9 @@ from bayesperiodic.posterior.noise import POINTS, SPECTRAL
 from bayesperiodic.posterior.parameters import checked_key, in_experiment, local_hint, local_names
 from bayesperiodic.posterior.problem import Problem
 
+# Fraction of a channel's variance below which its residual consists of rounding errors of the periodic solves.
+ROUNDING = 1e-16
+
 
 @dataclass(frozen=True)
 class Whiteness:
@@ -156,13 +159,16 @@ class MapEstimate(Result):
         Test of the prior against the estimate by the data alone, with its p-values and, if there is one, the conflict
         in words (``text``).
     undetermined : tuple of str
-        Changes of parameters, in words, that change no output; in these directions the posterior equals the prior.
+        Changes of parameters, in words, that change no output, confirmed by a change of 10 %, or "a combination of …"
+        where only a small change leaves the outputs as they are; in these directions the posterior equals the prior.
     history : array (iterations,)
         The objective before each step and at the end.
     starts : tuple of dict of str to float
         Of every start, the objective reached (−inf: none) under "objective", and the estimates.
     other_modes : tuple of Mode
         Separate optima other than the estimate whose objective is lower by less than 30, see `modes`.
+    fingerprint : str
+        Digests of the problem, by which results of another problem are refused.
     tied : dict of str to dict of str to float
         Derivatives of the tied parameters by the free ones at the estimate; NaN where experiments differ.
 
@@ -205,6 +211,7 @@ class MapEstimate(Result):
     history: np.ndarray
     starts: tuple[dict[str, float], ...]
     other_modes: tuple[Mode, ...]
+    fingerprint: str
     tied: dict[str, dict[str, float]]
 
     if not TYPE_CHECKING:
@@ -400,8 +407,16 @@ class MapEstimate(Result):
             if name not in free and all(other.get(name) == value for other in others)
         }
 
+    @property
+    def without_noise(self) -> tuple[str, ...]:
+        """Channels of unknown variance whose residuals are rounding errors: no standard deviation follows from them."""
+        names = {name.partition(", ")[0] for name in self.independent}
+        return tuple(c for c, fraction in self.fvu.items() if c in names and fraction < ROUNDING)
+
     def __repr__(self) -> str:
         status = self.status if self.converged else f"NOT CONVERGED: {self.status}; try another start, or starts=8"
+        if self.without_noise:
+            status = f"{self.status}; {', '.join(self.without_noise)} without noise"
         lines = [f"MapEstimate ({status}), estimate ± Laplace sd (robust sd):"]
         lines += [
             f"  {name:12s} {value:12.6g} ± {self.sd[name]:.3g} ({self.robust_sd[name]:.3g})"

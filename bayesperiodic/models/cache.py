@@ -2,8 +2,8 @@
 
 An entry is built in a temporary folder and renamed, so that several processes can fill the cache at once. Before an
 entry is executed, the folder must belong to the user and be closed to others, the source must equal the expected one,
-and every compiled file must have the digest recorded when it was written. Otherwise the kernels are compiled in
-memory, with a warning.
+and every compiled file must have the digest recorded when it was written. A damaged entry is removed, with a warning,
+and built again; if the folder cannot be used, the kernels are compiled in memory.
 """
 
 import hashlib
@@ -14,9 +14,11 @@ import shutil
 import stat
 import sys
 import tempfile
+import time
 import types
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,9 @@ import numba
 import platformdirs
 from numba.core.registry import cpu_target
 
-SOURCE, MANIFEST = "kernels.py", "manifest.json"
+SOURCE, MANIFEST, BUILDING = "kernels.py", "manifest.json", "building-"
+# Age in seconds after which an unfinished entry is that of a killed process.
+ABANDONED = 3600.0
 
 
 class CacheProblem(Exception):
@@ -46,19 +50,17 @@ def load(
     the names of the `shared` module, which this function returned, are defined in the module before its text is
     executed. An entry is compiled again when the text, the constants or the shared module change.
     """
+    configuration: Any = numba.config
+    if configuration.DISABLE_JIT:
+        raise RuntimeError("NUMBA_DISABLE_JIT: must not be set, because the kernels need compiled code; unset it.")
     constants = dict(constants or {})
     source = f"{_header()}# {constants!r}, {shared.__name__ if shared else None}\n{body}"
     names = {**(vars(shared) if shared else {}), **constants}
     try:
         entry = _private_folder() / hashlib.sha256(source.encode()).hexdigest()[:32]
-        if not entry.is_dir():
-            return _build(source, names, entry)
-        _check(entry, source)
-        return _execute(source, names, entry / SOURCE, cache=True)
+        return _stored(source, names, entry) or _build(source, names, entry)
     except (CacheProblem, OSError) as problem:
         reason = str(problem)
-    except Exception as problem:  # any error that a damaged compiled file causes in the loader
-        reason = f"{type(problem).__name__}: {problem}"
     warnings.warn(
         f"The kernel cache in {cache_folder()} cannot be used ({reason}); compiling in memory, at every start. Delete "
         "the folder or set BAYESPERIODIC_CACHE to one that you own.",
@@ -66,6 +68,31 @@ def load(
         stacklevel=2,
     )
     return _execute(source, names, Path("<kernels compiled in memory>"), cache=False)
+
+
+def _stored(source: str, names: Mapping[str, Any], entry: Path) -> types.ModuleType | None:
+    """Return the module of an entry; None if there is none, or if it was damaged and has been removed."""
+    if not os.path.lexists(entry):
+        return None
+    try:
+        _check(entry, source)
+        return _execute(source, names, entry / SOURCE, cache=True)
+    except CacheProblem as problem:
+        reason = str(problem)
+    except Exception as problem:  # any error that a damaged compiled file causes in the loader
+        reason = f"{type(problem).__name__}: {problem}"
+    warnings.warn(f"A damaged entry of the kernel cache is built again ({reason}).", RuntimeWarning, stacklevel=3)
+    _remove(entry)
+    return None
+
+
+def _remove(entry: Path) -> None:
+    """Remove an entry at once, also while another process reads it."""
+    aside = Path(tempfile.mkdtemp(prefix=BUILDING, dir=entry.parent))
+    try:
+        entry.rename(aside / entry.name)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 def _header() -> str:
@@ -86,7 +113,11 @@ def _private_folder() -> Path:
 
 
 def _build(source: str, names: Mapping[str, Any], entry: Path) -> types.ModuleType:
-    workshop = Path(tempfile.mkdtemp(prefix="building-", dir=entry.parent))
+    for other in entry.parent.glob(f"{BUILDING}*"):
+        with suppress(OSError):
+            if other.stat().st_mtime < time.time() - ABANDONED:
+                shutil.rmtree(other)
+    workshop = Path(tempfile.mkdtemp(prefix=BUILDING, dir=entry.parent))
     try:
         (workshop / SOURCE).write_text(source, encoding="utf-8")
         module = _execute(source, names, workshop / SOURCE, cache=True)
@@ -107,7 +138,7 @@ def _check(entry: Path, source: str) -> None:
             raise CacheProblem(f"the source in {entry.name} is not the one expected")
         if json.loads((entry / MANIFEST).read_text(encoding="utf-8")) != _digests(entry):
             raise CacheProblem(f"the compiled files in {entry.name} have changed since they were written")
-    except (FileNotFoundError, ValueError):
+    except (OSError, ValueError):
         raise CacheProblem(f"the entry {entry.name} is incomplete") from None
 
 

@@ -11,16 +11,20 @@ import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
+from bayesperiodic._expressions import parse
 from bayesperiodic.models.cache import load
 from bayesperiodic.models.code_generation import GridFunction, Kernels, SymbolicModel, VjpKernels, grid_functions
 
 RESERVED = ("tau", "frequency", "variance", "shift", "chain", "draw", "ensemble", "channel", "experiment")
 DERIVATIVES = ("", "d", "dd")
+LARGEST = np.finfo(float).max
 VJP_FUNCTIONS = ("outputs_vjp", "equations_vjp")
+# Texts of the TypeErrors of NumPy, math and `if` when they are given symbols.
+NUMERIC_ONLY = ("ufunc", "truth value", "expression to float", "to integer", "'Symbol'")
 
 
 class Names:
-    """Symbols as attributes, such as ``s.dx`` and ``p.k3``."""
+    """Symbols as attributes or keys, such as ``s.dx``, ``p.k3`` and ``p["k3"]``."""
 
     def __init__(self, kind: str, symbols: Mapping[str, sp.Symbol]):
         self._kind, self._symbols = kind, dict(symbols)
@@ -32,6 +36,10 @@ class Names:
             _checks.one_of(self._kind, name, self._symbols)
         except ValueError as error:
             raise AttributeError(str(error)) from None
+        return self._symbols[name]
+
+    def __getitem__(self, name: str) -> sp.Symbol:
+        _checks.one_of(self._kind, name, self._symbols)
         return self._symbols[name]
 
 
@@ -49,11 +57,12 @@ class Model:
         of first order if only its first does.
     parameters : mapping of str to str, or sequence of str
         Names of θ, optionally with their units.
-    equations : callable (s, p, u) -> sequence of expressions
+    equations : callable (s, p, u) -> sequence of expressions, or sequence of str
         The residuals g, one per state, as SymPy expressions of ``s.x, s.dx, s.ddx`` (state and its time derivatives,
         per second), ``s.tau`` (time in forcing periods), ``s.frequency`` [Hz], parameters ``p.c`` and inputs
-        ``u.force, u.dforce, u.ddforce``.
-    outputs : callable (s, p, u) -> mapping of str to expression
+        ``u.force, u.dforce, u.ddforce``; or texts of these names, such as ``"m*ddx + k*x - force"``, with the operators
+        and functions of `Problem`'s tied parameters.
+    outputs : callable (s, p, u) -> mapping of str to expression, or mapping of str to str
         The measured channels f.
     inputs : sequence of str, optional
         Prescribed periodic signals.
@@ -91,8 +100,8 @@ class Model:
         *,
         states: Iterable[str],
         parameters: Mapping[str, str] | Iterable[str],
-        equations: Callable[..., Iterable[Any]],
-        outputs: Callable[..., Mapping[str, Any]],
+        equations: Callable[..., Iterable[Any]] | Iterable[str],
+        outputs: Callable[..., Mapping[str, Any]] | Mapping[str, str],
         inputs: Iterable[str] = (),
         angles: Iterable[str] = (),
         units: Mapping[str, str] | None = None,
@@ -118,8 +127,8 @@ class Model:
             Names("parameters", self.parameter_symbols),
             Names("inputs", self.input_symbols),
         )
-        written = equations(*spaces)
-        if isinstance(written, sp.Basic):
+        written = _called("equations", equations, spaces)
+        if isinstance(written, sp.Basic | str):
             raise ValueError(f"equations: must return a list, one expression per state, got {written} alone.")
         self.equations = tuple(self._expression("equations", e) for e in written)
         if len(self.equations) != len(self.states):
@@ -127,7 +136,7 @@ class Model:
                 f"equations: must be {len(self.states)}, one for each of the states {list(self.states)}, got "
                 f"{len(self.equations)}. An equation may contain s.dd{self.states[0]}, so that rates need no states."
             )
-        given = dict(_checks.mapping("outputs", outputs(*spaces), "{'displacement': s.x}"))
+        given = dict(_checks.mapping("outputs", _called("outputs", outputs, spaces), "{'displacement': s.x}"))
         self.outputs = _checks.identifiers("outputs", given, (*RESERVED, *self.inputs))
         self.output_expressions = tuple(self._expression("outputs", given[n]) for n in self.outputs)
         if not self.outputs:
@@ -140,21 +149,42 @@ class Model:
         for channel, unit in (units or {}).items():
             _checks.one_of("units", channel, (*self.states, *self.inputs, *self.outputs))
             self.units[channel] = unit
+        for channel, unit in self.units.items():
+            _checks.text(f"units[{channel!r}]", unit)
         self.orders = {state: self._order(state) for state in self.states}
 
     def _expression(self, argument: str, given: Any) -> sp.Expr:
         if isinstance(given, int | float):
             given = sp.Float(given)
+        if isinstance(given, str):
+            given = self._parsed(argument, given)
         if not isinstance(given, sp.Expr):
             raise ValueError(
                 f"{argument}: must be SymPy expressions of s, p and u, got {given!r}; write an equation left = right "
                 "as left - right."
             )
+        numbers = given.atoms(sp.Number)
+        if given.has(sp.I, sp.zoo, sp.nan, sp.oo, -sp.oo) or any(abs(number) > sp.Float(LARGEST) for number in numbers):
+            raise ValueError(f"{argument}: must be real and finite, got {_checks.shortened(given)}.")
         known = {*self.state_symbols.values(), *self.input_symbols.values()}
         known |= {*self.parameter_symbols.values(), *self.time_symbols.values()}
         if unknown := sorted(map(str, given.free_symbols - known)):
             raise ValueError(f"{argument}: must contain only symbols of s, p and u, got {', '.join(unknown)}.")
         return given
+
+    def _parsed(self, argument: str, text: str) -> sp.Expr:
+        """Return a text as an expression of states, inputs, parameters and time, by their plain names."""
+        spaces = (self.state_symbols, self.input_symbols, self.parameter_symbols, self.time_symbols)
+        symbols = {name: symbol for space in spaces for name, symbol in space.items()}
+        if "=" in text:
+            raise ValueError(f"{argument}: must be without '=', got {text!r}; write left = right as left - (right).")
+        parsed = parse(argument, text, symbols)
+        for name in parsed.names:
+            if sum(name in space for space in spaces) > 1:
+                raise ValueError(
+                    f"{argument}: must have a single meaning of {name!r}, got {text!r}; rename one of them."
+                )
+        return parsed.symbolic(argument, symbols)[0]
 
     def _order(self, state: str) -> int:
         for order in (2, 1):
@@ -201,6 +231,12 @@ class Model:
             outputs=self.output_expressions,
             transitions=tuple(sign.args[0] for sign in self.smooth_signs),
         )
+
+    @property
+    def definition(self) -> str:
+        """All that solutions and residuals depend on, as text; equal for equal models."""
+        names = self.states, self.inputs, self.parameters, self.outputs, self.angles
+        return "\n".join([repr(names), *map(sp.srepr, (*self.equations, *self.output_expressions))])
 
     @cached_property
     def kernels(self) -> Kernels:
@@ -262,6 +298,22 @@ class Model:
             f"Model({self.name!r}, states={list(self.states)}, inputs={list(self.inputs)}, "
             f"parameters={list(self.parameters)}, outputs={list(self.outputs)})"
         )
+
+
+def _called(argument: str, given: Any, spaces: tuple[Names, ...]) -> Any:
+    """Return what the function of (s, p, u) returns, or `given` itself if it is no function."""
+    if not callable(given):
+        return given
+    try:
+        return given(*spaces)
+    except TypeError as error:
+        if not any(text in str(error) for text in NUMERIC_ONLY):
+            raise
+        raise ValueError(
+            f"{argument}: must use SymPy's functions of states, parameters and inputs (import sympy as sp; "
+            "sp.cos(s.x), sp.sign(s.dx), and sp.Piecewise instead of if), got an error of a function of numbers: "
+            f"{error}"
+        ) from error
 
 
 def _symbols(expressions: Iterable[sp.Expr]) -> set[sp.Symbol]:

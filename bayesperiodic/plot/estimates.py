@@ -1,6 +1,6 @@
 """Figures of estimates: fitted periods, loops, and posterior draws with the Laplace approximation."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -17,6 +17,7 @@ from bayesperiodic.diagnostics.predictive import Prediction
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot import style
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, LAPLACE, axis_label, caveats_of, chosen, draws_label
+from bayesperiodic.posterior.description import check_fingerprint, check_results
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
 
@@ -65,7 +66,12 @@ def fit(
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['displacement [m]', 'residual [m]']
     """
+    check_results(problem, estimate=estimate)
     runs = chosen(experiments, tuple(e.name for e in problem.experiments), "experiments")
+    if prediction is not None:
+        _checks.contains(
+            "prediction", prediction.median, runs, "give the one of this problem, predict(problem, posterior)"
+        )
     shown = [(e, channel) for e in problem.experiments if e.name in runs for channel in e.outputs]
     figure = figure or plt.figure(figsize=(7.0, 4.6 * len(shown)), layout="constrained")
     grid = figure.add_gridspec(2 * len(shown), 1, height_ratios=[3, 1] * len(shown))
@@ -139,6 +145,7 @@ def loops(
     >>> [axes.get_xlabel() for axes in figure.axes]
     ['force [N]', 'rate of force [N/s]']
     """
+    check_results(problem, estimate=estimate)
     output = problem.channels[0] if output is None else output
     _checks.one_of("output", output, problem.channels)
     input = next(iter(problem.model.inputs), "") if input is None else input
@@ -171,6 +178,7 @@ def corner(
     *,
     laplace: MapEstimate | None = None,
     names: Sequence[str] | None = None,
+    truths: Mapping[str, float] | None = None,
     figure: Figure | None = None,
 ) -> Figure:
     """Draw all pairs of parameters, with the ellipses of the Laplace approximation on top.
@@ -185,6 +193,8 @@ def corner(
     laplace : MapEstimate, optional
     names : sequence of str, optional
         Full names such as "k", "theta16[run 7]" and "variance[force]", in the order of the rows; by default all.
+    truths : mapping of str to float, optional
+        Values to mark by lines, such as the parameters of simulated data.
     figure : Figure, optional
 
     Returns
@@ -205,6 +215,8 @@ def corner(
     import corner as corner_package
 
     names = chosen(names, posterior.names)
+    for name in _checks.mapping("truths", truths or {}, "{'k': 1.0}"):
+        _checks.one_of("truths", name, posterior.names)
     draws = np.stack([posterior.draws(name) for name in names], axis=-1)
     titles = [draws_label(posterior, name) for name in names]
     bins = _bins(draws)
@@ -225,12 +237,16 @@ def corner(
         contour_kwargs={"linewidths": 0.9, "colors": COLOURS["map"]},
         max_n_ticks=3,
         labelpad=0.12,
+        truths=truths and [truths.get(name) for name in names],
+        truth_color=COLOURS["map"],
         fig=figure or plt.figure(figsize=(size, size)),
     )
     _write_out_ticks(figure)
     handles = [plt.Line2D([], [], color=COLOURS["mcmc"], lw=4, label=f"MCMC, {LEVELS_TEXT}")]
     if laplace is not None:
-        _laplace_on_corner(np.array(figure.axes).reshape(len(names), -1), *_normal_approximation(names, laplace))
+        _laplace_on_corner(
+            np.array(figure.axes).reshape(len(names), -1), *_normal_approximation(posterior, names, laplace)
+        )
         handles.append(plt.Line2D([], [], label=f"Laplace, {LEVELS_TEXT}", **LAPLACE))
     font = min(14, 4 * max(len(names), 2))
     place: dict[str, Any] = {"loc": "upper right", "bbox_to_anchor": (0.97, 0.97), "frameon": False}
@@ -264,9 +280,11 @@ def _write_out_ticks(figure: Figure) -> None:
             axis.get_offset_text().set_visible(False)
 
 
-def _normal_approximation(names: tuple[str, ...], fit: MapEstimate) -> tuple[np.ndarray, np.ndarray]:
+def _normal_approximation(
+    posterior: Posterior, names: tuple[str, ...], fit: MapEstimate
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean (names,) and covariance (names, names) in natural values; NaN if undefined."""
-    _checks.contains("laplace", [*fit.theta, *fit.noise], names, "give an estimate of the same problem")
+    check_fingerprint("laplace", fit, posterior.fingerprint)
     theta, noise = [n for n in names if n in fit.theta], [n for n in names if n not in fit.theta]
     mean = pd.Series(fit.joint_mode | fit.theta, dtype=float).reindex([*names])
     covariance = pd.DataFrame(0.0, index=[*names], columns=[*names])
@@ -337,7 +355,7 @@ def marginals(
     names = chosen(names, posterior.names)
     mean, sd = np.full((2, len(names)), np.nan)
     if laplace is not None:
-        mean, covariance = _normal_approximation(names, laplace)
+        mean, covariance = _normal_approximation(posterior, names, laplace)
         sd = np.sqrt(np.diag(covariance))
     columns, rows = style.panel_grid(len(names))
     figure = figure or plt.figure(figsize=(2.4 * columns + 0.4, 2.3 * rows + 0.6), layout="constrained")

@@ -1,23 +1,29 @@
 """A model, experiments, priors and a noise model, validated: what a posterior density is defined by."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields
 from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
+import sympy as sp
 
 from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.equations import PeriodicEquations
-from bayesperiodic.periodic.schemes import Scheme
+from bayesperiodic.periodic.schemes import Scheme, find_scheme
 from bayesperiodic.posterior.joint_priors import JointPrior
 from bayesperiodic.posterior.likelihood import Likelihood
 from bayesperiodic.posterior.noise import EXPERIMENT, Noise, as_noise
 from bayesperiodic.posterior.observation import Observation
 from bayesperiodic.posterior.parameters import SHIFT, ParameterMap, expand_priors, free_names, local_name
 from bayesperiodic.posterior.priors import Uniform
+
+# Least width of a prior relative to its median; below it the log-posterior is not smooth in double precision.
+NARROWEST = 1e-12
 
 
 class Description:
@@ -35,6 +41,9 @@ class Description:
         noise: str | Noise = "independent",
         scheme: str | Scheme = "central2",
     ):
+        if not isinstance(model, Model):
+            raise ValueError(f"model: must be a Model, got {_checks.shortened(model)}.")
+        find_scheme(scheme)
         self.model, self.scheme, self.noise = model, scheme, as_noise(noise)
         self.experiments = _checked_experiments(model, experiments)
         measured = {channel for experiment in self.experiments for channel in experiment.outputs}
@@ -49,6 +58,7 @@ class Description:
         given = expand_priors(priors, self.local, runs, self.fixed) | self._free_phases(priors, fixed, tied)
         self.joint_prior = JointPrior.of(given, free_names(model.parameters, self.local, runs))
         self.names = self.joint_prior.names
+        self._check_widths()
         self._check_free(fixed)
         self.parameter_maps = {
             run: ParameterMap.of(
@@ -56,6 +66,7 @@ class Description:
             )
             for run in runs
         }
+        self.ties = self._ties()
         self.observations = {
             e.name: Observation(e, model, self.parameter_maps[e.name].delayed) for e in self.experiments
         }
@@ -94,6 +105,16 @@ class Description:
                 raise ValueError(f"fixed: {name!r} has a prior too; give a prior or a value.")
         if not self.names:
             raise ValueError("priors: must have at least one free parameter, got {}.")
+
+    def _check_widths(self) -> None:
+        """Refuse priors that are narrower than the rounding of their parameter."""
+        sizes = np.spacing(np.abs(self.median())) / np.finfo(float).eps
+        for name, width, size in zip(self.names, self.joint_prior.widths, sizes, strict=True):
+            if not width > NARROWEST * size:
+                raise ValueError(
+                    f"priors[{name!r}]: must be wider than {NARROWEST:g} of the median, got a width of {width:.3g}; a "
+                    f"known value is given by fixed={{{name!r}: …}}."
+                )
 
     def _check_counts(self) -> None:
         """Refuse an improper prior of a variance where as many parameters can fit the data exactly."""
@@ -173,6 +194,15 @@ class Description:
         """The expressions of the tied parameters."""
         any_map = next(iter(self.parameter_maps.values()))
         return {name: expression.text for name, expression in any_map.tied.items()}
+
+    def _ties(self) -> dict[str, sp.Expr]:
+        """Return the expressions of the model's tied parameters by its symbols, those of others inserted."""
+        symbols: dict[str, sp.Expr] = self.model.parameter_symbols | {SHIFT: sp.Symbol(SHIFT, real=True)}
+        degrees: dict[str, float] = {}
+        tied = next(iter(self.parameter_maps.values())).tied  # each only of those before it
+        for name, tie in tied.items():
+            symbols[name], degrees[name] = tie.symbolic(f"tied[{name!r}]", symbols, degrees)
+        return {name: symbols[name] for name in tied if name != SHIFT}
 
     @property
     def priors(self) -> dict[str | tuple[str, ...], Any]:
@@ -305,6 +335,72 @@ class Description:
         )
 
 
+# What makes or computes each kind of result again.
+RESULTS = {"MapEstimate": "map_estimate(problem)", "Posterior": "sample(problem, fit)"}
+
+
+# Fields of experiments that no density depends on.
+LABELS = ("synthetic",)
+
+
+def fingerprint(problem: Description) -> str:
+    """Return digests of all that the density depends on, part by part: "model:… experiments:… priors:… …"."""
+    parts = {
+        "model": problem.model.definition,
+        "experiments": [[getattr(e, f.name) for f in fields(e) if f.name not in LABELS] for e in problem.experiments],
+        "priors": repr(problem.priors),
+        "constants": [problem.fixed, problem.tied, problem.likelihood.fixed],
+        "noise": repr(problem.noise),
+        "scheme": repr(find_scheme(problem.scheme)),
+    }
+    return " ".join(f"{part}:{hashlib.sha256(b''.join(_bytes(x))).hexdigest()[:12]}" for part, x in parts.items())
+
+
+def _bytes(value: Any) -> Iterator[bytes]:
+    """Yield the content of nested mappings, sequences, arrays and single values."""
+    if isinstance(value, np.ndarray):
+        yield f"array {value.dtype} {value.shape} ".encode() + np.ascontiguousarray(value).tobytes()
+    elif isinstance(value, Mapping | list | tuple):
+        yield f"{len(value)} items ".encode()
+        for item in value.items() if isinstance(value, Mapping) else value:
+            yield from _bytes(item)
+    else:
+        number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        yield repr(float(value) if number else value).encode("utf-8", "backslashreplace") + b";"
+
+
+def changed_parts(made_for: str, here: str) -> list[str]:
+    """Return the parts in which two fingerprints differ."""
+    there = dict(part.partition(":")[::2] for part in made_for.split())
+    return [name for name, _, digest in (part.partition(":") for part in here.split()) if there.get(name) != digest]
+
+
+def check_results(problem: Any, **results: Any) -> None:
+    """Raise a ValueError unless an estimate `fit` and draws `posterior`, if any, were computed from the problem.
+
+    The model's equations, experiments with their data, priors, constants, noise model and scheme must be the same.
+    """
+    if not isinstance(problem, Description):
+        raise ValueError(f"problem: must be a Problem, got {type(problem).__name__}.")
+    here = ""
+    for argument, result in results.items():
+        if result is not None:
+            here = here or fingerprint(problem)
+            check_fingerprint(argument, result, here)
+
+
+def check_fingerprint(argument: str, result: Any, here: str) -> None:
+    """Raise a ValueError unless an estimate, or draws if the argument is `posterior`, are of the problem `here`."""
+    kind = "Posterior" if argument == "posterior" else "MapEstimate"
+    if type(result).__name__ != kind:
+        raise ValueError(f"{argument}: must be a {kind}, got {type(result).__name__}; give {RESULTS[kind]}.")
+    if changed := changed_parts(result.fingerprint, here):
+        raise ValueError(
+            f"{argument}: must be a result of this problem, got one of a problem with other {', '.join(changed)}; give "
+            f"{RESULTS[kind]}."
+        )
+
+
 def _values(argument: str, given: Any, names: tuple[str, ...]) -> np.ndarray:
     if isinstance(given, Mapping):
         _checks.same_names(argument, given, names)
@@ -364,6 +460,7 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
     if len(set(names)) < len(names):
         raise ValueError(f"experiments: names must differ, got {names}. Name them with fold(name=…).")
     for e in result:
+        _checks.text("name of an experiment", e.name)
         _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
         if not e.outputs:
             raise ValueError(f"outputs of experiment {e.name!r}: must have at least one channel, got {{}}.")

@@ -23,11 +23,11 @@ from bayesperiodic.diagnostics.verdicts import FINE, MODE, UNCONVERGED
 from bayesperiodic.estimation.map_estimate import estimation_warnings
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.periodic.schemes import find_scheme
+from bayesperiodic.posterior.description import check_results, fingerprint
 from bayesperiodic.posterior.parameters import SHIFT, squared
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.reporting import html
 from bayesperiodic.reporting.html import Rows, code, number
-from bayesperiodic.sampling.checkpoint import fingerprint
 from bayesperiodic.sampling.posterior import Posterior
 
 # Level of the whiteness test, and the ratio of robust to Laplace sd above which the report warns.
@@ -65,10 +65,8 @@ class ReportInputs:
     ) -> "ReportInputs":
         """Check that all inputs belong to one problem, and compute the diagnostics that are not given."""
         runs, no_prediction = [e.name for e in problem.experiments], ""
-        _checks.same_names("fit", fit.theta, problem.names)
-        _checks.same_names("fit", fit.residuals, runs)
+        check_results(problem, fit=fit, posterior=posterior)
         if posterior is not None:
-            _check_data(posterior, problem)
             comparison = compare(problem, fit, posterior) if comparison is None else comparison
             try:
                 prediction = predict(problem, posterior) if prediction is None else prediction
@@ -125,21 +123,6 @@ class ReportInputs:
             channel = units.get(place.rstrip("]").partition(",")[0], "")
             return html.unit(squared(channel) if plain == "variance" and channel else "")
         return html.unit(units.get(plain, ""))
-
-
-def _check_data(posterior: Posterior, problem: Problem) -> None:
-    """Raise a ValueError unless the draws are of the problem's parameters and were made from its data."""
-    data = posterior.data["observed_data"]
-    measured = {f"{e.name} {channel}": values for e in problem.experiments for channel, values in e.outputs.items()}
-    if (
-        set(posterior.names) != {*problem.names, *problem.free_noise}
-        or set(data.data_vars) != set(measured)
-        or not all(np.array_equal(data[name].to_numpy(), values) for name, values in measured.items())
-    ):
-        raise ValueError(
-            "posterior: must be of the parameters and data of `problem`, got draws of other parameters or data. Give "
-            "sample(problem, fit)."
-        )
 
 
 def badge(verdict: str) -> html.Badge:
@@ -402,7 +385,7 @@ def settings(given: ReportInputs) -> Rows:
     worst = max(shifts, key=lambda name: shifts[name], default="")
     steps, starts = html.counted(len(fit.history) - 1, "step"), html.counted(len(fit.starts), "start")
     values = {
-        "Problem": fingerprint(problem).removeprefix("problem "),
+        "Problem": fingerprint(problem),
         "Difference scheme": find_scheme(problem.scheme).name,
         "Noise model": repr(problem.noise),
         "Search for the MAP": f"{fit.status}, {steps}, {starts}",

@@ -1,9 +1,9 @@
 """Checkpoints of sampling runs: one HDF5 file, always complete, in the format of emcee's backend."""
 
-import hashlib
+import glob
+import io
 import json
-import os
-import tempfile
+import shutil
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -15,7 +15,8 @@ import h5py
 import numpy as np
 from filelock import FileLock, Timeout
 
-from bayesperiodic.posterior.description import Description
+from bayesperiodic._io import draft_prefix, read_sealed, write_sealed
+from bayesperiodic.posterior.description import Description, changed_parts, fingerprint
 
 PATIENCE = 20.0
 MARK, RUN = "fingerprint", "run"
@@ -53,6 +54,8 @@ class Checkpoint:
             raise ValueError(
                 f"checkpoint: must be a writable file, got {str(self._path)!r} ({error}); name another file."
             ) from None
+        for draft in self._path.parent.glob(f"{glob.escape(draft_prefix(self._path))}*"):  # of a killed process
+            shutil.rmtree(draft, ignore_errors=True)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -65,39 +68,49 @@ class Checkpoint:
         if not self._path.exists():
             return None
         try:
-            with h5py.File(self._path, "r") as file:
-                found = file.attrs.get(MARK, "no run of this package")
-                if found != self._mark:
-                    raise ValueError(
-                        f"checkpoint: must be a file of this run ({self._mark}), got {str(self._path)!r} of another "
-                        f"run ({found}); name another file or delete it."
-                    )
+            with h5py.File(io.BytesIO(read_sealed(self._path)), "r") as file:
+                found = str(file.attrs.get(MARK, "no run of this package"))
                 state = json.loads(file[RUN][()])
-                names = sorted((name for name in file if name.startswith("ensemble ")), key=lambda name: int(name[9:]))
-        except OSError as error:
+            names = [f"ensemble {number}" for number in range(len(state["calls"]))]
+            stored = [emcee.backends.HDFBackend(str(self._path), name=name, read_only=True) for name in names]
+            saved = Saved([_in_memory(backend) for backend in stored], state)
+        except Exception as error:  # whatever HDF5, JSON and emcee raise for damaged files
             raise ValueError(
-                f"checkpoint: must be an intact HDF5 file, got {str(self._path)!r} ({error}); name another file or "
-                "delete it."
+                f"checkpoint: must be an intact file, got {str(self._path)!r} ({error}); name another file or delete "
+                "it."
             ) from None
-        stored = [emcee.backends.HDFBackend(str(self._path), name=name, read_only=True) for name in names]
-        return Saved([_in_memory(backend) for backend in stored], state)
+        if found != self._mark:
+            (problem, _, settings), (own, _, wanted) = found.partition("; "), self._mark.partition("; ")
+            other = ", ".join(changed_parts(problem, own))
+            raise ValueError(
+                f"checkpoint: must be a file of this run ({wanted}), got {str(self._path)!r} of another run "
+                f"({f'a problem with other {other}' if other else settings}); name another file or delete it."
+            )
+        return saved
 
     def save(self, backends: Sequence[emcee.backends.Backend], state: dict[str, Any], *, now: bool = False) -> None:
-        """Write all steps so far; without `now` only if the last write was long enough ago."""
+        """Write all steps so far; without `now` only if the last write was long enough ago.
+
+        An OSError, such as that of a full disk, leaves the previous file.
+        """
         started = time.monotonic()
         if not now and started < self._next:
             return
-        handle, draft = tempfile.mkstemp(prefix=f".{self._path.name}.", dir=self._path.parent)
-        os.close(handle)
+        content = io.BytesIO()
+        with h5py.File(content, "w") as file:
+            file.attrs[MARK] = self._mark
+            file.create_dataset(RUN, data=json.dumps(state))
+            for number, backend in enumerate(backends):
+                _write(file.create_group(f"ensemble {number}"), backend)
         try:
-            with h5py.File(draft, "w") as file:
-                file.attrs[MARK] = self._mark
-                file.create_dataset(RUN, data=json.dumps(state))
-                for number, backend in enumerate(backends):
-                    _write(file.create_group(f"ensemble {number}"), backend)
-            os.replace(draft, self._path)
-        finally:
-            Path(draft).unlink(missing_ok=True)
+            write_sealed(self._path, content.getbuffer())
+        except OSError as error:
+            raise OSError(
+                error.errno,
+                f"checkpoint: cannot be written ({error.strerror}, {len(content.getbuffer()) / 1e6:.3g} MB needed); an "
+                "earlier one is intact, and the same call goes on from it",
+                str(self._path),
+            ) from error
         ended = time.monotonic()
         self._next = ended + PATIENCE * (ended - started)
 
@@ -129,23 +142,3 @@ def _in_memory(stored: emcee.backends.HDFBackend) -> emcee.backends.Backend:
     if stored.has_blobs():
         backend.blobs = stored.get_blobs()
     return backend
-
-
-def fingerprint(problem: Description) -> str:
-    """Return a digest of model, data, priors, fixed values, ties, noise model and scheme."""
-    digest = hashlib.sha256(problem.model.symbolic.kernel_source().encode())
-    for experiment in problem.experiments:
-        names = ("name", "frequency", "samples", "periods", "winding", "independent", "harmonics", "frequency_se")
-        blocks = [
-            (b.channel, b.kind, b.count, b.averaged, b.measured) for b in problem.observations[experiment.name].blocks
-        ]
-        digest.update(repr((*(getattr(experiment, name) for name in names), blocks)).encode())
-        for signals in (experiment.outputs, experiment.inputs):
-            for name, values in signals.items():
-                digest.update(name.encode() + np.ascontiguousarray(values).tobytes())
-        for name in ("mask", "covariance", "multipliers", "multiplier_sd"):
-            values = getattr(experiment, name)
-            digest.update(name.encode() + (b"" if values is None else np.ascontiguousarray(values).tobytes()))
-    settings = (problem.priors, problem.fixed, problem.tied, problem.noise, problem.likelihood.fixed, problem.scheme)
-    digest.update(repr(settings).encode())
-    return f"problem {digest.hexdigest()[:16]}"

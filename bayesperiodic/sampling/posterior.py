@@ -15,7 +15,7 @@ from bayesperiodic._expressions import parse_all
 from bayesperiodic._io import Result
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 from bayesperiodic.posterior.density import LogPosterior
-from bayesperiodic.posterior.description import Description
+from bayesperiodic.posterior.description import Description, fingerprint
 from bayesperiodic.posterior.joint_priors import MultivariateNormal
 from bayesperiodic.posterior.noise import SCALE
 from bayesperiodic.posterior.parameters import (
@@ -37,7 +37,6 @@ from bayesperiodic.posterior.parameters import (
     squared,
 )
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.checkpoint import fingerprint
 from bayesperiodic.sampling.ensemble import CallCount
 
 SAMPLED_ONLY = "Only sampled parameters are part of the draws; write the value of a fixed one as a number."
@@ -107,6 +106,11 @@ class Posterior(Result):
     def names(self) -> tuple[str, ...]:
         """Full names of the sampled quantities, parameters first, in the order of the summary."""
         return tuple(self.tau)
+
+    @property
+    def fingerprint(self) -> str:
+        """Digests of the problem, see `bayesperiodic.posterior.description.fingerprint`."""
+        return str(self.data.attrs.get("fingerprint", ""))
 
     def draws(self, name: str) -> np.ndarray:
         """Return all draws of a quantity, chain by chain.

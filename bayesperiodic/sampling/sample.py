@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic._parallel import TaskPool, WorkersLost, checked_executor
+from bayesperiodic._parallel import TaskPool, WorkersLost, checked_executor, interrupted_by_termination
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.density import (
     COLLAPSED,
@@ -73,8 +73,8 @@ def sample(
 
     Sampling stops if, twice in succession, the chain is 50 autocorrelation times long after its first fifth was
     removed, that time has changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and 95
-    % quantiles agree within a quarter of a standard deviation. Ctrl-C, or the loss of the executor's workers, ends it
-    with the steps so far, not converged.
+    % quantiles agree within a quarter of a standard deviation. Ctrl-C, SIGTERM or the loss of the executor's workers
+    ends it with the steps so far, not converged.
 
     ``sampler="nuts"`` checks the result: it samples the same density by its gradient, with the no-U-turn sampler [3]_
     of nutpie. Each ensemble is then a single chain with 300 tuning draws, which are removed, and must be 500
@@ -128,6 +128,8 @@ def sample(
         For too few or an odd number of walkers, a start without a finite log-posterior, variances that cannot be
         integrated out, a checkpoint that is damaged, in use or of another problem, an invalid executor, an argument
         that "nuts" does not take.
+    OSError
+        If the checkpoint cannot be written, as on a full disk; an earlier one is intact.
     RuntimeError
         If the executor's workers were lost after fewer than 50 steps; the checkpoint contains these.
     ImportError
@@ -159,7 +161,10 @@ def sample(
     _checks.one_of("coordinates", coordinates, (RIDGE, NATURAL))
     _checks.one_of("variances", variances, (SAMPLED, COLLAPSED))
     _checks.one_of("sampler", sampler, (EMCEE, NUTS))
+    if not isinstance(fit, MapEstimate):
+        raise ValueError(f"fit: must be a MapEstimate, got {type(fit).__name__}; give map_estimate(problem).")
     _checks.same_names("fit", fit.theta, problem.names)
+    _checks.same_names("fit", fit.noise, problem.noise_names)
     runs = [e.name for e in problem.experiments]
     _checks.contains("fit", fit.solutions, runs, "give the estimate of this problem, map_estimate(problem)")
     executor = checked_executor(executor)
@@ -172,7 +177,8 @@ def sample(
         refuse_for_nuts(walkers, variances, checkpoint, executor)
     size = _checked_walkers(walkers, problem, variances)
     settings = f"seed {seed}, {ensembles} ensembles of {size} walkers, {start}, {coordinates}, {variances}"
-    with nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings) as store:
+    opened = nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings)
+    with interrupted_by_termination(), opened as store:
         saved = None if store is None else store.load()
         anchor = np.array(saved.state["anchor"]) if saved else problem.vector(fit.theta)
         guesses = saved.state["guesses"] if saved else {name: s.states for name, s in fit.solutions.items()}

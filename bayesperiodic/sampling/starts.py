@@ -30,6 +30,8 @@ def laplace_approximation(density: SamplingCoordinates, fit: MapEstimate) -> tup
             remedy = f"fix what the data do not determine ({'; '.join(fit.undetermined)})"
         elif fit.at_ends:
             remedy = f"widen the prior of {', '.join(map(repr, fit.at_ends))}, which is at the end of its support"
+        elif fit.without_noise:
+            remedy = f"give the variance of {', '.join(map(repr, fit.without_noise))}, whose data contain no noise"
         raise ValueError(
             "fit: its joint covariance must be finite, got none, so there is no Laplace approximation to start from; "
             f"{remedy}, or take start='prior'."

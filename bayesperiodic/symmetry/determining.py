@@ -75,8 +75,8 @@ def system_of(model: Model, outputs: Iterable[str]) -> System:
             symbols=model.state_symbols | model.input_symbols | model.time_symbols,
             parameters=dict(model.parameter_symbols),
             known={},
-            equations=tuple(_with_signs(e) for e in model.equations),
-            outputs={name: _with_signs(expressions[name]) for name in outputs},
+            equations=tuple(with_signs(e) for e in model.equations),
+            outputs={name: with_signs(expressions[name]) for name in outputs},
         )
     )
 
@@ -105,7 +105,7 @@ def _observed(system: System) -> System:
     )
 
 
-def _with_signs(expression: sp.Expr) -> sp.Expr:
+def with_signs(expression: sp.Expr) -> sp.Expr:
     """Return the expression with exact numbers, and with kinks and branches written as sums of signs."""
     exact = sp.nsimplify(expression, rational=True)
     exact = exact.replace(sp.Piecewise, _pieces).replace(sp.Heaviside, lambda x, *_: (1 + sp.sign(x)) / 2)

@@ -347,7 +347,7 @@ def test_error_names_the_bad_argument(solved):
     problem, fit, posterior = solved
     with pytest.raises(ValueError, match="coordinates: must be one of 'natural', 'sampling', got 'ridge'"):
         bp.compare(problem, fit, posterior, coordinates="ridge")
-    with pytest.raises(ValueError, match="posterior: must have 'a'.*; give draws of this problem"):
+    with pytest.raises(ValueError, match="posterior: must be a result of this problem"):
         bp.compare(case("edge")[0], case("edge")[1], posterior)
 
 

@@ -1,6 +1,8 @@
 """Diagnostics of an estimate: joint Laplace, discretisation, undetermined directions, starts, orbit identity."""
 
 import pickle
+import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -151,8 +153,62 @@ def test_fit_ends_on_a_ridge_with_uniform_priors():
 def test_several_undetermined_directions_are_named_separately():
     """Of a sum of four only the sum is known: three directions, each named by one parameter and the last."""
     row = np.ones(4)
-    found = undetermined(np.outer(row, row), np.ones(4), list("abcd"), np.ones(4, dtype=bool))
-    assert found == ("a → a·t, d → d·t^-1", "b → b·t, d → d·t^-1", "c → c·t, d → d·t^-1")
+
+    def found(total):
+        def change(theta):
+            return abs(total(theta) - total(np.ones(4)))
+
+        return undetermined(np.outer(row, row), np.ones(4), list("abcd"), np.ones(4, dtype=bool), change)
+
+    assert found(lambda x: np.log(x).sum()) == ("a → a·t, d → d·t^-1", "b → b·t, d → d·t^-1", "c → c·t, d → d·t^-1")
+    assert found(np.sum) == ("a → a + t, d → d − t", "b → b + t, d → d − t", "c → c + t, d → d − t")
+    assert found(lambda x: np.sum(x**3) / 3) == tuple(f"a combination of {x} and d" for x in "abc")
+
+
+def test_a_scale_that_all_parameters_share_is_named_completely():
+    """Signed and positive parameters of very different size scale together; a part of them alone changes the data."""
+    priors = {
+        "m": bp.LogNormal(1.2, 0.1), "c": bp.LogNormal(0.2, 0.5), "k": bp.LogNormal(1.0, 0.5),
+        "k3": bp.Normal(900.0, 500.0),
+    }  # fmt: skip
+    scale = 1e-2
+    model = bp.Model(
+        "scaled",
+        states=["x"],
+        inputs=["force"],
+        parameters=["m", "c", "k", "k3", "h"],
+        equations=["m*ddx + c*dx + k*x + k3*x**3 - h*force"],
+        outputs={"y": "x"},
+    )
+    tau, truth = grid(64), {"m": 1.2, "c": 0.2, "k": 1.0, "k3": 900.0, "h": 0.1}
+    force = {"force": scale * np.cos(2 * np.pi * tau)}
+    response = bp.solve_periodic(model, truth, force, frequency=0.1, samples=64).outputs["y"]
+    noise = 0.01 * np.std(response) * np.random.default_rng(1).normal(size=64)
+    run = bp.Experiment("run", 0.1, {"y": response + noise}, force, samples=64, harmonics={"y": 9})
+    problem = bp.Problem(model, [run], priors=priors | {"h": bp.Normal(0.1, 0.05)})
+    with pytest.warns(UserWarning, match="The data do not change under .*k3, h: LogNormal priors, if the signs are kn"):
+        fit = bp.map_estimate(problem, progress=False)
+    assert fit.undetermined == ("m → m·t, c → c·t, k → k·t, k3 → k3·t, h → h·t",)
+
+
+def test_a_difference_seen_at_one_frequency_is_named_as_such():
+    """At one frequency only k − m·ω² and c·ω act on a linear oscillator; a power law would be false."""
+    tau, omega = grid(64), 2 * np.pi * 0.2
+    parameters = {"m": 1.0, "c": 0.3, "k": 2.0, "k3": 0.0}
+    force = {"force": np.cos(2 * np.pi * tau)}
+    response = bp.solve_periodic(
+        bp.models.duffing, parameters, force, frequency=0.2, samples=64, scheme="fourier"
+    ).outputs["displacement"]
+    noise = 0.01 * np.random.default_rng(2).normal(size=64)
+    run = bp.Experiment(
+        "run", 0.2, {"displacement": response + noise}, force, samples=64, harmonics={"displacement": 3}
+    )
+    priors = {name: bp.LogNormal(parameters[name], 0.3) for name in "mck"}
+    problem = bp.Problem(bp.models.duffing, [run], priors=priors, fixed={"k3": 0.0}, scheme="fourier")
+    with pytest.warns(UserWarning, match="The data do not change under"):
+        (text,) = bp.map_estimate(problem, progress=False).undetermined
+    coefficient = float(re.fullmatch(r"m → m \+ t, k → k \+ ([0-9.]+)·t", text)[1])
+    assert coefficient == pytest.approx(omega**2, rel=1e-4)
 
 
 @pytest.mark.filterwarnings("ignore:Twice as many points")
@@ -330,3 +386,22 @@ def test_a_parameter_without_influence_is_at_the_mode_of_its_prior_and_at_no_end
         fit = bp.map_estimate(bp.Problem(model, [run], priors=priors, scheme="fourier"), progress=False)
         assert fit.converged and fit.at_ends == ()
         assert fit.theta["b"] == pytest.approx(mode, abs=1e-5)
+
+
+def test_exact_data_are_named_instead_of_standard_deviations_of_rounding():
+    force, parameters = {"force": np.cos(2 * np.pi * grid(100))}, {"m": 1.0, "c": 0.2, "k": 1.0, "k3": 0.5}
+    exact = bp.solve_periodic(bp.models.duffing, parameters, force, frequency=0.15, samples=100).outputs
+    run = bp.Experiment("run", 0.15, exact, force, samples=100)
+    priors = {"c": bp.LogNormal(0.3, 0.5), "k": bp.LogNormal(1.3, 0.5)}
+    settings = {"priors": priors, "fixed": {"m": 1.0, "k3": 0.5}}
+    problem = bp.Problem(bp.models.duffing, [run], **settings)
+    with pytest.warns(UserWarning, match="The data of 'displacement' contain no noise.*give its variance") as caught:
+        fit = bp.map_estimate(problem, progress=False)
+    assert fit.theta["k"] == pytest.approx(1.0, rel=1e-9) and fit.without_noise == ("displacement",)
+    assert "displacement without noise" in repr(fit)
+    assert not [w for w in caught if "Twice as many points" in str(w.message)]
+    settings["fixed"] |= {"variance[displacement]": 1e-2}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        known = bp.map_estimate(bp.Problem(bp.models.duffing, [run], **settings), progress=False)
+    assert known.without_noise == () and known.converged

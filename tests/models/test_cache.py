@@ -1,6 +1,8 @@
 import os
+import shutil
 import subprocess
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -92,7 +94,7 @@ def test_folder_is_private_to_the_user(folder):
 
 
 @pytest.mark.parametrize("damage", ["truncate", "alter", "remove", "source", "manifest"])
-def test_damaged_entry_is_never_executed(folder, damage):
+def test_damaged_entry_is_never_executed_but_built_again(folder, damage):
     cache.load(SMALL)
     compiled = sorted((entry(folder) / "__pycache__").glob("*.nbc"))[0]
     if damage == "truncate":
@@ -108,7 +110,36 @@ def test_damaged_entry_is_never_executed(folder, damage):
         source.write_text(source.read_text() + "\nraise SystemExit('executed')\n")
     else:
         (entry(folder) / cache.MANIFEST).write_text("{")
-    load_with_warning("compiling in memory")
+    load_with_warning("damaged entry of the kernel cache is built again")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert cache.load(SMALL).four_times(1.5) == 6.0
+    assert len(list(folder.iterdir())) == 1
+
+
+def test_file_in_the_place_of_an_entry_is_replaced(folder):
+    cache.load(SMALL)
+    place = entry(folder)
+    shutil.rmtree(place)
+    place.write_text("not a folder")
+    load_with_warning("built again")
+    assert entry(folder).is_dir()
+
+
+def test_folders_of_killed_builds_are_removed_after_an_hour(folder):
+    for name, age in (("building-killed", 3700.0), ("building-running", 60.0)):
+        other = folder / name
+        other.mkdir(parents=True)
+        other.parent.chmod(0o700)
+        os.utime(other, (time.time() - age,) * 2)
+    cache.load(SMALL)
+    assert sorted(path.name for path in folder.glob("building-*")) == ["building-running"]
+
+
+def test_disabled_compilation_is_refused_with_the_setting(folder, monkeypatch):
+    monkeypatch.setattr(cache.numba.config, "DISABLE_JIT", 1)
+    with pytest.raises(RuntimeError, match="NUMBA_DISABLE_JIT: must not be set"):
+        cache.load(SMALL)
 
 
 def test_folder_open_to_others_is_not_used(folder):

@@ -1,3 +1,4 @@
+import math
 import pickle
 
 import numpy as np
@@ -66,9 +67,9 @@ def test_piecewise_min_and_sign_compile_and_agree_with_sympy():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"states": ["tau"]}, "states: must be neither reserved nor repeated, got 'tau'"),
-        ({"parameters": ["m", "m", "k"]}, "neither reserved nor repeated, got 'm'"),
-        ({"inputs": ["x"]}, "neither reserved nor repeated, got 'x'"),
+        ({"states": ["tau"]}, "states: must be neither reserved nor used elsewhere .*'tau'.*got 'tau'"),
+        ({"parameters": ["m", "m", "k"]}, "must differ, got 'm' twice"),
+        ({"inputs": ["x"]}, "neither reserved nor used elsewhere .*got 'x'"),
         ({"states": ["x", "dx"]}, "states: must not contain derivatives, got 'dx' and 'x'; .* write s.dx"),
         ({"inputs": ["u", "ddu"]}, "inputs: must not contain derivatives, got 'ddu' and 'u'; .* write u.ddu"),
         (
@@ -83,7 +84,23 @@ def test_piecewise_min_and_sign_compile_and_agree_with_sympy():
             {"equations": lambda s, p, u: [s.ddx + sp.Symbol("stranger")]},
             "must contain only symbols of s, p and u, got stranger",
         ),
-        ({"equations": lambda s, p, u: ["s.ddx"]}, "must be SymPy expressions of s, p and u, got 's.ddx'"),
+        ({"equations": lambda s, p, u: ["s.ddx"]}, "equations: must consist of .*, got 's.ddx', .* attribute"),
+        ({"equations": ["m*ddx = force"]}, r"without '=', got 'm\*ddx = force'; write left = right as left - \(right"),
+        ({"equations": "m*ddx - force"}, "equations: must return a list, .* alone"),
+        ({"equations": lambda s, p, u: [s.ddx + sp.I * s.x]}, "equations: must be real and finite, got .*I"),
+        ({"outputs": lambda s, p, u: {"y": s.x * sp.Integer(10) ** 400}}, "outputs: must be real and finite"),
+        ({"equations": lambda s, p, u: [s.ddx + np.cos(s.x)]}, r"must use SymPy's functions .*sp\.cos\(s\.x\)"),
+        ({"equations": lambda s, p, u: [s.ddx + np.sign(s.dx)]}, "must use SymPy's functions .*sp.sign"),
+        ({"equations": lambda s, p, u: [s.ddx + math.cos(s.x)]}, "must use SymPy's functions"),
+        ({"equations": lambda s, p, u: [s.ddx + np.exp(2 * s.x)]}, "must use SymPy's functions"),
+        ({"equations": lambda s, p, u: [s.ddx if s.x > 0 else s.dx]}, "sp.Piecewise instead of if"),
+        ({"parameters": ["m", "K", "\u212a"]}, r"normal form NFKC.* \(U\+212A\); write 'K' \(U\+004B\)"),
+        ({"parameters": ["m", "k", "\uff4b"]}, r"parameters: .*normal form.*U\+FF4B"),
+        ({"states": ["\u00b5"]}, r"states: .*got '\u00b5' \(U\+00B5\); write '\u03bc' \(U\+03BC\)"),
+        ({"outputs": lambda s, p, u: {"y\u2170": s.x}}, "outputs: .*normal form"),
+        ({"parameters": ["m", "k", "\ud800"]}, "parameters: must be Python identifiers"),
+        ({"parameters": ["m", "k", "a" * 5000]}, "parameters: must have at most 200 letters, got 5000 in 'aa"),
+        ({"units": {"x": "\ud800"}}, r"units\['x'\]: must be a text of Unicode characters"),
         ({"equations": lambda s, p, u: [sp.Eq(s.ddx, u.force)]}, "an equation left = right as left - right"),
         ({"equations": lambda s, p, u: s.ddx + p.k * s.x}, "equations: must return a list, .* alone"),
         ({"outputs": lambda s, p, u: [s.x]}, "outputs: must be a mapping, such as .*"),
@@ -95,6 +112,24 @@ def test_piecewise_min_and_sign_compile_and_agree_with_sympy():
 def test_error_names_the_invalid_part_of_the_model(changes, message):
     with pytest.raises(ValueError, match=message):
         spring(**changes)
+
+
+def test_equations_and_outputs_may_be_texts():
+    written = spring(parameters=["m", "k"], equations=["m*ddx + k*x**3/8 - force"], outputs={"y": "2*dx"})
+    other = spring(
+        parameters=["m", "k"],
+        equations=lambda s, p, u: [p["m"] * s.ddx + p["k"] * s["x"] ** 3 / 8 - u.force],
+        outputs=lambda s, p, u: {"y": 2 * s.dx},
+    )
+    assert written.equations == other.equations and written.output_expressions == other.output_expressions
+    with pytest.raises(ValueError, match="equations: must have a single meaning of 'x'"):
+        spring(parameters=["x", "m"], equations=["m*ddx + x - force"])
+
+
+def test_names_that_python_writes_differently_are_different_parameters():
+    """In code, k and a full-width k are one name; with two stiffnesses named so, half of the force would be lost."""
+    model = spring(parameters=["m", "k", "\u03bc"], equations=["m*ddx + (k + \u00b5)*x - force"])
+    assert {str(s) for s in model.equations[0].free_symbols} >= {"p_k", "p_\u03bc"}
 
 
 def test_unknown_parameter_error_suggests_the_nearest_name():

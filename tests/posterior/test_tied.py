@@ -2,6 +2,8 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic._expressions import FUNCTIONS
+from bayesperiodic.diagnostics.identifiability import structure_of
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors, normal_posterior
 
 PRIORS = {"k": bp.Normal(800.0, 60.0), "coulomb": bp.Normal(20.0, 10.0)}
@@ -48,9 +50,31 @@ def test_chains_of_ties_and_nonlinear_ones_have_exact_slopes():
 
 
 def test_ties_are_part_of_the_fingerprint():
-    from bayesperiodic.sampling.checkpoint import fingerprint
+    from bayesperiodic.posterior.description import fingerprint
 
     assert fingerprint(problem({"c": "0.05*k"})) != fingerprint(problem({"c": "0.06*k"}))
+
+
+@pytest.mark.parametrize("function", [*FUNCTIONS])
+def test_every_function_of_a_tie_is_analysed_structurally(function):
+    """The force depends on k and on a function of it, so that k is determined."""
+    found = structure_of(problem({"c": f"30*{function}(k/800)"}))
+    assert found.table["verdict"].to_dict() == {"k": "determined", "coulomb": "determined"}
+    chained = {"c": f"{function}(coulomb)", "coulomb": f"{function}(k/800) + k/3"}
+    found = structure_of(problem(chained, priors={"k": PRIORS["k"]}))
+    assert found.table["verdict"].to_dict() == {"k": "determined"}
+
+
+def test_degrees_of_chained_ties_multiply():
+    with pytest.raises(ValueError, match=r"tied\['c'\]: must have .*of degree 36"):
+        problem({"c": "(coulomb+1)**6", "coulomb": "(k+1)**6"}, priors={"k": PRIORS["k"]})
+
+
+def test_report_of_a_tie_with_an_absolute_value(tmp_path):
+    tied = problem({"c": "abs(k)/20"})
+    fit = bp.map_estimate(tied, progress=False)
+    assert bp.identifiability(tied, fit, profile=False).verdicts["k"] == "determined"
+    assert bp.report(tied, fit, None, tmp_path / "report.html").is_file()
 
 
 @pytest.mark.parametrize(
@@ -62,6 +86,7 @@ def test_ties_are_part_of_the_fingerprint():
         ({"c": "k", "k": "c"}, {}, "tied: 'k' is in priors too"),
         ({"c": "k"}, {"c": 1.0}, "tied: 'c' is in fixed too"),
         ({"c": "__import__('os')"}, {}, r"tied\['c'\]: functions in .*: must be one of"),
+        ({"c": "(1+k)**1000"}, {}, r"tied\['c'\]: must have powers and products of a degree up to 20, got '\(1\+k"),
         ({"c": 3.0}, {}, r"tied\['c'\]: must be .*got 3.0"),
         ({}, {}, "'c' has neither a prior nor a value"),
     ],

@@ -188,10 +188,12 @@ def test_results_of_another_problem_are_rejected(solved, tmp_path):
     problem, fit, posterior = solved
     other = problem.with_experiments([linear_experiment(np.array([900.0, 40.0, 25.0]), 3.0, seed=2)])
     path = tmp_path / "report.html"
-    with pytest.raises(ValueError, match="posterior: must be of the parameters and data"):
+    with pytest.raises(
+        ValueError, match="fit: must be a result of this problem, got one of a problem with other experiments"
+    ):
         bp.report(other, fit, posterior, path)
-    with pytest.raises(ValueError, match="fit: must have .*got no 'k'"):
-        bp.report(problem, replace(fit, theta={}), None, path)
+    with pytest.raises(ValueError, match="posterior: must be a result of this problem, got .* other experiments"):
+        bp.report(other, bp.map_estimate(other, progress=False), posterior, path)
     with pytest.raises(FileNotFoundError, match="path: must be in an existing folder"):
         bp.report(problem, fit, None, tmp_path / "nowhere" / "report.html")
     assert not os.listdir(tmp_path)

@@ -185,15 +185,63 @@ def test_checkpoint_that_is_damaged_locked_or_of_another_run_is_rejected(problem
     path = tmp_path / "run.h5"
     bp.sample(*problem, checkpoint=path, **(RUN | {"max_steps": 50}))
     with pytest.raises(
-        ValueError, match=r"checkpoint: must be a file of this run \(.* seed 6.*\), got .* of another run \(.* seed 5"
+        ValueError, match=r"checkpoint: must be a file of this run \(seed 6.*\), got .* of another run \(seed 5"
     ):
         bp.sample(*problem, checkpoint=path, **(RUN | {"seed": 6}))
     with FileLock(f"{path}.lock"), pytest.raises(ValueError, match="checkpoint: must not be in use by another run"):
         bp.sample(*problem, checkpoint=path, **RUN)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match="checkpoint: must be an intact HDF5 file, got"):
+    with pytest.raises(ValueError, match="checkpoint: must be an intact file, got .* no checksum"):
         bp.sample(*problem, checkpoint=path, **RUN)
+    for place in np.random.default_rng(1).integers(len(whole), size=60):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match="checkpoint: must be an intact file, got"):
+            bp.sample(*problem, checkpoint=path, **RUN)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs the limits of Unix")
+def test_full_disk_is_an_error_after_which_the_run_goes_on(problem, uninterrupted, tmp_path, monkeypatch):
+    import resource
+
+    path = tmp_path / "run.h5"
+    bp.sample(*problem, checkpoint=path, **(RUN | {"max_steps": 50}))
+    before, (soft, hard) = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before), hard))
+    try:
+        with pytest.raises(OSError, match=r"checkpoint: cannot be written .*the same call goes on from it"):
+            bp.sample(*problem, checkpoint=path, **RUN)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["run.h5"]
+    bp.sample(*problem, checkpoint=path, **RUN)
+    assert same(content(path), uninterrupted[1])
+
+
+def test_draft_of_a_killed_process_is_removed_at_the_next_run(problem, tmp_path):
+    draft = tmp_path / ".run.h5.draft-killed"
+    draft.mkdir()
+    (draft / "run.h5").write_bytes(b"half")
+    bp.sample(*problem, checkpoint=tmp_path / "run.h5", **(RUN | {"max_steps": 50}))
+    assert os.listdir(tmp_path) == ["run.h5"]
+
+
+def test_termination_returns_the_draws_as_an_interrupt_does(problem, uninterrupted, tmp_path, monkeypatch):
+    path, original, calls = tmp_path / "run.h5", LogPosterior.log_likelihood, iter(range(10**9))
+
+    def terminated(self, *arguments, **named):
+        if next(calls) == 225:
+            signal.raise_signal(signal.SIGTERM)
+        return original(self, *arguments, **named)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LogPosterior, "log_likelihood", terminated)
+        partial = bp.sample(*problem, checkpoint=path, **RUN)
+    assert partial.reason.startswith("interrupted after ") and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    bp.sample(*problem, checkpoint=path, **RUN)
+    assert same(content(path), uninterrupted[1])
 
 
 def test_no_temporary_files_remain_beside_the_checkpoint(problem, tmp_path):

@@ -318,7 +318,9 @@ def test_expressions_use_the_local_parameters_of_one_experiment(local):
             result.derive({"a": "2*coulomb"})
         with pytest.raises(ValueError, match="experiment: must be one of 'run 7', 'run 8, 14.5 Hz', got 'run 9'"):
             result.derive({"a": "2*coulomb"}, experiment="run 9")
-        with pytest.raises(ValueError, match="expressions: must be neither reserved nor repeated, got 'coulomb'"):
+        with pytest.raises(
+            ValueError, match="expressions: must be neither reserved nor used elsewhere .*got 'coulomb'"
+        ):
             result.derive({"coulomb": "2*k"})
 
 
