@@ -3,7 +3,7 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
-from bayesperiodic.data import folding
+from bayesperiodic.data import folding, harmonics
 from tests.known import NOISES, autoregressive, grid
 
 FREQUENCY = 2.317
@@ -47,8 +47,8 @@ def test_mean_period_is_exact_on_a_grid_incommensurate_with_the_sampling():
 
 def test_noise_free_input_ends_the_frequency_refinement(monkeypatch):
     """Its frequency is exact before a step is small compared with its standard error."""
-    calls, original = [], folding._linearised
-    monkeypatch.setattr(folding, "_linearised", lambda *given: calls.append(given) or original(*given))
+    calls, original = [], harmonics.fit_harmonics
+    monkeypatch.setattr(harmonics, "fit_harmonics", lambda *given: calls.append(given) or original(*given))
     time = np.arange(716) / (119.37 * 2.0)
     x, y = np.sin(4 * np.pi * time), np.cos(4 * np.pi * time) + 0.1 * np.random.default_rng(1).standard_normal(716)
     assert bp.Recording.from_arrays(time, {"y": y}, {"x": x}).fold(100).frequency == pytest.approx(2.0, rel=1e-12)
