@@ -1,12 +1,13 @@
-"""Reading of columns from CSV, NPZ and MAT files."""
+"""Reading of columns from CSV, NPZ and MAT files, and conversion of their units."""
 
 import csv
 import itertools
+import re
 import warnings
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -14,6 +15,17 @@ from bayesperiodic import _checks
 
 # Lines among which the header is searched for.
 PREAMBLE = 1000
+
+Units = Mapping[str, float | Sequence[str]]
+
+LONGEST_UNIT = 100
+# Products, quotients and groups of names with an exponent of one digit; the only number is the 1 of "1/s".
+SUPERSCRIPTS = "¹²³⁰⁴⁵⁶⁷⁸⁹"
+UNIT_TOKEN = re.compile(
+    rf"(?:[^\W\d{SUPERSCRIPTS}]|[°%])[^\W{SUPERSCRIPTS}]*"
+    rf"(?:\s*(?:\*\*|\^)\s*[+-]?[0-9](?:\.5)?(?![\w.])|⁻?[{SUPERSCRIPTS}](?!\w))?"
+    r"|1(?![\w.])|[()]|[*/·]|\s+"
+)
 
 
 def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None) -> dict[str, np.ndarray]:
@@ -26,20 +38,20 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
     columns, file = [*columns], existing(path)
     try:
         names, lines = _header(file, columns)
-        with warnings.catch_warnings():
+        with file.open(encoding="utf-8-sig", newline="") as text, warnings.catch_warnings():
+            _skip(text, lines)
             warnings.simplefilter("error", pd.errors.ParserWarning)
             # One more column than names holds the fields after trailing commas, if there are any.
             table = pd.read_csv(
-                file, header=None, names=range(len(names) + 1), skiprows=lines, index_col=False,
-                skipinitialspace=True, low_memory=False,
-            )  # fmt: skip
-    except (pd.errors.ParserError, pd.errors.ParserWarning, pd.errors.EmptyDataError) as error:
+                text, header=None, names=range(len(names) + 1), index_col=False, skipinitialspace=True, low_memory=False
+            )
+    except (pd.errors.ParserError, pd.errors.ParserWarning) as error:
         _check_fields(file, names, lines)
         raise ValueError(f"path: must be a CSV file with a header line, got {str(path)!r} ({error}).") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"path: must be a CSV file with a header line, got {str(path)!r} ({error}).") from None
     if table.empty:
-        raise ValueError(f"path: must be a CSV file with rows of data, got {str(path)!r}, which has a header only.")
+        raise ValueError(f"path: must be a CSV file with rows of data, got {str(path)!r}, which has none.")
     if table[len(names)].notna().any() or table[len(names) - 1].isna().any():
         _check_fields(file, names, lines)
     result = {}
@@ -76,16 +88,25 @@ def _header(file: Path, columns: list[str]) -> tuple[list[str], int]:
 
 
 def _check_fields(file: Path, names: list[str], lines: int) -> None:
-    """Raise a ValueError if a row of a CSV file does not have one field per name; empty ones may follow."""
+    """Raise a ValueError unless each row has one field per name, and equally many empty ones after them."""
     with file.open(encoding="utf-8-sig", newline="") as text:
-        rows = csv.reader(text, skipinitialspace=True)
-        data = (row for row in rows if rows.line_num > lines and any(field.strip() for field in row))
+        _skip(text, lines)
+        fields = None
+        data = (row for row in csv.reader(text, skipinitialspace=True) if any(field.strip() for field in row))
         for number, row in enumerate(data, 1):
-            if len(row) < len(names) or any(field.strip() for field in row[len(names) :]):
+            fields = fields or len(row)
+            if len(row) < len(names) or len(row) != fields or any(field.strip() for field in row[len(names) :]):
                 raise ValueError(
                     f"path: must be a CSV file with {len(names)} fields in each row, as many as there are names, got "
-                    f"{len(row)} in data row {number} (line {rows.line_num}) of {str(file)!r}."
+                    f"{len(row)} in data row {number} of {str(file)!r}."
                 )
+
+
+def _skip(text: TextIO, lines: int) -> None:
+    """Read a file up to the end of its header."""
+    rows = csv.reader(text, skipinitialspace=True)
+    while rows.line_num < lines:
+        next(rows)
 
 
 def _place(path: str | Path, names: list[str], column: str) -> int:
@@ -164,3 +185,49 @@ def _numbers(path: str | Path, column: str, values: Any) -> np.ndarray:
             f"{argument}: must be one column of real numbers, got shape {np.shape(values)} and type {array.dtype}."
         )
     return array.astype(float)
+
+
+def convert(name: str, values: np.ndarray, unit: float | Sequence[str]) -> np.ndarray:
+    """Return the values of a channel, multiplied by a factor or converted by a pair of units such as ("mm", "m")."""
+    argument = f"units[{name!r}]"
+    if isinstance(unit, int | float):
+        factor = _checks.finite_number(argument, unit)
+        if factor == 0.0:
+            raise ValueError(f"{argument}: must not be zero, got {unit!r}.")
+        return values * factor
+    if isinstance(unit, str) or len(unit) != 2 or not all(isinstance(u, str) for u in unit):
+        raise ValueError(f"{argument}: must be a factor or a pair such as ('mm', 'm'), got {unit!r}.")
+    for text in unit:
+        if len(text) > LONGEST_UNIT or not _is_unit(text):
+            shown = text if len(text) <= LONGEST_UNIT else f"{text[:LONGEST_UNIT]}…"
+            raise ValueError(
+                f"{argument}: must be units that are multiplied or divided, with exponents of one digit, such as "
+                f"'kg*m/s**2', got {shown!r}."
+            )
+    import pint
+
+    try:
+        first, second = (text.replace("·", "*") for text in unit)
+        return np.asarray(pint.UnitRegistry().Quantity(values, first).to(second).magnitude, dtype=float)
+    except (pint.errors.PintError, AssertionError, TypeError, ValueError, ArithmeticError) as error:
+        raise ValueError(
+            f"{argument}: must be two units of the same dimension, got {tuple(unit)!r} ({error})."
+        ) from None
+
+
+def _is_unit(text: str) -> bool:
+    """Return whether a text consists of the permitted tokens, and no operator follows another one."""
+    place, operator, depth = 0, False, 0
+    while place < len(text):
+        token = UNIT_TOKEN.match(text, place)
+        if token is None:
+            return False
+        place, mark = token.end(), token.group().strip()
+        if mark in ("*", "/", "·"):
+            if operator:
+                return False
+            operator = True
+        elif mark:
+            operator = False
+            depth += {"(": 1, ")": -1}.get(mark, 0)
+    return depth == 0

@@ -1,4 +1,4 @@
-"""Estimation of the mean steady period of sampled signals, and of its uncertainty."""
+"""Estimation of the mean steady period of sampled signals, and of its uncertainty; division of records of several."""
 
 import warnings
 from collections.abc import Iterable, Mapping
@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.signal import medfilt
 from scipy.special import fdtrc, softmax
 
 from bayesperiodic import _checks, _fourier
@@ -20,10 +21,15 @@ from bayesperiodic.data.harmonics import (
     track_frequency,
 )
 
-# Steps of time that are gaps, in periods, if they are longer than so many usual steps.
-GAP, USUAL_STEPS = 0.25, 3.0
+# Steps of time that are gaps, in periods, if they are longer than so many usual steps; if the period is unknown,
+# in usual steps.
+GAP, USUAL_STEPS, MANY_STEPS = 0.25, 3.0, 30.0
 # Spreads of a channel whose squares and inverse squares are ordinary numbers, and grid points of a response period.
 SMALLEST_SPREAD, LARGEST_SPREAD, MAXIMUM_POINTS = 1e-100, 1e100, 1_000_000
+# A crossing counts after the signal was below minus this fraction of its standard deviation.
+HYSTERESIS = 0.25
+# Smallest relative step of the period, in itself and in standard errors.
+SMALLEST_STEP, SIGNIFICANT = 1e-3, 8.0
 MINIMUM_PERIODICITY = 0.5
 # Difference of two phases [cycles] at the ends of a recording that selects other cycles.
 OTHER_CYCLES = 0.05
@@ -140,14 +146,15 @@ def fold_signals(
 
 def _first_guess(signals: Signals, frequency: float | None, periods: int) -> float:
     remedy = "give the forcing frequency"
+    time, values = _longest_stretch(signals)
     if frequency is not None:
         fundamental: float | None = _checks.positive("frequency", frequency) / periods
         remedy = f"check frequency = {frequency!r} Hz and periods = {periods}"
     elif signals.inputs:
-        guess = guess_frequency(signals.time, signals.values[: signals.inputs])
+        guess = guess_frequency(time, values[: signals.inputs])
         fundamental = guess / periods if guess else None
     else:
-        fundamental = guess_frequency(signals.time, signals.values)
+        fundamental = guess_frequency(time, values)
     if fundamental is None or _cycles(signals.time, fundamental) < MINIMUM_CYCLES:
         found = "no period" if fundamental is None else f"{_cycles(signals.time, fundamental):.2f} cycles"
         raise ValueError(
@@ -155,6 +162,15 @@ def _first_guess(signals: Signals, frequency: float | None, periods: int) -> flo
             f"{np.ptp(signals.time):g} s; record longer, or {remedy}."
         )
     return fundamental
+
+
+def _longest_stretch(signals: Signals) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times and values of the longest part without gaps of many steps."""
+    step = np.diff(signals.time)
+    edges = np.concatenate([[0], np.flatnonzero(step > MANY_STEPS * np.median(step)) + 1, [signals.time.size]])
+    longest = int(np.argmax(np.diff(edges)))
+    part = slice(edges[longest], edges[longest + 1])
+    return signals.time[part], signals.values[:, part]
 
 
 def _cycles(time: np.ndarray, fundamental: float) -> float:
@@ -391,3 +407,60 @@ def _chosen(harmonics: int | Mapping[str, int] | None, names: tuple[str, ...], l
 def _power(variance: np.ndarray) -> float:
     """Return the variance of a signal whose complex amplitudes have these variances."""
     return float(variance[0] + 0.5 * variance[1:].sum())
+
+
+def parts(time: np.ndarray, signal: np.ndarray) -> list[slice]:
+    """Return the parts of at least three cycles between gaps of time and steps of the signal's frequency."""
+    rising = _rising(time, signal)
+    if rising.size < 2:
+        return [slice(0, time.size)]
+    period = float(np.median(np.diff(time[rising])))
+    edges = np.concatenate([[0], gaps(time, period) + 1, [time.size]])
+    found = []
+    for first, last in zip(edges[:-1], edges[1:], strict=True):
+        inside = first + _rising(time[first:last], signal[first:last])
+        steps = inside[_steps(time, signal, inside)]
+        bounds = [first, *steps.tolist(), last]
+        found += [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    cycles = [np.searchsorted(rising, own.stop) - np.searchsorted(rising, own.start) for own in found]
+    return [own for own, count in zip(found, cycles, strict=True) if count > MINIMUM_CYCLES]
+
+
+def _rising(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
+    """Return the samples at which the signal rises above its mean, which it must have left by the hysteresis."""
+    centred = signal - signal.mean()
+    level = HYSTERESIS * centred.std()
+    outside = np.flatnonzero(np.abs(centred) > level)
+    above = centred[outside] > 0.0
+    return outside[1:][above[1:] & ~above[:-1]]
+
+
+def _steps(time: np.ndarray, signal: np.ndarray, rising: np.ndarray) -> list[int]:
+    """Return the numbers of the crossings at which the period changes, by binary segmentation of its logarithm."""
+    if rising.size < 2 * MINIMUM_CYCLES + 2:
+        return []
+    level = signal[rising[0] : rising[-1] + 1].mean()
+    level += HYSTERESIS * signal[rising[0] : rising[-1] + 1].std()
+    fraction = (signal[rising] - level) / np.maximum(signal[rising] - signal[rising - 1], np.finfo(float).tiny)
+    crossing = time[rising] - np.clip(fraction, 0.0, 1.0) * (time[rising] - time[rising - 1])
+    period = np.log(np.diff(crossing))
+    noise = max(float(np.median(np.abs(np.diff(period)))), 1e-4)
+    # A single odd period, as at a jump of the phase, is no step.
+    period = medfilt(period, 3)
+    found, stack = [], [(0, period.size)]
+    while stack:
+        first, last = stack.pop()
+        size = last - first
+        number = np.arange(MINIMUM_CYCLES, size - MINIMUM_CYCLES + 1)
+        if not number.size:
+            continue
+        own = period[first:last]
+        before = np.cumsum(own)[number - 1]
+        difference = before / number - (own.sum() - before) / (size - number)
+        score = np.abs(difference) * np.sqrt(number * (size - number) / size)
+        best = int(np.argmax(score))
+        if score[best] > SIGNIFICANT * noise and abs(difference[best]) > SMALLEST_STEP:
+            middle = first + int(number[best])
+            found.append(middle)
+            stack += [(first, middle), (middle, last)]
+    return sorted(found)

@@ -145,7 +145,7 @@ def _pace(time: np.ndarray, fit: HarmonicFit, clear: np.ndarray, weights: np.nda
     return Pace(
         float(np.sqrt(noise * own / information)),
         others.size,
-        8.0 * sign * bend / score.size,
+        8.0 * sign * bend * score.size / (score.size - 1) ** 2,
         bool(bend > NEGLIGIBLE_PHASE and abs(phase[2]) > limit * np.sqrt(noise)),
     )
 

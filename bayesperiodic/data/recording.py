@@ -10,10 +10,8 @@ import numpy as np
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.data.files import read_csv, read_mat, read_npz
-from bayesperiodic.data.folding import Signals, fold_signals
-from bayesperiodic.data.splitting import parts
-from bayesperiodic.data.units import Units, convert
+from bayesperiodic.data.files import Units, convert, read_csv, read_mat, read_npz
+from bayesperiodic.data.folding import Signals, fold_signals, parts
 
 DROP, INTERPOLATE = "drop", "interpolate"
 # Successive samples that may be interpolated.
@@ -476,7 +474,13 @@ class Recording(Result):
         periods, samples = _checks.integer("periods", periods, 1), _checks.integer("samples", samples, 4)
         channels = self.inputs | self.outputs
         signals = Signals(self.name, self.time, tuple(channels), np.stack([*channels.values()]), len(self.inputs))
-        folded = fold_signals(signals, samples, periods, frequency, harmonics, origin, largest_drift)
+        try:
+            folded = fold_signals(signals, samples, periods, frequency, harmonics, origin, largest_drift)
+        except np.linalg.LinAlgError:
+            raise ValueError(
+                f"recording: must have samples in all parts of its periods, got {self.name!r}, which has too few; "
+                "check the frequency and the gaps, or fold a part by `between` or `split`."
+            ) from None
         return Experiment(name or self.name, synthetic=self.synthetic, **folded)
 
     def __repr__(self) -> str:
