@@ -37,13 +37,18 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
 
     columns, file = [*columns], existing(path)
     try:
-        names, lines = _header(file, columns)
+        names, lines, more = _header(file, columns)
         with file.open(encoding="utf-8-sig", newline="") as text, warnings.catch_warnings():
             _skip(text, lines)
             warnings.simplefilter("error", pd.errors.ParserWarning)
-            # One more column than names holds the fields after trailing commas, if there are any.
+            # More columns than names hold the fields after trailing commas.
             table = pd.read_csv(
-                text, header=None, names=range(len(names) + 1), index_col=False, skipinitialspace=True, low_memory=False
+                text,
+                header=None,
+                names=range(len(names) + max(more, 0) + 1),
+                index_col=False,
+                skipinitialspace=True,
+                low_memory=False,
             )
     except (pd.errors.ParserError, pd.errors.ParserWarning) as error:
         _check_fields(file, names, lines)
@@ -52,7 +57,7 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
         raise ValueError(f"path: must be a CSV file with a header line, got {str(path)!r} ({error}).") from None
     if table.empty:
         raise ValueError(f"path: must be a CSV file with rows of data, got {str(path)!r}, which has none.")
-    if table[len(names)].notna().any() or table[len(names) - 1].isna().any():
+    if table.iloc[:, len(names) :].notna().any(axis=None) or table[len(names) - 1].isna().any():
         _check_fields(file, names, lines)
     result = {}
     for column in columns:
@@ -70,21 +75,22 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
     return result
 
 
-def _header(file: Path, columns: list[str]) -> tuple[list[str], int]:
-    """Return the names of the columns of a CSV file, and the number of its lines up to there."""
+def _header(file: Path, columns: list[str]) -> tuple[list[str], int, int]:
+    """Return the names of the columns of a CSV file, the number of lines up to there, and of fields that follow."""
     with file.open(encoding="utf-8-sig", newline="") as lines:
         rows = csv.reader(lines, skipinitialspace=True)
         found = [([name.strip() for name in row], rows.line_num) for row in itertools.islice(rows, PREAMBLE) if row]
     if not found:
         raise ValueError(f"path: must be a CSV file with a header line, got {str(file)!r}, which is empty.")
     # Without a line of all names, that with most of them tells what is missing.
-    names, number = max(found, key=lambda row: len({*columns} & {*row[0]}))
+    place = max(range(len(found)), key=lambda i: len({*columns} & {*found[i][0]}))
+    names, number = found[place]
     if not {*columns} <= {*names} and _is_no_header(names):
         raise ValueError(
             f"path: must be a CSV file whose first line names the columns, separated by commas, got {str(file)!r}, "
             f"whose first line is read as {names}. Numbers must have a decimal point."
         )
-    return names, number
+    return names, number, max((len(row) - len(names) for row, _ in found[place + 1 : place + 2]), default=0)
 
 
 def _check_fields(file: Path, names: list[str], lines: int) -> None:

@@ -418,3 +418,15 @@ def test_work_is_linear_in_the_length_of_a_recording(monkeypatch):
         measured = driven(cycles, 0.1, 0, per_cycle=20)
         measured.fold(64)
         assert sum(sizes) < 30_000 + 5 * measured.time.size
+
+
+def test_standard_error_of_the_frequency_under_white_noise_is_that_of_cramer_and_rao_or_up_to_twice_as_large():
+    """It is the bound itself where slow noise is not the larger one, by chance in half of the recordings."""
+    time = np.arange(6000) / 50.0
+    bound = 0.2 / (2 * np.pi) * np.sqrt(24 / 6000) / 120.0
+    ratios = []
+    for seed in range(20):
+        y = np.cos(2 * np.pi * time) + 0.2 * np.random.default_rng(seed).standard_normal(6000)
+        ratios.append(bp.Recording.from_arrays(time, {"y": y}).fold(64).frequency_se / bound)
+    assert min(ratios) == pytest.approx(1.0, abs=0.04)
+    assert max(ratios) < 2.0

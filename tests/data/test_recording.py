@@ -187,8 +187,9 @@ def write(path, text):
     return path
 
 
-def test_trailing_commas_do_not_shift_columns(tmp_path):
-    path = write(tmp_path / "run.csv", "x,F,note\n1,10,0,\n2,20,0,\n3,30,0,\n")
+@pytest.mark.parametrize("more", [",", ",,", ", ,"])
+def test_trailing_commas_do_not_shift_columns(tmp_path, more):
+    path = write(tmp_path / "run.csv", f"x,F,note\n1,10,0{more}\n2,20,0{more}\n3,30,0{more}\n")
     recording = bp.Recording.from_csv(path, sampling_rate=1.0, outputs={"x": "x"}, inputs={"F": "F"})
     assert recording.outputs["x"].tolist() == [1.0, 2.0, 3.0]
     assert recording.inputs["F"].tolist() == [10.0, 20.0, 30.0]
@@ -230,7 +231,7 @@ def random_csv(seed):
     writer = table_format.writer(text, lineterminator=end)
     for _ in range(int(generator.integers(0, 5))):
         text.write(str(generator.choice(["# rig 3", "Date, 2026", "x", "", "a,b,c,d,e,f,g,h"])) + end)
-    more = [""] * int(generator.integers(0, 2))
+    more = [""] * int(generator.integers(0, 3))
     writer.writerow([*names, *more * int(generator.integers(0, 2))])
     for row in zip(*table.values(), strict=True):
         writer.writerow([*(repr(float(v)) if not isinstance(v, str) else v for v in row), *more])
