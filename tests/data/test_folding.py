@@ -321,16 +321,16 @@ def test_wrong_frequency_of_a_subharmonic_response_is_refused_in_forcing_periods
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [*NOISES])
 def test_right_frequency_is_accepted_and_the_standard_error_holds_under_noise_of_any_spectrum(kind):
-    """200 recordings: no false alarm of 1e-4 each (2 %), and few |z| > 3 (binomial at 0.3 %, 1e-4)."""
+    """120 recordings: no false alarm of 1e-4 each (1 %), and few |z| > 3 (binomial at 0.3 %, 1e-4)."""
     scores = []
-    for seed in range(200):
+    for seed in range(120):
         recording = driven(20, 0.3, seed, kind=kind)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", ".*only the last")
             assert recording.fold(64, frequency=FREQUENCY).frequency == FREQUENCY
             e = recording.fold(64)
         scores.append((e.frequency - FREQUENCY) / e.frequency_se)
-    assert np.count_nonzero(np.abs(scores) > 3.0) <= stats.binom.isf(1e-4, 200, 2 * stats.norm.sf(3.0))
+    assert np.count_nonzero(np.abs(scores) > 3.0) <= stats.binom.isf(1e-4, 120, 2 * stats.norm.sf(3.0))
 
 
 def drifting(change, cycles=40, noise=0.03):
