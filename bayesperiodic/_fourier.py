@@ -4,7 +4,12 @@ A real signal is sampled over one response period on an equidistant grid without
 c[h] satisfy y(t) = Re Σ_h c[h] exp(2πi h t / period), so that |c[h]| is the amplitude of harmonic h and c[0] the mean.
 """
 
+from math import factorial
+
 import numpy as np
+
+# Terms of a Taylor series about the points of a fine grid, and times evaluated together.
+TAYLOR, CHUNK = 6, 1 << 15
 
 
 def coefficients(values: np.ndarray, harmonics: int | None = None) -> np.ndarray:
@@ -27,12 +32,49 @@ def on_grid(amplitudes: np.ndarray, points: int) -> np.ndarray:
 
 
 def at_times(amplitudes: np.ndarray, phase: np.ndarray) -> np.ndarray:
-    """Return one signal at given phases (fractions of the period), by Horner's rule in exp(2πi phase)."""
-    turn = np.exp(2j * np.pi * np.asarray(phase))
-    total = np.zeros_like(turn)
-    for amplitude in amplitudes[::-1]:
-        total = total * turn + amplitude
-    return total.real
+    """Return signals (…, times) at given phases (times,), fractions of the period, from amplitudes (…, harmonics + 1).
+
+    Taylor series about the points of a fine grid, so that the time does not depend on the number of harmonics.
+    """
+    points = _fine(amplitudes.shape[-1] - 1)
+    rate = 2j * np.pi * np.arange(amplitudes.shape[-1]) / points
+    tables = [on_grid(amplitudes * rate**p / factorial(p), points) for p in range(TAYLOR)]
+    values = np.empty((*amplitudes.shape[:-1], phase.size))
+    for first in range(0, phase.size, CHUNK):
+        part = slice(first, first + CHUNK)
+        place, offset = _places(phase[part], points)
+        total = tables[-1][..., place]
+        for table in tables[-2::-1]:
+            total *= offset
+            total += table[..., place]
+        values[..., part] = total
+    return values
+
+
+def sums(values: np.ndarray, phase: np.ndarray, harmonics: int) -> np.ndarray:
+    """Return Σ_t y(t) exp(−2πi h phase(t)), h = 0 … harmonics, of signals (channels, times), by the same grid."""
+    points = _fine(harmonics)
+    place, offset = _places(phase, points)
+    rate = -2j * np.pi * np.arange(harmonics + 1) / points
+    total = np.zeros((len(values), harmonics + 1), dtype=complex)
+    for own, weighted in zip(total, np.array(values, dtype=float), strict=True):
+        for p in range(TAYLOR):
+            own += rate**p / factorial(p) * np.fft.rfft(np.bincount(place, weighted, points))[: harmonics + 1]
+            weighted *= offset
+    return total
+
+
+def _fine(harmonics: int) -> int:
+    """Return the number of grid points from which Taylor series of all harmonics are exact to rounding."""
+    return 256 << max(harmonics - 1, 1).bit_length()
+
+
+def _places(phase: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nearest grid point of each phase, and its distance in grid steps."""
+    offset = (phase - np.floor(phase)) * points
+    place = np.rint(offset)
+    offset -= place
+    return place.astype(int) % points, offset
 
 
 def derivative(amplitudes: np.ndarray, frequency: float, order: int = 1) -> np.ndarray:

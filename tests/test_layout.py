@@ -11,6 +11,7 @@ REASONS = {
     "Experiment": "one field per measured quantity; four are required, the rest are keywords with defaults",
     "sample": "settings of the sampler; two arguments and the seed are required, the rest are keywords with defaults",
     "Model": "the definition of a model: name, variables, equations, outputs, units; five are required",
+    "Recording.from_csv": "the columns of a file, gaps in them and several records; path and outputs are required",
     "calibrate": "the settings of a campaign and of the estimates in it; three are required",
     "plot.branch": "options of a figure; one argument is required",
     "simulate": "a problem (model, parameters, inputs, frequency), a time grid, and the noise",

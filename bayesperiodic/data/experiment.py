@@ -51,6 +51,8 @@ class Experiment(Result):
         explains, of the channel with the smallest one; time [s] of the recording at which τ = 0.
     drift : mapping of str to float
         Relative growth of the fundamental of each channel over the recording.
+    period_drift : float
+        Relative change of the period over the averaged cycles, by linear regression.
     synthetic : bool
         True if the data were simulated.
     mask : bool array (samples·periods,), optional
@@ -102,6 +104,7 @@ class Experiment(Result):
     frequency_se: float = field(default=0.0, kw_only=True)
     periodicity: float = field(default=1.0, kw_only=True)
     drift: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    period_drift: float = field(default=0.0, kw_only=True)
     origin: float = field(default=0.0, kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)

@@ -1,20 +1,39 @@
-"""Estimation of the mean steady period of sampled signals, and of its uncertainty."""
+"""Estimation of the mean steady period of sampled signals, and of its uncertainty; division of records of several."""
 
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_toeplitz
+from scipy.signal import medfilt
 from scipy.special import fdtrc, softmax
 
 from bayesperiodic import _checks, _fourier
+from bayesperiodic.data.harmonics import (
+    MINIMUM_CYCLES,
+    HarmonicFit,
+    Pace,
+    fit_harmonics,
+    guess_frequency,
+    refine_frequency,
+    resolved_harmonics,
+    track_frequency,
+)
 from bayesperiodic.data.quantisation import repeated_variance
 
-MAXIMUM_HARMONICS = 600
-SIGNIFICANT_POWER = 10.0
-MINIMUM_CYCLES = 3
+# Steps of time that are gaps, in periods, if they are longer than so many usual steps; if the period is unknown,
+# in usual steps.
+GAP, USUAL_STEPS, MANY_STEPS = 0.25, 3.0, 30.0
+# Spreads of a channel whose squares and inverse squares are ordinary numbers, and grid points of a response period.
+SMALLEST_SPREAD, LARGEST_SPREAD, MAXIMUM_POINTS = 1e-100, 1e100, 1_000_000
+# A crossing counts after the signal was below minus this fraction of its standard deviation.
+HYSTERESIS = 0.25
+# Smallest relative step of the period, in itself and in standard errors.
+SMALLEST_STEP, SIGNIFICANT = 1e-3, 8.0
 MINIMUM_PERIODICITY = 0.5
+# Difference of two phases [cycles] at the ends of a recording that selects other cycles.
+OTHER_CYCLES = 0.05
 FALSE_ALARM_RATE = 0.01
 CROSSING = "crossing"
 
@@ -48,137 +67,15 @@ class Signals:
                 raise ValueError(
                     f"{kind}[{channel!r}]: must vary, got the constant {values[0]:g}; leave the channel out{remedy}."
                 )
+            if not SMALLEST_SPREAD < np.max(np.abs(values)) < LARGEST_SPREAD:
+                raise ValueError(
+                    f"{'inputs' if i < self.inputs else 'outputs'}[{channel!r}]: must be between {SMALLEST_SPREAD:g} "
+                    f"and {LARGEST_SPREAD:g} in size, got up to {np.max(np.abs(values)):g}; choose another unit."
+                )
 
     def part(self, samples: np.ndarray) -> "Signals":
         """Return the signals at the selected samples."""
         return replace(self, time=self.time[samples], values=self.values[:, samples])
-
-
-@dataclass(frozen=True)
-class HarmonicFit:
-    """A Fourier series fitted to several channels."""
-
-    frequency: float  # fundamental frequency [Hz]
-    amplitudes: np.ndarray  # complex, as in `_fourier`, with phases relative to time 0, (channels, harmonics + 1)
-    residuals: np.ndarray  # (channels, samples)
-
-    @property
-    def variances(self) -> np.ndarray:
-        """Residual variance of each channel, (channels,)."""
-        degrees_of_freedom = max(self.residuals.shape[1] - (2 * self.amplitudes.shape[1] - 1), 1)
-        return np.sum(self.residuals**2, axis=1) / degrees_of_freedom
-
-
-def fit_harmonics(time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int) -> HarmonicFit:
-    """Fit harmonics 0 … `harmonics` of `frequency` to channels (channels, samples) by least squares.
-
-    The normal matrix of exp(2πi h f t), h = −H … H, is Hermitian Toeplitz, and well conditioned if the samples resolve
-    the highest harmonic.
-    """
-    turn = np.exp(-2j * np.pi * frequency * time)
-    power = np.ones_like(turn)
-    moments = np.empty(2 * harmonics + 1, dtype=complex)
-    right = np.empty((2 * harmonics + 1, len(channels)), dtype=complex)
-    for h in range(2 * harmonics + 1):
-        moments[h] = power.sum()
-        if h <= harmonics:
-            right[harmonics + h] = channels @ power
-            right[harmonics - h] = np.conj(right[harmonics + h])
-        power *= turn
-    amplitudes = solve_toeplitz((moments, np.conj(moments)), right)[harmonics:].T.copy()
-    amplitudes[:, 1:] *= 2.0
-    phase = frequency * time
-    residuals = np.stack([y - _fourier.at_times(c, phase) for y, c in zip(channels, amplitudes, strict=True)])
-    return HarmonicFit(frequency, amplitudes, residuals)
-
-
-def refine_frequency(
-    time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int, iterations: int = 20
-) -> tuple[HarmonicFit, float]:
-    """Return the fit at the least-squares frequency, and that frequency's standard error [Hz].
-
-    Gauss-Newton iteration for the fundamental, with the amplitudes projected out and every channel weighted by its
-    residual variance. The standard error is robust to correlation within a cycle, because the scores are summed over
-    each cycle before they are squared; it is at least that for independent samples.
-    """
-    for _ in range(iterations):
-        fit, slope, weights = _linearised(time, channels, frequency, harmonics)
-        information = float(np.sum(weights * np.sum(slope**2, axis=1)))
-        step = float(np.sum(weights * np.sum(slope * fit.residuals, axis=1))) / information
-        limit = 0.25 / np.ptp(time)
-        frequency += np.clip(step, -limit, limit)
-        if abs(step) < max(1e-6 / np.sqrt(information), np.finfo(float).eps * frequency):
-            break
-    fit, slope, weights = _linearised(time, channels, frequency, harmonics)
-    cycle = np.floor((time - time[0]) * frequency).astype(int)
-    scores = np.sum(weights[:, None] * slope * fit.residuals, axis=0)
-    clustered = float(np.sum(np.bincount(cycle, scores) ** 2))
-    return fit, float(np.sqrt(max(clustered, information))) / information
-
-
-def _linearised(
-    time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int
-) -> tuple[HarmonicFit, np.ndarray, np.ndarray]:
-    fit = fit_harmonics(time, channels, frequency, harmonics)
-    noise = 4.0 * fit.variances[:, None] / time.size
-    power = np.abs(fit.amplitudes) ** 2
-    # The slope contains the largest and the significant harmonics; noise in the others would count as information.
-    largest = power[:, 1:].max(axis=1, keepdims=True)
-    clear = np.where((power > SIGNIFICANT_POWER * noise) | (power == largest), fit.amplitudes, 0.0)
-    rate = _fourier.derivative(clear, 1.0)
-    slope = np.stack([_fourier.at_times(c, frequency * time) for c in rate]) * (time - time.mean())
-    slope = fit_harmonics(time, slope, frequency, harmonics).residuals
-    floor = 1e-24 * np.var(channels, axis=1)
-    return fit, slope, 1.0 / np.maximum(fit.variances, floor)
-
-
-def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
-    """Estimate the fundamental frequency [Hz] from the autocorrelation; None if it has no positive peak.
-
-    The lag is the smallest one whose peak reaches 90 % of the highest.
-    """
-    samples = time.size
-    step = (time[-1] - time[0]) / (samples - 1)
-    even = time[0] + step * np.arange(samples)
-    correlation = np.zeros(samples)
-    for values in channels:
-        signal = np.interp(even, time, values)
-        signal = (signal - signal.mean()) / signal.std()
-        power = np.abs(np.fft.rfft(signal, 2 * samples)) ** 2
-        correlation += np.fft.irfft(power)[:samples] / np.arange(samples, 0, -1)
-    correlation = correlation[: samples // 3 + 2]
-    negative = np.flatnonzero(correlation < 0.5 * correlation[0])
-    if negative.size == 0:
-        return None
-    inside = correlation[1:-1]
-    peaks = 1 + np.flatnonzero((inside >= correlation[:-2]) & (inside > correlation[2:]))
-    peaks = peaks[(peaks > negative[0]) & (correlation[peaks] > 0.0)]
-    if peaks.size == 0:
-        return None
-    lag = peaks[np.flatnonzero(correlation[peaks] >= 0.9 * correlation[peaks].max())[0]]
-    left, top, right = correlation[lag - 1 : lag + 2]
-    bend = left - 2.0 * top + right
-    offset = 0.5 * (left - right) / bend if bend else 0.0
-    return _largest_equivalent(time, channels, 1.0 / ((lag + offset) * step))
-
-
-def _largest_equivalent(time: np.ndarray, channels: np.ndarray, frequency: float) -> float:
-    """Return the largest multiple of a frequency that explains the signals equally well."""
-    last = time >= time[-1] - 6.0 / frequency
-    time, channels = time[last], channels[:, last]
-    nyquist = 0.5 * (time.size - 1) / np.ptp(time)
-    top = min(0.95 * nyquist, MAXIMUM_HARMONICS * frequency)
-
-    def unexplained(candidate: float) -> float:
-        fit = fit_harmonics(time, channels, candidate, max(int(top / candidate), 1))
-        return float(np.max(fit.variances / np.var(channels, axis=1)))
-
-    reference = unexplained(frequency)
-    for factor in (5, 4, 3, 2):
-        candidate = factor * frequency
-        if candidate < top and reference < 0.5 and unexplained(candidate) <= 1.2 * reference + 1e-9:
-            return candidate
-    return frequency
 
 
 def fold_signals(
@@ -192,24 +89,27 @@ def fold_signals(
 ) -> dict[str, Any]:
     """Return the arguments of the `Experiment` of the mean period of the steady part; see `Recording.fold`."""
     points = samples * periods
+    if points > MAXIMUM_POINTS:
+        raise ValueError(f"samples: must be at most {MAXIMUM_POINTS // periods} for {periods} periods, got {samples}.")
     if isinstance(origin, str) and origin != CROSSING:
         raise ValueError(f"origin: must be a time [s] or {CROSSING!r}, got {origin!r}.")
     start = 0.0 if origin == CROSSING else _checks.finite_number("origin", origin)
     signals = replace(signals, time=signals.time - start)
     fundamental = _first_guess(signals, frequency, periods)
-    if frequency is None:
-        fundamental = _track(signals, fundamental)
-    cycle, shape = _cycles_apart(signals, fundamental)
+    _refuse_gaps(signals, fundamental)
+    tracked = _tracked(signals, fundamental, frequency is not None)
+    cycle, shape = _cycles_apart(signals, tracked)
     drift = dict(zip(signals.channels, _drift(shape[::-1]), strict=True))
     _refuse_drift(signals.name, drift, largest_drift)
     steady = signals.part(_steady_part(cycle, shape))
-    limit = _resolved(steady.time, fundamental, points)
-    if frequency is None:
-        fit, fundamental_se = refine_frequency(steady.time, steady.values, fundamental, limit)
-    else:
-        fit, fundamental_se = fit_harmonics(steady.time, steady.values, fundamental, limit), 0.0
+    limit = resolved_harmonics(steady.time, tracked, points)
+    fit, pace = refine_frequency(steady.time, steady.values, tracked, limit)
+    if frequency is not None:
+        estimated, fit = fit, fit_harmonics(steady.time, steady.values, fundamental, limit)
+        _refuse_frequency(estimated, fit, pace, float(np.ptp(steady.time)), periods)
     periodicity = _periodicity(steady, fit)
     cycles = round(np.ptp(steady.time) * fit.frequency)
+    _warn(signals.name, pace, cycles, len(shape))
     one_cycle, noise = zip(*(_noise(steady, fit, row, cycles) for row in range(len(steady.values))), strict=True)
     significant = [_last_significant(a, own) for a, own in zip(fit.amplitudes, noise, strict=True)]
     kept = dict(zip(signals.channels, significant, strict=True)) | _chosen(harmonics, signals.channels, limit)
@@ -228,7 +128,8 @@ def fold_signals(
     inputs, outputs = signals.channels[: signals.inputs], signals.channels[signals.inputs :]
     return {
         "frequency": fit.frequency * periods,
-        "frequency_se": fundamental_se * periods,
+        "frequency_se": pace.se * periods if frequency is None else 0.0,
+        "period_drift": -pace.drift,
         "outputs": {channel: folded[channel] for channel in outputs},
         "inputs": {channel: folded[channel] for channel in inputs},
         "samples": samples,
@@ -248,14 +149,15 @@ def fold_signals(
 
 def _first_guess(signals: Signals, frequency: float | None, periods: int) -> float:
     remedy = "give the forcing frequency"
+    time, values = _longest_stretch(signals)
     if frequency is not None:
         fundamental: float | None = _checks.positive("frequency", frequency) / periods
         remedy = f"check frequency = {frequency!r} Hz and periods = {periods}"
     elif signals.inputs:
-        guess = guess_frequency(signals.time, signals.values[: signals.inputs])
+        guess = guess_frequency(time, values[: signals.inputs])
         fundamental = guess / periods if guess else None
     else:
-        fundamental = guess_frequency(signals.time, signals.values)
+        fundamental = guess_frequency(time, values)
     if fundamental is None or _cycles(signals.time, fundamental) < MINIMUM_CYCLES:
         found = "no period" if fundamental is None else f"{_cycles(signals.time, fundamental):.2f} cycles"
         raise ValueError(
@@ -265,33 +167,86 @@ def _first_guess(signals: Signals, frequency: float | None, periods: int) -> flo
     return fundamental
 
 
+def _longest_stretch(signals: Signals) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times and values of the longest part without gaps of many steps."""
+    step = np.diff(signals.time)
+    edges = np.concatenate([[0], np.flatnonzero(step > MANY_STEPS * np.median(step)) + 1, [signals.time.size]])
+    longest = int(np.argmax(np.diff(edges)))
+    part = slice(edges[longest], edges[longest + 1])
+    return signals.time[part], signals.values[:, part]
+
+
 def _cycles(time: np.ndarray, fundamental: float) -> float:
     """Return the number of cycles, the last sample's step included."""
     return float(np.ptp(time) * time.size / (time.size - 1) * fundamental * (1 + 1e-9))
 
 
-def _track(signals: Signals, fundamental: float) -> float:
-    """Refine a frequency on the last few cycles, then on more and more of them, so that no cycle is miscounted."""
-    time = signals.time
-    cycles, total = MINIMUM_CYCLES, np.ptp(time) * fundamental
-    while True:
-        last = signals.part(time >= time[-1] - cycles / fundamental)
-        few = min(10, _resolved(last.time, fundamental, time.size))
-        fundamental = refine_frequency(last.time, last.values, fundamental, few)[0].frequency
-        if cycles >= total / 2:
-            return fundamental
-        cycles = min(2 * cycles, total / 2)
+def gaps(time: np.ndarray, period: float) -> np.ndarray:
+    """Return the last samples before gaps."""
+    step = np.diff(time)
+    return np.flatnonzero(step > max(GAP * period, USUAL_STEPS * np.median(step)))
 
 
-def _resolved(time: np.ndarray, fundamental: float, points: int) -> int:
-    per_cycle = (time.size - 1) / (np.ptp(time) * fundamental)
-    resolved = min(int((per_cycle - 1.0) / 2.0), _fourier.highest_harmonic(points), (time.size - 2) // 2)
-    if resolved < 1:
+def _refuse_gaps(signals: Signals, fundamental: float) -> None:
+    if (found := gaps(signals.time, 1.0 / fundamental)).size:
+        first, last = signals.time[found[0]], signals.time[found[0] + 1]
         raise ValueError(
-            f"recording: must have at least 3 samples per cycle, to resolve the fundamental, got {per_cycle:.1f}; "
-            "sample faster, or check the frequency."
+            f"recording: must have no gap longer than {GAP:g} periods, got {signals.name!r} without samples from "
+            f"{first:g} to {last:g} s (period {1.0 / fundamental:g} s); fold the parts that `split` returns."
         )
-    return resolved
+
+
+def _tracked(signals: Signals, fundamental: float, given: bool) -> float:
+    """Return the frequency by which cycles are compared: the estimated one, if the given one is clearly another one."""
+    time, values = signals.time, signals.values
+    tracked = track_frequency(time, values, fundamental)
+    if given:
+        few = min(10, resolved_harmonics(time, max(tracked, fundamental), time.size))
+        near = abs(tracked - fundamental) * np.ptp(time) < OTHER_CYCLES
+        if near or not _explains_more(*(fit_harmonics(time, values, own, few) for own in (tracked, fundamental))):
+            return fundamental
+    if (cycles := _cycles(time, tracked)) < MINIMUM_CYCLES:
+        raise ValueError(
+            f"recording: must have at least {MINIMUM_CYCLES} cycles, got {cycles:.2f} cycles of {tracked:.6g} Hz in "
+            f"{signals.name!r}; record longer."
+        )
+    return tracked
+
+
+def _explains_more(fit: HarmonicFit, other: HarmonicFit) -> bool:
+    return bool(np.sum(np.log(fit.variances / other.variances)) < 0.0)
+
+
+def _refuse_frequency(estimated: HarmonicFit, given: HarmonicFit, pace: Pace, duration: float, periods: int) -> None:
+    """Raise a ValueError if the given frequency is not that of the recording."""
+    difference = given.frequency - estimated.frequency
+    if _explains_more(estimated, given) and pace.differs(difference, duration):
+        raise ValueError(
+            f"frequency: must be that of the recording, which is estimated as {estimated.frequency * periods:.9g} Hz "
+            f"with a standard error of {pace.se * periods:.1g} Hz, got {given.frequency * periods:.9g} Hz, whose phase "
+            f"drifts by {360.0 * abs(difference) * duration:.2g}° of the response period over the cycles used; correct "
+            "it, or leave it out to use the estimate."
+        )
+
+
+def _warn(name: str, pace: Pace, cycles: int, total: int) -> None:
+    """Warn of a period that drifts, and of a steady part that is less than half of the recording."""
+    if pace.drifts:
+        warnings.warn(
+            f"{name}: the period changes by {-pace.drift:+.2%} over the {cycles} cycles used (of {total}). The mean "
+            "period and its frequency assume a constant one, and their stated errors do not contain the change; select "
+            "a steadier part with `between`.",
+            UserWarning,
+            stacklevel=4,
+        )
+    elif cycles < total and cycles <= total // 2:
+        warnings.warn(
+            f"{name}: only the last {cycles} of {total} cycles are used, because those before differ from them: a long "
+            "transient, a drift, or several records in one. Check the recording, and select a part with `between` or "
+            "`split`.",
+            UserWarning,
+            stacklevel=4,
+        )
 
 
 def _cycles_apart(signals: Signals, fundamental: float) -> tuple[np.ndarray, np.ndarray]:
@@ -303,12 +258,24 @@ def _cycles_apart(signals: Signals, fundamental: float) -> tuple[np.ndarray, np.
     period = 1.0 / fundamental
     total = int(_cycles(time, fundamental))
     back = np.minimum(((time[-1] - time) / period + 1e-9).astype(int), total)
-    harmonics = min(5, _resolved(time, fundamental, time.size))
-    scale = values.std(axis=1)[:, None]
-    ends = np.searchsorted(-back, np.arange(1 - total, 2))[::-1]
-    parts = [slice(first, last) for first, last in zip(ends[1:], ends[:-1], strict=True)]
-    fits = [fit_harmonics(time[part], values[:, part] / scale, fundamental, harmonics) for part in parts]
-    return back, np.array([fit.amplitudes for fit in fits])
+    order = np.arange(2 * min(5, resolved_harmonics(time, fundamental, time.size)) + 1)
+    harmonics = order[: order.size // 2 + 1]
+    first = np.searchsorted(-back, np.arange(1 - total, 1))
+    used = slice(first[0], None)
+    wave, power = np.exp(-2j * np.pi * (fundamental * time[used] % 1.0)), np.ones(time[used].size, dtype=complex)
+    scaled = values[:, used] / values.std(axis=1)[:, None]
+    sums = np.empty((order.size, len(values) + 1, total), dtype=complex)
+    for h in order:
+        for own, signal in zip(sums[h], [1.0, *(scaled if h < harmonics.size else ())], strict=False):
+            own[:] = np.add.reduceat(signal * power, first - first[0])
+        power *= wave
+    # Normal equations of each cycle, as in `fit_harmonics`.
+    moments = np.concatenate([np.conj(sums[:0:-1, 0]), sums[:, 0]])
+    place = order[:, None] - order[None, :] + order.size - 1
+    right = np.concatenate([np.conj(sums[harmonics[:0:-1], 1:]), sums[harmonics, 1:]])
+    amplitudes = np.linalg.solve(np.moveaxis(moments[place], -1, 0), np.moveaxis(right, -1, 0))[:, harmonics[-1] :]
+    amplitudes[:, 1:] *= 2.0
+    return back, np.moveaxis(amplitudes, 1, 2)[::-1]
 
 
 def _drift(shape: np.ndarray) -> list[float]:
@@ -350,7 +317,8 @@ def _periodicity(signals: Signals, fit: HarmonicFit) -> float:
         raise ValueError(
             f"recording: must be periodic, got {signals.name!r}, whose mean period at {fit.frequency:.6g} Hz explains "
             f"only {max(explained[worst], 0.0):.1%} of the variance of {signals.channels[worst]!r} (periodicity "
-            f"{explained[worst]:.3f}, at least {MINIMUM_PERIODICITY} is needed); check the frequency and `periods`."
+            f"{explained[worst]:.3f}, at least {MINIMUM_PERIODICITY} is needed); check the frequency and `periods`, "
+            "and separate records of different frequencies by `split`."
         )
     return float(explained[worst])
 
@@ -465,3 +433,60 @@ def _chosen(harmonics: int | Mapping[str, int] | None, names: tuple[str, ...], l
 def _power(variance: np.ndarray) -> float:
     """Return the variance of a signal whose complex amplitudes have these variances."""
     return float(variance[0] + 0.5 * variance[1:].sum())
+
+
+def parts(time: np.ndarray, signal: np.ndarray) -> list[slice]:
+    """Return the parts of at least three cycles between gaps of time and steps of the signal's frequency."""
+    rising = _rising(time, signal)
+    if rising.size < 2:
+        return [slice(0, time.size)]
+    period = float(np.median(np.diff(time[rising])))
+    edges = np.concatenate([[0], gaps(time, period) + 1, [time.size]])
+    found = []
+    for first, last in zip(edges[:-1], edges[1:], strict=True):
+        inside = first + _rising(time[first:last], signal[first:last])
+        steps = inside[_steps(time, signal, inside)]
+        bounds = [first, *steps.tolist(), last]
+        found += [slice(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    cycles = [np.searchsorted(rising, own.stop) - np.searchsorted(rising, own.start) for own in found]
+    return [own for own, count in zip(found, cycles, strict=True) if count > MINIMUM_CYCLES]
+
+
+def _rising(time: np.ndarray, signal: np.ndarray) -> np.ndarray:
+    """Return the samples at which the signal rises above its mean, which it must have left by the hysteresis."""
+    centred = signal - signal.mean()
+    level = HYSTERESIS * centred.std()
+    outside = np.flatnonzero(np.abs(centred) > level)
+    above = centred[outside] > 0.0
+    return outside[1:][above[1:] & ~above[:-1]]
+
+
+def _steps(time: np.ndarray, signal: np.ndarray, rising: np.ndarray) -> list[int]:
+    """Return the numbers of the crossings at which the period changes, by binary segmentation of its logarithm."""
+    if rising.size < 2 * MINIMUM_CYCLES + 2:
+        return []
+    level = signal[rising[0] : rising[-1] + 1].mean()
+    level += HYSTERESIS * signal[rising[0] : rising[-1] + 1].std()
+    fraction = (signal[rising] - level) / np.maximum(signal[rising] - signal[rising - 1], np.finfo(float).tiny)
+    crossing = time[rising] - np.clip(fraction, 0.0, 1.0) * (time[rising] - time[rising - 1])
+    period = np.log(np.diff(crossing))
+    noise = max(float(np.median(np.abs(np.diff(period)))), 1e-4)
+    # A single odd period, as at a jump of the phase, is no step.
+    period = medfilt(period, 3)
+    found, stack = [], [(0, period.size)]
+    while stack:
+        first, last = stack.pop()
+        size = last - first
+        number = np.arange(MINIMUM_CYCLES, size - MINIMUM_CYCLES + 1)
+        if not number.size:
+            continue
+        own = period[first:last]
+        before = np.cumsum(own)[number - 1]
+        difference = before / number - (own.sum() - before) / (size - number)
+        score = np.abs(difference) * np.sqrt(number * (size - number) / size)
+        best = int(np.argmax(score))
+        if score[best] > SIGNIFICANT * noise and abs(difference[best]) > SMALLEST_STEP:
+            middle = first + int(number[best])
+            found.append(middle)
+            stack += [(first, middle), (middle, last)]
+    return sorted(found)

@@ -1,135 +1,98 @@
 """Recordings: measured signals over time."""
 
-import zipfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
 from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic.data.experiment import Experiment
-from bayesperiodic.data.folding import Signals, fold_signals
+from bayesperiodic.data.files import Units, convert, read_csv, read_mat, read_npz
+from bayesperiodic.data.folding import Signals, fold_signals, parts
+
+DROP, INTERPOLATE = "drop", "interpolate"
+# Successive samples that may be interpolated.
+LONGEST_INTERPOLATION = 3
+# Key of the times of a file without a column of times.
+NO_COLUMN = "\0"
 
 
-def read_csv(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return named columns of a CSV file with a header line."""
-    import pandas as pd
+@dataclass(frozen=True)
+class Layout:
+    """Meaning of the columns of a file, with the arguments of `Recording.from_csv`."""
 
-    try:
-        table = pd.read_csv(existing(path), skipinitialspace=True, low_memory=False)
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise ValueError(f"path: must be a CSV file with a header line, got {str(path)!r} ({error}).") from None
-    table.columns = [str(name).strip() for name in table.columns]
-    columns, names = [*columns], [*table.columns]
-    if not {*columns} <= {*names} and _is_no_header(names):
-        raise ValueError(
-            f"path: must be a CSV file whose first line names the columns, separated by commas, got {str(path)!r}, "
-            f"whose first line is read as {names}. Numbers must have a decimal point."
-        )
-    result = {}
-    for column in columns:
-        values = _pick(path, table, column)
-        if not pd.api.types.is_numeric_dtype(values):
-            row = int(np.flatnonzero(pd.to_numeric(values, errors="coerce").isna() & values.notna())[0])
+    file: str
+    outputs: Mapping[str, str]
+    inputs: Mapping[str, str]
+    time: str | None
+    sampling_rate: float | None
+    units: Units
+    missing: str | None
+
+    def __post_init__(self) -> None:
+        example = "{'force': 'the column of the force'}"
+        for kind in ("outputs", "inputs"):
+            _checks.mapping(kind, getattr(self, kind), example)
+        if (self.time is None) == (self.sampling_rate is None):
             raise ValueError(
-                f"column {column!r} of {Path(path).name}: must contain numbers, with a decimal point, got "
-                f"{values.iloc[row]!r} in data row {row + 1}."
+                f"time: must be given or sampling_rate, and not both, got {self.time!r} and {self.sampling_rate!r}."
             )
-        result[column] = _numbers(path, column, values.to_numpy())
-    return result
+        for key in self.units:
+            _checks.one_of("units", key, ("time", *self.outputs, *self.inputs))
+        if self.missing is not None:
+            _checks.one_of("missing", self.missing, (DROP, INTERPOLATE))
 
+    @property
+    def columns(self) -> dict[str, None]:
+        """Names of the columns, each once."""
+        return dict.fromkeys([*([self.time] if self.time else []), *self.outputs.values(), *self.inputs.values()])
 
-def read_npz(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return named arrays of an NPZ file, without loading pickled objects."""
-    try:
-        with np.load(existing(path), allow_pickle=False) as archive:
-            return {c: _numbers(path, c, _pick(path, archive, c)) for c in columns}
-    except (zipfile.BadZipFile, EOFError, AttributeError, TypeError) as error:
-        raise ValueError(
-            f"path: must be an NPZ file of named arrays (numpy.savez), got {str(path)!r} ({error})."
-        ) from None
-    except ValueError as error:
-        if "allow_pickle" in str(error):
-            raise ValueError(
-                f"path: must be an NPZ file without pickled objects, got {str(path)!r}. Save numeric arrays by "
-                "numpy.savez, or read a CSV or MAT file by from_csv or from_mat."
-            ) from None
-        raise
+    def recording(self, columns: Mapping[str, np.ndarray], name: str) -> "Recording":
+        """Return the recording of columns of numbers."""
+        seconds = self.time or NO_COLUMN
+        if not self.time:
+            rows = max((values.size for values in columns.values()), default=0)
+            columns = {**columns, NO_COLUMN: np.arange(rows) / _checks.positive("sampling_rate", self.sampling_rate)}
+        if self.missing and len({values.size for values in columns.values()}) == 1:
+            columns = self._completed(columns, columns[seconds])
 
+        def channel(key: str, column: str) -> np.ndarray:
+            argument = f"{key} (column {column!r} of {self.file})"
+            if self.missing is None and (lost := np.flatnonzero(np.isnan(columns[column]))).size:
+                raise ValueError(
+                    f"{argument}: must be finite, got nan at index {lost[0]} ({lost.size} of {columns[column].size} "
+                    f"values); missing={DROP!r} leaves such rows out, missing={INTERPOLATE!r} fills in single values."
+                )
+            values = _checks.finite_vector(argument, columns[column])
+            return convert(key, values, self.units[key]) if key in self.units else values
 
-def read_mat(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
-    """Return named variables of a MAT file, version 5 or 7.3."""
-    import h5py
-    from scipy.io import loadmat
-
-    file = existing(path)
-    if h5py.is_hdf5(file):
-        with h5py.File(file, "r") as archive:
-            return {c: _numbers(path, c, np.asarray(_pick(path, archive, c))) for c in columns}
-    try:
-        variables = {name: value for name, value in loadmat(file).items() if not name.startswith("__")}
-    except (ValueError, TypeError, NotImplementedError, EOFError) as error:
-        raise ValueError(f"path: must be a MAT file, got {str(path)!r} ({error}).") from None
-    return {c: _numbers(path, c, _pick(path, variables, c)) for c in columns}
-
-
-def existing(path: str | Path) -> Path:
-    """Return the path; raise a FileNotFoundError if there is no such file."""
-    file = Path(path)
-    if not file.is_file():
-        raise FileNotFoundError(f"path: must be an existing file, got {str(path)!r}.")
-    return file
-
-
-def _is_no_header(names: list[str]) -> bool:
-    """Return whether a first line contains numbers, or separators other than commas."""
-    if len(names) == 1 and any(mark in names[0] for mark in ";\t"):
-        return True
-    try:
-        return bool([float(name) for name in names])
-    except ValueError:
-        return False
-
-
-def _pick(path: str | Path, source: Any, column: str) -> Any:
-    _checks.one_of(f"column of {Path(path).name}", column, list(source.keys()))
-    return source[column]
-
-
-def _numbers(path: str | Path, column: str, values: Any) -> np.ndarray:
-    argument = f"column {column!r} of {Path(path).name}"
-    array = np.squeeze(np.asarray(values))
-    if array.ndim != 1 or array.dtype.kind not in "fiub":
-        raise ValueError(
-            f"{argument}: must be one column of real numbers, got shape {np.shape(values)} and type {array.dtype}."
+        measured, given = (
+            {key: channel(key, own) for key, own in kind.items()} for kind in (self.outputs, self.inputs)
         )
-    return array.astype(float)
+        return Recording(channel("time", seconds), measured, given, name)
 
+    def _completed(self, columns: Mapping[str, np.ndarray], seconds: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the columns without NaN."""
+        result = dict(columns)
+        if self.missing == INTERPOLATE:
+            for column, values in columns.items():
+                if values is not seconds:
+                    result[column] = self._interpolated(column, seconds, values)
+        keep = ~np.any([np.isnan(values) for values in result.values()], axis=0)
+        return {column: values[keep] for column, values in result.items()}
 
-def convert(name: str, values: np.ndarray, unit: float | Sequence[str]) -> np.ndarray:
-    """Return the values of a channel, multiplied by a factor or converted by a pair of units such as ("mm", "m")."""
-    argument = f"units[{name!r}]"
-    if isinstance(unit, int | float):
-        factor = _checks.finite_number(argument, unit)
-        if factor == 0.0:
-            raise ValueError(f"{argument}: must not be zero, got {unit!r}.")
-        return values * factor
-    if isinstance(unit, str) or len(unit) != 2 or not all(isinstance(u, str) for u in unit):
-        raise ValueError(f"{argument}: must be a factor or a pair such as ('mm', 'm'), got {unit!r}.")
-    import pint
-
-    try:
-        return np.asarray(pint.UnitRegistry().Quantity(values, unit[0]).to(unit[1]).magnitude, dtype=float)
-    except (pint.errors.PintError, AssertionError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{argument}: must be two units of the same dimension, got {tuple(unit)!r} ({error})."
-        ) from None
-
-
-Units = Mapping[str, float | Sequence[str]]
+    def _interpolated(self, column: str, axis: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return a column with NaN between numbers replaced; those at the ends remain."""
+        known = np.flatnonzero(~np.isnan(values) & ~np.isnan(axis))
+        if (longest := int(np.max(np.diff(known), initial=1)) - 1) > LONGEST_INTERPOLATION:
+            raise ValueError(
+                f"missing: must be {DROP!r} for column {column!r} of {self.file}, got {INTERPOLATE!r}, which fills in "
+                f"at most {LONGEST_INTERPOLATION} successive values, and {longest} are missing."
+            )
+        return np.interp(axis, axis[known], values[known], left=np.nan, right=np.nan) if known.size else values
 
 
 @dataclass(frozen=True)
@@ -177,7 +140,7 @@ class Recording(Result):
             index = int(np.flatnonzero(step <= 0)[0])
             raise ValueError(
                 f"time: must increase, got {self.time[index + 1]:g} s after {self.time[index]:g} s at index "
-                f"{index + 1}."
+                f"{index + 1}; a file of several records is divided by `from_csv(split=…)`."
             )
         if not self.outputs:
             raise ValueError("outputs: must have at least one channel, got none.")
@@ -222,7 +185,15 @@ class Recording(Result):
         given = _checks.mapping("inputs", {} if inputs is None else inputs, "{'force': values}")
         return cls(time, dict(measured.items()), dict(given.items()), name or "recording")
 
+    @overload
     @classmethod
+    def from_csv(cls, path: str | Path, *, split: None = None, **arguments: Any) -> "Recording": ...
+
+    @overload
+    @classmethod
+    def from_csv(cls, path: str | Path, *, split: str, **arguments: Any) -> "list[Recording]": ...
+
+    @classmethod  # type: ignore[misc]
     def from_csv(
         cls,
         path: str | Path,
@@ -232,9 +203,13 @@ class Recording(Result):
         time: str | None = None,
         sampling_rate: float | None = None,
         units: Units | None = None,
+        missing: str | None = None,
+        split: str | None = None,
         name: str | None = None,
-    ) -> "Recording":
+    ) -> "Recording | list[Recording]":
         """Read a recording from a CSV file with a header line.
+
+        The header is the first line that contains all columns; lines before it are skipped.
 
         Parameters
         ----------
@@ -247,20 +222,26 @@ class Recording(Result):
             Sampling rate [Hz], if the file has no column of times.
         units : mapping of str to float or (from, to), optional
             Conversion of a channel (or of "time") by a factor or a pair of units such as ``("mm", "m")``.
+        missing : "drop" or "interpolate", optional
+            What to do with NaN and empty cells, which are refused by default: leave their rows out, or interpolate
+            linearly in time over at most three successive ones.
+        split : str, optional
+            Column of numbers or texts that distinguishes successive records, such as the drive frequency: each part in
+            which it is constant is a recording. `split` divides a recording by the steps of its drive.
         name : str, optional
             By default the file name without its extension.
 
         Returns
         -------
-        Recording
+        Recording, or list of Recording with `split`
 
         Raises
         ------
         FileNotFoundError
             If there is no such file.
         ValueError
-            As for `Recording`, and for a missing column, a cell that is not a number, both or neither of ``time`` and
-            ``sampling_rate``, an unknown unit.
+            As for `Recording`, and for a missing or repeated column, rows with other numbers of fields than the header,
+            a cell that is not a number, both or neither of ``time`` and ``sampling_rate``, an unknown unit.
 
         Examples
         --------
@@ -272,7 +253,24 @@ class Recording(Result):
         >>> run.name, round(float(run.outputs["x"].max()), 3)
         ('run', 0.025)
         """
-        return cls._from_file(read_csv, path, outputs, inputs, time, sampling_rate, units, name)
+        layout = Layout(
+            Path(path).name, outputs, {} if inputs is None else inputs, time, sampling_rate, units or {}, missing
+        )
+        name = name or Path(path).stem
+        if split is None:
+            return layout.recording(read_csv(path, layout.columns), name)
+        columns = read_csv(path, dict.fromkeys([*layout.columns, split]), split)
+        label = columns[split] if split in layout.columns else columns.pop(split)
+        if any(lost := [value != value for value in label]):
+            row = lost.index(True) + 1
+            raise ValueError(f"split: must be a column without empty cells, got {split!r}, empty in data row {row}.")
+        edges = [0, *(np.flatnonzero(label[1:] != label[:-1]) + 1).tolist(), label.size]
+        return [
+            layout.recording(
+                {c: values[first:last] for c, values in columns.items()}, f"{name} {i}: {split} {label[first]}"
+            )
+            for i, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True), 1)
+        ]
 
     @classmethod
     def from_npz(
@@ -284,13 +282,14 @@ class Recording(Result):
         time: str | None = None,
         sampling_rate: float | None = None,
         units: Units | None = None,
+        missing: str | None = None,
         name: str | None = None,
     ) -> "Recording":
         """Read a recording from the named arrays of an NPZ file.
 
         Parameters
         ----------
-        path, outputs, inputs, time, sampling_rate, units, name
+        path, outputs, inputs, time, sampling_rate, units, missing, name
             As for `from_csv`, with arrays in place of columns.
 
         Returns
@@ -302,7 +301,10 @@ class Recording(Result):
         FileNotFoundError, ValueError
             As for `from_csv`, and for an array of objects, which would have to be unpickled.
         """
-        return cls._from_file(read_npz, path, outputs, inputs, time, sampling_rate, units, name)
+        layout = Layout(
+            Path(path).name, outputs, {} if inputs is None else inputs, time, sampling_rate, units or {}, missing
+        )
+        return layout.recording(read_npz(path, layout.columns), name or Path(path).stem)
 
     @classmethod
     def from_mat(
@@ -314,13 +316,14 @@ class Recording(Result):
         time: str | None = None,
         sampling_rate: float | None = None,
         units: Units | None = None,
+        missing: str | None = None,
         name: str | None = None,
     ) -> "Recording":
         """Read a recording from the variables of a MAT file, version 5 or 7.3.
 
         Parameters
         ----------
-        path, outputs, inputs, time, sampling_rate, units, name
+        path, outputs, inputs, time, sampling_rate, units, missing, name
             As for `from_csv`, with variables in place of columns.
 
         Returns
@@ -332,41 +335,10 @@ class Recording(Result):
         FileNotFoundError, ValueError
             As for `from_csv`, and for a variable that is not a vector of real numbers.
         """
-        return cls._from_file(read_mat, path, outputs, inputs, time, sampling_rate, units, name)
-
-    @classmethod
-    def _from_file(
-        cls,
-        read: Callable[[str | Path, Iterable[str]], dict[str, np.ndarray]],
-        path: str | Path,
-        outputs: Mapping[str, str],
-        inputs: Mapping[str, str] | None,
-        time: str | None,
-        sampling_rate: float | None,
-        units: Units | None,
-        name: str | None,
-    ) -> "Recording":
-        example = "{'force': 'the column of the force'}"
-        _checks.mapping("outputs", outputs, example)
-        inputs, units = _checks.mapping("inputs", {} if inputs is None else inputs, example), units or {}
-        if (time is None) == (sampling_rate is None):
-            raise ValueError(f"time: must be given or sampling_rate, and not both, got {time!r} and {sampling_rate!r}.")
-        for key in units:
-            _checks.one_of("units", key, ("time", *outputs, *inputs))
-        wanted = dict.fromkeys([*([time] if time else []), *outputs.values(), *inputs.values()])
-        columns = read(path, wanted)
-
-        def channel(key: str, column: str) -> np.ndarray:
-            values = _checks.finite_vector(f"{key} (column {column!r} of {Path(path).name})", columns[column])
-            return convert(key, values, units[key]) if key in units else values
-
-        measured, given = ({key: channel(key, name) for key, name in kind.items()} for kind in (outputs, inputs))
-        if time:
-            seconds = channel("time", time)
-        else:
-            samples = next((values.size for values in (measured | given).values()), 0)
-            seconds = np.arange(samples) / _checks.positive("sampling_rate", sampling_rate)
-        return cls(seconds, measured, given, name or Path(path).stem)
+        layout = Layout(
+            Path(path).name, outputs, {} if inputs is None else inputs, time, sampling_rate, units or {}, missing
+        )
+        return layout.recording(read_mat(path, layout.columns), name or Path(path).stem)
 
     def between(self, start: float, stop: float) -> "Recording":
         """Return the part with start ≤ time ≤ stop.
@@ -391,8 +363,42 @@ class Recording(Result):
                 f"start, stop: must select at least two samples between {self.time[0]:g} and {self.time[-1]:g} s, got "
                 f"{start!r}, {stop!r}."
             )
-        outputs, inputs = ({key: values[keep] for key, values in kind.items()} for kind in (self.outputs, self.inputs))
-        return replace(self, time=self.time[keep], outputs=outputs, inputs=inputs)
+        return self._part(keep, self.name)
+
+    def split(self) -> "list[Recording]":
+        """Divide the recording at gaps and at steps of the frequency of the first input (or output, without inputs).
+
+        A gap is a step of time of more than a quarter of a period. The frequency steps where the period, between
+        upward crossings of the mean, changes by more than 0.1 % and eight standard errors.
+
+        Returns
+        -------
+        list of Recording
+            The parts of at least three cycles, in their order.
+
+        Raises
+        ------
+        ValueError
+            If no part has three cycles.
+
+        Examples
+        --------
+        >>> t = np.arange(0, 60, 0.01)
+        >>> force = np.where(t < 30, np.sin(2 * np.pi * t), np.sin(2 * np.pi * 1.5 * t))
+        >>> runs = bp.Recording.from_arrays(t, {"x": 0.1 * force}, {"force": force}, name="sweep").split()
+        >>> [f"{run.name}: {run.fold(32).frequency:.2f} Hz" for run in runs]
+        ['sweep 1: 1.00 Hz', 'sweep 2: 1.50 Hz']
+        """
+        found = parts(self.time, next(iter((self.inputs or self.outputs).values())))
+        if not found:
+            raise ValueError(f"recording: must have a part of at least three cycles, got none in {self.name!r}.")
+        if len(found) == 1:
+            return [self._part(found[0], self.name)]
+        return [self._part(own, f"{self.name} {i}") for i, own in enumerate(found, 1)]
+
+    def _part(self, samples: Any, name: str) -> "Recording":
+        outputs, inputs = ({key: v[samples] for key, v in kind.items()} for kind in (self.outputs, self.inputs))
+        return replace(self, time=self.time[samples], outputs=outputs, inputs=inputs, name=name)
 
     def fold(
         self,
@@ -423,7 +429,9 @@ class Recording(Result):
         samples : int
             Grid points per forcing period.
         frequency : float, optional
-            Exact forcing frequency [Hz]; by default it is estimated, with a standard error.
+            Exact forcing frequency [Hz]; by default it is estimated, with a standard error. A value that differs from
+            the estimate significantly (false-alarm rate 1e-4) and by a drift of more than one degree of phase over the
+            cycles used is refused.
         periods : int
             Forcing periods per response period.
         harmonics : int or mapping of str to int, optional
@@ -441,13 +449,19 @@ class Recording(Result):
         Returns
         -------
         Experiment
-            NOPE
+            The mean period on samples·periods grid points, and its uncertainty.
 
         Raises
         ------
         ValueError
-            For fewer than three cycles, a constant channel, a signal that is not periodic, more harmonics than the
-            samples resolve, an unknown channel in `harmonics`, a drift beyond the limit.
+            For fewer than three cycles, a constant channel, a signal that is not periodic, a gap of more than a quarter
+            of a period, a frequency that is not that of the recording, more harmonics than the samples resolve, an
+            unknown channel in `harmonics`, a drift beyond the limit.
+
+        Warns
+        -----
+        UserWarning
+            If the period drifts by more than noise explains, or not more than half of the cycles are used.
 
         Examples
         --------
@@ -462,7 +476,13 @@ class Recording(Result):
         periods, samples = _checks.integer("periods", periods, 1), _checks.integer("samples", samples, 4)
         channels = self.inputs | self.outputs
         signals = Signals(self.name, self.time, tuple(channels), np.stack([*channels.values()]), len(self.inputs))
-        folded = fold_signals(signals, samples, periods, frequency, harmonics, origin, largest_drift)
+        try:
+            folded = fold_signals(signals, samples, periods, frequency, harmonics, origin, largest_drift)
+        except np.linalg.LinAlgError:
+            raise ValueError(
+                f"recording: must have samples in all parts of its periods, got {self.name!r}, which has too few; "
+                "check the frequency and the gaps, or fold a part by `between` or `split`."
+            ) from None
         return Experiment(name or self.name, synthetic=self.synthetic, **folded)
 
     def __repr__(self) -> str:

@@ -477,6 +477,6 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
             raise ValueError(
                 f"experiment {e.name!r}: frequency_se must be > 0, got {e.frequency_se:g}; {model.name!r} is "
                 "autonomous, so that its measured frequency is data. Fold without `frequency`, which is then "
-                "estimated with its error, or give frequency_se."
+                "estimated with its error, or set Experiment(…, frequency_se=…)."
             )
     return result

@@ -4,6 +4,7 @@ Records are folded without an input.
 """
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -241,7 +242,10 @@ def usable(records: list[Record]) -> tuple[dict[str, bp.Experiment], dict[str, s
     settings: dict[str, Any] = {"harmonics": HARMONICS, "origin": "crossing", "largest_drift": LARGEST_DRIFT}
     for recording in (record.recording for record in records):
         try:
-            admitted[recording.name] = recording.fold(SAMPLES, **settings)
+            with warnings.catch_warnings():
+                # The number of cycles used is in the study's results.
+                warnings.filterwarnings("ignore", r".*: only the last \d+ of \d+ cycles are used")
+                admitted[recording.name] = recording.fold(SAMPLES, **settings)
         except ValueError as error:
             refused[recording.name] = str(error)
     return admitted, refused

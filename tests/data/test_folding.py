@@ -1,9 +1,13 @@
+import re
+import warnings
+
 import numpy as np
 import pytest
 from scipy import stats
 
 import bayesperiodic as bp
-from bayesperiodic.data import folding
+from bayesperiodic import _fourier
+from bayesperiodic.data import folding, harmonics
 from tests.known import NOISES, autoregressive, grid
 
 FREQUENCY = 2.317
@@ -47,8 +51,8 @@ def test_mean_period_is_exact_on_a_grid_incommensurate_with_the_sampling():
 
 def test_noise_free_input_ends_the_frequency_refinement(monkeypatch):
     """Its frequency is exact before a step is small compared with its standard error."""
-    calls, original = [], folding._linearised
-    monkeypatch.setattr(folding, "_linearised", lambda *given: calls.append(given) or original(*given))
+    calls, original = [], harmonics.fit_harmonics
+    monkeypatch.setattr(harmonics, "fit_harmonics", lambda *given: calls.append(given) or original(*given))
     time = np.arange(716) / (119.37 * 2.0)
     x, y = np.sin(4 * np.pi * time), np.cos(4 * np.pi * time) + 0.1 * np.random.default_rng(1).standard_normal(716)
     assert bp.Recording.from_arrays(time, {"y": y}, {"x": x}).fold(100).frequency == pytest.approx(2.0, rel=1e-12)
@@ -273,3 +277,157 @@ def test_drift_is_the_growth_of_the_fundamental_over_the_recording():
         grown.fold(64, largest_drift=0.1)
     with pytest.raises(ValueError, match="largest_drift: must be > 0, got 0.0"):
         grown.fold(64, largest_drift=0.0)
+
+
+def driven(cycles, noise, seed, per_cycle=50, kind="white"):
+    time, generator = np.arange(int(cycles * per_cycle)) / (per_cycle * FREQUENCY), np.random.default_rng(seed)
+    angle = 2 * np.pi * FREQUENCY * time
+    x = np.sin(angle) + 0.01 * generator.standard_normal(time.size)
+    y = np.cos(angle + 0.3) + 0.1 * np.cos(3 * angle) + noise * NOISES[kind](time, generator)
+    return bp.Recording.from_arrays(time, {"y": y}, {"x": x}, name="run")
+
+
+@pytest.mark.parametrize(
+    ("cycles", "error"),
+    [(6, 1e-3), (6, 0.3), (20, -3e-4), (40, 1e-4), (40, 1e-3), (40, -0.05), (150, 1e-3), (150, 0.3)],
+)
+def test_wrong_frequency_is_refused_with_both_values(cycles, error):
+    wrong = FREQUENCY * (1 + error)
+    with pytest.raises(
+        ValueError, match=r"frequency: must be that of the recording, .*; correct it, or leave"
+    ) as caught:
+        driven(cycles, 0.01, 1).fold(64, frequency=wrong)
+    estimate, se, given = map(
+        float, re.search(r"as ([\d.]+) Hz .*of (\S+) Hz, got ([\d.]+) Hz", str(caught.value)).groups()
+    )
+    assert abs(estimate - FREQUENCY) < 5 * se and given == pytest.approx(wrong, rel=1e-8)
+
+
+@pytest.mark.parametrize("error", [0.0, 1e-5])
+def test_frequency_that_is_right_or_negligibly_wrong_is_accepted_as_exact(error):
+    """Over 40 cycles a relative error of 1e-5 is 0.14° of phase."""
+    e = driven(40, 0.01, 1).fold(64, frequency=FREQUENCY * (1 + error))
+    assert (e.frequency, e.frequency_se) == (FREQUENCY * (1 + error), 0.0)
+
+
+def test_wrong_frequency_of_a_subharmonic_response_is_refused_in_forcing_periods():
+    time = np.arange(3000) / 100.3
+    x, y = np.cos(2 * np.pi * FREQUENCY * time), np.cos(np.pi * FREQUENCY * time) + np.sin(2 * np.pi * FREQUENCY * time)
+    recording = bp.Recording.from_arrays(time, {"y": y}, {"x": x})
+    assert recording.fold(50, periods=2, frequency=FREQUENCY).frequency == FREQUENCY
+    with pytest.raises(ValueError, match=r"estimated as 2\.317 Hz .*got 2\.319317 Hz"):
+        recording.fold(50, periods=2, frequency=1.001 * FREQUENCY)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [*NOISES])
+def test_right_frequency_is_accepted_and_the_standard_error_holds_under_noise_of_any_spectrum(kind):
+    """120 recordings: no false alarm of 1e-4 each (1 %), and few |z| > 3 (binomial at 0.3 %, 1e-4)."""
+    scores = []
+    for seed in range(120):
+        recording = driven(20, 0.3, seed, kind=kind)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*only the last")
+            assert recording.fold(64, frequency=FREQUENCY).frequency == FREQUENCY
+            e = recording.fold(64)
+        scores.append((e.frequency - FREQUENCY) / e.frequency_se)
+    assert np.count_nonzero(np.abs(scores) > 3.0) <= stats.binom.isf(1e-4, 120, 2 * stats.norm.sf(3.0))
+
+
+def drifting(change, cycles=40, noise=0.03):
+    """Return a motion whose period grows linearly by `change` over the recording."""
+    tau = np.arange(0, cycles, 0.02)
+    time = (tau + change * (tau**2 / (2 * cycles) - tau / 2)) / FREQUENCY
+    y = mean_period(2 * np.pi * tau) + noise * np.random.default_rng(0).standard_normal(tau.size)
+    return bp.Recording.from_arrays(time, {"y": y}, name="free")
+
+
+@pytest.mark.parametrize("change", [0.01, -0.01, 0.02])
+def test_drift_of_the_period_is_reported_with_a_warning(change):
+    """The drift over the K cycles used is K/40 of that over the recording."""
+    with pytest.warns(
+        UserWarning, match=r"free: the period changes by [+-]0\.\d+% over the \d+ cycles used \(of \d+\)"
+    ):
+        e = drifting(change).fold(64)
+    assert e.period_drift == pytest.approx(change * e.cycles / 40, rel=0.1)
+
+
+def test_constant_period_has_no_drift():
+    assert abs(drifting(0.0).fold(64).period_drift) < 2e-4
+
+
+def test_warning_if_only_the_later_part_of_a_recording_is_used():
+    time = np.arange(4000) / 100.0
+    y = np.where(time < 25.0, 3.0, 1.0) * np.cos(2 * np.pi * time) + 0.01 * np.random.default_rng(0).standard_normal(
+        4000
+    )
+    with pytest.warns(UserWarning, match=r"only the last 1\d of \d+ cycles are used"):
+        bp.Recording.from_arrays(time, {"y": y}).fold(64)
+
+
+@pytest.mark.parametrize(("first", "last"), [(300, 500), (1000, 1400), (2050, 2380), (2399, 2700)])
+def test_gap_is_refused_with_its_place(first, last):
+    time = np.arange(3000) / 100.0
+    keep = (np.arange(3000) < first) | (np.arange(3000) >= last)
+    recording = bp.Recording.from_arrays(time[keep], {"y": np.cos(4 * np.pi * time[keep])}, name="run")
+    message = (
+        rf"no gap longer than 0\.25 periods, got 'run' without samples from {time[first - 1]:g} to {time[last]:g} s"
+    )
+    with pytest.raises(ValueError, match=message):
+        recording.fold(64)
+    assert [round(part.fold(64).frequency, 6) for part in recording.split()] == [2.0] * len(recording.split())
+
+
+def test_lost_samples_of_less_than_a_quarter_period_do_no_harm():
+    time = np.arange(3000) / 100.0
+    keep = np.random.default_rng(0).uniform(size=3000) > 0.1
+    e = bp.Recording.from_arrays(time[keep], {"y": mean_period(2 * np.pi * time[keep])}).fold(64, harmonics=8)
+    assert e.outputs["y"] == pytest.approx(mean_period(2 * np.pi * grid(64)), abs=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1e-160, 1e160])
+def test_values_whose_squares_are_no_numbers_are_refused(scale):
+    time = np.arange(1000) / 100.0
+    with pytest.raises(ValueError, match=r"outputs\['y'\]: must be between 1e-100 and 1e\+100 in size, got up to 1e"):
+        bp.Recording.from_arrays(time, {"y": scale * np.cos(4 * np.pi * time)}).fold(64)
+
+
+def test_huge_grid_is_refused_before_it_is_allocated():
+    with pytest.raises(ValueError, match="samples: must be at most 500000 for 2 periods, got 1000000000"):
+        recording().fold(10**9, periods=2)
+
+
+@pytest.mark.parametrize("harmonics", [1, 2, 59, 400])
+def test_sums_and_series_at_any_times_are_those_of_the_definition(harmonics):
+    generator = np.random.default_rng(0)
+    phase, values = generator.uniform(-2.0, 3.0, 700), generator.standard_normal((2, 700))
+    amplitudes = generator.standard_normal((2, harmonics + 1)) + 1j * generator.standard_normal((2, harmonics + 1))
+    amplitudes[:, 0] = amplitudes[:, 0].real
+    waves = np.exp(2j * np.pi * phase[:, None] * np.arange(harmonics + 1))
+    assert _fourier.sums(values, phase, harmonics) == pytest.approx(values @ waves.conj(), abs=1e-9)
+    assert _fourier.at_times(amplitudes, phase) == pytest.approx((amplitudes @ waves.T).real, abs=1e-9)
+
+
+def test_work_is_linear_in_the_length_of_a_recording(monkeypatch):
+    """Samples that are fitted, per sample of the recording, over both tracking and refinement."""
+    sizes, original = [], harmonics.fit_harmonics
+    monkeypatch.setattr(
+        harmonics, "fit_harmonics", lambda time, *given: sizes.append(time.size) or original(time, *given)
+    )
+    for cycles in (100, 1600):
+        sizes.clear()
+        measured = driven(cycles, 0.1, 0, per_cycle=20)
+        measured.fold(64)
+        assert sum(sizes) < 30_000 + 5 * measured.time.size
+
+
+def test_standard_error_of_the_frequency_under_white_noise_is_that_of_cramer_and_rao_or_up_to_twice_as_large():
+    """It is the bound itself where slow noise is not the larger one, by chance in half of the recordings."""
+    time = np.arange(6000) / 50.0
+    bound = 0.2 / (2 * np.pi) * np.sqrt(24 / 6000) / 120.0
+    ratios = []
+    for seed in range(20):
+        y = np.cos(2 * np.pi * time) + 0.2 * np.random.default_rng(seed).standard_normal(6000)
+        ratios.append(bp.Recording.from_arrays(time, {"y": y}).fold(64).frequency_se / bound)
+    assert min(ratios) == pytest.approx(1.0, abs=0.04)
+    assert max(ratios) < 2.0

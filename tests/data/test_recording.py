@@ -1,3 +1,6 @@
+import csv as table_format
+import io
+
 import h5py
 import numpy as np
 import pandas as pd
@@ -6,6 +9,7 @@ import scipy.io
 import xarray as xr
 
 import bayesperiodic as bp
+from bayesperiodic.data import files
 
 TIME = np.arange(200) / 50
 FORCE, DISPLACEMENT = np.cos(TIME), 3.0 * np.sin(TIME)
@@ -176,3 +180,202 @@ def test_file_that_is_not_mat_is_rejected(csv):
 def test_lengths_must_agree():
     with pytest.raises(ValueError, match=r"outputs\['force'\]: must have 200 values .*got 199"):
         bp.Recording.from_arrays(TIME, {"force": FORCE[1:]})
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("more", [",", ",,", ", ,"])
+def test_trailing_commas_do_not_shift_columns(tmp_path, more):
+    path = write(tmp_path / "run.csv", f"x,F,note\n1,10,0{more}\n2,20,0{more}\n3,30,0{more}\n")
+    recording = bp.Recording.from_csv(path, sampling_rate=1.0, outputs={"x": "x"}, inputs={"F": "F"})
+    assert recording.outputs["x"].tolist() == [1.0, 2.0, 3.0]
+    assert recording.inputs["F"].tolist() == [10.0, 20.0, 30.0]
+
+
+@pytest.mark.parametrize("row", ["2,20,0,7", "2,20,0,,7", "2,20", "2,,20,0", "2"])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_rows_with_other_numbers_of_fields_are_refused(tmp_path, row, place):
+    rows = ["1,10,0", "3,30,0"]
+    rows.insert(place, row)
+    path = write(tmp_path / "run.csv", "\n".join(["x,F,note", *rows]))
+    with pytest.raises(ValueError, match=f"3 fields in each row, .*, got {row.count(',') + 1} in data row {place + 1}"):
+        bp.Recording.from_csv(path, sampling_rate=1.0, outputs={"x": "x"}, inputs={"F": "F"})
+
+
+def test_repeated_column_is_refused_only_where_it_is_used(tmp_path):
+    path = write(tmp_path / "run.csv", "x,F,x\n1,10,5\n2,20,6\n")
+    assert bp.Recording.from_csv(path, sampling_rate=1.0, outputs={"F": "F"}).outputs["F"].tolist() == [10.0, 20.0]
+    with pytest.raises(ValueError, match=r"must be the name of one column, got 'x', the name of 2 \(columns 1, 3\)"):
+        bp.Recording.from_csv(path, sampling_rate=1.0, outputs={"x": "x"})
+
+
+@pytest.mark.parametrize("text", ["x,F\n", "x,F", "x,F\n\n\n", "", "\n"])
+def test_file_without_data_is_refused(tmp_path, text):
+    path = write(tmp_path / "run.csv", text)
+    with pytest.raises(ValueError, match="path: must be a CSV file with (rows of data|a header line), got"):
+        bp.Recording.from_csv(path, sampling_rate=1.0, outputs={"x": "x"})
+
+
+def random_csv(seed):
+    """Return a table with its text: preamble, quoted texts, trailing commas, blank lines, any end of line."""
+    generator = np.random.default_rng(seed)
+    names = [*generator.permutation(["t", "x", "F [N]", "a, b", "note"])]
+    rows = int(generator.integers(2, 30))
+    table = {name: np.round(generator.standard_normal(rows) * 10.0 ** generator.integers(-9, 9), 12) for name in names}
+    table["t"] = np.arange(rows) / 7.0
+    table["note"] = generator.choice(["", "ok", "a, b", 'say "x"', "x,t"], rows)
+    text, end = io.StringIO(newline=""), str(generator.choice(["\n", "\r\n", "\r"]))
+    writer = table_format.writer(text, lineterminator=end)
+    for _ in range(int(generator.integers(0, 5))):
+        text.write(str(generator.choice(["# rig 3", "Date, 2026", "x", "", "a,b,c,d,e,f,g,h"])) + end)
+    more = [""] * int(generator.integers(0, 3))
+    writer.writerow([*names, *more * int(generator.integers(0, 2))])
+    for row in zip(*table.values(), strict=True):
+        writer.writerow([*(repr(float(v)) if not isinstance(v, str) else v for v in row), *more])
+        text.write(end * int(generator.uniform() < 0.1))
+    return table, text.getvalue(), end
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_columns_of_any_csv_file_are_read_exactly(tmp_path, seed):
+    table, text, _ = random_csv(seed)
+    path = tmp_path / "run.csv"
+    path.write_bytes((b"\xef\xbb\xbf" if seed % 2 else b"") + text.encode())
+    channels = {"outputs": {"x": "x", "b": "a, b"}, "inputs": {"force": "F [N]"}}
+    recording = bp.Recording.from_csv(path, time="t", **channels)
+    assert recording.time.tolist() == table["t"].tolist()
+    assert [*recording.outputs["x"]] == [*table["x"]] and [*recording.outputs["b"]] == [*table["a, b"]]
+    assert [*recording.inputs["force"]] == [*table["F [N]"]]
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_missing_or_additional_field_of_any_csv_file_is_refused(tmp_path, seed):
+    table, text, end = random_csv(seed)
+    lines, generator = text.split(end), np.random.default_rng(seed)
+    head = next(i for i, line in enumerate(lines) if "F [N]" in line)
+    row = generator.choice([i for i, line in enumerate(lines) if i > head and line])
+    fields = next(table_format.reader([lines[row]]))
+    place = int(generator.integers(0, 5))
+    changed = fields[:place] + fields[place + 1 :] if seed % 2 else [*fields[:place], "1.5", *fields[place:]]
+    buffer = io.StringIO(newline="")
+    table_format.writer(buffer, lineterminator="").writerow(changed)
+    lines[row] = buffer.getvalue()
+    path = tmp_path / "run.csv"
+    path.write_bytes(end.join(lines).encode())
+    with pytest.raises(ValueError):
+        bp.Recording.from_csv(path, time="t", outputs={"x": "x", "b": "a, b"}, inputs={"force": "F [N]"})
+
+
+def test_preamble_is_skipped(tmp_path):
+    path = write(tmp_path / "run.csv", 'Rig 3\nDate,2026-11-24\n\n"a, b"\nt,x\n0,1\n1,2\n')
+    assert bp.Recording.from_csv(path, time="t", outputs={"x": "x"}).outputs["x"].tolist() == [1.0, 2.0]
+
+
+def test_rows_with_nan_are_dropped_or_interpolated_by_request(csv, tmp_path):
+    for row, text in ((5, "nan"), (20, ""), (21, "NaN"), (0, "")):
+        rewrite(csv, row, "x", text)
+    with pytest.raises(
+        ValueError, match=r"got nan at index 0 \(4 of 200 values\); missing='drop' leaves such rows out"
+    ):
+        bp.Recording.from_csv(csv, time="t", **CHANNELS)
+    rest = np.delete(np.arange(200), [0, 5, 20, 21])
+    for arguments in ({"time": "t"}, {"sampling_rate": 50.0}):
+        dropped = bp.Recording.from_csv(csv, **arguments, **CHANNELS, missing="drop")
+        assert dropped.time == pytest.approx(TIME[rest]) and np.array_equal(dropped.outputs["force"], FORCE[rest])
+        filled = bp.Recording.from_csv(csv, **arguments, **CHANNELS, missing="interpolate")
+        assert filled.time == pytest.approx(TIME[1:])
+        middle = DISPLACEMENT[19] + (DISPLACEMENT[22] - DISPLACEMENT[19]) / 3
+        assert filled.inputs["displacement"][19] == pytest.approx(middle)
+    rewrite(csv, slice(30, 33), "x", "nan")
+    with pytest.raises(
+        ValueError, match="missing: must be 'drop' for column 'x' .* at most 3 successive values, and 4"
+    ):
+        bp.Recording.from_csv(csv, time="t", **CHANNELS, missing="interpolate")
+    with pytest.raises(ValueError, match="missing: must be one of 'drop', 'interpolate', got 'fill'"):
+        bp.Recording.from_csv(csv, time="t", **CHANNELS, missing="fill")
+    np.savez(tmp_path / "run.npz", t=TIME, x=np.where(TIME > 3.9, np.nan, TIME))
+    assert bp.Recording.from_npz(tmp_path / "run.npz", time="t", outputs={"x": "x"}, missing="drop").time[-1] <= 3.9
+
+
+STEPS = (1.5, 1.52, 1.8)
+
+
+def stepped(gap=0.0, restart=False):
+    time = np.arange(4000) / 100.0
+    parts, phase = [], 0.0
+    for i, frequency in enumerate(STEPS):
+        angle = 2 * np.pi * frequency * time + phase
+        phase = angle[-1] + 2 * np.pi * frequency / 100.0
+        start = 0.0 if restart else i * (40.0 + gap)
+        parts.append(pd.DataFrame({"t": start + time, "F": np.sin(angle), "x": np.cos(angle), "run": f"step {i}"}))
+    table = pd.concat(parts)
+    table[["F", "x"]] += 0.01 * np.random.default_rng(0).standard_normal((12_000, 2))
+    return table
+
+
+@pytest.mark.parametrize("gap", [0.0, 3.0])
+def test_split_at_steps_of_the_drive_and_at_gaps(gap):
+    table = stepped(gap)
+    whole = bp.Recording.from_arrays(table["t"], {"x": table["x"]}, {"F": table["F"]}, name="sweep")
+    runs = whole.split()
+    assert [run.name for run in runs] == ["sweep 1", "sweep 2", "sweep 3"]
+    assert [run.fold(64).frequency for run in runs] == pytest.approx(STEPS, rel=1e-4)
+    assert sum(run.time.size for run in runs) > 0.98 * 12_000
+    (same,) = runs[0].split()
+    assert same.name == "sweep 1" and same.time.size == runs[0].time.size
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_file_is_divided_by_a_column(tmp_path, restart):
+    path = tmp_path / "all.csv"
+    stepped(restart=restart).to_csv(path, index=False)
+    arguments = {"time": "t", "outputs": {"x": "x"}, "inputs": {"F": "F"}}
+    runs = bp.Recording.from_csv(path, **arguments, split="run")
+    assert [run.name for run in runs] == [f"all {i + 1}: run step {i}" for i in range(3)]
+    assert [run.fold(64).frequency for run in runs] == pytest.approx(STEPS, rel=1e-4)
+    assert [run.time.size for run in runs] == [4000] * 3
+    if restart:
+        with pytest.raises(ValueError, match=r"must increase, got 0 s after 39\.99 s .*from_csv.split=…."):
+            bp.Recording.from_csv(path, **arguments)
+    rewrite(path, 3, "run", "")
+    with pytest.raises(ValueError, match="split: must be a column without empty cells, got 'run', empty in data row 4"):
+        bp.Recording.from_csv(path, **arguments, split="run")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "9**9**9**9 * m",
+        "m**9**9",
+        "(9**9)**9",
+        "9⁹⁹⁹",
+        "m**99",
+        "(m)**9",
+        "__import__('os')",
+        "m" * 101,
+        "m//s",
+        "1e9 m",
+        "m(",
+    ],
+)
+def test_units_that_are_no_products_of_names_never_reach_an_evaluator(monkeypatch, text):
+    import pint
+
+    monkeypatch.setattr(pint, "UnitRegistry", None)
+    with pytest.raises(ValueError, match=r"units\['x'\]: must be units that are multiplied or divided, with exponents"):
+        files.convert("x", np.ones(2), (text, "m"))
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "factor"),
+    [
+        ("µm", "m", 1e-6), ("kg*m/s**2", "kN", 1e-3), ("N/(m/s)", "N s m⁻¹", 1.0), ("m/s²", "mm/s^2", 1e3),
+        ("1/s", "Hz", 1.0),        ("°", "rad", np.pi / 180), ("%", "", 0.01), ("kN·s/m", "N*s/m", 1e3),
+        ("V*Hz**-0.5", "mV/Hz**0.5", 1e3),
+    ],
+)  # fmt: skip
+def test_usual_units_are_converted(first, second, factor):
+    assert files.convert("x", np.ones(2), (first, second)) == pytest.approx(factor)

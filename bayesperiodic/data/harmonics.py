@@ -1,0 +1,233 @@
+"""Fourier series of sampled signals whose fundamental frequency is unknown: least-squares fits and frequencies."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.fft import next_fast_len
+from scipy.linalg import solve_toeplitz
+from scipy.stats import t as student
+
+from bayesperiodic import _fourier
+
+MAXIMUM_HARMONICS = 600
+SIGNIFICANT_POWER = 10.0
+MINIMUM_CYCLES = 3
+# Cycles of a stretch from which its frequency is tracked.
+TRACKED = 48
+# Deviations of the phase [cycles] below this are of no consequence; others count if they are not explained by noise.
+NEGLIGIBLE_PHASE, FALSE_ALARM_RATE = 1.0 / 360.0, 1e-4
+
+
+@dataclass(frozen=True)
+class HarmonicFit:
+    """A Fourier series fitted to several channels."""
+
+    frequency: float  # fundamental frequency [Hz]
+    amplitudes: np.ndarray  # complex, as in `_fourier`, with phases relative to time 0, (channels, harmonics + 1)
+    residuals: np.ndarray  # (channels, samples)
+
+    @cached_property
+    def variances(self) -> np.ndarray:
+        """Residual variance of each channel, (channels,)."""
+        degrees_of_freedom = max(self.residuals.shape[1] - (2 * self.amplitudes.shape[1] - 1), 1)
+        return np.einsum("ij,ij->i", self.residuals, self.residuals) / degrees_of_freedom
+
+
+def fit_harmonics(time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int) -> HarmonicFit:
+    """Fit harmonics 0 … `harmonics` of `frequency` to channels (channels, samples) by least squares.
+
+    The normal matrix of exp(2πi h f t), h = −H … H, is Hermitian Toeplitz, and well conditioned if the samples resolve
+    the highest harmonic.
+    """
+    phase = frequency * time
+    amplitudes = _solved(_moments(phase, harmonics), _fourier.sums(channels, phase, harmonics))
+    amplitudes[:, 1:] *= 2.0
+    return HarmonicFit(frequency, amplitudes, channels - _fourier.at_times(amplitudes, phase))
+
+
+def _moments(phase: np.ndarray, harmonics: int) -> np.ndarray:
+    return _fourier.sums(np.ones((1, phase.size)), phase, 2 * harmonics)[0]
+
+
+def _solved(moments: np.ndarray, sums: np.ndarray) -> np.ndarray:
+    """Return the coefficients (channels, H + 1) of harmonics 0 … H for the sums of signals with exp(−2πi h f t)."""
+    right = np.concatenate([np.conj(sums[:, :0:-1]), sums], axis=1).T
+    return solve_toeplitz((moments, np.conj(moments)), right)[sums.shape[1] - 1 :].T.copy()
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Uncertainty and steadiness of an estimated fundamental frequency."""
+
+    se: float  # standard error [Hz]
+    freedom: int  # its degrees of freedom
+    drift: float  # relative change of the frequency over the recording, by linear regression
+    drifts: bool  # the phase deviates from that of a constant frequency by more than noise and a negligible angle
+
+    def differs(self, difference: float, duration: float) -> bool:
+        """Return whether a frequency differs from the estimated one significantly, and by a phase that matters."""
+        significant = abs(difference) > self.se * student.isf(0.5 * FALSE_ALARM_RATE, self.freedom)
+        return bool(significant and abs(difference) * duration > NEGLIGIBLE_PHASE)
+
+
+def refine_frequency(
+    time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int, iterations: int = 20
+) -> tuple[HarmonicFit, Pace]:
+    """Return the fit at the least-squares frequency, and the uncertainty of that frequency.
+
+    Gauss-Newton iteration for the fundamental, with the amplitudes projected out and every channel weighted by its
+    residual variance. It ends where a step is small compared with the standard error.
+    """
+    refined = _refined(time, channels, frequency, harmonics, iterations)
+    return refined[0], _pace(time, *refined)
+
+
+def _refined(
+    time: np.ndarray, channels: np.ndarray, frequency: float, harmonics: int, iterations: int = 20
+) -> tuple[HarmonicFit, np.ndarray, np.ndarray, float]:
+    """Return the fit at the least-squares frequency, its clear harmonics, the weights, and the information."""
+    duration, middle = np.ptp(time), time - time.mean()
+    floor = 1e-24 * np.var(channels, axis=1)
+    for _ in range(iterations):
+        fit = fit_harmonics(time, channels, frequency, harmonics)
+        clear, weights = _clear(fit), 1.0 / np.maximum(fit.variances, floor)
+        slope = _fourier.at_times(_fourier.derivative(clear, 1.0), frequency * time)
+        slope *= middle
+        information = _information(frequency * time, slope, weights, harmonics)
+        step = float(weights @ np.einsum("ij,ij->i", slope, fit.residuals)) / information
+        if abs(step) < max(1e-3 / np.sqrt(information), np.finfo(float).eps * frequency):
+            break
+        frequency += np.clip(step, -0.25 / duration, 0.25 / duration)
+    return fit, clear, weights, information
+
+
+def _clear(fit: HarmonicFit) -> np.ndarray:
+    """Return the largest and the significant harmonics; noise in the others would count as information."""
+    noise = 4.0 * fit.variances[:, None] / fit.residuals.shape[1]
+    power = np.abs(fit.amplitudes) ** 2
+    largest = power[:, 1:].max(axis=1, keepdims=True)
+    return np.where((power > SIGNIFICANT_POWER * noise) | (power == largest), fit.amplitudes, 0.0)
+
+
+def _information(phase: np.ndarray, slope: np.ndarray, weights: np.ndarray, harmonics: int) -> float:
+    """Return Σ weight · ‖slope without its harmonics‖²."""
+    sums = _fourier.sums(slope, phase, harmonics)
+    inside = np.real(np.conj(sums) * _solved(_moments(phase, harmonics), sums)) @ np.r_[1.0, np.full(harmonics, 2.0)]
+    return float(weights @ (np.einsum("ij,ij->i", slope, slope) - inside))
+
+
+def _pace(time: np.ndarray, fit: HarmonicFit, clear: np.ndarray, weights: np.ndarray, information: float) -> Pace:
+    """Return the uncertainty and the drift of a frequency from the phases of single cycles.
+
+    Their deviations from a straight line are expanded in orthonormal polynomials. Order 1 is an error of the frequency,
+    order 2 a linear drift; the mean square of the next ones, K/4 of them for K cycles (4 to 16), measures noise that is
+    slow compared with a cycle (as U. K. Müller, J. Econometrics 141 (2007) 1331-1352, with cosines), and is at least
+    that of independent samples. With less than seven cycles, noise of the amplitude is taken to be as large.
+    """
+    cycle = np.floor((time - time[0]) * fit.frequency).astype(int)
+    rate = _fourier.derivative(clear, 1.0)
+    turned = (_fourier.at_times(r, fit.frequency * time) * fit.residuals for r in (rate, 1j * rate))
+    score, quadrature = (np.bincount(cycle, weights @ own) for own in turned)
+    if score.size < MINIMUM_CYCLES:
+        return Pace(float(np.sqrt(1.0 / information)), 0, 0.0, False)
+    own = time.size * float(weights @ np.sum(np.abs(rate) ** 2, axis=1)) / 2.0 / score.size
+    orders = min(max(score.size // 4, 4), 16, score.size - 3)
+    number = np.linspace(-1.0, 1.0, score.size)
+    basis = np.linalg.qr(np.polynomial.legendre.legvander(number, orders + 2))[0].T
+    phase, amplitude = basis @ score / own, basis @ quadrature / own
+    others = np.concatenate([phase[3:], amplitude[1:] if orders < 4 else []])
+    noise = max(float(np.sum(others**2)) / max(others.size, 1), 1.0 / own)
+    curvature = phase[2] * basis[2]
+    bend = float(np.ptp(curvature))
+    limit = student.isf(0.5 * FALSE_ALARM_RATE, others.size)
+    sign = float(np.sign(curvature[0] - curvature[score.size // 2]))
+    return Pace(
+        float(np.sqrt(noise * own / information)),
+        others.size,
+        8.0 * sign * bend * score.size / (score.size - 1) ** 2,
+        bool(bend > NEGLIGIBLE_PHASE and abs(phase[2]) > limit * np.sqrt(noise)),
+    )
+
+
+def guess_frequency(time: np.ndarray, channels: np.ndarray) -> float | None:
+    """Estimate the fundamental frequency [Hz] from the autocorrelation; None if it has no positive peak.
+
+    The lag is the smallest one whose peak reaches 90 % of the highest.
+    """
+    samples = time.size
+    length = next_fast_len(2 * samples, real=True)
+    step = (time[-1] - time[0]) / (samples - 1)
+    even = time[0] + step * np.arange(samples)
+    correlation = np.zeros(samples)
+    for values in channels:
+        signal = np.interp(even, time, values)
+        signal = (signal - signal.mean()) / signal.std()
+        power = np.abs(np.fft.rfft(signal, length)) ** 2
+        correlation += np.fft.irfft(power, length)[:samples] / np.arange(samples, 0, -1)
+    correlation = correlation[: samples // 3 + 2]
+    negative = np.flatnonzero(correlation < 0.5 * correlation[0])
+    if negative.size == 0:
+        return None
+    inside = correlation[1:-1]
+    peaks = 1 + np.flatnonzero((inside >= correlation[:-2]) & (inside > correlation[2:]))
+    peaks = peaks[(peaks > negative[0]) & (correlation[peaks] > 0.0)]
+    if peaks.size == 0:
+        return None
+    lag = peaks[np.flatnonzero(correlation[peaks] >= 0.9 * correlation[peaks].max())[0]]
+    left, top, right = correlation[lag - 1 : lag + 2]
+    bend = left - 2.0 * top + right
+    offset = 0.5 * (left - right) / bend if bend else 0.0
+    return _largest_equivalent(time, channels, 1.0 / ((lag + offset) * step))
+
+
+def _largest_equivalent(time: np.ndarray, channels: np.ndarray, frequency: float) -> float:
+    """Return the largest multiple of a frequency that explains the signals equally well."""
+    last = time >= time[-1] - 6.0 / frequency
+    time, channels = time[last], channels[:, last]
+    nyquist = 0.5 * (time.size - 1) / np.ptp(time)
+    top = min(0.95 * nyquist, MAXIMUM_HARMONICS * frequency)
+
+    def unexplained(candidate: float) -> float:
+        fit = fit_harmonics(time, channels, candidate, max(int(top / candidate), 1))
+        return float(np.max(fit.variances / np.var(channels, axis=1)))
+
+    reference = unexplained(frequency)
+    for factor in (5, 4, 3, 2):
+        candidate = factor * frequency
+        if candidate < top and reference < 0.5 and unexplained(candidate) <= 1.2 * reference + 1e-9:
+            return candidate
+    return frequency
+
+
+def track_frequency(time: np.ndarray, channels: np.ndarray, fundamental: float) -> float:
+    """Refine a frequency on the last few cycles, then on more and more of them, so that no cycle is miscounted.
+
+    The result is that of the later half. Of a long stretch every so many cycles are used.
+    """
+    cycles, total = float(MINIMUM_CYCLES), np.ptp(time) * fundamental
+    while True:
+        window = slice(np.searchsorted(time, time[-1] - cycles / fundamental), None)
+        few = min(10, resolved_harmonics(time[window], fundamental, time.size))
+        stride = int(np.ceil(cycles / TRACKED))
+        if stride > 1:
+            used = (time[-1] - time[window]) * fundamental % stride < 1.0
+            part, values = time[window][used], channels[:, window][:, used]
+        else:
+            part, values = time[window], channels[:, window]
+        fundamental = _refined(part, values, fundamental, few)[0].frequency
+        if cycles >= total / 2:
+            return fundamental
+        cycles = min(2 * cycles, total / 2)
+
+
+def resolved_harmonics(time: np.ndarray, fundamental: float, points: int) -> int:
+    """Return the highest harmonic that the samples and a grid resolve; raise a ValueError if there is none."""
+    per_cycle = (time.size - 1) / (np.ptp(time) * fundamental)
+    resolved = min(int((per_cycle - 1.0) / 2.0), _fourier.highest_harmonic(points), (time.size - 2) // 2)
+    if resolved < 1:
+        raise ValueError(
+            f"recording: must have at least 3 samples per cycle, to resolve the fundamental, got {per_cycle:.1f}; "
+            "sample faster, or check the frequency."
+        )
+    return resolved
