@@ -9,7 +9,7 @@ import numpy as np
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.models.model import Model, integrate
 from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
-from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, OTHER_ORBIT
+from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, as_guess, describe
@@ -147,7 +147,7 @@ def solve_periodic(
     *,
     frequency: float,
     samples: int = 800,
-    scheme: str | Scheme = "central2",
+    scheme: str | Scheme | None = None,
     periods: int = 1,
     winding: int | Mapping[str, int] = 0,
     guess: str | Mapping[str, np.ndarray] | PeriodicSolution = "static",
@@ -170,9 +170,11 @@ def solve_periodic(
         Forcing frequency [Hz]; for an autonomous model the first guess of the orbit's frequency.
     samples : int
         Grid points per forcing period.
-    scheme : str or Scheme
+    scheme : str or Scheme, optional
         "central2" (accurate for smooth responses), "backward2" (better where the response has kinks), "central4" or
-        "fourier" (collocation as in harmonic balance, the most accurate for smooth responses; few points suffice).
+        "fourier" (collocation as in harmonic balance, the most accurate for smooth responses; few points suffice). By
+        default "central4" for a model with a state of first order, whose even and odd points "central2" does not
+        relate, and "central2" for other models.
     periods : int
         Forcing periods per response period.
     winding : int or mapping of str to int
@@ -197,7 +199,7 @@ def solve_periodic(
     Warns
     -----
     UserWarning
-        If the transition of a smooth sign takes fewer than four steps of the grid.
+        If the transition of a smooth sign takes fewer than four steps of the grid, or if the status is "not resolved".
 
     References
     ----------
@@ -233,6 +235,14 @@ def solve_periodic(
     else:
         solved, found_by = solve_driven(equations, theta, guess)
     solution = describe(equations, theta, solved, found_by)
+    if solution.status == STATUSES[NOT_RESOLVED]:
+        warnings.warn(
+            f"The solution of {model.name!r} is not resolved: its values at even and odd points differ, or "
+            f"{solution.scheme.name!r} does not relate them. Take more samples than {samples}, an odd number of them, "
+            'or another scheme, such as "central4" or "backward2".',
+            UserWarning,
+            stacklevel=2,
+        )
     if solution.converged and (steps := _steps_of_transitions(equations, theta, solved.z)) < FEW_STEPS:
         warnings.warn(
             f"The transition of a smooth sign of {model.name!r} takes {steps:.2g} steps of the grid; "
@@ -277,6 +287,7 @@ def solve_from(
     first = None
     for name, route in routes.items():
         solved = route()
+        solved = solved and equations.checked(solved)
         if solved is not None and solved.code == CONVERGED:
             return solved, name
         first = first or solved
@@ -322,7 +333,7 @@ def solve_free(
     shorter = code == CONVERGED and orbits.has_shorter_period(found.z)
     if shorter or (code != NOT_FINITE and orbits.has_shrunk(found.z, z)):
         code = OTHER_ORBIT
-    return equations, found._replace(code=code), found_by
+    return equations, equations.checked(found._replace(code=code)), found_by
 
 
 def _steps_of_transitions(equations: PeriodicEquations, theta: np.ndarray, z: np.ndarray) -> float:

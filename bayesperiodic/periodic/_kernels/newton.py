@@ -21,6 +21,8 @@ BORDERED = globals().get("BORDERED", True)
 CHORD_RATE = 0.2
 ROUNDING = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
+DETERMINED, MAX_ROUNDED = 1e-6, 3  # largest step that ends the iteration at a residual at rounding level; trials of it
+JAGGED, ALTERNATING = 0.01, 0.9  # see `is_jagged`
 FAR = 0.3
 SMALLEST_PART = 1.0 / 256.0  # smallest step of a continuation from an anchor
 
@@ -155,8 +157,10 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     """Solve g(z, values) = 0 and the conditions of the unknowns in place; return status, iterations and orientation.
 
     An iteration ends the search when its step, or the next step expected from the observed rate, is below
-    `STEP_TOLERANCE`, or when the residual is at rounding level. The orientation is the sign of the determinant of the
-    bordered matrix at the last but one iterate, 0 without a border.
+    `STEP_TOLERANCE`, or when the residual is at rounding level and the next step would be below `DETERMINED`. If it is
+    not at `MAX_ROUNDED` iterates in a row, rounding hides whether there is a solution, and the status is "singular".
+    The orientation is the sign of the determinant of the bordered matrix at the last but one iterate, 0 without a
+    border.
 
     The setting holds the arguments where the unknowns are zero, except for the frequency. The values of the unknowns
     are overwritten; there are none unless `BORDERED`, and ∂g/∂z must then be regular. The border holds the rows and the
@@ -176,7 +180,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
         frequency = fill_setting(setting, unknowns, unknowns.values, inputs, parameters)
     differentiate(z, drift, grid, frequency, states)
     residual_jacobian(states, inputs, parameters, tau, frequency, columns)
-    previous = np.inf
+    previous, rounded = np.inf, 0
     for iteration in range(MAX_ITERATIONS):
         largest(z, amplitude)
         scales(columns, states, grid, amplitude, frequency, size, rounding)
@@ -184,7 +188,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
         if not np.isfinite(before):
             return NOT_FINITE, iteration, orientation
         if iteration == 0 and not BORDERED and norm(columns, rounding) <= 1.0 and np.all(amplitude > 0.0):
-            return CONVERGED, 0, orientation
+            rounded = 1
         for s in range(count):
             if amplitude[s] == 0.0:
                 amplitude[s] = 1.0
@@ -206,6 +210,10 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
         full = max(full, scaled_step(z, step))
         if full == np.inf:
             return SINGULAR, iteration, orientation
+        if rounded > 0 and full <= DETERMINED:
+            return CONVERGED, iteration, orientation
+        if rounded == MAX_ROUNDED:
+            return SINGULAR, iteration, orientation
         history[iteration, 0], history[iteration, 1] = before, full
         damping, accepted = 1.0, False
         for _ in range(halvings):
@@ -221,7 +229,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
                 residual_jacobian(states, inputs, parameters, tau, frequency, columns)
                 after = norm(columns, size)
                 accepted = after <= (1.0 - 1e-4 * damping) * before or full <= STEP_TOLERANCE
-                if accepted or (BORDERED and norm(columns, rounding) <= 1.0):
+                if accepted or norm(columns, rounding) <= 1.0:
                     accepted = True
                     break
             damping *= 0.5
@@ -231,11 +239,12 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
         copy(trial, z)
         for k in range(borders):
             unknowns.values[k] = values[k]
-        if full <= STEP_TOLERANCE or (damping == 1.0 and norm(columns, rounding) <= 1.0):
+        if full <= STEP_TOLERANCE:
             return CONVERGED, iteration + 1, orientation
         if damping == 1.0 and full < CHORD_RATE * previous < np.inf and full**2 <= STEP_TOLERANCE * previous:
             return CONVERGED, iteration + 1, orientation
         previous = full if damping == 1.0 else np.inf
+        rounded = rounded + 1 if damping == 1.0 and norm(columns, rounding) <= 1.0 else 0
     return STALLED, MAX_ITERATIONS, orientation
 
 
@@ -262,6 +271,40 @@ def is_far(z, predicted, anchor_z):
             low, high = min(low, anchor_z[i, s]), max(high, anchor_z[i, s])
         if off > FAR * (high - low) and off > FAR * change:
             return True
+    return False
+
+
+@njit(FLAG(MATRIX), **OPTIONS)
+def is_jagged(z):
+    """Return whether a state has energy at the grid's highest harmonics: its values alternate from point to point.
+
+    The binomial fourth difference over 16 passes the harmonic k of n points with a factor sin⁴(πk/n), 1 at the highest.
+    A state is jagged if its root mean square exceeds `JAGGED` of the state's standard deviation, and if most of it is
+    at the highest harmonics: the sixth difference over 64 keeps more than `ALTERNATING` of the energy. The spectrum of
+    a resolved state decreases, also at kinks, and its sixth differences keep less than the 0.83 of white noise.
+    """
+    points, last = z.shape[0], z.shape[0] - 1
+    fourth, sixth = np.empty(points), np.empty(points)
+    for s in range(STATES if STATES > 0 else z.shape[1]):
+        for i in range(2, points - 2):
+            fourth[i] = 6.0 * z[i, s] - 4.0 * (z[i - 1, s] + z[i + 1, s]) + z[i - 2, s] + z[i + 2, s]
+        for i in (0, 1, last - 1, last):
+            near, far = z[i - 1, s] + z[(i + 1) % points, s], z[i - 2, s] + z[(i + 2) % points, s]
+            fourth[i] = 6.0 * z[i, s] - 4.0 * near + far
+        for i in range(1, last):
+            sixth[i] = 2.0 * fourth[i] - fourth[i - 1] - fourth[i + 1]
+        for i in (0, last):
+            sixth[i] = 2.0 * fourth[i] - fourth[i - 1] - fourth[(i + 1) % points]
+        energy = dot(fourth, fourth)
+        if dot(sixth, sixth) > 16.0 * ALTERNATING * energy:
+            total, square, reached = 0.0, 0.0, 0.0
+            for i in range(points):
+                total += z[i, s] - z[0, s]
+                square += (z[i, s] - z[0, s]) ** 2
+                reached = max(reached, abs(z[i, s]))
+            variation = JAGGED**2 * (square - total**2 / points)
+            if energy > 256.0 * max(variation, points * (10.0 * STEP_TOLERANCE * reached) ** 2):
+                return True
     return False
 
 
