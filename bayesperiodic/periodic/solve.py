@@ -1,7 +1,7 @@
 """`solve_periodic`: find a periodic equilibrium state, with fallbacks."""
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -138,6 +138,7 @@ def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tupl
 
 GUESSES = ("static", "integration")
 FEW_STEPS = 4
+UNCERTAIN, SMALL_CHANGE = 0.3, 1e-6  # share of the range, of the largest value
 
 
 def solve_periodic(
@@ -199,7 +200,8 @@ def solve_periodic(
     Warns
     -----
     UserWarning
-        If the transition of a smooth sign takes fewer than four steps of the grid, or if the status is "not resolved".
+        If the transition of a smooth sign takes fewer than four steps of the grid, if the estimated discretisation
+        error of a state exceeds 30 % of its range, or if the status is "not resolved".
 
     References
     ----------
@@ -235,23 +237,40 @@ def solve_periodic(
     else:
         solved, found_by = solve_driven(equations, theta, guess)
     solution = describe(equations, theta, solved, found_by)
-    if solution.status == STATUSES[NOT_RESOLVED]:
-        warnings.warn(
-            f"The solution of {model.name!r} is not resolved: its values at even and odd points differ, or "
-            f"{solution.scheme.name!r} does not relate them. Take more samples than {samples}, an odd number of them, "
-            'or another scheme, such as "central4" or "backward2".',
-            UserWarning,
-            stacklevel=2,
-        )
-    if solution.converged and (steps := _steps_of_transitions(equations, theta, solved.z)) < FEW_STEPS:
-        warnings.warn(
-            f"The transition of a smooth sign of {model.name!r} takes {steps:.2g} steps of the grid; "
-            f"{int(np.ceil(samples * FEW_STEPS / steps))} samples would resolve it. With fewer, the error may be far "
-            "larger than error_estimate.",
-            UserWarning,
-            stacklevel=2,
-        )
+    for text in _solution_warnings(equations, theta, solution, solved.z):
+        warnings.warn(text, UserWarning, stacklevel=2)
     return solution
+
+
+def _solution_warnings(
+    equations: PeriodicEquations, theta: np.ndarray, solution: PeriodicSolution, z: np.ndarray
+) -> Iterator[str]:
+    """Yield the warnings about a solution: what the grid does not resolve."""
+    name, samples = solution.model, solution.samples
+    if solution.status == STATUSES[NOT_RESOLVED]:
+        yield (
+            f"The solution of {name!r} is not resolved: its values at even and odd points differ, or "
+            f"{solution.scheme.name!r} does not relate them. Take more samples than {samples}, an odd number of them, "
+            'or another scheme, such as "central4" or "backward2".'
+        )
+    if not solution.converged:
+        return
+    steps = _steps_of_transitions(equations, theta, z)
+    if steps < FEW_STEPS:
+        yield (
+            f"The transition of a smooth sign of {name!r} takes {steps:.2g} steps of the grid; "
+            f"{int(np.ceil(samples * FEW_STEPS / steps))} samples would resolve it. With fewer, the error may be far "
+            "larger than error_estimate."
+        )
+    errors = solution.error_estimate() if np.isfinite(solution.scheme.order) else {}
+    for (state, error), values in zip(errors.items(), z.T, strict=False):
+        if error > max(UNCERTAIN * np.ptp(values), SMALL_CHANGE * np.abs(values).max()):
+            yield (
+                f"The discretisation error of {state!r} is estimated at {error / np.ptp(values):.0%} of its range, so "
+                "that the grid determines the solution. At resonance without damping there is no periodic solution; "
+                f"add damping, change the frequency, or take more samples than {samples} or a scheme of higher order."
+            )
+            return
 
 
 def solve_driven(
