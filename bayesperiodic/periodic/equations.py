@@ -264,9 +264,10 @@ class PeriodicEquations:
 
     def checked(self, solved: Solved) -> Solved:
         """Return a solve, marked "not resolved" if it converged but its points alternate, or may do so."""
-        if solved.code == CONVERGED and (self.separated or self.kernels.is_jagged(np.ascontiguousarray(solved.z))):
-            return solved._replace(code=NOT_RESOLVED)
-        return solved
+        if solved.code != CONVERGED:
+            return solved
+        jagged = self.separated or self.kernels.is_jagged(np.ascontiguousarray(solved.z), self.inputs)
+        return solved._replace(code=NOT_RESOLVED) if jagged else solved
 
     def states(self, z: np.ndarray, drift: np.ndarray | None = None) -> np.ndarray:
         """Return q, q̇, q̈ side by side, (points, 3·states), from the periodic part."""

@@ -9,7 +9,7 @@ import bayesperiodic as bp
 from bayesperiodic.periodic.batch import Anchor, AutonomousBatch, Batch
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations
-from tests.known import CYCLE, grid
+from tests.known import CYCLE, SADDLE_NODE, grid
 
 
 def fitzhugh_nagumo(inputs=()):
@@ -145,7 +145,7 @@ def alternating(samples, part):
 def test_only_alternation_above_one_per_cent_is_unresolved(values, jagged):
     equations = PeriodicEquations.build(CYCLE, None, frequency=1.0, samples=len(values))
     z = np.stack([np.cos(2 * np.pi * grid(len(values))), values], axis=-1)
-    assert equations.kernels.is_jagged(z) == jagged
+    assert equations.kernels.is_jagged(z, equations.inputs) == jagged
 
 
 @pytest.mark.filterwarnings("ignore:The solution of:UserWarning")
@@ -158,21 +158,33 @@ def test_batches_have_the_status_of_single_solves(reference):
         z = np.stack(list(single.states.values()), axis=-1)
         batch = AutonomousBatch([equations], [Anchor(theta, z, single.frequency)])
         assert batch.solve(theta[None]).status[0, 0] == NOT_RESOLVED
-    flat = bp.Model(
-        "integrator",
-        states=["x"],
-        inputs=["u"],
-        parameters=["a"],
-        equations=lambda s, p, u: [p.a * s.ddx + s.x - u.u],
-        outputs=lambda s, p, u: {"x": s.x},
-    )
-    drive = alternating(100, 0.1)
+
+
+@pytest.mark.parametrize("scheme", ["central2", "central4", "fourier"])
+def test_alternation_between_two_branches_of_a_driven_model_is_unresolved_in_batches_too(scheme):
+    """ẋ = 1 − x² + u: near x = ±1 the rates vanish, as does the first difference of alternating values."""
+    drive = {"u": 0.1 * np.cos(2 * np.pi * grid(100))}
+    guess = {"x": (-1.0) ** np.arange(100)}
     with pytest.warns(UserWarning, match="is not resolved"):
-        single = bp.solve_periodic(flat, {"a": 1e-9}, {"u": drive}, frequency=1.0, samples=100)
-    equations = PeriodicEquations.build(flat, {"u": drive}, frequency=1.0, samples=100)
-    z = np.ascontiguousarray(single.states["x"][:, None])
-    status = Batch([equations], [Anchor.at(equations, np.array([1e-9]), z)]).solve(np.array([[1e-9]])).status
+        single = bp.solve_periodic(
+            SADDLE_NODE, {"a": 1.0}, drive, frequency=0.01, samples=100, scheme=scheme, guess=guess
+        )
+    equations = PeriodicEquations.build(SADDLE_NODE, drive, frequency=0.01, samples=100, scheme=scheme)
+    theta, z = np.ones(1), np.ascontiguousarray(single.states["x"][:, None])
+    status = Batch([equations], [Anchor.at(equations, theta, z)]).solve(theta[None]).status
     assert single.status == STATUSES[int(status[0, 0])] == "not resolved"
+
+
+def test_response_to_a_noisy_input_is_accepted():
+    """The noise of the displacement's derivative is at all harmonics, so that no grid would resolve the response."""
+    theta = {"Kx": 1.0, "K": 1.0, "F0": 0.0, "Kw": 1.0, "rho": 40.0}
+    noise = np.random.default_rng(0).standard_normal(200)
+    for size in (1e-5, 1e-4, 1e-3):
+        displacement = 0.1 * np.cos(2 * np.pi * grid(200)) + size * noise
+        solution = bp.solve_periodic(
+            bp.models.dahl, theta, {"displacement": displacement}, frequency=1.0, samples=200
+        )
+        assert solution.converged
 
 
 @pytest.mark.parametrize("scheme", ["central2", "central4", "backward2", "fourier"])

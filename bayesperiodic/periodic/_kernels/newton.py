@@ -22,7 +22,7 @@ CHORD_RATE = 0.2
 ROUNDING = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
 DETERMINED, MAX_ROUNDED = 1e-6, 3  # largest step that ends the iteration at a residual at rounding level; trials of it
-JAGGED, ALTERNATING = 0.01, 0.9  # see `is_jagged`
+JAGGED, ALTERNATING, ROUGH = 0.01, 0.9, 0.01  # see `is_jagged`
 FAR = 0.3
 SMALLEST_PART = 1.0 / 256.0  # smallest step of a continuation from an anchor
 
@@ -274,38 +274,57 @@ def is_far(z, predicted, anchor_z):
     return False
 
 
-@njit(FLAG(MATRIX), **OPTIONS)
-def is_jagged(z):
-    """Return whether a state has energy at the grid's highest harmonics: its values alternate from point to point.
+@njit(NUMBER(MATRIX, VECTOR, COUNT), **OPTIONS)
+def fourth_differences(z, fourth, s):
+    """Fill the cyclic fourth differences of column s of z, over 16; return the sum of their squares."""
+    last = z.shape[0] - 1
+    for i in range(2, last - 1):
+        near, far = z[i - 1, s] + z[i + 1, s], z[i - 2, s] + z[i + 2, s]
+        fourth[i] = 0.375 * z[i, s] - 0.25 * near + 0.0625 * far
+    for i in (0, 1, last - 1, last):
+        near, far = z[i - 1, s] + z[(i + 1) % z.shape[0], s], z[i - 2, s] + z[(i + 2) % z.shape[0], s]
+        fourth[i] = 0.375 * z[i, s] - 0.25 * near + 0.0625 * far
+    return dot(fourth, fourth)
 
-    The binomial fourth difference over 16 passes the harmonic k of n points with a factor sin⁴(πk/n), 1 at the highest.
-    A state is jagged if its root mean square exceeds `JAGGED` of the state's standard deviation, and if most of it is
-    at the highest harmonics: the sixth difference over 64 keeps more than `ALTERNATING` of the energy. The spectrum of
-    a resolved state decreases, also at kinks, and its sixth differences keep less than the 0.83 of white noise.
+
+@njit(FLAG(MATRIX, COUNT, NUMBER, NUMBER), **OPTIONS)
+def is_large(z, s, energy, share):
+    """Return whether an energy exceeds that of a share of the variation of column s of z, and its accuracy."""
+    total, square, reached = 0.0, 0.0, 0.0
+    for i in range(z.shape[0]):
+        total += z[i, s] - z[0, s]
+        square += (z[i, s] - z[0, s]) ** 2
+        reached = max(reached, abs(z[i, s]))
+    variation = share**2 * (square - total**2 / z.shape[0])
+    return energy > max(variation, z.shape[0] * (10.0 * STEP_TOLERANCE * reached) ** 2)
+
+
+@njit(FLAG(MATRIX, MATRIX), **OPTIONS)
+def is_jagged(z, inputs):
+    """Return whether a state has energy at the grid's highest harmonics that the inputs (points, 3·inputs) lack.
+
+    The values of such a state alternate from point to point. The binomial fourth difference over 16 passes the harmonic
+    k of n points with a factor sin⁴(πk/n), 1 at the highest. A state is jagged if its root mean square exceeds `JAGGED`
+    of the state's standard deviation, and if most of it is at the highest harmonics: the sixth difference over 64 keeps
+    more than `ALTERNATING` of the energy. The spectrum of a resolved state decreases, also at kinks, and its sixth
+    differences keep less than the 0.83 of white noise. Where an input or its derivatives have more than `ROUGH` at
+    high harmonics, such as noise, so has the response.
     """
-    points, last = z.shape[0], z.shape[0] - 1
+    points, last, jagged = z.shape[0], z.shape[0] - 1, False
     fourth, sixth = np.empty(points), np.empty(points)
     for s in range(STATES if STATES > 0 else z.shape[1]):
-        for i in range(2, points - 2):
-            fourth[i] = 6.0 * z[i, s] - 4.0 * (z[i - 1, s] + z[i + 1, s]) + z[i - 2, s] + z[i + 2, s]
-        for i in (0, 1, last - 1, last):
-            near, far = z[i - 1, s] + z[(i + 1) % points, s], z[i - 2, s] + z[(i + 2) % points, s]
-            fourth[i] = 6.0 * z[i, s] - 4.0 * near + far
+        energy = fourth_differences(z, fourth, s)
         for i in range(1, last):
-            sixth[i] = 2.0 * fourth[i] - fourth[i - 1] - fourth[i + 1]
+            sixth[i] = 0.5 * fourth[i] - 0.25 * (fourth[i - 1] + fourth[i + 1])
         for i in (0, last):
-            sixth[i] = 2.0 * fourth[i] - fourth[i - 1] - fourth[(i + 1) % points]
-        energy = dot(fourth, fourth)
-        if dot(sixth, sixth) > 16.0 * ALTERNATING * energy:
-            total, square, reached = 0.0, 0.0, 0.0
-            for i in range(points):
-                total += z[i, s] - z[0, s]
-                square += (z[i, s] - z[0, s]) ** 2
-                reached = max(reached, abs(z[i, s]))
-            variation = JAGGED**2 * (square - total**2 / points)
-            if energy > 256.0 * max(variation, points * (10.0 * STEP_TOLERANCE * reached) ** 2):
-                return True
-    return False
+            sixth[i] = 0.5 * fourth[i] - 0.25 * (fourth[i - 1] + fourth[(i + 1) % points])
+        if dot(sixth, sixth) > ALTERNATING * energy and is_large(z, s, energy, JAGGED):
+            jagged = True
+    if jagged:
+        for k in range(inputs.shape[1]):
+            if is_large(inputs, k, fourth_differences(inputs, fourth, k), ROUGH):
+                return False
+    return jagged
 
 
 @njit(COUNT(MATRIX, COUNT), **OPTIONS)
