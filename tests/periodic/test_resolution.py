@@ -181,9 +181,7 @@ def test_response_to_a_noisy_input_is_accepted():
     noise = np.random.default_rng(0).standard_normal(200)
     for size in (1e-5, 1e-4, 1e-3):
         displacement = 0.1 * np.cos(2 * np.pi * grid(200)) + size * noise
-        solution = bp.solve_periodic(
-            bp.models.dahl, theta, {"displacement": displacement}, frequency=1.0, samples=200
-        )
+        solution = bp.solve_periodic(bp.models.dahl, theta, {"displacement": displacement}, frequency=1.0, samples=200)
         assert solution.converged
 
 

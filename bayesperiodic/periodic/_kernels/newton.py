@@ -157,8 +157,9 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     """Solve g(z, values) = 0 and the conditions of the unknowns in place; return status, iterations and orientation.
 
     An iteration ends the search when its step, or the next step expected from the observed rate, is below
-    `STEP_TOLERANCE`, or when the residual is at rounding level and the next step would be below `DETERMINED`. If it is
-    not at `MAX_ROUNDED` iterates in a row, rounding hides whether there is a solution, and the status is "singular".
+    `STEP_TOLERANCE`, or when the residual is at rounding level and the next step would be below `DETERMINED` of the
+    largest values so far, which for a state of rest is the guess. If it is not at `MAX_ROUNDED` iterates in a row,
+    rounding hides whether there is a solution, and the status is "singular".
     The orientation is the sign of the determinant of the bordered matrix at the last but one iterate, 0 without a
     border.
 
@@ -180,7 +181,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
         frequency = fill_setting(setting, unknowns, unknowns.values, inputs, parameters)
     differentiate(z, drift, grid, frequency, states)
     residual_jacobian(states, inputs, parameters, tau, frequency, columns)
-    previous, rounded = np.inf, 0
+    previous, rounded, moved, reached = np.inf, 0, np.empty(count), np.zeros(count)
     for iteration in range(MAX_ITERATIONS):
         largest(z, amplitude)
         scales(columns, states, grid, amplitude, frequency, size, rounding)
@@ -190,6 +191,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
         if iteration == 0 and not BORDERED and norm(columns, rounding) <= 1.0 and np.all(amplitude > 0.0):
             rounded = 1
         for s in range(count):
+            reached[s] = max(reached[s], amplitude[s])
             if amplitude[s] == 0.0:
                 amplitude[s] = 1.0
         for i in range(points):
@@ -207,11 +209,16 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
             if not factorise(columns, grid, frequency, amplitude, factors):
                 return SINGULAR, iteration, orientation
             back_substitute(grid, factors, step)
+        settling = full
         full = max(full, scaled_step(z, step))
         if full == np.inf:
             return SINGULAR, iteration, orientation
-        if rounded > 0 and full <= DETERMINED:
-            return CONVERGED, iteration, orientation
+        if rounded > 0:
+            largest(step, moved)
+            for s in range(count):
+                settling = max(settling, moved[s] / reached[s] if moved[s] > 0.0 else 0.0)
+            if settling <= DETERMINED:
+                return CONVERGED, iteration, orientation
         if rounded == MAX_ROUNDED:
             return SINGULAR, iteration, orientation
         history[iteration, 0], history[iteration, 1] = before, full
