@@ -121,8 +121,10 @@ class Candidate(NamedTuple):
 def default_candidates(problem: Problem) -> list[Candidate]:
     """Return half, once and twice the frequency and the amplitude of runs spread over the frequencies.
 
-    These are all runs if some parameters are local.
+    These are all runs if some parameters are local; none for a free-running model, which has no drive to change.
     """
+    if problem.model.autonomous:
+        return []
     runs = sorted(problem.experiments, key=lambda e: e.frequency)
     most = len(runs) if any("[" in name for name in problem.names) else MOST_RUNS
     chosen = [runs[i] for i in sorted({round(k) for k in np.linspace(0, len(runs) - 1, most)})]

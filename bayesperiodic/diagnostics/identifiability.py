@@ -21,7 +21,7 @@ from bayesperiodic.estimation.profile import profile as profile_of
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
 from bayesperiodic.posterior.description import check_results
-from bayesperiodic.posterior.parameters import local_names
+from bayesperiodic.posterior.parameters import SHIFT, local_names
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
 from bayesperiodic.symmetry.determining import system_of, with_signs
@@ -236,7 +236,7 @@ def identifiability(
         The profiles of all parameters, True to compute them, False to omit them.
     candidates : iterable of (run, frequency [Hz], scale), optional
         Possible further experiments: the inputs of a run with scaled variation at another frequency. By default half,
-        once and twice the frequency and the amplitude of up to five runs.
+        once and twice the frequency and the amplitude of up to five runs; none for a free-running model.
 
     Returns
     -------
@@ -372,9 +372,12 @@ def _half_width(values: np.ndarray) -> np.ndarray:
 
 
 def _negative(problem: Problem, fit: MapEstimate, posterior: Posterior | None, name: str) -> tuple[float, float]:
-    """Return the probability that a parameter is negative, and its Monte Carlo error; NaN if it cannot be."""
+    """Return the probability that a parameter is negative, and its Monte Carlo error; NaN if it cannot be.
+
+    NaN for the delay of a free-running model too: its zero is that of an arbitrary phase.
+    """
     low, high = problem.joint_prior.supports[name]
-    if not low < 0.0 < high:
+    if not low < 0.0 < high or (problem.model.autonomous and name.partition("[")[0] == SHIFT):
         return np.nan, np.nan
     if posterior is None:
         freedom = min(fit.degrees_of_freedom[name], 1e9)
@@ -467,11 +470,12 @@ def _remedy(row: dict, name: str, directions: pd.DataFrame, experiments: pd.Data
     ranked = experiments.dropna(subset=[name]).sort_values(name)
     if len(ranked) and ranked.iloc[0][name] < 0.9:
         best = ranked.iloc[0]
+        drive = f" with {best['scale']:.3g} times its amplitude" if experiments["scale"].nunique() > 1 else ""
         return (
-            f"measure {best['run']} at {best['frequency']:.3g} Hz with {best['scale']:.3g} times its amplitude: "
-            f"this would leave {best[name]:.0%} of the sd"
+            f"measure {best['run']} at {best['frequency']:.3g} Hz{drive}: this would leave {best[name]:.0%} of the sd"
         )
-    return "report it with its prior, or fix it; no candidate experiment would reduce its sd by 10 %"
+    none = "no candidate experiment would reduce its sd by 10 %" if len(experiments) else "or measure another output"
+    return f"report it with its prior, or fix it; {none}"
 
 
 def _directions(information: Information) -> pd.DataFrame:

@@ -9,7 +9,9 @@ import numpy as np
 
 from bayesperiodic._parallel import available_cores, in_threads
 from bayesperiodic.periodic.compiled import (
+    CONVERGED,
     NO_FACTORS,
+    NOT_RESOLVED,
     Anchors,
     BatchSolution,
     Border,
@@ -224,6 +226,8 @@ class AutonomousBatch:
             follow_many(*before, *block, whole, workspace(first, bordered=True), solution)
 
         _in_blocks(part, every.shape[1], 1, threads)
+        if first.separated:
+            solution.status[solution.status == CONVERGED] = NOT_RESOLVED
         return solution
 
 

@@ -15,8 +15,8 @@ from numba import types
 
 from bayesperiodic.models.cache import load
 
-STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit")
-CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT = range(len(STATUSES))
+STATUSES = ("converged", "stalled", "singular", "not finite", "other orbit", "not resolved")
+CONVERGED, STALLED, SINGULAR, NOT_FINITE, OTHER_ORBIT, NOT_RESOLVED = range(len(STATUSES))
 MAX_SEGMENTS = 12
 NO_FACTORS = -1
 MAX_ITERATIONS = 50

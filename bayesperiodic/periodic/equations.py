@@ -12,11 +12,13 @@ from bayesperiodic import _checks, _fourier
 from bayesperiodic.models.code_generation import as_columns
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.compiled import (
+    CONVERGED,
     MAX_HALVINGS,
     MAX_ITERATIONS,
     MAX_SEGMENTS,
     NO_BORDER,
     NO_UNKNOWNS,
+    NOT_RESOLVED,
     Border,
     Factors,
     Functions,
@@ -25,7 +27,7 @@ from bayesperiodic.periodic.compiled import (
     Workspace,
     kernels,
 )
-from bayesperiodic.periodic.schemes import CyclicGrid, Scheme, find_scheme
+from bayesperiodic.periodic.schemes import CyclicGrid, Scheme, default_scheme, find_scheme
 
 
 class CyclicFactors:
@@ -162,13 +164,13 @@ class PeriodicEquations:
         *,
         frequency: float,
         samples: int,
-        scheme: str | Scheme = "central2",
+        scheme: str | Scheme | None = None,
         periods: int = 1,
         winding: int | Mapping[str, int] = 0,
     ) -> "PeriodicEquations":
         """Check the arguments and differentiate the inputs spectrally; see `solve.solve_periodic`."""
         frequency = _checks.positive("frequency", frequency)
-        grid = CyclicGrid(find_scheme(scheme), samples, periods)
+        grid = CyclicGrid(find_scheme(scheme or default_scheme(model)), samples, periods)
         if model.autonomous and grid.periods > 1:
             raise ValueError(
                 f"periods: must be 1, got {periods!r}; {model.name!r} is autonomous and has no forcing period. Give "
@@ -252,6 +254,20 @@ class PeriodicEquations:
             self.functions, self.grid.packed, self.setting(parameters), unknowns, border, MAX_HALVINGS, z, history, work
         )
         return Solved(z, code, history[:iterations], unknowns.values)
+
+    @cached_property
+    def separated(self) -> bool:
+        """True if even and odd points of an autonomous model are separate solutions, each of free phase."""
+        used = self.grid.offsets[self.grid.first != 0.0]
+        alone = self.model.autonomous and set(self.model.orders.values()) == {1} and self.grid.points % 2 == 0
+        return alone and bool(np.all(used % 2))
+
+    def checked(self, solved: Solved) -> Solved:
+        """Return a solve, marked "not resolved" if it converged but its points alternate, or may do so."""
+        if solved.code != CONVERGED:
+            return solved
+        jagged = self.separated or self.kernels.is_jagged(np.ascontiguousarray(solved.z), self.inputs)
+        return solved._replace(code=NOT_RESOLVED) if jagged else solved
 
     def states(self, z: np.ndarray, drift: np.ndarray | None = None) -> np.ndarray:
         """Return q, q̇, q̈ side by side, (points, 3·states), from the periodic part."""

@@ -124,7 +124,7 @@ def emerging_cycle(
     *,
     amplitude: Mapping[str, float],
     samples: int = 800,
-    scheme: str | Scheme = "central2",
+    scheme: str | Scheme | None = None,
 ) -> PeriodicSolution:
     """Step from a Hopf point onto the branch of cycles that starts there, stable or unstable.
 

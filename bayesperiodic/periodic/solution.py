@@ -121,8 +121,11 @@ class PeriodicSolution(Result):
     autonomous : bool
         True if the frequency is part of the solution.
     status : str
-        "converged", "stalled", "singular", "not finite" or "other orbit" (an equilibrium instead of an autonomous
-        model's orbit, or an orbit whose period is a fraction of the guess's).
+        "converged", "stalled", "singular", "not finite", "other orbit" (an equilibrium instead of an autonomous
+        model's orbit, or an orbit whose period is a fraction of the guess's) or "not resolved": the solution alternates
+        from point to point by more than 1 % of a state's standard deviation, which is the scheme's doing, or the scheme
+        does not relate even and odd points of an autonomous model ("central2", states of first order, an even grid).
+        More points or another scheme help.
     found_by : str
         "newton", "sharpness", "input amplitude" or "time integration", see `solve_periodic`.
     frequency : float
@@ -298,7 +301,7 @@ def describe(
     equations: PeriodicEquations, theta: np.ndarray, solved: Solved, found_by: str = NEWTON, sensitivities: bool = True
 ) -> PeriodicSolution:
     """Return the result of a solve as a PeriodicSolution, with sensitivities, if requested, where it converged."""
-    model, grid, code = equations.model, equations.grid, solved.code
+    model, grid, code = equations.model, equations.grid, equations.checked(solved).code
     by_output: dict[str, dict[str, np.ndarray]] = {}
     by_state: dict[str, dict[str, np.ndarray]] = {}
     by_parameter: dict[str, float] = {}

@@ -1,7 +1,7 @@
 """`solve_periodic`: find a periodic equilibrium state, with fallbacks."""
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.models.model import Model, integrate
 from bayesperiodic.periodic.arclength import INPUTS, ParametrisedEquations, solve_autonomous, trace
-from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, OTHER_ORBIT
+from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.periodic.equations import PeriodicEquations, Solved
 from bayesperiodic.periodic.schemes import Scheme
 from bayesperiodic.periodic.solution import NEWTON, PeriodicSolution, as_guess, describe
@@ -138,6 +138,7 @@ def measured_cycle(equations: PeriodicEquations, parameters: np.ndarray) -> tupl
 
 GUESSES = ("static", "integration")
 FEW_STEPS = 4
+UNCERTAIN, SMALL_CHANGE = 0.3, 1e-6  # share of the range, of the largest value
 
 
 def solve_periodic(
@@ -147,7 +148,7 @@ def solve_periodic(
     *,
     frequency: float,
     samples: int = 800,
-    scheme: str | Scheme = "central2",
+    scheme: str | Scheme | None = None,
     periods: int = 1,
     winding: int | Mapping[str, int] = 0,
     guess: str | Mapping[str, np.ndarray] | PeriodicSolution = "static",
@@ -170,9 +171,11 @@ def solve_periodic(
         Forcing frequency [Hz]; for an autonomous model the first guess of the orbit's frequency.
     samples : int
         Grid points per forcing period.
-    scheme : str or Scheme
+    scheme : str or Scheme, optional
         "central2" (accurate for smooth responses), "backward2" (better where the response has kinks), "central4" or
-        "fourier" (collocation as in harmonic balance, the most accurate for smooth responses; few points suffice).
+        "fourier" (collocation as in harmonic balance, the most accurate for smooth responses; few points suffice). By
+        default "central4" for a model with a state of first order, whose even and odd points "central2" does not
+        relate, and "central2" for other models.
     periods : int
         Forcing periods per response period.
     winding : int or mapping of str to int
@@ -197,7 +200,8 @@ def solve_periodic(
     Warns
     -----
     UserWarning
-        If the transition of a smooth sign takes fewer than four steps of the grid.
+        If the transition of a smooth sign takes fewer than four steps of the grid, if the estimated discretisation
+        error of a state exceeds 30 % of its range, or if the status is "not resolved".
 
     References
     ----------
@@ -233,15 +237,40 @@ def solve_periodic(
     else:
         solved, found_by = solve_driven(equations, theta, guess)
     solution = describe(equations, theta, solved, found_by)
-    if solution.converged and (steps := _steps_of_transitions(equations, theta, solved.z)) < FEW_STEPS:
-        warnings.warn(
-            f"The transition of a smooth sign of {model.name!r} takes {steps:.2g} steps of the grid; "
-            f"{int(np.ceil(samples * FEW_STEPS / steps))} samples would resolve it. With fewer, the error may be far "
-            "larger than error_estimate.",
-            UserWarning,
-            stacklevel=2,
-        )
+    for text in _solution_warnings(equations, theta, solution, solved.z):
+        warnings.warn(text, UserWarning, stacklevel=2)
     return solution
+
+
+def _solution_warnings(
+    equations: PeriodicEquations, theta: np.ndarray, solution: PeriodicSolution, z: np.ndarray
+) -> Iterator[str]:
+    """Yield the warnings about a solution: what the grid does not resolve."""
+    name, samples = solution.model, solution.samples
+    if solution.status == STATUSES[NOT_RESOLVED]:
+        yield (
+            f"The solution of {name!r} is not resolved: its values at even and odd points differ, or "
+            f"{solution.scheme.name!r} does not relate them. Take more samples than {samples}, an odd number of them, "
+            'or another scheme, such as "central4" or "backward2".'
+        )
+    if not solution.converged:
+        return
+    steps = _steps_of_transitions(equations, theta, z)
+    if steps < FEW_STEPS:
+        yield (
+            f"The transition of a smooth sign of {name!r} takes {steps:.2g} steps of the grid; "
+            f"{int(np.ceil(samples * FEW_STEPS / steps))} samples would resolve it. With fewer, the error may be far "
+            "larger than error_estimate."
+        )
+    errors = solution.error_estimate() if np.isfinite(solution.scheme.order) else {}
+    for (state, error), values in zip(errors.items(), z.T, strict=False):
+        if error > max(UNCERTAIN * np.ptp(values), SMALL_CHANGE * np.abs(values).max()):
+            yield (
+                f"The discretisation error of {state!r} is estimated at {error / np.ptp(values):.0%} of its range, so "
+                "that the grid determines the solution. At resonance without damping there is no periodic solution; "
+                f"add damping, change the frequency, or take more samples than {samples} or a scheme of higher order."
+            )
+            return
 
 
 def solve_driven(
@@ -277,6 +306,7 @@ def solve_from(
     first = None
     for name, route in routes.items():
         solved = route()
+        solved = solved and equations.checked(solved)
         if solved is not None and solved.code == CONVERGED:
             return solved, name
         first = first or solved
@@ -322,7 +352,7 @@ def solve_free(
     shorter = code == CONVERGED and orbits.has_shorter_period(found.z)
     if shorter or (code != NOT_FINITE and orbits.has_shrunk(found.z, z)):
         code = OTHER_ORBIT
-    return equations, found._replace(code=code), found_by
+    return equations, equations.checked(found._replace(code=code)), found_by
 
 
 def _steps_of_transitions(equations: PeriodicEquations, theta: np.ndarray, z: np.ndarray) -> float:

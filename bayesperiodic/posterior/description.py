@@ -14,7 +14,7 @@ from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.equations import PeriodicEquations
-from bayesperiodic.periodic.schemes import Scheme, find_scheme
+from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
 from bayesperiodic.posterior.joint_priors import JointPrior
 from bayesperiodic.posterior.likelihood import Likelihood
 from bayesperiodic.posterior.noise import EXPERIMENT, Noise, as_noise
@@ -39,12 +39,13 @@ class Description:
         tied: Mapping[str, str] | None = None,
         local: Iterable[str] = (),
         noise: str | Noise = "independent",
-        scheme: str | Scheme = "central2",
+        scheme: str | Scheme | None = None,
     ):
         if not isinstance(model, Model):
             raise ValueError(f"model: must be a Model, got {_checks.shortened(model)}.")
-        find_scheme(scheme)
-        self.model, self.scheme, self.noise = model, scheme, as_noise(noise)
+        self.model, self.noise = model, as_noise(noise)
+        self.scheme = scheme or default_scheme(model)
+        find_scheme(self.scheme)
         self.experiments = _checked_experiments(model, experiments)
         measured = {channel for experiment in self.experiments for channel in experiment.outputs}
         self.channels = tuple(channel for channel in model.outputs if channel in measured)

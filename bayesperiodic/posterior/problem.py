@@ -54,7 +54,7 @@ class Problem(Description):
         name, or by that of one experiment; an experiment may have a fixed value instead.
     noise : str or noise model
         "independent", "measured" or "circulant", or a model of `bayesperiodic.noise`.
-    scheme : str or Scheme
+    scheme : str or Scheme, optional
         See `solve_periodic`.
 
     Raises

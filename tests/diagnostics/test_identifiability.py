@@ -8,7 +8,7 @@ from bayesperiodic.diagnostics.design import Candidate, Information, _added, ran
 from bayesperiodic.diagnostics.identifiability import cumulative_jensen_shannon, structure_of
 from tests.known import GEAR, LINEAR, grid, linear_experiment, linear_regressors
 from tests.pendulum import PENDULUM
-from tests.problems import pendulum_run
+from tests.problems import cycle_run, pendulum_run
 from tests.sampling.test_targets import known, model, run
 
 QUIET = {"progress": False}
@@ -335,3 +335,15 @@ def test_structural_analysis_uses_ties_and_fixed_zeros():
     assert [s.parameters for s in loose.symmetries] == [("theta5", "theta15", "theta16", "theta17")]
     held = found(("theta5", "theta15", "theta16"), {"theta17": "-293*theta16/2"})
     assert not held.symmetries
+
+
+def test_free_running_model_gets_no_advice_about_a_drive_and_no_verdict_about_the_sign_of_its_phase():
+    problem = bp.Problem(
+        bp.models.van_der_pol, [cycle_run()], priors={"mu": bp.LogNormal(1.5, 0.3), "omega": bp.LogNormal(1.0, 1e-4)}
+    )
+    found = bp.identifiability(problem, bp.map_estimate(problem, **QUIET), profile=False)
+    phase = next(name for name in problem.names if name.startswith("shift"))
+    assert not len(found.experiments) and "sign" not in found.verdicts[phase]
+    assert np.isnan(found.table.loc[phase, "p_negative"])
+    assert found.verdicts["omega"] == "only with the prior"
+    assert found.table.loc["omega", "remedy"] == "report it with its prior, or fix it; or measure another output"

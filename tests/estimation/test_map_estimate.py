@@ -1,9 +1,12 @@
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import sympy as sp
 
 import bayesperiodic as bp
+from bayesperiodic.estimation.map_estimate import unit_error
 from bayesperiodic.estimation.result import of_periodogram
 from tests.known import LINEAR, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors, normal_posterior
 
@@ -154,3 +157,81 @@ def test_start_without_periodic_solution_is_refused():
         match=r"start: must have .*, got a = 1 \(the priors' medians\), where .* ended without the orbit of 'run'",
     ):
         bp.map_estimate(bp.Problem(RUNAWAY, [experiment], priors={"a": bp.LogNormal(1.0, 0.1)}))
+
+
+def test_noise_of_inputs_that_are_not_differentiated_is_called_so():
+    """Force = c·x + filtered x with one noisy harmonic of x: no derivative to measure, no harmonic to leave out."""
+    model = formula_model("spring", ["c"], lambda p, u, s: {"force": p.c * u.x + s.w})
+    wave = 2 * np.pi * grid(200)
+    filtered = np.real(np.exp(1j * (wave - 0.5 * np.pi)) / (1 + 2j * np.pi * 1.5))
+    noise = np.random.default_rng(9).standard_normal(200) * 0.02
+    experiment = bp.Experiment(
+        "run",
+        1.5,
+        {"force": 2 * np.sin(wave) + filtered + noise},
+        {"x": np.sin(wave)},
+        samples=200,
+        amplitude_variance={"x": np.array([0.0, 1e-3])},
+    )
+    with pytest.warns(UserWarning, match="noise of the measured inputs causes .*; average more cycles.$"):
+        bp.map_estimate(bp.Problem(model, [experiment], priors={"c": bp.Normal(0, 10)}))
+
+
+STIFFNESS = 900.0
+OSCILLATOR = {"m": 1.0, "c": 3.0, "k3": 0.0}
+
+
+def oscillation(frequency: float, length: float, *, samples: int = 64) -> bp.Experiment:
+    """Return the response of the linear oscillator (closed form) to 2 N near 4.8 Hz, in units of `length` [m]."""
+    omega, drive = 2 * np.pi * 4.5, 2.0 * np.exp(2j * np.pi * grid(samples))
+    x = np.real(drive / (STIFFNESS - omega**2 + 3j * omega)) / length
+    noise = 0.01 * np.std(x) * np.random.default_rng(1).standard_normal(samples)
+    return bp.Experiment("run", frequency, {"displacement": x + noise}, {"force": drive.real}, samples=samples)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "length", "sentence"),
+    [
+        (4.5, 1e-3, r"the measured amplitude of 'displacement' is 1e\+3 times that of the linearised model"),
+        (4.5e-3, 1.0, r"the measured frequency .Hz. is 1e-3 times that of the linearised model"),
+    ],
+    ids=["mm for m", "ms for s"],
+)
+def test_wrong_units_are_named_where_the_fit_fails(frequency, length, sentence):
+    problem = bp.Problem(
+        bp.models.duffing,
+        [oscillation(frequency, length)],
+        priors={"k": bp.LogNormal(STIFFNESS, 0.05)},
+        fixed=OSCILLATOR,
+    )
+    with pytest.warns(UserWarning) as caught:
+        bp.map_estimate(problem, progress=False)
+    texts = [str(one.message) for one in caught]
+    assert any(re.search(f"Check the units, such as mm for m or ms for s: .*{sentence}", text) for text in texts)
+
+
+def test_right_units_are_not_blamed():
+    problem = bp.Problem(
+        bp.models.duffing, [oscillation(4.5, 1.0)], priors={"k": bp.LogNormal(800.0, 0.2)}, fixed=OSCILLATOR
+    )
+    assert unit_error(problem) == ""
+    fit = bp.map_estimate(problem, progress=False)
+    assert fit.theta["k"] == pytest.approx(STIFFNESS, rel=0.01)
+
+
+def test_failed_start_compares_measured_and_modelled_sizes():
+    """ẋ = −a x + u with a = 2 rad/s has the amplitude |û/(a + iω)|; the density is not finite as k overflows."""
+    model = bp.Model(
+        "relaxation",
+        states=["x"],
+        inputs=["u"],
+        parameters=["a", "k"],
+        equations=lambda s, p, u: [s.dx + p.a * s.x - u.u],
+        outputs=lambda s, p, u: {"x": s.x, "big": sp.exp(p.k) * s.x},
+    )
+    wave = np.cos(2 * np.pi * grid(40))
+    experiment = bp.Experiment("run", 1.0, {"x": wave, "big": wave}, {"u": wave}, samples=40)
+    problem = bp.Problem(model, [experiment], priors={"k": bp.Normal(800.0, 1.0)}, fixed={"a": 2.0})
+    size = abs(1 / (2 + 2j * np.pi))
+    with pytest.raises(ValueError, match=f"frequency .Hz. 1 against 0.318, amplitude of 'x' 1 against {size:.3g}"):
+        bp.map_estimate(problem, progress=False)

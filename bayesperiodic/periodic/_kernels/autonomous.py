@@ -199,6 +199,8 @@ def follow_many(functions, grid, sets, orbits, parameters, start, stop, whole, w
                     functions, grid, setting, anchor, orientation, own, z, history, work
                 )
                 used += more
+            if code == CONVERGED and is_jagged(z, sets.inputs[e]):
+                code = NOT_RESOLVED
             lost = max(lost, code)
             scale_rates(sets.inputs[e], f / anchor[2], inputs)
             differentiate(z, sets.drift[e], grid, f, work.states)

@@ -209,6 +209,8 @@ def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop,
                 code == CONVERGED, z, history, work,
             )  # fmt: skip
             used += more
+        if code == CONVERGED and is_jagged(z, setting.inputs):
+            code = NOT_RESOLVED
         if rates:
             differentiate(z, setting.drift, grid, setting.frequency, states)
         else:

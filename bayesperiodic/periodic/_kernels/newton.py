@@ -21,6 +21,8 @@ BORDERED = globals().get("BORDERED", True)
 CHORD_RATE = 0.2
 ROUNDING = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
+DETERMINED, MAX_ROUNDED = 1e-6, 3  # largest step that ends the iteration at a residual at rounding level; trials of it
+JAGGED, ALTERNATING, ROUGH = 0.01, 0.9, 0.01  # see `is_jagged`
 FAR = 0.3
 SMALLEST_PART = 1.0 / 256.0  # smallest step of a continuation from an anchor
 
@@ -155,8 +157,11 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     """Solve g(z, values) = 0 and the conditions of the unknowns in place; return status, iterations and orientation.
 
     An iteration ends the search when its step, or the next step expected from the observed rate, is below
-    `STEP_TOLERANCE`, or when the residual is at rounding level. The orientation is the sign of the determinant of the
-    bordered matrix at the last but one iterate, 0 without a border.
+    `STEP_TOLERANCE`, or when the residual is at rounding level and the next step would be below `DETERMINED` of the
+    largest values so far, which for a state of rest is the guess. If it is not at `MAX_ROUNDED` iterates in a row,
+    rounding hides whether there is a solution, and the status is "singular".
+    The orientation is the sign of the determinant of the bordered matrix at the last but one iterate, 0 without a
+    border.
 
     The setting holds the arguments where the unknowns are zero, except for the frequency. The values of the unknowns
     are overwritten; there are none unless `BORDERED`, and ∂g/∂z must then be regular. The border holds the rows and the
@@ -176,7 +181,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
         frequency = fill_setting(setting, unknowns, unknowns.values, inputs, parameters)
     differentiate(z, drift, grid, frequency, states)
     residual_jacobian(states, inputs, parameters, tau, frequency, columns)
-    previous = np.inf
+    previous, rounded, moved, reached = np.inf, 0, np.empty(count), np.zeros(count)
     for iteration in range(MAX_ITERATIONS):
         largest(z, amplitude)
         scales(columns, states, grid, amplitude, frequency, size, rounding)
@@ -184,8 +189,9 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
         if not np.isfinite(before):
             return NOT_FINITE, iteration, orientation
         if iteration == 0 and not BORDERED and norm(columns, rounding) <= 1.0 and np.all(amplitude > 0.0):
-            return CONVERGED, 0, orientation
+            rounded = 1
         for s in range(count):
+            reached[s] = max(reached[s], amplitude[s])
             if amplitude[s] == 0.0:
                 amplitude[s] = 1.0
         for i in range(points):
@@ -203,8 +209,17 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
             if not factorise(columns, grid, frequency, amplitude, factors):
                 return SINGULAR, iteration, orientation
             back_substitute(grid, factors, step)
+        settling = full
         full = max(full, scaled_step(z, step))
         if full == np.inf:
+            return SINGULAR, iteration, orientation
+        if rounded > 0:
+            largest(step, moved)
+            for s in range(count):
+                settling = max(settling, moved[s] / reached[s] if moved[s] > 0.0 else 0.0)
+            if settling <= DETERMINED:
+                return CONVERGED, iteration, orientation
+        if rounded == MAX_ROUNDED:
             return SINGULAR, iteration, orientation
         history[iteration, 0], history[iteration, 1] = before, full
         damping, accepted = 1.0, False
@@ -221,7 +236,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
                 residual_jacobian(states, inputs, parameters, tau, frequency, columns)
                 after = norm(columns, size)
                 accepted = after <= (1.0 - 1e-4 * damping) * before or full <= STEP_TOLERANCE
-                if accepted or (BORDERED and norm(columns, rounding) <= 1.0):
+                if accepted or norm(columns, rounding) <= 1.0:
                     accepted = True
                     break
             damping *= 0.5
@@ -231,11 +246,12 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
         copy(trial, z)
         for k in range(borders):
             unknowns.values[k] = values[k]
-        if full <= STEP_TOLERANCE or (damping == 1.0 and norm(columns, rounding) <= 1.0):
+        if full <= STEP_TOLERANCE:
             return CONVERGED, iteration + 1, orientation
         if damping == 1.0 and full < CHORD_RATE * previous < np.inf and full**2 <= STEP_TOLERANCE * previous:
             return CONVERGED, iteration + 1, orientation
         previous = full if damping == 1.0 else np.inf
+        rounded = rounded + 1 if damping == 1.0 and norm(columns, rounding) <= 1.0 else 0
     return STALLED, MAX_ITERATIONS, orientation
 
 
@@ -263,6 +279,59 @@ def is_far(z, predicted, anchor_z):
         if off > FAR * (high - low) and off > FAR * change:
             return True
     return False
+
+
+@njit(NUMBER(MATRIX, VECTOR, COUNT), **OPTIONS)
+def fourth_differences(z, fourth, s):
+    """Fill the cyclic fourth differences of column s of z, over 16; return the sum of their squares."""
+    last = z.shape[0] - 1
+    for i in range(2, last - 1):
+        near, far = z[i - 1, s] + z[i + 1, s], z[i - 2, s] + z[i + 2, s]
+        fourth[i] = 0.375 * z[i, s] - 0.25 * near + 0.0625 * far
+    for i in (0, 1, last - 1, last):
+        near, far = z[i - 1, s] + z[(i + 1) % z.shape[0], s], z[i - 2, s] + z[(i + 2) % z.shape[0], s]
+        fourth[i] = 0.375 * z[i, s] - 0.25 * near + 0.0625 * far
+    return dot(fourth, fourth)
+
+
+@njit(FLAG(MATRIX, COUNT, NUMBER, NUMBER), **OPTIONS)
+def is_large(z, s, energy, share):
+    """Return whether an energy exceeds that of a share of the variation of column s of z, and its accuracy."""
+    total, square, reached = 0.0, 0.0, 0.0
+    for i in range(z.shape[0]):
+        total += z[i, s] - z[0, s]
+        square += (z[i, s] - z[0, s]) ** 2
+        reached = max(reached, abs(z[i, s]))
+    variation = share**2 * (square - total**2 / z.shape[0])
+    return energy > max(variation, z.shape[0] * (10.0 * STEP_TOLERANCE * reached) ** 2)
+
+
+@njit(FLAG(MATRIX, MATRIX), **OPTIONS)
+def is_jagged(z, inputs):
+    """Return whether a state has energy at the grid's highest harmonics that the inputs (points, 3·inputs) lack.
+
+    The values of such a state alternate from point to point. The binomial fourth difference over 16 passes the harmonic
+    k of n points with a factor sin⁴(πk/n), 1 at the highest. A state is jagged if its root mean square exceeds `JAGGED`
+    of the state's standard deviation, and if most of it is at the highest harmonics: the sixth difference over 64 keeps
+    more than `ALTERNATING` of the energy. The spectrum of a resolved state decreases, also at kinks, and its sixth
+    differences keep less than the 0.83 of white noise. Where an input or its derivatives have more than `ROUGH` at
+    high harmonics, such as noise, so has the response.
+    """
+    points, last, jagged = z.shape[0], z.shape[0] - 1, False
+    fourth, sixth = np.empty(points), np.empty(points)
+    for s in range(STATES if STATES > 0 else z.shape[1]):
+        energy = fourth_differences(z, fourth, s)
+        for i in range(1, last):
+            sixth[i] = 0.5 * fourth[i] - 0.25 * (fourth[i - 1] + fourth[i + 1])
+        for i in (0, last):
+            sixth[i] = 0.5 * fourth[i] - 0.25 * (fourth[i - 1] + fourth[(i + 1) % points])
+        if dot(sixth, sixth) > ALTERNATING * energy and is_large(z, s, energy, JAGGED):
+            jagged = True
+    if jagged:
+        for k in range(inputs.shape[1]):
+            if is_large(inputs, k, fourth_differences(inputs, fourth, k), ROUGH):
+                return False
+    return jagged
 
 
 @njit(COUNT(MATRIX, COUNT), **OPTIONS)
