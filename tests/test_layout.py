@@ -4,8 +4,9 @@ from statistics import median
 
 from tests import layout
 
-# The package had 25,000 lines when it was last shortened; the rest is room for statistics that were missing then.
-MOST_FILES, MOST_LINES, LONGEST_FILE = 100, 27_500, 600
+# The package had 25,000 lines when it was last shortened; the rest is room for the statistics and the checks of input
+# that were missing then.
+MOST_FILES, MOST_LINES, LONGEST_FILE = 105, 28_500, 600
 MOST_PARAMETERS = 8
 REASONS = {
     "Experiment": "one field per measured quantity; four are required, the rest are keywords with defaults",

@@ -58,6 +58,8 @@ class CyclicFactors:
         return self._substitute(kernels("batch", self._states, self._grid.stencil).solve_transposed, right)
 
     def _substitute(self, routine: Callable[..., None], right: np.ndarray) -> np.ndarray:
+        if not self.regular:
+            raise np.linalg.LinAlgError("∂g/∂z is singular")
         folded = self._fold(right)
         routine(self.band, self._lower, self._lower, self.pivots, folded)
         return self._unfold(folded).reshape(right.shape)

@@ -82,11 +82,12 @@ def test_predictive_multipliers_are_reported_without_rejecting_draws():
 
 
 def test_predictions_start_from_the_orbits_of_the_draws():
-    """With another guess in the problem the prediction stays on the rotation that was sampled."""
+    """With the problem anchored elsewhere the prediction stays on the rotation that was sampled."""
     problem = pendulum_problem([pendulum_run()])
     posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=250, progress=False)
     states = posterior.guesses(["rotation"], ["phi"])["rotation"]
     assert states["phi"][-1] - states["phi"][0] == pytest.approx(2 * np.pi, abs=0.2)
-    astray = pendulum_problem([pendulum_run(guess={"phi": rotation().states["phi"] + np.pi})])
+    middle = {name: float(np.median(posterior.draws(name))) for name in problem.names}
+    astray = problem.anchored(middle, {"rotation": {"phi": rotation().states["phi"] + np.pi}})
     median = bp.predict(astray, posterior, draws=20).median["rotation"]["rate"]
     assert median == pytest.approx(rotation().outputs["rate"], abs=0.5)
