@@ -34,6 +34,8 @@ SMALLEST_STEP, SIGNIFICANT = 1e-3, 8.0
 MINIMUM_PERIODICITY = 0.5
 # Difference of two phases [cycles] at the ends of a recording that selects other cycles.
 OTHER_CYCLES = 0.05
+# Distance of a cycle from the steady ones, in medians of their own, in harmonics and in the mean value.
+STEADY, STEADY_MEAN = 3.0, 12.0
 FALSE_ALARM_RATE = 0.01
 CROSSING = "crossing"
 
@@ -298,12 +300,17 @@ def _refuse_drift(name: str, drift: Mapping[str, float], largest: float | None) 
 
 
 def _steady_part(cycle: np.ndarray, shape: np.ndarray) -> np.ndarray:
-    """Return a mask of the last whole cycles, without the first ones if they differ from the later half."""
+    """Return a mask of the last whole cycles, without the first ones if they differ from the later half.
+
+    Mean values differ under noise slower than a cycle too, and are allowed a larger difference.
+    """
     total = len(shape)
     half = max(total // 2, MINIMUM_CYCLES)
     middle = np.median(shape[:half].real, axis=0) + 1j * np.median(shape[:half].imag, axis=0)
-    distance = np.max(np.sqrt(np.sum(np.abs(shape - middle) ** 2, axis=2)), axis=1)
-    settled = distance <= 3.0 * np.median(distance[:half]) + 1e-9
+    away, settled = np.abs(shape - middle) ** 2, np.ones(total, dtype=bool)
+    for squares, factor in ((away[:, :, 1:].sum(axis=2), STEADY), (away[:, :, 0], STEADY_MEAN)):
+        distance = np.sqrt(squares.max(axis=1))
+        settled &= distance <= factor * np.median(distance[:half]) + 1e-9
     used = total
     while used > MINIMUM_CYCLES and not settled[used - 1 - min(2, used - 1) : used].all():
         used -= 1
