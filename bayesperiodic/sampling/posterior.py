@@ -109,7 +109,7 @@ class Posterior(Result):
 
     @property
     def fingerprint(self) -> str:
-        """Digests of the problem, see `bayesperiodic.posterior.description.fingerprint`."""
+        """Digests of the parts of the problem (model, experiments, priors, constants, noise, scheme)."""
         return str(self.data.attrs.get("fingerprint", ""))
 
     def draws(self, name: str) -> np.ndarray:
