@@ -215,14 +215,14 @@ def identifiability(
        compromise, and its contraction means nothing. With draws, power-scaling confirms it or not.
     2. "sign undetermined": the size of a signed parameter is determined, but both signs have a probability above 2.5 %
        (by more than three Monte Carlo errors).
-    2. "several values": it would be "determined", but has another value, further away than a standard deviation, at
+    3. "several values": it would be "determined", but has another value, further away than a standard deviation, at
        another optimum with more than 1 % of the mass.
-    3. "only with the prior": the profile (Raue et al., Bioinformatics 25 (2009) 1923-1929) ends at the support of the
+    4. "only with the prior": the profile (Raue et al., Bioinformatics 25 (2009) 1923-1929) ends at the support of the
        prior on one side, although the parameter is not collinear with others.
-    4. "not determined": with all other parameters known, the data have less than 1 % of the information of the prior.
-    5. "only in combination": a structural symmetry of the equations contains the parameter, see `structure`.
-    6. "determined": with the other parameters unknown, the data alone leave less than a third of the prior sd.
-    7. "only in combination" if the other parameters increase its sd at least fivefold, otherwise "only with the prior".
+    5. "not determined": with all other parameters known, the data have less than 1 % of the information of the prior.
+    6. "only in combination": a structural symmetry of the equations contains the parameter, see `structure`.
+    7. "determined": with the other parameters unknown, the data alone leave less than a third of the prior sd.
+    8. "only in combination" if the other parameters increase its sd at least fivefold, otherwise "only with the prior".
 
     "not determined" replaces "determined" if an orbit of the estimate is not the measured one
     (`MapEstimate.other_orbits`).
