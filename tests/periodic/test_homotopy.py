@@ -1,5 +1,6 @@
 import re
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ import sympy as sp
 from scipy.integrate import solve_ivp
 
 import bayesperiodic as bp
+from bayesperiodic.periodic import solve
 from studies import shooting
 from tests.known import grid
 from tests.pendulum import PENDULUM
@@ -197,6 +199,16 @@ def test_warning_states_the_samples_that_resolve_a_narrow_transition(steps):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         switch(steps, int(samples) + 2)
+
+
+def test_a_transition_that_turns_back_before_the_sign_changes_counts():
+    """An argument that goes from 3 to 0.5 in one step would go from −1 to 1 in 0.8; above 1 nothing counts."""
+    for lowest, steps in ((0.5, 0.8), (1.5, np.inf)):
+        arguments = np.array([[3.0], [lowest], [3.0], [4.0]])
+        equations = SimpleNamespace(
+            model=SimpleNamespace(smooth_signs=("one",)), evaluate=lambda *_, values=arguments: values
+        )
+        assert solve._steps_of_transitions(equations, np.empty(0), np.empty(0)) == pytest.approx(steps)
 
 
 def test_resolved_transition_gives_no_warning():
