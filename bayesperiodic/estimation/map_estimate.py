@@ -2,9 +2,8 @@
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -36,9 +35,8 @@ from bayesperiodic.estimation.gauss_newton import (
 from bayesperiodic.estimation.laplace import COMBINED, SILENT, joint_laplace, undetermined
 from bayesperiodic.estimation.modes import default_starts, notable, weighed, with_images
 from bayesperiodic.estimation.result import MapEstimate, channel_whiteness, noise_split
+from bayesperiodic.estimation.units import compared_with_data, unit_error
 from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
-from bayesperiodic.periodic.equations import FREQUENCY
-from bayesperiodic.periodic.floquet import first_order_matrix
 from bayesperiodic.posterior.density import NATURAL, RIDGE, Linearisation, LogPosterior
 from bayesperiodic.posterior.description import fingerprint
 from bayesperiodic.posterior.initial import InitialEstimate, measured_orbits, simultaneous_fit
@@ -51,7 +49,6 @@ SHOWN = 3
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
 MOST_UNEXPLAINED = 0.5
-UNIT_DECADES = 2.0
 # Value of a field of MapEstimate that is computed at its first use.
 deferred: Any = partial
 
@@ -465,65 +462,3 @@ def _not_finite(problem: Problem, theta: np.ndarray, given_start: bool) -> str:
         f"start: must have a finite log-posterior, got {values}, where the periodic solve ended {ended}. Give {cures} "
         f"{compared_with_data(problem, theta)} {unit_error(problem, theta)}"
     ).rstrip()
-
-
-class Scales(NamedTuple):
-    """Frequency [Hz] and amplitudes by channel, measured and of the model linearised about its equilibrium."""
-
-    measured: dict[str, float]
-    modelled: dict[str, float]
-
-
-def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
-    """Return by experiment the measured and the modelled sizes at θ, where the linearised model has any.
-
-    The frequency of the model is that of the eigenvalue whose modulus is nearest to the measured frequency.
-    """
-    found = {}
-    for e in problem.experiments:
-        equations, parameters = problem.equations[e.name], problem.parameters(theta[None], e.name)[0]
-        measured, modelled = {FREQUENCY: e.frequency}, {}
-        with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
-            z = equations.static_guess(parameters)
-            columns = equations.residual_jacobian(z, parameters)
-            jacobian = columns[:1, equations.count :].reshape(1, equations.count, -1)
-            rates = np.linalg.eigvals(first_order_matrix(jacobian, tuple(problem.model.orders.values()))[0])
-            sizes = np.abs(rates[rates != 0.0]) / (2 * np.pi)
-            if sizes.size:
-                modelled[FREQUENCY] = float(sizes[np.argmin(np.abs(np.log(sizes / e.frequency)))])
-            if not problem.model.autonomous:
-                z = z - equations.factors(columns).solve(np.ascontiguousarray(columns[:, : equations.count]))
-                outputs = equations.outputs(z, parameters)
-                for channel, values in e.outputs.items():
-                    measured[channel] = 0.5 * float(np.ptp(values))
-                    modelled[channel] = 0.5 * float(np.ptp(outputs[:, problem.model.outputs.index(channel)]))
-        found[e.name] = Scales(measured, {name: size for name, size in modelled.items() if 0.0 < size < np.inf})
-    return found
-
-
-def _quantity(name: str) -> str:
-    return "frequency [Hz]" if name == FREQUENCY else f"amplitude of {name!r}"
-
-
-def compared_with_data(problem: Problem, theta: np.ndarray) -> str:
-    """Return a sentence that compares the frequency and the amplitudes of the data with those of the model at θ."""
-    lines = []
-    for run, (measured, modelled) in _scales(problem, theta).items():
-        parts = [f"{_quantity(name)} {measured[name]:.3g} against {size:.3g}" for name, size in modelled.items()]
-        lines += [f"{run!r}: {', '.join(parts)}"] if parts else []
-    more = f"; and {len(lines) - SHOWN} more" if len(lines) > SHOWN else ""
-    return f"Measured against the linearised model: {'; '.join(lines[:SHOWN])}{more}." if lines else ""
-
-
-def unit_error(problem: Problem, theta: np.ndarray | None = None) -> str:
-    """Return a sentence if data and model at θ, or at the medians, differ by powers of ten in every experiment."""
-    theta = problem.median() if theta is None else theta
-    found, texts = list(_scales(problem, theta).values()), []
-    for name in found[0].modelled if found else ():
-        ratios = [one.measured[name] / one.modelled[name] for one in found if name in one.modelled]
-        decades = np.log10(np.median(ratios)) if len(ratios) == len(found) and min(ratios) > 0.0 else 0.0
-        if abs(decades) >= UNIT_DECADES:
-            texts.append(f"the measured {_quantity(name)} is 1e{round(decades):+d} times that of the linearised model")
-    if not texts:
-        return ""
-    return f"Check the units, such as mm for m or ms for s: {'; '.join(texts)}."

@@ -6,8 +6,8 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
-from bayesperiodic.estimation.map_estimate import unit_error
 from bayesperiodic.estimation.result import of_periodogram
+from bayesperiodic.estimation.units import unit_error
 from tests.known import LINEAR, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors, normal_posterior
 
 TRUTH = np.array([900.0, 40.0, 25.0])

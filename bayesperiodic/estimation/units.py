@@ -1,0 +1,75 @@
+"""Hints where a fit fails: measured against modelled frequency and amplitude, and units as a likely cause."""
+
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+
+from bayesperiodic.periodic.equations import FREQUENCY
+from bayesperiodic.periodic.floquet import first_order_matrix
+from bayesperiodic.posterior.problem import Problem
+
+# Experiments named in a message, and the powers of ten that point to a unit.
+SHOWN, UNIT_DECADES = 3, 2.0
+
+
+class Scales(NamedTuple):
+    """Frequency [Hz] and amplitudes by channel, measured and of the model linearised about its equilibrium."""
+
+    measured: dict[str, float]
+    modelled: dict[str, float]
+
+
+def _scales(problem: Problem, theta: np.ndarray) -> dict[str, Scales]:
+    """Return by experiment the measured and the modelled sizes at θ, where the linearised model has any.
+
+    The frequency of the model is that of the eigenvalue whose modulus is nearest to the measured frequency.
+    """
+    found = {}
+    for e in problem.experiments:
+        equations, parameters = problem.equations[e.name], problem.parameters(theta[None], e.name)[0]
+        measured, modelled = {FREQUENCY: e.frequency}, {}
+        with np.errstate(all="ignore"), suppress(np.linalg.LinAlgError):
+            z = equations.static_guess(parameters)
+            columns = equations.residual_jacobian(z, parameters)
+            jacobian = columns[:1, equations.count :].reshape(1, equations.count, -1)
+            rates = np.linalg.eigvals(first_order_matrix(jacobian, tuple(problem.model.orders.values()))[0])
+            sizes = np.abs(rates[rates != 0.0]) / (2 * np.pi)
+            if sizes.size:
+                modelled[FREQUENCY] = float(sizes[np.argmin(np.abs(np.log(sizes / e.frequency)))])
+            if not problem.model.autonomous:
+                z = z - equations.factors(columns).solve(np.ascontiguousarray(columns[:, : equations.count]))
+                outputs = equations.outputs(z, parameters)
+                for channel, values in e.outputs.items():
+                    measured[channel] = 0.5 * float(np.ptp(values))
+                    modelled[channel] = 0.5 * float(np.ptp(outputs[:, problem.model.outputs.index(channel)]))
+        found[e.name] = Scales(measured, {name: size for name, size in modelled.items() if 0.0 < size < np.inf})
+    return found
+
+
+def _quantity(name: str) -> str:
+    return "frequency [Hz]" if name == FREQUENCY else f"amplitude of {name!r}"
+
+
+def compared_with_data(problem: Problem, theta: np.ndarray) -> str:
+    """Return a sentence that compares the frequency and the amplitudes of the data with those of the model at θ."""
+    lines = []
+    for run, (measured, modelled) in _scales(problem, theta).items():
+        parts = [f"{_quantity(name)} {measured[name]:.3g} against {size:.3g}" for name, size in modelled.items()]
+        lines += [f"{run!r}: {', '.join(parts)}"] if parts else []
+    more = f"; and {len(lines) - SHOWN} more" if len(lines) > SHOWN else ""
+    return f"Measured against the linearised model: {'; '.join(lines[:SHOWN])}{more}." if lines else ""
+
+
+def unit_error(problem: Problem, theta: np.ndarray | None = None) -> str:
+    """Return a sentence if data and model at θ, or at the medians, differ by powers of ten in every experiment."""
+    theta = problem.median() if theta is None else theta
+    found, texts = list(_scales(problem, theta).values()), []
+    for name in found[0].modelled if found else ():
+        ratios = [one.measured[name] / one.modelled[name] for one in found if name in one.modelled]
+        decades = np.log10(np.median(ratios)) if len(ratios) == len(found) and min(ratios) > 0.0 else 0.0
+        if abs(decades) >= UNIT_DECADES:
+            texts.append(f"the measured {_quantity(name)} is 1e{round(decades):+d} times that of the linearised model")
+    if not texts:
+        return ""
+    return f"Check the units, such as mm for m or ms for s: {'; '.join(texts)}."
