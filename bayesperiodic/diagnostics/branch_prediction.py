@@ -13,6 +13,7 @@ from bayesperiodic._io import Result
 from bayesperiodic.diagnostics.predictive import QUANTILES, draws_of
 from bayesperiodic.periodic.continuation import FOLD, Branch, continue_periodic
 from bayesperiodic.periodic.equations import FREQUENCY
+from bayesperiodic.posterior.description import check_results
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling.posterior import Posterior
 
@@ -190,8 +191,7 @@ def predict_branch(
     names = [e.name for e in problem.experiments]
     name = names[0] if experiment is None else experiment
     _checks.one_of("experiment", name, names)
-    every = (*problem.names, *problem.free_noise)
-    _checks.contains("posterior", posterior.names, every, "give draws of this problem, sample(problem, fit)")
+    check_results(problem, posterior=posterior)
     size = posterior.draws(problem.names[0]).size
     points, _ = draws_of(problem, posterior, np.linspace(0, size - 1, count).astype(int))
     guesses = posterior.guesses([*problem.observations], problem.model.states)

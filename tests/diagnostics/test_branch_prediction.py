@@ -85,6 +85,10 @@ def test_input_that_cannot_be_followed_is_refused():
     ):
         with pytest.raises(ValueError, match=text):
             bp.predict_branch(problem, posterior, progress=False, **arguments)
+    with pytest.raises(
+        ValueError, match="posterior: must be a result of this problem, got one of .* with other constants"
+    ):
+        bp.predict_branch(problem_of(0.5, 0.1), posterior, "frequency", until=0.2, progress=False)
     found = bp.predict_branch(problem, posterior, "force", until=2.0, draws=1, progress=False)
     with pytest.raises(ValueError, match="measure: must be one of"):
         found.band(measure="period")
