@@ -39,8 +39,9 @@ STEADY, STEADY_MEAN = 3.0, 12.0
 FALSE_ALARM_RATE = 0.01
 CROSSING = "crossing"
 
-# The spectrum of the noise: grid points a sample, and neighbouring lines on each side of a harmonic.
-FINENESS, NEIGHBOURS = 4, 16
+# The spectrum of the noise: grid points a sample, and a cycle if there are not many harmonics; neighbouring lines on
+# each side of a harmonic.
+FINENESS, FINEST, NEIGHBOURS = 4, 1 << 14, 16
 # Degrees of freedom of the variance of repeated errors, less than of any measured one.
 REPEATED_FREEDOM = 3.0
 # Lines from which frequency zero is extrapolated: for the kind of noise, and for the level of white and slow noise.
@@ -241,6 +242,15 @@ def _warn(name: str, pace: Pace, cycles: int, total: int) -> None:
             UserWarning,
             stacklevel=4,
         )
+    elif pace.wander:
+        warnings.warn(
+            f"{name}: the phase wanders irregularly by {360.0 * pace.wander:.2g}° of the response period over the "
+            f"{cycles} cycles used, while the amplitude is steadier. The mean period assumes a constant frequency: its "
+            "higher harmonics are smeared. Measure with a steadier clock or drive, or fold shorter parts with "
+            "`between`.",
+            UserWarning,
+            stacklevel=4,
+        )
     elif cycles < total and cycles <= total // 2:
         warnings.warn(
             f"{name}: only the last {cycles} of {total} cycles are used, because those before differ from them: a long "
@@ -351,20 +361,22 @@ def _noise(signals: Signals, fit: HarmonicFit, row: int, cycles: int) -> tuple[n
     """
     time, residuals = signals.time, fit.residuals[row]
     per_cycle = (time.size - 1) / (np.ptp(time) * fit.frequency)
-    # On a grid in phase, finer than the samples, the lines are those of a discrete Fourier transform at any sampling.
-    points = FINENESS * int(np.ceil(per_cycle - 1e-6))
-    place = np.minimum(np.rint((time - time[0]) * fit.frequency * points).astype(int), points * cycles - 1)
-    signal = np.bincount(place, residuals, points * cycles)
     harmonic = np.arange(fit.amplitudes.shape[1])
+    # On a grid in phase, finer than the samples or the harmonics, the lines are those of a discrete Fourier transform
+    # at any sampling.
+    grid = FINENESS * int(np.ceil(per_cycle - 1e-6))
+    points = min(grid, max(FINEST, 2 * FINENESS * harmonic.size))
+    phase = (time - time[0]) * fit.frequency
+    place = np.minimum(np.rint(phase * points).astype(int), points * cycles - 1)
+    signal = np.bincount(place, residuals, points * cycles)
     size = np.bincount(place // points, minlength=cycles)[:, None]
     deviation = np.fft.rfft(signal.reshape(cycles, points), axis=1)[:, harmonic] / size
-    power = np.abs(np.fft.rfft(signal) / time.size) ** 2
-    side = np.arange(1, np.clip(cycles // 4, min(4, cycles // 2), NEIGHBOURS) + 1)
-    near = power[np.abs(harmonic[:, None] * cycles + np.concatenate([side, -side]))].mean(axis=1)
-    freedom = np.full(harmonic.size, 4.0 * side.size)
-    lines = np.arange(1, power.size)
-    near[0], freedom[0] = _at_zero(power[lines[lines % cycles > 0][:LINES]])
-    repeated = _repeated_error(signals.values[row], residuals, fit.amplitudes[row], place % points, points)
+    sides = np.clip(cycles // 4, min(4, cycles // 2), NEIGHBOURS)
+    power = _between(signal.reshape(cycles, points)) / time.size**2
+    near = 0.5 * (power[:sides, harmonic] + power[:sides, -harmonic]).mean(axis=0)
+    freedom = np.full(harmonic.size, 4.0 * sides)
+    near[0], freedom[0] = _at_zero(power[:, : points // 2].T.ravel()[:LINES])
+    repeated = _repeated_error(signals.values[row], residuals, fit.amplitudes[row], phase, grid)
     # Satterthwaite; how the repeated error is distributed over the harmonics is hardly known.
     uncertain = near**2 / freedom + repeated**2 / REPEATED_FREEDOM
     total = np.divide((near + repeated) ** 2, uncertain, out=freedom.copy(), where=uncertain > 0.0)
@@ -374,12 +386,26 @@ def _noise(signals: Signals, fit: HarmonicFit, row: int, cycles: int) -> tuple[n
     return one_cycle, AmplitudeNoise(scale * near, total, freedom)
 
 
+def _between(signal: np.ndarray) -> np.ndarray:
+    """Return the power of lines s = 1, 2, … above the harmonics 0 … points − 1 of a signal (cycles, points).
+
+    By sums over the cycles first, so that the time does not depend on the prime factors of their number.
+    """
+    cycles, points = signal.shape
+    side = np.arange(1, min(cycles, LINES + 1))[:, None]
+    turn = 2.0 * np.pi / cycles * side * np.arange(cycles)
+    total = np.cos(turn) @ signal - 1j * (np.sin(turn) @ signal)
+    total *= np.exp(-2j * np.pi / (cycles * points) * side * np.arange(points))
+    return np.abs(np.fft.fft(total, axis=1)) ** 2
+
+
 def _repeated_error(
     values: np.ndarray, residuals: np.ndarray, amplitudes: np.ndarray, phase: np.ndarray, points: int
 ) -> float:
-    """Return the variance of the mean over a cycle due to repeated quantisation errors; `phase` are grid points."""
-    count = np.bincount(phase, minlength=points)
-    square = np.sum(residuals**2) - np.sum(np.bincount(phase, residuals, points) ** 2 / np.maximum(count, 1))
+    """Return the variance of the mean over a cycle due to repeated quantisation errors; `phase` is in cycles."""
+    place = np.rint(phase * points).astype(int) % points
+    count = np.bincount(place, minlength=points)
+    square = np.sum(residuals**2) - np.sum(np.bincount(place, residuals, points) ** 2 / np.maximum(count, 1))
     phases = np.count_nonzero(count)
     again = values.size - phases
     fitted = _fourier.on_grid(amplitudes, points)

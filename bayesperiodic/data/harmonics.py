@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 from scipy.fft import next_fast_len
 from scipy.linalg import solve_toeplitz
+from scipy.special import fdtri
 from scipy.stats import t as student
 
 from bayesperiodic import _fourier
@@ -64,6 +65,7 @@ class Pace:
     freedom: int  # its degrees of freedom
     drift: float  # relative change of the frequency over the recording, by linear regression
     drifts: bool  # the phase deviates from that of a constant frequency by more than noise and a negligible angle
+    wander: float = 0.0  # range of slow irregular phase deviations [cycles], 0 if not above those of the amplitude
 
     def differs(self, difference: float, duration: float) -> bool:
         """Return whether a frequency differs from the estimated one significantly, and by a phase that matters."""
@@ -138,6 +140,9 @@ def _pace(time: np.ndarray, fit: HarmonicFit, clear: np.ndarray, weights: np.nda
     phase, amplitude = basis @ score / own, basis @ quadrature / own
     others = np.concatenate([phase[3:], amplitude[1:] if orders < 4 else []])
     noise = max(float(np.sum(others**2)) / max(others.size, 1), 1.0 / own)
+    irregular = float(np.ptp(phase[3:] @ basis[3:]))
+    allowed = fdtri(orders, orders, 1.0 - FALSE_ALARM_RATE) * max(float(np.sum(amplitude[3:] ** 2)), orders / own)
+    wanders = orders >= 4 and irregular > NEGLIGIBLE_PHASE and float(np.sum(phase[3:] ** 2)) > allowed
     curvature = phase[2] * basis[2]
     bend = float(np.ptp(curvature))
     limit = student.isf(0.5 * FALSE_ALARM_RATE, others.size)
@@ -147,6 +152,7 @@ def _pace(time: np.ndarray, fit: HarmonicFit, clear: np.ndarray, weights: np.nda
         others.size,
         8.0 * sign * bend * score.size / (score.size - 1) ** 2,
         bool(bend > NEGLIGIBLE_PHASE and abs(phase[2]) > limit * np.sqrt(noise)),
+        irregular if wanders else 0.0,
     )
 
 

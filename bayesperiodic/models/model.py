@@ -1,5 +1,7 @@
 """Models: differential and output equations in symbolic form, and their time integration."""
 
+import inspect
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from functools import cache, cached_property
@@ -79,6 +81,11 @@ class Model:
         For names that are reserved, repeated or not identifiers, a number of equations different from that of the
         states, an expression with an unknown symbol or function, and a state without a derivative.
 
+    Warns
+    -----
+    UserWarning
+        If a parameter appears in no equation and no output.
+
     References
     ----------
     .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
@@ -128,7 +135,7 @@ class Model:
             Names("inputs", self.input_symbols),
         )
         written = _called("equations", equations, spaces)
-        if isinstance(written, sp.Basic | str):
+        if isinstance(written, sp.Basic | str) or not isinstance(written, Iterable):
             raise ValueError(f"equations: must return a list, one expression per state, got {written} alone.")
         self.equations = tuple(self._expression("equations", e) for e in written)
         if len(self.equations) != len(self.states):
@@ -141,6 +148,15 @@ class Model:
         self.output_expressions = tuple(self._expression("outputs", given[n]) for n in self.outputs)
         if not self.outputs:
             raise ValueError("outputs: must have at least one output, got none.")
+
+        used = _symbols((*self.equations, *self.output_expressions))
+        if unused := [n for n, symbol in self.parameter_symbols.items() if symbol not in used]:
+            warnings.warn(
+                f"parameters: no equation and no output of {self.name!r} contains {', '.join(map(repr, unused))}, so "
+                "that no data can determine the value; leave the name out, or check the equations.",
+                UserWarning,
+                stacklevel=2,
+            )
 
         self.angles = tuple(angles)
         for angle in self.angles:
@@ -304,6 +320,10 @@ def _called(argument: str, given: Any, spaces: tuple[Names, ...]) -> Any:
     """Return what the function of (s, p, u) returns, or `given` itself if it is no function."""
     if not callable(given):
         return given
+    try:
+        inspect.signature(given).bind(*spaces)
+    except TypeError as error:
+        raise ValueError(f"{argument}: must be a function of (s, p, u), got {given!r}: {error}.") from None
     try:
         return given(*spaces)
     except TypeError as error:

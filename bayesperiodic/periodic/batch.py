@@ -260,7 +260,7 @@ def smallest_singular_vectors(
     derivatives, scaled so that left · (∂g/∂z) · change is 1.
     """
     factors, amplitude = equations.factors(columns), np.abs(z).max(axis=0)
-    size, _ = equations.scales(z, columns)
+    size = equations.sizes(z, columns)
     units, terms = np.where(amplitude > 0, amplitude, 1.0), np.where(size > 0, size, 1.0)
     right = np.broadcast_to(units, z.shape)
     for _ in range(SWEEPS):

@@ -310,17 +310,19 @@ class PeriodicEquations:
         amplitude[amplitude == 0.0] = 1.0
         return self.kernels.factorise(columns, self.grid.packed, self.frequency, amplitude, factors)
 
-    def scales(self, z: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the size of each equation's terms, and the rounding error its residual cannot fall below."""
-        size, rounding = np.empty(self.count), np.empty(self.count)
-        amplitude = np.abs(z).max(axis=0)
-        self.kernels.scales(columns, self.states(z), self.grid.packed, amplitude, self.frequency, size, rounding)
-        return size, rounding
+    def sizes(self, z: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the size of each equation's terms."""
+        size, rounding = np.empty((2, self.count))
+        amplitude, weight = np.abs(z).max(axis=0), np.empty((self.count, self.count))
+        self.kernels.scales(
+            columns, self.states(z), self.grid.packed, amplitude, self.frequency, size, rounding, weight
+        )
+        return size
 
     def scaled_residual(self, z: np.ndarray, parameters: np.ndarray) -> float:
         """Return the largest residual in units of the size of its equation's terms."""
         columns = self.residual_jacobian(z, parameters)
-        size, _ = self.scales(z, columns)
+        size = self.sizes(z, columns)
         worst = np.abs(columns[:, : self.count]).max(axis=0)
         with np.errstate(invalid="ignore"):
             return float(np.max(np.divide(worst, size, out=np.zeros(self.count), where=size > 0)))

@@ -264,7 +264,8 @@ def _solution_warnings(
         )
     errors = solution.error_estimate() if np.isfinite(solution.scheme.order) else {}
     for (state, error), values in zip(errors.items(), z.T, strict=False):
-        if error > max(UNCERTAIN * np.ptp(values), SMALL_CHANGE * np.abs(values).max()):
+        reached = np.abs(values).max()
+        if reached > 0.0 and error > max(UNCERTAIN * np.ptp(values), SMALL_CHANGE * reached):
             yield (
                 f"The discretisation error of {state!r} is estimated at {error / np.ptp(values):.0%} of its range, so "
                 "that the grid determines the solution. At resonance without damping there is no periodic solution; "

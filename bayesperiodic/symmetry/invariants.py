@@ -112,22 +112,30 @@ def null_directions(system: System) -> list[tuple[dict[sp.Symbol, float], np.nda
         theta = random.uniform(0.5, 1.5, len(system.parameters))
         known = random.uniform(0.5, 1.5, len(system.known))
         try:
-            sensitivities = _sensitivities(system, theta, known, random)
+            sensitivities, size = _sensitivities(system, theta, known, random)
         except (TypeError, NameError, np.linalg.LinAlgError):
             return []
         if len(sensitivities) < len(theta):
             return []
-        _, size, directions = np.linalg.svd(sensitivities)
+        # Each parameter in the unit of its own effect, so that a large one does not hide the others.
+        unit = np.where(size > 0.0, size, 1.0)
+        _, singular, directions = np.linalg.svd(sensitivities / unit)
+        without = directions[np.count_nonzero(singular > ZERO * singular[0]) :] / unit
         values = dict(zip((*system.parameters.values(), *system.known.values()), [*theta, *known], strict=True))
-        found.append((values, directions[np.count_nonzero(size > ZERO * size[0]) :]))
+        found.append((values, np.linalg.qr(without.T)[0].T))
     return found
 
 
-def _sensitivities(system: System, theta: np.ndarray, known: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Return sensitivities to the logarithms of the parameters that changes of the states cannot compensate."""
+def _sensitivities(
+    system: System, theta: np.ndarray, known: np.ndarray, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return sensitivities to the logarithms of the parameters that changes of the states cannot compensate.
+
+    The second array (parameters,) is the largest sensitivity to each, what the states can compensate included.
+    """
     order, points = sum(system.orders.values()) + 1, 20 + 3 * len(theta)
     taylor = _motions(system, theta, known, order, points, random)
-    rows = []
+    rows, largest = [], np.zeros(len(theta))
     for values in taylor.transpose(1, 0, 3, 2).reshape(points, -1, taylor.shape[2]):
         if not np.all(np.isfinite(values)) or np.any(np.abs(values.imag) > 1e-12 * (1.0 + np.abs(values.real))):
             continue
@@ -138,7 +146,8 @@ def _sensitivities(system: System, theta: np.ndarray, known: np.ndarray, random:
         basis, singular, _ = np.linalg.svd(slopes[:, len(theta) :])
         rank = np.count_nonzero(singular > ZERO * max(singular, default=1.0))
         rows.append(basis[:, rank:].T @ slopes[:, : len(theta)])
-    return np.concatenate(rows) if rows else np.empty((0, len(theta)))
+        largest = np.maximum(largest, np.abs(slopes[:, : len(theta)]).max(axis=0, initial=0.0))
+    return (np.concatenate(rows) if rows else np.empty((0, len(theta)))), largest
 
 
 def _motions(

@@ -352,6 +352,43 @@ def test_drift_of_the_period_is_reported_with_a_warning(change):
     assert e.period_drift == pytest.approx(change * e.cycles / 40, rel=0.1)
 
 
+def wandering(size, seed, cycles=60):
+    """Return a motion in white noise whose phase is a random walk of so many cycles after one cycle."""
+    random = np.random.default_rng(seed)
+    phase = np.arange(0, cycles, 0.02)
+    phase += size * np.sqrt(0.02) * np.cumsum(random.standard_normal(phase.size))
+    y = mean_period(2 * np.pi * phase) + 0.01 * random.standard_normal(phase.size)
+    return bp.Recording.from_arrays(np.arange(phase.size) * 0.02 / FREQUENCY, {"y": y}, name="free")
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_irregular_phase_is_reported_with_a_warning(seed):
+    with pytest.warns(UserWarning, match=r"free: the phase wanders irregularly by [\d.e+]+° of the response period"):
+        wandering(0.005, seed).fold(64)
+
+
+@pytest.mark.parametrize("coefficient", [0.0, 0.9, 0.99, 0.999])
+def test_noise_is_no_irregular_phase(coefficient):
+    """At a false-alarm rate of 1e-4, one alarm in twenty recordings has probability 0.002."""
+    for seed in range(5):
+        random = np.random.default_rng(seed)
+        time = np.arange(3000) / (50 * FREQUENCY)
+        noise = 0.05 * autoregressive(coefficient)(time, random)
+        y = mean_period(2 * np.pi * FREQUENCY * time) + noise
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", ".*wanders")
+            bp.Recording.from_arrays(time, {"y": y}).fold(64)
+
+
+@pytest.mark.parametrize(("cycles", "points"), [(3, 12), (7, 20), (41, 16), (101, 12)])
+def test_lines_between_harmonics_are_those_of_the_fourier_transform(cycles, points):
+    signal = np.random.default_rng(1).standard_normal((cycles, points))
+    power = np.abs(np.fft.fft(signal.ravel())) ** 2
+    found = folding._between(signal)
+    for side in range(1, len(found) + 1):
+        np.testing.assert_allclose(found[side - 1], power[side::cycles], rtol=1e-9)
+
+
 def test_constant_period_has_no_drift():
     assert abs(drifting(0.0).fold(64).period_drift) < 2e-4
 

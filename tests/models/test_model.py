@@ -155,3 +155,28 @@ def test_smooth_sign_and_absolute_value_have_the_stated_width():
     assert float(sp.diff(bp.smooth_abs(x, 0.2), x, 2).subs(x, 0)) == pytest.approx(5)
     with pytest.raises(ValueError, match="width: must be .*got -1"):
         bp.smooth_sign(x, -1)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"equations": lambda s: [s.dx]},
+        {"equations": lambda s, p, u, t: [s.dx]},
+        {"outputs": lambda s, p: {"x": s.x}},
+    ],
+)
+def test_functions_of_other_arguments_are_refused(changed):
+    given = {"equations": lambda s, p, u: [s.dx], "outputs": lambda s, p, u: {"x": s.x}} | changed
+    with pytest.raises(ValueError, match=rf"{next(iter(changed))}: must be a function of \(s, p, u\), got"):
+        bp.Model("m", states=["x"], parameters=[], **given)
+
+
+@pytest.mark.parametrize("written", [None, 5])
+def test_equations_that_are_no_list_are_refused(written):
+    with pytest.raises(ValueError, match=f"equations: must return a list, one expression per state, got {written}"):
+        bp.Model("m", states=["x"], parameters=[], equations=lambda s, p, u: written, outputs={"x": "x"})
+
+
+def test_parameter_in_no_equation_is_named_in_a_warning():
+    with pytest.warns(UserWarning, match="no equation and no output of 'm' contains 'b', 'd', so that no data"):
+        bp.Model("m", states=["x"], parameters=["a", "b", "c", "d"], equations=["dx + a*x"], outputs={"x": "c*x"})

@@ -202,6 +202,85 @@ def test_model_without_periodic_solution_does_not_converge(sharpness, scheme):
     assert solution.status in ("singular", "stalled", "not finite")
 
 
+@pytest.mark.parametrize("scheme", ["central2", "central4", "backward2", "fourier"])
+@pytest.mark.parametrize(
+    "force",
+    [
+        lambda x: sp.exp(x),
+        lambda x: 1 + sp.tanh(x),
+        lambda x: sp.log(1 + sp.exp(x)),
+        lambda x: 2 + sp.atan(x),
+        lambda x: 1 / (3 + x),
+        lambda x: sp.exp(-(x**2)),
+    ],
+)
+def test_restoring_force_of_one_sign_holds_no_periodic_solution(force, scheme):
+    """The means of ẍ, ẋ and of the drive are zero, that of the force is not; it vanishes as x tends to ±∞."""
+    model = bp.Model(
+        "escaping",
+        states=["x"],
+        inputs=["u"],
+        parameters=["c"],
+        equations=lambda s, p, u: [s.ddx + p.c * s.dx + force(s.x) - u.u],
+        outputs=lambda s, p, u: {"x": s.x},
+    )
+    drive = np.cos(2 * np.pi * grid(200))
+    solution = bp.solve_periodic(model, {"c": 0.1}, {"u": drive}, frequency=1.0, samples=200, scheme=scheme)
+    assert solution.status in ("singular", "stalled", "not finite")
+
+
+def chain(masses):
+    """Return three masses in a row, the outer ones driven oppositely, or the first with the middle one fixed."""
+    own = lambda s, p, x, sign, u: s["dd" + x] + p.c * s["d" + x] + s[x] ** 3 - sign * u.u  # noqa: E731
+    equations = {
+        1: lambda s, p, u: [own(s, p, "a", 1, u) + 2 * p.k * s.a],
+        3: lambda s, p, u: [
+            own(s, p, "a", 1, u) + p.k * (2 * s.a - s.b),
+            s.ddb + p.c * s.db + p.k * (3 * s.b - s.a - s.d),
+            own(s, p, "d", -1, u) + p.k * (2 * s.d - s.b),
+        ],
+    }
+    return bp.Model(
+        "chain",
+        states=["a", "b", "d"][:masses],
+        inputs=["u"],
+        parameters=["c", "k"],
+        equations=equations[masses],
+        outputs=lambda s, p, u: {"a": s.a},
+    )
+
+
+@pytest.mark.parametrize("scheme", ["central2", "central4", "backward2", "fourier"])
+@pytest.mark.parametrize("stiffness", [1.0, 3.7, 100.3])
+def test_mass_that_symmetry_keeps_at_rest_does_not_prevent_convergence(stiffness, scheme):
+    """The middle of a symmetric chain whose ends are driven oppositely; its ends move like a mass on fixed springs."""
+    drive = np.cos(2 * np.pi * grid(200)) + 0.3 * np.cos(4 * np.pi * grid(200) + 0.7)
+    whole, part = (
+        bp.solve_periodic(
+            chain(masses), {"c": 0.1, "k": stiffness}, {"u": drive}, frequency=0.237, samples=200, scheme=scheme
+        )
+        for masses in (3, 1)
+    )
+    assert whole.status == part.status == "converged"
+    np.testing.assert_allclose(whole.states["a"], part.states["a"], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(whole.states["d"], -part.states["a"], rtol=1e-7, atol=1e-9)
+    assert np.abs(whole.states["b"]).max() < 1e-9
+
+
+def test_density_of_a_chain_with_a_mass_at_rest_is_that_of_half_the_chain():
+    drive = np.cos(2 * np.pi * grid(100))
+    y = 0.4 * np.cos(2 * np.pi * grid(100) - 0.3) + 0.01 * np.random.default_rng(3).standard_normal(100)
+    data = bp.Experiment("synthetic", frequency=0.237, inputs={"u": drive}, outputs={"a": y}, samples=100)
+    priors = {"c": bp.LogNormal(0.1, 1.0), "k": bp.LogNormal(1.0, 1.0)}
+    points = np.array([[0.1, 1.0], [0.2, 0.9], [0.05, 3.0], [0.3, 2.0]])
+    whole, half = (
+        bp.Problem(chain(masses), [data], priors=priors).log_posterior(points, np.full((4, 1), 1e-4))
+        for masses in (3, 1)
+    )
+    assert np.isfinite(half).all()
+    np.testing.assert_allclose(whole, half, rtol=1e-7)
+
+
 @pytest.mark.parametrize("scheme", ["central2", "central4", "backward2"])
 def test_undamped_resonance_is_singular_or_said_to_depend_on_the_grid(scheme):
     force = np.cos(2 * np.pi * grid(200))

@@ -501,3 +501,17 @@ def test_error_names_the_bad_argument():
         bp.structure(bp.models.pendulum, fixed=["mass"])
     with pytest.raises(ValueError, match="fixed: must not be zero if the equations divide by it, got m = 0"):
         bp.structure(bp.models.pendulum, fixed={"m": 0.0})
+
+
+@pytest.mark.parametrize("power", [3, 99])
+def test_large_effect_of_one_parameter_does_not_hide_the_others(power):
+    """The coefficients c, k and (1 + a)**power of x, ẋ and x³ are determined, and with them a."""
+    model = small(
+        ["x"],
+        ["c", "k", "a"],
+        lambda s, p, u: [s.ddx + p.c * s.dx + p.k * s.x + (1 + p.a) ** power * s.x**3 - u.u],
+        lambda s, p, u: {"x": s.x},
+    )
+    found = bp.structure(model)
+    assert found.complete and found.rank == 3
+    assert set(found.table["verdict"]) == {"determined"}

@@ -22,6 +22,7 @@ CHORD_RATE = 0.2
 ROUNDING = 4.0 * np.finfo(float).eps
 SCALE_POINTS = 200
 DETERMINED, MAX_ROUNDED = 1e-6, 3  # largest step that ends the iteration at a residual at rounding level; trials of it
+UNDETERMINED, RESTING = 0.1, 1e-8  # see `ending` and `find_resting`
 JAGGED, ALTERNATING, ROUGH = 0.01, 0.9, 0.01  # see `is_jagged`
 FAR = 0.3
 SMALLEST_PART = 1.0 / 256.0  # smallest step of a continuation from an anchor
@@ -61,11 +62,12 @@ def differentiate(z, drift, grid, frequency, states):
             states[i, 2 * count + s] = acceleration * squared
 
 
-@njit(types.void(MATRIX, MATRIX, GRID, VECTOR, NUMBER, VECTOR, VECTOR), **OPTIONS)
-def scales(columns, states, grid, amplitude, frequency, size, rounding):
+@njit(types.void(MATRIX, MATRIX, GRID, VECTOR, NUMBER, VECTOR, VECTOR, MATRIX), **OPTIONS)
+def scales(columns, states, grid, amplitude, frequency, size, rounding, weight):
     """Fill, for each equation, the size of its terms and the rounding error that its residual cannot fall below.
 
-    About `SCALE_POINTS` points are used, all of them if the terms of an equation vanish there.
+    `weight` (equations, states) is filled with the largest change of an equation for a unit change of a state. About
+    `SCALE_POINTS` points are used, all of them if the terms of an equation vanish there.
     """
     first, second = grid.first, grid.second
     points, count = states.shape[0], STATES if STATES > 0 else amplitude.size
@@ -76,6 +78,7 @@ def scales(columns, states, grid, amplitude, frequency, size, rounding):
     for e in range(count):
         start = count + e * 3 * count
         size[e], rounding[e], stride = 0.0, 0.0, max(1, points // SCALE_POINTS)
+        weight[e] = 0.0
         while stride > 0:
             for i in range(0, points, stride):
                 terms, error = 0.0, 0.0
@@ -85,7 +88,9 @@ def scales(columns, states, grid, amplitude, frequency, size, rounding):
                     inertia = abs(columns[i, start + 2 * count + s])
                     terms += stiffness * abs(states[i, s]) + damping * abs(states[i, count + s])
                     terms += inertia * abs(states[i, 2 * count + s])
-                    error += amplitude[s] * (stiffness + damping * one + inertia * two)
+                    total = stiffness + damping * one + inertia * two
+                    weight[e, s] = max(weight[e, s], total)
+                    error += amplitude[s] * total
                 size[e] = max(size[e], terms, abs(columns[i, e]))
                 rounding[e] = max(rounding[e], error)
             stride = 1 if stride > 1 and size[e] == 0.0 else 0
@@ -132,9 +137,22 @@ def norm(columns, size):
     return np.sqrt(total / (columns.shape[0] * count))
 
 
-@njit(NUMBER(MATRIX, MATRIX), **OPTIONS)
-def scaled_step(z, step):
-    """Return the largest step of any state in units of that state's largest value; infinite if not finite."""
+@njit(types.void(VECTOR, VECTOR, VECTOR, MATRIX, types.boolean[::1]), **OPTIONS)
+def find_resting(amplitude, moved, size, weight, resting):
+    """Mark the states that change no equation noticeably, neither by their values nor by their step.
+
+    They are at rest up to rounding, as the middle of a symmetric chain whose ends move oppositely.
+    """
+    for s in range(amplitude.size):
+        resting[s] = True
+        for e in range(size.size):
+            if not weight[e, s] * max(amplitude[s], moved[s]) <= RESTING * size[e]:
+                resting[s] = False
+
+
+@njit(NUMBER(MATRIX, MATRIX, types.boolean[::1]), **OPTIONS)
+def scaled_step(z, step, resting):
+    """Return the largest step of any moving state in units of its largest value; infinite if not finite."""
     result = 0.0
     for s in range(STATES if STATES > 0 else z.shape[1]):
         moved, reached = 0.0, 0.0
@@ -144,9 +162,33 @@ def scaled_step(z, step):
                 return np.inf
             moved = max(moved, change)
             reached = max(reached, abs(z[i, s]), abs(z[i, s] + step[i, s]))
-        if moved > 0.0:
+        if moved > 0.0 and not resting[s]:
             result = max(result, moved / reached)
     return result
+
+
+@njit(COUNT(GRID, FACTORS, VECTOR, VECTOR, types.boolean[::1], MATRIX, MATRIX), **OPTIONS)
+def ending(grid, factors, rounding, reached, resting, z, change):
+    """Set the states at rest to zero, and return the status of a settled iteration: "singular" if undetermined.
+
+    Constant residuals at rounding level then change a state by more than `UNDETERMINED` of its size: the restoring
+    forces are too small to hold it, as where exp(x) is the only one and x tends to −∞. `change` (points, states) is
+    overwritten.
+    """
+    for s in range(rounding.size):
+        if resting[s]:
+            z[:, s] = 0.0
+    if BORDERED:
+        return CONVERGED
+    for e in range(rounding.size):
+        change[:] = 0.0
+        change[:, e] = rounding[e]
+        back_substitute(grid, factors, change)
+        for i in range(change.shape[0]):
+            for s in range(rounding.size):
+                if not (resting[s] or abs(change[i, s]) <= UNDETERMINED * reached[s]):
+                    return SINGULAR
+    return CONVERGED
 
 
 @njit(
@@ -159,7 +201,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     An iteration ends the search when its step, or the next step expected from the observed rate, is below
     `STEP_TOLERANCE`, or when the residual is at rounding level and the next step would be below `DETERMINED` of the
     largest values so far, which for a state of rest is the guess. If it is not at `MAX_ROUNDED` iterates in a row,
-    rounding hides whether there is a solution, and the status is "singular".
+    rounding hides whether there is a solution, and the status is "singular", as for a solution that is undetermined.
     The orientation is the sign of the determinant of the bordered matrix at the last but one iterate, 0 without a
     border.
 
@@ -172,7 +214,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     residual_jacobian, drift, factors = grid_function_at(functions.residual_jacobian), setting.drift, work.factors
     states, columns, tau = work.states, work.columns, grid.tau
     points, count, borders = z.shape[0], STATES if STATES > 0 else z.shape[1], unknowns.values.size
-    size, rounding, amplitude = np.empty(count), np.empty(count), np.empty(count)
+    size, rounding, amplitude, weight = np.empty(count), np.empty(count), np.empty(count), np.empty((count, count))
     step, trial = np.empty((points, count)), np.empty((points, count))
     inputs, parameters, frequency = setting.inputs, setting.parameters, setting.frequency
     values, change, orientation = np.empty(borders), np.empty(borders), 0.0
@@ -182,9 +224,10 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     differentiate(z, drift, grid, frequency, states)
     residual_jacobian(states, inputs, parameters, tau, frequency, columns)
     previous, rounded, moved, reached = np.inf, 0, np.empty(count), np.zeros(count)
+    unit, resting = np.empty(count), np.zeros(count, dtype=np.bool_)
     for iteration in range(MAX_ITERATIONS):
         largest(z, amplitude)
-        scales(columns, states, grid, amplitude, frequency, size, rounding)
+        scales(columns, states, grid, amplitude, frequency, size, rounding, weight)
         before = norm(columns, size)
         if not np.isfinite(before):
             return NOT_FINITE, iteration, orientation
@@ -192,8 +235,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
             rounded = 1
         for s in range(count):
             reached[s] = max(reached[s], amplitude[s])
-            if amplitude[s] == 0.0:
-                amplitude[s] = 1.0
+            unit[s] = amplitude[s] if amplitude[s] > 0.0 else 1.0
         for i in range(points):
             for s in range(count):
                 step[i, s] = -columns[i, s]
@@ -206,19 +248,21 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
             if orientation == 0.0:
                 return SINGULAR, iteration, orientation
         else:
-            if not factorise(columns, grid, frequency, amplitude, factors):
+            if not factorise(columns, grid, frequency, unit, factors):
                 return SINGULAR, iteration, orientation
             back_substitute(grid, factors, step)
+        largest(step, moved)
+        find_resting(amplitude, moved, size, weight, resting)
         settling = full
-        full = max(full, scaled_step(z, step))
+        full = max(full, scaled_step(z, step, resting))
         if full == np.inf:
             return SINGULAR, iteration, orientation
         if rounded > 0:
-            largest(step, moved)
             for s in range(count):
-                settling = max(settling, moved[s] / reached[s] if moved[s] > 0.0 else 0.0)
+                if moved[s] > 0.0 and not resting[s]:
+                    settling = max(settling, moved[s] / reached[s])
             if settling <= DETERMINED:
-                return CONVERGED, iteration, orientation
+                return ending(grid, factors, rounding, reached, resting, z, step), iteration, orientation
         if rounded == MAX_ROUNDED:
             return SINGULAR, iteration, orientation
         history[iteration, 0], history[iteration, 1] = before, full
@@ -246,10 +290,9 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
         copy(trial, z)
         for k in range(borders):
             unknowns.values[k] = values[k]
-        if full <= STEP_TOLERANCE:
-            return CONVERGED, iteration + 1, orientation
-        if damping == 1.0 and full < CHORD_RATE * previous < np.inf and full**2 <= STEP_TOLERANCE * previous:
-            return CONVERGED, iteration + 1, orientation
+        fast = damping == 1.0 and full < CHORD_RATE * previous < np.inf and full**2 <= STEP_TOLERANCE * previous
+        if full <= STEP_TOLERANCE or fast:
+            return ending(grid, factors, rounding, reached, resting, z, step), iteration + 1, orientation
         previous = full if damping == 1.0 else np.inf
         rounded = rounded + 1 if damping == 1.0 and norm(columns, rounding) <= 1.0 else 0
     return STALLED, MAX_ITERATIONS, orientation
@@ -269,14 +312,18 @@ def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fract
 
 @njit(FLAG(MATRIX, MATRIX, MATRIX), **OPTIONS)
 def is_far(z, predicted, anchor_z):
-    """Return whether z is off the prediction by more than `FAR` of the anchor's range and of the change."""
+    """Return whether z is off the prediction by more than `FAR` of the anchor's range and of the change.
+
+    States that remain exactly at rest do not count.
+    """
     for s in range(STATES if STATES > 0 else z.shape[1]):
-        off, change, low, high = 0.0, 0.0, np.inf, -np.inf
+        off, change, low, high, rest = 0.0, 0.0, np.inf, -np.inf, True
         for i in range(z.shape[0]):
+            rest = rest and z[i, s] == 0.0 and anchor_z[i, s] == 0.0
             off = max(off, abs(z[i, s] - predicted[i, s]))
             change = max(change, abs(predicted[i, s] - anchor_z[i, s]))
             low, high = min(low, anchor_z[i, s]), max(high, anchor_z[i, s])
-        if off > FAR * (high - low) and off > FAR * change:
+        if not rest and off > FAR * (high - low) and off > FAR * change:
             return True
     return False
 
