@@ -24,9 +24,18 @@ def one_of(argument: str, value: Any, allowed: Iterable[str]) -> None:
     raise ValueError(f"{argument}: must be {choice}, got {shown}.{hint}")
 
 
+def instance(argument: str, value: Any, kind: type | tuple[type, ...]) -> None:
+    """Raise a ValueError unless `value` is an instance of a class, or of one of several."""
+    if not isinstance(value, kind):
+        names = " or ".join(one.__name__ for one in (kind if isinstance(kind, tuple) else (kind,)))
+        raise ValueError(f"{argument}: must be a {names}, got {type(value).__name__}.")
+
+
 def same_names(argument: str, given: Mapping[str, Any], required: Iterable[str]) -> None:
-    """Raise a ValueError unless the keys of `given` are exactly `required`."""
+    """Raise a ValueError unless `given` is a mapping whose keys are exactly `required`."""
     names = list(required)
+    if not isinstance(given, Iterable):
+        raise ValueError(f"{argument}: must be a mapping of {_listed(names)} to values, got {shortened(given)}.")
     for name in given:
         one_of(argument, name, names)
     if missing := [name for name in names if name not in given]:
@@ -100,6 +109,8 @@ def positive(argument: str, value: Any) -> float:
 def finite_number(argument: str, value: Any) -> float:
     """Return `value` as a float; raise a ValueError unless it is one finite real number."""
     try:
+        if isinstance(value, str | np.complexfloating):
+            raise TypeError
         number = float(value)
     except (TypeError, ValueError):
         raise ValueError(f"{argument}: must be a real number, got {shortened(value)}.") from None
@@ -119,12 +130,20 @@ def integer(argument: str, value: Any, minimum: int | None = None) -> int:
     return int(value)
 
 
-def finite_vector(argument: str, values: Any, length: int | None = None, meaning: str = "") -> np.ndarray:
-    """Return `values` as a finite 1-d float array; `meaning` explains the length, such as "samples·periods"."""
+def real_array(argument: str, values: Any) -> np.ndarray:
+    """Return `values` as an array of floats; raise a ValueError unless they are real numbers."""
     try:
-        array = np.asarray(values, dtype=float)
+        found = np.asarray(values)
+        if np.iscomplexobj(found):
+            raise ValueError
+        return found.astype(float)
     except (TypeError, ValueError):
         raise ValueError(f"{argument}: must be an array of real numbers, got {shortened(values)}.") from None
+
+
+def finite_vector(argument: str, values: Any, length: int | None = None, meaning: str = "") -> np.ndarray:
+    """Return `values` as a finite 1-d float array; `meaning` explains the length, such as "samples·periods"."""
+    array = real_array(argument, values)
     if array.ndim != 1:
         raise ValueError(f"{argument}: must be one-dimensional, got shape {array.shape}.")
     if length is not None and array.size != length:

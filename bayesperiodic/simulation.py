@@ -79,6 +79,7 @@ def simulate(
     >>> round(float(run.outputs["displacement"][-1]), 3)
     1.0
     """
+    _checks.instance("model", model, Model)
     frequency = _checks.positive("frequency", frequency)
     samples = int(_checks.positive("duration", duration) * _checks.positive("sampling_rate", sampling_rate)) + 1
     time = np.arange(samples) / sampling_rate

@@ -179,7 +179,7 @@ class Experiment(Result):
             if logarithms and self.multiplier_sd is None:
                 raise ValueError("multipliers: must have standard deviations; give multiplier_sd.")
             return
-        matrix = np.asarray(self.covariance, dtype=float)
+        matrix = _checks.real_array("covariance", self.covariance)
         size = values if self.multiplier_sd is not None else values + logarithms
         if matrix.shape != (size, size):
             further = f" and {logarithms} multipliers" if size > values else ""

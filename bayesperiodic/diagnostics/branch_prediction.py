@@ -187,6 +187,7 @@ def predict_branch(
     >>> curves = bp.predict_branch(problem, posterior, "frequency", until=0.2, draws=5, progress=False)
     >>> figure = bp.plot.branch(curves)
     """
+    _checks.instance("problem", problem, Problem)
     count = _checks.integer("draws", draws, 1)
     names = [e.name for e in problem.experiments]
     name = names[0] if experiment is None else experiment

@@ -236,6 +236,7 @@ def calibrate(
     >>> found.failures, found.names, found.table["verdict"].tolist()
     ({}, ('k',), ['too few replicates', 'too few replicates'])
     """
+    _checks.instance("problem", problem, Problem)
     _checks.integer("replicates", replicates, 1)
     _checks.integer("seed", seed, 0)
     check_supported(problem)

@@ -176,6 +176,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     >>> bp.compare(problem, fit, posterior, coordinates="sampling").table["coordinate"].tolist()
     ['ln c', 'ln k', 'ln variance[displacement]']
     """
+    _checks.instance("problem", problem, Problem)
     _checks.one_of("coordinates", coordinates, COORDINATES)
     check_results(problem, fit=fit, posterior=posterior)
     scored = _scores(problem, fit, posterior, coordinates)

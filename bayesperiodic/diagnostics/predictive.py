@@ -304,6 +304,7 @@ def predict(
     >>> bp.predict(linear, draws, draws=50).verdict
     'misspecified'
     """
+    _checks.instance("problem", problem, Problem)
     count = _checks.integer("draws", draws, 20)
     if experiment is not None and run is None:
         raise ValueError(f"experiment: must be given together with `run`, got {experiment!r} without `run`.")
@@ -451,6 +452,7 @@ def prior_predictive(problem: Problem, *, draws: int = 200, seed: int = 0, progr
     >>> float(expected.table.loc["synthetic duffing", "inside"])
     1.0
     """
+    _checks.instance("problem", problem, Problem)
     count = _checks.integer("draws", draws, 20)
     theta = problem.joint_prior.sample(count, np.random.default_rng(_checks.integer("seed", seed, 0)))
     density, runs = problem.density(), [e.name for e in problem.experiments]

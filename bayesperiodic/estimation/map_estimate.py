@@ -134,6 +134,7 @@ def map_estimate(
     >>> estimate.status, abs(estimate.theta["k"] - 1.0) < 3 * estimate.sd["k"]
     ('converged', True)
     """
+    _checks.instance("problem", problem, Problem)
     if isinstance(start, Mapping):
         _checks.same_names("start", start, problem.names)
     theta = problem.median() if start is None else problem.vector(start)

@@ -366,6 +366,7 @@ def profile(problem: Problem, fit: MapEstimate, names: Sequence[str] | None = No
     c       0.1980  0.1979        0.2011  0.2012
     k       0.9986  0.9984        1.0022  1.0023
     """
+    _checks.instance("problem", problem, Problem)
     chosen, executor = _checked_names(problem, names), checked_executor(executor)
     objective, peak = _at_estimate(problem, fit)
     with TaskPool(executor, (objective, peak)) as pool:

@@ -89,6 +89,7 @@ def find_orbits(
     >>> [orbit.period for orbit in bp.find_orbits(henon_section, periods=[1, 2, 3])]
     [1, 2]
     """
+    _checks.instance("section", section, PoincareSection)
     wanted = _periods(periods, len(section))
     _checks.one_of("method", method, METHODS)
     neighbours, box = _checks.integer("neighbours", neighbours, 16), _checks.positive("box", box)

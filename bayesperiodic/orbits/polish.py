@@ -88,6 +88,8 @@ def polish_orbits(
     >>> print(f"{turning.solution.multipliers[0].real:.3f}")
     -1.706
     """
+    _checks.instance("model", model, Model)
+    _checks.instance("orbits", orbits, (Orbits, list, tuple))
     given = orbits if isinstance(orbits, Orbits) else Orbits(tuple(orbits))
     polisher = _Polisher(model, given.orbits, parameters, inputs or {}, parameter_sd or {}, samples, scheme, tolerance)
     results = [(orbit, *polisher.polish(orbit)) for orbit in given]
@@ -423,6 +425,7 @@ def select_orbits(
     >>> 0 < len(best) < len(polished), "a state of rest" in [reason for _, reason in best.rejected]
     (True, True)
     """
+    _checks.instance("orbits", orbits, Orbits)
     names = list(parameters)
     _checks.positive("largest_multiplier", largest_multiplier)
     _checks.finite_number("least_quality", least_quality)

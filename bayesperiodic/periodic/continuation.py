@@ -183,6 +183,8 @@ def continue_periodic(
     >>> response.complete, len(response.folds), len(response.period_doublings)
     (True, 2, 0)
     """
+    _checks.instance("model", model, Model)
+    _checks.instance("solution", solution, PeriodicSolution)
     points = []
     with tqdm(desc=f"{model.name}: {vary} to {until:g}", unit=" points", disable=not progress, leave=False) as bar:
         for point in iterate_periodic(model, solution, vary, until=until, step=step):
@@ -225,6 +227,8 @@ def iterate_periodic(
     >>> round(frequency, 3)
     0.303
     """
+    _checks.instance("model", model, Model)
+    _checks.instance("solution", solution, PeriodicSolution)
     equations, parameters, z = equations_of(model, solution)
     parametrised, values = _parametrised(equations, parameters, vary)
     until = _checks.finite_number("until", until)
@@ -270,6 +274,8 @@ def double_period(model: Model, solution: PeriodicSolution, vary: str) -> Period
     >>> doubled.periods, doubled.winding, doubled.stable
     (2, {'phi': 2}, True)
     """
+    _checks.instance("model", model, Model)
+    _checks.instance("solution", solution, PeriodicSolution)
     equations, parameters, z = equations_of(model, solution)
     if np.min(abs(solution.multipliers + 1.0)) > 0.1:
         raise ValueError(
@@ -413,6 +419,8 @@ def solutions_at(model: Model, branch: Branch, value: float) -> tuple[PeriodicSo
     >>> [orbit.stable for orbit in bp.solutions_at(bp.models.duffing, branch, 0.25)]
     [True, False, True]
     """
+    _checks.instance("model", model, Model)
+    _checks.instance("branch", branch, Branch)
     if branch[0].model != model.name:
         raise ValueError(f"model: must be {branch[0].model!r}, as of the branch, got {model.name!r}.")
     if branch.vary not in (*model.parameters, FREQUENCY):

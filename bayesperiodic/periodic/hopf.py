@@ -91,6 +91,7 @@ def hopf_points(
     >>> abs(point.value) < 1e-9, round(point.frequency, 6)
     (True, 0.95493)
     """
+    _checks.instance("model", model, Model)
     if not model.autonomous:
         raise ValueError(f"model: must be autonomous, got {model.name!r}, which is driven and has no equilibrium.")
     _checks.one_of("vary", vary, model.parameters)
@@ -153,6 +154,8 @@ def emerging_cycle(
     >>> bp.emerging_cycle(bp.models.van_der_pol, hopf_point, amplitude={"x": 0.5}, samples=100).status
     'converged'
     """
+    _checks.instance("model", model, Model)
+    _checks.instance("point", point, HopfPoint)
     if point.model != model.name:
         raise ValueError(f"model: must be {point.model!r}, as of the point, got {model.name!r}.")
     if len(amplitude) != 1:

@@ -431,6 +431,8 @@ def multiplier_sensitivities(model: Model, solution: PeriodicSolution) -> dict[s
     >>> bool(np.isclose(sum(by_parameter["c"] / solution.multipliers), -10.0))
     True
     """
+    _checks.instance("model", model, Model)
+    _checks.instance("solution", solution, PeriodicSolution)
     equations, theta, z = equations_of(model, solution)
     derivative = parameter_sensitivities(equations, z, theta)
     if solution.floquet is None or derivative is None:

@@ -227,6 +227,7 @@ def solve_periodic(
     >>> round(orbit.period, 4)
     6.3807
     """
+    _checks.instance("model", model, Model)
     equations = PeriodicEquations.build(
         model, inputs, frequency=frequency, samples=samples, scheme=scheme, periods=periods, winding=winding
     )

@@ -76,6 +76,7 @@ def branch(
     >>> figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()
     ('frequency [Hz]', 'amplitude of displacement [m]')
     """
+    _checks.instance("branch", branch, (Branch, BranchPrediction))
     branches = (branch, *more)
     if len({b.vary for b in branches}) > 1:
         raise ValueError(f"more: branches must all vary {branch.vary!r}, got {[b.vary for b in more]}.")
@@ -220,6 +221,7 @@ def section(
     >>> bp.plot.section(henon_section, units={"x": "m", "y": "m/s"}).axes[0].get_xlabel()
     'x [m]'
     """
+    _checks.instance("section", section, PoincareSection)
     if ax is None:
         ax = (figure or plt.figure(figsize=(7.0, 5.2), layout="constrained")).add_subplot()
     every = 1 + len(section.points) // MOST_POINTS
@@ -269,6 +271,7 @@ def orbits(
     >>> [axes.get_title().splitlines()[0] for axes in figure.axes]
     ['period 1, winding 0', 'period 2, winding 0']
     """
+    _checks.instance("orbits", orbits, (Orbits, list, tuple))
     if not len(orbits):
         raise ValueError("orbits: must be at least one, got none.")
     columns = min(COLUMNS, len(orbits))

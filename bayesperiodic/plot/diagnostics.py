@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import ndtri
 
+from bayesperiodic import _checks
 from bayesperiodic.diagnostics import calibration as uniformity
 from bayesperiodic.diagnostics.calibration import METHODS, Calibration
 from bayesperiodic.diagnostics.comparison import Comparison
@@ -53,6 +54,7 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
     >>> [axes.get_title() for axes in bp.plot.ranks(calibration).axes]
     ['count per bin / expected', 'distribution function − diagonal', 'coverage − probability']
     """
+    _checks.instance("calibration", calibration, Calibration)
     names = calibration.names
     figure = figure or plt.figure(figsize=(10.5, 2.1 * len(names) + 1.0), layout="constrained")
     grid = figure.subplots(len(names), 3, squeeze=False)
@@ -131,6 +133,7 @@ def comparison(comparison: Comparison, *, names: Sequence[str] | None = None, fi
     >>> [axes.get_xlabel().splitlines()[0] for axes in figure.axes]
     ['c', 'k', 'Laplace quantile − MAP [posterior sd]', 'probability of the Laplace ellipsoid']
     """
+    _checks.instance("comparison", comparison, Comparison)
     names = chosen(names, tuple(comparison.table.index))
     columns, rows = style.panel_grid(len(names))
     figure = figure or plt.figure(figsize=(max(2.4 * columns, 8.4), 2.5 * rows + 4.6), layout="constrained")
@@ -226,6 +229,7 @@ def profile(profile: Profile, *, names: Sequence[str] | None = None, figure: Fig
     >>> figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()
     ('k [N/m]', 'relative log-density')
     """
+    _checks.instance("profile", profile, Profile)
     shown = chosen(names, profile.names)
     columns, rows = style.panel_grid(len(shown), PROFILES_ACROSS)
     figure = figure or plt.figure(figsize=(3.0 * columns + 0.8, 2.7 * rows + 0.6), layout="constrained")

@@ -212,6 +212,7 @@ def corner(
     >>> len(figure.axes), figure.axes[2].get_xlabel().splitlines()
     (4, ['c', '[N s/m]'])
     """
+    _checks.instance("posterior", posterior, Posterior)
     import corner as corner_package
 
     names = chosen(names, posterior.names)
@@ -352,6 +353,7 @@ def marginals(
     >>> [axes.get_xlabel().splitlines()[0] for axes in figure.axes]
     ['c', 'k', 'variance[displacement]']
     """
+    _checks.instance("posterior", posterior, Posterior)
     names = chosen(names, posterior.names)
     mean, sd = np.full((2, len(names)), np.nan)
     if laplace is not None:
@@ -396,6 +398,7 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
     >>> [axes.get_ylabel().splitlines()[0] for axes in figure.axes]
     ['c', 'k', 'variance[displacement]']
     """
+    _checks.instance("posterior", posterior, Posterior)
     _checks.integer("walkers", walkers, 1)
     names, group = posterior.names, posterior.data["posterior"]
     chains, steps = group.sizes["chain"], group.sizes["draw"]

@@ -377,7 +377,7 @@ def changed_parts(made_for: str, here: str) -> list[str]:
 
 
 def check_results(problem: Any, **results: Any) -> None:
-    """Raise a ValueError unless an estimate `fit` and draws `posterior`, if any, were computed from the problem.
+    """Raise a ValueError unless an estimate `fit` and draws `posterior` were computed from the problem.
 
     The model's equations, experiments with their data, priors, constants, noise model and scheme must be the same.
     """
@@ -385,9 +385,8 @@ def check_results(problem: Any, **results: Any) -> None:
         raise ValueError(f"problem: must be a Problem, got {type(problem).__name__}.")
     here = ""
     for argument, result in results.items():
-        if result is not None:
-            here = here or fingerprint(problem)
-            check_fingerprint(argument, result, here)
+        here = here or fingerprint(problem)
+        check_fingerprint(argument, result, here)
 
 
 def check_fingerprint(argument: str, result: Any, here: str) -> None:
@@ -405,8 +404,8 @@ def check_fingerprint(argument: str, result: Any, here: str) -> None:
 def _values(argument: str, given: Any, names: tuple[str, ...]) -> np.ndarray:
     if isinstance(given, Mapping):
         _checks.same_names(argument, given, names)
-        given = np.stack(np.broadcast_arrays(*(np.asarray(given[name], dtype=float) for name in names)), -1)
-    values = np.asarray(given, dtype=float)
+        given = np.stack(np.broadcast_arrays(*(_checks.real_array(argument, given[name]) for name in names)), -1)
+    values = _checks.real_array(argument, given)
     if values.shape[-1:] != (len(names),):
         raise ValueError(f"{argument}: last axis must be {list(names)}, got shape {values.shape}.")
     return values

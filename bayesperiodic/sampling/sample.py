@@ -154,6 +154,7 @@ def sample(
     >>> draws.reason.split(" with ")[0], draws.failures
     ('max_steps = 250 reached', {})
     """
+    _checks.instance("problem", problem, Problem)
     _checks.integer("ensembles", ensembles, 2)
     _checks.integer("max_steps", max_steps, BLOCK)
     _checks.integer("seed", seed, 0)

@@ -266,6 +266,7 @@ def structure(
     >>> found.table.verdict["l"]
     'determined'
     """
+    _checks.instance("model", model, Model)
     measured = model.outputs if outputs is None else tuple(outputs)
     for name in measured:
         _checks.one_of("outputs", name, model.outputs)

@@ -1,5 +1,7 @@
 """What makes two problems different, and results of another problem."""
 
+import inspect
+import operator
 from dataclasses import fields, replace
 
 import numpy as np
@@ -118,24 +120,24 @@ def two():
 
 
 CALLS = {
-    "identifiability": lambda p, f, d, path: bp.identifiability(p, f, profile=False),
-    "identifiability with draws": lambda p, f, d, path: bp.identifiability(p, None, d, profile=False),
-    "compare": lambda p, f, d, path: bp.compare(p, f, None),
-    "compare draws": lambda p, f, d, path: bp.compare(p, None, d),
-    "predict": lambda p, f, d, path: bp.predict(p, d, draws=20),
-    "profile": lambda p, f, d, path: bp.profile(p, f),
-    "report": lambda p, f, d, path: bp.report(p, f, None, path),
-    "report draws": lambda p, f, d, path: bp.report(p, f, d, path),
-    "plot.fit": lambda p, f, d, path: bp.plot.fit(p, f),
-    "plot.loops": lambda p, f, d, path: bp.plot.loops(p, f),
+    "identifiability": lambda p, own, f, d, path: bp.identifiability(p, f, profile=False),
+    "identifiability with draws": lambda p, own, f, d, path: bp.identifiability(p, own, d, profile=False),
+    "compare": lambda p, own, f, d, path: bp.compare(p, f, None),
+    "compare draws": lambda p, own, f, d, path: bp.compare(p, own, d),
+    "predict": lambda p, own, f, d, path: bp.predict(p, d, draws=20),
+    "profile": lambda p, own, f, d, path: bp.profile(p, f),
+    "report": lambda p, own, f, d, path: bp.report(p, f, None, path),
+    "report draws": lambda p, own, f, d, path: bp.report(p, f, d, path),
+    "plot.fit": lambda p, own, f, d, path: bp.plot.fit(p, f),
+    "plot.loops": lambda p, own, f, d, path: bp.plot.loops(p, f),
 }
 
 
 @pytest.mark.parametrize("call", CALLS)
 def test_results_of_other_data_are_refused_everywhere(two, call, tmp_path):
-    (problem, _, _), (_, fit, posterior) = two
+    (problem, own, _), (_, fit, posterior) = two
     with pytest.raises(ValueError, match=r"must be a result of this problem, got .* with other experiments; give"):
-        CALLS[call](problem, fit, posterior, tmp_path / "report.html")
+        CALLS[call](problem, own, fit, posterior, tmp_path / "report.html")
 
 
 def test_draws_and_laplace_approximation_of_different_problems_are_not_drawn_together(two):
@@ -156,6 +158,46 @@ def test_confused_arguments_are_named(two):
     with pytest.raises(ValueError, match="fit: must be a MapEstimate, got Posterior"):
         bp.sample(problem, posterior, seed=1)
     check_results(problem, fit=fit, posterior=posterior)
+
+
+FIRST = {
+    "problem": ["calibrate", "compare", "identifiability", "map_estimate", "predict", "predict_branch", "profile",
+                "prior_predictive", "sample"],
+    "model": ["continue_periodic", "double_period", "emerging_cycle", "hopf_points",
+              "multiplier_sensitivities", "polish_orbits", "simulate", "solutions_at", "solve_periodic", "structure"],
+    "section": ["find_orbits", "plot.section"],
+    "orbits": ["select_orbits", "plot.orbits"],
+    "posterior": ["plot.corner", "plot.marginals", "plot.traces"],
+    "branch": ["plot.branch"],
+    "calibration": ["plot.ranks"],
+    "comparison": ["plot.comparison"],
+    "profile": ["plot.profile"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("argument", "name"), [(argument, name) for argument, names in FIRST.items() for name in names]
+)
+@pytest.mark.parametrize("kind", ["experiment", "text", "none"])
+def test_first_argument_of_another_class_is_named(argument, name, kind, two):
+    problem, _, _ = two[0]
+    given = {"experiment": problem.experiments[0], "text": "problem", "none": None}[kind]
+    function = operator.attrgetter(name)(bp)
+    wanted = inspect.signature(function).parameters.values()
+    missing = [p for p in wanted if p.default is p.empty][1:]
+    positional = [given for p in missing if p.kind is p.POSITIONAL_OR_KEYWORD]
+    keywords = {p.name: 1 for p in missing if p.kind is p.KEYWORD_ONLY}
+    with pytest.raises(ValueError, match=f"^{argument}: must be an? .*, got {type(given).__name__}"):
+        function(given, *positional, **keywords)
+
+
+@pytest.mark.parametrize("values", [1j * np.ones(4), np.ones(4, dtype=complex), ["a"] * 4, [{}] * 4])
+def test_numbers_that_are_not_real_are_refused(values):
+    with pytest.raises(ValueError, match=r"outputs\['x'\]: must be an array of real numbers, got"):
+        bp.Experiment("e", frequency=1.0, samples=4, outputs={"x": values})
+    for value in (values[0], "1"):
+        with pytest.raises(ValueError, match=r"frequency: must be a real number, got"):
+            bp.Experiment("e", frequency=value, samples=4, outputs={"x": np.arange(4.0)})
 
 
 def test_truths_are_marked_in_corner_plots(two):
