@@ -12,6 +12,7 @@ from scipy.special import fdtrc, softmax
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.harmonics import (
     MINIMUM_CYCLES,
+    NEGLIGIBLE_PHASE,
     HarmonicFit,
     Pace,
     fit_harmonics,
@@ -32,6 +33,8 @@ HYSTERESIS = 0.25
 # Smallest relative step of the period, in itself and in standard errors.
 SMALLEST_STEP, SIGNIFICANT = 1e-3, 8.0
 MINIMUM_PERIODICITY = 0.5
+# Ratio of residual variances from which the estimated frequency is right, and the given one wrong.
+CLEARLY = 4.0
 # Difference of two phases [cycles] at the ends of a recording that selects other cycles.
 OTHER_CYCLES = 0.05
 # Distance of a cycle from the steady ones, in medians of their own, in harmonics and in the mean value.
@@ -223,7 +226,10 @@ def _explains_more(fit: HarmonicFit, other: HarmonicFit) -> bool:
 def _refuse_frequency(estimated: HarmonicFit, given: HarmonicFit, pace: Pace, duration: float, periods: int) -> None:
     """Raise a ValueError if the given frequency is not that of the recording."""
     difference = given.frequency - estimated.frequency
-    if _explains_more(estimated, given) and pace.differs(difference, duration):
+    # Few cycles have too few degrees of freedom for a test, but noise of any kind would not shrink so much.
+    shrinks = np.mean(np.log(given.variances / estimated.variances)) > np.log(CLEARLY)
+    clear = shrinks and abs(difference) * duration > NEGLIGIBLE_PHASE
+    if clear or (_explains_more(estimated, given) and pace.differs(difference, duration)):
         raise ValueError(
             f"frequency: must be that of the recording, which is estimated as {estimated.frequency * periods:.9g} Hz "
             f"with a standard error of {pace.se * periods:.1g} Hz, got {given.frequency * periods:.9g} Hz, whose phase "

@@ -303,6 +303,14 @@ def test_wrong_frequency_is_refused_with_both_values(cycles, error):
     assert abs(estimate - FREQUENCY) < 5 * se and given == pytest.approx(wrong, rel=1e-8)
 
 
+@pytest.mark.parametrize("error", [0.03, -0.03, 0.1])
+def test_clearly_wrong_frequency_of_few_cycles_is_refused(error):
+    """A residual four times smaller decides where the phases of single cycles are too few for a test."""
+    for seed in range(10):
+        with pytest.raises(ValueError, match="frequency: must be that of the recording"):
+            driven(4, 0.01, seed).fold(64, frequency=FREQUENCY * (1 + error))
+
+
 @pytest.mark.parametrize("error", [0.0, 1e-5])
 def test_frequency_that_is_right_or_negligibly_wrong_is_accepted_as_exact(error):
     """Over 40 cycles a relative error of 1e-5 is 0.14° of phase."""
