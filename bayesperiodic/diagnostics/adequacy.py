@@ -207,6 +207,9 @@ def rejections(table: pd.DataFrame) -> dict[str, str]:
         if reasons := [f"{REJECTIONS[test]} (p = {row[test]:.2g})" for test in compress(TESTS, small)]:
             error, harmonic = row["model_error_share"], row["harmonic"]
             text = "" if np.isnan(harmonic) else f"; its strongest harmonic is {harmonic:.0f}"
+            if harmonic > 1:
+                kind = "odd" if harmonic % 2 else "even"
+                text += f", as where a force {kind} in the motion is missing, if the drive is a sine"
             text += "" if np.isnan(error) else f"; {error:.1%} of the residual variance is model error"
             found[str(label)] = f"{', '.join(reasons)}{text}"
     return found
