@@ -212,6 +212,50 @@ class Likelihood:
             total = (self._flat if self.model.flat else self._by_kind)(residuals, values, log_variance_factor)
         return np.where(np.isfinite(total), total, -np.inf)
 
+    @cached_property
+    def observations(self) -> tuple[str, ...]:
+        """Names of what is independent given θ and φ, the parts of the likelihood in `terms`.
+
+        Of whole periods these are the harmonics of each channel of each experiment; of the points of a mask the
+        samples, if the noise is white, otherwise the channel as a whole; of values with a given covariance the whitened
+        values; also each whitened multiplier, and the frequency of a free-running model.
+        """
+        return tuple(f"{self.blocks[b].experiment}: {label}" for b, labels, _ in self._parts for label in labels)
+
+    @cached_property
+    def _parts(self) -> list[tuple[int, list[str], np.ndarray]]:
+        """Of each block its index, the labels of its observations, and the first component of each in sorted order."""
+        found = []
+        for b, block in enumerate(self.blocks):
+            name, place = {SCALE: "value"}.get(block.channel, block.channel), np.arange(block.size)
+            if block.kind == SPECTRAL:
+                name, place = f"{block.channel}, harmonic", block.harmonic
+            elif self._is_dense(block):
+                place = np.zeros(block.size, dtype=int)
+            elif block.kind == POINTS:
+                name, place = f"{block.channel}, sample", np.rint(block.position * block.points).astype(int)
+            unique, starts = np.unique(np.sort(place), return_index=True)
+            labels = [f"{name} {int(i)}" for i in unique] if unique.size > 1 else [name]
+            found.append((b, labels, starts))
+        return found
+
+    def terms(self, residuals: Sequence[np.ndarray], values: np.ndarray) -> np.ndarray:
+        """Return the log-likelihoods (…, observations) of the `observations`, which sum to that of `__call__`."""
+        found = []
+        for b, _, starts in self._parts:
+            block, own, r = self.blocks[b], values[..., self._columns[b]], residuals[b]
+            if self._is_dense(block):
+                found.append(self._together([r], block, own, 1.0)[..., None])
+                continue
+            each = r**2
+            if block.kind != KNOWN:
+                variances = self._variances(block, own)[0]
+                each = block.weight * (np.log(variances) + each / variances)
+            if block.kind == SPECTRAL:
+                each = each[..., np.argsort(block.harmonic, kind="stable")]
+            found.append(-0.5 * np.add.reduceat(each, starts, axis=-1))
+        return np.concatenate(found, axis=-1)
+
     def _by_kind(
         self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
     ) -> np.ndarray:

@@ -23,11 +23,11 @@ END = 1.6448536269514722
 
 
 def with_draws(posterior, name, change):
-    data = posterior.data.copy(deep=True)
+    data = posterior.tree.copy(deep=True)
     group = data["posterior"].to_dataset()
     group[name] = change(group[name])
     data["posterior"] = type(data)(group)
-    return replace(posterior, data=data)
+    return replace(posterior, tree=data)
 
 
 def test_a_normal_posterior_is_fine(solved):
@@ -109,7 +109,7 @@ def posterior_of(problem, points):
 
 def redrawn(problem, posterior, points):
     density = problem.density()
-    return replace(posterior, data=tree(density, *density.to_natural(points), points[..., 0], 0))
+    return replace(posterior, tree=tree(density, points, points[..., 0], 0))
 
 
 def by_inversion(log_density, values, generator):

@@ -49,10 +49,7 @@ def edge():
 
 def by_ensemble(posterior: bp.Posterior, name: str) -> np.ndarray:
     """Return the draws (ensembles, steps, walkers) of what has this name."""
-    group = posterior.data["posterior"]
-    count = len(np.unique(group["ensemble"]))
-    draws = posterior.draws(name).reshape(count, group.sizes["chain"] // count, -1)
-    return draws.transpose(0, 2, 1)
+    return posterior.by_step(posterior.draws(name))
 
 
 def mean_and_error(values: np.ndarray) -> tuple[float, float]:
