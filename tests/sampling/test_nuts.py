@@ -154,7 +154,7 @@ def test_too_few_draws_are_not_converged_and_nuts_statistics_are_kept(linear, br
     assert not posterior.converged
     assert "max_steps = 250 reached with" in posterior.reason
     posterior.save(tmp_path / "draws")
-    known = bp.load(tmp_path / "draws").data
+    known = bp.load(tmp_path / "draws").tree
     assert known.attrs["nutpie"]
     group = known["sample_stats"]
     assert dict(group.sizes) == {"chain": 2, "draw": 250}
