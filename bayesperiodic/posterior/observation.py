@@ -256,7 +256,7 @@ class Observation:
             mask = np.ones(self._points, dtype=bool) if e.mask is None else e.mask
             noise[:, mask] = values.reshape(len(values), -1, len(self.channels))
         else:
-            for c, channel in enumerate(self.channels):
+            for c in range(len(self.channels)):
                 if e.mask is None:
                     noise[..., c] = _fourier.from_components(components[c], self._points)
                 else:

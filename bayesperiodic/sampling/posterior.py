@@ -187,7 +187,8 @@ class Posterior(Result):
     def summary(self) -> pd.DataFrame:
         """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, one row per parameter.
 
-        mcse_mean, ess and rhat are mcse_mean, ess_bulk and r_hat of `arviz.summary`. Its ``attrs`` contain interval, converged, reason and failures.
+        mcse_mean, ess and rhat are mcse_mean, ess_bulk and r_hat of `arviz.summary`. Its ``attrs`` contain interval,
+        converged, reason and failures.
         """
         table = _table(
             {
@@ -432,8 +433,8 @@ def _terms(density: LogPosterior, posterior: xr.Dataset) -> xr.Dataset:
     terms[simulation.status != CONVERGED] = np.nan
     shaped = terms.reshape(chosen.sizes[CHAIN], chosen.sizes[DRAW], -1)
     coords = {name: chosen.coords[name] for name in (CHAIN, DRAW, STEP, WALKER)}
-    coords[OBSERVATION] = [*likelihood.observations]
-    return xr.Dataset({"data": ((CHAIN, DRAW, OBSERVATION), shaped)}, coords=coords)
+    group = xr.Dataset({"data": ((CHAIN, DRAW, OBSERVATION), shaped)}, coords=coords)
+    return group.assign_coords({OBSERVATION: [*likelihood.observations]})
 
 
 def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr.Dataset:

@@ -1,6 +1,7 @@
 """What ArviZ, in the installed version, makes of draws and their file: the package's numbers, and true ones."""
 
 import warnings
+from dataclasses import replace
 
 import emcee
 import matplotlib.pyplot as plt
@@ -110,8 +111,6 @@ def test_observations_are_independent_values_of_the_data():
     ):  # fmt: skip
         found = []
         for own in (run.outputs["displacement"], outputs):
-            from dataclasses import replace
-
             experiment = replace(run, name="run", outputs={"displacement": own}, independent={}, **changes)
             problem = bp.Problem(
                 bp.models.duffing, [experiment], priors={"k": bp.Normal(1.0, 0.3)},
@@ -170,7 +169,7 @@ def test_drift_of_all_walkers_together_shows_in_rhat():
 def test_means_of_repeated_runs_scatter_by_the_printed_error(dimension):
     """60 runs of two ensembles on a standard normal: Σ(mean/mcse)² is χ² with 60 to 360 degrees of freedom.
 
-    The false-alarm rate is 0.1 % each; the error itself is allowed to be wrong by 10 %. The coordinates are independent.
+    The coordinates are independent. The false-alarm rate is 0.1 % each; the error itself may be wrong by 10 %.
     """
     moves = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)]
     walkers, steps, total, count = 32, 800, 0.0, 60
