@@ -62,11 +62,13 @@ class Posterior(Result):
         Attributes: ``units``, or ``units of <channel>`` of ``variance``; ``noise``, the name of the noise model, on its
         parameters. Group ``sample_stats``: lp, the log-density in sampling coordinates; the status of the draw's
         solves; acceptance_rate, with emcee 1 where the proposal of the step was accepted, else 0. Group
-        ``log_likelihood``, for `arviz.loo`: terms of independent observations at some draws, which sum to the
-        log-likelihood, see `Likelihood.observations`. Group ``posterior_predictive``: for some draws, replicates of the
-        measured outputs, noise included, and largest_multiplier, the modulus of each orbit's largest Floquet
-        multiplier. Group ``orbits``: states of every experiment, turns included, at the draw with the highest density.
-        Groups ``observed_data`` and ``constant_data``: outputs and inputs.
+        ``log_likelihood``, for `arviz.loo`: at some draws, the terms of independent observations, which sum to the
+        log-likelihood, up to constants of the data: values of the mean period at equally spaced instants, or its
+        harmonics if the noise is coloured. Terms of fewer or more independent values than components are weighted as
+        in the likelihood. Group ``posterior_predictive``: for some draws, replicates of the measured outputs, noise
+        included, and largest_multiplier, the modulus of each orbit's largest Floquet multiplier. Group ``orbits``:
+        states of every experiment, turns included, at the draw with the highest density. Groups ``observed_data`` and
+        ``constant_data``: outputs and inputs.
     converged : bool
         True if the stop rule was met.
     reason : str
@@ -91,6 +93,7 @@ class Posterior(Result):
     True
     >>> posterior.data["posterior"]["k"].dims, posterior.draws("k").size == posterior.data["posterior"]["k"].size
     (('chain', 'draw'), True)
+    >>> import arviz as az
     >>> float(az.rhat(posterior.data)["k"]) == posterior.rhat["k"]
     True
     >>> list(posterior.derive({"damping_ratio": "c/(2*sqrt(k))"}).index)

@@ -35,10 +35,10 @@ def posterior_of(problem: bp.Problem, theta: np.ndarray, noise: np.ndarray, seed
     """Return draws θ (draws, names) and noise parameters (draws, noise_names) as a Posterior."""
     theta, noise = (v.reshape(1, CHAINS, -1, v.shape[-1]).transpose(0, 2, 1, 3) for v in (theta, noise))
     anchored = problem.anchored(np.median(theta, axis=(0, 1, 2)))
-    density = anchored.log_posterior(theta, noise)
+    density, points = anchored.log_posterior(theta, noise), anchored.density().from_natural(theta, noise)
     names = [*problem.names, *problem.free_noise]
     return bp.Posterior(
-        data=tree(anchored.density(), theta, noise, density, seed),
+        tree=tree(anchored.density(), points, density, seed),
         converged=True,
         reason="independent draws",
         tau=dict.fromkeys(names, 1.0),
