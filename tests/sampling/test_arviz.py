@@ -96,6 +96,17 @@ def test_terms_sum_to_the_log_likelihood_in_every_case(case):
     assert terms.sum(axis=-1) == pytest.approx(problem.likelihood(residuals, noise), rel=1e-10)
 
 
+def test_terms_count_the_independent_values():
+    """Known: of 40 samples that stand for 20 values each term is −½·½·(ln v + r²/v)."""
+    run = linear_experiment(TRUTH, SD, 1, independent=20)
+    problem = bp.Problem(LINEAR, [run], priors={n: bp.Normal(0.0, 1e3) for n in ("k", "c", "coulomb")})
+    residual = run.outputs["force"] - linear_regressors(0.05, 2.0, grid(40)) @ TRUTH
+    density = problem.density()
+    residuals = density.comparisons.residuals(density.simulator.solve(TRUTH[None]))
+    found = problem.likelihood.terms(residuals, np.array([[4.0]]))[0]
+    assert found == pytest.approx(-0.25 * (np.log(4.0) + residual**2 / 4.0), abs=1e-6)
+
+
 def test_observations_are_independent_values_of_the_data():
     """Under white noise moving one sample changes one term; harmonics under coloured noise, all points with a mask."""
     run = duffing_run()
@@ -150,7 +161,7 @@ def test_effective_size_and_error_of_autoregressive_walkers_are_those_of_the_clo
         values[:, i] += r * values[:, i - 1]
     chains = scale * convergence.as_chains(values)
     assert convergence.effective_size(chains) == pytest.approx(64_000 / 9, rel=0.1)
-    assert convergence.mean_error(chains) == pytest.approx(scale * np.sqrt(9 / 64_000), rel=0.05)
+    assert convergence.mean_error(chains) / scale == pytest.approx(np.sqrt(9 / 64_000), rel=0.05)
     assert convergence.effective_size(values.reshape(4, -1)) > 5 * 64_000 / 9
 
 
