@@ -229,7 +229,7 @@ class Likelihood:
         """Of each block its index, labels of its observations, values in their order, and where each begins."""
         found = []
         for b, block in enumerate(self.blocks):
-            name, place, end = block.channel, np.arange(block.size), ""
+            name, place, end = "value" if block.channel == SCALE else block.channel, np.arange(block.size), ""
             if self._is_dense(block):
                 place = np.zeros(block.size, dtype=int)
             elif block.kind == SPECTRAL and not self.model.flat:
@@ -240,8 +240,8 @@ class Likelihood:
                 name, end = f"{name}, at", f"/{points} of the period"
             order = np.argsort(place, kind="stable")
             numbers, starts = np.unique(place[order], return_index=True)
-            labels = [f"{name} {i}{end}" for i in numbers] if numbers.size > 1 else [block.channel]
-            found.append((b, labels, order, starts))
+            labels = [f"{name} {i}{end}" for i in numbers]
+            found.append((b, [name] if labels == [f"{block.channel} 0"] else labels, order, starts))
         return found
 
     def terms(self, residuals: Sequence[np.ndarray], values: np.ndarray) -> np.ndarray:

@@ -31,11 +31,7 @@ def arviz() -> ModuleType:
 def for_arviz(tree: xr.DataTree) -> Any:
     """Return a tree as the installed ArviZ takes it, in version 0.23 as InferenceData."""
     module = arviz()
-    if not module.__version__.startswith("0."):
-        return tree
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*not defined in the InferenceData scheme")
-        return module.from_datatree(tree)
+    return module.from_datatree(tree) if module.__version__.startswith("0.") else tree
 
 
 def as_chains(values: np.ndarray) -> np.ndarray:

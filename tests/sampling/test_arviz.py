@@ -85,6 +85,13 @@ def test_terms_and_prior_sum_to_the_log_density_of_the_draws(known_variance):
     assert np.array_equal(terms["step"], draws["step"]) and np.array_equal(terms["walker"], draws["walker"])
 
 
+def test_observations_have_names_in_words():
+    names = CASES["section and multiplier"]()[0].likelihood.observations
+    assert names == ("rotation: value 0", "rotation: value 1", "rotation: multipliers")
+    masked = CASES["masked, correlated"]()[0].likelihood.observations
+    assert masked == ("rotation: angle", "rotation: rate", "rotation: multipliers")
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_terms_sum_to_the_log_likelihood_in_every_case(case):
     problem, theta = CASES[case]()
