@@ -31,6 +31,24 @@ def on_grid(amplitudes: np.ndarray, points: int) -> np.ndarray:
     return np.fft.irfft(spectrum, n=points, axis=-1)
 
 
+def from_components(components: np.ndarray, points: int) -> np.ndarray:
+    """Return signals (…, points) from real components (…, size), whose mean square is that of the signal.
+
+    These are the mean, the real and then the imaginary parts of the harmonics, and if their number is even that of the
+    Nyquist harmonic. On as many points as components the transform is orthogonal.
+    """
+    size = components.shape[-1]
+    highest = (size - 1) // 2
+    amplitudes = components[..., : highest + 1].astype(complex)
+    amplitudes.imag[..., 1:] = components[..., highest + 1 : 2 * highest + 1]
+    amplitudes *= np.sqrt(2.0 / size)
+    amplitudes[..., 0] *= np.sqrt(0.5)
+    signal = on_grid(amplitudes, points)
+    if size % 2 == 0:
+        signal += components[..., -1:] / np.sqrt(size) * np.where(np.arange(points) % 2 == 0, 1.0, -1.0)
+    return signal
+
+
 def at_times(amplitudes: np.ndarray, phase: np.ndarray) -> np.ndarray:
     """Return signals (…, times) at given phases (times,), fractions of the period, from amplitudes (…, harmonics + 1).
 

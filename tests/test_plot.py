@@ -71,9 +71,9 @@ def test_corner_laplace_ellipses_cover_the_draws(solved):
 def test_corner_ticks_show_complete_values(solved, middle, spread):
     """Also for values that differ in their last digits only or are large, for which matplotlib prints offsets."""
     _, _, posterior = solved
-    data = posterior.data.copy()
+    data = posterior.tree.copy()
     data["posterior"] = data["posterior"].to_dataset().map(lambda values: middle + spread * values / values.std())
-    figure = bp.plot.corner(replace(posterior, data=data), names=["k", "c"])
+    figure = bp.plot.corner(replace(posterior, tree=data), names=["k", "c"])
     figure.canvas.draw()
     assert not [
         axis.get_offset_text().get_text()
@@ -89,14 +89,14 @@ def test_corner_ticks_show_complete_values(solved, middle, spread):
 def test_corner_draws_a_ridge_no_wider_than_it_is(solved, correlation):
     """Share of draws inside the 90 % contour; with 35 bins that of the ridge holds 96 % of them."""
     _, _, posterior = solved
-    data, generator = posterior.data.copy(), np.random.default_rng(5)
+    data, generator = posterior.tree.copy(), np.random.default_rng(5)
     shape = data["posterior"]["k"].shape
     one, other = generator.standard_normal((2, *shape))
     group = data["posterior"].to_dataset()
     group["k"] = (group["k"].dims, one)
     group["c"] = (group["c"].dims, correlation * one + np.sqrt(1 - correlation**2) * other)
     data["posterior"] = type(data)(group)
-    ridge = replace(posterior, data=data)
+    ridge = replace(posterior, tree=data)
     axes = bp.plot.corner(ridge, names=["k", "c"]).axes[2]
     draws = np.stack([ridge.draws("k"), ridge.draws("c")], axis=-1)
     lines = next(c for c in axes.collections if isinstance(c, ContourSet) and not c.filled)

@@ -426,14 +426,12 @@ def _ranks(
 
 def independent_draws(posterior: Posterior) -> dict[str, np.ndarray] | None:
     """Return draws of every quantity at steps five autocorrelation times apart; None for fewer than 20."""
-    tau, group = max(posterior.tau.values()), posterior.data["posterior"]
+    tau = max(posterior.tau.values())
     if not np.isfinite(tau):
         return None
-    chains, steps = group.sizes["chain"], group.sizes["draw"]
-    kept = np.arange(steps - 1, -1, -int(np.ceil(SPACING * tau)))
-    if chains * kept.size < FEWEST_DRAWS:
-        return None
-    return {name: posterior.draws(name).reshape(chains, steps)[:, kept].ravel() for name in posterior.names}
+    apart = int(np.ceil(SPACING * tau))
+    draws = {name: posterior.by_step(posterior.draws(name))[:, ::-1][:, ::apart].ravel() for name in posterior.names}
+    return draws if min(map(len, draws.values())) >= FEWEST_DRAWS else None
 
 
 def position(draws: np.ndarray, truth: float, generator: Generator) -> float:

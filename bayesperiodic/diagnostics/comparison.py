@@ -3,7 +3,6 @@
 import html
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from itertools import zip_longest
 from typing import Any
 
@@ -187,7 +186,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
         )
     doubtful = coordinates == NATURAL and posterior.converged and not scored.fine
     cured = _scores(problem, fit, posterior, SAMPLING) if doubtful else None
-    group, draws = posterior.data["posterior"].to_dataset(), {n: s.whole for n, s in scored.samples.items()}
+    group, draws = posterior.tree["posterior"].to_dataset(), {n: s.whole for n, s in scored.samples.items()}
     shares, errors = scored.inside(PROBABILITIES)
     table, joint = _table(scored, cured), _joint(scored, cured)
     if advice := orbit_advice(fit):
@@ -205,7 +204,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
         shares=shares,
         shares_mcse=errors,
         units={name: unit(group, name) for name in draws},
-        synthetic=bool(posterior.data.attrs.get("synthetic")),
+        synthetic=bool(posterior.tree.attrs.get("synthetic")),
         converged=posterior.converged,
         limitations=tuple(filter(None, [fit.prior_conflict.text, misfit(problem, fit)])),
     )
@@ -330,9 +329,11 @@ def _scores(problem: Problem, fit: MapEstimate, posterior: Posterior, coordinate
     if laplace is None:
         return None
     points = laplace.points(posterior)
-    ensemble = posterior.data["posterior"]["ensemble"].to_numpy()
-    samples = {name: Sample.of(points[:, i], ensemble, posterior.ess[name]) for i, name in enumerate(laplace.names)}
-    sampled = partial(Sample.of, ensemble=ensemble, size=min(posterior.ess[name] for name in laplace.names))
+
+    def sampled(values: np.ndarray, size: float = min(posterior.ess[name] for name in laplace.names)) -> Sample:
+        return Sample.of(posterior.by_step(values), size)
+
+    samples = {name: sampled(points[:, i], posterior.ess[name]) for i, name in enumerate(laplace.names)}
     normals = zip(samples.items(), laplace.mean.tolist(), laplace.sds.tolist(), laplace.supports, strict=True)
     marginal = {
         name: verdicts.marginal_verdict(draws, mean, sd, support, posterior.converged)

@@ -69,7 +69,7 @@ def power_scaling(problem: Problem, posterior: Posterior) -> dict[str, tuple[flo
     large, prior and likelihood are in conflict; if only the first is, the data are uninformative. The two series of
     ArviZ that the package supports scale this diagnostic differently.
     """
-    lp = posterior.data["sample_stats"]["lp"].transpose("chain", "draw").to_numpy().ravel()
+    lp = posterior.tree["sample_stats"]["lp"].transpose("chain", "draw").to_numpy().ravel()
     thinned = slice(None, None, max(1, lp.size // MOST_DRAWS))
     theta, noise = draws_of(problem, posterior, thinned)
     prior = np.asarray(problem.log_prior(theta))

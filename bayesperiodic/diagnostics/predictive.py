@@ -309,7 +309,7 @@ def predict(
     if experiment is not None and run is None:
         raise ValueError(f"experiment: must be given together with `run`, got {experiment!r} without `run`.")
     check_results(problem, posterior=posterior)
-    lp = posterior.data["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()
+    lp = posterior.tree["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()
     points, noise = draws_of(problem, posterior, np.linspace(0, lp.size - 1, count).astype(int))
     peak = draws_of(problem, posterior, [int(np.argmax(lp))])[0][0]
     guesses = posterior.guesses([*problem.observations], problem.model.states)

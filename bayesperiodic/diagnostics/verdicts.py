@@ -30,15 +30,12 @@ class Sample:
     ensembles: int
 
     @classmethod
-    def of(cls, draws: np.ndarray, ensemble: np.ndarray, size: float) -> "Sample":
-        """Return the sample of draws (chains·steps,), one chain after the other, by their ensembles (chains,)."""
-        chains = draws.reshape(ensemble.size, -1)[np.argsort(ensemble, kind="stable")]
-        count, steps = np.unique(ensemble).size, chains.shape[1]
+    def of(cls, draws: np.ndarray, size: float) -> "Sample":
+        """Return the sample of draws (ensembles, steps, walkers)."""
+        count, steps = draws.shape[:2]
         parts = min(BATCHES, steps)
-        used = steps // parts * parts
-        shaped = chains[:, steps - used :].reshape(count, -1, parts, used // parts)
-        batches = shaped.transpose(0, 2, 1, 3).reshape(count * parts, -1)
-        return cls(draws, batches, max(size, 1.0) if np.isfinite(size) else 1.0, count)
+        batches = draws[:, steps % parts :].reshape(count * parts, -1)
+        return cls(draws.ravel(), batches, max(size, 1.0) if np.isfinite(size) else 1.0, count)
 
     def by_ensemble(self) -> list["Sample"]:
         """Return the sample of each ensemble."""

@@ -400,16 +400,14 @@ def traces(posterior: Posterior, *, walkers: int = 4, figure: Figure | None = No
     """
     _checks.instance("posterior", posterior, Posterior)
     _checks.integer("walkers", walkers, 1)
-    names, group = posterior.names, posterior.data["posterior"]
-    chains, steps = group.sizes["chain"], group.sizes["draw"]
-    ensemble = group["ensemble"].to_numpy()
+    names = posterior.names
+    steps = posterior.by_step(posterior.draws(names[0])).shape[1]
     shown = np.arange(0, steps, max(1, steps // MOST_STEPS))
     figure = figure or plt.figure(figsize=(8.0, 1.25 * len(names) + 0.6), layout="constrained")
     rows = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
     for axes, name in zip(rows, names, strict=True):
-        paths = posterior.draws(name).reshape(chains, steps)[:, shown]
-        for e in np.unique(ensemble):
-            axes.plot(shown, paths[ensemble == e][:walkers].T, color=ENSEMBLES[e % len(ENSEMBLES)], lw=0.4, alpha=0.6)
+        for e, paths in enumerate(posterior.by_step(posterior.draws(name))[:, shown]):
+            axes.plot(shown, paths[:, :walkers], color=ENSEMBLES[e % len(ENSEMBLES)], lw=0.4, alpha=0.6)
         axes.set_ylabel(draws_label(posterior, name), fontsize=8)
         text = f"tau {posterior.tau[name]:.0f} steps, R-hat {posterior.rhat[name]:.3f}"
         place: dict[str, Any] = {"xycoords": "axes fraction", "ha": "right", "va": "top"}

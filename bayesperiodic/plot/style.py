@@ -22,7 +22,7 @@ LABEL_LENGTH, ACROSS = 24, 4
 
 def caveats_of(posterior: Posterior) -> str:
     """Return the caveats on draws, for the title of a figure."""
-    return caveats(bool(posterior.data.attrs.get("synthetic")), posterior.converged)
+    return caveats(bool(posterior.tree.attrs.get("synthetic")), posterior.converged)
 
 
 def caveats(synthetic: bool, converged: bool) -> str:
@@ -32,7 +32,7 @@ def caveats(synthetic: bool, converged: bool) -> str:
 
 def draws_label(posterior: Posterior, name: str) -> str:
     """Return the label of a quantity by its full name."""
-    return wrapped_label(name, unit(posterior.data["posterior"].to_dataset(), name))
+    return wrapped_label(name, unit(posterior.tree["posterior"].to_dataset(), name))
 
 
 def wrapped_label(name: str, unit: str) -> str:

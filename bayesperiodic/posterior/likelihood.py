@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 
-from bayesperiodic import _checks
+from bayesperiodic import _checks, _fourier
 from bayesperiodic.posterior.noise import (
     CORRELATED,
     FLAT,
@@ -211,6 +211,55 @@ class Likelihood:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             total = (self._flat if self.model.flat else self._by_kind)(residuals, values, log_variance_factor)
         return np.where(np.isfinite(total), total, -np.inf)
+
+    @cached_property
+    def observations(self) -> tuple[str, ...]:
+        """Names of what is independent given θ and φ, the parts of the likelihood in `terms`.
+
+        Under white noise these are the values of a channel at the points of a mask, or of its mean period at as many
+        equally spaced instants as it has independent components; these are the samples where all harmonics are kept.
+        Under coloured noise they are the harmonics of a channel, or, with a mask, the channel of an experiment as a
+        whole. Values with a given covariance, and multipliers, are whitened; the last ones are frequencies of
+        free-running models.
+        """
+        return tuple(f"{self.blocks[b].experiment}: {label}" for b, labels, *_ in self._parts for label in labels)
+
+    @cached_property
+    def _parts(self) -> list[tuple[int, list[str], np.ndarray, np.ndarray]]:
+        """Of each block its index, labels of its observations, values in their order, and where each begins."""
+        found = []
+        for b, block in enumerate(self.blocks):
+            name, place, end = "value" if block.channel == SCALE else block.channel, np.arange(block.size), ""
+            if self._is_dense(block):
+                place = np.zeros(block.size, dtype=int)
+            elif block.kind == SPECTRAL and not self.model.flat:
+                name, place = f"{name}, harmonic", block.harmonic
+            elif block.kind in (SPECTRAL, POINTS):
+                points = block.size if block.kind == SPECTRAL else block.points
+                place = place if block.kind == SPECTRAL else np.rint(block.position * points).astype(int)
+                name, end = f"{name}, at", f"/{points} of the period"
+            order = np.argsort(place, kind="stable")
+            numbers, starts = np.unique(place[order], return_index=True)
+            labels = [f"{name} {i}{end}" for i in numbers]
+            found.append((b, [name] if labels == [f"{block.channel} 0"] else labels, order, starts))
+        return found
+
+    def terms(self, residuals: Sequence[np.ndarray], values: np.ndarray) -> np.ndarray:
+        """Return the log-likelihoods (…, observations) of the `observations`, which sum to that of `__call__`."""
+        found = []
+        for b, _, order, starts in self._parts:
+            block, phi, r = self.blocks[b], values[..., self._columns[b]], residuals[b]
+            if self._is_dense(block):
+                found.append(self._together([r], block, phi, 1.0)[..., None])
+                continue
+            if block.kind == SPECTRAL and self.model.flat:
+                r = _fourier.from_components(r, block.size)
+            each = r**2
+            if block.kind != KNOWN:
+                variances = self._variances(block, phi)[0]
+                each = block.weight * (np.log(variances) + each / variances)
+            found.append(-0.5 * np.add.reduceat(each[..., order], starts, axis=-1))
+        return np.concatenate(found, axis=-1)
 
     def _by_kind(
         self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray

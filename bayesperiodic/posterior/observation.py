@@ -256,9 +256,9 @@ class Observation:
             mask = np.ones(self._points, dtype=bool) if e.mask is None else e.mask
             noise[:, mask] = values.reshape(len(values), -1, len(self.channels))
         else:
-            for c, channel in enumerate(self.channels):
+            for c in range(len(self.channels)):
                 if e.mask is None:
-                    noise[..., c] = self._signal(components[c], self._harmonics[channel])
+                    noise[..., c] = _fourier.from_components(components[c], self._points)
                 else:
                     noise[:, e.mask, c] = components[c]
         values = self._predicted(response) + noise
@@ -329,18 +329,6 @@ class Observation:
         if size % 2 == 0:
             result[..., -1] = np.sum(signal * (self._alternating / self._points), axis=-1) * math.sqrt(size)
 
-    def _signal(self, components: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
-        """Return the signals (…, points) that have these real Fourier components (…, size): `_spectral` undone."""
-        highest = (harmonic.size - 1) // 2
-        amplitudes = components[..., : highest + 1].astype(complex)
-        amplitudes.imag[..., 1:] = components[..., highest + 1 : 2 * highest + 1]
-        amplitudes *= math.sqrt(2.0 / harmonic.size)
-        amplitudes[..., 0] *= math.sqrt(0.5)
-        signal = _fourier.on_grid(amplitudes, self._points)
-        if harmonic.size % 2 == 0:
-            signal += components[..., -1:] / math.sqrt(harmonic.size) * self._alternating
-        return signal
-
     @cached_property
     def _alternating(self) -> np.ndarray:
         """The signal (points,) 1, −1, 1, … of the Nyquist harmonic."""
@@ -348,7 +336,7 @@ class Observation:
 
     def _spread(self, weights: np.ndarray, harmonic: np.ndarray) -> np.ndarray:
         """Return the transpose of `_spectral` applied to weights (size,), its inverse but for a factor."""
-        return self._signal(weights, harmonic) * harmonic.size / self._points
+        return _fourier.from_components(weights, self._points) * harmonic.size / self._points
 
     def _predicted(self, response: Response) -> np.ndarray:
         """Return the model's outputs (…, points, channels), turned and delayed."""

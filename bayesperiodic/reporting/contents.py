@@ -394,13 +394,12 @@ def settings(given: ReportInputs) -> Rows:
         ),
     }
     if posterior is not None:
-        group, attributes = posterior.data["posterior"], posterior.data.attrs
-        chains, draws = group.sizes["chain"], group.sizes["draw"]
-        count = np.unique(group["ensemble"].to_numpy()).size
+        attributes = posterior.tree.attrs
+        count, steps, walkers = posterior.by_step(posterior.draws(posterior.names[0])).shape
         programs = [f"{name} {attributes[name]}" for name in ("bayesperiodic", "emcee", "nutpie") if name in attributes]
         values |= {
             "Seed": str(posterior.seed),
-            "Draws": f"{count} ensembles, {chains // count} chains each, {draws} draws per chain",
+            "Draws": f"{count} ensembles, {html.counted(walkers, 'walker')} each, {steps} draws per walker",
             "Drawn with": ", ".join(programs),
         }
     return [{"Setting": name, "Value": code(value)} for name, value in values.items()]

@@ -1,12 +1,21 @@
-"""Convergence diagnostics of chains; calls of ArviZ (0.23 and 1.x)."""
+"""Convergence diagnostics of chains; calls of ArviZ (0.23 and 1.x).
+
+A chain, in the sense of ArviZ, is an independent ensemble. Its draws are those of the first half of the steps, walker
+by walker, then those of the second half. So the halves that R-hat compares are early and late, and the autocorrelation
+from which ArviZ counts effective draws is that along the walkers. Step by step it would see different walkers in
+neighbouring draws and count ten times too many.
+"""
 
 import warnings
 from collections.abc import Sequence
 from types import ModuleType
+from typing import Any
 
 import emcee
 import numpy as np
 import xarray as xr
+
+from bayesperiodic.posterior.parameters import CHAIN, DRAW
 
 FEWEST_WEIGHTS, EQUAL, SMALLEST = 0.25, 1e-6, 700.0
 
@@ -19,16 +28,40 @@ def arviz() -> ModuleType:
     return module
 
 
-def rhat(chains: np.ndarray) -> np.ndarray:
-    """Return the rank-normalised split R-hat of each coordinate of chains (ensembles, steps, walkers, coordinates).
+def for_arviz(tree: xr.DataTree) -> Any:
+    """Return a tree as the installed ArviZ takes it, in version 0.23 as InferenceData."""
+    module = arviz()
+    return module.from_datatree(tree) if module.__version__.startswith("0.") else tree
 
-    The walkers of an ensemble depend on each other; therefore an ensemble is one chain here, its steps in order.
+
+def as_chains(values: np.ndarray) -> np.ndarray:
+    """Return values (ensembles, steps, walkers, …) as (chains, draws, …)."""
+    halves = np.split(values, [values.shape[1] // 2], axis=1)
+    return np.concatenate([h.swapaxes(1, 2).reshape(len(h), -1, *h.shape[3:]) for h in halves], axis=1)
+
+
+def rhat(values: np.ndarray) -> float:
+    """Return ArviZ's rank-normalised split R-hat of values (chains, draws)."""
+    return _of_arviz("rhat", values, "rank")
+
+
+def effective_size(values: np.ndarray) -> float:
+    """Return ArviZ's effective sample size of values (chains, draws), "ess_bulk"; NaN if they do not vary."""
+    return _of_arviz("ess", values, "bulk") if np.ptp(values) > 0.0 else np.nan
+
+
+def mean_error(values: np.ndarray) -> float:
+    """Return ArviZ's Monte Carlo error of the mean of values (chains, draws), "mcse_mean"; NaN if they do not vary.
+
+    In units of their sd: ArviZ takes values within 1e-15 of each other for constant.
     """
-    count = chains.shape[-1]
-    pooled = chains.reshape(len(chains), -1, count)
-    data = xr.Dataset({str(i): (("chain", "draw"), pooled[:, :, i]) for i in range(count)})
-    result = arviz().rhat(data, method="rank")
-    return np.array([float(result[str(i)]) for i in range(count)])
+    sd = values.std()
+    return float(sd * _of_arviz("mcse", (values - values.mean()) / sd, "mean")) if np.ptp(values) > 0.0 else np.nan
+
+
+def _of_arviz(statistic: str, values: np.ndarray, method: str) -> float:
+    data = xr.Dataset({"x": ((CHAIN, DRAW), values)})
+    return float(getattr(arviz(), statistic)(data, method=method)["x"])
 
 
 def autocorrelation_time(chains: np.ndarray) -> np.ndarray:
@@ -98,7 +131,7 @@ def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: 
         found.append(f"quantiles of the ensembles {spread:.2f} sd apart")
     if not found and (alone := _furthest(kept, tau)) > APART:
         found.append(f"walkers that stay apart, by {alone:.0f} standard errors")
-    if not found and (worst := rhat(kept).max()) > RHAT:
+    if not found and (worst := max(map(rhat, np.moveaxis(as_chains(kept), -1, 0)))) > RHAT:
         found.append(f"R-hat {worst:.3f}")
     return found
 

@@ -216,9 +216,9 @@ class _Run:
             acceptance=float(stats["acceptance_rate"].mean()),
             seed=seed,
         )
-        described = result.data["sample_stats"].to_dataset()
-        result.data["sample_stats"] = xr.DataTree(
+        described = result.tree["sample_stats"].to_dataset()
+        result.tree["sample_stats"] = xr.DataTree(
             described.assign({name: ((CHAIN, DRAW), values) for name, values in stats.items()})
         )
-        result.data.attrs["nutpie"] = version
+        result.tree.attrs["nutpie"] = version
         return result

@@ -4,6 +4,7 @@ import importlib.metadata
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import emcee
 import numpy as np
@@ -51,25 +52,30 @@ class Posterior(Result):
 
     Attributes
     ----------
-    data : DataTree
-        Group ``posterior``: variables with dims (chain, draw) first; a chain is a walker, its coordinate ``ensemble``
-        the number of its ensemble. A local parameter is one variable with the dim ``experiment``, with its fixed value
-        where it is not free. ``variance``, ``lengthscale`` and ``floor`` have the dim ``channel``, then ``experiment``
-        if each has its own; ``scale`` has at most the latter. Known noise parameters are included with their values;
-        NaN marks missing ones, such as the variance of a channel in an experiment without it. Attributes: ``units``, or
-        ``units of <channel>`` of ``variance``; ``noise``, the name of the noise model, on its parameters. Group
-        ``sample_stats``: lp, the log-density in sampling coordinates, and the status of the draw's solves. Group
-        ``posterior_predictive``: for some draws, replicates of the measured outputs, noise included, and
-        largest_multiplier, the modulus of each orbit's largest Floquet multiplier. Group ``orbits``: states of every
-        experiment, turns included, at the draw with the highest density. Groups ``observed_data`` and
+    tree : DataTree
+        In the schema of ArviZ. Group ``posterior``: variables with dims (chain, draw) first. A chain is an independent
+        ensemble; its draws are those of the first half of the steps, walker by walker, then those of the second half,
+        with the coordinates ``walker`` and ``step``. A local parameter is one variable with the dim ``experiment``,
+        with its fixed value where it is not free. ``variance``, ``lengthscale`` and ``floor`` have the dim ``channel``,
+        then ``experiment`` if each has its own; ``scale`` has at most the latter. Known noise parameters are included
+        with their values; NaN marks missing ones, such as the variance of a channel in an experiment without it.
+        Attributes: ``units``, or ``units of <channel>`` of ``variance``; ``noise``, the name of the noise model, on its
+        parameters. Group ``sample_stats``: lp, the log-density in sampling coordinates; the status of the draw's
+        solves; acceptance_rate, with emcee 1 where the proposal of the step was accepted, else 0. Group
+        ``log_likelihood``, for `arviz.loo`: at some draws, the terms of independent observations, which sum to the
+        log-likelihood, up to constants of the data: values of the mean period at equally spaced instants, or its
+        harmonics if the noise is coloured. Terms of fewer or more independent values than components are weighted as
+        in the likelihood. Group ``posterior_predictive``: for some draws, replicates of the measured outputs, noise
+        included, and largest_multiplier, the modulus of each orbit's largest Floquet multiplier. Group ``orbits``:
+        states of every experiment, turns included, at the draw with the highest density. Groups ``observed_data`` and
         ``constant_data``: outputs and inputs.
     converged : bool
         True if the stop rule was met.
     reason : str
         Why sampling stopped.
     tau, ess, rhat : dict of str to float
-        Integrated autocorrelation time [steps], effective sample size (draws / tau), R-hat between ensembles; in
-        sampling coordinates, by full name.
+        By full name: the integrated autocorrelation time of the stop rule [steps], in sampling coordinates; ArviZ's
+        effective sample size (ess_bulk) and R-hat (r_hat) between the halves of all ensembles.
     acceptance : float
         Mean fraction of accepted proposals.
     failures : dict of str to float
@@ -87,11 +93,14 @@ class Posterior(Result):
     True
     >>> posterior.data["posterior"]["k"].dims, posterior.draws("k").size == posterior.data["posterior"]["k"].size
     (('chain', 'draw'), True)
+    >>> import arviz as az
+    >>> float(az.rhat(posterior.data)["k"]) == posterior.rhat["k"]
+    True
     >>> list(posterior.derive({"damping_ratio": "c/(2*sqrt(k))"}).index)
     ['damping_ratio']
     """
 
-    data: xr.DataTree
+    tree: xr.DataTree
     converged: bool
     reason: str
     tau: dict[str, float]
@@ -110,10 +119,15 @@ class Posterior(Result):
     @property
     def fingerprint(self) -> str:
         """Digests of the parts of the problem (model, experiments, priors, constants, noise, scheme)."""
-        return str(self.data.attrs.get("fingerprint", ""))
+        return str(self.tree.attrs.get("fingerprint", ""))
+
+    @property
+    def data(self) -> Any:
+        """`tree` as the functions of the installed ArviZ take it: itself, or with ArviZ 0.23 as InferenceData."""
+        return convergence.for_arviz(self.tree)
 
     def draws(self, name: str) -> np.ndarray:
-        """Return all draws of a quantity, chain by chain.
+        """Return all draws of a quantity, chain by chain; `by_step` arranges them by steps and walkers.
 
         Parameters
         ----------
@@ -132,6 +146,22 @@ class Posterior(Result):
         """
         return column(self._group, name).ravel()
 
+    def by_step(self, values: np.ndarray) -> np.ndarray:
+        """Return values at all draws by the steps and walkers of the ensembles.
+
+        Parameters
+        ----------
+        values : array (draws,)
+            In the order of `draws`.
+
+        Returns
+        -------
+        array (ensembles, steps, walkers)
+        """
+        step, walker = (self._group[name].to_numpy() for name in (STEP, WALKER))
+        shape = self._group.sizes[CHAIN], int(step.max()) + 1, int(walker.max()) + 1
+        return values.reshape(shape[0], -1)[:, np.lexsort((walker, step))].reshape(shape)
+
     def guesses(self, experiments: Iterable[str], states: Iterable[str]) -> dict[str, dict[str, np.ndarray]]:
         """Return the states at the draw with the highest density, as guesses for further solves.
 
@@ -145,12 +175,12 @@ class Posterior(Result):
         dict of str to dict of str to array (samples·periods,)
             By experiment and state, turns of angles included.
         """
-        group, states = self.data["orbits"].to_dataset(), tuple(states)
+        group, states = self.tree["orbits"].to_dataset(), tuple(states)
         return {run: {state: group[f"{run} {state}"].to_numpy() for state in states} for run in experiments}
 
     @property
     def _group(self) -> xr.Dataset:
-        return self.data["posterior"].to_dataset()
+        return self.tree["posterior"].to_dataset()
 
     @property
     def _noise(self) -> list[str]:
@@ -160,11 +190,13 @@ class Posterior(Result):
     def summary(self) -> pd.DataFrame:
         """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, one row per parameter.
 
-        Its ``attrs`` contain interval, converged, reason and failures.
+        mcse_mean, ess and rhat are mcse_mean, ess_bulk and r_hat of `arviz.summary`. Its ``attrs`` contain interval,
+        converged, reason and failures.
         """
         table = _table(
             {
-                name: _described(self.draws(name), self.ess[name]) | {"tau": self.tau[name], "rhat": self.rhat[name]}
+                name: _described(column(self._group, name), self.ess[name])
+                | {"tau": self.tau[name], "rhat": self.rhat[name]}
                 for name in self.names
             }
         )
@@ -211,7 +243,7 @@ class Posterior(Result):
                     f"expressions[{name!r}]: must be finite at all draws, got NaN or infinity at {bad} of {draws.size} "
                     f"for {quantity.text!r}."
                 )
-            rows[name] = _described(draws.ravel(), self._effective_size(draws))
+            rows[name] = _described(draws, convergence.effective_size(draws))
         return _table(rows)
 
     def as_prior(self, names: tuple[str, ...]) -> MultivariateNormal:
@@ -251,14 +283,6 @@ class Posterior(Result):
         draws = np.stack([self.draws(name) for name in key])
         return MultivariateNormal(draws.mean(axis=1), np.cov(draws).reshape(len(key), len(key)))
 
-    def _effective_size(self, draws: np.ndarray) -> float:
-        """Return the effective sample size of values (chains, draws); NaN if they do not vary."""
-        if np.ptp(draws) == 0.0:
-            return np.nan
-        ensemble = self._group["ensemble"].to_numpy()
-        ensembles = np.stack([draws[ensemble == e].T[:, :, None] for e in np.unique(ensemble)])
-        return draws.size / float(convergence.autocorrelation_time(ensembles)[0])
-
     def __repr__(self) -> str:
         state = "converged" if self.converged else "NOT CONVERGED"
         failed = ", ".join(f"{status} {share:.2%}" for status, share in self.failures.items())
@@ -271,7 +295,7 @@ def _described(draws: np.ndarray, ess: float) -> dict[str, float]:
     low, median, high = np.quantile(draws, [0.05, 0.5, 0.95])
     sd = draws.std(ddof=1)
     found = {"mean": draws.mean(), "sd": sd, "q05": low, "q50": median, "q95": high}
-    return found | {"mcse_mean": sd / np.sqrt(ess), "ess": ess}
+    return found | {"mcse_mean": convergence.mean_error(draws), "ess": ess}
 
 
 def _table(rows: dict[str, dict[str, float]]) -> pd.DataFrame:
@@ -280,22 +304,20 @@ def _table(rows: dict[str, dict[str, float]]) -> pd.DataFrame:
     return table
 
 
-MOST = {CHAIN: 20, DRAW: 5}
+REPLICATES = 100
+# Draws at which the terms of the log-likelihood are stored, and the most numbers that these may take.
+TERM_DRAWS, MOST_TERMS = (500, 2000), 10_000_000
 
 
 def posterior_predictive(density: LogPosterior, posterior: xr.Dataset, time: dict[str, str], seed: int) -> xr.Dataset:
-    """Return replicates of the measured mean periods, noise included, for some draws of some walkers.
+    """Return replicates of the measured mean periods, noise included, for some draws.
 
     Variables are ``<experiment> <channel>`` with dims (chain, draw, time axis), and ``largest_multiplier``, the modulus
     of the largest Floquet multiplier, with dims (chain, draw, experiment); NaN where a solve fails.
     """
     problem = density.problem
-    chosen = posterior.isel({d: _spread(posterior.sizes[d], n) for d, n in MOST.items()})
+    chosen, theta, noise = _some(problem, posterior, REPLICATES)
     shape = chosen.sizes[CHAIN], chosen.sizes[DRAW]
-    theta, noise = (
-        np.array([column(chosen, name).ravel() for name in names]).reshape(len(names), shape[0] * shape[1]).T
-        for names in (problem.names, problem.noise_names)
-    )
     components = problem.likelihood.simulate(noise, np.random.default_rng(seed))
     simulation, variables, largest = density.simulator.solve(theta, keep=True, polish=True), {}, []
     for e in problem.experiments:
@@ -319,12 +341,20 @@ def orbits(density: LogPosterior, theta: np.ndarray, time: dict[str, str]) -> xr
     return xr.Dataset(states, coords={time[e.name]: e.time for e in density.problem.experiments})
 
 
-def _spread(size: int, wanted: int) -> np.ndarray:
-    """Return at most `wanted` indices, equally spaced."""
-    return np.linspace(0, size - 1, min(size, wanted)).astype(int)
+def _some(problem: Description, posterior: xr.Dataset, most: int) -> tuple[xr.Dataset, np.ndarray, np.ndarray]:
+    """Return equally spaced draws of every chain, their θ (draws, names) and noise parameters (draws, noise_names)."""
+    each = max(1, most // posterior.sizes[CHAIN])
+    draws = posterior.sizes[DRAW]
+    chosen = posterior.isel({DRAW: np.linspace(0, draws - 1, min(each, draws)).astype(int)})
+    size = chosen.sizes[CHAIN] * chosen.sizes[DRAW]
+    theta, noise = (
+        np.array([column(chosen, name).ravel() for name in names]).reshape(len(names), size).T
+        for names in (problem.names, problem.noise_names)
+    )
+    return chosen, theta, noise
 
 
-ENSEMBLE = "ensemble"
+STEP, WALKER, OBSERVATION = "step", "walker", "observation"
 
 
 def gather(
@@ -340,16 +370,16 @@ def gather(
 ) -> Posterior:
     """Return the posterior of chains (ensembles, steps, walkers, coordinates) in sampling coordinates."""
     names = density.labels
-    data = tree(density, *density.to_natural(kept), log_density, seed)
+    data = tree(density, kept, log_density, seed)
     data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason}
-    tau = convergence.autocorrelation_time(kept)
+    tau, group = convergence.autocorrelation_time(kept), data["posterior"].to_dataset()
     return Posterior(
-        data=data,
+        tree=data,
         converged=converged,
         reason=reason,
         tau=dict(zip(names, tau.tolist(), strict=True)),
-        ess=dict(zip(names, (log_density.size / tau).tolist(), strict=True)),
-        rhat=dict(zip(names, convergence.rhat(kept).tolist(), strict=True)),
+        ess={name: convergence.effective_size(column(group, name)) for name in names},
+        rhat={name: convergence.rhat(column(group, name)) for name in names},
         acceptance=acceptance,
         failures={status: count / calls.points for status, count in calls.failures.items()},
         log_posterior_calls=calls.points,
@@ -357,29 +387,30 @@ def gather(
     )
 
 
-def tree(
-    density: LogPosterior, theta: np.ndarray, noise: np.ndarray, log_density: np.ndarray, seed: int
-) -> xr.DataTree:
-    """Return draws (ensembles, steps, walkers, names), in natural values, as the groups of `Posterior.data`."""
-    problem = density.problem
-    ensembles, steps, walkers = log_density.shape
-    best = theta.reshape(-1, theta.shape[-1])[np.argmax(log_density)]
-    theta, noise, lp = (_by_chain(values) for values in (theta, noise, log_density[..., None]))
+def tree(density: LogPosterior, kept: np.ndarray, log_density: np.ndarray, seed: int) -> xr.DataTree:
+    """Return draws (ensembles, steps, walkers, coordinates) as the groups of `Posterior.tree`."""
+    problem, lp = density.problem, convergence.as_chains(log_density)
+    steps, walkers = log_density.shape[1:]
+    moved = np.full(log_density.shape, np.nan)
+    moved[:, 1:] = np.any(np.diff(kept[..., : len(problem.names)], axis=1) != 0.0, axis=-1)
+    theta, noise = density.to_natural(convergence.as_chains(kept))
+    best = theta.reshape(-1, theta.shape[-1])[np.argmax(lp)]
+    step, walker = (convergence.as_chains(index[None])[0] for index in np.indices((steps, walkers)))
     coords = {
-        CHAIN: np.arange(ensembles * walkers),
-        DRAW: np.arange(steps),
-        ENSEMBLE: (CHAIN, np.repeat(np.arange(ensembles), walkers)),
-    }
+        CHAIN: np.arange(len(lp)), DRAW: np.arange(lp.shape[1]), STEP: (DRAW, step), WALKER: (DRAW, walker)
+    }  # fmt: skip
     posterior, time = _variables(problem, theta, noise).assign_coords(coords), _time_axes(problem)
-    status = np.where(np.isfinite(lp[..., 0]), CONVERGED, NOT_FINITE).astype(np.int8)
+    status = np.where(np.isfinite(lp), CONVERGED, NOT_FINITE).astype(np.int8)
     meanings = {
         "flag_values": list(range(len(STATUSES))),
         "flag_meanings": " ".join(s.replace(" ", "_") for s in STATUSES),
     }
-    stats = {"lp": ((CHAIN, DRAW), lp[..., 0]), "status": ((CHAIN, DRAW), status, meanings)}
+    stats = {"lp": ((CHAIN, DRAW), lp), "status": ((CHAIN, DRAW), status, meanings)}
+    stats |= {"acceptance_rate": ((CHAIN, DRAW), convergence.as_chains(moved))}
     groups = {
         "posterior": posterior,
         "sample_stats": xr.Dataset(stats, coords=coords),
+        "log_likelihood": _terms(density, posterior),
         "posterior_predictive": posterior_predictive(density, posterior, time, seed),
         "orbits": orbits(density, best, time),
         "observed_data": _signals(problem, "outputs", time),
@@ -395,10 +426,18 @@ def tree(
     return result
 
 
-def _by_chain(values: np.ndarray) -> np.ndarray:
-    """Return values (ensembles, steps, walkers, columns) as (chains, draws, columns)."""
-    ensembles, steps, walkers, columns = values.shape
-    return values.transpose(0, 2, 1, 3).reshape(ensembles * walkers, steps, columns)
+def _terms(density: LogPosterior, posterior: xr.Dataset) -> xr.Dataset:
+    """Return the terms of the log-likelihood at some draws as the only variable of a group."""
+    likelihood = density.problem.likelihood
+    most = min(max(MOST_TERMS // len(likelihood.observations), TERM_DRAWS[0]), TERM_DRAWS[1])
+    chosen, theta, noise = _some(density.problem, posterior, most)
+    simulation = density.simulator.solve(theta, whole=True)
+    terms = likelihood.terms(density.comparisons.residuals(simulation, None), noise)
+    terms[simulation.status != CONVERGED] = np.nan
+    shaped = terms.reshape(chosen.sizes[CHAIN], chosen.sizes[DRAW], -1)
+    coords = {name: chosen.coords[name] for name in (CHAIN, DRAW, STEP, WALKER)}
+    group = xr.Dataset({"data": ((CHAIN, DRAW, OBSERVATION), shaped)}, coords=coords)
+    return group.assign_coords({OBSERVATION: [*likelihood.observations]})
 
 
 def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr.Dataset:

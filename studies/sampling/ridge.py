@@ -25,15 +25,8 @@ def standard_error(posterior: bp.Posterior, values: np.ndarray) -> float:
     Each ensemble, or chain of NUTS, is cut into consecutive batches. Their means reflect the dependence in time,
     between walkers, and the differences between ensembles.
     """
-    group = posterior.data["posterior"]
-    by_chain = values.reshape(group.sizes["chain"], group.sizes["draw"])
-    ensemble = group["ensemble"].to_numpy()
-    means = [
-        batch.mean()
-        for number in np.unique(ensemble)
-        for batch in np.array_split(by_chain[ensemble == number], BATCHES, axis=1)
-    ]
-    return float(stats.sem(means))
+    ensembles = posterior.by_step(values)
+    return float(stats.sem([batch.mean() for steps in ensembles for batch in np.array_split(steps, BATCHES)]))
 
 
 WIDTH = 0.02

@@ -135,7 +135,7 @@ def limit(count: int, ensembles: int) -> float:
 def collect(sampled: sampling_ridge.Runs, data: dict[str, Any]) -> dict[str, Any]:
     """Return the entries of results.json on the damper."""
     differences = compare_all({name: posterior for name, (posterior, _) in sampled.items()})
-    ensembles = [np.unique(posterior.data["posterior"]["ensemble"]).size for posterior, _ in sampled.values()]
+    ensembles = [posterior.tree["posterior"].sizes["chain"] for posterior, _ in sampled.values()]
     return {
         "data": data,
         "units": {name: bp.models.dahl.units[name] for name in bp.models.dahl.parameters} | {"variance[force]": "N²"},

@@ -5,11 +5,11 @@ import pytest
 
 from bayesperiodic.diagnostics.verdicts import Sample, has_other_mode
 
-SIZE, ENSEMBLE = 3200, np.repeat(np.arange(4), 8)
+SIZE = 3200
 
 
 def sample(draws):
-    return Sample.of(draws, ENSEMBLE, draws.size)
+    return Sample.of(draws.reshape(4, -1, 8), draws.size)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import bayesperiodic as bp
+from bayesperiodic import _fourier
 from bayesperiodic.diagnostics.adequacy import TESTS, adequacy
 from bayesperiodic.sampling.posterior import tree
 from tests.known import LINEAR, NOISES, RUNAWAY, formula_model, grid, linear_experiment, linear_regressors
@@ -34,10 +35,10 @@ def posterior_of(problem: bp.Problem, theta: np.ndarray, noise: np.ndarray, seed
     """Return draws θ (draws, names) and noise parameters (draws, noise_names) as a Posterior."""
     theta, noise = (v.reshape(1, CHAINS, -1, v.shape[-1]).transpose(0, 2, 1, 3) for v in (theta, noise))
     anchored = problem.anchored(np.median(theta, axis=(0, 1, 2)))
-    density = anchored.log_posterior(theta, noise)
+    density, points = anchored.log_posterior(theta, noise), anchored.density().from_natural(theta, noise)
     names = [*problem.names, *problem.free_noise]
     return bp.Posterior(
-        data=tree(anchored.density(), theta, noise, density, seed),
+        tree=tree(anchored.density(), points, density, seed),
         converged=True,
         reason="independent draws",
         tau=dict.fromkeys(names, 1.0),
@@ -192,7 +193,7 @@ def test_circulant_noise_hides_a_correlated_misfit_from_all_but_the_scatter():
     components = 30.0 * np.sqrt(spectrum / spectrum.mean()) * generator.standard_normal(40)
     plain = linear_experiment(TRUTH, 3.0, seed=1)
     problem = bp.Problem(LINEAR, [plain], priors=FLAT)
-    error = problem.observations["run"]._signal(components, harmonic)
+    error = _fourier.from_components(components, problem.experiments[0].samples)
     run = replace(plain, outputs={"force": plain.outputs["force"] + error})
     for given, misspecified in (({}, False), ({"scatter": {"force": 9.0}, "cycles": 9}, True)):
         problem = bp.Problem(LINEAR, [replace(run, **given)], priors=FLAT, noise="circulant")

@@ -63,7 +63,7 @@ def test_settings_seed_and_versions_are_shown(solved, page):
     settings, versions = page.rows("table-settings"), page.rows("table-versions")
     assert settings["Seed"] == [str(solved[2].seed)]
     assert settings["Difference scheme"] == ["central4"]
-    assert "2 ensembles, 32 chains each" in settings["Draws"][0]
+    assert "2 ensembles, 32 walkers each" in settings["Draws"][0]
     assert versions["numpy"] == [np.__version__]
 
 

@@ -90,25 +90,21 @@ def test_derived_posterior_statistics_equal_those_of_numpy(solved):
         row = table.loc[name]
         assert row[["mean", "sd"]].tolist() == pytest.approx([draws.mean(), draws.std(ddof=1)], rel=1e-12)
         assert row[["q05", "q50", "q95"]].tolist() == pytest.approx(np.quantile(draws, [0.05, 0.5, 0.95]), rel=1e-12)
-        assert row["mcse_mean"] == pytest.approx(row["sd"] / np.sqrt(row["ess"]))
+        assert row["mcse_mean"] == pytest.approx(row["sd"] / np.sqrt(row["ess"]), rel=0.1)
     assert table.loc["half", ["mean", "sd", "q95"]].tolist() == [0.5, 0.0, 0.5] and np.isnan(table.loc["half", "ess"])
     assert table.attrs["interval"] == posterior.summary().attrs["interval"]
     assert set(table.columns) < set(posterior.summary().columns)
 
 
 def test_ess_of_a_derived_quantity_is_its_own(solved):
-    """The ESS equals that of the summary in the coordinate in which the parameter is sampled."""
+    """It counts ranks, which increasing functions keep; the stop rule's count along walkers is about the same."""
     posterior = solved[2]
     table = posterior.derive({"k_scaled": "3 - 2*k", "log_c": "log(c)"})
     assert table.loc["k_scaled", "ess"] == pytest.approx(posterior.ess["k"], rel=1e-9)
     assert table.loc["log_c", "ess"] == pytest.approx(posterior.ess["c"], rel=1e-9)
     draws = posterior.draws("c")
-    ensembles = posterior.data["posterior"]["ensemble"].to_numpy()
-    shaped = draws.reshape(ensembles.size, -1).reshape(
-        len(set(ensembles)), -1, posterior.data["posterior"].sizes["draw"]
-    )
-    tau = convergence.autocorrelation_time(shaped.transpose(0, 2, 1)[..., None])[0]
-    assert posterior.derive({"a": "c*1"}).loc["a", "ess"] == pytest.approx(draws.size / tau)
+    tau = convergence.autocorrelation_time(posterior.by_step(draws)[..., None])[0]
+    assert posterior.derive({"a": "c*1"}).loc["a", "ess"] == pytest.approx(draws.size / tau, rel=0.25)
 
 
 def test_posterior_and_estimate_agree_where_both_are_normal(solved):

@@ -49,10 +49,7 @@ def edge():
 
 def by_ensemble(posterior: bp.Posterior, name: str) -> np.ndarray:
     """Return the draws (ensembles, steps, walkers) of what has this name."""
-    group = posterior.data["posterior"]
-    count = len(np.unique(group["ensemble"]))
-    draws = posterior.draws(name).reshape(count, group.sizes["chain"] // count, -1)
-    return draws.transpose(0, 2, 1)
+    return posterior.by_step(posterior.draws(name))
 
 
 def mean_and_error(values: np.ndarray) -> tuple[float, float]:
@@ -157,7 +154,7 @@ def test_too_few_draws_are_not_converged_and_nuts_statistics_are_kept(linear, br
     assert not posterior.converged
     assert "max_steps = 250 reached with" in posterior.reason
     posterior.save(tmp_path / "draws")
-    known = bp.load(tmp_path / "draws").data
+    known = bp.load(tmp_path / "draws").tree
     assert known.attrs["nutpie"]
     group = known["sample_stats"]
     assert dict(group.sizes) == {"chain": 2, "draw": 250}

@@ -53,12 +53,12 @@ def test_replicates_scatter_about_the_draws_own_curves_by_their_own_variances():
     """100 draws of a linear model: the squared distance is χ² per sample, its mean within 4 standard errors."""
     problem = bp.Problem(LINEAR, [linear_experiment(TRUTH, 3.0, seed=1)], priors=PRIORS)
     posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=500, progress=False)
-    replicates = posterior.data["posterior_predictive"].to_dataset()
-    draws = posterior.data["posterior"].to_dataset().sel(chain=replicates["chain"], draw=replicates["draw"])
+    replicates = posterior.tree["posterior_predictive"].to_dataset()
+    draws = posterior.tree["posterior"].to_dataset().sel(chain=replicates["chain"], draw=replicates["draw"])
     theta = np.stack([draws[name].to_numpy() for name in problem.names], axis=-1)
     variance = draws["variance"].sel(channel="force").to_numpy()
     squared = (replicates["run force"].to_numpy() - theta @ linear_regressors(0.05, 2.0, grid(40)).T) ** 2
-    assert squared.shape == (20, 5, 40)
+    assert squared.shape == (4, 25, 40)
     assert np.mean(squared / variance[..., None]) == pytest.approx(1.0, abs=4 * np.sqrt(2 / squared.size))
     assert replicates["run force"].dims[:2] == ("chain", "draw")
     assert set(replicates.data_vars) == {"run force", "largest_multiplier"}
@@ -70,11 +70,11 @@ def test_predictive_multipliers_are_reported_without_rejecting_draws():
     """The pendulum's rotation is unstable at every draw, and its multiplier is the solver's."""
     problem = pendulum_problem([pendulum_run()])
     posterior = bp.sample(problem, bp.map_estimate(problem, progress=False), seed=1, max_steps=250, progress=False)
-    group = posterior.data["posterior_predictive"].to_dataset()
+    group = posterior.tree["posterior_predictive"].to_dataset()
     largest = group["largest_multiplier"].sel(experiment="rotation")
-    assert largest.shape == (20, 5) and np.all(largest > 1.0) and not posterior.failures
+    assert largest.shape == (4, 25) and np.all(largest > 1.0) and not posterior.failures
     at = {"chain": group["chain"][3], "draw": group["draw"][2]}
-    draw = posterior.data["posterior"].to_dataset().sel(at)
+    draw = posterior.tree["posterior"].to_dataset().sel(at)
     solution = problem.solve({name: float(draw[name]) for name in problem.names})["rotation"]
     assert float(largest.sel(at)) == pytest.approx(abs(solution.multipliers[0]), rel=1e-8)
     data = problem.experiments[0].outputs["angle"]

@@ -48,9 +48,9 @@ def check(
         assert abs(draws.std() / sd - 1.0) < error * np.sqrt((kurtosis - 1.0) / 4.0)
         if cdf and name in cdf:
             assert stats.kstest(draws, cdf[name]).statistic < 0.5 * error
-    group = posterior.data["posterior"]
     for name in moments:
-        values = group[name].transpose("draw", "chain").to_numpy()
+        steps = posterior.by_step(posterior.draws(name)).swapaxes(0, 1)
+        values = steps.reshape(len(steps), -1)
         between = np.corrcoef(values[:: max(1, int(2 * posterior.tau[name]))].T)
         pairs = between[np.triu_indices_from(between, 1)]
         assert abs(pairs.mean()) < ERRORS / np.sqrt(values.size / (2 * posterior.tau[name])) + 1 / len(values)

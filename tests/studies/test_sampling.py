@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import xarray as xr
 from PIL import Image
 from scipy import integrate, stats
 
@@ -87,14 +86,14 @@ def test_density_on_the_ridge_equals_a_double_integral():
 
 def chain(generator: np.random.Generator, correlation: float, mean: float = 0.0) -> SimpleNamespace:
     """Return four ensembles of 8 walkers over 2000 steps, autoregressive with unit variance."""
-    values = np.empty((32, 2000))
-    values[:, 0] = generator.standard_normal(32)
+    values = generator.standard_normal((4, 2000, 8))
+    values[:, 1:] *= np.sqrt(1 - correlation**2)
     for i in range(1, 2000):
-        values[:, i] = correlation * values[:, i - 1] + np.sqrt(1 - correlation**2) * generator.standard_normal(32)
+        values[:, i] += correlation * values[:, i - 1]
     values += mean
-    ensemble = np.repeat(np.arange(4), 8)
-    group = xr.Dataset({"x": (("chain", "draw"), values)}, coords={"ensemble": ("chain", ensemble)})
-    return SimpleNamespace(data={"posterior": group}, names=("x",), draws=lambda name: values.ravel())
+    return SimpleNamespace(
+        names=("x",), draws=lambda name: values.ravel(), by_step=lambda draws: draws.reshape(values.shape)
+    )
 
 
 def test_monte_carlo_errors_of_an_autoregressive_chain_agree_with_the_closed_form():
