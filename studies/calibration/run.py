@@ -96,7 +96,7 @@ CASES: dict[str, Callable[[], bp.Problem]] = {
 }  # fmt: skip
 DEFAULT, QUICK = 20, 5
 STRIDE = 4
-# The stop rule of `sample` takes 500 steps at least, so no chain can pass it. Ranks need independent draws, not this rule.
+# The stop rule of `sample` takes 500 steps at least, so no chain can pass it. Ranks need independent draws instead.
 STEPS = 250
 BINS = 20
 

@@ -120,8 +120,15 @@ def test_failures_are_counted_by_kind():
     assert found.failures == {"no steady state": 3} and found.replicates == 3
     lines = [
         {"status": "draws not usable", "map": "stalled", "rhat": 1.5, "failed": 0.5},
-        {"status": "done", "map": "converged", "mcmc": {"k": 0.5}, "laplace": {"k": 0.5}, "draws": 30, "rhat": 1.02,
-         "failed": 0.0},
+        {
+            "status": "done",
+            "map": "converged",
+            "mcmc": {"k": 0.5},
+            "laplace": {"k": 0.5},
+            "draws": 30,
+            "rhat": 1.02,
+            "failed": 0.0,
+        },
     ]
     counted = summary(lines, ["k"])
     assert counted.failures == {"draws not usable": 1, "estimate not converged": 1} and counted.failed_solves == 0.25

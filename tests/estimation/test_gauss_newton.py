@@ -26,15 +26,19 @@ class Inexact:
     )
 
     def at(self, theta, near, noise):
+        """Return the iterate at θ."""
         return Iterate(theta, near, noise, -0.5 * float(theta @ theta) - self.error)
 
     def moved(self, theta, step):
+        """Return θ after a step."""
         return theta + step
 
     def anchored(self, iterate):
+        """Return the iterate itself."""
         return iterate
 
     def hessian_and_gradient(self, iterate):
+        """Return those of the exact objective."""
         return np.eye(1), -iterate.theta
 
 
