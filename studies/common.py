@@ -26,6 +26,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from PIL import Image
 
+import bayesperiodic as bp
 from bayesperiodic import _parallel
 from bayesperiodic._parallel import TaskPool, available_cores
 
@@ -216,8 +217,9 @@ def _shrink(path: Path) -> None:
 
 
 def source_key(*files: str | None) -> str:
-    """Return a key of the package's version and of source files, which marks the results of older code as stale."""
-    text = versions()["bayesperiodic"] + "".join(sha256(Path(str(file))) for file in files)
+    """Return a key of the package's source and of further files, which marks the results of older code as stale."""
+    package = sorted(Path(bp.__file__).parent.rglob("*.py"))
+    text = "".join(sha256(Path(str(file))) for file in (*package, *files))
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

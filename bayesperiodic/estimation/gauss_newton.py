@@ -15,9 +15,13 @@ MAX_ITERATIONS = 100
 MAX_HALVINGS = 30
 SCALED_STEP = 1e-8
 SMALL_STEP, SMALL_GAIN = 1e-4, 1e-12
+# A step that gains less than the rounding errors of the objective, which are up to 1e-7 [standard deviations].
+NEGLIGIBLE = 1e-3
 SINGULAR = 1e-13
 MAX_ROUNDS, PRESSED, LONGEST = 10, 1e-3, 3.0
 LOST = 1e-6
+# Residuals whose sum of squares is no finite number.
+OVERFLOWS = 1e150
 # Change of the factors that ends the correction, and the largest part of its values that parameters may take up.
 SETTLED, MOST_TAKEN = 1e-6, 0.99
 
@@ -64,7 +68,7 @@ class Objective:
 
     def iterate(self, here: Linearisation, noise: np.ndarray) -> Iterate | None:
         """Return the iterate of solved residuals; None if the log-posterior is not finite."""
-        if not here.converged or not all(np.isfinite(r).all() for r in here.residuals):
+        if not here.converged or not all(np.abs(r).max(initial=0.0) < OVERFLOWS for r in here.residuals):
             return None
         noise = estimate_noise(self.density.problem.likelihood, here.residuals, noise, self.log_variance_factor)
         value = self.density.objective(here, noise, self.log_variance_factor)
@@ -233,7 +237,7 @@ def _ascend(
             if size < SMALL_STEP:
                 return now, "converged", history
         if trial is None:
-            return now, "stalled", history
+            return now, "converged" if size < NEGLIGIBLE else "stalled", history
         gain, now = trial.objective - now.objective, objective.anchored(trial)
         history.append(now.objective)
         if report is not None:

@@ -108,8 +108,8 @@ class MapEstimate(Result):
     Attributes
     ----------
     status : str
-        "converged", "stalled" (no step increased the objective), "iterations" (their limit was reached), "singular" or
-        "other orbit" (see `other_orbits`).
+        "converged", "stalled" (no step increased the objective, though one of more than a thousandth of a standard
+        deviation was left), "iterations" (their limit was reached), "singular" or "other orbit" (see `other_orbits`).
     theta, sd : dict of str to float
         Estimates and their standard deviations, in natural values and the parameters' units.
     robust_sd : dict of str to float

@@ -161,6 +161,7 @@ def _of_records(records: list[rig.Record], experiments: Experiments) -> dict[str
 
 def _of_fits(fits: dict[str, Fitted], experiments: Experiments, authors: dict[str, Any]) -> dict[str, Any]:
     fit, found = fits["both"].fit, questions.errors(fits["both"], experiments)
+    by_kind = contraction(fits)
     return {
         "units": {name: rig.MODEL.units[name] for name in fit.theta},
         "map": fit.theta,
@@ -183,7 +184,8 @@ def _of_fits(fits: dict[str, Fitted], experiments: Experiments, authors: dict[st
         "branches_kept_apart": all(one["as_measured"] for one in found.values()),
         "authors_errors": authors,
         "authors_errors_rms_where_a_cycle_exists": questions.mean_size(authors),
-        "contraction": contraction(fits),
+        "contraction": by_kind,
+        "springs": questions.model_error_of_springs(by_kind),
     }
 
 
@@ -217,6 +219,7 @@ def _tables(results: dict[str, Any]) -> str:
         "misfit by channel (sensor units; whiteness: p of the whitened residual)",
         pd.DataFrame(results["misfit"]).to_string(float_format="{:.3g}".format),
         common.shown("estimate, and sd over the prior's sd, by data", results["contraction"], gained),
+        common.shown("springs by data: differences are model error", results["springs"]),
         *(
             common.shown(f"cycles that were not fitted, {case}: relative error, in sds; - without a cycle", one, missed)
             for case, one in results["predictions"].items()

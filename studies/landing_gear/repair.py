@@ -156,6 +156,9 @@ def table(found: Mapping[str, Any]) -> str:
             "gain": gain, "its error": error, "better in": one["experiments_predicted_better"]
         }  # fmt: skip
     lines = [common.shown("rms error held out, mean gain over eq. (9) of the score of an experiment", rows)]
+    statuses = [status for one in found["models"].values() for status in one["status"]]
+    statuses += [one["status"] for one in found["theta16"].values()]
+    lines.append(f"  {statuses.count('converged')} of {len(statuses)} fits converged")
     for model, one in found["theta16"].items():
         chances = one["p_negative_laplace"].values()
         lines.append(f"  {model}: theta16 negative with P > 99 % in {sum(p > 0.99 for p in chances)} of {len(chances)}")

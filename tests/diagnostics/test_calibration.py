@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
+from scipy.special import ndtr
 from tqdm import tqdm
 
 import bayesperiodic as bp
@@ -109,6 +111,18 @@ def test_ranks_are_uniform_and_ties_are_broken_at_random():
     assert min(found) >= 0.4 and max(found) <= 0.5 and np.mean(found) == pytest.approx(0.45, abs=0.005)
 
 
+def test_power_of_the_tests_against_variances_that_are_a_fifth_too_small():
+    """The README's 99.2 and 76 % at a level of 1 %; the first exactly, the second within 4 of its standard errors."""
+    null = stats.chi2(1000)
+    low, high = null.ppf([0.005, 0.995])
+    assert null.cdf(low / 1.25) + null.sf(high / 1.25) == pytest.approx(0.992, abs=5e-4)
+    at_the_limits = [ndtr(np.full(1000, np.sqrt(square / 1000))) for square in (low, high)]
+    assert [calibration.dispersion_test(values)[1] for values in at_the_limits] == pytest.approx([0.01, 0.01])
+    drawn = np.sqrt(1.25) * np.random.default_rng(1).standard_normal((1000, 1000))
+    found = np.mean([calibration.ecdf_test(ndtr(row)) < 0.01 for row in drawn])
+    assert found == pytest.approx(0.76, abs=4 * np.sqrt(0.76 * 0.24 / 1000))
+
+
 def test_failures_are_counted_by_kind():
     """A model without any steady state; chains of which one has not moved."""
     wave = np.cos(2 * np.pi * grid(16))
@@ -120,11 +134,20 @@ def test_failures_are_counted_by_kind():
     assert found.failures == {"no steady state": 3} and found.replicates == 3
     lines = [
         {"status": "draws not usable", "map": "stalled", "rhat": 1.5, "failed": 0.5},
-        {"status": "done", "map": "converged", "mcmc": {"k": 0.5}, "laplace": {"k": 0.5}, "draws": 30, "failed": 0.0},
+        {
+            "status": "done",
+            "map": "converged",
+            "mcmc": {"k": 0.5},
+            "laplace": {"k": 0.5},
+            "draws": 30,
+            "rhat": 1.02,
+            "failed": 0.0,
+        },
     ]
     counted = summary(lines, ["k"])
     assert counted.failures == {"draws not usable": 1, "estimate not converged": 1} and counted.failed_solves == 0.25
     assert "failed: draws not usable 1, estimate not converged 1" in repr(counted)
+    assert "ranks among 30 independent draws, R-hat at most 1.020; stop rule of sample passed by 0" in repr(counted)
 
 
 @pytest.mark.parametrize(

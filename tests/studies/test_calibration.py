@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from bayesperiodic.diagnostics.calibration import check_supported
+from bayesperiodic.diagnostics.calibration import LARGEST_RHAT, check_supported
 from studies.__main__ import main
 from studies.calibration import run as calibration
 from studies.calibration.run import OVERCOUNT
@@ -32,12 +32,13 @@ def test_results_and_figures_are_written(found):
     for name in ("duffing", "miscounted"):
         case = results[name]
         assert case["replicates"] == 2 and not case["failures"] and case["failed_solves"] == 0.0
+        assert case["largest_rhat"] <= LARGEST_RHAT and case["largest_error_of_a_position"] < 0.15
         assert {row["verdict"] for row in case["table"]} == {"too few replicates"}
         assert [row["method"] for row in case["table"]] == 4 * ["mcmc"] + 4 * ["laplace"]
         assert all(sum(counts) == 2 for by_name in case["histograms"].values() for counts in by_name.values())
         assert len((folder / name / "replicates.jsonl").read_text().splitlines()) == 2
     assert {path.name for path in folder.glob("*.png")} == {"duffing.png", "miscounted.png"}
-    assert "SYNTHETIC" in printed and "draws per rank" in printed
+    assert "SYNTHETIC" in printed and "ranks among" in printed
 
 
 def test_second_run_recomputes_nothing(found, monkeypatch):

@@ -45,6 +45,15 @@ def test_half_range_is_that_of_the_interpolated_signal():
     assert questions.half_range(0.2 + np.cos(2 * np.pi * tau), flutter.CURVE) == pytest.approx(1.0, rel=1e-6)
 
 
+def test_interval_of_a_spring_contains_its_estimates_from_all_kinds_of_cycles():
+    rows = {"stable": (100.0, 3.0), "unstable": (105.0, 4.0), "both": (113.0, 5.0)}
+    one = {kind: {"estimate": value, "sd": sd} for kind, (value, sd) in rows.items()}
+    found = questions.model_error_of_springs(dict.fromkeys(rig.SPRINGS, one))["k_alpha2 at gain 1"]
+    assert found["largest_difference_in_sds"] == pytest.approx(13.0 / np.sqrt(34.0))
+    assert found["interval_with_model_error"] == pytest.approx([100.0 - 1.6449 * 3.0, 113.0 + 1.6449 * 5.0], abs=1e-3)
+    assert found["relative_sd"]["both"] == pytest.approx(5.0 / 113.0)
+
+
 @pytest.mark.slow
 def test_quick_run_writes_all_results_and_labels_synthetic_data(tmp_path):
     printed = run(tmp_path, "--quick")

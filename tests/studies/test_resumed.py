@@ -1,4 +1,19 @@
-from studies.common import remembered
+import shutil
+from pathlib import Path
+
+import bayesperiodic as bp
+from studies.common import remembered, source_key
+
+
+def test_results_of_an_older_package_are_stale(tmp_path, monkeypatch):
+    copy = tmp_path / "bayesperiodic"
+    shutil.copytree(Path(bp.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(bp, "__file__", str(copy / "__init__.py"))
+    before = source_key(__file__)
+    assert before == source_key(__file__)
+    with (copy / "data" / "experiment.py").open("a", encoding="utf-8") as file:
+        file.write("# changed\n")
+    assert source_key(__file__) != before
 
 
 def test_cached_part_is_recomputed_for_another_source(tmp_path):

@@ -1,0 +1,488 @@
+"""Numbers in README.md and docs/*.md: each is the one in figures/*/results.json, or listed with the reason why not.
+
+A function below yields the phrases of one subject with the stored numbers filled in, rounded as they are printed; each
+must occur in the README. Every other number in the text must be part of a phrase in `WITHOUT_RESULTS`. So a figure that
+is made again changes a phrase, and the test prints the new one.
+"""
+
+import json
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = ("README.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))))
+# Code, addresses and the titles of the paper's equations and figures contain no measured numbers.
+NO_TEXT = (
+    r"^```.*?^```", r"`[^`]*`", r"\]\([^)]*\)", r"^\d+\. ", r"\(8\)",
+    r"\b(eq\.|figures?|tables?|section) [\d(), and]*\d\)?",
+)  # fmt: skip
+NUMBER = re.compile(r"(?<![\w.,])\d[\d.,]*(?:e-?\d+)?")
+WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
+WORDS += ("thirteen", "fourteen")
+
+
+def text(document):
+    """Return a document in one line, without what NO_TEXT describes."""
+    found = (ROOT / document).read_text("utf-8")
+    for pattern in NO_TEXT:
+        found = re.sub(pattern, "]" if pattern.startswith(r"\]") else " ", found, flags=re.DOTALL | re.MULTILINE)
+    return " ".join(found.split())
+
+
+@cache
+def results(study):
+    """Return results.json of a study."""
+    return json.loads((ROOT / "figures" / study / "results.json").read_text("utf-8"))
+
+
+def percents(values, digits):
+    """Return fractions as "a, b and c", in percent."""
+    *first, last = (f"{100 * abs(value):.{digits}f}" for value in values)
+    return f"{', '.join(first)} and {last}"
+
+
+def listed(values):
+    """Return texts as "a, b and c"."""
+    *first, last = map(str, values)
+    return f"{', '.join(first)} and {last}"
+
+
+def pendulum():
+    d, table = results("pendulum"), results("pendulum/table")
+    m_and_l, k3 = (d["estimates"][which]["parameters"] for which in ("m and l", "k3"))
+    start, used = d["start_errors"], d["data_reduction"]
+    yield (
+        f"From {d['recording']['drive_periods']:,} drive periods, {used['numbers_in_the_recording'] / 1e6:.1f} million "
+        f"numbers with noise of {100 * d['noise']:.1f} % of the attractor, {used['numbers_used']} numbers are left: "
+        f"the section points of {WORDS[len(d['selected'])]} unstable orbits."
+    )
+    yield (
+        f"From a start that is {100 * start['m']:.0f} % off in m and {100 * start['l']:.1f} % in l, m comes out "
+        f"{100 * abs(m_and_l['m']['relative_error']):.3f} % and l {100 * abs(m_and_l['l']['relative_error']):.3f} % "
+        f"off the truth, and k3, from a start {100 * start['k3']:.0f} % off, "
+        f"{100 * abs(k3['k3']['relative_error']):.3f} %."
+    )
+    low, high = table["table"]["0.001"], table["table"]["0.01"]
+    names = ("m", "l", "k3")
+    covered = [[one[n]["covered"]["cover"] for n in names] for one in (low, high)]
+    band = low["m"]["covered"]
+    yield f"Over {low['recordings']} recordings"
+    yield f"Errors of m, l and k3 over {low['recordings']} recordings"
+    yield (
+        f"the median errors of m, l and k3 are {percents([low[n]['median_error'] for n in names], 3)} %, and the 90 % "
+        f"intervals hold {listed(covered[0])} truths"
+    )
+    yield (
+        f"with noise of 1 % they are {percents([high[n]['median_error'] for n in names], 2)} %, and hold "
+        f"{listed(covered[1])}"
+    )
+    inside = all(band["band_low"] <= cover <= band["band_high"] for both in covered for cover in both)
+    assert inside, "the sentence on the band says that all are inside"
+    yield f"All are within the 99 % band, {band['band_low']:.0f} to {band['band_high']:.0f}."
+    bars = low["eigenvalue_bars"]
+    yield f"The error bars of the unstable eigenvalues hold {bars['cover']:,} of {bars['bars']:,} at 0.1 %."
+    paper = d["paper_errors"]
+    yield f"The paper's experiment came to {percents([paper[n] for n in names], 1)} %."
+    yield f"table 1: m {100 * paper['m']:.1f} %, l {100 * paper['l']:.1f} %, k3 {100 * paper['k3']:.1f} %"
+    medians = ", ".join(f"{100 * low[n]['median_error']:.3f}" for n in names)
+    yield f"medians {medians} % (synthetic, noise 0.1 %)"
+
+
+def landing_gear():
+    d = results("landing_gear")
+    a, b = d["A"], d["B"]
+    fast = [name for name in b["signs"]["negative"] if float(name.split()[0]) >= 2.0]
+    assert len(fast) == len(b["signs"]["negative"]) and not b["force_given"]["signs"]["negative"]
+    assert not a["signs"]["negative"] and not a["force_given"]["signs"]["negative"]
+    assert len(b["misspecified"]) == len(b["force_given"]["misspecified"]) == 14 and not a["misspecified"]
+    exact = a["force_given"]["force_taken_for_exact"].values()
+    signs = sum(one["p_negative_laplace"]["theta16"] > 0.975 for one in exact)
+    yield f"a fit that takes the force as exact calls {WORDS[signs]} signs negative"
+    yield f"it comes out negative with confidence in all {WORDS[len(fast)]} experiments from 2 Hz up"
+    yield "Either way all fourteen residuals call the model misspecified"
+    yield f"of the right model {WORDS[len(a['force_given']['misspecified'])]} of fourteen is called so, wrongly"
+    effects = d["repair"]["models"]
+    force = {model: one["rms_error"]["force"] for model, one in effects.items()}
+    yield f"the force is predicted to {force['all four']:.1f} N instead of {force['eq. (9)']:.0f} N"
+    fits = [status for one in effects.values() for status in one["status"]]
+    fits += [one["status"] for one in d["repair"]["theta16"].values()]
+    yield f"({fits.count('converged')} of the {len(fits)} fits converged)"
+    early = {truth: one["drop"]["displacement"] for truth, one in (("A", a), ("B", b))}
+    share = {truth: 100 * one["share_within_the_band"]["0 to 2.5 s"] for truth, one in early.items()}
+    off = {truth: 1e3 * one["largest_error_of_the_median"] for truth, one in early.items()}
+    yield (
+        f"stays within {off['A']:.3f} mm of the prediction, and within its 90 % band for {share['A']:.0f} % of the "
+        f"first 2.5 s; for the other it is off by {off['B']:.2f} mm, and the band, right for a right model, holds it "
+        f"for {share['B']:.1f} %."
+    )
+    kinds = d["quality"]["kinds"]
+    assert all(one["units_with_any"] == one["units"] for kind, one in kinds.items() if kind != "good")
+    yield f"call {kinds['good']['units_with_any']} of {kinds['good']['units']} good units different"
+
+
+def landing_gear_cost():
+    cost = results("landing_gear")["cost"]
+    schemes = {(drive, scheme): one for drive in cost for scheme, one in cost[drive]["schemes"].items()}
+    names = ("compiled from static equilibrium", "compiled from the steady state at the estimate")
+    static, near = (
+        {key: one["ratios"][f"{name} / warm"]["median"] for key, one in schemes.items()} for name in names
+    )  # fmt: skip
+    worst = {key: max(e["error"] for e in one["experiments"].values()) for key, one in schemes.items()}
+    force, second, fourth = ("force", "central4"), ("displacement", "central2"), ("displacement", "central4")
+    lsoda = schemes[force]["ratios"]["LSODA from static equilibrium / warm"]["median"]
+    yield (
+        f"with the force given it costs {static[force]:.0f} times less than from static equilibrium and "
+        f"{near[force]:.0f} times less than from the steady state at the estimate, {lsoda:,.0f} times less than "
+        "SciPy's LSODA."
+    )
+    yield (
+        f"With the displacement given one smooth equation is left: {static[second]:.1f} and {near[second]:.1f} times "
+        f"less at errors of {worst[second]:.0e} of the range".replace("e-0", "e-")
+    )
+    yield f"{static[fourth]:.0f} and {near[fourth]:.0f} times less at {worst[fourth]:.0e}".replace("e-0", "e-")
+    least, most = near[second], static[fourth]
+    yield (
+        f"{near[force]:.0f} to {static[force]:.0f} times with the force given, {least:.1f} to {most:.0f} with the "
+        "displacement"
+    )
+    rows = ratios("landing gear, force given")
+    yield (
+        f"has {rows[STEADY + ' from equilibrium']:.0f} and {rows[STEADY + chr(32) + ESTIMATE]:.0f} for the same two "
+        "comparisons"
+    )
+
+
+def landing_gear_campaigns():
+    d = results("landing_gear/campaigns")
+    low, high = d["band"]
+    yield (
+        f"the 90 % intervals of theta4, theta6 and theta16 cover {listed(d['covered']['mcmc'].values())} of "
+        f"{d['experiments']} times (99 % band {low:.0f} to {high:.0f})"
+    )
+    yield f"Over {d['campaigns']} campaigns of the first truth"
+    yield (
+        f"theta16 is called negative {d['called_negative']} times and the model misspecified "
+        f"{d['called_misspecified']} times, at a level of 1 %"
+    )
+    assert d["stop_rule_passed"] == 0, "the sentence on the stop rule is about none"
+    yield f"Laplace's intervals, which need no draws, cover {listed(d['covered']['laplace'].values())} times"
+
+
+def damper():
+    d = results("damper")
+    laplace, robust, choices = d["laplace_sd"], d["robust_sd"], d["input_harmonics"]["choices"]
+    assert [name for name, verdict in d["comparison"].items() if verdict != "fine"] == ["rho"]
+    yield f"identified from {d['cycles']} measured cycles"
+    end = d["map"]["rho"] + 1.645 * laplace["rho"]
+    short = (d["posterior"]["rho"]["q95"] - end) / d["posterior"]["rho"]["sd"]
+    yield f"the upper end of Laplace's 90 % interval is {short:.1f} standard deviations too low"
+    split = d["noise_split"]
+    yield f"of {split['total']:.1f} N the scatter of the cycles explains {split['measurement']:.2f} N"
+    ratio = {name: robust[name] / laplace[name] for name in laplace}
+    yield (
+        f"{ratio['rho']:.1f} times as large for rho, {ratio['Kw']:.1f} for Kw, {ratio['Kx']:.1f} for Kx, "
+        f"{ratio['K']:.1f} for K and {ratio['F0']:.0f} for F0"
+    )
+    kept, rho = ([one[key] for one in choices] for key in ("harmonics", "map"))
+    values = listed(f"{one['rho']:,.0f}" for one in rho)
+    yield (
+        f"rho is {values} 1/m with {listed(kept)} displacement harmonics, at a "
+        f"standard deviation of {laplace['rho']:,.0f} 1/m"
+    )
+
+
+def silverbox():
+    d = results("silverbox")
+    repeats = d["repetition"]
+    yield f"{WORDS[d['cycles']]} measured periods with {d['input_harmonics']} lines"
+    yield (
+        f"leaves {100 * d['residual_fraction']:.3f} % of the response's standard deviation; what repeats of it is "
+        f"{repeats['repeats'] / repeats['does_not']:.1f} times what does not"
+    )
+    yield f"{100 * d['beyond_drive']['share_of_residual_power']:.0f} % of its power lies above the drive's last line"
+    independent, circulant = (
+        [d["robust_sd"][noise][name] / sd for name, sd in d["sd"][noise].items()]
+        for noise in ("independent", "circulant")
+    )
+    yield (
+        f"the robust ones are {min(independent):.1f} to {max(independent):.1f} times as large with independent noise, "
+        f"{min(circulant):.3f} to {max(circulant):.1f} times with circulant noise"
+    )
+
+
+def flutter():
+    d = results("flutter")
+    yield (
+        f"the fitted amplitudes miss the {WORDS[len(d['errors'])]} measured ones by {100 * d['errors_rms']:.1f} % "
+        f"(rms), those of the authors' values by {100 * d['authors_errors_rms_where_a_cycle_exists']:.0f} % where "
+        "they have a cycle at all"
+    )
+    model, noise = d["misfit"]["model_error"], d["misfit"]["measurement_noise"]
+    yield (
+        f"wrong, by {model['heave']:.4f} in heave and {model['pitch']:.4f} in pitch (sensor units), "
+        f"{model['heave'] / noise['heave']:.0f} and {model['pitch'] / noise['pitch']:.0f} times the measurement's noise"
+    )
+    missed = {
+        case: [
+            abs(one[channel]["error"]) for one in rows.values() if one["cycle_at_map"] for channel in ("heave", "pitch")
+        ]
+        for case, rows in d["predictions"].items()
+    }
+    lost = {case for case, rows in d["predictions"].items() if not all(one["cycle_at_map"] for one in rows.values())}
+    assert lost == {"unstable from stable", "stable from unstable", "without 14.9 m/s"}
+    yield (
+        "Without the cycles at 16.4 and 16.5 m/s these are predicted within "
+        f"{100 * max(missed['without 16.4 and 16.5 m/s']):.0f} %, without those at 17.2 and 17.3 m/s up to "
+        f"{100 * max(missed['without 17.2 and 17.3 m/s']):.0f} % too small; neither kind alone, nor all without 14.9 "
+        "m/s"
+    )
+    for order, name in (("quadratic", "k_alpha2 at gain 1"), ("cubic", "k_alpha3 at gain 1")):
+        spring, by_kind = d["springs"][name], d["contraction"][name]
+        stable, unstable, both = (by_kind[kind]["estimate"] for kind in ("stable", "unstable", "both"))
+        sds = listed(f"{100 * value:.2g}" for value in spring["relative_sd"].values())
+        low, high = spring["interval_with_model_error"]
+        yield (
+            f"the {order} one is {stable:,.0f} from the stable cycles, {unstable:,.0f} from the unstable ones and "
+            f"{both:,.0f} from both, with standard deviations of {sds} %"
+        )
+        yield f"the {order} one lies between {max(low, 0.0):,.0f} and {high:,.0f}"
+    apart = listed(f"{one['largest_difference_in_sds']:.0f}" for one in d["springs"].values())
+    yield f"These estimates are up to {apart} of their standard deviations apart."
+
+
+def flutter_campaigns():
+    account = results("flutter/campaigns")["account"]
+    covered = {account["covered"][name] for name in ("k_alpha2", "k_alpha3")}
+    low, high = account["band"]
+    assert account["kept_apart"] == account["campaigns"] and not account["failures"]
+    yield (
+        f"the 90 % intervals of the two springs cover {' and '.join(map(str, sorted(covered)))} of "
+        f"{account['campaigns']} times (99 % band {low:.0f} to {high:.0f})"
+    )
+
+
+def solver():
+    first = results("solver")["pendulum"]["rotations"]["first"]
+    errors = {scheme: f"{one['relative_difference']:.0e}".replace("e-0", "e-") for scheme, one in first.items()}
+    yield f"right to {errors['central4']} instead of {errors['central2']} with {first['central4']['samples']} points"
+
+
+STEADY, ESTIMATE = "Runge-Kutta until steady", "from the estimate's orbit"
+COLUMNS = (
+    "landing gear, force given", "landing gear, displacement given", "Duffing, damping ratio 0.5 %", "damper",
+    "Silverbox",
+)  # fmt: skip
+ROWS = {
+    "compiled Runge-Kutta from equilibrium": f"{STEADY} from equilibrium",
+    "the same from the estimate's orbit": f"{STEADY} {ESTIMATE}",
+    "compiled shooting from the predicted orbit": "shooting from the predicted orbit",
+    "SciPy's LSODA from the estimate's orbit": f"LSODA {ESTIMATE}",
+    "SciPy's solve_bvp from the estimate's orbit": f"solve_bvp {ESTIMATE}",
+    "diffrax from the estimate's orbit": f"diffrax {ESTIMATE}",
+    "diffrax, one shooting step from the predicted orbit": "diffrax shooting from the predicted orbit",
+    "a package for harmonic balance": f"harmonic balance {ESTIMATE}",
+    "this package, 64 walkers at once": "this package, batched, all cores, central4",
+    "this package, cold": "this package, cold, central4",
+}
+
+
+def ratios(problem):
+    """Return the ratios of all methods to one warm log-posterior of a problem of the benchmark."""
+    rows = results("benchmark")["problems"][problem]["rows"]
+    return {row["name"]: row["ratio"]["median"] if isinstance(row["ratio"], dict) else row["ratio"] for row in rows}
+
+
+def cell(value):
+    """Return a ratio with two digits, or all that are before the point."""
+    if value is None:
+        return "-"
+    if value >= 1000.0:
+        return f"{round(value, -1):,.0f}"
+    return f"{value:.0f}" if value >= 9.95 else f"{value:.1f}" if value >= 0.995 else f"{value:.2f}"
+
+
+def benchmark_table():
+    problems = [ratios(problem) for problem in COLUMNS]
+    for label, name in ROWS.items():
+        yield f"| {label} | {' | '.join(cell(rows.get(name)) for rows in problems)} |"
+    gradients = [results("benchmark")["problems"][problem]["gradient_ratio"] for problem in COLUMNS]
+    medians = (one["median"] if isinstance(one, dict) else one for one in gradients)
+    yield f"| compiled shooting's value and gradient / ours | {' | '.join(map(cell, medians))} |"
+
+
+def benchmark():
+    d, floor = results("benchmark"), {}
+    for problem in (*COLUMNS[:1], *COLUMNS[2:3]):
+        schemes = d["floor"][f"{problem}, folded"]["schemes"]
+        floor[problem] = {
+            part: [f"{schemes[scheme]['ratio'][part]['median']:.2g}" for scheme in ("central2", "central4")]
+            for part in ("near", "batched", "gradient")
+        }
+    gear, duffing = floor.values()
+    batched = {f"{float(value):.2f}" for value in gear["batched"]}
+    assert len(batched) == 1 and len(set(duffing["batched"])) == 1
+    yield f"then takes {gear['near'][0]} ( ) and {gear['near'][1]} ( ) of it on one core and {batched.pop()} in a batch"
+    yield f"value and gradient take {' and '.join(gear['gradient'])}."
+    yield (
+        f"the ratios are {' and '.join(duffing['near'])}, {duffing['batched'][0]}, {' and '.join(duffing['gradient'])}."
+    )
+    checks = {one["what"]: one for one in d["checks"]}
+    (gain,) = (one["value"] for what, one in checks.items() if "emcee around the fastest" in what)
+    yield f"has {gain:.1f} times the effective samples per second of emcee around the fastest"
+    step = [ratios(problem)["diffrax shooting from the predicted orbit"] for problem in COLUMNS[1:3]]
+    yield f"one shooting step of diffrax takes {cell(min(step))} and {cell(max(step))} times a warm log-posterior"
+    gradient = d["problems"][COLUMNS[1]]["gradient_ratio"]["median"]
+    yield f"with the displacement given takes {gradient:.1f} times ours"
+    seconds = checks["import with the names of an identification [s]"]["value"]
+    yield f"the import of the names of an identification takes {seconds:.1f} s"
+    yield f"It takes about {WORDS[round(d['seconds']['total'] / 60)]} minutes"
+    missed, of_damper = (
+        [what for what, one in checks.items() if not one["met"]],
+        [w for w in checks if w[:6] == "damper"],
+    )
+    others = [what for what in missed if what not in of_damper]
+    assert len(others) == 4, f"the README names four missed targets beside the damper's, not {others}"
+    assert 2 * (len(missed) - len(others)) > len(of_damper), "it says that the damper misses most of its rows"
+
+
+def calibration():
+    d = results("calibration")
+    count = d["study"]["replicates"]
+    cases = ("duffing", "damper", "landing_gear", "miscounted")
+    assert all(d[case]["replicates"] == count and not d[case]["failures"] for case in cases)
+    yield f"Over {count} replicates each, of which none failed"
+    labels = {
+        "duffing": "Duffing: c, k, k3, variance", "damper": "damper: Kx, Kw, rho, variance",
+        "landing_gear": "landing gear: theta4, theta6, theta16, two variances",
+        "miscounted": "Duffing, variance a fifth too small: c, k, k3, variance",
+    }  # fmt: skip
+    for case, label in labels.items():
+        rows = [row for row in d[case]["table"] if row["method"] == "mcmc"]
+        least = [min(row[test] for test in ("p_dispersion", "p_ecdf", "p_chi_square")) for row in rows]
+        p = ", ".join(f"{value:.1g}".replace("e-0", "e-") for value in least)
+        if case != "miscounted":
+            p = f"{min(least):.2g}"
+        cover, dispersion = (
+            ", ".join(f"{row[key]:.{digits}f}" for row in rows)
+            for key, digits in (("coverage_90", 3), ("dispersion", 2))
+        )
+        yield f"| {label} | {cover} | {dispersion} | {p} |"
+    rejected = [
+        (case, row["quantity"])
+        for case in cases[:3]
+        for row in d[case]["table"]
+        if row["method"] == "laplace" and row["verdict"] != "calibrated"
+    ]
+    assert len(rejected) == 3 and ("landing_gear", "variance[force]") not in rejected
+    assert all(quantity.startswith("variance") for _, quantity in rejected)
+    assert all(d[case]["stop_rule_passed"] == 0 for case in cases)
+    assert len({d[case]["independent_draws"] for case in cases}) == 1
+    yield (
+        f"Each rank is among {d['duffing']['independent_draws']:.0f} draws (median) that are five autocorrelation "
+        f"times apart, so that its position has a Monte Carlo error of at most "
+        f"{d['duffing']['largest_error_of_a_position']:.2f}; R-hat of these chains is at most "
+        f"{max(d[case]['largest_rhat'] for case in cases):.3f}."
+    )
+    yield f"Chains of {d['study']['steps']} steps"
+
+
+def verdicts():
+    found = results("verdicts")["replicates"]
+    right = found["linear"]
+    faulty = {name: one for name, one in found.items() if name != "linear"}
+    assert all(one["data"]["named"] == one["data"]["replicates"] for one in faulty.values())
+    assert not any(one["sampler"]["verdicts_that_flip"] for one in found.values())
+    wrong = {name: sum(one["data"]["wrong"].values()) for name, one in faulty.items() if one["data"]["wrong"]}
+    assert wrong == {"two_modes": 1}, "the sentence in brackets is about one wrong verdict"
+    yield (
+        f"of {right['data']['replicates']} problems without a fault {WORDS[right['data']['warned']]} gets a "
+        f"warning, of {faulty['two_modes']['data']['replicates']} with each fault all are named (one of those with two "
+        f"modes is also called misspecified, wrongly), and over {right['sampler']['replicates']} seeds of the "
+        "sampler no verdict changes"
+    )
+
+
+def sampling():
+    yield f"{results('sampling')['seconds']['total'] / 60:.0f} minutes on two cores; what pools cost"
+
+
+SUBJECTS = (
+    pendulum, landing_gear, landing_gear_cost, landing_gear_campaigns, damper, silverbox, flutter, flutter_campaigns,
+    solver, benchmark, benchmark_table, calibration, verdicts, sampling,
+)  # fmt: skip
+
+SETTING, DEFINITION, ELSEWHERE, UNSTORED, DATE = (
+    "a setting in the code of the study",
+    "part of a definition or of a level that is stated, not measured",
+    "published by others",
+    "measured once, by a command that stores no results",
+    "a date of results that are older than the code",
+)
+WITHOUT_RESULTS = {
+    "README.md": {
+        "de Kraker, Verbeek & van de Wouw did in 1997": ELSEWHERE,
+        "Python ≥ 3.11": SETTING,
+        "doi 10.5281/zenodo.4445334": ELSEWHERE,
+        "a gas charge lower by 2 %, friction by 20 % and oil leaked by 1 %": SETTING,
+        "are of 22 November 2026": DATE,
+        "(counted on 21 November 2026)": DATE,
+        "of 126 intervals of Laplace in three campaigns repeated": UNSTORED,
+        "T. Wigren, J. Schoukens, 2013": ELSEWHERE,
+        "K. H. Lee, D. A. W. Barton, L. Renson, 2023": ELSEWHERE,
+        "two states on 800 points: a batch takes twice as long, and errors are 300 to 1000 times smaller": UNSTORED,
+        "Duffing, ζ = 0.5 %": SETTING,
+        "two ensembles of 64 walkers": SETTING,
+        "of 64 walkers on two cores": SETTING,
+        "not 50 times": SETTING,
+        "A mean period on 800 grid points": SETTING,
+        "2·harmonics + 1 for each channel": DEFINITION,
+        "Jeffreys' prior 1/v": DEFINITION,
+        "modulo 2π": DEFINITION,
+        "variances that are a fifth too small come out in 99.2 % of calibrations with 1000 replicates, by the latter "
+        "alone in 76 %": "computed in tests/diagnostics/test_calibration.py",
+        "90 % intervals, MCMC": DEFINITION,
+        "A. de Kraker, G. Verbeek, N. van de Wouw (1997)": ELSEWHERE,
+        "schemes of order 2 and 4": DEFINITION,
+        "the l parameters of (7)": DEFINITION,
+        "θ16 < 0": DEFINITION,
+        "Kluwer, 1997, 191-198. BSD-3-Clause": ELSEWHERE,
+    },
+    "docs/running.md": {
+        "the scheduler's own address instead of 127.0.0.1": SETTING,
+        "128 processes": SETTING,
+        "a replicate takes 0.8 to 1.3 s of one core, an empty task 5 ms, and the pickled problem has 5 kB": UNSTORED,
+        "At 5 ms a task it handles 200 tasks a second, which is enough for 160 to 260 workers": UNSTORED,
+        "10,000 replicates would take 50 s instead of 8 to 13 s": UNSTORED,
+        "(5 MB in total) and writing 200 lines a second (0.8 kB each)": UNSTORED,
+    },
+}
+
+
+@pytest.mark.parametrize("subject", SUBJECTS, ids=lambda subject: subject.__name__)
+def test_numbers_of_the_readme_are_those_of_the_results(subject):
+    printed = text("README.md")
+    missing = [phrase for phrase in map(without_code, subject()) if phrase not in printed]
+    assert not missing, "the README should say:\n" + "\n".join(missing)
+
+
+def without_code(phrase):
+    """Return a phrase as it is compared with the text of a document."""
+    for pattern in NO_TEXT[1:]:
+        phrase = re.sub(pattern, " ", phrase)
+    return " ".join(phrase.split())
+
+
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_every_other_number_has_a_reason(document):
+    left = text(document)
+    phrases = [without_code(phrase) for subject in SUBJECTS for phrase in subject()] if document == "README.md" else []
+    for phrase in sorted(map(without_code, WITHOUT_RESULTS.get(document, {})), key=len, reverse=True):
+        assert phrase in left, f"no longer in {document}: {phrase}"
+        phrases.append(phrase)
+    for phrase in sorted(phrases, key=len, reverse=True):
+        left = left.replace(phrase, " … ")
+    untied = [left[max(found.start() - 60, 0) : found.end() + 30] for found in NUMBER.finditer(left)]
+    assert not untied, "\n".join(untied)
