@@ -216,6 +216,11 @@ def section(
     -------
     Figure
 
+    Raises
+    ------
+    ValueError
+        For another object than a `PoincareSection`.
+
     Examples
     --------
     >>> bp.plot.section(henon_section, units={"x": "m", "y": "m/s"}).axes[0].get_xlabel()

@@ -49,6 +49,11 @@ def ranks(calibration: Calibration, *, figure: Figure | None = None) -> Figure:
     -------
     Figure
 
+    Raises
+    ------
+    ValueError
+        For another object than a `Calibration`.
+
     Examples
     --------
     >>> [axes.get_title() for axes in bp.plot.ranks(calibration).axes]
