@@ -1,0 +1,204 @@
+"""Parts of the robust covariance and of the test of the prior, against explicit sums, optimisation and closed forms."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+from scipy.optimize import minimize_scalar
+
+import bayesperiodic as bp
+from bayesperiodic.estimation import conflict, covariance, units
+from bayesperiodic.estimation.gauss_newton import _step, inverse_hessian
+from bayesperiodic.estimation.modes import Mode, images, notable
+from bayesperiodic.posterior.noise import SPECTRAL, Block
+
+HIGHEST = 9
+HARMONIC = np.array([0, *np.repeat(np.arange(1, HIGHEST + 1), 2)])
+BLOCK = Block("run", "y", SPECTRAL, 15.2, 19, HARMONIC, np.zeros(0), 32, 200.0, np.nan)
+
+
+def test_a_variance_exceeds_its_estimate_by_the_mean_of_the_inverse_chi_square():
+    assert covariance._excess(np.array([10.0, 3.5, 2.5, 0.5])) == pytest.approx([10 / 8, 3.5 / 1.5, 2.5, 1.0])
+
+
+def smoothed(square, left):
+    """Return squares over their expectation, smoothed over about √H harmonics with parabolic weights."""
+    half, result = int(np.ceil(np.sqrt(HIGHEST + 1.0))), []
+    for h in HARMONIC:
+        weight = np.array([1.0 - ((h - k) / (half + 1)) ** 2 if abs(h - k) <= half else 0.0 for k in HARMONIC])
+        expected = np.sum(weight * left)
+        power = {k: np.sum(left[k == HARMONIC]) for k in range(HIGHEST + 1)}
+        squared = sum((1.0 - ((h - k) / (half + 1)) ** 2) ** 2 * power[k] for k in power if abs(h - k) <= half)
+        freedom, total = expected**2 / squared, np.sum(left)
+        excess = freedom / (freedom - 2.0) / (total / (total - 2.0))
+        result.append(np.sum(weight * square) / expected * excess)
+    return np.array(result)
+
+
+def test_squares_are_smoothed_over_neighbouring_harmonics():
+    generator = np.random.default_rng(0)
+    square, left = generator.exponential(size=19), generator.uniform(0.3, 0.8, 19)
+    assert covariance._smoothed(BLOCK, square, left) == pytest.approx(smoothed(square, left))
+
+
+def spectra(unit):
+    """Return white and autoregressive spectra of mean 1, and their prior probabilities, half of it for white noise."""
+    lengths = np.geomspace(1e-3, 3.0, 40)
+    density = stats.lognorm.pdf(lengths, 1.5, scale=0.03) * lengths
+    shape = [unit**2 / (1.0 + (2 * np.pi * length * HARMONIC) ** 2) for length in (0.0, *lengths)]
+    return [own / own.mean() for own in shape], np.array([0.5, *(0.5 * density / density.sum())])
+
+
+def test_variance_of_a_residual_is_that_of_restricted_likelihood_averaged_over_the_spectra():
+    """The size of each spectrum is found by a search."""
+    generator = np.random.default_rng(1)
+    unit = generator.uniform(0.8, 1.2, 19)
+    s = generator.standard_normal((2, 19)) * np.exp(-HARMONIC / 3.0) * np.array([[1.0], [50.0]])
+    r = generator.standard_normal(19) / (1.0 + HARMONIC / 3.0)
+    information = s @ s.T + np.diag([2.0, 4000.0])
+    others = information - s @ s.T
+    logs, values = [], []
+    shapes, prior = spectra(unit)
+    for shape, probability in zip(shapes, prior, strict=True):
+
+        def restricted(log_size, shape=shape):
+            variance = np.exp(log_size) * shape
+            total = (s / variance) @ s.T + others
+            step = np.linalg.solve(total, (s / variance) @ r - s @ r)
+            misfit = np.sum((r - step @ s) ** 2 / variance) + step @ others @ step + 2 * step @ (s @ r)
+            taken = np.einsum("am,am->m", s, np.linalg.solve(total, s / variance))
+            value = misfit + BLOCK.weight * np.sum(np.log(variance)) + np.linalg.slogdet(total)[1]
+            return value, (r - step @ s) ** 2 / variance, np.maximum(BLOCK.weight - taken, 0.0)
+
+        best = minimize_scalar(lambda x: restricted(x)[0], bounds=(-12.0, 8.0), method="bounded", options={"xatol": 1e-9})  # noqa: B023
+        value, square, left = restricted(best.x)
+        logs.append(np.log(probability) - 0.5 * value)
+        values.append(np.exp(best.x) * shape * smoothed(square, left))
+    weight = np.exp(np.array(logs) - max(logs))
+    found = covariance._residual_variance(BLOCK, s, r, unit, information)
+    assert found == pytest.approx(weight @ np.array(values) / weight.sum(), rel=5e-3)
+
+
+def test_degrees_of_freedom_are_those_of_satterthwaite():
+    inverse = np.diag([2.0, 5.0])
+    part = lambda a, b, freedom: covariance.VariancePart(np.diag([a, b]), np.eye(2), 1.0, freedom)  # noqa: E731
+    found = covariance.degrees_of_freedom(inverse, {"u": part(1.5, 0.0, 8.0), "v": part(0.5, 2.5, 4.0)})
+    assert found == pytest.approx([1 / (0.75**2 / 8 + 0.25**2 / 4), 1 / (0.5**2 / 4)])
+    assert np.isinf(covariance.degrees_of_freedom(inverse, {})).all()
+
+
+def test_negative_eigenvalues_are_removed_in_units_of_the_covariance():
+    scale = np.diag([1.0, 1e3])
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    matrix = scale @ turn @ np.diag([2.0, -1.0]) @ turn.T @ scale
+    found = covariance._without_negative(matrix, np.array([[1.0, 300.0], [300.0, 1e6]]))
+    assert found == pytest.approx(scale @ turn @ np.diag([2.0, 0.0]) @ turn.T @ scale)
+
+
+def test_shape_parameters_are_spread_over_99_percent_of_their_priors():
+    first, second = bp.LogNormal(0.03, 1.5), bp.LogUniform(0.1, 10.0)
+    problem = SimpleNamespace(noise=SimpleNamespace(shape_priors={"lengthscale": first, "floor": second}))
+    points, log_prior = covariance._points(problem)
+    z = stats.norm.ppf(0.995)
+    lengths = np.exp(np.log(0.03) + 1.5 * np.linspace(-z, z, 60))
+    floors = np.exp(np.log(0.1) + np.linspace(0.005, 0.995, 9) * np.log(100.0))
+    assert points == pytest.approx(np.array([(a, b) for a in lengths for b in floors]))
+    expected = stats.lognorm.logpdf(points[:, 0], 1.5, scale=0.03) + np.log(points[:, 0])
+    assert np.ptp(log_prior - expected) < 1e-9
+
+
+@pytest.mark.parametrize("value", [-0.7, 0.0, 0.4, 2.5])
+def test_score_of_an_estimate_under_a_normal_prior_is_that_of_the_sum_of_variances(value):
+    prior = 2.0 * conflict.SCORES
+    found = conflict._scores(prior, 5.0 * value, np.array([0.5, 3.0]))
+    assert found == pytest.approx(5.0 * value / np.hypot(2.0, [0.5, 3.0]), rel=5e-3, abs=1e-9)
+
+
+@pytest.mark.parametrize("value", [0.3, -0.95, 1.5, -1.2, 4.0])
+def test_score_under_a_uniform_prior_is_that_of_the_tail_or_of_the_density(value):
+    """Both are integrals of the normal distribution; the density relates to its maximum at the centre."""
+    sd = 0.3
+    prior = 2.0 * stats.norm.cdf(conflict.SCORES) - 1.0
+    area = lambda x: x * stats.norm.cdf(x) + stats.norm.pdf(x)  # noqa: E731  ∫ Φ
+    tail = 0.5 * sd * (area((1 - abs(value)) / sd) - area((-1 - abs(value)) / sd))
+    density = lambda at: stats.norm.cdf((at + 1) / sd) - stats.norm.cdf((at - 1) / sd)  # noqa: E731
+    drop = np.sqrt(2 * np.log(density(0.0) / density(abs(value))))
+    expected = np.sign(value) * min(-stats.norm.ppf(tail), drop)
+    assert conflict._scores(prior, value, np.array([sd]))[0] == pytest.approx(expected, rel=0.01, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("p", "joint", "smallest", "members"),
+    [
+        ([0.001, 0.5, np.nan], 0.2, 4 * 0.001, ("a",)),
+        ([0.5, 0.6, 0.7], 0.002, 0.004, ("b", "c")),
+        ([0.009, 0.006, 0.7], 0.001, 0.002, ("a", "b")),
+        ([0.5, 0.6, 0.7], 0.006, 0.012, ()),
+        ([0.9, 0.9, 0.9], 0.9, 1.0, ()),
+        ([np.nan, np.nan, np.nan], np.nan, np.nan, ()),
+    ],
+)
+def test_p_values_are_corrected_for_their_number(p, joint, smallest, members):
+    """Twice for parameters and directions, and for the number of tested parameters."""
+    found = conflict._summary(pd.DataFrame({"p": p}, index=["a", "b", "c"]), joint, np.array([0.29, 1.0, 0.31]))
+    assert found.p == pytest.approx(smallest, nan_ok=True)
+    assert (found.members, found.table["p"].tolist()) == (members, pytest.approx(p, nan_ok=True))
+
+
+def test_the_p_value_of_a_single_parameter_is_not_corrected():
+    found = conflict._summary(pd.DataFrame({"p": [0.3]}, index=["a"]), 0.009, np.ones(1))
+    assert (found.p, found.members) == (0.009, ("a",))
+
+
+def test_newton_steps_are_scaled_by_the_curvature_and_leave_out_flat_directions():
+    hessian = np.array([[4.0, 1e3, 0.0], [1e3, 1e6, 0.0], [0.0, 0.0, 0.0]])
+    gradient, held = np.array([1.0, 500.0, 7.0]), np.zeros(3, dtype=bool)
+    expected = np.linalg.solve(hessian[:2, :2], gradient[:2])
+    step, size = _step(hessian, gradient, held)
+    assert step == pytest.approx([*expected, 0.0])
+    assert size == pytest.approx(np.sqrt(expected @ hessian[:2, :2] @ expected))
+    held[1] = True
+    assert _step(hessian, gradient, held)[0] == pytest.approx([0.25, 0.0, 0.0])
+    assert _step(hessian, gradient, ~np.zeros(3, dtype=bool)) == (pytest.approx(np.zeros(3)), 0.0)
+    # Negative curvature is taken with the opposite sign: uphill.
+    assert _step(np.diag([-4.0, 1.0]), np.ones(2), held[:2] & False)[0] == pytest.approx([0.25, 1.0])
+    inverse, lost = inverse_hessian(hessian)
+    assert inverse[:2, :2] == pytest.approx(np.linalg.inv(hessian[:2, :2]))
+    assert lost.tolist() == [False, False, True] and not inverse[2].any()
+
+
+def named(**supports):
+    return SimpleNamespace(joint_prior=SimpleNamespace(supports=supports))
+
+
+def test_images_of_an_optimum_are_its_signs_and_exchanges():
+    ends, positive = (-np.inf, np.inf), (0.0, np.inf)
+    found = images(named(a=ends, b=positive, c=ends), np.array([1.0, 2.0, 3.0]))
+    signs = [[-1, 2, 3], [1, 2, -3], [-1, 2, -3]]
+    assert found.tolist() == [*signs, [2, 1, 3], [3, 2, 1], [1, 3, 2]]
+    assert images(named(**{"a[run]": positive, "b": positive}), np.array([1.0, 2.0])).shape == (0, 2)
+    many = images(named(**dict.fromkeys([f"{name}[run]" for name in "abcde"], ends)), np.arange(1.0, 6.0))
+    assert many.tolist() == [*(np.arange(1, 6) * (1 - 2 * np.eye(5))).tolist(), [-1, -2, -3, -4, -5]]
+    assert len(images(named(**dict.fromkeys([f"{name}[run]" for name in "abcd"], ends)), np.ones(4))) == 15
+
+
+def test_a_value_differs_from_another_by_more_than_the_smaller_sd():
+    mode = Mode({"a": 3.0}, {"a": 0.5}, -1.0, 0.02, {}, pd.DataFrame())
+    assert mode.differs("a", 2.4, 9.0) and not mode.differs("a", 2.6, 9.0)
+    assert mode.differs("a", 2.6, 0.3) and mode.differs("a", 3.6, np.nan)
+    assert repr(mode) == "a = 3 (objective -1, 2.0% of the mass)"
+    masses = {0.02: True, 0.01: False, 0.0: False, np.nan: True}
+    modes = [Mode({}, {}, 0.0, mass, {}, pd.DataFrame()) for mass in masses]
+    assert [any(one is mode for one in notable(modes)) for mode in modes] == list(masses.values())
+
+
+@pytest.mark.parametrize(("ratio", "said"), [(101.0, "1e+2 times"), (99.0, ""), (0.0099, "1e-2 times"), (1e3, "1e+3")])
+def test_units_are_doubted_from_two_powers_of_ten_on(monkeypatch, ratio, said):
+    scales = {name: units.Scales({"y": ratio * size}, {"y": size}) for name, size in (("a", 1.0), ("b", 5.0))}
+    monkeypatch.setattr(units, "_scales", lambda problem, theta: scales)
+    text = units.unit_error(None, np.ones(1))
+    assert said in text and bool(text) == bool(said)
+    scales["b"] = units.Scales({}, {})
+    assert units.unit_error(None, np.ones(1)) == ""
