@@ -115,7 +115,9 @@ def test_power_at_zero_is_the_mean_over_the_spectra_by_their_likelihoods():
     line = np.arange(13)
     slow = [np.concatenate([[2.75], 1.0 / line[1:]])]
     for time in (0.45, 0.1, 0.05, 0.025):
-        wave = [quad(lambda u, t=time, j=j: (1 - u) * np.exp(-u / t) * np.cos(2 * np.pi * j * u), 0, 1)[0] for j in line]
+        wave = [
+            quad(lambda u, t=time, j=j: (1 - u) * np.exp(-u / t) * np.cos(2 * np.pi * j * u), 0, 1)[0] for j in line
+        ]
         slow.append(np.array(wave))
     shapes = [np.ones(13), *(own / own[1] + floor for own in slow for floor in (0.0, 0.01, 0.1))]
     weights, values = [], []
@@ -185,7 +187,7 @@ def test_cycles_include_the_step_of_the_last_sample():
 
 
 def test_a_signal_rises_only_after_it_was_below_the_mean_by_a_quarter_of_its_sd():
-    """Samples −4, −0.6 · sd …: crossings between levels inside the band do not count."""
+    """The expected crossings come from a loop over the samples with the state "below"."""
     signal = np.array([-2.0, 2.0, 0.1, -0.1, 2.0, -2.0, 0.1, 2.0, -0.1, 0.1, 2.0, -2.0, 2.0])
     signal = np.concatenate([signal, -signal.sum(keepdims=True)])
     assert signal.mean() == pytest.approx(0.0, abs=1e-15)

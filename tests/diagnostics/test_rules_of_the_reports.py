@@ -159,7 +159,12 @@ def test_directions_are_described_with_their_gain_and_invariant_combinations():
     # Directions without information are reduced to single parameters.
     assert table["parameters"].tolist() == ["a", "b", "c, d", "c, d"]
     assert table["combinations"].tolist() == ["", "", "d - 1.33*c", ""]
-    assert table["direction"].tolist() == ["a → a·t", "b → b·t", "c → c + 0.75·t, d → d + t", "c → c + t, d → d − 0.75·t"]
+    assert table["direction"].tolist() == [
+        "a → a·t",
+        "b → b·t",
+        "c → c + 0.75·t, d → d + t",
+        "c → c + t, d → d − 0.75·t",
+    ]
 
 
 def test_distance_under_power_scaling_of_a_normal_is_that_of_quadrature():
@@ -200,8 +205,8 @@ TABLE = pd.DataFrame(
 def test_rejections_in_words():
     """Holm: 1e-6 times 8 tests and 1e-5 times 7 are below 1 %."""
     assert adequacy.rejections(TABLE) == {
-        "run y": "the residual has excess power in some harmonics (p = 1e-06), the amplitude differs from the predicted "
-        "one (p = 1e-05); its strongest harmonic is 3; 12.3% of the residual variance is model error"
+        "run y": "the residual has excess power in some harmonics (p = 1e-06), the amplitude differs from the "
+        "predicted one (p = 1e-05); its strongest harmonic is 3; 12.3% of the residual variance is model error"
     }
     plain = TABLE.assign(harmonic=np.nan, model_error_share=np.nan, amplitude=np.nan)
     assert adequacy.rejections(plain) == {"run y": "the residual has excess power in some harmonics (p = 1e-06)"}

@@ -5,7 +5,15 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from bayesperiodic.estimation.laplace import by_powers, by_sums, combinations, exponents, in_words, reduced, undetermined
+from bayesperiodic.estimation.laplace import (
+    by_powers,
+    by_sums,
+    combinations,
+    exponents,
+    in_words,
+    reduced,
+    undetermined,
+)
 
 NAMES = ["a", "b", "c"]
 BOTH = np.array([True, True, True])

@@ -72,7 +72,7 @@ def test_variance_of_a_residual_is_that_of_restricted_likelihood_averaged_over_t
             value = misfit + BLOCK.weight * np.sum(np.log(variance)) + np.linalg.slogdet(total)[1]
             return value, (r - step @ s) ** 2 / variance, np.maximum(BLOCK.weight - taken, 0.0)
 
-        best = minimize_scalar(lambda x: restricted(x)[0], bounds=(-12.0, 8.0), method="bounded", options={"xatol": 1e-9})  # noqa: B023
+        best = minimize_scalar(lambda x: restricted(x)[0], bounds=(-12.0, 8.0), method="bounded")  # noqa: B023
         value, square, left = restricted(best.x)
         logs.append(np.log(probability) - 0.5 * value)
         values.append(np.exp(best.x) * shape * smoothed(square, left))
