@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 from resource import RUSAGE_CHILDREN, getrusage
 
-BUDGET = 60.0
+BUDGET = 40.0
 STATISTICS = Path("mutants/mutmut-stats.json")
 KILLED = ("killed", "timeout")
 

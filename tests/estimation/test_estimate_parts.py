@@ -202,3 +202,25 @@ def test_units_are_doubted_from_two_powers_of_ten_on(monkeypatch, ratio, said):
     assert said in text and bool(text) == bool(said)
     scales["b"] = units.Scales({}, {})
     assert units.unit_error(None, np.ones(1)) == ""
+
+
+def test_perturbations_are_waves_of_one_sd_and_their_derivatives():
+    """The variance of a complex amplitude is shared by its cosine and its sine; that of the mean is its own."""
+    variance = {"v": np.array([0.3, 0.02, 0.08])}
+    e = bp.Experiment(
+        "run", 3.0, {"y": np.zeros(16)}, {"u": np.zeros(16), "v": np.zeros(16)}, samples=8, periods=2,
+        amplitude_variance=variance, harmonics={"v": 2, "u": 1, "y": 1},
+    )  # fmt: skip
+    phase = 2 * np.pi * np.arange(16) / 16
+    expected = np.zeros((5, 16, 6))
+    expected[0, :, 1] = np.sqrt(0.3)
+    for h, row in ((1, 1), (2, 3)):
+        rate, size = 2 * np.pi * h * 3.0 / 2, np.sqrt(0.5 * variance["v"][h])
+        for order, (cosine, sine) in enumerate([(1, 0), (0, -1), (-1, 0)]):
+            expected[row, :, 2 * order + 1] = (
+                size * rate**order * (cosine * np.cos(h * phase) + sine * np.sin(h * phase))
+            )
+            wave = cosine * np.sin(h * phase) - sine * np.cos(h * phase)
+            expected[row + 1, :, 2 * order + 1] = -size * rate**order * wave
+    assert covariance._perturbations(e) == pytest.approx(expected, abs=1e-12)
+    assert len(covariance._perturbations(bp.Experiment("run", 3.0, {"y": np.zeros(8)}, samples=8))) == 0
