@@ -73,7 +73,7 @@ def main() -> None:
     options = parser.parse_args()
     # Writes the mutants and records the calls, or those that have changed, and tests one mutant.
     mutmut = Path(sys.executable).with_name("mutmut")
-    subprocess.run([mutmut, "run", "--max-children", "1", "bayesperiodic.data.quantisation.x_step_of__mutmut_1"])
+    subprocess.run([mutmut, "run", "--max-children", "1", "bayesperiodic.data.folding.x_parts__mutmut_1"])
     metadata = [json.loads(path.read_text()) for path in Path("mutants").rglob("*.meta")]
     known = sorted(name for one in metadata for name in one["exit_code_by_key"])
     statuses = run(options.names or random.Random(options.seed).sample(known, options.count))

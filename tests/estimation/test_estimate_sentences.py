@@ -9,7 +9,7 @@ from scipy import stats
 
 from bayesperiodic.estimation import map_estimate, profile, result
 from bayesperiodic.estimation.modes import Mode
-from bayesperiodic.estimation.result import NoiseSplit, of_periodogram
+from bayesperiodic.estimation.result import MapEstimate, NoiseSplit, of_periodogram
 from bayesperiodic.posterior.noise import KNOWN, SPECTRAL
 
 
@@ -209,3 +209,45 @@ def test_steps_end_nine_tenths_of_the_way_to_the_end_or_at_the_limit():
     assert profile._next(1.0, -50.0, -np.inf, -np.inf) == -49.0
     assert profile._root(3.0, SimpleNamespace(objective=1.0)) == pytest.approx(2.0)
     assert profile._root(1.0, SimpleNamespace(objective=3.0)) == 0.0
+
+
+def test_a_printed_estimate_lists_what_is_known_of_it():
+    white = {"y": SimpleNamespace(p=0.0321), "z": SimpleNamespace(p=np.nan)}
+    fit = fitted(
+        status="converged", sd={"a": 0.0512, "b": 0.3}, robust_sd={"a": 0.0612, "b": 0.4}, rms={"y": 2.0, "z": 0.5},
+        noise={"variance[y]": 4.0, "variance[z]": 0.25}, noise_prior="prior 1/v", fvu={"y": 0.1234, "z": 0.5},
+        whiteness=white, noise_split={"y": NoiseSplit(1.5, 1.25, 2.0), "z": NoiseSplit(np.nan, 1.0, 1.0)},
+    )  # fmt: skip
+    expected = [
+        "MapEstimate (converged), estimate ± Laplace sd (robust sd):",
+        "  a                    1.25 ± 0.0512 (0.0612)",
+        "  b                       3 ± 0.3 (0.4)",
+        "  variance[y] = 4",
+        "  variance[z] = 0.25 (prior 1/v)",
+        "  rms of y: 2, unexplained variance 12.34%, measurement noise 1.5, model error 1.25, whiteness p = 0.032",
+        "  rms of z: 0.5, unexplained variance 50.00%",
+    ]
+    assert MapEstimate.__repr__(fit).split("\n") == expected
+    fit.converged, fit.status, fit.noise = False, "stalled", {}
+    fit.other_orbits, fit.prior_conflict.text = {"run": "half the period"}, "Prior and data disagree"
+    fit.undetermined = ("a: no output depends on it",)
+    fit.other_modes = (
+        Mode({"a": 2.0}, {"a": 0.1}, -1.0, 0.2, {}, pd.DataFrame()),
+        Mode({"a": 3.0}, {"a": 0.1}, -1.0, 0.001, {}, pd.DataFrame()),
+    )
+    assert MapEstimate.__repr__(fit).split("\n") == [
+        "MapEstimate (NOT CONVERGED: stalled; try another start, or starts=8), estimate ± Laplace sd (robust sd):",
+        *expected[1:3],
+        *expected[5:],
+        "  other orbit than the recorded one in 'run': half the period",
+        "  Prior and data disagree",
+        "  not determined by the data: a: no output depends on it",
+        "  another optimum: a = 2 (objective -1, 20.0% of the mass)",
+    ]
+    fit.without_noise = ("y", "z")
+    assert MapEstimate.__repr__(fit).startswith("MapEstimate (stalled; y, z without noise), estimate")
+
+
+def test_channels_of_rounding_errors_are_without_noise_if_their_variance_is_unknown():
+    fit = fitted(independent={"y": 9.0, "z, run": 9.0}, fvu={"y": 0.9e-16, "z": 0.9e-16, "w": 0.0, "v": 1.1e-16})
+    assert MapEstimate.without_noise.fget(fit) == ("y", "z")
