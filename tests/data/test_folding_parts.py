@@ -200,3 +200,26 @@ def test_a_signal_rises_only_after_it_was_below_the_mean_by_a_quarter_of_its_sd(
             rising += [i] if below else []
             below = False
     assert folding._rising(np.arange(signal.size), signal + 5.0).tolist() == rising == [1, 7, 12]
+
+
+def test_exact_data_have_no_noise_and_the_degrees_of_freedom_of_the_lines():
+    time = np.arange(64) / 8.0
+    fit = harmonics.HarmonicFit(1.0, np.array([[0.5, 1.0, 0.0]], dtype=complex), np.zeros((1, 64)))
+    one_cycle, noise = folding._noise(signals(time, np.round(np.cos(2 * np.pi * time), 9)), fit, 0, 8)
+    assert one_cycle.tolist() == noise.variance.tolist() == [0.0, 0.0, 0.0]
+    assert noise.freedom.tolist() == noise.lines.tolist() == [16.0, 16.0, 16.0]
+
+
+def test_repeated_quantisation_errors_count_with_three_degrees_of_freedom():
+    """Values rounded to a coarse step, sampled at the same phases in every cycle: nothing averages out.
+
+    The variance of the mean of a cycle of n samples is step²/12 over the number of different errors, at most n.
+    """
+    time = np.arange(20 * 16) / 16.0
+    clean = 3.0 * np.cos(2 * np.pi * time) + np.sin(4 * np.pi * time)
+    values = 0.25 * np.round((clean + 0.013) / 0.25)
+    fit = harmonics.fit_harmonics(time, values[None], 1.0, 3)
+    _, noise = folding._noise(signals(time, values), fit, 0, 20)
+    repeated = 0.25**2 / 12 / 16
+    assert noise.variance == pytest.approx(repeated * np.array([1.0, 4.0, 4.0, 4.0]), rel=1e-3)
+    assert noise.freedom == pytest.approx(np.full(4, 3.0))
