@@ -1,8 +1,8 @@
 """Mutation testing of a random sample of mutants: ``python -m tests.mutants --count 100 --seed 1``.
 
 mutmut writes the mutants of the modules in `pyproject.toml` and records the tests that call each function. A mutant is
-tested by the files of the folder of `tests/` that mirrors its own, if one of their tests calls the mutated function:
-the quickest tests first, as many as take `BUDGET` seconds. It survives if they pass. Results are in `mutants.md`.
+tested by the folder of `tests/` that mirrors its own: the tests that call the mutated function, the quickest first, and
+the others of their files, as many as take `BUDGET` seconds. It survives if they pass. Results are in `mutants.md`.
 """
 
 import argparse
@@ -22,11 +22,11 @@ def tests_of(mutant: str, statistics: dict) -> tuple[list[str], float]:
     """Return the tests of a mutant, and how long they take [s]."""
     folder, function = f"tests/{mutant.split('.')[1]}/", mutant.rpartition("__mutmut_")[0]
     calling = statistics["tests_by_mangled_function_name"].get(function, [])
-    # A result that several tests share is computed in the first of them only, so whole files are taken.
+    # A result that several tests share is computed in the first of them only, so the others in its file follow.
     files = {test.partition("::")[0] for test in calling if test.startswith(folder)}
     seconds = {test: time for test, time in statistics["duration_by_test"].items() if test.partition("::")[0] in files}
     chosen, total = [], 0.0
-    for test in sorted(seconds, key=seconds.__getitem__):
+    for test in sorted(seconds, key=lambda test: (test not in calling, seconds[test])):
         if chosen and total + seconds[test] > BUDGET:
             break
         chosen.append(test)
