@@ -223,3 +223,46 @@ def test_repeated_quantisation_errors_count_with_three_degrees_of_freedom():
     repeated = 0.25**2 / 12 / 16
     assert noise.variance == pytest.approx(repeated * np.array([1.0, 4.0, 4.0, 4.0]), rel=1e-3)
     assert noise.freedom == pytest.approx(np.full(4, 3.0))
+
+
+@pytest.mark.parametrize(("change", "found"), [(0.0069, []), (0.0077, [6])])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_step_of_the_period_exceeds_eight_times_the_noise_of_single_periods(change, found, sign):
+    """6 and 24 periods, their logarithms ±0.001 about their means: |difference| √(6·24/30) > 8 · 0.002."""
+    logs = 0.001 * (-1.0) ** np.arange(30) + sign * change * (np.arange(30) >= 6)
+    rising = np.concatenate([[0.0], np.cumsum(np.exp(logs))])
+    time = np.stack([rising - 0.01, rising], axis=1).ravel()
+    signal = np.tile([-1.0, 1.0], rising.size)
+    assert folding._steps(time, signal, 1 + 2 * np.arange(rising.size)) == found
+
+
+def test_a_step_of_the_period_is_larger_than_a_thousandth():
+    for change, found in ((0.00095, []), (0.00105, [15])):
+        rising = np.concatenate([[0.0], np.cumsum(np.exp(change * (np.arange(30) >= 15)))])
+        time = np.stack([rising - 0.01, rising], axis=1).ravel()
+        assert folding._steps(time, np.tile([-1.0, 1.0], 31), 1 + 2 * np.arange(31)) == found
+    assert folding._steps(time[:14], np.tile([-1.0, 1.0], 7), 1 + 2 * np.arange(7)) == []
+
+
+def test_steps_at_several_places_are_found_and_a_jump_of_the_phase_is_none():
+    logs = np.repeat([0.0, 0.2, 0.5, 0.1], [7, 5, 9, 4])
+    logs[3] = 0.4
+    rising = np.concatenate([[0.0], np.cumsum(np.exp(logs))])
+    time = np.stack([rising - 0.01, rising], axis=1).ravel()
+    assert folding._steps(time, np.tile([-1.0, 1.0], 26), 1 + 2 * np.arange(26)) == [7, 12, 21]
+
+
+def test_constant_channels_and_sizes_beyond_floats_are_named():
+    wave, rest = np.array([0.0, 1.0, 0.0]), np.full(3, 2.5)
+    with pytest.raises(
+        ValueError, match=r"^outputs\['y1'\]: must vary, got the constant 2.5; leave the channel out\.$"
+    ):
+        signals(np.arange(3.0), wave, rest, inputs=1)
+    remedy = ", and write it in the model as a parameter with its value in `fixed`"
+    with pytest.raises(ValueError, match=rf"^inputs\['y0'\]: must vary, got the constant 2.5; .* out{remedy}\.$"):
+        signals(np.arange(3.0), rest, wave, inputs=1)
+    for scale in (1e-101, 1e101):
+        with pytest.raises(ValueError, match=r"^inputs\['y0'\]: must be between 1e-100 and 1e\+100 in size, got up to"):
+            signals(np.arange(3.0), scale * wave, wave, inputs=1)
+        with pytest.raises(ValueError, match=r"^outputs\['y1'\]: must be between"):
+            signals(np.arange(3.0), wave, scale * wave, inputs=1)
