@@ -83,12 +83,13 @@ def test_at_least_three_cycles_are_steady():
 def test_noise_of_a_harmonic_is_the_mean_power_of_the_lines_beside_it(row):
     """36 cycles of 8 samples: lines 36 h ± 1 … 9 of the Fourier transform of the residual; 4·9 degrees of freedom."""
     cycles, per_cycle = 36, 8
-    time = 1.5 + np.arange(cycles * per_cycle) / per_cycle
-    values = np.cos(2 * np.pi * time) + 0.1 * np.random.default_rng(1).standard_normal((2, time.size))
+    time = 1.5 + np.arange(cycles * per_cycle) / per_cycle / 0.3
+    values = np.cos(2 * np.pi * 0.3 * time) + 0.1 * np.random.default_rng(1).standard_normal((2, time.size))
     values[1] *= 3.0
-    fit = harmonics.fit_harmonics(time, values, 1.0, 3)
+    fit = harmonics.fit_harmonics(time, values, 0.3, 3)
     one_cycle, noise = folding._noise(signals(time, *values), fit, row, cycles)
-    residual = values[row] - design(time, 3) @ np.linalg.lstsq(design(time, 3), values[row], rcond=None)[0]
+    basis = design(0.3 * time, 3)
+    residual = values[row] - basis @ np.linalg.lstsq(basis, values[row], rcond=None)[0]
     power = np.abs(np.fft.fft(residual) / time.size) ** 2
     each = np.fft.fft(residual.reshape(cycles, per_cycle), axis=1) / per_cycle
     for h in (1, 2, 3):

@@ -86,5 +86,5 @@ def test_stacked_residuals_behave_like_a_list():
 def test_names_and_values_of_fixed_noise_are_checked():
     with pytest.raises(ValueError, match="^fixed: must be 'variance"):
         Likelihood(noise.Independent(), [block()], {"variance[x]": 1.0})
-    with pytest.raises(ValueError, match=r"^fixed\['variance\[y\]'\]: must be positive"):
+    with pytest.raises(ValueError, match=r"^fixed\['variance\[y\]'\]: must be > 0, got 0.0"):
         Likelihood(noise.Independent(), [block()], {"variance[y]": 0.0})
