@@ -168,15 +168,15 @@ def test_power_of_a_signal_is_that_of_its_amplitudes():
 
 
 def test_gaps_are_longer_than_a_quarter_period_and_than_three_usual_steps():
-    time = np.cumsum([0.0, 1.0, 1.0, 2.9, 1.0, 1.0, 3.1, 1.0, 1.0, 6.0, 1.0])
-    assert folding.gaps(time, 4.0).tolist() == [5, 8]
-    assert folding.gaps(time, 11.9).tolist() == [5, 8]
-    assert folding.gaps(time, 12.5).tolist() == [8]
-    assert folding.gaps(time, 24.1).tolist() == []
+    time = 0.5 * np.cumsum([0.0, 1.0, 1.0, 2.9, 1.0, 1.0, 3.1, 1.0, 1.0, 6.0, 1.0])
+    assert folding.gaps(time, 2.0).tolist() == [5, 8]
+    assert folding.gaps(time, 5.95).tolist() == [5, 8]
+    assert folding.gaps(time, 6.25).tolist() == [8]
+    assert folding.gaps(time, 12.05).tolist() == []
 
 
 def test_the_longest_stretch_ends_at_gaps_of_more_than_thirty_steps():
-    time = np.cumsum([0.0, 1.0, 1.0, 30.5, 1.0, 1.0, 29.5, 1.0, 1.0, 40.0, 1.0])
+    time = 0.5 * np.cumsum([0.0, 1.0, 1.0, 30.5, 1.0, 1.0, 29.5, 1.0, 1.0, 40.0, 1.0])
     part, values = folding._longest_stretch(signals(time, np.arange(11.0), np.arange(11.0) ** 2))
     assert part.tolist() == time[3:9].tolist()
     assert values.tolist() == [[3, 4, 5, 6, 7, 8], [9, 16, 25, 36, 49, 64]]
