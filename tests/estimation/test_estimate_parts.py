@@ -11,8 +11,10 @@ from scipy.optimize import minimize_scalar
 import bayesperiodic as bp
 from bayesperiodic.estimation import conflict, covariance, units
 from bayesperiodic.estimation.gauss_newton import _step, inverse_hessian
+from bayesperiodic.estimation.laplace import joint_laplace
 from bayesperiodic.estimation.modes import Mode, images, notable
 from bayesperiodic.posterior.noise import SPECTRAL, Block
+from tests.known import LINEAR, linear_experiment
 
 HIGHEST = 9
 HARMONIC = np.array([0, *np.repeat(np.arange(1, HIGHEST + 1), 2)])
@@ -224,3 +226,21 @@ def test_perturbations_are_waves_of_one_sd_and_their_derivatives():
             expected[row + 1, :, 2 * order + 1] = -size * rate**order * wave
     assert covariance._perturbations(e) == pytest.approx(expected, abs=1e-12)
     assert len(covariance._perturbations(bp.Experiment("run", 3.0, {"y": np.zeros(8)}, samples=8))) == 0
+
+
+def test_nothing_is_tested_or_approximated_where_derivatives_or_the_density_do_not_exist():
+    data = linear_experiment([900.0, 40.0, 25.0], 3.0, seed=1)
+    priors = {"k": bp.LogNormal(800.0, 0.1), "c": bp.Uniform(0.0, 90.0), "coulomb": bp.Normal(20.0, 10.0)}
+    problem = bp.Problem(LINEAR, [data], priors=priors)
+    size = problem.likelihood.blocks[0].size
+    here = SimpleNamespace(changes=[np.full((3, size), np.nan)], residuals=[np.ones(size)])
+    estimate = SimpleNamespace(theta=np.array([880.0, 41.0, 22.0]), here=here, noise=np.array([9.0]))
+    tested = conflict._tested(problem, estimate)
+    assert np.isnan([tested.joint, tested.p]).all() and tested.members == ()
+    assert tested.table[["prior_low", "prior_high"]].loc["c"].tolist() == pytest.approx([4.5, 85.5])
+    assert np.isnan(covariance.robust_covariance(problem, estimate, np.eye(3))).all()
+    assert conflict._by_the_data(problem, estimate) is estimate
+    outside = SimpleNamespace(theta=np.array([880.0, 95.0, 22.0]), here=None, noise=None)
+    found = joint_laplace(problem.density(), outside)
+    assert found.mode == {} and found.covariance.isna().all(axis=None) and np.isnan(found.log_density)
+    assert list(found.covariance) == list(found.covariance.index) == ["k", "c", "coulomb", "variance[force]"]
