@@ -267,3 +267,71 @@ def test_constant_channels_and_sizes_beyond_floats_are_named():
             signals(np.arange(3.0), scale * wave, wave, inputs=1)
         with pytest.raises(ValueError, match=r"^outputs\['y1'\]: must be between"):
             signals(np.arange(3.0), wave, scale * wave, inputs=1)
+
+
+def test_every_field_of_a_folded_response_of_two_forcing_periods():
+    """Forcing at 2.5 Hz, response at 1.25 Hz: 16 whole cycles of 24 samples, with white noise."""
+    generator, cycles, per_cycle = np.random.default_rng(5), 16, 24
+    time = 7.0 + np.arange(cycles * per_cycle) / (1.25 * per_cycle)
+    phase = 1.25 * time
+    u = np.cos(4 * np.pi * phase) + 1e-3 * generator.standard_normal(time.size)
+    y = (
+        0.5
+        + np.cos(2 * np.pi * phase + 0.4)
+        + 0.3 * np.sin(4 * np.pi * phase)
+        + 0.05 * generator.standard_normal(u.size)
+    )
+    given = Signals("record", time, ("u", "y"), np.array([u, y]), 1)
+    found = folding.fold_signals(given, 20, 2, 2.5, {"y": 3}, 1.0, None)
+    basis = design(1.25 * (time - 1.0), 3)
+    fitted = np.linalg.lstsq(basis, np.array([u, y]).T, rcond=None)[0].T
+    grid = design(np.arange(40) / 40, 3)
+    assert found["outputs"]["y"] == pytest.approx(grid @ fitted[1], abs=0.02)
+    assert found["inputs"]["u"] == pytest.approx(np.cos(4 * np.pi * (np.arange(40) / 40 + 1.25)), abs=1e-3)
+    exact = {"frequency": 2.5, "frequency_se": 0.0, "samples": 20, "periods": 2, "cycles": 16, "averaged": time.size}
+    assert {key: found[key] for key in exact} == exact
+    assert found["harmonics"] == {"u": 2, "y": 3} and found["independent"] == {"y": 7} and found["origin"] == 1.0
+    assert list(found["outputs"]) == ["y"] and list(found["inputs"]) == ["u"]
+    own = np.fft.fft(y.reshape(cycles, per_cycle), axis=1)[:, :4] / per_cycle
+    variance = np.var(own, axis=0, ddof=1) * [1.0, 2.0, 2.0, 2.0]
+    assert found["scatter"]["y"] == pytest.approx(np.sqrt(variance.sum()), rel=1e-2)
+    assert found["amplitude_variance"]["y"].shape == found["amplitude_freedom"]["y"].shape == (4,)
+    assert found["amplitude_variance"]["u"].shape == (3,)
+    basis = design(phase, 9)
+    rest = y - basis @ np.linalg.lstsq(basis, y, rcond=None)[0]
+    assert found["periodicity"] == pytest.approx(1.0 - rest.var(ddof=19) / y.var(ddof=1), abs=1e-3)
+    size = np.abs(own[:, 1])
+    slope = np.polyfit(np.arange(cycles), size, 1)[0] * cycles / size.mean()
+    assert found["drift"]["y"] == pytest.approx(slope, rel=0.05)
+    estimated = folding.fold_signals(given, 20, 2, None, None, "crossing", None)
+    assert estimated["frequency"] == pytest.approx(2.5, rel=1e-3) and estimated["frequency_se"] > 0.0
+    # Response and phase at the upward crossing of its fundamental: −π/2, the first after time 0.
+    start = (-0.25 - 0.4 / (2 * np.pi)) % 1.0 / 1.25
+    assert estimated["origin"] == pytest.approx(start, abs=0.02) and 0.0 <= estimated["origin"] < 0.8
+    crossing = np.fft.rfft(estimated["outputs"]["y"])[1]
+    assert np.angle(crossing) == pytest.approx(-0.5 * np.pi, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"samples": 500_001}, "^samples: must be at most 500000 for 2 periods, got 500001"),
+        ({"origin": "start"}, "^origin: must be a time .s. or 'crossing', got 'start'"),
+        (
+            {"harmonics": {"y": 12}},
+            r"^harmonics\['y'\]: must be at most 11, which the samples and the grid resolve, got 12",
+        ),
+        ({"harmonics": {"z": 2}}, "^harmonics: must be one of|^harmonics: .*'z'"),
+        (
+            {"largest_drift": 1e-9},
+            "^recording: must be steady, got 'record', in which the fundamental of 'y' changes by",
+        ),
+        ({"frequency": 0.25}, r"^recording: must have at least 3 cycles, got 1.60 cycles in 'record'"),
+    ],
+)
+def test_arguments_of_a_fold_are_checked(changes, message):
+    time = np.arange(16 * 24) / (1.25 * 24)
+    y = (1.0 + 0.001 * time) * np.cos(2 * np.pi * 1.25 * time)
+    given = {"samples": 20, "periods": 2, "frequency": 2.5, "harmonics": None, "origin": 0.0, "largest_drift": None}
+    with pytest.raises(ValueError, match=message):
+        folding.fold_signals(Signals("record", time, ("y",), y[None], 0), **(given | changes))

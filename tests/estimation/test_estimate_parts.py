@@ -9,9 +9,9 @@ from scipy import stats
 from scipy.optimize import minimize_scalar
 
 import bayesperiodic as bp
-from bayesperiodic.estimation import conflict, covariance, units
-from bayesperiodic.estimation.gauss_newton import _step, inverse_hessian
-from bayesperiodic.estimation.laplace import joint_laplace
+from bayesperiodic.estimation import conflict, covariance, modes, units
+from bayesperiodic.estimation.gauss_newton import End, _step, inverse_hessian
+from bayesperiodic.estimation.laplace import JointLaplace, joint_laplace
 from bayesperiodic.estimation.modes import Mode, images, notable
 from bayesperiodic.posterior.noise import SPECTRAL, Block
 from tests.known import LINEAR, linear_experiment
@@ -126,7 +126,7 @@ def test_score_under_a_uniform_prior_is_that_of_the_tail_or_of_the_density(value
     area = lambda x: x * stats.norm.cdf(x) + stats.norm.pdf(x)  # noqa: E731  ∫ Φ
     tail = 0.5 * sd * (area((1 - abs(value)) / sd) - area((-1 - abs(value)) / sd))
     density = lambda at: stats.norm.cdf((at + 1) / sd) - stats.norm.cdf((at - 1) / sd)  # noqa: E731
-    drop = np.sqrt(2 * np.log(density(0.0) / density(abs(value))))
+    drop = np.sqrt(2 * np.log(density(0.0) / max(density(abs(value)), 1e-300)))
     expected = np.sign(value) * min(-stats.norm.ppf(tail), drop)
     assert conflict._scores(prior, value, np.array([sd]))[0] == pytest.approx(expected, rel=0.01, abs=0.02)
 
@@ -192,8 +192,8 @@ def test_a_value_differs_from_another_by_more_than_the_smaller_sd():
     assert mode.differs("a", 2.6, 0.3) and mode.differs("a", 3.6, np.nan)
     assert repr(mode) == "a = 3 (objective -1, 2.0% of the mass)"
     masses = {0.02: True, 0.01: False, 0.0: False, np.nan: True}
-    modes = [Mode({}, {}, 0.0, mass, {}, pd.DataFrame()) for mass in masses]
-    assert [any(one is mode for one in notable(modes)) for mode in modes] == list(masses.values())
+    optima = [Mode({}, {}, 0.0, mass, {}, pd.DataFrame()) for mass in masses]
+    assert [any(one is mode for one in notable(optima)) for mode in optima] == list(masses.values())
 
 
 @pytest.mark.parametrize(("ratio", "said"), [(101.0, "1e+2 times"), (99.0, ""), (0.0099, "1e-2 times"), (1e3, "1e+3")])
@@ -244,3 +244,65 @@ def test_nothing_is_tested_or_approximated_where_derivatives_or_the_density_do_n
     found = joint_laplace(problem.density(), outside)
     assert found.mode == {} and found.covariance.isna().all(axis=None) and np.isnan(found.log_density)
     assert list(found.covariance) == list(found.covariance.index) == ["k", "c", "coulomb", "variance[force]"]
+
+
+def end(theta, objective, status="converged", others=()):
+    here = SimpleNamespace(other_orbits=dict.fromkeys(others, ""))
+    return End(SimpleNamespace(theta=np.array([theta]), here=here, objective=objective), status, np.zeros(1))
+
+
+def test_optima_are_more_than_one_sd_apart_converged_and_on_the_measured_orbits(monkeypatch):
+    monkeypatch.setattr(modes, "_credible_images", lambda objective, here: np.empty((0, 1)))
+    curved = SimpleNamespace(hessian_and_gradient=lambda iterate: (np.array([[4.0]]), None))
+
+    def found(*ends):
+        return [float(one.iterate.theta[0]) for one in modes.with_images(curved, ends, None)]
+
+    assert found(end(3.0, -1.0), end(3.51, -5.0), end(3.49, -2.0), end(9.0, -4.0)) == [3.0, 9.0, 3.51]
+    assert found(end(3.0, -1.0), end(9.0, -30.9), end(6.0, -31.1)) == [3.0, 9.0]
+    assert found(end(3.0, -1.0, "stalled"), end(3.1, -1.0009), end(3.2, -1.0011)) == [3.1]
+    assert found(end(3.0, -1.0, "stalled"), end(3.1, -1.0011)) == [3.0]
+    assert found(end(3.0, -1.0), end(9.0, -4.0, "stalled"), end(6.0, -2.0, others=["run"])) == [3.0]
+    assert found(end(3.0, -1.0, others=["run"]), end(9.0, -4.0)) == [9.0]
+    # An image is climbed from where it is separate, and followed by its own images.
+    images_of = {3.0: [3.1, -3.0], -3.0: [5.0], -8.0: [20.0]}
+    monkeypatch.setattr(
+        modes, "_credible_images", lambda _, here: np.array(images_of.get(float(here.theta[0]), []))[:, None]
+    )
+    started = []
+    moving = SimpleNamespace(
+        hessian_and_gradient=curved.hessian_and_gradient,
+        at=lambda theta, here, noise: started.append(float(theta[0])) or SimpleNamespace(theta=theta),
+        anchored=lambda iterate: iterate,
+    )
+    first = end(3.0, -1.0)
+    first.iterate.noise = None
+    climbed = lambda start: with_noise(end(float(start.theta[0]), -2.0))  # noqa: E731
+    assert [float(one.iterate.theta[0]) for one in modes.with_images(moving, [first], climbed)] == [3.0, -3.0, 5.0]
+    assert started == [-3.0, 5.0]
+
+
+def with_noise(one):
+    one.iterate.noise = None
+    return one
+
+
+def test_masses_are_densities_times_the_volumes_of_the_laplace_approximations():
+    covariances = [np.array([[4.0, 1.0], [1.0, 2.0]]), np.array([[0.09, 0.0], [0.0, 1e-8]])]
+    names = ["a", "b"]
+    laplaces = [
+        JointLaplace({"a": 1.0}, pd.DataFrame(c, names, names), height)
+        for c, height in zip(covariances, (-3.0, 6.0), strict=True)
+    ]
+    problem = SimpleNamespace(names=("a", "b"), logarithmic=np.array([True, False]))
+    ends = [end(3.0, -1.0), End(SimpleNamespace(theta=np.array([5.0, -2.0]), objective=-4.0), "converged", None)]
+    (mode,) = modes.weighed(problem, ends, laplaces)
+    volumes = [np.exp(height) * np.sqrt(np.linalg.det(c)) for c, height in zip(covariances, (-3.0, 6.0), strict=True)]
+    assert mode.mass == pytest.approx(volumes[1] / sum(volumes))
+    assert (mode.theta, mode.objective) == ({"a": 5.0, "b": -2.0}, -4.0)
+    assert mode.sd == pytest.approx({"a": 5.0 * 0.3, "b": 1e-4})
+    laplaces[0] = laplaces[0]._replace(covariance=pd.DataFrame(np.full((2, 2), np.nan), names, names))
+    (mode,) = modes.weighed(problem, ends, laplaces)
+    assert mode.mass == pytest.approx(1.0 / (1.0 + np.exp(-9.0)))
+    laplaces[0] = laplaces[0]._replace(log_density=np.nan)
+    assert np.isnan(modes.weighed(problem, ends, laplaces)[0].mass)
