@@ -18,7 +18,7 @@ STATISTICS = Path("mutants/mutmut-stats.json")
 KILLED = ("killed", "timeout")
 
 
-def tests_of(mutant: str, statistics: dict) -> tuple[list[str], float]:
+def chosen_tests(mutant: str, statistics: dict) -> tuple[list[str], float]:
     """Return the tests of a mutant, and how long they take [s]."""
     folder, function = f"tests/{mutant.split('.')[1]}/", mutant.rpartition("__mutmut_")[0]
     calling = statistics["tests_by_mangled_function_name"].get(function, [])
@@ -45,7 +45,7 @@ def run(names: list[str]) -> dict[str, str]:
     runner, statuses = get_mutant_runner(1), {}
     runner.startup()
     for number, name in enumerate(names, 1):
-        tests, seconds = tests_of(name, statistics)
+        tests, seconds = chosen_tests(name, statistics)
         statuses[name] = "no tests"
         if tests:
             # The limits are wide, so that no mutant is killed because the machine is busy.
