@@ -126,7 +126,8 @@ def test_error_names_the_experiment_that_is_no_orbit():
     points = np.stack([angle[::100], np.array([20.0, -20.0, 20.0])], axis=-1)
     false = replace(like, name="false", winding=0, points=points, cycle={"angle": angle, "rate": 0 * angle})
     experiments = [*runs(1e-3, 0)[:4], false.experiment(samples=200, states=PHI)]
-    with pytest.raises(ValueError, match="start: must be .*'false' cannot be followed from its guess to parameters"):
+    where = "parameters at which the other experiments' orbits are"
+    with pytest.raises(ValueError, match=f"start: must be .*'false' cannot be followed from its guess to {where}"):
         bp.map_estimate(section_problem(experiments, "m", "l"), start={"m": 0.15, "l": 0.35}, progress=False)
 
 
