@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 MOST_LETTERS, SHOWN = 200, 12
+# Sizes of measured values, whose squares and their ratios must be numbers.
+SMALLEST, LARGEST = 1e-100, 1e100
 
 
 def one_of(argument: str, value: Any, allowed: Iterable[str]) -> None:
@@ -135,6 +137,18 @@ def finite_vector(argument: str, values: Any, length: int | None = None, meaning
         raise ValueError(
             f"{argument}: must be finite, got {array[bad[0]]} at index {bad[0]} ({bad.size} of {array.size} values are "
             "NaN or infinite)."
+        )
+    return array
+
+
+def measured_vector(argument: str, values: Any, length: int | None = None, meaning: str = "") -> np.ndarray:
+    """Return `values` as by `finite_vector`; raise a ValueError if its values are too small or too large."""
+    array = finite_vector(argument, values, length, meaning)
+    size = float(np.max(np.abs(array), initial=0.0))
+    if size and not SMALLEST < size < LARGEST:
+        raise ValueError(
+            f"{argument}: must be between {SMALLEST:g} and {LARGEST:g} in size, got up to {size:g}; choose another "
+            "unit."
         )
     return array
 

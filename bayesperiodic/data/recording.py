@@ -132,22 +132,23 @@ class Recording(Result):
     synthetic: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "time", _checks.finite_vector("time", self.time))
+        _checks.text("name", self.name)
+        object.__setattr__(self, "time", _checks.measured_vector("time", self.time))
         if self.time.size < 2:
-            raise ValueError(f"time: must have at least 2 samples, got {self.time.size}.")
+            raise ValueError(f"time: must have at least 2 samples, got {self.time.size} in {self.name!r}.")
         step = np.diff(self.time)
         if np.any(step <= 0):
             index = int(np.flatnonzero(step <= 0)[0])
             raise ValueError(
                 f"time: must increase, got {self.time[index + 1]:g} s after {self.time[index]:g} s at index "
-                f"{index + 1}; a file of several records is divided by `from_csv(split=…)`."
+                f"{index + 1} of {self.name!r}; a file of several records is divided by `from_csv(split=…)`."
             )
         if not self.outputs:
             raise ValueError("outputs: must have at least one channel, got none.")
         _checks.identifiers("outputs and inputs", (*self.outputs, *self.inputs))
         for kind in ("outputs", "inputs"):
             channels = {
-                name: _checks.finite_vector(f"{kind}[{name!r}]", values, self.time.size, "one per time")
+                name: _checks.measured_vector(f"{kind}[{name!r}]", values, self.time.size, "one per time")
                 for name, values in getattr(self, kind).items()
             }
             object.__setattr__(self, kind, channels)
