@@ -83,12 +83,16 @@ def identifiers(argument: str, names: Iterable[str], reserved: Iterable[str] = (
 
 
 def text(argument: str, value: Any) -> str:
-    """Return `value`; raise a ValueError unless it is a text that can be written to a file."""
+    """Return `value`; raise a ValueError unless it is a text that can be written to a file.
+
+    Arrays of texts and HDF5 end a text at the character 0.
+    """
     try:
-        str.encode(value, "utf-8")
+        if b"\0" not in str.encode(value, "utf-8"):
+            return str(value)
     except (TypeError, UnicodeEncodeError):
-        raise ValueError(f"{argument}: must be a text of Unicode characters, got {shortened(value)}.") from None
-    return str(value)
+        pass
+    raise ValueError(f"{argument}: must be a text of Unicode characters, got {shortened(value)}.")
 
 
 def positive(argument: str, value: Any) -> float:

@@ -17,6 +17,11 @@ import numpy as np
 
 from bayesperiodic import _checks
 
+# Texts of missing values.
+MISSING = [
+    "", "nan", "NaN", "NAN", "-nan", "-NaN", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None", "1.#IND",
+    "-1.#IND", "1.#QNAN", "-1.#QNAN",
+]  # fmt: skip
 # Lines among which the header is searched for.
 PREAMBLE = 1000
 
@@ -59,13 +64,18 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
             _skip(text, lines)
             warnings.simplefilter("error", pd.errors.ParserWarning)
             # More columns than names hold the fields after trailing commas.
+            # The only column of a file may have empty cells, which are empty lines, but not at the end.
+            alone, surplus = len(names) == 1, max(more, 0) + 1
             table = pd.read_csv(
-                text,
+                io.StringIO(text.read().rstrip()) if alone else text,
+                skip_blank_lines=not alone,
                 header=None,
-                names=range(len(names) + max(more, 0) + 1),
+                names=range(len(names) + surplus),
                 index_col=False,
                 skipinitialspace=True,
                 low_memory=False,
+                keep_default_na=False,
+                na_values={i: MISSING for i in range(len(names))} | {i + len(names): [""] for i in range(surplus)},
             )
     except (pd.errors.ParserError, pd.errors.ParserWarning) as error:
         _check_fields(file, names, lines)
@@ -112,6 +122,7 @@ def _header(file: Path, columns: list[str]) -> tuple[list[str], int, int]:
     # Without a line of all names, that with most of them tells what is missing.
     place = max(range(len(found)), key=lambda i: len({*columns} & {*found[i][0]}))
     names, number = found[place]
+    names = names[: max((i for i, name in enumerate(names, 1) if name), default=len(names))]  # no trailing commas
     if not {*columns} <= {*names} and _is_no_header(names):
         raise ValueError(
             f"path: must be a CSV file whose first line names the columns, separated by commas, got {str(file)!r}, "
