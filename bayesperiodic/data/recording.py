@@ -66,7 +66,7 @@ class Layout:
                     f"{argument}: must be finite, got nan at index {lost[0]} ({lost.size} of {columns[column].size} "
                     f"values); missing={DROP!r} leaves such rows out, missing={INTERPOLATE!r} fills in single values."
                 )
-            values = _checks.finite_vector(argument, columns[column])
+            values = _checks.measured_vector(argument, columns[column])
             return convert(key, values, self.units[key]) if key in self.units else values
 
         measured, given = (
