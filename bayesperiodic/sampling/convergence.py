@@ -1,8 +1,11 @@
 """Convergence diagnostics of chains; calls of ArviZ (0.23 and 1.x)."""
 
+import tempfile
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from types import ModuleType
+from unittest import mock
 
 import emcee
 import numpy as np
@@ -12,10 +15,15 @@ FEWEST_WEIGHTS, EQUAL, SMALLEST = 0.25, 1e-6, 700.0
 
 
 def arviz() -> ModuleType:
-    """Return the arviz module, imported without the notice of version 0.23."""
+    """Return the arviz module, imported without the notice of version 0.23, also if no cache folder can be written."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=FutureWarning, module="arviz")
-        import arviz as module
+        with suppress(OSError):  # version 0.23 keeps the date of its notice in the cache folder of the user
+            import arviz as module
+
+            return module
+        with tempfile.TemporaryDirectory() as folder, mock.patch("platformdirs.user_cache_dir", return_value=folder):
+            import arviz as module
     return module
 
 
