@@ -218,7 +218,8 @@ if __name__ == "__main__":
 def test_workers_end_when_their_parent_is_killed(tmp_path, how, workers):
     """Also those of an executor of the user, which wait for tasks forever otherwise.
 
-    The tasks would run for ten minutes; the limit of a minute is for slow machines."""
+    The tasks would run for ten minutes; the limit of a minute is for slow machines.
+    """
     (tmp_path / "orphans.py").write_text(ORPHANS)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     parent = subprocess.Popen(

@@ -66,6 +66,7 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
             # More columns than names hold the fields after trailing commas.
             # The only column of a file may have empty cells, which are empty lines, but not at the end.
             alone, surplus = len(names) == 1, max(more, 0) + 1
+            missing: Any = dict(enumerate([MISSING] * len(names) + [[""]] * surplus))
             table = pd.read_csv(
                 io.StringIO(text.read().rstrip()) if alone else text,
                 skip_blank_lines=not alone,
@@ -75,7 +76,7 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
                 skipinitialspace=True,
                 low_memory=False,
                 keep_default_na=False,
-                na_values={i: MISSING for i in range(len(names))} | {i + len(names): [""] for i in range(surplus)},
+                na_values=missing,
             )
     except (pd.errors.ParserError, pd.errors.ParserWarning) as error:
         _check_fields(file, names, lines)
@@ -299,8 +300,8 @@ def _variable(data: memoryview, order: str) -> tuple[str, int, list[int], Iterat
 
 def _array(name: str, flags: int, shape: list[int], parts: Iterator[tuple[int, memoryview]], order: str) -> np.ndarray:
     if flags & 0xFF not in NUMERIC or flags & COMPLEX:
-        kind = "complex" if flags & COMPLEX else f"of MATLAB class {flags & 0xFF}"
-        raise ValueError(f"its variable {name!r} is no array of real numbers, but {kind}")
+        other = "complex" if flags & COMPLEX else f"of MATLAB class {flags & 0xFF}"
+        raise ValueError(f"its variable {name!r} is no array of real numbers, but {other}")
     kind, values = next(parts)
     array = np.frombuffer(values, f"{order}{STORED[kind]}")
     if next(parts, None) is not None or min(shape) < 0 or array.size != math.prod(shape):

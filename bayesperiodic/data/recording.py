@@ -111,8 +111,8 @@ class Recording(Result):
     Raises
     ------
     ValueError
-        For fewer than two samples, samples that are NaN or infinite, different lengths, a time that does not increase,
-        no output, names that are repeated or not identifiers.
+        For fewer than two samples, samples that are NaN or infinite, or of sizes outside 1e-100 to 1e100, different
+        lengths, a time that does not increase, no output, names that are repeated or not identifiers.
 
     Examples
     --------
@@ -224,8 +224,8 @@ class Recording(Result):
         units : mapping of str to float or (from, to), optional
             Conversion of a channel (or of "time") by a factor or a pair of units such as ``("mm", "m")``.
         missing : "drop" or "interpolate", optional
-            What to do with NaN and empty cells, which are refused by default: leave their rows out, or interpolate
-            linearly in time over at most three successive ones.
+            What to do with NaN and empty cells (in a file with one column: empty lines), which are refused by default:
+            leave their rows out, or interpolate linearly in time over at most three successive ones.
         split : str, optional
             Column of numbers or texts that distinguishes successive records, such as the drive frequency: each part in
             which it is constant is a recording. `split` divides a recording by the steps of its drive.
@@ -300,7 +300,7 @@ class Recording(Result):
         Raises
         ------
         FileNotFoundError, ValueError
-            As for `from_csv`, and for an array of objects, which would have to be unpickled.
+            As for `from_csv`, and for a damaged file or an array of objects, which would have to be unpickled.
         """
         layout = Layout(
             Path(path).name, outputs, {} if inputs is None else inputs, time, sampling_rate, units or {}, missing
@@ -334,7 +334,8 @@ class Recording(Result):
         Raises
         ------
         FileNotFoundError, ValueError
-            As for `from_csv`, and for a variable that is not a vector of real numbers.
+            As for `from_csv`, and for a damaged file, one of version 4, or a variable that is not a vector of real
+            numbers.
         """
         layout = Layout(
             Path(path).name, outputs, {} if inputs is None else inputs, time, sampling_rate, units or {}, missing

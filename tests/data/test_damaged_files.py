@@ -193,7 +193,8 @@ def test_mat_file_of_the_other_byte_order_is_read(tmp_path):
         return element(14, parts + element(1, name.encode()) + element(9, values.astype(">f8").tobytes()))
 
     packed = zlib.compress(variable("F", COLUMNS["F"]))
-    whole = bytes(124) + b"\1\0MI" + variable("t", TIME) + struct.pack(">II", 15, len(packed)) + packed
+    head = b"MATLAB 5.0 MAT-file".ljust(124) + b"\1\0MI"
+    whole = head + variable("t", TIME) + struct.pack(">II", 15, len(packed)) + packed
     path = tmp_path / "run.mat"
     path.write_bytes(whole)
     recording = bp.Recording.from_mat(path, time="t", outputs={"force": "F"})

@@ -15,8 +15,8 @@ NUMBER = re.compile(r"[ \t]*[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?[ \
 # What pandas and the documentation take for a missing value.
 MISSING = {"", "nan", "NaN", "NA", "N/A", "null", "-nan"}
 JUNK = [
-    "x", "1,5", "1;5", "1_000", "0x1F", "\u0661", "1d3", "True", "false", "inf", "-Infinity", "--1", "1e", "1 2", "\u22121",
-    "1e400", "'1'", "#N/A!", "1.2.3", "\ufeff1", "1\u00a0", "\u20281",
+    "x", "1,5", "1;5", "1_000", "0x1F", "\u0661", "1d3", "True", "false", "inf", "-Infinity", "--1", "1e", "1 2",
+    "\u22121", "1e400", "'1'", "#N/A!", "1.2.3", "\ufeff1", "1\u00a0", "\u20281",
 ]  # fmt: skip
 floats = st.floats(-1e99, 1e99, allow_nan=False).filter(lambda x: x == 0.0 or abs(x) > 1e-90)
 
@@ -161,7 +161,9 @@ def test_segments_of_a_split_file_make_up_the_file(path, parts, lost, restart):
     with path.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file)
         table.writerow(["run", "t", "x"])
-        table.writerows([label, t, "" if gone else 7.0 * i] for label, t, i, gone in zip(labels, times, rows, lost))
+        table.writerows(
+            [label, t, "" if gone else 7.0 * i] for label, t, i, gone in zip(labels, times, rows, lost, strict=True)
+        )
     merged = any(one == other for (one, _), (other, _) in zip(parts, parts[1:], strict=False))
     arguments = {"time": "t", "outputs": {"x": "x"}, "split": "run", "missing": "drop"}
     if merged and restart:
