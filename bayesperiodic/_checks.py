@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 MOST_LETTERS, SHOWN = 200, 12
+# Sizes of measured values, whose squares and their ratios must be numbers.
+SMALLEST, LARGEST = 1e-100, 1e100
 
 
 def one_of(argument: str, value: Any, allowed: Iterable[str]) -> None:
@@ -90,12 +92,16 @@ def identifiers(argument: str, names: Iterable[str], reserved: Iterable[str] = (
 
 
 def text(argument: str, value: Any) -> str:
-    """Return `value`; raise a ValueError unless it is a text that can be written to a file."""
+    """Return `value`; raise a ValueError unless it is a text that can be written to a file.
+
+    Arrays of texts and HDF5 end a text at the character 0.
+    """
     try:
-        str.encode(value, "utf-8")
+        if b"\0" not in str.encode(value, "utf-8"):
+            return str(value)
     except (TypeError, UnicodeEncodeError):
-        raise ValueError(f"{argument}: must be a text of Unicode characters, got {shortened(value)}.") from None
-    return str(value)
+        pass
+    raise ValueError(f"{argument}: must be a text of Unicode characters, got {shortened(value)}.")
 
 
 def positive(argument: str, value: Any) -> float:
@@ -154,6 +160,18 @@ def finite_vector(argument: str, values: Any, length: int | None = None, meaning
         raise ValueError(
             f"{argument}: must be finite, got {array[bad[0]]} at index {bad[0]} ({bad.size} of {array.size} values are "
             "NaN or infinite)."
+        )
+    return array
+
+
+def measured_vector(argument: str, values: Any, length: int | None = None, meaning: str = "") -> np.ndarray:
+    """Return `values` as by `finite_vector`; raise a ValueError if its values are too small or too large."""
+    array = finite_vector(argument, values, length, meaning)
+    size = float(np.max(np.abs(array), initial=0.0))
+    if size and not SMALLEST < size < LARGEST:
+        raise ValueError(
+            f"{argument}: must be between {SMALLEST:g} and {LARGEST:g} in size, got up to {size:g}; choose another "
+            "unit."
         )
     return array
 

@@ -177,7 +177,7 @@ def load(path: str | Path) -> Any:
             raise ValueError(f"it contains a {type(result).__name__}")
     except Exception as error:  # whatever HDF5, JSON, NumPy and xarray raise for files that someone has made up
         if str(error).startswith(OTHER):
-            raise
+            raise ValueError(f"{str(error).removesuffix('.')}: {str(path)!r}.") from None
         reason = f"{type(error).__name__}: {error}" if not isinstance(error, ValueError) else error
         raise ValueError(
             f"path: must be a file written by save(), got {str(path)!r} ({reason}); a checkpoint is read by "

@@ -33,6 +33,8 @@ MAIN_GUARD = "A script that uses processes must have its calls below: if __name_
 QUEUED_PER_WORKER = 2
 # Shared objects that a process keeps unpickled.
 KEPT = 4
+# Digest of a shared object, and the process that submits the tasks.
+Key = tuple[str, int]
 
 
 class WorkersLost(RuntimeError):
@@ -88,14 +90,20 @@ def checked_executor(executor: Any) -> Any:
 def _start_worker() -> None:
     """Ignore Ctrl-C, which the main process handles, and end with the main process, whatever ends that."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _end_with(os.getppid())
 
 
-def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+@cache
+def _end_with(parent: int) -> None:
+    """End this process, from a thread, when the process with this number ends, if that has started it."""
+    process = parent_process()
+    if process is not None and process.pid == parent:
+
+        def wait() -> None:
+            process.join()
+            os._exit(1)
+
+        threading.Thread(target=wait, daemon=True).start()
 
 
 @contextmanager
@@ -129,7 +137,8 @@ class TaskPool:
         self._executor, self._shared = checked_executor(executor), shared
         self._hint = MAIN_GUARD if isinstance(self._executor, int) else ""
         self._running: dict[int, tuple[Any, Any]] = {}
-        self._key, self._content, self._unsent, self._at_once = "", shared, 0, None
+        self._key: Key | None = None
+        self._content, self._unsent, self._at_once = shared, 0, None
         self._always_sent = True
         self._stack = ExitStack()
 
@@ -154,7 +163,7 @@ class TaskPool:
         if isinstance(executor, ThreadPoolExecutor):
             return
         payload = _pickled(self._shared)
-        self._key, self._content = hashlib.sha256(payload).hexdigest(), payload
+        self._key, self._content = (hashlib.sha256(payload).hexdigest(), os.getpid()), payload
         self._always_sent = _is_dask(executor) and hasattr(executor, "scatter")
         if self._always_sent:
             self._submit = partial(executor.submit, pure=False)
@@ -244,13 +253,15 @@ class _Missing:
 
 
 _TASK = threading.local()
-_UNPICKLED: OrderedDict[str, Any] = OrderedDict()
+_UNPICKLED: OrderedDict[Key, Any] = OrderedDict()
 _UNPICKLING = threading.Lock()
 
 
 @in_one_thread
-def _call(function: Callable[[Any, Any], Any], task: Any, key: str, content: Any) -> Any:
+def _call(function: Callable[[Any, Any], Any], task: Any, key: Key | None, content: Any) -> Any:
     """Run one task; `content` is the shared object itself (no key), pickled, or None if it was sent before."""
+    if key:
+        _end_with(key[1])  # also a worker of an executor of the user, which may have been forked
     shared = _unpickled(key, content) if key else content
     if isinstance(shared, _Missing):
         return shared
@@ -261,7 +272,7 @@ def _call(function: Callable[[Any, Any], Any], task: Any, key: str, content: Any
         _TASK.inside = outside
 
 
-def _unpickled(key: str, content: bytes | None) -> Any:
+def _unpickled(key: Key, content: bytes | None) -> Any:
     with _UNPICKLING:
         if key not in _UNPICKLED:
             if content is None:

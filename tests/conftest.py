@@ -1,14 +1,22 @@
 import signal
+import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 import matplotlib
 import pytest
+from hypothesis import configuration, settings
 
 import bayesperiodic as bp
 from tests.known import LINEAR, linear_experiment
 
 matplotlib.use("Agg")
+
+# The same examples in each run, and no files in the repository. More of them: --hypothesis-profile=thorough.
+configuration.set_hypothesis_home_dir(tempfile.gettempdir())
+settings.register_profile("default", derandomize=True, deadline=None, database=None, max_examples=100)
+settings.register_profile("thorough", settings.get_profile("default"), max_examples=2000)
+settings.load_profile("default")
 
 
 @pytest.fixture(scope="session", autouse=True)

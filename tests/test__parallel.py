@@ -196,7 +196,9 @@ def test_items_shared_by_threads_keep_their_order_and_raise():
 
 
 ORPHANS = """
-import os, time
+import os, sys, time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from bayesperiodic._parallel import TaskPool
 
 def busy(shared, task):
@@ -204,19 +206,24 @@ def busy(shared, task):
     time.sleep(600.0)
 
 if __name__ == "__main__":
-    with TaskPool(2, None) as pool:
+    executor = 2 if sys.argv[1] == "number" else ProcessPoolExecutor(2, get_context(sys.argv[1]))
+    with TaskPool(executor, None) as pool:
         list(pool.run(busy, [1, 2]))
 """
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for processes in /proc")
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
-def test_workers_end_when_their_parent_is_killed(tmp_path, how):
-    """The tasks would run for ten minutes; the limit of a minute is for slow machines."""
+@pytest.mark.parametrize("workers", ["number", "spawn", "forkserver", "fork"])
+def test_workers_end_when_their_parent_is_killed(tmp_path, how, workers):
+    """Also those of an executor of the user, which wait for tasks forever otherwise.
+
+    The tasks would run for ten minutes; the limit of a minute is for slow machines.
+    """
     (tmp_path / "orphans.py").write_text(ORPHANS)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     parent = subprocess.Popen(
-        [sys.executable, "orphans.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True, env=environment
+        [sys.executable, "orphans.py", workers], cwd=tmp_path, stdout=subprocess.PIPE, text=True, env=environment
     )
     workers = [int(parent.stdout.readline()) for _ in range(2)]
     os.kill(parent.pid, how)

@@ -114,7 +114,7 @@ class Experiment(Result):
     guess: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
 
     def __post_init__(self) -> None:
-        if not self.name or any(c in self.name for c in "/[]"):
+        if not _checks.text("name", self.name) or any(c in self.name for c in "/[]"):
             raise ValueError(f"name: must be a text without '/', '[' and ']', got {self.name!r}.")
         object.__setattr__(self, "frequency", _checks.positive("frequency", self.frequency))
         points = _checks.integer("samples", self.samples, 4) * _checks.integer("periods", self.periods, 1)
@@ -123,7 +123,7 @@ class Experiment(Result):
         for kind in ("outputs", "inputs"):
             _checks.mapping(kind, getattr(self, kind), "{'force': values}")
             channels = {
-                key: _checks.finite_vector(f"{kind}[{key!r}]", self._measured(kind, values), points, MEANING)
+                key: _checks.measured_vector(f"{kind}[{key!r}]", self._measured(kind, values), points, MEANING)
                 for key, values in getattr(self, kind).items()
             }
             _checks.identifiers(kind, channels)

@@ -1,11 +1,15 @@
 """Reading of columns from CSV, NPZ and MAT files, and conversion of their units."""
 
 import csv
+import io
 import itertools
+import math
 import re
+import struct
 import warnings
 import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -13,10 +17,27 @@ import numpy as np
 
 from bayesperiodic import _checks
 
+# Texts of missing values.
+MISSING = [
+    "", "nan", "NaN", "NAN", "-nan", "-NaN", "NA", "N/A", "n/a", "#N/A", "<NA>", "null", "NULL", "None", "1.#IND",
+    "-1.#IND", "1.#QNAN", "-1.#QNAN",
+]  # fmt: skip
 # Lines among which the header is searched for.
 PREAMBLE = 1000
 
+# Bytes of an array, against files that unpack to more than the memory.
+LARGEST = 2**31
+# Of MAT files, version 5: types of elements and of numbers, classes of arrays, flag of complex arrays, and the bytes in
+# which the name of a variable ends.
+INT32, MATRIX, COMPRESSED, COMPLEX, HEAD = 5, 14, 15, 0x800, 4096
+STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", INT32: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+NUMERIC = {
+    6: "double", 7: "single", 8: "int8", 9: "uint8", 10: "int16", 11: "uint16", 12: "int32", 13: "uint32", 14: "int64",
+    15: "uint64",
+}  # fmt: skip
+
 Units = Mapping[str, float | Sequence[str]]
+Stored = tuple[Iterable[str], Mapping[str, Any]]
 
 LONGEST_UNIT = 100
 # Products, quotients and groups of names with an exponent of one digit; the only number is the 1 of "1/s".
@@ -36,19 +57,26 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
     import pandas as pd
 
     columns, file = [*columns], existing(path)
+    _refuse_zeros(file)
     try:
         names, lines, more = _header(file, columns)
         with file.open(encoding="utf-8-sig", newline="") as text, warnings.catch_warnings():
             _skip(text, lines)
             warnings.simplefilter("error", pd.errors.ParserWarning)
             # More columns than names hold the fields after trailing commas.
+            # The only column of a file may have empty cells, which are empty lines, but not at the end.
+            alone, surplus = len(names) == 1, max(more, 0) + 1
+            missing: Any = dict(enumerate([MISSING] * len(names) + [[""]] * surplus))
             table = pd.read_csv(
-                text,
+                io.StringIO(text.read().rstrip()) if alone else text,
+                skip_blank_lines=not alone,
                 header=None,
-                names=range(len(names) + max(more, 0) + 1),
+                names=range(len(names) + surplus),
                 index_col=False,
                 skipinitialspace=True,
                 low_memory=False,
+                keep_default_na=False,
+                na_values=missing,
             )
     except (pd.errors.ParserError, pd.errors.ParserWarning) as error:
         _check_fields(file, names, lines)
@@ -75,6 +103,16 @@ def read_csv(path: str | Path, columns: Iterable[str], label: str | None = None)
     return result
 
 
+def _refuse_zeros(file: Path) -> None:
+    """Raise a ValueError if a file contains bytes 0, at which pandas ends a number."""
+    with file.open("rb") as content:
+        if any(b"\0" in part for part in iter(lambda: content.read(2**20), b"")):
+            raise ValueError(
+                f"path: must be a CSV file in UTF-8, got {str(file)!r}, which contains bytes 0; it was damaged when it "
+                "was written, or is no text in UTF-8."
+            )
+
+
 def _header(file: Path, columns: list[str]) -> tuple[list[str], int, int]:
     """Return the names of the columns of a CSV file, the number of lines up to there, and of fields that follow."""
     with file.open(encoding="utf-8-sig", newline="") as lines:
@@ -85,6 +123,7 @@ def _header(file: Path, columns: list[str]) -> tuple[list[str], int, int]:
     # Without a line of all names, that with most of them tells what is missing.
     place = max(range(len(found)), key=lambda i: len({*columns} & {*found[i][0]}))
     names, number = found[place]
+    names = names[: max((i for i, name in enumerate(names, 1) if name), default=len(names))]  # no trailing commas
     if not {*columns} <= {*names} and _is_no_header(names):
         raise ValueError(
             f"path: must be a CSV file whose first line names the columns, separated by commas, got {str(file)!r}, "
@@ -128,36 +167,151 @@ def _place(path: str | Path, names: list[str], column: str) -> int:
 
 def read_npz(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
     """Return named arrays of an NPZ file, without loading pickled objects."""
-    try:
-        with np.load(existing(path), allow_pickle=False) as archive:
-            return {c: _numbers(path, c, _pick(path, archive, c)) for c in columns}
-    except (zipfile.BadZipFile, EOFError, AttributeError, TypeError) as error:
-        raise ValueError(
-            f"path: must be an NPZ file of named arrays (numpy.savez), got {str(path)!r} ({error})."
-        ) from None
-    except ValueError as error:
-        if "allow_pickle" in str(error):
-            raise ValueError(
-                f"path: must be an NPZ file without pickled objects, got {str(path)!r}. Save numeric arrays by "
-                "numpy.savez, or read a CSV or MAT file by from_csv or from_mat."
-            ) from None
-        raise
+    kind = "an NPZ file of named arrays (numpy.savez) without pickled objects, or be read by from_csv or from_mat"
+    return _read(path, columns, _npz_arrays, kind)
 
 
 def read_mat(path: str | Path, columns: Iterable[str]) -> dict[str, np.ndarray]:
     """Return named variables of a MAT file, version 5 or 7.3."""
     import h5py
-    from scipy.io import loadmat
 
-    file = existing(path)
-    if h5py.is_hdf5(file):
-        with h5py.File(file, "r") as archive:
-            return {c: _numbers(path, c, np.asarray(_pick(path, archive, c))) for c in columns}
+    reader = _hdf5_arrays if h5py.is_hdf5(existing(path)) else _mat5_arrays
+    return _read(path, columns, reader, "a MAT file of version 5 or 7.3")
+
+
+def _read(
+    path: str | Path, columns: Iterable[str], arrays: Callable[[Path, set[str]], Stored], kind: str
+) -> dict[str, np.ndarray]:
+    """Return named arrays; arrays(file, wanted) returns all names in the file, and the wanted arrays among them."""
+    columns, file = [*columns], existing(path)
     try:
-        variables = {name: value for name, value in loadmat(file).items() if not name.startswith("__")}
-    except (ValueError, TypeError, NotImplementedError, EOFError) as error:
-        raise ValueError(f"path: must be a MAT file, got {str(path)!r} ({error}).") from None
-    return {c: _numbers(path, c, _pick(path, variables, c)) for c in columns}
+        names, found = arrays(file, {*columns})
+    except Exception as error:  # whatever zipfile, zlib, NumPy and HDF5 raise for damaged files
+        reason = error if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        raise ValueError(f"path: must be {kind}, got {str(path)!r} ({reason}).") from None
+    for column in columns:
+        _checks.one_of(f"column of {file.name}", column, names)
+    return {column: _numbers(path, column, found[column]) for column in columns}
+
+
+def _npz_arrays(file: Path, wanted: set[str]) -> Stored:
+    """Return names and wanted arrays of an NPZ file; whole members are read, because only they have a checksum."""
+    found = {}
+    with zipfile.ZipFile(file) as archive:
+        members = [(member, member.filename.removesuffix(".npy")) for member in archive.infolist()]
+        for member, name in members:
+            if name not in wanted:
+                continue
+            if name in found:
+                raise ValueError(f"it has two arrays {name!r}")
+            _check_size(name, member.file_size)
+            content = io.BytesIO(archive.read(member))
+            found[name] = np.lib.format.read_array(content, allow_pickle=False)
+            if content.read(1):
+                raise ValueError(f"its array {name!r} has another size than its header says")
+    return [name for _, name in members], found
+
+
+def _hdf5_arrays(file: Path, wanted: set[str]) -> Stored:
+    """Return names and wanted arrays of a MAT file, version 7.3."""
+    import h5py
+
+    found = {}
+    with h5py.File(file, "r") as archive:
+        names = [name for name in archive if isinstance(name, str)]  # bytes are no text
+        for name in wanted & {*names}:
+            item, own = archive[name], isinstance(archive.get(name, getlink=True), h5py.HardLink)
+            if not own or not isinstance(item, h5py.Dataset) or item.is_virtual or item.external:
+                raise ValueError(f"its variable {name!r} is not an array in this file")
+            kind = np.bytes_(item.attrs.get("MATLAB_class", b"double")).decode()
+            if kind not in (*NUMERIC.values(), "logical") or item.attrs.get("MATLAB_empty"):
+                raise ValueError(f"its variable {name!r} is empty or no array of numbers, but {kind}")
+            _check_size(name, item.nbytes)
+            if not _is_stored(item):
+                raise ValueError(f"parts of its variable {name!r} are missing")
+            found[name] = item[()]
+    return names, found
+
+
+def _is_stored(item: Any) -> bool:
+    """Return whether all values of an HDF5 array are in the file; HDF5 reads missing parts as zeros."""
+    if item.chunks is None:
+        return item.id.get_storage_size() == item.nbytes
+    places = [range(0, length, step) for length, step in zip(item.shape, item.chunks, strict=True)]
+    if item.id.get_num_chunks() != math.prod(map(len, places)):
+        return False
+    stored: set[Any] = set()
+    item.id.chunk_iter(lambda chunk: stored.add((chunk.chunk_offset, chunk.filter_mask)))
+    return stored == {(place, 0) for place in itertools.product(*places)}
+
+
+def _mat5_arrays(file: Path, wanted: set[str]) -> Stored:
+    """Return names and wanted arrays of a MAT file, version 5, after MathWorks' "MAT-File Format".
+
+    scipy.io.loadmat ends the process with a segmentation fault for some damaged files.
+    """
+    content = file.read_bytes()
+    order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
+    if order is None:
+        raise ValueError("it has no header of version 5; an older version is converted by save('-v7') in MATLAB")
+    names, found = [], {}
+    for kind, data in _elements(memoryview(content)[128:], order):
+        stream = zlib.decompressobj()
+        if compressed := kind == COMPRESSED:
+            data = memoryview(stream.decompress(data, HEAD))[8:]
+        elif kind != MATRIX:
+            raise ValueError(f"it contains an element of type {kind}")
+        name, *_ = _variable(data, order)
+        names.append(name)
+        if name not in wanted:
+            continue
+        if name in found:
+            raise ValueError(f"it has two variables {name!r}")
+        if compressed:
+            data = memoryview(bytes(data) + stream.decompress(stream.unconsumed_tail, LARGEST))
+            if not stream.eof:
+                raise ValueError(f"its variable {name!r} is cut off or has more than {LARGEST / 1e9:.3g} GB")
+        found[name] = _array(*_variable(data, order), order)
+    return names, found
+
+
+def _elements(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
+    """Yield types and contents of the elements of a MAT file, version 5."""
+    place = 0
+    while place < len(content):
+        kind, size = struct.unpack_from(f"{order}II", content, place)
+        start, step = place + 8, size if kind == COMPRESSED else size + -size % 8
+        if kind >> 16:  # at most four bytes, in the place of the size
+            kind, size, start, step = kind & 0xFFFF, kind >> 16, place + 4, 0
+        if start + size > len(content):
+            raise ValueError("it is cut off")
+        yield kind, content[start : start + size]
+        place += 8 + step
+
+
+def _variable(data: memoryview, order: str) -> tuple[str, int, list[int], Iterator[tuple[int, memoryview]]]:
+    """Return name, flags and shape of a variable, and its remaining elements."""
+    parts = _elements(data, order)
+    (flags, _), (kind, second) = struct.unpack(f"{order}II", next(parts)[1]), next(parts)
+    # Objects of classes have no shape.
+    shape, name = (np.frombuffer(second, f"{order}i4").tolist(), next(parts)[1]) if kind == INT32 else ([], second)
+    return bytes(name).decode(), flags, shape, parts
+
+
+def _array(name: str, flags: int, shape: list[int], parts: Iterator[tuple[int, memoryview]], order: str) -> np.ndarray:
+    if flags & 0xFF not in NUMERIC or flags & COMPLEX:
+        other = "complex" if flags & COMPLEX else f"of MATLAB class {flags & 0xFF}"
+        raise ValueError(f"its variable {name!r} is no array of real numbers, but {other}")
+    kind, values = next(parts)
+    array = np.frombuffer(values, f"{order}{STORED[kind]}")
+    if next(parts, None) is not None or min(shape) < 0 or array.size != math.prod(shape):
+        raise ValueError(f"its variable {name!r} has another size than its header says")
+    return array.reshape(shape)
+
+
+def _check_size(name: str, size: int) -> None:
+    if size > LARGEST:
+        raise ValueError(f"its array {name!r} has more than {LARGEST / 1e9:.3g} GB")
 
 
 def existing(path: str | Path) -> Path:
@@ -176,11 +330,6 @@ def _is_no_header(names: list[str]) -> bool:
         return bool([float(name) for name in names])
     except ValueError:
         return False
-
-
-def _pick(path: str | Path, source: Any, column: str) -> Any:
-    _checks.one_of(f"column of {Path(path).name}", column, list(source.keys()))
-    return source[column]
 
 
 def _numbers(path: str | Path, column: str, values: Any) -> np.ndarray:

@@ -27,7 +27,7 @@ from bayesperiodic.data.quantisation import repeated_variance
 # in usual steps.
 GAP, USUAL_STEPS, MANY_STEPS = 0.25, 3.0, 30.0
 # Spreads of a channel whose squares and inverse squares are ordinary numbers, and grid points of a response period.
-SMALLEST_SPREAD, LARGEST_SPREAD, MAXIMUM_POINTS = 1e-100, 1e100, 1_000_000
+MAXIMUM_POINTS = 1_000_000
 # A crossing counts after the signal was below minus this fraction of its standard deviation.
 HYSTERESIS = 0.25
 # Smallest relative step of the period, in itself and in standard errors.
@@ -72,11 +72,6 @@ class Signals:
                     kind, remedy = "inputs", ", and write it in the model as a parameter with its value in `fixed`"
                 raise ValueError(
                     f"{kind}[{channel!r}]: must vary, got the constant {values[0]:g}; leave the channel out{remedy}."
-                )
-            if not SMALLEST_SPREAD < np.max(np.abs(values)) < LARGEST_SPREAD:
-                raise ValueError(
-                    f"{'inputs' if i < self.inputs else 'outputs'}[{channel!r}]: must be between {SMALLEST_SPREAD:g} "
-                    f"and {LARGEST_SPREAD:g} in size, got up to {np.max(np.abs(values)):g}; choose another unit."
                 )
 
     def part(self, samples: np.ndarray) -> "Signals":

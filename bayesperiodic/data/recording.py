@@ -66,7 +66,7 @@ class Layout:
                     f"{argument}: must be finite, got nan at index {lost[0]} ({lost.size} of {columns[column].size} "
                     f"values); missing={DROP!r} leaves such rows out, missing={INTERPOLATE!r} fills in single values."
                 )
-            values = _checks.finite_vector(argument, columns[column])
+            values = _checks.measured_vector(argument, columns[column])
             return convert(key, values, self.units[key]) if key in self.units else values
 
         measured, given = (
@@ -111,8 +111,8 @@ class Recording(Result):
     Raises
     ------
     ValueError
-        For fewer than two samples, samples that are NaN or infinite, different lengths, a time that does not increase,
-        no output, names that are repeated or not identifiers.
+        For fewer than two samples, samples that are NaN or infinite, or of sizes outside 1e-100 to 1e100, different
+        lengths, a time that does not increase, no output, names that are repeated or not identifiers.
 
     Examples
     --------
@@ -132,22 +132,23 @@ class Recording(Result):
     synthetic: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "time", _checks.finite_vector("time", self.time))
+        _checks.text("name", self.name)
+        object.__setattr__(self, "time", _checks.measured_vector("time", self.time))
         if self.time.size < 2:
-            raise ValueError(f"time: must have at least 2 samples, got {self.time.size}.")
+            raise ValueError(f"time: must have at least 2 samples, got {self.time.size} in {self.name!r}.")
         step = np.diff(self.time)
         if np.any(step <= 0):
             index = int(np.flatnonzero(step <= 0)[0])
             raise ValueError(
                 f"time: must increase, got {self.time[index + 1]:g} s after {self.time[index]:g} s at index "
-                f"{index + 1}; a file of several records is divided by `from_csv(split=…)`."
+                f"{index + 1} of {self.name!r}; a file of several records is divided by `from_csv(split=…)`."
             )
         if not self.outputs:
             raise ValueError("outputs: must have at least one channel, got none.")
         _checks.identifiers("outputs and inputs", (*self.outputs, *self.inputs))
         for kind in ("outputs", "inputs"):
             channels = {
-                name: _checks.finite_vector(f"{kind}[{name!r}]", values, self.time.size, "one per time")
+                name: _checks.measured_vector(f"{kind}[{name!r}]", values, self.time.size, "one per time")
                 for name, values in getattr(self, kind).items()
             }
             object.__setattr__(self, kind, channels)
@@ -223,8 +224,8 @@ class Recording(Result):
         units : mapping of str to float or (from, to), optional
             Conversion of a channel (or of "time") by a factor or a pair of units such as ``("mm", "m")``.
         missing : "drop" or "interpolate", optional
-            What to do with NaN and empty cells, which are refused by default: leave their rows out, or interpolate
-            linearly in time over at most three successive ones.
+            What to do with NaN and empty cells (in a file with one column: empty lines), which are refused by default:
+            leave their rows out, or interpolate linearly in time over at most three successive ones.
         split : str, optional
             Column of numbers or texts that distinguishes successive records, such as the drive frequency: each part in
             which it is constant is a recording. `split` divides a recording by the steps of its drive.
@@ -299,7 +300,7 @@ class Recording(Result):
         Raises
         ------
         FileNotFoundError, ValueError
-            As for `from_csv`, and for an array of objects, which would have to be unpickled.
+            As for `from_csv`, and for a damaged file or an array of objects, which would have to be unpickled.
         """
         layout = Layout(
             Path(path).name, outputs, {} if inputs is None else inputs, time, sampling_rate, units or {}, missing
@@ -333,7 +334,8 @@ class Recording(Result):
         Raises
         ------
         FileNotFoundError, ValueError
-            As for `from_csv`, and for a variable that is not a vector of real numbers.
+            As for `from_csv`, and for a damaged file, one of version 4, or a variable that is not a vector of real
+            numbers.
         """
         layout = Layout(
             Path(path).name, outputs, {} if inputs is None else inputs, time, sampling_rate, units or {}, missing

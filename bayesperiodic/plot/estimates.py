@@ -19,6 +19,7 @@ from bayesperiodic.plot import style
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, LAPLACE, axis_label, caveats_of, chosen, draws_label
 from bayesperiodic.posterior.description import check_fingerprint, check_results
 from bayesperiodic.posterior.problem import Problem
+from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.posterior import Posterior
 
 MEASURED: dict[str, Any] = {"color": COLOURS["measured"], "marker": "o"}
@@ -213,6 +214,7 @@ def corner(
     (4, ['c', '[N s/m]'])
     """
     _checks.instance("posterior", posterior, Posterior)
+    convergence.arviz()  # corner imports it
     import corner as corner_package
 
     names = chosen(names, posterior.names)

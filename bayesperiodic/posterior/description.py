@@ -460,7 +460,6 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
     if len(set(names)) < len(names):
         raise ValueError(f"experiments: names must differ, got {names}. Name them with fold(name=…).")
     for e in result:
-        _checks.text("name of an experiment", e.name)
         _checks.same_names(f"inputs of experiment {e.name!r}", e.inputs, model.inputs)
         if not e.outputs:
             raise ValueError(f"outputs of experiment {e.name!r}: must have at least one channel, got {{}}.")

@@ -6,10 +6,13 @@ from which ArviZ counts effective draws is that along the walkers. Step by step 
 neighbouring draws and count ten times too many.
 """
 
+import tempfile
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from types import ModuleType
 from typing import Any
+from unittest import mock
 
 import emcee
 import numpy as np
@@ -21,10 +24,15 @@ FEWEST_WEIGHTS, EQUAL, SMALLEST = 0.25, 1e-6, 700.0
 
 
 def arviz() -> ModuleType:
-    """Return the arviz module, imported without the notice of version 0.23."""
+    """Return the arviz module, imported without the notice of version 0.23, also if no cache folder can be written."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=FutureWarning, module="arviz")
-        import arviz as module
+        with suppress(OSError):  # version 0.23 keeps the date of its notice in the cache folder of the user
+            import arviz as module
+
+            return module
+        with tempfile.TemporaryDirectory() as folder, mock.patch("platformdirs.user_cache_dir", return_value=folder):
+            import arviz as module
     return module
 
 

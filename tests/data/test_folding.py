@@ -3,6 +3,8 @@ import warnings
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 from scipy import stats
 
 import bayesperiodic as bp
@@ -476,3 +478,30 @@ def test_standard_error_of_the_frequency_under_white_noise_is_that_of_cramer_and
         ratios.append(bp.Recording.from_arrays(time, {"y": y}).fold(64).frequency_se / bound)
     assert min(ratios) == pytest.approx(1.0, abs=0.04)
     assert max(ratios) < 2.0
+
+
+@given(
+    frequency=st.floats(0.01, 100.0),
+    rate=st.floats(11.3, 60.0),
+    cycles=st.floats(6.0, 60.0),
+    origin=st.floats(-1e3, 1e3),
+    amplitudes=st.lists(st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)), min_size=0, max_size=3),
+    mean=st.floats(-10.0, 10.0),
+)
+def test_amplitudes_of_any_exact_signal_are_recovered(frequency, rate, cycles, origin, amplitudes, mean):
+    """Rate is in samples a cycle, origin in cycles; the fundamental has amplitude 1, the drive's phase is 0."""
+    assume(abs(rate - round(rate)) * cycles > 0.5 or abs(rate - round(rate)) < 1e-9)
+    start = origin / frequency
+    time = start + np.arange(int(rate * cycles)) / (rate * frequency)
+    known = np.array([mean, 1.0, *(complex(*pair) for pair in amplitudes)])
+
+    def signal(tau):
+        return sum((c * np.exp(2j * np.pi * h * tau)).real for h, c in enumerate(known))
+
+    tau = frequency * (time - start)
+    recording = bp.Recording.from_arrays(time, {"y": signal(tau)}, {"drive": np.cos(2 * np.pi * tau)})
+    experiment = recording.fold(64, harmonics=known.size - 1, origin=start)
+    assert experiment.frequency == pytest.approx(frequency, rel=1e-9)
+    found = np.fft.rfft(experiment.outputs["y"])[: known.size] / 32
+    found[0] /= 2
+    np.testing.assert_allclose(found, known, atol=1e-6)

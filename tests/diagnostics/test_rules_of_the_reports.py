@@ -206,7 +206,8 @@ def test_rejections_in_words():
     """Holm: 1e-6 times 8 tests and 1e-5 times 7 are below 1 %."""
     assert adequacy.rejections(TABLE) == {
         "run y": "the residual has excess power in some harmonics (p = 1e-06), the amplitude differs from the "
-        "predicted one (p = 1e-05); its strongest harmonic is 3; 12.3% of the residual variance is model error"
+        "predicted one (p = 1e-05); its strongest harmonic is 3, as where a force odd in the motion is missing, if the "
+        "drive is a sine; 12.3% of the residual variance is model error"
     }
     plain = TABLE.assign(harmonic=np.nan, model_error_share=np.nan, amplitude=np.nan)
     assert adequacy.rejections(plain) == {"run y": "the residual has excess power in some harmonics (p = 1e-06)"}

@@ -167,20 +167,19 @@ def test_an_ellipsoid_must_be_wrong_by_three_standard_errors():
 
 
 def test_a_sample_is_split_into_eighths_of_the_steps_of_each_ensemble():
-    draws = np.arange(4 * 19.0)
-    own = Sample.of(draws, np.array([1, 0, 1, 0]), 50.0)
-    chains = draws.reshape(4, 19)[:, 3:].reshape(4, 8, 2)
-    expected = [np.concatenate([chains[a, i], chains[b, i]]) for a, b in ((1, 3), (0, 2)) for i in range(8)]
+    draws = np.arange(4 * 19.0).reshape(2, 19, 2)
+    own = Sample.of(draws, 50.0)
+    expected = [draws[e, 3 + 2 * i : 5 + 2 * i].ravel() for e in range(2) for i in range(8)]
     assert own.batches.tolist() == np.array(expected).tolist()
-    assert (own.size, own.ensembles, own.whole.tolist()) == (50.0, 2, draws.tolist())
+    assert (own.size, own.ensembles, own.whole.tolist()) == (50.0, 2, draws.ravel().tolist())
     first, second = own.by_ensemble()
     assert first.batches.tolist() == np.array(expected[:8]).tolist()
     assert second.batches.tolist() == np.array(expected[8:]).tolist()
     assert sorted(first.whole) == sorted(np.concatenate(expected[:8]))
     assert (first.size, first.ensembles) == (25.0, 1)
-    short = Sample.of(np.arange(6.0), np.array([0, 1]), 0.5)
+    short = Sample.of(np.arange(6.0).reshape(2, 3, 1), 0.5)
     assert short.batches.shape == (6, 1) and short.size == 1.0 and short.by_ensemble()[0].size == 1.0
-    assert Sample.of(draws, np.zeros(4), np.inf).size == 1.0
+    assert Sample.of(draws, np.inf).size == 1.0
 
 
 def test_monte_carlo_errors_are_those_of_the_mean_over_batches():

@@ -155,6 +155,30 @@ def test_unwritable_cache_falls_back_to_memory(tmp_path, monkeypatch):
     load_with_warning("compiling in memory")
 
 
+HOMELESS = """
+from bayesperiodic.models import cache
+from bayesperiodic.sampling import convergence
+from tests.models.test_cache import SMALL
+print(cache.load(SMALL).four_times(1.5), convergence.arviz().rhat)
+"""
+
+
+def test_unwritable_home_is_a_warning(tmp_path):
+    """A file in the place of the home folder, which no user can write below, not even root; ArviZ 0.23 would fail."""
+    (tmp_path / "home").write_text("")
+    dropped = ("BAYESPERIODIC_CACHE", "XDG_CACHE_HOME")
+    environment = {key: value for key, value in os.environ.items() if key not in dropped}
+    done = subprocess.run(
+        [sys.executable, "-c", HOMELESS],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[2],
+        env=environment | {"HOME": str(tmp_path / "home")},
+    )
+    assert done.stdout.startswith("6.0 <function rhat"), done.stderr
+    assert "cannot be used" in done.stderr and "compiling in memory" in done.stderr
+
+
 def test_failed_build_leaves_nothing_behind(folder, monkeypatch):
     def full(*_):
         raise OSError("no space left on device")

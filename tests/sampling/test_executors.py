@@ -298,11 +298,19 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.skipif(find_spec("mpi4py") is None or shutil.which("mpiexec") is None, reason="needs mpi4py and mpiexec")
+# Wheels of both put mpiexec beside the interpreter.
+PLACES = os.pathsep.join([os.path.dirname(sys.executable), os.environ.get("PATH", "")])
+MPIEXEC = shutil.which("mpiexec", path=PLACES)
+needs_mpi = pytest.mark.skipif(
+    find_spec("mpi4py") is None or MPIEXEC is None, reason="needs mpi4py and mpiexec: pip install mpich mpi4py"
+)
+
+
+@needs_mpi
 def test_chains_are_identical_with_mpi(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or str(Path.cwd()) for path in sys.path)}
-    command = ["mpiexec", "-n", "3", sys.executable, "-m", "mpi4py.futures", str(script)]
+    command = [MPIEXEC, "-n", "3", sys.executable, "-m", "mpi4py.futures", str(script)]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
     assert "same True {'c': 'closed', 'k': 'closed'}" in done.stdout, done.stderr

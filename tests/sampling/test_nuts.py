@@ -1,6 +1,7 @@
 """NUTS samples the same density as emcee, by its gradient."""
 
 import importlib.util
+import signal
 import sys
 from collections.abc import Callable
 
@@ -206,6 +207,18 @@ def interrupting_at(draws: int) -> Callable[..., list[str]]:
         return ["nothing"]
 
     return check
+
+
+@needs_nutpie
+def test_terminated_run_returns_its_draws(linear, briefly, monkeypatch):
+    def terminate(kept: np.ndarray, *_: np.ndarray) -> list[str]:
+        signal.raise_signal(signal.SIGTERM)
+        return ["nothing"]
+
+    monkeypatch.setattr(nuts, "unmet_criteria", terminate)
+    posterior = bp.sample(*linear, seed=1, **(briefly | {"max_steps": 5000}))
+    assert posterior.reason.startswith("interrupted after ") and not posterior.converged
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 @needs_nutpie
