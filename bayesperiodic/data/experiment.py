@@ -50,7 +50,7 @@ class Experiment(Result):
         Standard error of the frequency [Hz], zero if it is known; fraction of the variance that the mean period
         explains, of the channel with the smallest one; time [s] of the recording at which τ = 0.
     drift : mapping of str to float
-        Relative growth of the fundamental of each channel over the recording.
+        Relative growth of the strongest harmonic of each channel over the recording.
     period_drift : float
         Relative change of the period over the averaged cycles, by linear regression.
     synthetic : bool

@@ -292,8 +292,10 @@ def _cycles_apart(signals: Signals, fundamental: float) -> tuple[np.ndarray, np.
 
 
 def _drift(shape: np.ndarray) -> list[float]:
-    """Return the relative growth of each channel's fundamental from the first cycle to the last."""
-    size = np.abs(shape[:, :, 1])
+    """Return the relative growth of each channel's strongest harmonic from the first cycle to the last."""
+    every = np.abs(shape[:, :, 1:])
+    strongest = every.mean(axis=0).argmax(axis=1)
+    size = np.take_along_axis(every, strongest[None, :, None], axis=2)[:, :, 0]
     number = np.arange(len(size)) - 0.5 * (len(size) - 1)
     return (number @ size / (number @ number) * len(size) / size.mean(axis=0)).tolist()
 
@@ -304,7 +306,7 @@ def _refuse_drift(name: str, drift: Mapping[str, float], largest: float | None) 
     worst = max(drift, key=lambda channel: abs(drift[channel]))
     if abs(drift[worst]) > _checks.positive("largest_drift", largest):
         raise ValueError(
-            f"recording: must be steady, got {name!r}, in which the fundamental of {worst!r} changes by "
+            f"recording: must be steady, got {name!r}, in which the strongest harmonic of {worst!r} changes by "
             f"{drift[worst]:+.1%}, more than largest_drift = {largest:.1%}; leave it out, or select a steady part with "
             "`between`."
         )

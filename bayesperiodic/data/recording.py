@@ -444,7 +444,7 @@ class Recording(Result):
             Time [s] at which τ = 0. "crossing", for autonomous systems, whose phase is arbitrary: the first time >= 0
             at which the fundamental of the first output crosses zero upwards.
         largest_drift : float, optional
-            Limit of the relative change of a channel's fundamental over the recording, by linear regression.
+            Limit of the relative change of a channel's strongest harmonic over the recording, by linear regression.
         name : str, optional
             By default the recording's name.
 

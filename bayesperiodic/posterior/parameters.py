@@ -231,8 +231,8 @@ def unit(group: xr.Dataset, name: str) -> str:
 
 
 def squared(unit: str) -> str:
-    """Return the unit of a variance: N², or (m/s)²."""
-    return f"{unit}²" if unit.isalpha() else f"({unit})²"
+    """Return the unit of a variance: N², (m/s)², or 1."""
+    return unit if unit == "1" else f"{unit}²" if unit.isalpha() else f"({unit})²"
 
 
 def is_noise(group: xr.Dataset, variable: str) -> bool:

@@ -269,13 +269,23 @@ def test_phase_origin_at_a_crossing_does_not_depend_on_the_start_of_the_recordin
         assert e.origin * FREQUENCY == pytest.approx((-0.25 - 0.3 / (2 * np.pi)) % 1.0, abs=1e-9)
 
 
-def test_drift_is_the_growth_of_the_fundamental_over_the_recording():
+def test_drift_of_a_steady_drive_is_small_where_its_period_is_a_fraction_of_the_response_period():
+    """The drive has noise alone at the fundamental of the response."""
+    time, random = np.arange(4000) / (50 * FREQUENCY), np.random.default_rng(2)
+    angle = 2 * np.pi * FREQUENCY * time
+    y = np.cos(angle) + 0.5 * np.cos(angle / 2) + 0.01 * random.standard_normal(time.size)
+    drive = {"u": np.sin(angle) + 0.01 * random.standard_normal(time.size)}
+    e = bp.Recording.from_arrays(time, {"y": y}, drive).fold(64, periods=2, largest_drift=0.02)
+    assert max(map(abs, e.drift.values())) < 0.01
+
+
+def test_drift_is_the_growth_of_the_strongest_harmonic_over_the_recording():
     time = np.arange(5000) / 250.0
     growth = 1.0 + 0.2 * (time - 10.0) / 20.0
     grown = bp.Recording.from_arrays(time, {"y": growth * np.cos(2 * np.pi * FREQUENCY * time)}, name="grown")
     assert grown.fold(64).drift["y"] == pytest.approx(0.2, rel=0.02)
     assert grown.fold(64, largest_drift=0.25).cycles > 3
-    with pytest.raises(ValueError, match="must be steady, got 'grown', .* fundamental of 'y' changes by .19.* 10.0%"):
+    with pytest.raises(ValueError, match="must be steady, got 'grown', .* strongest harmonic of 'y' changes by .19.* 10.0%"):
         grown.fold(64, largest_drift=0.1)
     with pytest.raises(ValueError, match="largest_drift: must be > 0, got 0.0"):
         grown.fold(64, largest_drift=0.0)

@@ -46,7 +46,7 @@ def test_drift_is_the_slope_of_a_regression_over_all_cycles():
     size = np.array([[1.0, 2.0], [1.5, 2.0], [1.1, 2.5], [2.2, 2.1], [2.0, 1.7]])
     shape = np.zeros((5, 2, 3), dtype=complex)
     shape[:, :, 1] = size * np.exp(1j * np.arange(10).reshape(5, 2))
-    shape[:, :, 2] = 7.0
+    shape[:, :, 2] = 0.7
     slopes = [np.polyfit(np.arange(5), own, 1)[0] * 5 / own.mean() for own in size.T]
     assert folding._drift(shape) == pytest.approx(slopes)
 
@@ -324,7 +324,7 @@ def test_every_field_of_a_folded_response_of_two_forcing_periods():
         ({"harmonics": {"z": 2}}, "^harmonics: must be one of|^harmonics: .*'z'"),
         (
             {"largest_drift": 1e-9},
-            "^recording: must be steady, got 'record', in which the fundamental of 'y' changes by",
+            "^recording: must be steady, got 'record', in which the strongest harmonic of 'y' changes by",
         ),
         ({"frequency": 0.25}, r"^recording: must have at least 3 cycles, got 1.60 cycles in 'record'"),
     ],
