@@ -285,7 +285,9 @@ def test_drift_is_the_growth_of_the_strongest_harmonic_over_the_recording():
     grown = bp.Recording.from_arrays(time, {"y": growth * np.cos(2 * np.pi * FREQUENCY * time)}, name="grown")
     assert grown.fold(64).drift["y"] == pytest.approx(0.2, rel=0.02)
     assert grown.fold(64, largest_drift=0.25).cycles > 3
-    with pytest.raises(ValueError, match="must be steady, got 'grown', .* strongest harmonic of 'y' changes by .19.* 10.0%"):
+    with pytest.raises(
+        ValueError, match="must be steady, got 'grown', .* strongest harmonic of 'y' changes by .19.* 10.0%"
+    ):
         grown.fold(64, largest_drift=0.1)
     with pytest.raises(ValueError, match="largest_drift: must be > 0, got 0.0"):
         grown.fold(64, largest_drift=0.0)
