@@ -62,7 +62,7 @@ class Result:
     def save(self, path: str | Path) -> None:
         """Write the result to an HDF5 file; an existing file is replaced when the new one is complete.
 
-        The file of a result with draws is a netCDF file, which xarray and ArviZ open (`arviz.from_netcdf`).
+        The file of a result with draws is a netCDF file, which xarray and ArviZ open (``arviz.from_netcdf``).
 
         Parameters
         ----------
