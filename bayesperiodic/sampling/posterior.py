@@ -62,7 +62,7 @@ class Posterior(Result):
         Attributes: ``units``, or ``units of <channel>`` of ``variance``; ``noise``, the name of the noise model, on its
         parameters. Group ``sample_stats``: lp, the log-density in sampling coordinates; the status of the draw's
         solves; acceptance_rate, with emcee 1 where the proposal of the step was accepted, else 0. Group
-        ``log_likelihood``, for `arviz.loo`: at some draws, the terms of independent observations, which sum to the
+        ``log_likelihood``, for ``arviz.loo``: at some draws, the terms of independent observations, which sum to the
         log-likelihood, up to constants of the data: values of the mean period at equally spaced instants, or its
         harmonics if the noise is coloured. Terms of fewer or more independent values than components are weighted as
         in the likelihood. Group ``posterior_predictive``: for some draws, replicates of the measured outputs, noise
@@ -190,7 +190,7 @@ class Posterior(Result):
     def summary(self) -> pd.DataFrame:
         """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, one row per parameter.
 
-        mcse_mean, ess and rhat are mcse_mean, ess_bulk and r_hat of `arviz.summary`. Its ``attrs`` contain interval,
+        mcse_mean, ess and rhat are mcse_mean, ess_bulk and r_hat of ``arviz.summary``. Its ``attrs`` contain interval,
         converged, reason and failures.
         """
         table = _table(
