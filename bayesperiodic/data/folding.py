@@ -247,8 +247,8 @@ def _warn(name: str, pace: Pace, cycles: int, total: int) -> None:
         warnings.warn(
             f"{name}: the phase wanders irregularly by {360.0 * pace.wander:.2g}° of the response period over the "
             f"{cycles} cycles used, while the amplitude is steadier. The mean period assumes a constant frequency: its "
-            "higher harmonics are smeared. Measure with a steadier clock or drive, or fold shorter parts with "
-            "`between`.",
+            "higher harmonics are smeared. Fold shorter parts with `between`, or measure with a steadier drive or "
+            "clock.",
             UserWarning,
             stacklevel=4,
         )
