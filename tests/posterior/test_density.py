@@ -11,7 +11,7 @@ import bayesperiodic as bp
 from bayesperiodic import noise
 from bayesperiodic.posterior.density import SamplingCoordinates, collapsible
 from bayesperiodic.posterior.noise import KNOWN, POINTS, SPECTRAL
-from tests.known import LINEAR, linear_experiment
+from tests.known import LINEAR, SADDLE_NODE, linear_experiment
 
 PRIORS = {"k": bp.LogNormal(800.0, 0.1), "c": bp.Normal(30.0, 20.0), "coulomb": bp.Normal(20.0, 10.0)}
 
@@ -126,3 +126,23 @@ def test_a_point_outside_the_support_has_no_density_and_is_not_solved():
         for e in steps
     ]
     assert gradient == pytest.approx(np.array(slopes), rel=1e-4, abs=1e-4)
+
+
+def test_points_beside_failed_solves_have_their_own_values():
+    """ẋ = a − x² + u has no periodic solution for a < 0; variances differ, and (2π)^(−n/2) is left out."""
+    tau = np.arange(64) / 64
+    data = bp.Experiment(
+        "synthetic", 0.1, {"x": 1.0 + 0.3 * np.cos(2 * np.pi * tau)}, {"u": 0.1 * np.cos(2 * np.pi * tau)}, samples=64
+    )
+    problem = bp.Problem(SADDLE_NODE, [data], priors={"a": bp.Normal(0.5, 1.0)}, scheme="central4")
+    theta, variance = np.array([[1.0], [-0.5], [0.8], [1.2]]), np.array([[0.01], [0.02], [0.03], [0.04]])
+    found = problem.log_likelihood(theta, variance)
+    assert np.isneginf(found).tolist() == [False, True, False, False]
+    for i in (0, 2, 3):
+        x = bp.solve_periodic(
+            SADDLE_NODE, {"a": theta[i, 0]}, dict(data.inputs), frequency=0.1, samples=64, scheme="central4"
+        ).states["x"]
+        expected = stats.norm.logpdf(data.outputs["x"] - x, scale=np.sqrt(variance[i, 0])).sum() + 32 * np.log(
+            2 * np.pi
+        )
+        assert found[i] == pytest.approx(expected, rel=1e-8)
