@@ -14,7 +14,7 @@ from bayesperiodic.estimation.gauss_newton import End, _step, inverse_hessian
 from bayesperiodic.estimation.laplace import JointLaplace, joint_laplace
 from bayesperiodic.estimation.modes import Mode, images, notable
 from bayesperiodic.posterior.noise import SPECTRAL, Block
-from tests.known import LINEAR, linear_experiment
+from tests.known import LINEAR, formula_model, linear_experiment
 
 HIGHEST = 9
 HARMONIC = np.array([0, *np.repeat(np.arange(1, HIGHEST + 1), 2)])
@@ -306,3 +306,30 @@ def test_masses_are_densities_times_the_volumes_of_the_laplace_approximations():
     assert mode.mass == pytest.approx(1.0 / (1.0 + np.exp(-9.0)))
     laplaces[0] = laplaces[0]._replace(log_density=np.nan)
     assert np.isnan(modes.weighed(problem, ends, laplaces)[0].mass)
+
+
+def test_uncertain_spectra_of_several_channels_widen_each_parameter_as_its_own_channel_alone():
+    """Each output has a parameter and a noise spectrum of its own, so that the problem falls into two."""
+    formulas = {"left": lambda p, u: p.a * u.x, "right": lambda p, u: p.b * u.dx}
+    random, tau = np.random.default_rng(4), np.arange(24) / 24
+    x = {"x": np.cos(2 * np.pi * tau) + 0.5 * np.cos(6 * np.pi * tau)}
+    rough = np.convolve(random.standard_normal(60), np.ones(6) / 6, "valid")[:48].reshape(2, 24)
+    data = {
+        "left": 2.0 * x["x"] + 0.1 * rough[0],
+        "right": -6 * np.pi * (np.sin(2 * np.pi * tau) + 1.5 * np.sin(6 * np.pi * tau)) + 2.0 * rough[1],
+    }
+    sd = {}
+    for channels in (["left"], ["right"], ["left", "right"]):
+        names = [{"left": "a", "right": "b"}[channel] for channel in channels]
+        model = formula_model("two", names, lambda p, u, s, own=channels: {c: formulas[c](p, u) for c in own})
+        run = bp.Experiment("synthetic", 1.0, {channel: data[channel] for channel in channels}, x, samples=24)
+        problem = bp.Problem(
+            model,
+            [run],
+            priors=dict.fromkeys(names, bp.Normal(2.0, 50.0)),
+            noise=bp.noise.Circulant(),
+            scheme="fourier",
+        )
+        fit = bp.map_estimate(problem, progress=False)
+        sd[len(channels)] = sd.get(len(channels), {}) | fit.sd
+    assert sd[2] == pytest.approx(sd[1], rel=1e-4)
