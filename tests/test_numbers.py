@@ -164,7 +164,7 @@ def landing_gear_campaigns():
     )
     yield f"Over {d['campaigns']} campaigns of the first truth"
     yield (
-        f"theta16 is called negative {d['called_negative']} times and the model misspecified "
+        f"theta16 is called negative {d['called_negative'] or 'no'} times and the model misspecified "
         f"{d['called_misspecified']} times, at a level of 1 %"
     )
     assert d["stop_rule_passed"] == 0, "the sentence on the stop rule is about none"
@@ -429,7 +429,6 @@ WITHOUT_RESULTS = {
         "a gas charge lower by 2 %, friction by 20 % and oil leaked by 1 %": SETTING,
         "are of 22 November 2026": DATE,
         "(counted on 21 November 2026)": DATE,
-        "of 126 intervals of Laplace in three campaigns repeated": UNSTORED,
         "T. Wigren, J. Schoukens, 2013": ELSEWHERE,
         "K. H. Lee, D. A. W. Barton, L. Renson, 2023": ELSEWHERE,
         "two states on 800 points: a batch takes twice as long, and errors are 300 to 1000 times smaller": UNSTORED,
