@@ -406,7 +406,14 @@ def verdicts():
 
 
 def sampling():
-    yield f"{results('sampling')['seconds']['total'] / 60:.0f} minutes on two cores; what pools cost"
+    d = results("sampling")
+    yield f"{d['seconds']['total'] / 60:.0f} minutes on two cores; what pools cost"
+    force, displacement = (d["cost"]["vectorised"][drive] for drive in ("force", "displacement"))
+    yield (
+        f"Calls of {d['cost']['vectorised']['walkers']} walkers of the landing gear take {force['milliseconds']:.0f} "
+        f"and {displacement['milliseconds']:.0f} ms, so short that two cores gain {force['gain']:.2f} and "
+        f"{displacement['gain']:.2f} times on them, and {force['plain']:.2f} times on a plain loop"
+    )
 
 
 SUBJECTS = (
