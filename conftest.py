@@ -110,6 +110,15 @@ def duffing_posterior() -> bp.Posterior:
     return bp.sample(duffing_problem(), duffing_fit(), seed=1, ensembles=2, progress=False)
 
 
+@cache
+def duffing_springs() -> dict[str, tuple[bp.Problem, bp.Posterior]]:
+    """Return this problem and that of a linear spring, each with draws."""
+    priors = duffing_problem().priors
+    linear = bp.Problem(bp.models.duffing, [duffing_run()], priors=priors, fixed={"m": 1, "k3": 0}, scheme="fourier")
+    draws = bp.sample(linear, bp.map_estimate(linear, progress=False), seed=1, ensembles=2, progress=False)
+    return {"cubic": (duffing_problem(), duffing_posterior()), "linear": (linear, draws)}
+
+
 EXAMPLES: dict[str, Callable[[], Any]] = {
     "np": lambda: np,
     "bp": lambda: bp,
@@ -121,6 +130,7 @@ EXAMPLES: dict[str, Callable[[], Any]] = {
     "problem": duffing_problem,
     "fit": duffing_fit,
     "posterior": duffing_posterior,
+    "springs": duffing_springs,
     "calibration": duffing_calibration,
     "henon_section": henon_section,
     "pendulum_parameters": lambda: PENDULUM,

@@ -13,6 +13,8 @@ from .diagnostics.comparison import Comparison as Comparison
 from .diagnostics.comparison import compare as compare
 from .diagnostics.identifiability import Identifiability as Identifiability
 from .diagnostics.identifiability import identifiability as identifiability
+from .diagnostics.model_comparison import ModelComparison as ModelComparison
+from .diagnostics.model_comparison import compare_models as compare_models
 from .diagnostics.predictive import Prediction as Prediction
 from .diagnostics.predictive import PriorPredictive as PriorPredictive
 from .diagnostics.predictive import predict as predict
@@ -54,6 +56,8 @@ from .posterior.priors import TruncatedNormal as TruncatedNormal
 from .posterior.priors import Uniform as Uniform
 from .posterior.problem import Problem as Problem
 from .reporting import report as report
+from .sampling.evidence import Evidence as Evidence
+from .sampling.evidence import evidence as evidence
 from .sampling.posterior import Posterior as Posterior
 from .sampling.sample import sample as sample
 from .simulation import simulate as simulate

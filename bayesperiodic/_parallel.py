@@ -120,6 +120,35 @@ def interrupted_by_termination() -> Iterator[None]:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
+@contextmanager
+def interrupts_deferred() -> Iterator[Callable[[], None]]:
+    """Defer Ctrl-C, and SIGTERM where it acts as Ctrl-C, until the function provided is called.
+
+    A second signal acts at once.
+    """
+    noted: list[int] = []
+
+    def note(number: int, _: Any) -> None:
+        if noted:
+            raise KeyboardInterrupt
+        noted.append(number)
+
+    def check() -> None:
+        if noted:
+            raise KeyboardInterrupt
+
+    main = threading.current_thread() is threading.main_thread()
+    own = signal.default_int_handler
+    taken = [n for n in (signal.SIGINT, signal.SIGTERM) if main and signal.getsignal(n) is own]
+    for number in taken:
+        signal.signal(number, note)
+    try:
+        yield check
+    finally:
+        for number in taken:
+            signal.signal(number, own)
+
+
 class TaskPool:
     """Workers for independent tasks that need the same data; a context manager.
 

@@ -4,11 +4,11 @@ Every function returns the matplotlib Figure; an empty one to draw into can be g
 """
 
 from bayesperiodic.plot.branches import branch, orbits, section
-from bayesperiodic.plot.diagnostics import comparison, profile, ranks
+from bayesperiodic.plot.diagnostics import comparison, models, profile, ranks
 from bayesperiodic.plot.estimates import corner, fit, loops, marginals, traces
 from bayesperiodic.plot.style import COLOURS
 
 __all__ = [
-    "COLOURS", "branch", "comparison", "corner", "fit", "loops", "marginals", "orbits", "profile", "ranks", "section",
-    "traces",
+    "COLOURS", "branch", "comparison", "corner", "fit", "loops", "marginals", "models", "orbits", "profile", "ranks",
+    "section", "traces",
 ]  # fmt: skip

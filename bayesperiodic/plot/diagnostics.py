@@ -1,10 +1,11 @@
-"""Figures of calibrations, comparisons of Laplace with MCMC, and profiles."""
+"""Figures of calibrations, comparisons of Laplace with MCMC and of models, and profiles."""
 
 from collections.abc import Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import ndtri
@@ -13,6 +14,7 @@ from bayesperiodic import _checks
 from bayesperiodic.diagnostics import calibration as uniformity
 from bayesperiodic.diagnostics.calibration import METHODS, Calibration
 from bayesperiodic.diagnostics.comparison import Comparison
+from bayesperiodic.diagnostics.model_comparison import DECISIVE, SMALLEST_GAIN, ModelComparison
 from bayesperiodic.diagnostics.verdicts import END_SHIFT, ERRORS, FINE, LEVELS
 from bayesperiodic.estimation.profile import CLOSED, Profile
 from bayesperiodic.plot import style
@@ -285,3 +287,63 @@ def _laplace_range(profile: Profile, name: str) -> np.ndarray:
     margin = 0.5 * np.ptp(values)
     start = min(values[0], max(low, values[0] - margin, at - reach))
     return np.linspace(start, max(values[-1], min(high, values[-1] + margin, at + reach)), 400)
+
+
+def models(comparison: ModelComparison, *, figure: Figure | None = None) -> Figure:
+    """Draw a comparison of models: differences of evidence, leave-one-out prediction and held-out experiments.
+
+    One row per model, relative to the first. Bars are two standard errors, small circles single experiments. Outside
+    the grey band a difference can decide: a probability above 95 %, or an ELPD difference above 4 that also exceeds its
+    bar.
+
+    Parameters
+    ----------
+    comparison : ModelComparison
+    figure : Figure, optional
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ValueError
+        For another object than a `ModelComparison`.
+
+    Examples
+    --------
+    >>> [axes.get_title() for axes in bp.plot.models(bp.compare_models(springs)).axes]
+    ['evidence', 'one value left out', 'one experiment left out']
+    """
+    _checks.instance("comparison", comparison, ModelComparison)
+    table, runs = comparison.table, comparison.experiments
+    figure = figure or plt.figure(figsize=(10.5, 0.55 * len(table) + 1.8), layout="constrained")
+    change = table["log_evidence"] - table["log_evidence"].iloc[0]
+    error = np.hypot(table["log_evidence_error"], table["log_evidence_error"].iloc[0]) * (change != 0.0)
+    panels = (
+        ("evidence", "log evidence − that of the first", change, error, DECISIVE),
+        ("one value left out", "ELPD − that of the first", *_difference(table, "elpd"), SMALLEST_GAIN),
+        ("one experiment left out", "sum of ELPD − that of the first", *_difference(table, "held_out"), SMALLEST_GAIN),
+    )
+    rows = np.arange(len(table))
+    for axes, (title, label, values, errors, band) in zip(figure.subplots(1, 3, sharey=True), panels, strict=True):
+        axes.axvspan(-band, band, **BAND)
+        axes.axvline(0.0, color="grey", lw=0.8)
+        axes.errorbar(values, rows, xerr=2.0 * errors, fmt="o", color=COLOURS["measured"], ms=5, capsize=3)
+        axes.set(xlabel=label, ylim=(len(table) - 0.5, -0.5))
+        axes.set_title(title, fontsize="medium")
+        if np.isnan(np.asarray(values, dtype=float)).all():
+            axes.annotate("not available", (0.5, 0.5), xycoords="axes fraction", ha="center", va="center")
+    single = runs.pivot(index="model", columns="experiment", values="elpd").reindex(table.index)
+    for _, own in (single - single.iloc[0]).items():
+        figure.axes[2].plot(own, rows + 0.2, "o", color=COLOURS["mcmc"], ms=4, mfc="none", zorder=1)
+    names = [wrapped_label(str(name), "") for name in table.index]
+    chances = ["" if np.isnan(p) else f"\nprobability {p:.2g}" for p in table["probability"]]
+    figure.axes[0].set_yticks(rows, [f"{name}{chance}" for name, chance in zip(names, chances, strict=True)])
+    subject = wrapped_label(f"verdict on {table.index[0]}: {table['verdict'].iloc[0]}", "").replace("\n", " ")
+    figure.suptitle(f"{subject}{', synthetic data' * comparison.synthetic}", fontsize="medium")
+    return figure
+
+
+def _difference(table: pd.DataFrame, name: str) -> tuple[pd.Series, pd.Series]:
+    return table[f"{name}_difference"], table[f"{name}_difference_se"]

@@ -1,6 +1,7 @@
 """Figures of estimates: fitted periods, loops, and posterior draws with the Laplace approximation."""
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -186,7 +187,8 @@ def corner(
 
     Contours and ellipses contain 50 and 90 % of the probability. The ellipses of parameters are those of
     `MapEstimate.covariance`. Those of noise parameters are v ± v·sd(ln v) around the mode in sampling coordinates,
-    independent of the parameters. Quantities without a Laplace approximation have no ellipse.
+    independent of the parameters. Quantities without a Laplace approximation have no ellipse. Where the draws belong to
+    several optima, see `Posterior.modes`, the mean of each is marked by its number.
 
     Parameters
     ----------
@@ -251,6 +253,7 @@ def corner(
             np.array(figure.axes).reshape(len(names), -1), *_normal_approximation(posterior, names, laplace)
         )
         handles.append(plt.Line2D([], [], label=f"Laplace, {LEVELS_TEXT}", **LAPLACE))
+    handles += _modes_on_corner(np.array(figure.axes).reshape(len(names), -1), posterior, names)
     font = min(14, 4 * max(len(names), 2))
     place: dict[str, Any] = {"loc": "upper right", "bbox_to_anchor": (0.97, 0.97), "frameon": False}
     figure.legend(handles=handles, fontsize=font, title=caveats_of(posterior) or None, title_fontsize=font, **place)
@@ -258,6 +261,20 @@ def corner(
     top = 0.98 if len(names) > 1 else 0.75
     figure.subplots_adjust(left=margin / width, bottom=margin / height, right=0.98, top=top)
     return figure
+
+
+def _modes_on_corner(axes: np.ndarray, posterior: Posterior, names: tuple[str, ...]) -> list[Any]:
+    """Mark the mean of every mode by its number, and return the entries of the legend."""
+    handles = []
+    for row, mode in posterior.modes.iterrows():
+        look: dict[str, Any] = {"marker": f"${row}$", "color": COLOURS["map"], "ls": ""}
+        for i, j in combinations(range(len(names)), 2):
+            axes[j, i].plot(mode[names[i]], mode[names[j]], ms=9, zorder=5, **look)
+        for i, name in enumerate(names):
+            axes[i, i].axvline(mode[name], color=COLOURS["map"], lw=0.8, ls=":")
+        mass = f"{100 * mode['mass']:.1f} ± {100 * mode['mcse_mass']:.1g} %"
+        handles.append(plt.Line2D([], [], label=mass, ms=9, **look))
+    return handles
 
 
 def _bins(draws: np.ndarray) -> int:

@@ -354,7 +354,12 @@ def fingerprint(problem: Description) -> str:
         "noise": repr(problem.noise),
         "scheme": repr(find_scheme(problem.scheme)),
     }
-    return " ".join(f"{part}:{hashlib.sha256(b''.join(_bytes(x))).hexdigest()[:12]}" for part, x in parts.items())
+    return " ".join(f"{part}:{digest(value)}" for part, value in parts.items())
+
+
+def digest(value: Any) -> str:
+    """Return a digest of nested mappings, sequences, arrays and single values."""
+    return hashlib.sha256(b"".join(_bytes(value))).hexdigest()[:12]
 
 
 def _bytes(value: Any) -> Iterator[bytes]:

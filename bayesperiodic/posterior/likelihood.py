@@ -11,7 +11,9 @@ from scipy.optimize import minimize
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.posterior.noise import (
+    CHANNEL,
     CORRELATED,
+    EXPERIMENT,
     FLAT,
     JEFFREYS,
     KNOWN,
@@ -223,6 +225,21 @@ class Likelihood:
         free-running models.
         """
         return tuple(f"{self.blocks[b].experiment}: {label}" for b, labels, *_ in self._parts for label in labels)
+
+    @cached_property
+    def labels(self) -> dict[str, np.ndarray]:
+        """Experiment, channel, harmonic (NaN if it is not one) and weight of each of the `observations`, by name.
+
+        The weight is the number of independent values for each value.
+        """
+        rows = []
+        for b, _, order, starts in self._parts:
+            block = self.blocks[b]
+            spectral = block.kind == SPECTRAL and not self.model.flat
+            harmonic = block.harmonic[order][starts] if spectral else np.full(len(starts), np.nan)
+            rows += [(block.experiment, block.channel, h, block.weight) for h in harmonic]
+        columns = zip(*rows, strict=True)
+        return {name: np.array(c) for name, c in zip((EXPERIMENT, CHANNEL, "harmonic", "weight"), columns, strict=True)}
 
     @cached_property
     def _parts(self) -> list[tuple[int, list[str], np.ndarray, np.ndarray]]:

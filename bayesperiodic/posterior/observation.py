@@ -179,6 +179,13 @@ class Observation:
         slopes = np.linalg.solve(e.covariance[:size, :size], cross.T).T
         return values, slopes, _whitening(e.covariance[size:, size:] - slopes @ cross.T)
 
+    @property
+    def log_scale(self) -> float:
+        """ln|∂ components/∂ data|: of values and multipliers with a given covariance, and of a measured frequency."""
+        values, _, multipliers = self._joint
+        scale = float(np.log(np.diag(values)).sum() + np.log(np.diag(multipliers)).sum())
+        return scale - (math.log(self.experiment.frequency_se) if self._free_phase else 0.0)
+
     def data_components(self) -> list[np.ndarray]:
         """Return the Fourier components (size,) of each measured channel."""
         return [self._spectral(self.data[:, c], self._harmonics[name]) for c, name in enumerate(self.channels)]

@@ -1,18 +1,17 @@
-"""Checkpoints of sampling runs: one HDF5 file, always complete, in the format of emcee's backend."""
+"""Checkpoints of sampling runs: one HDF5 file, always complete, written by emcee's backend."""
 
 import glob
 import io
 import json
 import shutil
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import emcee
 import h5py
-import numpy as np
 from filelock import FileLock, Timeout
 
 from bayesperiodic._io import draft_prefix, read_sealed, write_sealed
@@ -22,18 +21,35 @@ PATIENCE = 20.0
 MARK, RUN = "fingerprint", "run"
 
 
-class Saved(NamedTuple):
-    """Content of a checkpoint: the chains of each ensemble, in memory, and the other data needed to resume the run."""
+class MemoryBackend(emcee.backends.HDFBackend):
+    """emcee's HDF5 backend on a file in memory."""
 
-    backends: list[emcee.backends.Backend]
-    state: dict[str, Any]
+    def __init__(self, content: bytes = b""):
+        super().__init__("in memory")
+        self._buffer = io.BytesIO(content)
+        self.file = h5py.File(self._buffer, "a")
+
+    @property
+    def initialized(self) -> bool:
+        """Whether there is a chain."""
+        return self.name in self.file
+
+    @contextmanager
+    def open(self, mode: str = "r") -> Iterator[h5py.File]:
+        """Return the file, which stays open."""
+        yield self.file
+
+    def content(self) -> memoryview:
+        """Return the file as bytes."""
+        self.file.flush()
+        return self._buffer.getbuffer()
 
 
 class Checkpoint:
     """A file with all steps up to some moment; an interrupted write leaves the previous content.
 
     emcee's HDF5 backend writes every step in pieces, and a run killed between two of them leaves a damaged file. Here
-    chains grow in memory; from time to time they are written to a new file, which then replaces the old one. The time
+    its file is in memory; from time to time it is written to a new file, which then replaces the old one. The time
     between is at least twenty times the time of a write.
     Problem and settings (seed, numbers of ensembles and walkers …) must be equal when a run is resumed.
     """
@@ -63,17 +79,17 @@ class Checkpoint:
             Path(self._lock.lock_file).unlink()
         self._lock.release()
 
-    def load(self) -> Saved | None:
-        """Return the content of the file; None if there is no file."""
+    def load(self) -> tuple[MemoryBackend, dict[str, Any]]:
+        """Return the chain of the file and the state of its run; both are empty if there is no file."""
         if not self._path.exists():
-            return None
+            return MemoryBackend(), {}
         try:
-            with h5py.File(io.BytesIO(read_sealed(self._path)), "r") as file:
-                found = str(file.attrs.get(MARK, "no run of this package"))
-                state = json.loads(file[RUN][()])
-            names = [f"ensemble {number}" for number in range(len(state["calls"]))]
-            stored = [emcee.backends.HDFBackend(str(self._path), name=name, read_only=True) for name in names]
-            saved = Saved([_in_memory(backend) for backend in stored], state)
+            backend = MemoryBackend(read_sealed(self._path))
+            found, state = (
+                str(backend.file.attrs.get(MARK, "no run of this package")),
+                json.loads(backend.file[RUN][()]),
+            )
+            backend.get_last_sample()
         except Exception as error:  # whatever HDF5, JSON and emcee raise for damaged files
             raise ValueError(
                 f"checkpoint: must be an intact file, got {str(self._path)!r} ({error}); name another file or delete "
@@ -86,9 +102,9 @@ class Checkpoint:
                 f"checkpoint: must be a file of this run ({wanted}), got {str(self._path)!r} of another run "
                 f"({f'a problem with other {other}' if other else settings}); name another file or delete it."
             )
-        return saved
+        return backend, state
 
-    def save(self, backends: Sequence[emcee.backends.Backend], state: dict[str, Any], *, now: bool = False) -> None:
+    def save(self, backend: MemoryBackend, state: dict[str, Any], *, now: bool = False) -> None:
         """Write all steps so far; without `now` only if the last write was long enough ago.
 
         An OSError, such as that of a full disk, leaves the previous file.
@@ -96,49 +112,19 @@ class Checkpoint:
         started = time.monotonic()
         if not now and started < self._next:
             return
-        content = io.BytesIO()
-        with h5py.File(content, "w") as file:
-            file.attrs[MARK] = self._mark
-            file.create_dataset(RUN, data=json.dumps(state))
-            for number, backend in enumerate(backends):
-                _write(file.create_group(f"ensemble {number}"), backend)
-        try:
-            write_sealed(self._path, content.getbuffer())
-        except OSError as error:
-            raise OSError(
-                error.errno,
-                f"checkpoint: cannot be written ({error.strerror}, {len(content.getbuffer()) / 1e6:.3g} MB needed); an "
-                "earlier one is intact, and the same call goes on from it",
-                str(self._path),
-            ) from error
+        backend.file.attrs[MARK] = self._mark
+        if RUN in backend.file:
+            del backend.file[RUN]
+        backend.file.create_dataset(RUN, data=json.dumps(state))
+        with backend.content() as content:
+            try:
+                write_sealed(self._path, content)
+            except OSError as error:
+                raise OSError(
+                    error.errno,
+                    f"checkpoint: cannot be written ({error.strerror}, {len(content) / 1e6:.3g} MB needed); an earlier "
+                    "one is intact, and the same call goes on from it",
+                    str(self._path),
+                ) from error
         ended = time.monotonic()
         self._next = ended + PATIENCE * (ended - started)
-
-
-def _write(group: h5py.Group, backend: emcee.backends.Backend) -> None:
-    """Write a chain in the layout of emcee's HDF5 backend."""
-    walkers, dimension = backend.shape
-    group.attrs["version"], group.attrs["nwalkers"], group.attrs["ndim"] = emcee.__version__, walkers, dimension
-    group.attrs["has_blobs"], group.attrs["iteration"] = backend.has_blobs(), backend.iteration
-    for number, part in enumerate(backend.random_state):
-        group.attrs[f"random_state_{number}"] = part
-    steps = backend.iteration
-    group.create_dataset("accepted", data=backend.accepted)
-    group.create_dataset("chain", data=backend.chain[:steps], maxshape=(None, walkers, dimension))
-    group.create_dataset("log_prob", data=backend.log_prob[:steps], maxshape=(None, walkers))
-    if backend.has_blobs():
-        blobs = backend.blobs[:steps]
-        group.create_dataset("blobs", data=blobs, maxshape=(None, *blobs.shape[1:]))
-
-
-def _in_memory(stored: emcee.backends.HDFBackend) -> emcee.backends.Backend:
-    """Return a chain read into memory, which can be extended."""
-    backend = emcee.backends.Backend()
-    backend.reset(*stored.shape)
-    backend.iteration = stored.iteration
-    backend.random_state = stored.random_state
-    backend.accepted = np.array(stored.accepted)
-    backend.chain, backend.log_prob = stored.get_chain(), stored.get_log_prob()
-    if stored.has_blobs():
-        backend.blobs = stored.get_blobs()
-    return backend

@@ -17,10 +17,12 @@ from unittest import mock
 import emcee
 import numpy as np
 import xarray as xr
+from scipy.stats import norm
 
 from bayesperiodic.posterior.parameters import CHAIN, DRAW
 
 FEWEST_WEIGHTS, EQUAL, SMALLEST = 0.25, 1e-6, 700.0
+LEVELS = np.array([0.05, 0.5, 0.95])
 
 
 def arviz() -> ModuleType:
@@ -80,10 +82,14 @@ def autocorrelation_time(chains: np.ndarray) -> np.ndarray:
 
 
 def quantile_spread(chains: np.ndarray) -> np.ndarray:
-    """Return the largest difference between ensembles of the 5, 50 and 95 % quantiles, in pooled sds."""
-    pooled = chains.reshape(len(chains), -1, chains.shape[-1])
-    quantiles = np.quantile(pooled, [0.05, 0.5, 0.95], axis=1)
-    return np.ptp(quantiles, axis=1).max(axis=0) / pooled.reshape(-1, pooled.shape[-1]).std(axis=0)
+    """Return the largest difference between ensembles of the 5, 50 and 95 % quantiles, in sds of a normal distribution.
+
+    It is that of the fractions of draws up to the pooled quantiles, over the normal density there: between two modes a
+    quantile is nowhere certain, but the fraction is.
+    """
+    pooled = np.quantile(chains.reshape(-1, chains.shape[-1]), LEVELS, axis=0)
+    below = np.stack([np.mean(chains <= quantile, axis=(1, 2)) for quantile in pooled])
+    return np.max(np.ptp(below, axis=1) / norm.pdf(norm.ppf(LEVELS))[:, None], axis=0)
 
 
 def pareto_k(log_weights: np.ndarray) -> float:
@@ -106,8 +112,8 @@ def pareto_k(log_weights: np.ndarray) -> float:
     return float(xr.DataArray(-weights, dims="draw").azstats.psislw(dim="draw")[1])
 
 
-# Steps between checks of the stop rule, and the number of passes in succession after which sampling ends.
-BLOCK, PASSES = 250, 2
+# Number of passes of the stop rule in succession after which sampling ends.
+PASSES = 2
 LENGTHS = 50.0
 LENGTHS_ALONE = 500.0
 TAU_CHANGE = 0.05
@@ -116,7 +122,33 @@ QUANTILE_SPREAD = 0.25
 APART = 8.0
 
 
-def unmet_criteria(kept: np.ndarray, tau: np.ndarray, last: np.ndarray, labels: Sequence[str]) -> list[str]:
+def stop_rule(
+    kept: np.ndarray, modes: np.ndarray | None, last: np.ndarray, labels: Sequence[str]
+) -> tuple[np.ndarray, list[str]]:
+    """Return autocorrelation times [steps], now, and the criteria of the stop rule that are not met, in words.
+
+    `kept` are chains (ensembles, steps, walkers, coordinates), `last` the times at the previous check, empty at the
+    first one. If there are several optima, `modes` (ensembles, steps, walkers) contains that of each draw: the
+    fractions of those that are visited must meet the criteria too, and their times follow those of the coordinates.
+    """
+    tau, own = autocorrelation_time(kept), kept.shape[-1]
+    missing = unmet_criteria(kept, tau, last[:own] if last.size else np.full(own, np.inf), labels)
+    if modes is None or len(visited := np.unique(modes)) < 2:
+        return tau, missing
+    inside = (modes[..., None] == visited[1:]).astype(float)
+    of_modes = autocorrelation_time(inside)
+    before = last[own:] if last.size == own + of_modes.size else np.full(of_modes.size, np.inf)
+    names = [f"mode {row}" for row in visited[1:]]
+    weights = [f"weights of modes: {text}" for text in unmet_criteria(inside, of_modes, before, names)]
+    return np.concatenate([tau, of_modes]), missing + weights
+
+
+def unmet_criteria(
+    kept: np.ndarray,
+    tau: np.ndarray,
+    last: np.ndarray,
+    labels: Sequence[str],
+) -> list[str]:
     """Return the criteria of the stop rule that are not met, in words.
 
     An ensemble of 32 walkers that is 50 autocorrelation times long contains 1600 independent draws, a single walker

@@ -1,22 +1,17 @@
-"""Ensembles of walkers, advanced by segments; a segment is a pure function of its task, in any process."""
+"""Moves of emcee for several independent ensembles that advance as one, and their coordinates."""
 
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from copy import copy
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
 
 import emcee
 import numpy as np
 
 from bayesperiodic._linalg import covariance_eigh
 from bayesperiodic.periodic.compiled import CONVERGED, STATUSES
-from bayesperiodic.posterior.density import Evaluation
+from bayesperiodic.sampling.proposals import StudentMixture
 
-PIECE, ROOM = 25, 250
-Evaluate = Callable[[np.ndarray], Evaluation]
+# Fraction of the steps that propose from the mixture, if there is one; the other steps move within the ensembles.
+MIXTURE_STEPS = 0.8
 
 
 @dataclass(frozen=True)
@@ -24,8 +19,7 @@ class AffineTransform:
     """Sampling coordinates x = origin + axes·u, in which the Laplace approximation is a standard normal distribution.
 
     The columns of `axes` are the eigenvectors of the Laplace covariance times the standard deviations along them.
-    emcee's moves are invariant under linear maps, except for the jitter that differential evolution adds to every
-    proposal: it would block narrow coordinates if the scales differed by powers of ten.
+    emcee's moves are invariant under linear maps, but fits of mixtures are regularised in proportion to the scales.
     """
 
     origin: np.ndarray
@@ -62,147 +56,56 @@ class CallCount:
         return CallCount(self.points + other.points, self.failures + other.failures)
 
 
-class SamplingTarget(NamedTuple):
-    """Density of all ensembles, `LogPosterior.evaluate`, and the transform to its coordinates."""
+class WithinEnsembles(emcee.moves.RedBlueMove):
+    """A move of emcee, made in every ensemble by itself; the points of all are evaluated in one call.
 
-    evaluate: Evaluate
-    transform: AffineTransform
-
-
-class ChainSegment(NamedTuple):
-    """Steps of an ensemble, and the number of calls that they took."""
-
-    backend: emcee.backends.Backend
-    calls: CallCount
-
-
-def advance(target: SamplingTarget, task: tuple[emcee.State, int]) -> ChainSegment:
-    """Advance an ensemble from a state by a number of steps."""
-    (state, steps), calls = task, CallCount()
-
-    def log_prob(u: np.ndarray) -> np.ndarray:
-        found = target.evaluate(target.transform.unwhiten(u))
-        calls.add(found.status)
-        return np.column_stack([found.log_prob, found.moments]) if found.moments.size else found.log_prob
-
-    np.random.RandomState().set_state(state.random_state)  # raises, while emcee would continue with another one
-    moves = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)]
-    sampler = emcee.EnsembleSampler(*state.coords.shape, log_prob, moves=moves, vectorize=True)
-    sampler.run_mcmc(state, steps, skip_initial_state_check=True, progress=False)
-    return ChainSegment(sampler.backend, calls)
-
-
-@dataclass(frozen=True)
-class Ensemble:
-    """State of one ensemble: chain in memory, coordinates and random state after the last step, number of calls."""
-
-    backend: emcee.backends.Backend
-    start: emcee.State
-    calls: CallCount
-
-    @classmethod
-    def at(cls, points: np.ndarray, generator: np.random.RandomState, calls: CallCount) -> "Ensemble":
-        """Return the ensemble that starts at points (walkers, dimension), which took a number of calls."""
-        backend = emcee.backends.Backend()
-        backend.reset(*points.shape)
-        return cls(backend, emcee.State(points, random_state=generator.get_state()), calls)
-
-    @property
-    def steps(self) -> int:
-        """Number of steps so far."""
-        return self.backend.iteration
-
-    def next_task(self, until: int) -> tuple[emcee.State, int] | None:
-        """Return the next task for `advance` up to a number of steps; None if they are done."""
-        missing = until - self.steps
-        return (self.start, min(missing, PIECE)) if missing > 0 else None
-
-    def extended(self, segment: ChainSegment) -> "Ensemble":
-        """Return the ensemble with a segment appended, in the same memory."""
-        backend, new, first = copy(self.backend), segment.backend, self.steps
-        last = first + new.iteration
-        if last > len(backend.chain):
-            backend.grow(max(new.iteration, ROOM), None if new.blobs is None else new.blobs[0])
-        backend.chain[first:last], backend.log_prob[first:last] = new.chain, new.log_prob
-        if new.blobs is not None:
-            backend.blobs[first:last] = new.blobs
-        backend.accepted = backend.accepted + new.accepted
-        backend.random_state, backend.iteration = new.random_state, last
-        return Ensemble(backend, backend.get_last_sample(), self.calls + segment.calls)
-
-
-class LockstepPool:
-    """Runs tasks like `TaskPool`, in threads whose points are evaluated in one call.
-
-    The overhead dominates small calls, and one large call uses the cores better than several small ones.
+    Rows are ordered by ensemble. Each half of an ensemble, its even and its odd walkers, moves by the other half.
     """
 
-    def __init__(self, target: SamplingTarget):
-        self._target = target
+    def __init__(self, move: emcee.moves.RedBlueMove, ensembles: int):
+        super().__init__(randomize_split=False)
+        self._move, self._ensembles = move, ensembles
 
-    def run(
-        self, advance: Callable[[SamplingTarget, Any], Any], tasks: Sequence[Any], then: Callable[[int, Any], Any]
-    ) -> Iterator[tuple[int, Any]]:
-        """Yield number and result advance(target, task) of every task, round by round; raise the exceptions of tasks.
+    def setup(self, coords: np.ndarray) -> None:
+        """Prepare the move for the dimension of the walkers (walkers, dimension)."""
+        self._move.setup(coords)
 
-        `tasks` are the first ones of each ensemble; then(number, result) returns its next task, or None.
-        """
-        waiting = dict(enumerate(tasks))
-        with ThreadPoolExecutor(max(1, len(waiting))) as threads:
-            while waiting:
-                shared = JointEvaluation(self._target.evaluate, len(waiting))
-                target = self._target._replace(evaluate=shared.evaluate)
-                futures = {n: threads.submit(shared.call, advance, target, task) for n, task in waiting.items()}
-                results = {number: future.result() for number, future in futures.items()}
-                following = {number: then(number, result) for number, result in results.items()}
-                waiting = {number: task for number, task in following.items() if task is not None}
-                yield from results.items()
+    def get_proposal(
+        self, s: np.ndarray, c: list[np.ndarray], random: np.random.RandomState
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return proposals for the half s (walkers, dimension) by the other half, and the logs of their factors."""
+        halves = zip(np.split(s, self._ensembles), np.split(c[0], self._ensembles), strict=True)
+        points, factors = zip(*(self._move.get_proposal(a, [b], random) for a, b in halves), strict=True)
+        return np.concatenate(points), np.concatenate(factors)
 
 
-class JointEvaluation:
-    """Collects the calls of several threads and evaluates their points (points, dimension) in one call."""
+class MixtureMove(emcee.moves.MHMove):
+    """Proposals from a mixture, independent of the walkers, with their acceptance."""
 
-    def __init__(self, evaluate: Evaluate, callers: int):
-        self._evaluate, self._callers = evaluate, callers
-        self._calls: list[tuple[np.ndarray, Future]] = []
-        self._lock = threading.Lock()
+    def __init__(self, mixture: StudentMixture):
+        super().__init__(self._proposal)
+        self._mixture = mixture
+        self.proposed = self.accepted = 0
 
-    def call(self, advance: Callable[[SamplingTarget, Any], Any], target: SamplingTarget, task: Any) -> Any:
-        """Return advance(target, task); then the other threads no longer wait for this one."""
-        try:
-            return advance(target, task)
-        finally:
-            with self._lock:
-                self._callers -= 1
-                calls = self._complete()
-            self._answer(calls)
+    def _proposal(self, points: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        drawn = self._mixture.draw(len(points), random)
+        return drawn, self._mixture.log_density(points) - self._mixture.log_density(drawn)
 
-    def evaluate(self, points: np.ndarray) -> Evaluation:
-        """Return the evaluation of these points when all other threads have called too."""
-        own: Future = Future()
-        with self._lock:
-            self._calls.append((points, own))
-            calls = self._complete()
-        self._answer(calls)
-        return own.result()
+    def propose(self, model: emcee.model.Model, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
+        """Move all walkers, and count."""
+        state, accepted = super().propose(model, state)
+        self.proposed += accepted.size
+        self.accepted += int(accepted.sum())
+        return state, accepted
 
-    def _complete(self) -> list[tuple[np.ndarray, Future]]:
-        """Return the calls if all threads have called, else none."""
-        if len(self._calls) < self._callers:
-            return []
-        calls, self._calls = self._calls, []
-        return calls
 
-    def _answer(self, calls: list[tuple[np.ndarray, Future]]) -> None:
-        if not calls:
-            return
-        try:
-            found = self._evaluate(np.concatenate([points for points, _ in calls]))
-        except BaseException as error:
-            for _, own in calls:
-                own.set_exception(error)
-            return
-        ends = np.cumsum([len(points) for points, _ in calls])[:-1]
-        parts = zip(*(np.split(values, ends) for values in found), strict=True)
-        for part, (_, own) in zip(parts, calls, strict=True):
-            own.set_result(Evaluation(*part))
+def moves(ensembles: int, mixture: MixtureMove | None) -> list[tuple[emcee.moves.Move, float]]:
+    """Return the moves with their fractions of the steps.
+
+    Of the steps within ensembles, seven in ten are differential evolution, two are stretch moves, and one is
+    differential evolution of full length, which can jump between modes.
+    """
+    own = 1.0 if mixture is None else 1.0 - MIXTURE_STEPS
+    within = (emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)
+    found = [(WithinEnsembles(move, ensembles), own * fraction) for move, fraction in within]
+    return found if mixture is None else [*found, (mixture, MIXTURE_STEPS)]

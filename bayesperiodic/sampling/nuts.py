@@ -15,12 +15,14 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.density import SAMPLED, LogPosterior
 from bayesperiodic.posterior.parameters import CHAIN, DRAW
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.convergence import BLOCK, PASSES, unmet_criteria
+from bayesperiodic.sampling.convergence import PASSES, stop_rule
 from bayesperiodic.sampling.ensemble import AffineTransform, CallCount
 from bayesperiodic.sampling.posterior import Posterior, gather
-from bayesperiodic.sampling.starts import sampling_axes, start_points
+from bayesperiodic.sampling.starts import mode_of, sampling_axes, start_points
 
 TUNE = 300
+# Draws between checks of the stop rule.
+BLOCK = 250
 PAUSE = 0.01
 POSITION = "u"
 # Statistics of nutpie by their names in ArviZ's schema.
@@ -59,7 +61,7 @@ def sample_nuts(
     sequences = np.random.SeedSequence(seed).spawn(ensembles + 2)
     axes = sampling_axes(density, fit, start, np.random.default_rng(sequences[ensembles]))
     starts = start_points(density, fit, start, ensembles, np.random.default_rng(sequences[ensembles + 1]))
-    run = _Run(density, axes)
+    run = _Run(density, fit, axes)
     try:
         for u, sequence in zip(axes.whiten(starts), sequences, strict=False):
             chain_seed = int(sequence.generate_state(1, np.uint64)[0])
@@ -142,8 +144,8 @@ class _Chain:
 class _Run:
     """The chains, their number of draws, and the result of the stop rule."""
 
-    def __init__(self, density: LogPosterior, axes: AffineTransform):
-        self.density, self.axes = density, axes
+    def __init__(self, density: LogPosterior, fit: MapEstimate, axes: AffineTransform):
+        self.density, self.fit, self.axes = density, fit, axes
         self.chains: list[_Chain] = []
         self.steps, self.converged, self.reason = 0, False, ""
 
@@ -158,13 +160,12 @@ class _Run:
             self.reason = f"interrupted after {self.steps} draws"
 
     def _judge(self, max_steps: int, progress: bool) -> None:
-        passes, last = 0, np.full(self.density.dimension, np.inf)
+        passes, tau = 0, np.empty(0)
         with tqdm(total=max_steps, unit="draw", desc="sampling", disable=not progress) as bar:
             for steps in range(BLOCK, max_steps + 1, BLOCK):
                 self._wait(steps, bar)
                 self.steps, kept = steps, self.kept(steps)
-                tau = convergence.autocorrelation_time(kept)
-                missing, last = unmet_criteria(kept, tau, last, self.density.labels), tau
+                tau, missing = stop_rule(kept, mode_of(self.density, self.fit, kept), tau, self.density.labels)
                 bar.set_postfix_str(f"tau {tau.max():.1f}, length {steps / tau.max():.0f} tau")
                 passes = 0 if missing else passes + 1
                 if passes >= PASSES:
@@ -206,11 +207,13 @@ class _Run:
                 stacklevel=5,
             )
         accounts = [chain.accounts[TUNE + self.steps - 1] for chain in self.chains]
+        kept = self.kept(self.steps)
         result = gather(
             self.density,
-            self.kept(self.steps),
+            kept,
             log_density[:, :, None],
             sum(accounts, CallCount()),
+            modes=mode_of(self.density, self.fit, kept),
             converged=self.converged,
             reason=self.reason,
             acceptance=float(stats["acceptance_rate"].mean()),

@@ -61,14 +61,17 @@ class Posterior(Result):
         with their values; NaN marks missing ones, such as the variance of a channel in an experiment without it.
         Attributes: ``units``, or ``units of <channel>`` of ``variance``; ``noise``, the name of the noise model, on its
         parameters. Group ``sample_stats``: lp, the log-density in sampling coordinates; the status of the draw's
-        solves; acceptance_rate, with emcee 1 where the proposal of the step was accepted, else 0. Group
+        solves; acceptance_rate, with emcee 1 where the proposal of the step was accepted, else 0; mode, the row of
+        `MapEstimate.modes` whose Laplace approximation is the densest there, if there are several. Group
+        ``proposal``: the mixture from which emcee proposed, in sampling coordinates: weight, degrees of freedom, mean
+        and scale matrix of its Student t components; attributes acceptance and burn_in [steps]. Group
         ``log_likelihood``, for ``arviz.loo``: at some draws, the terms of independent observations, which sum to the
-        log-likelihood, up to constants of the data: values of the mean period at equally spaced instants, or its
-        harmonics if the noise is coloured. Terms of fewer or more independent values than components are weighted as
-        in the likelihood. Group ``posterior_predictive``: for some draws, replicates of the measured outputs, noise
-        included, and largest_multiplier, the modulus of each orbit's largest Floquet multiplier. Group ``orbits``:
-        states of every experiment, turns included, at the draw with the highest density. Groups ``observed_data`` and
-        ``constant_data``: outputs and inputs.
+        log-likelihood without the factor (2π)^(−n/2) and other constants of the data: values of the mean period at
+        equally spaced instants, or its harmonics if the noise is coloured; with the coordinates experiment, channel,
+        harmonic (NaN at an instant) and weight, the independent values per value. Group ``posterior_predictive``: for
+        some draws, replicates of the measured outputs, noise included, and largest_multiplier, the modulus of each
+        orbit's largest Floquet multiplier. Group ``orbits``: states of every experiment, turns included, at the draw
+        with the highest density. Groups ``observed_data`` and ``constant_data``: outputs and inputs.
     converged : bool
         True if the stop rule was met.
     reason : str
@@ -120,6 +123,23 @@ class Posterior(Result):
     def fingerprint(self) -> str:
         """Digests of the parts of the problem (model, experiments, priors, constants, noise, scheme)."""
         return str(self.tree.attrs.get("fingerprint", ""))
+
+    @property
+    def modes(self) -> pd.DataFrame:
+        """Optima that draws belong to, by the rows of `MapEstimate.modes`; empty if the estimate has one optimum.
+
+        Columns: mass, the fraction of the draws, its Monte Carlo error mcse_mass, and the mean of every quantity there.
+        """
+        stats = self.tree["sample_stats"].to_dataset()
+        if MODE not in stats:
+            return pd.DataFrame()
+        mode, rows = stats[MODE].to_numpy(), {}
+        for row in np.unique(mode):
+            inside = (mode == row).astype(float)
+            error = 0.0 if inside.all() else convergence.mean_error(inside)
+            means = {name: float(self.draws(name)[mode.ravel() == row].mean()) for name in self.names}
+            rows[int(row)] = {"mass": float(inside.mean()), "mcse_mass": error} | means
+        return pd.DataFrame.from_dict(rows, orient="index").rename_axis(MODE)
 
     @property
     def data(self) -> Any:
@@ -187,12 +207,30 @@ class Posterior(Result):
         """Full names of the noise parameters."""
         return [n for n, (variable, _) in places(self._group).items() if is_noise(self._group, variable)]
 
-    def summary(self) -> pd.DataFrame:
+    def summary(self, *, mode: int | None = None) -> pd.DataFrame:
         """Return mean, sd, 90 % equal-tailed interval, Monte Carlo error, ESS, tau and R-hat, one row per parameter.
 
         mcse_mean, ess and rhat are mcse_mean, ess_bulk and r_hat of ``arviz.summary``. Its ``attrs`` contain interval,
         converged, reason and failures.
+
+        Parameters
+        ----------
+        mode : int, optional
+            Row of `modes`: only mean, sd and interval of the draws that belong to this optimum.
+
+        Returns
+        -------
+        DataFrame
+
+        Raises
+        ------
+        ValueError
+            For a mode without draws.
         """
+        if mode is not None:
+            _checks.one_of("mode", mode, self.modes.index.tolist())
+            inside = self.tree["sample_stats"][MODE].to_numpy().ravel() == mode
+            return _table({name: _moments(self.draws(name)[inside]) for name in self.names})
         table = _table(
             {
                 name: _described(column(self._group, name), self.ess[name])
@@ -287,15 +325,18 @@ class Posterior(Result):
         state = "converged" if self.converged else "NOT CONVERGED"
         failed = ", ".join(f"{status} {share:.2%}" for status, share in self.failures.items())
         solves = f"; failed solves of {self.log_posterior_calls} proposals: {failed or 'none'}"
-        table = self.summary().to_string(float_format="{:.5g}".format)
-        return f"Posterior ({state}: {self.reason}{solves})\n{table}"
+        tables = [self.summary(), self.modes]
+        text = "\n".join(t.to_string(float_format="{:.5g}".format) for t in tables if not t.empty)
+        return f"Posterior ({state}: {self.reason}{solves})\n{text}"
 
 
 def _described(draws: np.ndarray, ess: float) -> dict[str, float]:
+    return _moments(draws) | {"mcse_mean": convergence.mean_error(draws), "ess": ess}
+
+
+def _moments(draws: np.ndarray) -> dict[str, float]:
     low, median, high = np.quantile(draws, [0.05, 0.5, 0.95])
-    sd = draws.std(ddof=1)
-    found = {"mean": draws.mean(), "sd": sd, "q05": low, "q50": median, "q95": high}
-    return found | {"mcse_mean": convergence.mean_error(draws), "ess": ess}
+    return {"mean": draws.mean(), "sd": draws.std(ddof=1), "q05": low, "q50": median, "q95": high}
 
 
 def _table(rows: dict[str, dict[str, float]]) -> pd.DataFrame:
@@ -354,7 +395,7 @@ def _some(problem: Description, posterior: xr.Dataset, most: int) -> tuple[xr.Da
     return chosen, theta, noise
 
 
-STEP, WALKER, OBSERVATION = "step", "walker", "observation"
+STEP, WALKER, OBSERVATION, MODE = "step", "walker", "observation", "mode"
 
 
 def gather(
@@ -367,10 +408,14 @@ def gather(
     reason: str,
     acceptance: float,
     seed: int,
+    modes: np.ndarray | None = None,
 ) -> Posterior:
-    """Return the posterior of chains (ensembles, steps, walkers, coordinates) in sampling coordinates."""
+    """Return the posterior of chains (ensembles, steps, walkers, coordinates) in sampling coordinates.
+
+    `log_density` and `modes`, the optimum to which each draw belongs, are (ensembles, steps, walkers).
+    """
     names = density.labels
-    data = tree(density, kept, log_density, seed)
+    data = tree(density, kept, log_density, seed, modes)
     data.attrs |= {"seed": seed, "converged": int(converged), "reason": reason}
     tau, group = convergence.autocorrelation_time(kept), data["posterior"].to_dataset()
     return Posterior(
@@ -387,7 +432,9 @@ def gather(
     )
 
 
-def tree(density: LogPosterior, kept: np.ndarray, log_density: np.ndarray, seed: int) -> xr.DataTree:
+def tree(
+    density: LogPosterior, kept: np.ndarray, log_density: np.ndarray, seed: int, modes: np.ndarray | None = None
+) -> xr.DataTree:
     """Return draws (ensembles, steps, walkers, coordinates) as the groups of `Posterior.tree`."""
     problem, lp = density.problem, convergence.as_chains(log_density)
     steps, walkers = log_density.shape[1:]
@@ -407,10 +454,12 @@ def tree(density: LogPosterior, kept: np.ndarray, log_density: np.ndarray, seed:
     }
     stats = {"lp": ((CHAIN, DRAW), lp), "status": ((CHAIN, DRAW), status, meanings)}
     stats |= {"acceptance_rate": ((CHAIN, DRAW), convergence.as_chains(moved))}
+    if modes is not None:
+        stats |= {MODE: ((CHAIN, DRAW), convergence.as_chains(modes.astype(np.int8)))}
     groups = {
         "posterior": posterior,
         "sample_stats": xr.Dataset(stats, coords=coords),
-        "log_likelihood": _terms(density, posterior),
+        "log_likelihood": log_likelihood_terms(density, posterior),
         "posterior_predictive": posterior_predictive(density, posterior, time, seed),
         "orbits": orbits(density, best, time),
         "observed_data": _signals(problem, "outputs", time),
@@ -426,8 +475,11 @@ def tree(density: LogPosterior, kept: np.ndarray, log_density: np.ndarray, seed:
     return result
 
 
-def _terms(density: LogPosterior, posterior: xr.Dataset) -> xr.Dataset:
-    """Return the terms of the log-likelihood at some draws as the only variable of a group."""
+def log_likelihood_terms(density: LogPosterior, posterior: xr.Dataset) -> xr.Dataset:
+    """Return the terms of the log-likelihood at some draws of the group ``posterior`` as the only variable of a group.
+
+    The observations have the coordinates experiment, channel, harmonic and weight, see `Likelihood.labels`.
+    """
     likelihood = density.problem.likelihood
     most = min(max(MOST_TERMS // len(likelihood.observations), TERM_DRAWS[0]), TERM_DRAWS[1])
     chosen, theta, noise = _some(density.problem, posterior, most)
@@ -437,7 +489,8 @@ def _terms(density: LogPosterior, posterior: xr.Dataset) -> xr.Dataset:
     shaped = terms.reshape(chosen.sizes[CHAIN], chosen.sizes[DRAW], -1)
     coords = {name: chosen.coords[name] for name in (CHAIN, DRAW, STEP, WALKER)}
     group = xr.Dataset({"data": ((CHAIN, DRAW, OBSERVATION), shaped)}, coords=coords)
-    return group.assign_coords({OBSERVATION: [*likelihood.observations]})
+    labels = {name: (OBSERVATION, values) for name, values in likelihood.labels.items()}
+    return group.assign_coords({OBSERVATION: [*likelihood.observations], **labels})
 
 
 def _variables(problem: Description, theta: np.ndarray, noise: np.ndarray) -> xr.Dataset:

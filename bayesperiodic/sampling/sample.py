@@ -1,47 +1,56 @@
 """Sampling of θ and the noise parameters with emcee."""
 
 from collections import Counter
+from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import emcee
 import numpy as np
+import xarray as xr
 from tqdm import tqdm
 
 from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
-from bayesperiodic._parallel import TaskPool, WorkersLost, checked_executor, interrupted_by_termination
+from bayesperiodic._parallel import (
+    TaskPool,
+    WorkersLost,
+    checked_executor,
+    interrupted_by_termination,
+    interrupts_deferred,
+)
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.density import (
     COLLAPSED,
     NATURAL,
     RIDGE,
     SAMPLED,
+    Evaluation,
     LogPosterior,
     SamplingCoordinates,
     collapsible,
 )
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import Simulator
-from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.checkpoint import Checkpoint, Saved
-from bayesperiodic.sampling.convergence import BLOCK, PASSES, unmet_criteria
-from bayesperiodic.sampling.ensemble import (
-    AffineTransform,
-    CallCount,
-    ChainSegment,
-    Ensemble,
-    LockstepPool,
-    SamplingTarget,
-    advance,
-)
+from bayesperiodic.sampling.checkpoint import Checkpoint
+from bayesperiodic.sampling.convergence import PASSES, stop_rule
+from bayesperiodic.sampling.ensemble import MIXTURE_STEPS, AffineTransform, CallCount, MixtureMove, moves
 from bayesperiodic.sampling.nuts import refuse_for_nuts, sample_nuts
 from bayesperiodic.sampling.posterior import Posterior, gather
-from bayesperiodic.sampling.starts import LAPLACE, STARTS, sampling_axes, start_points
+from bayesperiodic.sampling.proposals import StudentMixture, expected_time, fit_mixture
+from bayesperiodic.sampling.starts import LAPLACE, STARTS, laplace_mixture, mode_of, sampling_axes, start_points
 
 EMCEE, NUTS = "emcee", "nuts"
-FEWEST_STEPS = 50
+FEWEST_STEPS, FEWEST_KEPT = 50, 10
+# Steps between fits of the mixture, and at least between checks of the stop rule.
+ROUND = 50
+# Burn-in ends when the autocorrelation time [steps] expected of the mixture is FAST, or after MOST_ROUNDS.
+FAST, MOST_ROUNDS = 3.0, 20
+# Points of a task for an executor.
+PIECE = 16
+Evaluate = Callable[[np.ndarray], Evaluation]
 
 
 @in_one_thread
@@ -66,15 +75,18 @@ def sample(
     Several independent ensembles [1]_ start from draws of the Laplace approximation with doubled standard deviations,
     at every optimum of `MapEstimate.modes` in proportion to its mass. Parameters with positive support and the noise
     parameters are sampled in their logarithms, where ridges of products are straight; Jeffreys' prior 1/v is constant
-    there. The eigenvectors of the Laplace approximation in these coordinates are the axes. Seven steps in ten are
-    differential-evolution moves [2]_, which mix three times faster than stretch moves on a normal target of six
-    dimensions (tau 21 against 67), two are stretch moves, and one is a differential-evolution move of full length,
-    which can jump between modes.
+    there. The eigenvectors of the Laplace approximation in these coordinates are the axes. Four steps in five propose
+    from a mixture of Student t distributions, independently of the walkers; the others are differential-evolution [2]_
+    and stretch moves within each ensemble, for what the mixture misses. The mixture is fitted to the draws of all
+    ensembles every 50 steps of the burn-in, which is removed; it ends when a tau of at most 3 is expected, or after
+    1000 steps, and the mixture is fixed. On the posterior of the damper, in six dimensions, tau is 2, with moves within
+    the ensembles alone 23.
 
-    Sampling stops if, twice in succession, the chain is 50 autocorrelation times long after its first fifth was
-    removed, that time has changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and 95
-    % quantiles agree within a quarter of a standard deviation. Ctrl-C, SIGTERM or the loss of the executor's workers
-    ends it with the steps so far, not converged.
+    Sampling stops if, twice in succession, the chain after the burn-in and after its first fifth is 50 autocorrelation
+    times long, that time has changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and
+    95 % quantiles agree within a quarter of a standard deviation; if there are several optima, the same holds for the
+    fraction of draws at each. Ctrl-C, SIGTERM or the loss of the executor's workers ends it with the steps so far, not
+    converged.
 
     ``sampler="nuts"`` checks the result: it samples the same density by its gradient, with the no-U-turn sampler [3]_
     of nutpie. Each ensemble is then a single chain with 300 tuning draws, which are removed, and must be 500
@@ -88,7 +100,7 @@ def sample(
     seed : int
         The same seed gives the same draws, bit for bit, for all executors and numbers of threads.
     ensembles : int
-        At least 2; also the largest number of busy workers of an executor.
+        At least 2.
     walkers : int, optional
         Of each ensemble, even and at least twice the number of coordinates.
     max_steps : int
@@ -111,12 +123,12 @@ def sample(
         with another executor, and returns at once if it is finished. It can be read by emcee's HDFBackend, in
         coordinates in which the Laplace approximation is a standard normal distribution.
     executor : None, int, Dask Client, or executor with the interface of concurrent.futures
-        Executor that advances the ensembles. By default all ensembles advance in this process, with their proposals
-        solved together on all cores, which is fastest on one machine. A number is a number of processes; a script needs
+        Executor that evaluates the proposals of a step, 16 a task. By default they are solved together on all cores of
+        this process, which is fastest on one machine. A number is a number of processes; a script needs
         its calls below ``if __name__ == "__main__":``. ``mpi4py.futures.MPIPoolExecutor`` and Dask use the nodes of a
         cluster, with processors of the same kind, because others may round differently. Each worker uses one core.
     progress : bool
-        Show a progress bar with acceptance, tau and length in units of tau.
+        Show a progress bar with tau and length in units of tau.
 
     Returns
     -------
@@ -156,7 +168,7 @@ def sample(
     """
     _checks.instance("problem", problem, Problem)
     _checks.integer("ensembles", ensembles, 2)
-    _checks.integer("max_steps", max_steps, BLOCK)
+    _checks.integer("max_steps", max_steps, FEWEST_STEPS)
     _checks.integer("seed", seed, 0)
     _checks.one_of("start", start, STARTS)
     _checks.one_of("coordinates", coordinates, (RIDGE, NATURAL))
@@ -180,16 +192,16 @@ def sample(
     settings = f"seed {seed}, {ensembles} ensembles of {size} walkers, {start}, {coordinates}, {variances}"
     opened = nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings)
     with interrupted_by_termination(), opened as store:
-        saved = None if store is None else store.load()
-        anchor = np.array(saved.state["anchor"]) if saved else problem.vector(fit.theta)
-        guesses = saved.state["guesses"] if saved else {name: s.states for name, s in fit.solutions.items()}
+        backend, saved = (emcee.backends.Backend(), {}) if store is None else store.load()
+        anchor = np.array(saved["anchor"]) if saved else problem.vector(fit.theta)
+        guesses = saved["guesses"] if saved else {name: s.states for name, s in fit.solutions.items()}
         anchored = Simulator.start(problem, anchor, guesses)
         density = LogPosterior(problem, anchored, coordinates=coordinates, variances=variances)
         if sampler == NUTS:
             return sample_nuts(density, fit, seed, ensembles, max_steps, start, progress)
         lists = {run: {state: [*map(float, x)] for state, x in states.items()} for run, states in guesses.items()}
-        state = {"anchor": anchor.tolist(), "guesses": lists}
-        run = _Run(density, fit, seed, start, size, ensembles, saved, state)
+        state = {"anchor": anchor.tolist(), "guesses": lists} | saved
+        run = _Run(density, fit, seed, start, (ensembles, size), backend, state)
         run.go(max_steps, store, executor, progress)
         return run.posterior()
 
@@ -207,7 +219,7 @@ def _checked_walkers(walkers: int | None, problem: Problem, variances: str) -> i
 
 
 class _Run:
-    """A sampling run: its ensembles, their progress and the state of the stop rule."""
+    """A sampling run: one emcee sampler for all ensembles, the fit of its mixture, and the state of the stop rule."""
 
     def __init__(
         self,
@@ -215,37 +227,41 @@ class _Run:
         fit: MapEstimate,
         seed: int,
         start: str,
-        walkers: int,
-        ensembles: int,
-        saved: Saved | None,
+        shape: tuple[int, int],
+        backend: emcee.backends.Backend,
         state: dict[str, Any],
     ):
-        self.seed, self.density = seed, density
-        sequences = np.random.SeedSequence(seed).spawn(ensembles + 2)
-        self.redraws = np.random.default_rng(sequences[ensembles])
-        if saved:
-            self.state = saved.state
-            self.transform = AffineTransform(np.array(self.state["origin"]), np.array(self.state["axes"]))
-            counts = zip(self.state["calls"], self.state["failures"], strict=True)
-            self.ensembles = [
-                Ensemble(backend, backend.get_last_sample(), CallCount(points, Counter(failures)))
-                for backend, (points, failures) in zip(saved.backends, counts, strict=True)
-            ]
+        self.seed, self.density, self.fit, self.backend = seed, density, fit, backend
+        self.ensembles, self.walkers = shape
+        first, redraws, axes = np.random.SeedSequence(seed).spawn(3)
+        self.redraws = np.random.default_rng(redraws)
+        if "axes" in state:
+            self.state = state
+            self.transform = AffineTransform(np.array(state["origin"]), np.array(state["axes"]))
+            self.calls = CallCount(state["calls"], Counter(state["failures"]))
+            self.walk = backend.get_last_sample()
             return
-        self.transform = sampling_axes(density, fit, start, np.random.default_rng(sequences[ensembles + 1]))
+        self.calls, generator = CallCount(), np.random.default_rng(first)
+        self.transform = sampling_axes(density, fit, start, np.random.default_rng(axes))
+        random = np.random.RandomState(generator.integers(2**32, size=4))
+        starts = [start_points(density, fit, start, self.walkers, generator, self.calls) for _ in range(shape[0])]
+        self.walk = emcee.State(self.transform.whiten(np.concatenate(starts)), random_state=random.get_state())
+        first_mixture = self._first_mixture()
         self.state = state | {
             "origin": self.transform.origin.tolist(), "axes": self.transform.axes.tolist(),
-            "steps": 0, "checked": 0, "passes": 0, "missing": [], "tau": [np.inf] * density.dimension,
+            "mixture": first_mixture and first_mixture.as_lists(), "burnt": 0, "tries": [0, 0],
+            "steps": 0, "next": ROUND, "passes": 0, "missing": ["proposals that are still adapted"], "tau": [],
             "converged": False, "reason": "",
         }  # fmt: skip
-        self.ensembles = [
-            self._started(fit, start, walkers, np.random.default_rng(sequence)) for sequence in sequences[:ensembles]
-        ]
 
-    def _started(self, fit: MapEstimate, start: str, walkers: int, generator: np.random.Generator) -> Ensemble:
-        steps, calls = np.random.RandomState(generator.integers(2**32, size=4)), CallCount()
-        points = start_points(self.density, fit, start, walkers, generator, calls)
-        return Ensemble.at(self.transform.whiten(points), steps, calls)
+    def _first_mixture(self) -> StudentMixture | None:
+        """Return Student t distributions at the optima of the estimate, None if there is no Laplace approximation."""
+        try:
+            mixture, _ = laplace_mixture(self.density, self.fit)
+        except ValueError:
+            return None
+        inverse = np.linalg.inv(self.transform.axes)
+        return mixture.mapped(-inverse @ self.transform.origin, inverse)
 
     def go(self, max_steps: int, store: Checkpoint | None, executor: Any, progress: bool) -> None:
         """Sample until the stop rule is met, `max_steps` are reached, Ctrl-C is pressed, or workers are lost."""
@@ -253,106 +269,190 @@ class _Run:
             return
         try:
             if executor is None:
-                evaluate = partial(self.density.evaluate, threads=None)
-                self._sample(max_steps, store, LockstepPool(SamplingTarget(evaluate, self.transform)), progress)
+                self._sample(max_steps, store, partial(self.density.evaluate, threads=None), progress)
                 return
-            with TaskPool(executor, SamplingTarget(self.density.evaluate, self.transform)) as pool:
-                self._sample(max_steps, store, pool, progress)
+            with TaskPool(executor, self.density) as pool:
+                self._sample(max_steps, store, partial(_evaluate_pieces, pool), progress)
         except KeyboardInterrupt:
             if not self._stopped("interrupted", store):
                 raise
         except WorkersLost as lost:
             if not self._stopped("stopped", store, f": {lost}"):
-                kept = "the same call goes on from the checkpoint" if store and self._done else "start again"
-                raise RuntimeError(f"{lost} That was after {self._done} steps, too few for a result; {kept}.") from lost
+                done = self._done
+                kept = "the same call goes on from the checkpoint" if store and done else "start again"
+                raise RuntimeError(f"{lost} That was after {done} steps, too few for a result; {kept}.") from lost
 
     @property
     def _done(self) -> int:
-        """Number of steps of the shortest ensemble."""
-        return min(ensemble.steps for ensemble in self.ensembles)
+        """Number of steps so far."""
+        return int(self.backend.iteration) if self.backend.initialized else 0
 
     def _stopped(self, how: str, store: Checkpoint | None, why: str = "") -> bool:
         """Save a stopped run; return whether its steps are enough for a result."""
-        enough = self._done >= FEWEST_STEPS
-        if enough:
-            self.state |= {"steps": self._done, "converged": False, "reason": f"{how} after {self._done} steps{why}"}
-        if self._done:
+        done = self._done
+        if done >= FEWEST_STEPS:
+            self.state |= {"steps": done, "reason": f"{how} after {done} steps{why}"}
+        if done:
             self._save(store, now=True)
-        return enough
+        return done >= FEWEST_STEPS
 
-    def _sample(self, max_steps: int, store: Checkpoint | None, pool: TaskPool | LockstepPool, progress: bool) -> None:
+    def _sample(self, max_steps: int, store: Checkpoint | None, evaluate: Evaluate, progress: bool) -> None:
+        """Advance from check to check; before the last round of adaptation a check fits the mixture."""
         state = self.state
         with tqdm(total=max_steps, unit="step", desc="sampling", disable=not progress) as bar:
-            for steps in range(state["checked"] + BLOCK, max_steps + 1, BLOCK):
-                self._advance(steps, pool, bar)
-                kept = self._kept(steps)
-                tau = convergence.autocorrelation_time(kept)
-                missing = unmet_criteria(kept, tau, np.array(state["tau"]), self.density.labels)
-                passes = 0 if missing else state["passes"] + 1
-                state |= {"steps": steps, "checked": steps, "tau": tau.tolist(), "passes": passes, "missing": missing}
-                bar.set_postfix_str(self._account(kept, tau))
-                if passes >= PASSES:
-                    shape = f"{len(self.ensembles)} × {self.ensembles[0].backend.shape[0]} walkers"
-                    reason = f"stop rule passed after {steps} steps of {shape}"
-                    state |= {"converged": True, "reason": reason}
-                    self._save(store, now=True)
+            while state["steps"] < max_steps:
+                until = min(state["next"], max_steps)
+                self._advance(until, evaluate, bar)
+                state |= {"steps": until}
+                if until == state["next"]:
+                    if state["burnt"]:
+                        bar.set_postfix_str(self._judge())
+                    else:
+                        self._adapt()
+                self._save(store, now=state["converged"] or until == max_steps)
+                if state["converged"]:
                     return
-                self._save(store, now=steps + BLOCK > max_steps)
         left = ", ".join(state["missing"]) or "the stop rule passed only once"
-        state |= {"steps": state["checked"], "reason": f"max_steps = {max_steps} reached with {left}"}
+        state |= {"reason": f"max_steps = {max_steps} reached with {left}"}
 
-    def _advance(self, steps: int, pool: TaskPool | LockstepPool, bar: tqdm) -> None:
-        """Advance all ensembles to a number of steps, segment by segment."""
-        behind = [number for number, ensemble in enumerate(self.ensembles) if ensemble.steps < steps]
+    def _advance(self, until: int, evaluate: Evaluate, bar: tqdm) -> None:
+        """Advance all ensembles to a number of steps."""
+        mixture = self.state["mixture"] and MixtureMove(StudentMixture.from_lists(self.state["mixture"]))
+        calls = CallCount()
 
-        def then(task: int, segment: ChainSegment) -> Any:
-            number = behind[task]
-            self.ensembles[number] = self.ensembles[number].extended(segment)
-            return self.ensembles[number].next_task(steps)
+        def log_prob(u: np.ndarray) -> np.ndarray:
+            found = evaluate(self.transform.unwhiten(u))
+            calls.add(found.status)
+            return np.column_stack([found.log_prob, found.moments]) if found.moments.size else found.log_prob
 
-        for _ in pool.run(advance, [self.ensembles[number].next_task(steps) for number in behind], then):
-            bar.update(self._done - bar.n)
+        np.random.RandomState().set_state(self.walk.random_state)  # raises, where emcee would go on with another one
+        sampler = emcee.EnsembleSampler(
+            *self.walk.coords.shape, log_prob, moves=moves(self.ensembles, mixture), vectorize=True,
+            backend=self.backend,
+        )  # fmt: skip
+        tries, steps = self.state["tries"], until - self._done
+        with interrupts_deferred() as check:
+            for walk in sampler.sample(self.walk, iterations=steps, skip_initial_state_check=True):
+                self.walk = walk
+                self.calls, calls = self.calls + calls, CallCount()
+                if mixture:
+                    self.state["tries"] = [tries[0] + mixture.accepted, tries[1] + mixture.proposed]
+                bar.update(self._done - bar.n)
+                check()
 
-    @property
-    def _calls(self) -> CallCount:
-        return sum((e.calls for e in self.ensembles), CallCount())
+    def _chains(self, first: int) -> np.ndarray:
+        """Return the chains (ensembles, steps, walkers, coordinates) in whitened coordinates, from a step on."""
+        return self._by_ensemble(self.backend.get_chain(discard=first))
 
-    def _account(self, kept: np.ndarray, tau: np.ndarray) -> str:
-        text = f"acceptance {self._acceptance():.2f}, tau {tau.max():.0f}, length {kept.shape[1] / tau.max():.0f} tau"
-        failed = sum(self._calls.failures.values())
-        return text + (f", failed solves {failed / self._calls.points:.1%}" if failed else "")
+    def _by_ensemble(self, values: np.ndarray) -> np.ndarray:
+        """Return values (steps, all walkers, …) as (ensembles, steps, walkers, …)."""
+        return values.reshape(len(values), self.ensembles, self.walkers, *values.shape[2:]).swapaxes(0, 1)
+
+    def _adapt(self) -> None:
+        """Fit the mixture to the later half of the steps, and end the burn-in when it is fast.
+
+        It must be fast at the draws of the last round, which it was not fitted to, and at the later half. The mixture
+        before stays if it is expected to be faster there.
+        """
+        state = self.state
+        half, last, first = state["steps"] // 2, state["steps"] - ROUND, self._first_mixture()
+        present = state["mixture"] and StudentMixture.from_lists(state["mixture"])
+        chains = self._chains(half).reshape(self.ensembles, -1, self.density.dimension)
+        new = self._expected_time(present, last) if present else np.inf
+        if chains.std(axis=(0, 1)).min() > 0.0:
+            fitted = fit_mixture(chains, [] if first is None else [first])
+            if not present or self._expected_time(fitted, half) < self._expected_time(present, half):
+                state["mixture"] = fitted.as_lists()
+        rounds, fast = state["steps"] // ROUND, False
+        if present and rounds > 1 and new <= FAST:
+            fast = self._expected_time(StudentMixture.from_lists(state["mixture"]), half) <= FAST
+        state |= {"tries": [0, 0], "next": state["steps"] + ROUND}
+        if fast or rounds == MOST_ROUNDS:
+            state |= {"burnt": state["steps"], "missing": []}
+
+    def _expected_time(self, mixture: StudentMixture, first: int) -> float:
+        """Return the autocorrelation time expected of a mixture, from the draws since a step."""
+        points, log_density = self.backend.get_chain(discard=first, flat=True), self.backend.get_log_prob(discard=first)
+        return expected_time(mixture, points, log_density.ravel(), MIXTURE_STEPS)
+
+    def _judge(self) -> str:
+        """Apply the stop rule, and return an account of the run."""
+        state = self.state
+        steps, kept = state["steps"], self._kept()
+        modes = mode_of(self.density, self.fit, kept)
+        tau, missing = stop_rule(kept, modes, np.array(state["tau"]), self.density.labels)
+        passes = 0 if missing else state["passes"] + 1
+        ahead = max(ROUND, (steps - state["burnt"]) // 4 // ROUND * ROUND)
+        state |= {"next": steps + ahead, "tau": tau.tolist(), "passes": passes, "missing": missing}
+        if passes >= PASSES:
+            shape = f"{self.ensembles} × {self.walkers} walkers"
+            state |= {"converged": True, "reason": f"stop rule passed after {steps} steps of {shape}"}
+        failed, slowest = sum(self.calls.failures.values()), max(tau)
+        text = f"tau {slowest:.1f}, length {kept.shape[1] / slowest:.0f} tau"
+        return text + (f", failed solves {failed / self.calls.points:.1%}" if failed else "")
 
     def _save(self, store: Checkpoint | None, *, now: bool) -> None:
         if store is not None:
-            calls = [e.calls.points for e in self.ensembles]
-            failures = [dict(e.calls.failures) for e in self.ensembles]
-            backends = [e.backend for e in self.ensembles]
-            store.save(backends, self.state | {"calls": calls, "failures": failures}, now=now)
+            counts = {"calls": self.calls.points, "failures": dict(self.calls.failures)}
+            store.save(self.backend, self.state | counts, now=now)
 
-    def _kept(self, steps: int) -> np.ndarray:
-        """Return the chains (ensembles, steps, walkers, coordinates) up to a step, without their first fifth."""
-        chains = np.stack([e.backend.get_chain()[steps // 5 : steps] for e in self.ensembles])
-        return self.transform.unwhiten(chains)
+    @property
+    def _first_kept(self) -> int:
+        """First step that is kept: after the first fifth, and after the burn-in if there are steps after it."""
+        burnt, steps = self.state["burnt"], self.state["steps"]
+        return max(burnt if steps - burnt >= FEWEST_KEPT else 0, steps // 5)
 
-    def _acceptance(self) -> float:
-        return float(np.mean([e.backend.accepted / e.steps for e in self.ensembles]))
+    def _kept(self) -> np.ndarray:
+        """Return the kept chains (ensembles, steps, walkers, coordinates)."""
+        return self.transform.unwhiten(self._chains(self._first_kept))
 
     def posterior(self) -> Posterior:
         """Return the draws, with draws of the variances that were integrated out."""
-        steps = self.state["steps"]
-        kept, part = self._kept(steps), slice(steps // 5, steps)
-        log_density = np.stack([e.backend.get_log_prob()[part] for e in self.ensembles])
+        kept, first = self._kept(), self._first_kept
+        log_density = self._by_ensemble(self.backend.get_log_prob(discard=first))
+        modes = mode_of(self.density, self.fit, kept)
         if self.density.collapsed:
-            moments = np.stack([e.backend.get_blobs()[part] for e in self.ensembles])
-            moments = moments.reshape(*kept.shape[:-1], -1)
+            moments = self._by_ensemble(self.backend.get_blobs(discard=first)).reshape(*kept.shape[:-1], -1)
             kept, log_density = self.density.with_variances(kept, log_density, moments, self.redraws)
-        return gather(
+        found = gather(
             self.density.with_settings(variances=SAMPLED),
             kept,
             log_density,
-            self._calls,
+            self.calls,
+            modes=modes,
             converged=self.state["converged"],
             reason=self.state["reason"],
-            acceptance=self._acceptance(),
+            acceptance=float(np.mean(self.backend.accepted / self.backend.iteration)),
             seed=self.seed,
         )
+        if self.state["mixture"]:
+            found.tree["proposal"] = xr.DataTree(self._proposal())
+        return found
+
+    def _proposal(self) -> xr.Dataset:
+        """Return the mixture, in sampling coordinates, with the acceptance of its steps since the last fit."""
+        mixture = StudentMixture.from_lists(self.state["mixture"])
+        mixture = mixture.mapped(self.transform.origin, self.transform.axes)
+        (accepted, proposed), where = self.state["tries"], ("component", "coordinate")
+        return xr.Dataset(
+            {
+                "weight": (where[:1], mixture.weights),
+                "degrees": (where[:1], mixture.degrees),
+                "mean": (where, mixture.means),
+                "scale": ((*where, "other"), mixture.factors @ mixture.factors.swapaxes(1, 2)),
+            },
+            coords={"coordinate": list(self.density.labels), "other": list(self.density.labels)},
+            attrs={"acceptance": accepted / max(proposed, 1), "burn_in": self.state["burnt"]},
+        )
+
+
+def _evaluate_pieces(pool: TaskPool, points: np.ndarray) -> Evaluation:
+    """Return the evaluation of points (points, dimension), computed by the workers piece by piece."""
+    pieces = [points[k : k + PIECE] for k in range(0, len(points), PIECE)]
+    found = dict(pool.run(_evaluate, pieces))
+    parts = [found[number] for number in range(len(pieces))]
+    return Evaluation(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def _evaluate(density: LogPosterior, points: np.ndarray) -> Evaluation:
+    return density.evaluate(points)

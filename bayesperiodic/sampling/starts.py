@@ -11,6 +11,7 @@ from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.posterior.density import LogPosterior, SamplingCoordinates
 from bayesperiodic.posterior.likelihood import estimate_noise
 from bayesperiodic.sampling.ensemble import AffineTransform, CallCount
+from bayesperiodic.sampling.proposals import HEAVY, StudentMixture
 
 LAPLACE, PRIOR, OVERDISPERSED = "laplace", "prior", "overdispersed"
 STARTS = (LAPLACE, PRIOR, OVERDISPERSED)
@@ -78,15 +79,59 @@ def start_points(
         factor = SPREAD[start] * covariance_cholesky(covariance)
         return lambda count: mean + generator.standard_normal((count, mean.size)) @ factor.T
 
-    points = _finite(density, calls, drawn(*laplace_approximation(density, fit)), walkers, start)
+    (_, _, own), *others = laplace_modes(density, fit)
+    points = _finite(density, calls, drawn(*own), walkers, start)
     left = walkers
-    for mode in fit.other_modes:
-        count, laplace = min(max(FEWEST, round(mode.mass * walkers)), left - FEWEST), _laplace(density, mode)
-        if laplace is not None and mode.mass > LEAST_MASS and count > 0:
+    for _, mass, laplace in others:
+        count = min(max(FEWEST, round(mass * walkers)), left - FEWEST)
+        if count > 0:
             there = _finite(density, calls, drawn(*laplace), count, start, needed=0)
             points[left - len(there) : left] = there
             left -= len(there)
     return points
+
+
+def laplace_modes(
+    density: SamplingCoordinates, fit: MapEstimate
+) -> list[tuple[int, float, tuple[np.ndarray, np.ndarray]]]:
+    """Return row in `MapEstimate.modes`, mass, and mean and covariance of the optima with a notable mass.
+
+    The first one is the estimate. Raises a ValueError if it has no Laplace approximation.
+    """
+    found = [(0, 1.0 - sum(mode.mass for mode in fit.other_modes), laplace_approximation(density, fit))]
+    for row, mode in enumerate(fit.other_modes, 1):
+        laplace = _laplace(density, mode)
+        if laplace is not None and mode.mass > LEAST_MASS:
+            found.append((row, mode.mass, laplace))
+    return found
+
+
+def laplace_mixture(density: SamplingCoordinates, fit: MapEstimate) -> tuple[StudentMixture, np.ndarray]:
+    """Return Student t distributions at the optima, in sampling coordinates, and their rows in `MapEstimate.modes`.
+
+    Raises a ValueError if the estimate has no Laplace approximation.
+    """
+    rows, masses, laplaces = zip(*laplace_modes(density, fit), strict=True)
+    means, covariances = (np.stack(parts) for parts in zip(*laplaces, strict=True))
+    known = np.isfinite(masses).all()
+    factors = np.stack([covariance_cholesky(covariance) for covariance in covariances])
+    weights = np.array(masses) / np.sum(masses) if known else np.full(len(rows), 1.0 / len(rows))
+    return StudentMixture(weights, means, factors, np.full(len(rows), HEAVY)), np.array(rows)
+
+
+def mode_of(density: SamplingCoordinates, fit: MapEstimate, points: np.ndarray) -> np.ndarray | None:
+    """Return to which optimum points (…, dimension) belong, its row in `MapEstimate.modes` (…); None if there is one.
+
+    It is the one whose Laplace approximation, with heavy tails, is the densest there.
+    """
+    if not fit.other_modes:
+        return None
+    try:
+        mixture, rows = laplace_mixture(density, fit)
+    except ValueError:
+        return None
+    nearest = mixture.log_components(points.reshape(-1, density.dimension)).argmax(axis=1)
+    return np.asarray(rows[nearest].reshape(points.shape[:-1]))
 
 
 def _finite(

@@ -131,7 +131,6 @@ def test_sign_that_the_data_do_not_determine_is_reported():
     found = bp.identifiability(problem, fit, posterior, profile=False)
     assert found.verdicts == {"a": "sign undetermined"}
     assert "both signs fit the data" in found.table.loc["a", "remedy"]
-    assert not found.converged and "NOT CONVERGED" in repr(found)
 
 
 @pytest.mark.filterwarnings("ignore:2 separate optima")

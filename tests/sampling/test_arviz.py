@@ -73,6 +73,28 @@ def test_loo_is_the_exact_one_of_a_linear_model(opened):
     assert float(found.pareto_k.max()) < 0.7
 
 
+def test_terms_are_labelled_by_experiment_channel_and_harmonic(known_variance):
+    terms = known_variance[1].tree["log_likelihood"]["data"]
+    assert set(terms["experiment"].values) == {"run"} and set(terms["channel"].values) == {"force"}
+    assert np.isnan(terms["harmonic"]).all() and (terms["weight"] == 1.0).all()
+    labels = CASES["circulant"]()[0].likelihood.labels
+    assert labels["harmonic"].tolist() == [*range(10)] and set(labels["channel"]) == {"displacement"}
+
+
+def test_arviz_compares_models_and_draws_its_figures(opened):
+    """The functions of 0.23 and 1.x have different names of some arguments and figures."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        table = az.compare({"one": opened, "same": opened})
+        found = az.loo(opened, pointwise=True)
+        az.plot_compare(table)
+        az.plot_khat(found)
+    difference = table["elpd_diff"].astype(float)
+    assert list(table.index) == ["one", "same"] or list(table.index) == ["same", "one"]
+    assert (difference == 0.0).all()
+    plt.close("all")
+
+
 def test_terms_and_prior_sum_to_the_log_density_of_the_draws(known_variance):
     """The latter was evaluated while sampling."""
     problem, posterior = known_variance

@@ -1,76 +1,102 @@
-"""Proposals of several ensembles are evaluated in one call, with the results of separate calls."""
+"""Moves of several ensembles as one: the ensembles stay apart, and detailed balance holds."""
 
-import threading
-from concurrent.futures import ThreadPoolExecutor
-
+import emcee
 import numpy as np
 import pytest
+from scipy import stats
 
-from bayesperiodic.posterior.density import Evaluation
-from bayesperiodic.sampling.ensemble import JointEvaluation, LockstepPool, SamplingTarget
-
-
-def squares(points):
-    return Evaluation(points[:, 0] ** 2, np.zeros((len(points), 0)), np.zeros(len(points), dtype=int))
+from bayesperiodic.sampling.ensemble import MixtureMove, WithinEnsembles, moves
+from bayesperiodic.sampling.proposals import StudentMixture, expected_time, fit_mixture
 
 
-def three_calls(evaluate, turns):
-    """Return the results of three threads that call in turns, thread n with n + 1 points."""
-    start = threading.Barrier(3)
-
-    def ask(number):
-        start.wait()
-        return [evaluate(np.full((number + 1, 1), 10.0 * number + turn))[0] for turn in range(turns)]
-
-    with ThreadPoolExecutor(3) as threads:
-        return list(threads.map(ask, range(3)))
+def mixture(*means: float, weights: list[float] | None = None, width: float = 1.0) -> StudentMixture:
+    """Return Student t distributions in one dimension."""
+    count = len(means)
+    factors = np.full((count, 1, 1), width)
+    shares = np.full(count, 1.0 / count) if weights is None else np.array(weights)
+    return StudentMixture(shares, np.array(means)[:, None], factors, np.full(count, 5.0))
 
 
-def test_every_caller_gets_its_own_points_and_one_call_is_made_for_all():
-    sizes = []
-
-    def counted(points):
-        sizes.append(len(points))
-        return squares(points)
-
-    for number, answers in enumerate(three_calls(JointEvaluation(counted, 3).evaluate, turns=20)):
-        for turn, answer in enumerate(answers):
-            assert np.array_equal(answer, np.full(number + 1, (10.0 * number + turn) ** 2))
-    assert sizes == [6] * 20
+def walked(log_prob, starts, used, steps, seed=1):
+    """Return the chain (steps, walkers, dimension)."""
+    sampler = emcee.EnsembleSampler(*starts.shape, log_prob, moves=used, vectorize=True)
+    random = np.random.RandomState(seed).get_state()
+    sampler.run_mcmc(emcee.State(starts, random_state=random), steps, skip_initial_state_check=True)
+    return sampler.get_chain()
 
 
-def advance(target, steps):
-    """Evaluate a number of points one by one."""
-    return [float(target.evaluate(np.full((1, 1), float(k))).log_prob[0]) for k in range(steps)]
+@pytest.mark.parametrize("move", [emcee.moves.DEMove(), emcee.moves.StretchMove()])
+def test_proposals_of_an_ensemble_depend_on_its_own_walkers_only(move):
+    """Three ensembles around 0, 1000 and −1000, whose walkers span one unit."""
+    generator = np.random.default_rng(1)
+    centres = np.repeat([0.0, 1000.0, -1000.0], 8)[:, None]
+    starts = centres + generator.standard_normal((24, 2))
+
+    def log_prob(x):
+        return -0.5 * np.min(np.sum((x[:, None] - np.array([0.0, 1000.0, -1000.0])[:, None]) ** 2, axis=2), axis=1)
+
+    chain = walked(log_prob, starts, WithinEnsembles(move, 3), 100)
+    assert np.abs(chain - centres).max() < 10.0
+    assert np.all(np.any(chain[-1] != starts, axis=-1))
 
 
-def test_no_thread_waits_for_an_ensemble_that_is_finished():
-    tasks = {0: [5, 2], 1: [3], 2: [4, 4, 1]}
-    left = {number: list(own) for number, own in tasks.items()}
+def test_a_target_of_two_unequal_modes_is_sampled_from_a_mixture_of_other_weights():
+    """0.7 N(4, ½²) + 0.3 N(−4, ½²): weights, means and sds within 5 Monte Carlo errors, from weights of one half.
 
-    def then(number, _):
-        return left[number].pop(0) if left[number] else None
+    False-alarm rate below 1e-5. Without the factor of the proposals the weights would be 0.5.
+    """
+    two = [stats.norm(4.0, 0.5), stats.norm(-4.0, 0.5)]
 
-    first = [own.pop(0) for own in left.values()]
-    found = list(LockstepPool(SamplingTarget(squares, None)).run(advance, first, then))
-    for number, own in tasks.items():
-        assert [len(values) for n, values in found if n == number] == own
-    assert all(values == [float(k) ** 2 for k in range(len(values))] for _, values in found)
+    def log_prob(x):
+        return np.log(0.7 * two[0].pdf(x[:, 0]) + 0.3 * two[1].pdf(x[:, 0]) + 1e-300)
 
-
-def test_an_error_of_the_density_is_raised_and_ends_all_threads():
-    def broken(points):
-        raise ArithmeticError("no density here")
-
-    with pytest.raises(ArithmeticError, match="no density here"):
-        list(LockstepPool(SamplingTarget(broken, None)).run(advance, [3, 3, 3], lambda *_: None))
+    starts = np.repeat([4.0, -4.0], 32)[:, None] + 0.1 * np.random.default_rng(2).standard_normal((64, 1))
+    chain = walked(log_prob, starts, moves(2, MixtureMove(mixture(4.0, -4.0, width=0.7))), 1200)[200:, :, 0]
+    positive = chain > 0.0
+    each = positive.reshape(1000, -1).mean(axis=0)
+    assert abs(positive.mean() - 0.7) < 5.0 * each.std() / np.sqrt(each.size)
+    for side, centre in ((chain[positive], 4.0), (chain[~positive], -4.0)):
+        error = 5.0 / np.sqrt(side.size / 5.0)
+        assert abs(side.mean() - centre) < 0.5 * error and abs(side.std() / 0.5 - 1.0) < error
 
 
-def test_an_error_of_one_task_is_raised_and_ends_all_threads():
-    def stumbling(target, steps):
-        if steps == 2:
-            raise ArithmeticError("stumbled")
-        return advance(target, steps)
+def test_the_density_of_a_mixture_is_that_of_its_draws_and_integrates_to_one():
+    """SciPy's multivariate t; the same after a linear map and its inverse."""
+    generator = np.random.default_rng(3)
+    factors = np.tril(generator.standard_normal((2, 3, 3))) + 2.0 * np.eye(3)
+    own = StudentMixture(np.array([0.3, 0.7]), generator.standard_normal((2, 3)), factors, np.array([5.0, 30.0]))
+    points = own.draw(400, generator)
+    parts = [
+        weight * stats.multivariate_t(mean, factor @ factor.T, df=degrees).pdf(points)
+        for weight, mean, factor, degrees in zip(own.weights, own.means, factors, own.degrees, strict=True)
+    ]
+    assert own.log_density(points) == pytest.approx(np.log(np.sum(parts, axis=0)))
+    origin, axes = generator.standard_normal(3), generator.standard_normal((3, 3))
+    mapped = own.mapped(origin, axes).log_density(origin + points @ axes.T)
+    assert mapped == pytest.approx(own.log_density(points) - np.linalg.slogdet(axes)[1])
+    assert StudentMixture.from_lists(own.as_lists()).log_density(points) == pytest.approx(own.log_density(points))
+    other = StudentMixture(np.ones(1), np.zeros((1, 3)), 4.0 * np.eye(3)[None], np.array([5.0]))
+    drawn = other.draw(100_000, generator)
+    ratios = np.exp(own.log_density(drawn) - other.log_density(drawn))
+    assert abs(ratios.mean() - 1.0) < 5.0 * ratios.std() / np.sqrt(ratios.size)
 
-    with pytest.raises(ArithmeticError, match="stumbled"):
-        list(LockstepPool(SamplingTarget(squares, None)).run(stumbling, [3, 2, 3], lambda *_: None))
+
+def test_a_mixture_is_fitted_with_as_many_components_as_the_draws_show():
+    """Two separate normal distributions and one: two kinds of components, of equal and of doubled width."""
+    generator = np.random.default_rng(4)
+    centres = np.where(generator.random((4, 1500, 1)) < 0.7, 5.0, -5.0) * np.array([1.0, 0.0])
+    fitted = fit_mixture(centres + generator.standard_normal((4, 1500, 2)))
+    weights = [fitted.weights[fitted.means[:, 0] * sign > 0.0].sum() for sign in (1.0, -1.0)]
+    assert weights == pytest.approx([0.7, 0.3], abs=0.03)
+    assert len(fit_mixture(generator.standard_normal((4, 1500, 2))).weights) == 2
+
+
+def test_the_expected_time_of_a_proposal_equal_to_the_target_is_that_of_independent_draws():
+    """All proposals accepted in four steps of five: at most 2/0.8 − 1 = 1.5, and more where the mixture is narrow."""
+    own = mixture(0.0)
+    points = own.draw(20_000, np.random.default_rng(5))
+    assert expected_time(own, points, own.log_density(points) + 7.0, 1.0) == pytest.approx(1.0)
+    with_others = expected_time(own, points, own.log_density(points), 0.8)
+    assert 1.0 < with_others < 1.5
+    narrow = mixture(0.0, width=0.3)
+    assert expected_time(narrow, points, own.log_density(points), 0.8) > 1.5 * with_others

@@ -13,20 +13,12 @@ import pytest
 from scipy import stats
 
 import bayesperiodic as bp
-from bayesperiodic.sampling import sample
 from tests.known import LINEAR, linear_experiment
 from tests.sampling.test_executors import MPIEXEC, needs_mpi
 
 TRUTH = np.array([900.0, 40.0, 25.0])
 PRIORS = {"k": bp.Normal(800.0, 60.0), "c": bp.LogNormal(30.0, 0.5), "coulomb": bp.Normal(20.0, 10.0)}
 RUN = {"seed": 5, "ensembles": 2, "walkers": 8, "max_steps": 150, "progress": False}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def short_blocks():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sample, "BLOCK", 50)
-        yield
 
 
 def posed(**priors):

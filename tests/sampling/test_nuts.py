@@ -193,29 +193,29 @@ def test_failed_solves_and_trajectories_that_end_in_them_are_counted(edge, brief
 
 @needs_nutpie
 def test_interrupted_run_returns_its_draws(linear, briefly, monkeypatch):
-    monkeypatch.setattr(nuts, "unmet_criteria", interrupting_at(250))
+    monkeypatch.setattr(nuts, "stop_rule", interrupting_at(250))
     posterior = bp.sample(*linear, seed=1, **(briefly | {"max_steps": 5000}))
     assert not posterior.converged
     assert posterior.reason == f"interrupted after {posterior.data['posterior'].sizes['draw']} draws"
     assert posterior.data["posterior"].sizes["draw"] >= 250
 
 
-def interrupting_at(draws: int) -> Callable[..., list[str]]:
-    def check(kept: np.ndarray, *_: np.ndarray) -> list[str]:
+def interrupting_at(draws: int) -> Callable[..., tuple]:
+    def check(kept: np.ndarray, *_: np.ndarray) -> tuple:
         if kept.shape[1] == draws:
             raise KeyboardInterrupt
-        return ["nothing"]
+        return np.empty(0), ["nothing"]
 
     return check
 
 
 @needs_nutpie
 def test_terminated_run_returns_its_draws(linear, briefly, monkeypatch):
-    def terminate(kept: np.ndarray, *_: np.ndarray) -> list[str]:
+    def terminate(kept: np.ndarray, *_: np.ndarray) -> tuple:
         signal.raise_signal(signal.SIGTERM)
-        return ["nothing"]
+        return np.empty(0), ["nothing"]
 
-    monkeypatch.setattr(nuts, "unmet_criteria", terminate)
+    monkeypatch.setattr(nuts, "stop_rule", terminate)
     posterior = bp.sample(*linear, seed=1, **(briefly | {"max_steps": 5000}))
     assert posterior.reason.startswith("interrupted after ") and not posterior.converged
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL

@@ -70,11 +70,10 @@ def test_same_seed_same_results_but_for_seconds_and_versions(quick, synthetic, t
         assert (folder / f"{name}.png").read_bytes() == (tmp_path / f"{name}.png").read_bytes()
 
 
-def test_quick_run_reports_that_it_reached_its_limit(quick):
+def test_quick_run_converges(quick):
     results = quick[1]
-    assert results["converged"] is False
-    assert "max_steps = 500 reached" in results["reason"]
-    assert set(results["comparison"].values()) == {"not converged"}
+    assert results["converged"] is True and "stop rule passed" in results["reason"]
+    assert "not converged" not in results["comparison"].values()
 
 
 def test_errors_are_one_line_with_an_exit_status(tmp_path, capsys):
