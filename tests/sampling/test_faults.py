@@ -105,7 +105,10 @@ if __name__ == "__main__":
 
 
 class Job:
-    """A run in a process of its own, whose children are found by their environment."""
+    """A run in a session of its own, whose processes are found by the session or, where they leave it, by a variable.
+
+    Workers of Dask overwrite their environment if setproctitle is installed.
+    """
 
     def __init__(self, folder, kind, draws):
         (folder / "job.py").write_text(JOB)
@@ -125,8 +128,9 @@ class Job:
         found = []
         for number in filter(str.isdigit, os.listdir("/proc")):
             try:
-                ended = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-                if not ended and self.mark in Path(f"/proc/{number}/environ").read_bytes():
+                state, _, _, session = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[:4]
+                own = int(session) == self.process.pid or self.mark in Path(f"/proc/{number}/environ").read_bytes()
+                if own and state != "Z":
                     found.append(int(number))
             except OSError:
                 continue
