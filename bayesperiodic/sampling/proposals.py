@@ -100,17 +100,16 @@ def fit_mixture(draws: np.ndarray, candidates: Sequence[StudentMixture] = ()) ->
     train, test = draws[:-1].reshape(-1, draws.shape[2]), draws[-1]
     best, size, degrees, chosen = -np.inf, 0, HEAVY, None
     for candidate in candidates:
-        if (score := float(candidate.log_density(test).mean())) > best:
+        if (score := float(_with_wider(candidate).log_density(test).mean())) > best:
             best, chosen = score, candidate
     worse = 0
     for count in SIZES:
         if count > 1 and len(train) < PER_COMPONENT * count * draws.shape[2]:
             break
         fitted = _fitted(train, count)
-        scores = {nu: float(_of_degrees(fitted, nu).log_density(test).mean()) for nu in (HEAVY, LIGHT)}
-        found = max(scores, key=scores.__getitem__)
-        if scores[found] > best + (GAIN if size else 0.0):
-            best, size, degrees, chosen, worse = scores[found], count, found, None, 0
+        found = {nu: float(_with_wider(_of_degrees(fitted, nu)).log_density(test).mean()) for nu in (HEAVY, LIGHT)}
+        if (score := max(found.values())) > best + (GAIN if size else 0.0):
+            best, size, degrees, chosen, worse = score, count, max(found, key=found.__getitem__), None, 0
         elif (worse := worse + 1) == 2:
             break
     return _with_wider(chosen or _of_degrees(_fitted(draws.reshape(-1, draws.shape[2]), size), degrees))

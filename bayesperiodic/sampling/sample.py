@@ -48,6 +48,9 @@ FEWEST_STEPS, FEWEST_KEPT = 50, 10
 ROUND = 50
 # Burn-in ends when the autocorrelation time [steps] expected of the mixture is FAST, or after MOST_ROUNDS.
 FAST, MOST_ROUNDS = 3.0, 20
+# It starts again, before MOST_ROUNDS, if SLOW is expected at the draws that are kept: their tails were not known yet.
+SLOW = 6.0
+ADAPTED = "proposals that are still adapted"
 # Points of a task for an executor.
 PIECE = 16
 Evaluate = Callable[[np.ndarray], Evaluation]
@@ -250,7 +253,7 @@ class _Run:
         self.state = state | {
             "origin": self.transform.origin.tolist(), "axes": self.transform.axes.tolist(),
             "mixture": first_mixture and first_mixture.as_lists(), "burnt": 0, "tries": [0, 0],
-            "steps": 0, "next": ROUND, "passes": 0, "missing": ["proposals that are still adapted"], "tau": [],
+            "steps": 0, "next": ROUND, "passes": 0, "missing": [ADAPTED], "tau": [],
             "converged": False, "reason": "",
         }  # fmt: skip
 
@@ -305,7 +308,7 @@ class _Run:
                 self._advance(until, evaluate, bar)
                 state |= {"steps": until}
                 if until == state["next"]:
-                    if state["burnt"]:
+                    if state["burnt"] and not self._outdated():
                         bar.set_postfix_str(self._judge())
                     else:
                         self._adapt()
@@ -367,8 +370,15 @@ class _Run:
         if present and rounds > 1 and new <= FAST:
             fast = self._expected_time(StudentMixture.from_lists(state["mixture"]), half) <= FAST
         state |= {"tries": [0, 0], "next": state["steps"] + ROUND}
-        if fast or rounds == MOST_ROUNDS:
-            state |= {"burnt": state["steps"], "missing": []}
+        done = fast or rounds >= MOST_ROUNDS
+        state |= {"burnt": state["steps"] if done else 0, "missing": [] if done else [ADAPTED], "tau": [], "passes": 0}
+
+    def _outdated(self) -> bool:
+        """Return whether the burn-in ended too early: the draws since then have tails that the mixture lacks."""
+        if self.state["burnt"] >= MOST_ROUNDS * ROUND:
+            return False
+        mixture = StudentMixture.from_lists(self.state["mixture"])
+        return self._expected_time(mixture, self._first_kept) > SLOW
 
     def _expected_time(self, mixture: StudentMixture, first: int) -> float:
         """Return the autocorrelation time expected of a mixture, from the draws since a step."""
