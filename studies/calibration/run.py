@@ -1,4 +1,4 @@
-"""Coverage of intervals: simulated campaigns of three problems, and of one with a wrong likelihood.
+"""Coverage of intervals: simulated campaigns of four problems, and of one with a wrong likelihood.
 
 All data are synthetic, with white noise. Every replicate draws its truth from the priors, records it by time
 integration, and runs fold, MAP estimate, Laplace approximation and emcee (`bp.calibrate`). The likelihood of the second
@@ -70,6 +70,16 @@ def landing_gear() -> bp.Problem:
     return _problem(bp.models.landing_gear("displacement"), run, priors, fixed, 230.0**2, tied)
 
 
+def two_optima() -> bp.Problem:
+    """Return the problem of a gain 1.5 + (a − 2)²: two optima, of different mass by the prior, one for a near 2."""
+    model = bp.Model(
+        "squared_gain", states=["w"], inputs=["x"], parameters=["a"], equations=lambda s, p, u: [s.dw + s.w - u.x],
+        outputs=lambda s, p, u: {"y": (1.5 + (p.a - 2) ** 2) * u.x},
+    )  # fmt: skip
+    run = _run("1 Hz", 1.0, {"x": (0.0, 1.0)}, {"y": 3}, 20)
+    return _problem(model, run, {"a": bp.Normal(2.4, 0.8)}, {}, 0.6**2)
+
+
 def _problem(
     model: bp.Model, run: bp.Experiment, priors: Any, fixed: Any, variance: float, tied: Any = None
 ) -> bp.Problem:
@@ -93,9 +103,10 @@ def _run(
 
 CASES: dict[str, Callable[[], bp.Problem]] = {
     "duffing": duffing, "miscounted": miscounted, "damper": damper, "landing_gear": landing_gear,
+    "two_optima": two_optima,
 }  # fmt: skip
 DEFAULT, QUICK = 20, 5
-STRIDE = 4
+STRIDE = 5
 # The stop rule of `sample` takes 500 steps at least, so no chain can pass it. Ranks need independent draws instead.
 STEPS = 250
 BINS = 20
