@@ -247,11 +247,6 @@ class Given:
     def sample(self, size, generator):  # noqa: D102
         return self.normal.sample(size, generator)
 
-    @property
-    def median(self) -> float:
-        """The median."""
-        return self.normal.median
-
     def __repr__(self) -> str:
         return f"Given({self.factor})"
 

@@ -7,6 +7,7 @@ import bayesperiodic as bp
 from bayesperiodic.periodic import batch
 from bayesperiodic.posterior import observation
 from bayesperiodic.sampling import convergence
+from bayesperiodic.sampling import sample as sample_module
 from tests.known import LINEAR, grid, linear_experiment, linear_regressors, normal_posterior
 
 TRUTH = np.array([900.0, 40.0, 25.0])
@@ -246,3 +247,18 @@ def test_error_without_a_laplace_approximation_names_the_alternative(known_varia
         lost = replace(fit, joint_covariance=fit.joint_covariance * np.nan, **known)
         with pytest.raises(ValueError, match=f"no Laplace approximation .*{step}, or take start='prior'"):
             bp.sample(problem, lost, seed=1, **PAIR)
+
+
+@pytest.mark.parametrize(("slow", "burn_in"), [(None, 100), (8, 150), (11, 300)])
+def test_burn_in_starts_again_if_slow_moves_are_expected_at_the_draws_kept(known_variance, monkeypatch, slow, burn_in):
+    """Times expected of the mixture are stated: the checks at 150, 200, 250 and 300 steps are the 8th to the 11th."""
+    asked = []
+
+    def stated(*_):
+        asked.append(1)
+        return 10.0 if len(asked) == slow else 2.0
+
+    monkeypatch.setattr(sample_module, "expected_time", stated)
+    posterior = bp.sample(*known_variance, seed=1, max_steps=350, **PAIR)
+    assert posterior.tree["proposal"].attrs["burn_in"] == burn_in
+    assert posterior.by_step(posterior.draws("k")).shape[1] == 350 - burn_in
