@@ -27,17 +27,18 @@ def walked(log_prob, starts, used, steps, seed=1):
 
 @pytest.mark.parametrize("move", [emcee.moves.DEMove(), emcee.moves.StretchMove()])
 def test_proposals_of_an_ensemble_depend_on_its_own_walkers_only(move):
-    """Three ensembles around 0, 1000 and −1000, whose walkers span one unit."""
-    generator = np.random.default_rng(1)
-    centres = np.repeat([0.0, 1000.0, -1000.0], 8)[:, None]
-    starts = centres + generator.standard_normal((24, 2))
-
-    def log_prob(x):
-        return -0.5 * np.min(np.sum((x[:, None] - np.array([0.0, 1000.0, -1000.0])[:, None]) ** 2, axis=2), axis=1)
-
-    chain = walked(log_prob, starts, WithinEnsembles(move, 3), 100)
-    assert np.abs(chain - centres).max() < 10.0
-    assert np.all(np.any(chain[-1] != starts, axis=-1))
+    """Three ensembles, of which the walkers of the others are shifted; same random numbers."""
+    generator, within = np.random.default_rng(1), WithinEnsembles(move, 3)
+    moving, others = generator.standard_normal((2, 12, 2))
+    within.setup(moving)
+    proposed, factors = within.get_proposal(moving, [others], np.random.RandomState(1))
+    assert np.all(np.any(proposed != moving, axis=1))
+    for ensemble in range(3):
+        own = np.repeat(np.arange(3), 4) == ensemble
+        shifted = np.where(own[:, None], others, others + generator.standard_normal((12, 2)))
+        again, same = within.get_proposal(moving, [shifted], np.random.RandomState(1))
+        assert np.array_equal(again[own], proposed[own]) and np.array_equal(same[own], factors[own])
+        assert np.all(np.any(again[~own] != proposed[~own], axis=1))
 
 
 def test_a_target_of_two_unequal_modes_is_sampled_from_a_mixture_of_other_weights():
