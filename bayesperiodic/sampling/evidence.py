@@ -21,6 +21,7 @@ from bayesperiodic.posterior.parameters import CHAIN, DRAW, SHIFT, local_name
 from bayesperiodic.posterior.priors import LOG_ROOT_TWO_PI, Uniform
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling import convergence
+from bayesperiodic.sampling.ensemble import AffineTransform
 from bayesperiodic.sampling.posterior import Posterior
 from bayesperiodic.sampling.proposals import fit_mixture
 
@@ -202,29 +203,27 @@ def _bridge(
     The mixture is fitted in coordinates u in which the draws have mean 0 and covariance 1.
     """
     pooled = fitted.reshape(-1, fitted.shape[-1])
-    mean = pooled.mean(axis=0)
+    dimension = pooled.shape[1]
+    covariance = np.cov(pooled, rowvar=False).reshape(dimension, dimension)
     try:
-        axes = covariance_cholesky(np.cov(pooled, rowvar=False).reshape(mean.size, mean.size))
+        covariance_cholesky(covariance)
     except np.linalg.LinAlgError:
         raise ValueError("posterior: draws must vary in all directions; sample longer, see max_steps.") from None
-
-    def whitened(points: np.ndarray) -> np.ndarray:
-        flat = (points - mean).reshape(-1, mean.size)
-        return np.linalg.solve(axes, flat.T).T.reshape(points.shape)
+    transform = AffineTransform.of(pooled.mean(axis=0), covariance)
 
     # Early and late halves of the ensembles apart, as the size of the mixture is chosen by the last of them.
-    groups = [half.reshape(len(fitted), -1, mean.size) for half in np.array_split(whitened(fitted), 2, axis=1)]
+    groups = [half.reshape(len(fitted), -1, dimension) for half in np.array_split(transform.whiten(fitted), 2, axis=1)]
     fewest = min(group.shape[1] for group in groups)
     mixture = fit_mixture(np.concatenate([group[:, :fewest] for group in groups]))
     thin = max(1, min(used.shape[1] // 4, -(-used[..., 0].size // DRAWS)))
-    kept = whitened(used[:, ::thin])
-    constant = constant + float(np.log(np.diag(axes)).sum())
+    kept = transform.whiten(used[:, ::thin])
+    constant = constant + float(np.linalg.slogdet(transform.axes)[1])
 
     def log_ratios(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found = density.evaluate(mean + u @ axes.T, threads=None)
+        found = density.evaluate(transform.unwhiten(u), threads=None)
         return found.log_prob + constant - mixture.log_density(u), found.status
 
-    at_draws = log_ratios(kept.reshape(-1, mean.size))[0].reshape(kept.shape[:-1])
+    at_draws = log_ratios(kept.reshape(-1, dimension))[0].reshape(kept.shape[:-1])
     at_mixture, status = log_ratios(mixture.draw(DRAWS, generator))
     return _estimate(at_draws, at_mixture, float(np.mean(status != CONVERGED)))
 

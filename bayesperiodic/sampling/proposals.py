@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,8 @@ WIDE, WIDER = 0.1, 2.0
 # Most draws used in a fit, and draws needed per coordinate and component.
 MOST_DRAWS, PER_COMPONENT = 6000, 20
 REGULAR = 1e-6
+# Most coordinates whose products describe curvature, and ridge of that regression, relative to the mean square.
+MOST_CURVED, RIDGE = 20, 1e-3
 
 
 @dataclass(frozen=True)
@@ -24,31 +26,43 @@ class StudentMixture:
 
     `weights` (components,) sum to 1; `means` (components, dimension); `factors` (components, dimension, dimension) are
     lower triangular, factor·factorᵀ being the scale matrix; `degrees` (components,) are degrees of freedom.
+
+    With `curvature` (bent, products) these describe straightened coordinates: from each of the first coordinates a
+    quadratic form of the others is subtracted, see `_products`. The determinant of that map is 1.
     """
 
     weights: np.ndarray
     means: np.ndarray
     factors: np.ndarray
     degrees: np.ndarray
+    curvature: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
+
+    def straightened(self, points: np.ndarray, sign: float = -1.0) -> np.ndarray:
+        """Return the coordinates that the components describe, of points (points, dimension); `sign` 1 inverts it."""
+        bent = len(self.curvature)
+        if not bent:
+            return points
+        straight = points[:, :bent] + sign * _products(points[:, bent:]) @ self.curvature.T
+        return np.hstack([straight, points[:, bent:]])
 
     def mapped(self, origin: np.ndarray, axes: np.ndarray) -> "StudentMixture":
-        """Return the mixture of origin + axes·x."""
+        """Return the mixture of origin + axes·x, without curvature."""
         turned = np.linalg.qr((axes @ self.factors).swapaxes(1, 2))[1].swapaxes(1, 2)
         signs = np.sign(np.diagonal(turned, axis1=1, axis2=2))
         return StudentMixture(self.weights, origin + self.means @ axes.T, turned * signs[:, None, :], self.degrees)
 
     def as_lists(self) -> dict[str, Any]:
         """Return the arguments as numbers and lists."""
-        return {field.name: getattr(self, field.name).tolist() for field in fields(self)}
+        return {one.name: getattr(self, one.name).tolist() for one in fields(self)}
 
     @classmethod
     def from_lists(cls, lists: dict[str, Any]) -> "StudentMixture":
         """Return the mixture of `as_lists`."""
-        return cls(*(np.array(lists[field.name]) for field in fields(cls)))
+        return cls(*(np.array(lists[one.name]) for one in fields(cls)))
 
     def log_components(self, points: np.ndarray) -> np.ndarray:
         """Return the log of weight times density of every component at points (points, dimension), one row a point."""
-        half, columns = 0.5 * points.shape[1], []
+        half, columns, points = 0.5 * points.shape[1], [], self.straightened(points)
         for weight, mean, factor, degrees in zip(self.weights, self.means, self.factors, self.degrees, strict=True):
             squared = np.sum(np.linalg.solve(factor, (points - mean).T) ** 2, axis=0)
             total = gammaln(0.5 * degrees + half) - gammaln(0.5 * degrees) - half * np.log(degrees * np.pi)
@@ -66,7 +80,8 @@ class StudentMixture:
         normal = random.standard_normal((count, self.means.shape[1]))
         degrees = self.degrees[component]
         wide = np.sqrt(degrees / random.chisquare(degrees))
-        return self.means[component] + wide[:, None] * np.einsum("nij,nj->ni", self.factors[component], normal)
+        drawn = self.means[component] + wide[:, None] * np.einsum("nij,nj->ni", self.factors[component], normal)
+        return self.straightened(drawn, 1.0)
 
 
 def expected_time(mixture: StudentMixture, points: np.ndarray, log_density: np.ndarray, fraction: float) -> float:
@@ -91,31 +106,72 @@ def expected_time(mixture: StudentMixture, points: np.ndarray, log_density: np.n
 def fit_mixture(draws: np.ndarray, candidates: Sequence[StudentMixture] = ()) -> StudentMixture:
     """Return the mixture that describes draws (ensembles, draws, dimension) best, with wider components.
 
-    Numbers of components and of degrees of freedom are those with the largest mean log-density at the last ensemble, if
-    the others are fitted; the mixture is then fitted to all. `candidates` are other mixtures to compare with. A part of
-    the weight, WIDE, is moved to components of WIDER times the width with heavy tails, for what the draws lack.
+    Curvature, numbers of components and of degrees of freedom are those with the largest mean log-density at the last
+    ensemble, if the others are fitted; the mixture is then fitted to all. `candidates` are other mixtures to compare
+    with. Coordinates should be ordered by their widths, the narrowest first. A part of the weight, WIDE, is moved to
+    components of WIDER times the width with heavy tails, for what the draws lack.
     """
     each = max(1, draws.shape[0] * draws.shape[1] // MOST_DRAWS)
     draws = draws[:, ::each]
-    train, test = draws[:-1].reshape(-1, draws.shape[2]), draws[-1]
+    points, train, test = draws.reshape(-1, draws.shape[2]), draws[:-1].reshape(-1, draws.shape[2]), draws[-1]
     best, size, degrees, chosen = -np.inf, 0, HEAVY, None
     for candidate in candidates:
         if (score := float(_with_wider(candidate).log_density(test).mean())) > best:
             best, chosen = score, candidate
-    worse = 0
+    bent = _bent(train, test)
+    worse, curvature = 0, _curvature(train, bent)
     for count in SIZES:
         if count > 1 and len(train) < PER_COMPONENT * count * draws.shape[2]:
             break
-        fitted = _fitted(train, count)
+        fitted = _fitted(train, count, curvature)
         found = {nu: float(_with_wider(_of_degrees(fitted, nu)).log_density(test).mean()) for nu in (HEAVY, LIGHT)}
         if (score := max(found.values())) > best + (GAIN if size else 0.0):
             best, size, degrees, chosen, worse = score, count, max(found, key=found.__getitem__), None, 0
         elif (worse := worse + 1) == 2:
             break
-    return _with_wider(chosen or _of_degrees(_fitted(draws.reshape(-1, draws.shape[2]), size), degrees))
+    return _with_wider(chosen or _of_degrees(_fitted(points, size, _curvature(points, bent)), degrees))
 
 
-def _fitted(draws: np.ndarray, count: int) -> StudentMixture:
+def _products(points: np.ndarray) -> np.ndarray:
+    """Return squares and products (points, products) of the last coordinates of points, at most MOST_CURVED."""
+    wide = points[:, -MOST_CURVED:]
+    first, second = np.triu_indices(wide.shape[1])
+    return wide[:, first] * wide[:, second]
+
+
+def _regression(points: np.ndarray, bent: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return coefficients of the first coordinates by the others, linear and then with products: ridge regressions."""
+    others = points[:, bent:]
+    linear = np.column_stack([np.ones(len(points)), others])
+    found = []
+    for terms in (linear, np.column_stack([linear, _products(others)])):
+        square = terms.T @ terms
+        square += RIDGE * np.diag(np.diag(square))
+        found.append(np.linalg.solve(square, terms.T @ points[:, :bent]).T)
+    return found[0], found[1]
+
+
+def _bent(train: np.ndarray, test: np.ndarray) -> int:
+    """Return how many of the first coordinates are curved: that with the smallest residuals at the test points."""
+    dimension, gains = train.shape[1], {0: GAIN}
+    for bent in sorted({1, 2, 3, dimension // 4, dimension // 2} & set(range(1, dimension))):
+        others = test[:, bent:]
+        linear = np.column_stack([np.ones(len(test)), others])
+        plain, curved = _regression(train, bent)
+        variances = [
+            (test[:, :bent] - terms @ coefficients.T).var(axis=0)
+            for terms, coefficients in ((linear, plain), (np.column_stack([linear, _products(others)]), curved))
+        ]
+        gains[bent] = 0.5 * float(np.sum(np.log(variances[0] / variances[1])))
+    return max(gains, key=gains.__getitem__)
+
+
+def _curvature(points: np.ndarray, bent: int) -> np.ndarray:
+    """Return the coefficients (bent, products) of the products."""
+    return _regression(points, bent)[1][:, 1 + points.shape[1] - bent :] if bent else np.empty((0, 0))
+
+
+def _fitted(draws: np.ndarray, count: int, curvature: np.ndarray) -> StudentMixture:
     """Return Student t distributions with weights, means and scale matrices of normal distributions fitted to draws.
 
     In one thread: the sums of several depend on their order.
@@ -123,11 +179,14 @@ def _fitted(draws: np.ndarray, count: int) -> StudentMixture:
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.mixture import GaussianMixture
 
+    none = np.empty(0)
+    draws = StudentMixture(none, none, none, none, curvature).straightened(draws)
     fit = GaussianMixture(count, reg_covar=REGULAR * draws.var(axis=0).min(), random_state=0, tol=1e-2).fit
     with threadpool_limits(limits=1), warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # a mixture that is not the best one is a proposal too
         found = fit(draws)
-    return StudentMixture(found.weights_, found.means_, np.linalg.cholesky(found.covariances_), np.full(count, HEAVY))
+    factors = np.linalg.cholesky(found.covariances_)
+    return StudentMixture(found.weights_, found.means_, factors, np.full(count, HEAVY), curvature)
 
 
 def _of_degrees(mixture: StudentMixture, degrees: float) -> StudentMixture:
@@ -137,4 +196,5 @@ def _of_degrees(mixture: StudentMixture, degrees: float) -> StudentMixture:
 def _with_wider(mixture: StudentMixture) -> StudentMixture:
     weights = np.concatenate([(1.0 - WIDE) * mixture.weights, WIDE * mixture.weights])
     factors, means = np.concatenate([mixture.factors, WIDER * mixture.factors]), np.tile(mixture.means, (2, 1))
-    return StudentMixture(weights, means, factors, np.append(mixture.degrees, np.full(len(mixture.weights), HEAVY)))
+    degrees = np.append(mixture.degrees, np.full(len(mixture.weights), HEAVY))
+    return StudentMixture(weights, means, factors, degrees, mixture.curvature)

@@ -440,18 +440,23 @@ class _Run:
         return found
 
     def _proposal(self) -> xr.Dataset:
-        """Return the mixture, in sampling coordinates, with the acceptance of its steps since the last fit."""
+        """Return the mixture, with the acceptance of its steps since the last fit.
+
+        Its components are those of the coordinates u, straightened by `curvature`, of origin + axes·u.
+        """
         mixture = StudentMixture.from_lists(self.state["mixture"])
-        mixture = mixture.mapped(self.transform.origin, self.transform.axes)
-        (accepted, proposed), where = self.state["tries"], ("component", "coordinate")
+        (accepted, proposed), where = self.state["tries"], ("component", "axis")
         return xr.Dataset(
             {
                 "weight": (where[:1], mixture.weights),
                 "degrees": (where[:1], mixture.degrees),
                 "mean": (where, mixture.means),
                 "scale": ((*where, "other"), mixture.factors @ mixture.factors.swapaxes(1, 2)),
+                "curvature": (("bent", "product"), np.atleast_2d(mixture.curvature)[: len(mixture.curvature)]),
+                "origin": ("coordinate", self.transform.origin),
+                "axes": (("coordinate", "axis"), self.transform.axes),
             },
-            coords={"coordinate": list(self.density.labels), "other": list(self.density.labels)},
+            coords={"coordinate": list(self.density.labels)},
             attrs={"acceptance": accepted / max(proposed, 1), "burn_in": self.state["burnt"]},
         )
 

@@ -71,7 +71,8 @@ def test_masses_of_two_modes_are_those_of_a_quadrature(case):
     weight = np.exp(-0.5 * ((size(a) - 1.0) / 0.05) ** 2 + prior.log_prob(a))
     above = weight[a > between].sum() / weight.sum()
     modes = posterior.modes
-    row = modes.index[modes["a"] > between].item()
+    row = fit.modes.index[fit.modes["a"] > between].item()
+    assert modes.loc[row, "a"] > between
     assert posterior.converged and len(modes) == 2
     assert modes.loc[row, "mcse_mass"] < 0.006
     assert abs(modes.loc[row, "mass"] - above) < 5.0 * modes.loc[row, "mcse_mass"]
