@@ -1,5 +1,6 @@
 """Evidences of models against closed forms and quadratures written here, and against nested sampling."""
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -324,7 +325,7 @@ def test_draws_that_have_missed_a_mode_in_some_ensembles_bring_a_warning():
     steps = 0.05 * np.random.default_rng(1).standard_normal((2, 300, 32))
     with pytest.warns(UserWarning, match="The evidence is unreliable: .*overlap") as seen:
         found = bp.evidence(problem, with_draws(posterior, steps + np.array([1.0, 3.0])[:, None, None]))
-    assert any("misses 99.2% of the other half" in str(w.message) for w in seen)
+    assert any(re.search(r"misses 99\.\d% of the other half", str(w.message)) for w in seen)
     assert found.overlap < 0.01 and found.missed > 0.9 and sum(n.startswith("Unreliable") for n in found.notes) >= 2
 
 
