@@ -17,7 +17,7 @@ WIDE, WIDER = 0.1, 2.0
 MOST_DRAWS, PER_COMPONENT = 6000, 20
 REGULAR = 1e-6
 # Most coordinates whose products describe curvature, and ridge of that regression, relative to the mean square.
-MOST_CURVED, RIDGE = 20, 1e-3
+MOST_CURVED, RIDGE = 20, 1e-6
 
 
 @dataclass(frozen=True)
