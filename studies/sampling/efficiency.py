@@ -10,16 +10,14 @@ minutes on training networks of PyTorch, and is left out.
 
 import importlib
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import emcee
 import numpy as np
-from scipy import stats
 
 import bayesperiodic as bp
 from studies.benchmark.problems import duffing
@@ -30,7 +28,6 @@ from studies.timing import timed
 
 ENSEMBLES, WALKERS, LIVE, REPLICAS = 4, 32, 500, 20
 LONG = 50.0  # Autocorrelation times; shorter runs have no verdict
-FALSE_ALARM = 0.01
 DAMPER, DUFFING, RIDGE = "damper", "Duffing", "ridge"
 OURS = ("bp.sample", "bp.sample, collapsed", "NUTS")
 EVOLUTION = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.1), (emcee.moves.StretchMove(), 0.2)]
@@ -207,10 +204,10 @@ def _dynesty(case: Case, seed: int, calls: int) -> Run:
 
 
 class Contender(NamedTuple):
-    """A sampler, its steps in a full and in a quick run, and the package that it needs."""
+    """A sampler."""
 
     run: Callable[..., Run]
-    steps: tuple[int, int]
+    steps: tuple[int, int]  # In a full and in a quick run
     package: str = "emcee"
 
 
@@ -250,38 +247,3 @@ def sample_all(case: Case, seed: int, quick: bool) -> dict[str, Run | str]:
             run = found[name] = contender.run(case, seed, contender.steps[quick])
             print(f"  {name}: {run.calls} evaluations, {run.seconds:.0f} s, {run.ess:.0f} effective; {run.reason}")
     return found
-
-
-def collect(case: Case, runs: Mapping[str, Run | str]) -> dict[str, Any]:
-    """Return the entries of results.json on one case."""
-    samplers = {name: run.account(case.names) for name, run in runs.items() if isinstance(run, Run)}
-    differences = compare_all({name: e["moments"] for name, e in samplers.items() if e["length"] >= LONG})
-    return {
-        "samplers": samplers,
-        "without": {name: reason for name, reason in runs.items() if isinstance(reason, str)},
-        "compared": len(differences),
-        "largest_difference": max(differences, key=lambda d: d["errors"], default=None),
-    }
-
-
-def compare_all(tables: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[dict[str, Any]]:
-    """Return every difference of two samplers in a mean or sd, over the combined Monte Carlo error."""
-    return [
-        {
-            "samplers": [one, other],
-            "quantity": f"{kind} of {name}",
-            "errors": abs(tables[one][name][kind] - tables[other][name][kind])
-            / float(np.hypot(tables[one][name][f"{kind}_error"], tables[other][name][f"{kind}_error"])),
-        }
-        for one, other in combinations(tables, 2)
-        for name in tables[one]
-        for kind in ("mean", "sd")
-    ]
-
-
-def limit(count: int) -> float:
-    """Return the limit that the largest of `count` differences exceeds with a probability of at most 1 % (Bonferroni).
-
-    Each is Student's t; its degrees of freedom are at least those of one sampler's error, one less than it has batches.
-    """
-    return float(stats.t.isf(0.5 * FALSE_ALARM / max(count, 1), ENSEMBLES * sampling_ridge.BATCHES - 1))

@@ -5,13 +5,14 @@ The ridge is computed; the damper is measured or synthetic, see studies/damper/r
 
 import argparse
 from collections.abc import Mapping
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from scipy import stats
 
 from studies import common
 from studies.sampling import cost as sampling_cost
@@ -20,10 +21,11 @@ from studies.sampling import ridge as sampling_ridge
 from studies.sampling.efficiency import OURS
 
 GAIN, LEAST_GAIN = (efficiency.DAMPER, efficiency.DUFFING), 8.0
+FALSE_ALARM = 0.01
 TRUTH, DRAWS, HISTOGRAM = "#000000", "#0072B2", "#56B4E9"
 SHOWN = 1500
 FARTHEST = 4.0
-BAR, NEUTRAL, LIMIT = "#56B4E9", "#BBBBBB", "#D55E00"
+NEUTRAL = "#BBBBBB"
 
 
 def run(options: argparse.Namespace) -> None:
@@ -42,22 +44,53 @@ def run(options: argparse.Namespace) -> None:
     for name, case in cases.items():
         with watch.part(name, f"{name} by all samplers"):
             runs = efficiency.sample_all(case, options.seed, options.quick)
-        found["efficiency"][name] = efficiency.collect(case, runs)
+        found["efficiency"][name] = collect(case, runs)
     found |= {"data": data, "cost": cost | {"note": busy}}
     found["checks"] = sampling_ridge.rows(found["ridge"]) + rows(found["efficiency"], options.quick)
     found["checks"] += against_quadrature(found["efficiency"][efficiency.RIDGE]["samplers"])
     found["checks"] += sampling_cost.rows(cost)
     with watch.part("figures", "drawing"):
         # The ridge is the last case.
-        figures = {
-            "ridge": draw_ridge(runs),
-            "samplers": draw_samplers(found["efficiency"]),
-            "costs": draw_costs(cost, busy),
-        }
+        figures = {"ridge": draw_ridge(runs), "samplers": draw_samplers(found["efficiency"])}
         paths = common.save_figures(options.out, figures)
     print("\n" + tables(found) + "\n")
     results = {"seed": options.seed, "quick": options.quick} | found
     common.finish(options.out, results, watch, paths, synthetic=data["synthetic"])
+
+
+def collect(case: efficiency.Case, runs: Mapping[str, efficiency.Run | str]) -> dict[str, Any]:
+    """Return the entries of results.json on one case."""
+    samplers = {name: run.account(case.names) for name, run in runs.items() if isinstance(run, efficiency.Run)}
+    differences = compare_all({name: e["moments"] for name, e in samplers.items() if e["length"] >= efficiency.LONG})
+    return {
+        "samplers": samplers,
+        "without": {name: reason for name, reason in runs.items() if isinstance(reason, str)},
+        "compared": len(differences),
+        "largest_difference": max(differences, key=lambda d: d["errors"], default=None),
+    }
+
+
+def compare_all(tables: Mapping[str, Mapping[str, Mapping[str, float]]]) -> list[dict[str, Any]]:
+    """Return every difference of two samplers in a mean or sd, over the combined Monte Carlo error."""
+    return [
+        {
+            "samplers": [one, other],
+            "quantity": f"{kind} of {name}",
+            "errors": abs(tables[one][name][kind] - tables[other][name][kind])
+            / float(np.hypot(tables[one][name][f"{kind}_error"], tables[other][name][f"{kind}_error"])),
+        }
+        for one, other in combinations(tables, 2)
+        for name in tables[one]
+        for kind in ("mean", "sd")
+    ]
+
+
+def limit(count: int) -> float:
+    """Return the limit that the largest of `count` differences exceeds with a probability of at most 1 % (Bonferroni).
+
+    Each is Student's t; its degrees of freedom are at least those of one sampler's error, one less than it has batches.
+    """
+    return float(stats.t.isf(0.5 * FALSE_ALARM / max(count, 1), efficiency.ENSEMBLES * sampling_ridge.BATCHES - 1))
 
 
 def rows(found: Mapping[str, Any], quick: bool) -> list[common.Row]:
@@ -74,7 +107,7 @@ def rows(found: Mapping[str, Any], quick: bool) -> list[common.Row]:
             gain = samplers[own]["ess_per_1000"] / samplers["emcee"]["ess_per_1000"]
             what = f"{case}: effective samples per evaluation, {own} over emcee's default move"
             result.append(common.row(what, gain, LEAST_GAIN, None))
-        worst, most = entry["largest_difference"], efficiency.limit(entry["compared"])
+        worst, most = entry["largest_difference"], limit(entry["compared"])
         short = [name for name, e in samplers.items() if e["length"] < efficiency.LONG]
         note = f"{worst['quantity']}, {' against '.join(worst['samplers'])}" if worst else "no two long runs"
         note += f"; shorter than {efficiency.LONG:.0f} tau: {', '.join(short)}" if short else ""
@@ -85,7 +118,7 @@ def rows(found: Mapping[str, Any], quick: bool) -> list[common.Row]:
 
 def against_quadrature(samplers: Mapping[str, Any]) -> list[common.Row]:
     """Return of every sampler the error of sd(a) on the ridge, without a verdict if its run is too short."""
-    truth, most, result = sampling_ridge.spread(cut=True), efficiency.limit(len(samplers)), []
+    truth, most, result = sampling_ridge.spread(cut=True), limit(len(samplers)), []
     for name, entry in samplers.items():
         sd, error = entry["moments"]["a"]["sd"], entry["moments"]["a"]["sd_error"]
         note = f"{name}: sd over that by quadrature {sd / truth:.3f} ± {error / truth:.3f}"
@@ -160,61 +193,15 @@ def draw_samplers(found: Mapping[str, Any]) -> Figure:
                 entry = of[name][column]
                 if entry is None:
                     continue
-                colour = NEUTRAL if entry["length"] < efficiency.LONG else DRAWS if name in OURS else BAR
+                colour = NEUTRAL if entry["length"] < efficiency.LONG else DRAWS if name in OURS else HISTOGRAM
                 bar = axes.barh(at, entry[key], color=colour, edgecolor="black", lw=0.6)
                 axes.bar_label(bar, [f"{entry[key]:.2g}" if entry[key] < 10 else f"{entry[key]:.0f}"], padding=2)
             axes.set(xscale="log", xlabel=unit, yticks=range(len(order)), yticklabels=order)
             axes.set_title(case if key == "ess_per_1000" else "", fontsize=11)
         values = [entry[key] for entries in of.values() for entry in entries if entry]
         line[0].set_xlim(0.4 * min(values), 12.0 * max(values))
-    kinds = {"this package": DRAWS, "other packages": BAR, f"shorter than {efficiency.LONG:.0f} tau": NEUTRAL}
+    kinds = {"this package": DRAWS, "other packages": HISTOGRAM, f"shorter than {efficiency.LONG:.0f} tau": NEUTRAL}
     handles = [Patch(facecolor=colour, edgecolor="black", label=kind) for kind, colour in kinds.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     figure.suptitle("Effective samples of the slowest quantity", fontsize=11)
     return figure
-
-
-def draw_costs(cost: dict[str, Any], busy: str) -> Figure:
-    """Draw the overhead of pools and the gain of cores, with the limits; grey without a verdict."""
-    figure = plt.figure(figsize=(10.0, 4.8), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    pools, gains = cost["pools"], cost["vectorised"]
-    if pools is None:
-        left.text(0.5, 0.4, "not measured", ha="center", va="center", transform=left.transAxes)
-        left.set(xticks=[], ylim=(0.0, 8.0))
-    else:
-        values = 1e2 * (np.array([[e["median"], *e["quartiles"]] for e in pools["ratios"].values()]) - 1.0)
-        names = [f"one {name}\nworker" for name in pools["ratios"]]
-        _draw_bars(left, names, values, [NEUTRAL if busy else BAR] * len(names))
-        left.axhline(0.0, color="black", lw=0.8)
-        left.set_ylim(min(-1.0, 1.2 * values.min()), max(8.0, 1.5 * values.max()))
-    _draw_limit(left, 1e2 * (sampling_cost.POOL_LIMIT - 1.0), "limit: at most {:g} %")
-    title = f"A pool of one worker, log-posteriors of {1e3 * sampling_cost.LOG_POSTERIOR:g} ms"
-    left.set(ylabel="wall time beyond that of one thread [%]", title=title)
-    drives = {f"landing gear,\n{drive}-driven": gains[drive] for drive in ("force", "displacement")}
-    colours = [NEUTRAL if busy or e["plain"] < sampling_cost.LEAST_GAIN else BAR for e in drives.values()]
-    values = np.array([[e["ratio"], *e["ratio_quartiles"]] for e in drives.values()])
-    _draw_bars(right, list(drives), values, colours)
-    for at, entry in enumerate(drives.values()):
-        right.text(at, 0.05, f"call × {entry['gain']:.2f}\nloop × {entry['plain']:.2f}", ha="center", va="bottom")
-    right.set_ylim(0.0, max(1.35, 1.3 * values.max()))
-    _draw_limit(right, sampling_cost.GAIN_LIMIT, "limit: at least {:g}")
-    title = f"{gains['cores']} cores on a call of {gains['walkers']} walkers × {gains['experiments']} experiments"
-    right.set(ylabel="gain of the call / gain of a plain loop [1]", title=title)
-    figure.suptitle("Cost of sampling" + (f": {busy}" if busy else ""), fontsize=11)
-    return figure
-
-
-def _draw_bars(axes: Axes, names: list[str], values: np.ndarray, colours: list[str]) -> None:
-    """Draw medians and quartiles, (bars, 3)."""
-    at, ranges = np.arange(len(names)), np.abs(values[:, 1:] - values[:, :1]).T
-    axes.bar(at, values[:, 0], width=0.5, color=colours, edgecolor="black")
-    label = "quartiles of the repeats"
-    axes.errorbar(at, values[:, 0], ranges, fmt="none", ecolor="black", capsize=5, label=label)
-    axes.set_xticks(at, names)
-    axes.set_xlim(-0.6, len(names) - 0.4)
-
-
-def _draw_limit(axes: Axes, limit: float, what: str) -> None:
-    axes.axhline(limit, color=LIMIT, lw=1.8, ls="--", label=what.format(round(limit, 6)))
-    axes.legend(frameon=False, loc="upper right", ncols=2, fontsize=9)
