@@ -1,11 +1,11 @@
 """Effective samples per density evaluation and per second, by `bp.sample` and by samplers of other packages.
 
-All sample the same density over parameters and unknown variances, the prior of variances being 1/v, and start from the
-Laplace approximation. emcee's default move has natural parameters, as in its tutorial, the others logarithms of
-positive ones. dynesty takes the priors' quantile functions, and for 1/v, which is improper, the log-uniform
-distribution within a factor of 100 of the estimate. Ensembles are evaluated in blocks on all cores, other samplers
-point by point. zeus 2.5.4 runs with NumPy 2.4 and is compared if it is installed. pocoMC 1.2.6 runs too, but spends
-minutes on training networks of PyTorch, and is left out.
+All sample the same density over parameters and unknown variances, the prior of variances being 1/v, and start from
+draws of the Laplace approximation. emcee's default move has natural parameters and starts from a small ball, as in its
+tutorial; the others have logarithms of positive parameters. dynesty takes the priors' quantile functions, and for 1/v,
+which is improper, the log-uniform distribution within a factor of 100 of the estimate. Ensembles are evaluated in
+blocks on all cores, other samplers point by point. zeus 2.5.4 runs with NumPy 2.4 and is compared if it is installed.
+pocoMC 1.2.6 runs too, but spends minutes on training networks of PyTorch, and is left out.
 """
 
 import importlib
@@ -27,6 +27,7 @@ from studies.sampling import ridge as sampling_ridge
 from studies.timing import timed
 
 ENSEMBLES, WALKERS, LIVE, REPLICAS = 4, 32, 500, 20
+BALL = 0.1
 LONG = 50.0  # Autocorrelation times; shorter runs have no verdict
 DAMPER, DUFFING, RIDGE = "damper", "Duffing", "ridge"
 OURS = ("bp.sample", "bp.sample, collapsed", "NUTS")
@@ -44,10 +45,10 @@ class Case:
         self.mode = np.array([self.fit.joint_mode[name] for name in self.names])
         self.covariance = self.fit.joint_covariance.loc[self.names, self.names].to_numpy()
 
-    def starts(self, size: int, generator: np.random.Generator) -> np.ndarray:
-        """Return draws (size, names) of the Laplace approximation, in natural values."""
+    def starts(self, size: int, generator: np.random.Generator, sd: float = 1.0) -> np.ndarray:
+        """Return draws (size, names) of the Laplace approximation with `sd` times its sds, in natural values."""
         centre = np.log(self.mode, out=self.mode.copy(), where=self.positive)
-        drawn = generator.multivariate_normal(centre, self.covariance, size)
+        drawn = generator.multivariate_normal(centre, sd**2 * self.covariance, size)
         return np.exp(drawn, out=drawn, where=self.positive)
 
 
@@ -146,7 +147,7 @@ def _ensembles(
 
     def one(number: int) -> np.ndarray:
         np.random.seed(ENSEMBLES * seed + number)  # noqa: NPY002 (the generator of both)
-        start = case.starts(WALKERS, generator)
+        start = case.starts(WALKERS, generator, BALL if coordinates == "natural" else 1.0)
         start = np.log(start, out=start, where=target.logarithmic)
         sampler = sampler_of(*start.shape, target, vectorize=True, **options)
         sampler.run_mcmc(start, steps, progress=False)
@@ -215,10 +216,10 @@ CONTENDERS = {
     OURS[0]: Contender(_own, (20_000, 250)),
     OURS[1]: Contender(partial(_own, variances="collapsed"), (20_000, 250)),
     OURS[2]: Contender(partial(_own, sampler="nuts"), (20_000, 250), "nutpie"),
-    "emcee": Contender(partial(_ensembles, coordinates="natural"), (4200, 200)),
+    "emcee": Contender(partial(_ensembles, coordinates="natural"), (4500, 200)),
     "emcee, DE": Contender(partial(_ensembles, moves=EVOLUTION), (2000, 200)),
-    "zeus": Contender(partial(_ensembles, module="zeus", verbose=False), (560, 40), "zeus"),
-    "PINTS, population": Contender(_pints, (12_000, 2000), "pints"),
+    "zeus": Contender(partial(_ensembles, module="zeus", verbose=False), (700, 40), "zeus"),
+    "PINTS, population": Contender(_pints, (20_000, 2000), "pints"),
     "dynesty": Contender(_dynesty, (300_000, 5000), "dynesty"),
 }
 
