@@ -124,7 +124,8 @@ def against_quadrature(samplers: Mapping[str, Any]) -> list[common.Row]:
         note = f"{name}: sd over that by quadrature {sd / truth:.3f} ± {error / truth:.3f}"
         what = f"ridge, {name}: sd(a) against quadrature, in Monte Carlo errors"
         judged = common.row(what, abs(sd - truth) / error, 0.0, most, note)
-        short = {"met": None, "note": f"{note}; without a verdict, only {entry['length']:.0f} tau long"}
+        why = f"only {entry['length']:.0f} tau long" if entry["length"] else "stopped before its end"
+        short = {"met": None, "note": f"{note}; without a verdict, {why}"}
         result.append(judged if entry["length"] >= efficiency.LONG else judged | short)
     return result
 
@@ -133,7 +134,8 @@ def tables(found: dict[str, Any]) -> str:
     """Return the text to print."""
     columns, lines = ["evaluations", "seconds", "length", "ess_min", "ess_per_1000", "ess_per_second"], []
     for case, entry in found["efficiency"].items():
-        lines += [common.shown(f"Effective samples, {case}", entry["samplers"], columns), ""]
+        lines += [common.shown(f"Effective samples, {case}", entry["samplers"], columns)]
+        lines += [*(f"{name}: {reason}" for name, reason in entry["without"].items()), ""]
     pools = found["cost"]["pools"]
     if pools is not None:
         title = (
