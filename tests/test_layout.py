@@ -5,8 +5,8 @@ from statistics import median
 from tests import layout
 
 # The package had 25,000 lines when it was last shortened; the rest is room for the statistics and the checks of input
-# that were missing then, and of the evidence and comparison of models.
-MOST_FILES, MOST_LINES, LONGEST_FILE = 105, 29_600, 600
+# that were missing then, of the evidence and comparison of models, and of proposals for curved posteriors.
+MOST_FILES, MOST_LINES, LONGEST_FILE = 105, 29_620, 600
 MOST_PARAMETERS = 8
 REASONS = {
     "Experiment": "one field per measured quantity; four are required, the rest are keywords with defaults",

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -124,12 +124,12 @@ def fit_mixture(draws: np.ndarray, candidates: Sequence[StudentMixture] = ()) ->
         if count > 1 and len(train) < PER_COMPONENT * count * draws.shape[2]:
             break
         fitted = _fitted(train, count, curvature)
-        found = {nu: float(_with_wider(_of_degrees(fitted, nu)).log_density(test).mean()) for nu in (HEAVY, LIGHT)}
+        found = {nu: float(_with_wider(fitted, nu).log_density(test).mean()) for nu in (HEAVY, LIGHT)}
         if (score := max(found.values())) > best + (GAIN if size else 0.0):
             best, size, degrees, chosen, worse = score, count, max(found, key=found.__getitem__), None, 0
         elif (worse := worse + 1) == 2:
             break
-    return _with_wider(chosen or _of_degrees(_fitted(points, size, _curvature(points, bent)), degrees))
+    return _with_wider(chosen) if chosen else _with_wider(_fitted(points, size, _curvature(points, bent)), degrees)
 
 
 def _products(points: np.ndarray) -> np.ndarray:
@@ -139,36 +139,32 @@ def _products(points: np.ndarray) -> np.ndarray:
     return wide[:, first] * wide[:, second]
 
 
-def _regression(points: np.ndarray, bent: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients of the first coordinates by the others, linear and then with products: ridge regressions."""
-    others = points[:, bent:]
-    linear = np.column_stack([np.ones(len(points)), others])
-    found = []
-    for terms in (linear, np.column_stack([linear, _products(others)])):
-        square = terms.T @ terms
-        square += RIDGE * np.diag(np.diag(square))
-        found.append(np.linalg.solve(square, terms.T @ points[:, :bent]).T)
-    return found[0], found[1]
+def _terms(points: np.ndarray, bent: int) -> np.ndarray:
+    return np.column_stack([np.ones(len(points)), points[:, bent:], _products(points[:, bent:])])
+
+
+def _coefficients(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
+    square = terms.T @ terms
+    return np.linalg.solve(square + RIDGE * np.diag(np.diag(square)), terms.T @ values)
 
 
 def _bent(train: np.ndarray, test: np.ndarray) -> int:
-    """Return how many of the first coordinates are curved: that with the smallest residuals at the test points."""
+    """Return how many of the first coordinates are curved: where products reduce the variance at the test points."""
     dimension, gains = train.shape[1], {0: GAIN}
     for bent in sorted({1, 2, 3, dimension // 4, dimension // 2} & set(range(1, dimension))):
-        others = test[:, bent:]
-        linear = np.column_stack([np.ones(len(test)), others])
-        plain, curved = _regression(train, bent)
-        variances = [
-            (test[:, :bent] - terms @ coefficients.T).var(axis=0)
-            for terms, coefficients in ((linear, plain), (np.column_stack([linear, _products(others)]), curved))
-        ]
-        gains[bent] = 0.5 * float(np.sum(np.log(variances[0] / variances[1])))
+        known, new = _terms(train, bent), _terms(test, bent)
+        straight, curved = (
+            (test[:, :bent] - new[:, :count] @ _coefficients(known[:, :count], train[:, :bent])).var(axis=0)
+            for count in (1 + dimension - bent, None)
+        )
+        gains[bent] = 0.5 * float(np.sum(np.log(straight / curved)))
     return max(gains, key=gains.__getitem__)
 
 
 def _curvature(points: np.ndarray, bent: int) -> np.ndarray:
     """Return the coefficients (bent, products) of the products."""
-    return _regression(points, bent)[1][:, 1 + points.shape[1] - bent :] if bent else np.empty((0, 0))
+    linear = 1 + points.shape[1] - bent
+    return _coefficients(_terms(points, bent), points[:, :bent])[linear:].T if bent else np.empty((0, 0))
 
 
 def _fitted(draws: np.ndarray, count: int, curvature: np.ndarray) -> StudentMixture:
@@ -189,12 +185,10 @@ def _fitted(draws: np.ndarray, count: int, curvature: np.ndarray) -> StudentMixt
     return StudentMixture(found.weights_, found.means_, factors, np.full(count, HEAVY), curvature)
 
 
-def _of_degrees(mixture: StudentMixture, degrees: float) -> StudentMixture:
-    return replace(mixture, degrees=np.full(len(mixture.weights), degrees))
-
-
-def _with_wider(mixture: StudentMixture) -> StudentMixture:
+def _with_wider(mixture: StudentMixture, degrees: float | None = None) -> StudentMixture:
+    """Return a mixture, with `degrees` if given, and wider components."""
+    count = len(mixture.weights)
     weights = np.concatenate([(1.0 - WIDE) * mixture.weights, WIDE * mixture.weights])
     factors, means = np.concatenate([mixture.factors, WIDER * mixture.factors]), np.tile(mixture.means, (2, 1))
-    degrees = np.append(mixture.degrees, np.full(len(mixture.weights), HEAVY))
-    return StudentMixture(weights, means, factors, degrees, mixture.curvature)
+    own = mixture.degrees if degrees is None else np.full(count, degrees)
+    return StudentMixture(weights, means, factors, np.append(own, np.full(count, HEAVY)), mixture.curvature)

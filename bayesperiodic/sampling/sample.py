@@ -80,10 +80,12 @@ def sample(
     parameters are sampled in their logarithms, where ridges of products are straight; Jeffreys' prior 1/v is constant
     there. The eigenvectors of the Laplace approximation in these coordinates are the axes. Four steps in five propose
     from a mixture of Student t distributions, independently of the walkers; the others are differential-evolution [2]_
-    and stretch moves within each ensemble, for what the mixture misses. The mixture is fitted to the draws of all
-    ensembles every 50 steps of the burn-in, which is removed; it ends when a tau of at most 3 is expected, or after
-    1000 steps, and the mixture is fixed. On the posterior of the damper, in six dimensions, tau is 2, with moves within
-    the ensembles alone 23.
+    and stretch moves within each ensemble, for what the mixture misses. The narrow axes of the mixture follow quadratic
+    forms of the wider ones, where ridges are curved. It is fitted to the draws of all ensembles every 50 steps of the
+    burn-in, which is removed; that ends when a tau of at most 3 is expected, or after 1000 steps, and the mixture is
+    fixed. Before 1000 steps the burn-in starts again if later draws let a tau above 6 be expected. On the posterior of
+    the damper, in six dimensions, tau is 2, with moves within the ensembles alone 23; on that of the landing gear's 15
+    parameters and two variances 2.6 and 82.
 
     Sampling stops if, twice in succession, the chain after the burn-in and after its first fifth is 50 autocorrelation
     times long, that time has changed by less than 5 %, R-hat between the ensembles is at most 1.005 and their 5, 50 and
