@@ -201,7 +201,7 @@ def draw_samplers(found: Mapping[str, Any]) -> Figure:
             axes.set(xscale="log", xlabel=unit, yticks=range(len(order)), yticklabels=order)
             axes.set_title(case if key == "ess_per_1000" else "", fontsize=11)
         values = [entry[key] for entries in of.values() for entry in entries if entry]
-        line[0].set_xlim(0.4 * min(values), 12.0 * max(values))
+        line[0].set_xlim(0.4 * min(values), 25.0 * max(values))
     kinds = {"this package": DRAWS, "other packages": HISTOGRAM, f"shorter than {efficiency.LONG:.0f} tau": NEUTRAL}
     handles = [Patch(facecolor=colour, edgecolor="black", label=kind) for kind, colour in kinds.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
