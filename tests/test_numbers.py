@@ -382,7 +382,7 @@ def calibration():
     assert all(quantity.startswith("variance") for _, quantity in rejected)
     own, laplace = (next(r for r in d["two_optima"]["table"] if r["method"] == m) for m in ("mcmc", "laplace"))
     assert own["quantity"] == laplace["quantity"] == "a"
-    yield f"cover a in {laplace['coverage_90']:.0%} of the cases with two optima, those of MCMC in"
+    yield f"cover a in {laplace['coverage_90']:.0%} of the cases with two optima"
     yield f"those of MCMC in {own['coverage_90']:.0%}."
     assert sum(d[case]["stop_rule_passed"] for case in cases) == 1
     draws = [d[case]["independent_draws"] for case in cases]
