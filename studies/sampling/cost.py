@@ -21,7 +21,9 @@ from studies.gear import GEAR, RIG, gear_problem
 from studies.timing import gain_of_cores, plain_loop, timed
 
 LOG_POSTERIOR, SHORT = 5e-3, 1e-5
-WALKERS, ENSEMBLES, STEPS, PIECE = 4, 2, 250, 25
+# Half a step is one task, of as many points as in a default run.
+WALKERS, ENSEMBLES, STEPS = 8, 4, 100
+PIECE = WALKERS * ENSEMBLES // 2
 POOLS = ("process", "dask")
 POINTS = 64
 TURNS = 100_000
@@ -88,8 +90,8 @@ def pool_overhead(repeats: int = 3, pools: tuple[str, ...] = POOLS, seconds: flo
     Both compute on the same core, the worker while this process waits on another one: then neither the cores' speeds
     nor other load on them affects the comparison. Runs alternate, thread, processes, thread, Dask, thread, and so on,
     and each is compared with the mean of its two neighbours. The workers have done a short run before, as starting
-    processes takes seconds whatever the length of a run. A piece, which is what a message carries, is 4 walkers × 25
-    steps, an eighth of what the default walkers make it, so that the overhead of a default run is smaller.
+    processes takes seconds whatever the length of a run. Half a step of all ensembles is one task of 16 points, as
+    large as the tasks of a default run.
 
     `repeats`: Of each pool, 20 s each. `pools`: "dask" is omitted if it is not installed. `seconds`: Of a
     log-posterior. Processor times are those of this process and the worker together; other load changes them little.
@@ -124,7 +126,7 @@ def pool_overhead(repeats: int = 3, pools: tuple[str, ...] = POOLS, seconds: flo
         "ratios": ratios,
         "milliseconds": {"wall": float(wall), "processor": float(processor)},
         "walkers": WALKERS,
-        "log_posteriors": {"run": count, "piece": WALKERS * PIECE},
+        "log_posteriors": {"run": count, "piece": PIECE},
     }
 
 

@@ -205,7 +205,7 @@ def test_wrong_spread_of_the_natural_chain_passes_only_without_claimed_convergen
 def test_overhead_of_a_worker_is_measured():
     found = sampling_cost.pool_overhead(1, ("process",), 1e-5)
     assert found["ratios"]["process"]["median"] > 0.0 and found["ratios"]["process"]["processor_time"] > 0.0
-    assert found["log_posteriors"]["piece"] == 100 and found["log_posteriors"]["run"] >= 2000
+    assert found["log_posteriors"]["piece"] == 16 and found["log_posteriors"]["run"] >= 2000
 
 
 def test_gain_has_no_verdict_if_a_plain_loop_gains_nothing():
