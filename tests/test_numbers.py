@@ -413,7 +413,7 @@ def verdicts():
 
 def sampling():
     d = results("sampling")
-    yield f"{d['seconds']['total'] / 60:.0f} minutes on two cores; what pools cost"
+    yield f"{d['seconds']['total'] / 60:.0f} minutes on two cores; what several cores gain"
     force, displacement = (d["cost"]["vectorised"][drive] for drive in ("force", "displacement"))
     yield (
         f"Calls of {d['cost']['vectorised']['walkers']} walkers of the landing gear take {force['milliseconds']:.0f} "
