@@ -420,6 +420,12 @@ def sampling():
         f"and {displacement['milliseconds']:.0f} ms, so short that two cores gain {force['gain']:.2f} and "
         f"{displacement['gain']:.2f} times on them, and {force['plain']:.2f} times on a plain loop"
     )
+    pools = d["cost"]["pools"]
+    process, dask = (100 * (pools["ratios"][name]["median"] - 1) for name in ("process", "dask"))
+    yield (
+        f"At {pools['milliseconds']['wall']:.0f} ms a density a pool of one process costs {process:.0f} %, one of Dask "
+        f"{dask:.0f} %"
+    )
     pairs = {
         name: f"{entry['ess_per_1000']:.0f}{{}} and {entry['ess_per_second']:.0f}{{}}"
         for name, entry in d["efficiency"]["damper"]["samplers"].items()
