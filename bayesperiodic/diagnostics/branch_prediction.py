@@ -192,7 +192,7 @@ def predict_branch(
     names = [e.name for e in problem.experiments]
     name = names[0] if experiment is None else experiment
     _checks.one_of("experiment", name, names)
-    check_results(problem, posterior=posterior)
+    problem = check_results(problem, posterior=posterior)
     size = posterior.draws(problem.names[0]).size
     points, _ = draws_of(problem, posterior, np.linspace(0, size - 1, count).astype(int))
     guesses = posterior.guesses([*problem.observations], problem.model.states)

@@ -177,7 +177,7 @@ def compare(problem: Problem, fit: MapEstimate, posterior: Posterior, *, coordin
     """
     _checks.instance("problem", problem, Problem)
     _checks.one_of("coordinates", coordinates, COORDINATES)
-    check_results(problem, fit=fit, posterior=posterior)
+    problem = check_results(problem, fit=fit, posterior=posterior)
     scored = _scores(problem, fit, posterior, coordinates)
     if scored is None:
         raise ValueError(

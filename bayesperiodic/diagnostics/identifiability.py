@@ -252,7 +252,7 @@ def identifiability(
     >>> bp.identifiability(problem, fit, profile=False).verdicts
     {'c': 'determined', 'k': 'determined'}
     """
-    check_results(problem, fit=fit, **({} if posterior is None else {"posterior": posterior}))
+    problem = check_results(problem, fit=fit, **({} if posterior is None else {"posterior": posterior}))
     information, structure = Information.of(problem, fit), structure_of(problem)
     shapes = profile_of(problem, fit).shape if profile is True else profile.shape if profile else {}
     options = default_candidates(problem) if candidates is None else [Candidate(*c) for c in candidates]

@@ -131,7 +131,7 @@ def compare_models(models: Mapping[str, tuple[Problem, Posterior]], *, held_out:
     >>> print(bp.compare_models(springs, held_out=False).conclusion.partition(" (")[0])
     'cubic' is preferred by evidence and leave-one-out prediction
     """
-    _check(models)
+    models = _checked(models)
     notes: list[str] = []
     provisional = {name for name, (_, draws) in models.items() if not draws.converged}
     experiments = _experiments(models, held_out, notes)
@@ -159,8 +159,9 @@ def compare_models(models: Mapping[str, tuple[Problem, Posterior]], *, held_out:
     return ModelComparison(table, experiments, conclusion, tuple(dict.fromkeys(notes)), synthetic)
 
 
-def _check(models: Any) -> None:
-    """Raise a ValueError for anything else than models of the same data with their draws."""
+def _checked(models: Any) -> dict[str, tuple[Problem, Posterior]]:
+    """Return models of the same data with their draws; raise a ValueError for anything else."""
+    given = {}
     _checks.mapping("models", models, "{'Dahl': (problem, posterior), …}")
     if len(models) < 2:
         raise ValueError(f"models: must be at least two, got {list(models)}.")
@@ -168,13 +169,13 @@ def _check(models: Any) -> None:
         if not (isinstance(pair, tuple | list) and len(pair) == 2 and isinstance(pair[0], Problem)):
             raise ValueError(f"models[{name!r}]: must be (problem, posterior), got {_checks.shortened(pair)}.")
         try:
-            check_results(pair[0], posterior=pair[1])
+            given[name] = check_results(pair[0], posterior=pair[1]), pair[1]
         except ValueError as error:
             raise ValueError(f"models[{name!r}]: {error}") from None
-    first, *others = models
-    wanted = _data(models[first][0])
+    first, *others = given
+    wanted = _data(given[first][0])
     for other in others:
-        data = _data(models[other][0])
+        data = _data(given[other][0])
         if [*data.items()] != [*wanted.items()]:
             different = [key for key in wanted | data if wanted.get(key) != data.get(key)] or ["order"]
             raise ValueError(
@@ -182,6 +183,7 @@ def _check(models: Any) -> None:
                 f"harmonics, got {first!r} and {other!r} with different {different[0]}. Evidence and prediction of "
                 "different data cannot be compared; give both problems the same experiments."
             )
+    return given
 
 
 FIELDS = ("outputs", "frequency", "frequency_se", "samples", "mask", "covariance", "multipliers", "multiplier_sd")

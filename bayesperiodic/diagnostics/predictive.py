@@ -308,7 +308,7 @@ def predict(
     count = _checks.integer("draws", draws, 20)
     if experiment is not None and run is None:
         raise ValueError(f"experiment: must be given together with `run`, got {experiment!r} without `run`.")
-    check_results(problem, posterior=posterior)
+    problem = check_results(problem, posterior=posterior)
     lp = posterior.tree["sample_stats"]["lp"].transpose(CHAIN, DRAW).to_numpy()
     points, noise = draws_of(problem, posterior, np.linspace(0, lp.size - 1, count).astype(int))
     peak = draws_of(problem, posterior, [int(np.argmax(lp))])[0][0]

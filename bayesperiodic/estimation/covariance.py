@@ -13,7 +13,8 @@ from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.equations import PeriodicEquations, input_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 from bayesperiodic.periodic.solve import solve_driven, solve_free
-from bayesperiodic.posterior.noise import LENGTHSCALE, SPECTRAL, VARIANCE, Block
+from bayesperiodic.posterior.input_noise import InputNoise, directions, error_waves, expected_errors
+from bayesperiodic.posterior.noise import LENGTHSCALE, POINTS, SPECTRAL, VARIANCE, Block
 from bayesperiodic.posterior.observation import Response
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import orbit_multipliers
@@ -343,40 +344,82 @@ def _on_twice_the_points(
     return Response(outputs, np.array(equations.frequency), np.log(np.abs(found)), np.array(delay))
 
 
-def input_noise(problem: Problem, theta: np.ndarray, solutions: Mapping[str, PeriodicSolution]) -> dict[str, float]:
+def input_loadings(
+    problem: Problem, theta: np.ndarray, solutions: Mapping[str, PeriodicSolution], noise: InputNoise
+) -> dict[str, np.ndarray]:
+    """Return L (components of all blocks, errors) of every experiment with noisy inputs, at its periodic solution.
+
+    Without those whose problem is singular.
+    """
+    found = {}
+    for e in problem.experiments:
+        changes, solution = directions(e, problem.model.inputs, noise), solutions[e.name]
+        if not len(changes):
+            continue
+        equations = problem.equations[e.name].at_frequency(solution.frequency)
+        values = problem.parameter_maps[e.name].values(theta[None])[0]
+        parameters, z = np.ascontiguousarray(values[:-1]), periodic_part(equations, solution.states)
+        moved = input_sensitivities(equations, z, parameters, changes)
+        if moved is None:
+            continue
+        count, none = 0 if e.multipliers is None else e.multipliers.size, np.zeros(len(changes))
+        here = Response(
+            equations.outputs(z, parameters), np.array(equations.frequency), np.empty(count), np.array(values[-1])
+        )
+        along = Response(moved.outputs, moved.frequency, np.zeros((len(changes), count)), none)
+        found[e.name] = np.concatenate(problem.observations[e.name].changes(here, along), axis=1).T
+    return found
+
+
+def caused_by_inputs(problem: Problem, loadings: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Return the standard deviation that the inputs' noise causes in each channel, root mean square over experiments.
 
-    The noise of each kept Fourier amplitude of an input and of its derivatives is propagated through the linearised
-    problem; the variance is averaged over the period.
+    The variance is averaged over the period.
     """
     variances: dict[str, list[float]] = {channel: [0.0] for channel in problem.channels}
-    for e in problem.experiments:
-        directions = _perturbations(e)
-        if not len(directions):
-            continue
-        equations = problem.equations[e.name].at_frequency(solutions[e.name].frequency)
-        z = periodic_part(equations, solutions[e.name].states)
-        derivative = input_sensitivities(equations, z, problem.parameters(theta[None], e.name)[0], directions)
-        if derivative is None:
-            continue
-        for channel in e.outputs:
-            moved = e.project(channel, derivative.outputs[:, :, problem.model.outputs.index(channel)])
-            variances[channel].append(float(np.sum(np.mean(moved**2, axis=1))))
+    for name, matrix in loadings.items():
+        blocks = problem.observations[name].blocks
+        for block, own in zip(blocks, np.split(matrix, np.cumsum([b.size for b in blocks])[:-1]), strict=True):
+            if block.channel in variances:
+                variances[block.channel].append(float(np.sum(np.mean(own**2, axis=0))))
     return {channel: float(np.sqrt(np.mean(v[1:] or v))) for channel, v in variances.items()}
 
 
-def _perturbations(experiment: Experiment) -> np.ndarray:
-    """Return one-sd perturbations (directions, points, 3·inputs) of (u, u̇, ü), two a noisy Fourier amplitude."""
-    points = experiment.samples * experiment.periods
-    count, directions = len(experiment.inputs), []
-    for i, name in enumerate(experiment.inputs):
-        for h, variance in enumerate(experiment.amplitude_variance.get(name, ())):
-            for part in (1.0,) if h == 0 else (1.0, 1j):
-                amplitude = np.zeros(h + 1, dtype=complex)
-                amplitude[h] = part * np.sqrt(variance if h == 0 else 0.5 * variance)
-                direction = np.zeros((points, 3 * count))
-                for order in range(3):
-                    rate = _fourier.derivative(amplitude, experiment.frequency / experiment.periods, order)
-                    direction[:, order * count + i] = _fourier.on_grid(rate, points)
-                directions.append(direction)
-    return np.array(directions)
+class EstimatedInputs(NamedTuple):
+    """Estimated true inputs and their sds, by experiment and input, and residuals without the errors of the inputs."""
+
+    values: dict[str, dict[str, np.ndarray]]
+    sd: dict[str, dict[str, np.ndarray]]
+    residuals: list[np.ndarray]  # components, one array (size,) a block
+    compared: dict[str, dict[str, np.ndarray]]  # (points,) by experiment and channel
+
+
+def estimated_inputs(problem: Problem, estimate: Iterate) -> EstimatedInputs:
+    """Return the true inputs given the estimate, linearised there."""
+    likelihood, compared = problem.likelihood, estimate.here.compared()
+    residuals = [r.copy() for r in estimate.here.residuals]
+    values = {e.name: {name: u.copy() for name, u in e.inputs.items()} for e in problem.experiments}
+    sd = {e.name: {name: np.zeros_like(u) for name, u in e.inputs.items()} for e in problem.experiments}
+    for e in problem.experiments:
+        matrix = likelihood.loadings.get(e.name)
+        if matrix is None:
+            continue
+        members = [b for b, block in enumerate(likelihood.blocks) if block.experiment == e.name]
+        own = [residuals[b] for b in members]
+        errors, covariance = expected_errors(matrix, own, likelihood.precisions(members, estimate.noise))
+        caused = np.split(matrix @ errors, np.cumsum([r.size for r in own])[:-1])
+        for b, part in zip(members, caused, strict=True):
+            residuals[b] += part
+            block, points = likelihood.blocks[b], e.samples * e.periods
+            if block.kind == SPECTRAL:
+                compared[e.name][block.channel] += _fourier.from_components(part, points)
+            elif block.kind == POINTS:
+                compared[e.name][block.channel][e.mask] += part
+        where, waves = error_waves(e, problem.input_noise)
+        signals = _fourier.on_grid(waves, e.samples * e.periods)
+        for name in set(where):
+            mine = np.array([owner == name for owner in where])
+            values[e.name][name] -= errors[mine] @ signals[mine]
+            variance = np.einsum("ip,ij,jp->p", signals[mine], covariance[np.ix_(mine, mine)], signals[mine])
+            sd[e.name][name] = np.sqrt(variance)
+    return EstimatedInputs(values, sd, residuals, compared)

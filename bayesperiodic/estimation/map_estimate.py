@@ -13,9 +13,11 @@ from bayesperiodic import _checks
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.estimation.conflict import prior_conflict
 from bayesperiodic.estimation.covariance import (
+    caused_by_inputs,
     degrees_of_freedom,
     doubling_shift,
-    input_noise,
+    estimated_inputs,
+    input_loadings,
     robust_covariance,
     variance_parts,
     with_uncertain_noise,
@@ -40,6 +42,7 @@ from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.posterior.density import NATURAL, RIDGE, Linearisation, LogPosterior
 from bayesperiodic.posterior.description import fingerprint
 from bayesperiodic.posterior.initial import InitialEstimate, measured_orbits, simultaneous_fit
+from bayesperiodic.posterior.input_noise import EXACT, MEASURED
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import Simulator
 
@@ -49,6 +52,8 @@ SHOWN = 3
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
 MOST_UNEXPLAINED = 0.5
+# Linearisations about the estimate, and its change [sds] that ends them.
+MOST_ROUNDS, SETTLED = 10, 0.01
 # Value of a field of MapEstimate that is computed at its first use.
 deferred: Any = partial
 
@@ -149,13 +154,42 @@ def map_estimate(
     ends: list[End | None] = [end]
     for draw in problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0))):
         ends.append(_from_draw(objective, end.iterate, draw, progress))
-    objective, _ = corrected(objective, max((end for end in ends if end), key=preference))
+    best = max((end for end in ends if end), key=preference)
+    problem, objective, best = _with_noisy_inputs(problem, objective, best, progress)
+    objective, _ = corrected(objective, best)
     ends = [end and resumed(objective, end) for end in ends]
     modes = with_images(objective, [end for end in ends if end], partial(_climb, objective, progress=progress))
     result = _describe(problem, objective, modes, tuple(_outcome(problem, end) for end in ends))
     for text in estimation_warnings(problem, result):
         warnings.warn(text, UserWarning, stacklevel=3)
     return result
+
+
+def _with_noisy_inputs(
+    problem: Problem, objective: Objective, end: End, progress: bool
+) -> tuple[Problem, Objective, End]:
+    """Return problem, objective and end of the climb with the errors of the inputs linearised about the estimate."""
+    if problem.input_noise == EXACT:
+        return problem, objective, end
+    for _ in range(MOST_ROUNDS):
+        before, here = end.iterate.theta, end.iterate.here
+        loadings = input_loadings(problem, before, here.simulator.solutions(before), problem.input_noise)
+        problem = problem.with_loadings(loadings)
+        objective = Objective(LogPosterior(problem, here.simulator, coordinates=NATURAL))
+        first = objective.iterate(here, end.iterate.noise)
+        if first is None:
+            break
+        end = _climb(objective, first, progress)
+        step = end.iterate.theta - before
+        if step @ objective.hessian_and_gradient(end.iterate)[0] @ step < SETTLED**2:
+            return problem, objective, end
+    warnings.warn(
+        "The errors of the inputs could not be linearised: the estimate still moves by more than a hundredth of its "
+        "standard deviation when this is repeated. Average more cycles, or keep fewer harmonics of the inputs.",
+        UserWarning,
+        stacklevel=4,
+    )
+    return problem, objective, end
 
 
 def _objective(problem: Problem, near: Linearisation) -> Objective:
@@ -256,7 +290,10 @@ def _describe(
     shift[lost] = np.nan
     covariance[lost], covariance[:, lost] = np.nan, np.nan
     covariance[lost, lost] = np.inf
-    residuals = best.here.compared()
+    found = estimated_inputs(problem, best)
+    residuals = found.compared
+    known = MEASURED if problem.input_noise == EXACT else problem.input_noise
+    loadings = problem.likelihood.loadings or input_loadings(problem, best.theta, solutions, known)
     sampled = objective.density.with_settings(coordinates=RIDGE)
     joint = cache(partial(in_one_thread(joint_laplace), sampled, best))
     others = [joint_laplace(sampled, end.iterate) for end in modes[1:]]
@@ -281,8 +318,11 @@ def _describe(
         rms=rms,
         fvu={c: rms[c] ** 2 / max(_pooled(problem, c, measured) ** 2, np.finfo(float).tiny) for c in problem.channels},
         whiteness=channel_whiteness(problem, best),
-        noise_split=noise_split(problem, best, objective.log_variance_factor),
-        input_noise=input_noise(problem, best.theta, solutions),
+        noise_split=noise_split(problem, found.residuals, objective.log_variance_factor),
+        input_noise=caused_by_inputs(problem, loadings),
+        inputs=found.values,
+        input_sd=found.sd,
+        loadings=problem.likelihood.loadings,
         doubling_shift=dict(zip(names, shift.tolist(), strict=True)),
         other_orbits=best.here.other_orbits,
         at_ends=tuple(np.array(names)[acting & (at_ends(objective, best) != 0.0)].tolist()),
@@ -329,7 +369,7 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
         )
     rates = max(problem.model.input_derivatives().values(), default=0)
     kept = max((np.count_nonzero(v) for e in problem.experiments for v in e.amplitude_variance.values()), default=0)
-    for channel, noise in fit.input_noise.items():
+    for channel, noise in fit.input_noise.items() if not fit.loadings else ():
         if noise > NOISE_SHARE * fit.rms[channel]:
             remedies = ["average more cycles"] + ["keep fewer input harmonics (fold(harmonics=…))"] * int(kept > 2)
             yield (

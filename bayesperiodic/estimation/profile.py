@@ -410,7 +410,7 @@ def _checked_names(problem: Problem, names: Sequence[str] | None) -> tuple[str, 
 
 def _at_estimate(problem: Problem, fit: MapEstimate) -> tuple[Objective, Iterate]:
     """Return the objective and its iterate at the estimate, anchored at the estimate's solutions."""
-    check_results(problem, fit=fit)
+    problem = check_results(problem, fit=fit)
     theta, noise = problem.vector(fit.theta), np.array([fit.noise[name] for name in problem.noise_names])
     guesses = {name: s.states for name, s in fit.solutions.items()}
     density = LogPosterior(problem, Simulator.start(problem, theta, guesses), coordinates=NATURAL)

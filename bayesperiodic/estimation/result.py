@@ -1,7 +1,7 @@
 """MapEstimate: the MAP point, its Laplace approximations, and tests of the residual."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from itertools import product
@@ -68,12 +68,14 @@ class NoiseSplit:
     total: float
 
 
-def noise_split(problem: Problem, estimate: Iterate, log_variance_factor: float | np.ndarray) -> dict[str, NoiseSplit]:
+def noise_split(
+    problem: Problem, residuals: Sequence[np.ndarray], log_variance_factor: float | np.ndarray
+) -> dict[str, NoiseSplit]:
     """Return the split of every channel with compared time histories; the factor is 1 − p/n of eq. (7)."""
     sums = {channel: np.zeros(4) for channel in problem.channels}
     blocks = problem.likelihood.blocks
     factors = np.broadcast_to(log_variance_factor, len(blocks))
-    for block, r, one in zip(blocks, estimate.here.residuals, factors, strict=True):
+    for block, r, one in zip(blocks, residuals, factors, strict=True):
         if block.kind in (SPECTRAL, POINTS):
             square = block.weight * float(r @ r)
             sums[block.channel] += [block.count, block.count * one, square, block.count * block.measured]
@@ -148,6 +150,13 @@ class MapEstimate(Result):
         Measurement noise and model error of each channel.
     input_noise : dict of str to float
         Standard deviation that the noise of the measured inputs causes in each channel.
+    inputs, input_sd : dict of str to dict of str to array (points,)
+        By experiment and input, the estimated true inputs and their standard deviations given the estimate, in the
+        inputs' units; the measured ones and zero where ``Problem(input_noise=…)`` takes them as exact. `residuals`,
+        `rms`, `fvu` and `noise_split` are those with the estimated inputs.
+    loadings : dict of str to array (components, errors)
+        By experiment with noisy inputs, the derivatives L of the compared components by independent standard normal
+        errors of the inputs, at the estimate; L·Lᵀ is what these add to the covariance of the residual.
     doubling_shift : dict of str to float
         Change of each estimate on twice as many points, in standard deviations; NaN if those solves fail.
     at_ends : tuple of str
@@ -203,6 +212,9 @@ class MapEstimate(Result):
     whiteness: dict[str, Whiteness]
     noise_split: dict[str, NoiseSplit]
     input_noise: dict[str, float]
+    inputs: dict[str, dict[str, np.ndarray]]
+    input_sd: dict[str, dict[str, np.ndarray]]
+    loadings: dict[str, np.ndarray]
     doubling_shift: dict[str, float]
     at_ends: tuple[str, ...]
     other_orbits: dict[str, str]

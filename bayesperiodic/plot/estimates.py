@@ -68,7 +68,7 @@ def fit(
     >>> [axes.get_ylabel() for axes in figure.axes]
     ['displacement [m]', 'residual [m]']
     """
-    check_results(problem, estimate=estimate)
+    problem = check_results(problem, estimate=estimate)
     runs = chosen(experiments, tuple(e.name for e in problem.experiments), "experiments")
     if prediction is not None:
         _checks.contains(
@@ -147,7 +147,7 @@ def loops(
     >>> [axes.get_xlabel() for axes in figure.axes]
     ['force [N]', 'rate of force [N/s]']
     """
-    check_results(problem, estimate=estimate)
+    problem = check_results(problem, estimate=estimate)
     output = problem.channels[0] if output is None else output
     _checks.one_of("output", output, problem.channels)
     input = next(iter(problem.model.inputs), "") if input is None else input

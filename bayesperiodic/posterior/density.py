@@ -386,8 +386,10 @@ class LogPosterior(SamplingCoordinates):
 def collapsible(problem: Description) -> tuple[str, ...]:
     """Return the free variances that can be integrated out in closed form, those with the prior 1/v or a flat one.
 
-    The errors must be independent, or of whole periods with a spectrum of known shape.
+    The errors must be independent, or of whole periods with a spectrum of known shape, and the inputs exact.
     """
+    if problem.likelihood.shared:
+        return ()
     noise, counts = problem.noise, problem.likelihood.counts
     shaped = isinstance(noise, Circulant) and all(b.kind in (SPECTRAL, KNOWN) for b in problem.likelihood.blocks)
     closed = (isinstance(noise, Independent) or shaped) and noise.prior in (JEFFREYS, FLAT)

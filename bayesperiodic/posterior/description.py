@@ -15,6 +15,7 @@ from bayesperiodic.data.recording import Recording
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
+from bayesperiodic.posterior.input_noise import EXACT, InputNoise, checked
 from bayesperiodic.posterior.joint_priors import JointPrior
 from bayesperiodic.posterior.likelihood import Likelihood
 from bayesperiodic.posterior.noise import EXPERIMENT, Noise, as_noise
@@ -40,6 +41,7 @@ class Description:
         local: Iterable[str] = (),
         noise: str | Noise = "independent",
         scheme: str | Scheme | None = None,
+        input_noise: InputNoise = EXACT,
     ):
         if not isinstance(model, Model):
             raise ValueError(f"model: must be a Model, got {_checks.shortened(model)}.")
@@ -47,6 +49,7 @@ class Description:
         self.scheme = scheme or default_scheme(model)
         find_scheme(self.scheme)
         self.experiments = _checked_experiments(model, experiments)
+        self.input_noise = checked(input_noise, model.inputs, self.experiments)
         measured = {channel for experiment in self.experiments for channel in experiment.outputs}
         self.channels = tuple(channel for channel in model.outputs if channel in measured)
         runs = [e.name for e in self.experiments]
@@ -188,6 +191,7 @@ class Description:
             local=self.local,
             noise=self.noise,
             scheme=self.scheme,
+            input_noise=self.input_noise,
         )
 
     @property
@@ -354,6 +358,8 @@ def fingerprint(problem: Description) -> str:
         "noise": repr(problem.noise),
         "scheme": repr(find_scheme(problem.scheme)),
     }
+    if problem.input_noise != EXACT:
+        parts["input noise"] = [problem.input_noise]
     return " ".join(f"{part}:{digest(value)}" for part, value in parts.items())
 
 
@@ -381,10 +387,11 @@ def changed_parts(made_for: str, here: str) -> list[str]:
     return [name for name, _, digest in (part.partition(":") for part in here.split()) if there.get(name) != digest]
 
 
-def check_results(problem: Any, **results: Any) -> None:
-    """Raise a ValueError unless an estimate `fit` and draws `posterior` were computed from the problem.
+def check_results(problem: Any, **results: Any) -> Any:
+    """Return the problem as an estimate `fit` and draws `posterior` have it, with the errors of its inputs.
 
-    The model's equations, experiments with their data, priors, constants, noise model and scheme must be the same.
+    A ValueError is raised unless they were computed from the problem: model's equations, experiments with their data,
+    priors, constants, noise model and scheme must be the same.
     """
     if not isinstance(problem, Description):
         raise ValueError(f"problem: must be a Problem, got {type(problem).__name__}.")
@@ -392,6 +399,19 @@ def check_results(problem: Any, **results: Any) -> None:
     for argument, result in results.items():
         here = here or fingerprint(problem)
         check_fingerprint(argument, result, here)
+    first, *others = [result.loadings for result in results.values()]
+    if any(not same_loadings(first, other) for other in others):
+        raise ValueError(
+            "posterior: must be draws from the density of `fit`, got draws with other errors of the inputs, which "
+            f"another estimate determined; give {RESULTS['Posterior']}."
+        )
+    given: Any = problem
+    return given.with_loadings(first)
+
+
+def same_loadings(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> bool:
+    """Return whether two loadings of the inputs' errors are equal."""
+    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
 
 
 def check_fingerprint(argument: str, result: Any, here: str) -> None:

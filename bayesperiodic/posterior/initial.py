@@ -23,7 +23,8 @@ from bayesperiodic._linalg import hessian_eigh, scaled
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.periodic.equations import CyclicFactors, PeriodicEquations
 from bayesperiodic.posterior.description import Description
-from bayesperiodic.posterior.likelihood import Likelihood, estimate_noise
+from bayesperiodic.posterior.likelihood import Likelihood
+from bayesperiodic.posterior.noise_estimate import estimate_noise
 from bayesperiodic.posterior.observation import Observation, Response
 
 MAX_ITERATIONS = 60

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.optimize import minimize
 
 from bayesperiodic import _checks, _fourier
+from bayesperiodic.posterior.input_noise import Shared
 from bayesperiodic.posterior.noise import (
     CHANNEL,
     CORRELATED,
     EXPERIMENT,
-    FLAT,
     JEFFREYS,
     KNOWN,
     POINTS,
@@ -22,7 +21,6 @@ from bayesperiodic.posterior.noise import (
     SPECTRAL,
     VARIANCE,
     Block,
-    Independent,
     Noise,
 )
 
@@ -87,10 +85,18 @@ class Residuals(Sequence[np.ndarray]):
 class Likelihood:
     """Log-likelihood of the residuals of a problem's blocks under a noise model, and its derivatives.
 
-    `names` are all noise parameters, `fixed` those with known values, `free` the others.
+    `names` are all noise parameters, `fixed` those with known values, `free` the others. `loadings` are those of noisy
+    inputs by experiment, L (components of all its blocks, errors), see `input_noise`.
     """
 
-    def __init__(self, model: Noise, blocks: Sequence[Block], fixed: Mapping[str, float]):
+    def __init__(
+        self,
+        model: Noise,
+        blocks: Sequence[Block],
+        fixed: Mapping[str, float],
+        loadings: Mapping[str, np.ndarray] | None = None,
+    ):
+        self.loadings = dict(loadings or {})
         self.model, self.blocks = model, tuple(blocks)
         model.check([b for b in blocks if not set(model.parameter_names(b)) <= set(fixed)])
         self.names = tuple(dict.fromkeys(name for block in blocks for name in model.parameter_names(block)))
@@ -101,6 +107,11 @@ class Likelihood:
         self.free = tuple(name for name in self.names if name not in fixed)
         self._columns = [[self.names.index(name) for name in model.parameter_names(block)] for block in blocks]
         self._free = [self.names.index(name) for name in self.free]
+        self.shared = []
+        for experiment, matrix in self.loadings.items():
+            members = [b for b, block in enumerate(self.blocks) if block.experiment == experiment]
+            if matrix.any():
+                self.shared.append(Shared(members, [self.blocks[b].size for b in members], matrix))
 
     def groups(self) -> list[tuple[tuple[str, ...], list[int]]]:
         """Return the noise parameters that belong together, by name, and the indices of their blocks."""
@@ -187,7 +198,28 @@ class Likelihood:
         for kind, columns, measured in self._kinds:
             value, slopes[..., columns] = self.model.log_prior(kind, values[..., columns], measured)
             total = total + value.sum(axis=-1)
+        for column, block, spectrum in self._spectra_of_errors:
+            value, slope = self.model.jeffreys_factor(block, values[..., column], spectrum)
+            total = total + value
+            slopes[..., column] += slope
         return total, slopes
+
+    @cached_property
+    def _spectra_of_errors(self) -> list[tuple[int, Block, np.ndarray]]:
+        """Column of each free variance with Jeffreys' prior, a block, and the eigenvalues of L·Lᵀ of all its blocks."""
+        found: dict[int, list[tuple[int, np.ndarray]]] = {}
+        if self.model.prior == JEFFREYS:
+            for one in self.shared:
+                for b, matrix in zip(one.members, one.covariances, strict=True):
+                    if self._columns[b] and self._columns[b][0] in self._free:
+                        found.setdefault(self._columns[b][0], []).append((b, np.linalg.eigvalsh(matrix)))
+        result = []
+        for column, own in found.items():
+            with_errors = {b for b, _ in own}
+            others = [b for b, columns in enumerate(self._columns) if columns[:1] == [column] and b not in with_errors]
+            rest = [np.zeros(self.blocks[b].size) for b in others]
+            result.append((column, self.blocks[own[0][0]], np.maximum(np.concatenate([v for _, v in own] + rest), 0.0)))
+        return result
 
     @cached_property
     def _kinds(self) -> list[tuple[str, list[int], np.ndarray]]:
@@ -212,6 +244,9 @@ class Likelihood:
         """
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             total = (self._flat if self.model.flat else self._by_kind)(residuals, values, log_variance_factor)
+            for one in self.shared:
+                own, precisions = [residuals[b] for b in one.members], self.precisions(one.members, values)
+                total = total + one.log_likelihood(own, precisions, _mean(log_variance_factor, one))
         return np.where(np.isfinite(total), total, -np.inf)
 
     @cached_property
@@ -263,11 +298,17 @@ class Likelihood:
 
     def terms(self, residuals: Sequence[np.ndarray], values: np.ndarray) -> np.ndarray:
         """Return the log-likelihoods (…, observations) of the `observations`, which sum to that of `__call__`."""
-        found = []
+        found, shared = [], self._shared_terms(residuals, values)
         for b, _, order, starts in self._parts:
             block, phi, r = self.blocks[b], values[..., self._columns[b]], residuals[b]
             if self._is_dense(block):
                 found.append(self._together([r], block, phi, 1.0)[..., None])
+                continue
+            if b in shared:
+                each = shared[b]
+                if block.kind != KNOWN:
+                    each = each + block.weight * np.log(self._variances(block, phi)[0])
+                found.append(-0.5 * np.add.reduceat(each[..., order], starts, axis=-1))
                 continue
             if block.kind == SPECTRAL and self.model.flat:
                 r = _fourier.from_components(r, block.size)
@@ -277,6 +318,21 @@ class Likelihood:
                 each = block.weight * (np.log(variances) + each / variances)
             found.append(-0.5 * np.add.reduceat(each[..., order], starts, axis=-1))
         return np.concatenate(found, axis=-1)
+
+    def _shared_terms(self, residuals: Sequence[np.ndarray], values: np.ndarray) -> dict[int, np.ndarray]:
+        """Return the squares of whitened components plus their parts of ln|S|, by block that shares errors."""
+        found: dict[int, np.ndarray] = {}
+        for one in self.shared:
+            p = self.precisions(one.members, values)
+            axes, squares = one.whitening(p)
+            scaled = [residuals[b] * np.sqrt(own) for b, own in zip(one.members, p, strict=True)]
+            white = np.concatenate(scaled, axis=-1)
+            along = (white[..., None, :] @ axes)[..., 0, :] * (1.0 - 1.0 / np.sqrt(1.0 + squares))
+            white = white - (axes @ along[..., None])[..., 0]
+            each = white**2 + np.sum(axes**2 * np.log1p(squares)[..., None, :], axis=-1)
+            parts = np.split(each, np.cumsum([len(part) for part in one.parts])[:-1], axis=-1)
+            found |= zip(one.members, parts, strict=True)
+        return found
 
     def _by_kind(
         self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
@@ -347,6 +403,18 @@ class Likelihood:
         terms = len(residuals) * log_variance_factor * np.log(variances) + squares / variances
         return -0.5 * block.weight * np.sum(terms, axis=-1)
 
+    def precisions(self, members: Sequence[int], values: np.ndarray) -> list[np.ndarray]:
+        """Return weights over variances of the components of some blocks, (…, size), or (…, 1) if they are the same."""
+        result = []
+        for b in members:
+            block, phi = self.blocks[b], values[..., self._columns[b]]
+            if block.kind == KNOWN:
+                result.append(np.ones((*values.shape[:-1], 1)))
+                continue
+            variances = self._variances(block, phi)[0]
+            result.append(block.weight / (variances[..., :1] if self.model.flat else variances))
+        return result
+
     def _is_dense(self, block: Block) -> bool:
         """Return whether the components of a block are correlated: points under noise that is not white."""
         return block.kind == POINTS and not self.model.flat
@@ -378,31 +446,48 @@ class Likelihood:
         )
 
     def gradients(
-        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float = 1.0
+        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray = 1.0
     ) -> tuple[Sequence[np.ndarray], np.ndarray]:
         """Return the gradients of log-likelihood plus log-prior of φ, by each block's residual and by ln φ (names,)."""
-        if self.model.flat:
-            return self._flat_gradients(Residuals.of(residuals), values, log_variance_factor)
+        find = self._flat_gradients if self.model.flat else self._gradients_by_kind
+        by_residual, by_value = find(Residuals.of(residuals), values, log_variance_factor)
+        if not self.shared:
+            return by_residual, by_value
+        total = list(by_residual)
+        for one in self.shared:
+            own, precisions = [residuals[b] for b in one.members], self.precisions(one.members, values)
+            found = one.gradients(own, precisions, _mean(log_variance_factor, one))
+            for b, more, by_precision in zip(one.members, *found, strict=True):
+                total[b] = total[b] + more
+                if columns := self._columns[b]:
+                    by_value[columns] -= by_precision @ self._variances(self.blocks[b], values[columns])[1]
+        return total, by_value
+
+    def _gradients_by_kind(
+        self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
+    ) -> tuple[list[np.ndarray], np.ndarray]:
+        """Return the gradients by each block's residual and by ln φ (names,) under errors that are not white."""
         slopes = self._log_prior(values)[1]
         by_residual: list[np.ndarray] = [np.empty(0)] * len(self.blocks)
         for members in self._alike:
             block, columns = self.blocks[members[0]], self._columns[members[0]]
             own = np.stack([residuals[b] for b in members])
+            factor = float(np.broadcast_to(log_variance_factor, len(self.blocks))[members[0]])
             if block.kind == KNOWN:
                 by_residual[members[0]] = -own[0]
                 continue
             if self._is_dense(block):
-                _, by_residual[members[0]], by_phi = self._dense(block, own[0], values[columns], log_variance_factor)
+                _, by_residual[members[0]], by_phi = self._dense(block, own[0], values[columns], factor)
             else:
                 variances, change = self._variances(block, values[columns])
                 for b, r in zip(members, own, strict=True):
                     by_residual[b] = -block.weight * r / variances
-                by_phi = 0.5 * block.weight * np.sum(own**2 / variances - log_variance_factor, axis=0) @ change
+                by_phi = 0.5 * block.weight * np.sum(own**2 / variances - factor, axis=0) @ change
             slopes[columns] += by_phi
         return by_residual, slopes
 
     def _flat_gradients(
-        self, residuals: Residuals, values: np.ndarray, log_variance_factor: float
+        self, residuals: Residuals, values: np.ndarray, log_variance_factor: float | np.ndarray
     ) -> tuple[Residuals, np.ndarray]:
         """Return the gradients by each block's residual and by ln φ (names,) under errors whose spectrum is flat."""
         by_value, squares = self._log_prior(values)[1], residuals.squares
@@ -412,7 +497,8 @@ class Likelihood:
         by_square = np.full(len(self.blocks), -0.5)
         by_square[at] = -0.5 * weights / v
         # V is proportional to v, or to v plus what is measured.
-        by_level = 0.5 * weights * (squares[at] / v - log_variance_factor * sizes) * raised / v
+        factor = np.broadcast_to(log_variance_factor, len(self.blocks))[at]
+        by_level = 0.5 * weights * (squares[at] / v - factor * sizes) * raised / v
         np.add.at(by_value, columns, by_level)
         return residuals.scaled(2.0 * by_square), by_value
 
@@ -432,6 +518,10 @@ class Likelihood:
                 scale = np.sqrt(block.weight / self._variances(block, values[columns])[0])
                 for b in members:
                     result[b] = vectors[b] * scale
+        for one in self.shared:
+            joint = one.whitened([result[b] for b in one.members], self.precisions(one.members, values))
+            for b, own in zip(one.members, joint, strict=True):
+                result[b] = own
         return result
 
     def simulate(self, values: np.ndarray, generator: np.random.Generator) -> list[np.ndarray]:
@@ -445,6 +535,10 @@ class Likelihood:
             elif block.kind != KNOWN:
                 white *= np.sqrt(self._variances(block, values[:, columns])[0])
             result.append(white)
+        for one in self.shared:
+            errors = generator.standard_normal((len(values), one.parts[0].shape[1]))
+            for b, part in zip(one.members, one.parts, strict=True):
+                result[b] += errors @ part.T
         return result
 
     def guess(self) -> np.ndarray:
@@ -458,79 +552,13 @@ class Likelihood:
         return values
 
 
+def _mean(log_variance_factor: float | np.ndarray, one: Shared) -> float:
+    """Return the factor of errors that blocks share: the mean of theirs, weighted by their sizes."""
+    if isinstance(log_variance_factor, float):
+        return log_variance_factor
+    return float(np.average(log_variance_factor[list(one.members)], weights=[len(part) for part in one.parts]))
+
+
 def _square(r: np.ndarray) -> np.ndarray:
     """Return the sum of squares (…,) of components (…, size)."""
     return np.einsum("...i,...i->...", r, r)
-
-
-LOWEST, HIGHEST = 25.0, 8.0
-TINY = np.finfo(float).tiny
-
-
-def estimate_noise(
-    likelihood: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, log_variance_factor: float | np.ndarray
-) -> np.ndarray:
-    """Return the noise parameters (names,) that fit residuals best, one array (size,) a block, from a start.
-
-    For independent errors with the prior 1/v this is eq. (7) of [1]_, v = Σe²/(n·f) with the factor f; otherwise it
-    maximises the log-likelihood, its logarithms multiplied by f as in `Likelihood.__call__`, plus the log-prior.
-
-    References
-    ----------
-    .. [1] A. de Kraker, G. Verbeek, N. van de Wouw, Parameter identification in nonlinear models using periodic
-       equilibrium states, 1997.
-    """
-    values = start.copy()
-    for group, members in likelihood.groups():
-        if not set(group) & set(likelihood.free):
-            continue
-        blocks = [likelihood.blocks[b] for b in members]
-        factor = float(np.broadcast_to(log_variance_factor, len(residuals))[members[0]])
-        chosen = [residuals[b] for b in members]
-        total = sum(
-            block.weight / likelihood.model.gain(block) * float(r @ r) for block, r in zip(blocks, chosen, strict=True)
-        )
-        count = sum(block.count for block in blocks)
-        plain = isinstance(likelihood.model, Independent) or all(block.kind == CORRELATED for block in blocks)
-        corrected = count * factor - {JEFFREYS: 0.0, FLAT: 2.0}.get(str(likelihood.model.prior), np.inf)
-        columns = [likelihood.names.index(name) for name in group]
-        if plain and corrected > 0.0:
-            values[columns[0]] = max(total / corrected, TINY)
-            continue
-        held = {name: values[i] for name, i in zip(group, columns, strict=True) if name in likelihood.fixed}
-        part = Likelihood(likelihood.model, blocks, held)
-        values[columns] = _maximise(part, chosen, values[columns], max(total / count, TINY), factor)
-    return values
-
-
-def _maximise(
-    part: Likelihood, residuals: Sequence[np.ndarray], start: np.ndarray, size: float, log_variance_factor: float
-) -> np.ndarray:
-    """Return the best values of one group's noise parameters, from a start and from variances of the given size."""
-    free = [part.names.index(name) for name in part.free]
-
-    def complete(logarithms: np.ndarray) -> np.ndarray:
-        values = start.copy()
-        values[free] = np.exp(logarithms)
-        return values
-
-    def negative(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
-        values = complete(logarithms)
-        value = float(part(residuals, values, log_variance_factor) + part.log_prior(values))
-        if not np.isfinite(value):
-            return 1e300, np.zeros(len(free))
-        return -value, -part.gradients(residuals, values, log_variance_factor)[1][free]
-
-    variances = [part.names[i].startswith((VARIANCE, SCALE)) for i in free]
-    centre = np.where(variances, np.log(size), np.log(part.guess()[free]))
-    bounds = [(c - LOWEST, c + HIGHEST) for c in centre]
-    here = np.clip(np.log(start[free]), *np.transpose(bounds))
-    found = minimize(
-        negative,
-        min((here, centre), key=lambda x: negative(x)[0]),
-        jac=True,
-        method="L-BFGS-B",
-        bounds=bounds,
-        options={"gtol": 1e-9, "ftol": 1e-15, "maxiter": 500},
-    )
-    return complete(found.x)

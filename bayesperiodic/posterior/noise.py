@@ -289,6 +289,34 @@ class Noise(ABC):
             return np.log(value), np.ones_like(value)
         return _over_logarithm(self._proper_prior, value)
 
+    def jeffreys_factor(self, block: Block, value: np.ndarray, added: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return by what Jeffreys' prior of a variance is smaller where errors of the inputs add variances.
+
+        With components of variances V + λ it is √(Σ 1/(V + λ)²), the root of the information, instead of 1/V; without
+        it the density has no integral where errors of the inputs can explain all components.
+
+        Parameters
+        ----------
+        block : Block
+            One of those with this variance.
+        value : array (…)
+            The variance.
+        added : array (components,)
+            Variances λ that the inputs' errors add.
+
+        Returns
+        -------
+        log_factor : array (…)
+        slope : array (…)
+            By the logarithm of the variance.
+        """
+        from_value = value * (self.gain(block) if self.flat else block.size / block.points)
+        total = self.level(from_value, block.measured) if block.kind != CORRELATED else from_value
+        share = total[..., None] / (total[..., None] + added)
+        mean = np.mean(share**2, axis=-1)
+        slope = np.mean(share**2 * (1.0 - share), axis=-1) / mean * from_value / total
+        return 0.5 * np.log(mean), slope
+
     @cached_property
     def _proper_prior(self) -> Prior:
         return as_prior("prior", self.prior)

@@ -11,7 +11,7 @@ from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.posterior.density import NATURAL, RIDGE, SAMPLED, Evaluation, LogPosterior
-from bayesperiodic.posterior.description import Description
+from bayesperiodic.posterior.description import Description, same_loadings
 from bayesperiodic.posterior.likelihood import Likelihood
 from bayesperiodic.posterior.observation import Observation
 from bayesperiodic.posterior.simulator import Guesses, Simulator
@@ -56,6 +56,11 @@ class Problem(Description):
         "independent", "measured" or "circulant", or a model of `bayesperiodic.noise`.
     scheme : str or Scheme, optional
         See `solve_periodic`.
+    input_noise : "exact", "measured" or mapping of str to float or array
+        Whether the measured inputs are the true ones, or have errors: with the variances that `fold` found (at least
+        five cycles), averaged over neighbouring harmonics, or with the given standard deviation of one value of the
+        mean period, white noise, or the covariance of mean, cosines and sines of the harmonics kept. The true inputs,
+        with a flat prior, are integrated out, linearised about the estimate; see `MapEstimate.loadings`.
 
     Raises
     ------
@@ -132,6 +137,33 @@ class Problem(Description):
         else:
             density = LogPosterior(self, Simulator.start(self, values, guesses))
         other._densities = {(density.coordinates, SAMPLED): density}
+        return other
+
+    def with_loadings(self, loadings: Mapping[str, np.ndarray]) -> "Problem":
+        """Return the same problem with the errors of its inputs in the likelihood.
+
+        `map_estimate`, `sample` and whatever takes their results do this themselves.
+
+        Parameters
+        ----------
+        loadings : mapping of str to array (components, errors)
+            By experiment, as `MapEstimate.loadings`; none for exact inputs.
+
+        Returns
+        -------
+        Problem
+        """
+        own = self.likelihood
+        if same_loadings(own.loadings, loadings):
+            return self
+        other = copy(self)
+        other.likelihood = Likelihood(own.model, own.blocks, own.fixed, loadings)
+        other._densities = {
+            settings: LogPosterior(
+                other, d.simulator, coordinates=d.coordinates, variances=settings[1], comparisons=d.comparisons
+            )
+            for settings, d in self._densities.items()
+        }
         return other
 
     def planned(self, experiment: Experiment, noise: Mapping[str, float]) -> "Problem":

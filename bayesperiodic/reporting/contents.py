@@ -65,7 +65,7 @@ class ReportInputs:
     ) -> "ReportInputs":
         """Check that all inputs belong to one problem, and compute the diagnostics that are not given."""
         runs, no_prediction = [e.name for e in problem.experiments], ""
-        check_results(problem, fit=fit, **({} if posterior is None else {"posterior": posterior}))
+        problem = check_results(problem, fit=fit, **({} if posterior is None else {"posterior": posterior}))
         if posterior is not None:
             comparison = compare(problem, fit, posterior) if comparison is None else comparison
             try:

@@ -145,7 +145,7 @@ def evidence(problem: Problem, posterior: Posterior) -> Evidence:
     (True, {'synthetic duffing: displacement': 11.0})
     """
     _checks.instance("problem", problem, Problem)
-    check_results(problem, posterior=posterior)
+    problem = check_results(problem, posterior=posterior)
     _check_phases(problem)
     for name, prior in _priors(problem):
         _check_normalised(name, prior)

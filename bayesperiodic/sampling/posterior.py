@@ -125,6 +125,12 @@ class Posterior(Result):
         return str(self.tree.attrs.get("fingerprint", ""))
 
     @property
+    def loadings(self) -> dict[str, np.ndarray]:
+        """Effect of the inputs' errors by experiment, as `MapEstimate.loadings`; empty for exact inputs."""
+        group = self.tree.children.get(INPUT_NOISE)
+        return {} if group is None else {str(n): values.to_numpy() for n, values in group.data_vars.items()}
+
+    @property
     def modes(self) -> pd.DataFrame:
         """Optima that draws belong to, by the rows of `MapEstimate.modes`; empty if the estimate has one optimum.
 
@@ -395,7 +401,7 @@ def _some(problem: Description, posterior: xr.Dataset, most: int) -> tuple[xr.Da
     return chosen, theta, noise
 
 
-STEP, WALKER, OBSERVATION, MODE = "step", "walker", "observation", "mode"
+STEP, WALKER, OBSERVATION, MODE, INPUT_NOISE = "step", "walker", "observation", "mode", "input_noise"
 
 
 def gather(
@@ -465,6 +471,9 @@ def tree(
         "observed_data": _signals(problem, "outputs", time),
         "constant_data": _signals(problem, "inputs", time),
     }
+    if problem.likelihood.loadings:
+        shapes = {name: (f"{name} component", f"{name} error") for name in problem.likelihood.loadings}
+        groups[INPUT_NOISE] = xr.Dataset({n: (shapes[n], own) for n, own in problem.likelihood.loadings.items()})
     result = xr.DataTree.from_dict(groups)
     result.attrs = {
         "fingerprint": fingerprint(problem),

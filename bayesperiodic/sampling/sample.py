@@ -33,6 +33,7 @@ from bayesperiodic.posterior.density import (
     SamplingCoordinates,
     collapsible,
 )
+from bayesperiodic.posterior.description import digest
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import Simulator
 from bayesperiodic.sampling.checkpoint import Checkpoint
@@ -187,16 +188,18 @@ def sample(
     _checks.same_names("fit", fit.noise, problem.noise_names)
     runs = [e.name for e in problem.experiments]
     _checks.contains("fit", fit.solutions, runs, "give the estimate of this problem, map_estimate(problem)")
+    problem = problem.with_loadings(fit.loadings)
     executor = checked_executor(executor)
     if variances == COLLAPSED and not collapsible(problem):
         raise ValueError(
             "variances: must be 'sampled' for this problem, got 'collapsed'; it needs an unknown variance with the "
-            "prior 1/v or a flat one, of independent errors or of circulant ones with a fixed shape."
+            "prior 1/v or a flat one, of independent errors or of circulant ones with a fixed shape, and exact inputs."
         )
     if sampler == NUTS:
         refuse_for_nuts(walkers, variances, checkpoint, executor)
     size = _checked_walkers(walkers, problem, variances)
     settings = f"seed {seed}, {ensembles} ensembles of {size} walkers, {start}, {coordinates}, {variances}"
+    settings += f", input noise {digest(fit.loadings)}" if fit.loadings else ""
     opened = nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings)
     with interrupted_by_termination(), opened as store:
         backend, saved = (emcee.backends.Backend(), {}) if store is None else store.load()

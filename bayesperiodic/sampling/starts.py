@@ -9,7 +9,7 @@ from bayesperiodic.estimation.modes import Mode
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.posterior.density import LogPosterior, SamplingCoordinates
-from bayesperiodic.posterior.likelihood import estimate_noise
+from bayesperiodic.posterior.noise_estimate import estimate_noise
 from bayesperiodic.sampling.ensemble import AffineTransform, CallCount
 from bayesperiodic.sampling.proposals import HEAVY, StudentMixture
 

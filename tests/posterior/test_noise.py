@@ -9,7 +9,8 @@ from scipy import integrate, linalg, optimize, stats
 import bayesperiodic as bp
 from bayesperiodic import noise
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, climb
-from bayesperiodic.posterior.likelihood import Likelihood, estimate_noise
+from bayesperiodic.posterior.likelihood import Likelihood
+from bayesperiodic.posterior.noise_estimate import estimate_noise
 from bayesperiodic.posterior.noise import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
 from tests.known import LINEAR, difference, formula_model, grid, linear_experiment, linear_regressors
 
