@@ -13,8 +13,15 @@ from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.periodic.equations import PeriodicEquations, input_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 from bayesperiodic.periodic.solve import solve_driven, solve_free
-from bayesperiodic.posterior.input_noise import InputNoise, directions, error_waves, expected_errors
-from bayesperiodic.posterior.noise import LENGTHSCALE, POINTS, SPECTRAL, VARIANCE, Block
+from bayesperiodic.posterior.input_noise import (
+    InputErrors,
+    InputNoise,
+    directions,
+    error_waves,
+    expected_errors,
+    true_inputs,
+)
+from bayesperiodic.posterior.noise import LENGTHSCALE, SPECTRAL, VARIANCE, Block
 from bayesperiodic.posterior.observation import Response
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import orbit_multipliers
@@ -321,9 +328,10 @@ def _on_twice_the_points(
 ) -> Response | None:
     """Return the response on a grid of twice as many points, at every second of them; None if the solve fails."""
     points = 2 * experiment.samples * experiment.periods
+    inputs = true_inputs(experiment, problem.input_noise, problem.input_errors.get(experiment.name))
     equations = PeriodicEquations.build(
         problem.model,
-        {n: _fourier.on_grid(_fourier.coefficients(u), points) for n, u in experiment.inputs.items()},
+        {n: _fourier.on_grid(_fourier.coefficients(u), points) for n, u in inputs.items()},
         frequency=coarse.frequency,
         samples=2 * experiment.samples,
         scheme=problem.scheme,
@@ -385,41 +393,41 @@ def caused_by_inputs(problem: Problem, loadings: Mapping[str, np.ndarray]) -> di
     return {channel: float(np.sqrt(np.mean(v[1:] or v))) for channel, v in variances.items()}
 
 
-class EstimatedInputs(NamedTuple):
-    """Estimated true inputs and their sds, by experiment and input, and residuals without the errors of the inputs."""
+class InputEstimate(NamedTuple):
+    """Errors of the inputs given an estimate: expected ones with loadings there, and what has no errors of inputs."""
 
-    values: dict[str, dict[str, np.ndarray]]
-    sd: dict[str, dict[str, np.ndarray]]
-    residuals: list[np.ndarray]  # components, one array (size,) a block
-    compared: dict[str, dict[str, np.ndarray]]  # (points,) by experiment and channel
+    errors: dict[str, InputErrors]
+    sd: dict[str, dict[str, np.ndarray]]  # (points,) of the estimated inputs, by experiment and input
+    residuals: list[np.ndarray]  # components y − ŷ with the estimated inputs, one array (size,) a block
 
 
-def estimated_inputs(problem: Problem, estimate: Iterate) -> EstimatedInputs:
-    """Return the true inputs given the estimate, linearised there."""
-    likelihood, compared = problem.likelihood, estimate.here.compared()
-    residuals = [r.copy() for r in estimate.here.residuals]
-    values = {e.name: {name: u.copy() for name, u in e.inputs.items()} for e in problem.experiments}
-    sd = {e.name: {name: np.zeros_like(u) for name, u in e.inputs.items()} for e in problem.experiments}
+def estimated_inputs(
+    problem: Problem, estimate: Iterate, loadings: Mapping[str, np.ndarray] | None = None
+) -> InputEstimate:
+    """Return the errors of the inputs given the estimate, by default with the loadings of the problem."""
+    likelihood, errors, sd = problem.likelihood, {}, {}
+    residuals = list(estimate.here.residuals)
     for e in problem.experiments:
-        matrix = likelihood.loadings.get(e.name)
+        members = [b for b, block in enumerate(likelihood.blocks) if block.experiment == e.name]
+        before = problem.input_errors.get(e.name)
+        if before is not None:
+            sizes = [likelihood.blocks[b].size for b in members]
+            for b, part in zip(members, before.parts(sizes), strict=True):
+                residuals[b] = residuals[b] + part
+        matrix = likelihood.loadings.get(e.name) if loadings is None else loadings.get(e.name)
+        sd[e.name] = {name: np.zeros_like(u) for name, u in e.inputs.items()}
         if matrix is None:
             continue
-        members = [b for b, block in enumerate(likelihood.blocks) if block.experiment == e.name]
-        own = [residuals[b] for b in members]
-        errors, covariance = expected_errors(matrix, own, likelihood.precisions(members, estimate.noise))
-        caused = np.split(matrix @ errors, np.cumsum([r.size for r in own])[:-1])
-        for b, part in zip(members, caused, strict=True):
-            residuals[b] += part
-            block, points = likelihood.blocks[b], e.samples * e.periods
-            if block.kind == SPECTRAL:
-                compared[e.name][block.channel] += _fourier.from_components(part, points)
-            elif block.kind == POINTS:
-                compared[e.name][block.channel][e.mask] += part
+        expected = np.zeros(matrix.shape[1]) if before is None else before.expected
+        sizes = [residuals[b].size for b in members]
+        moved = np.split(matrix @ expected, np.cumsum(sizes)[:-1])
+        own = [residuals[b] - part for b, part in zip(members, moved, strict=True)]
+        mean, covariance = expected_errors(matrix, own, likelihood.precisions(members, estimate.noise))
+        errors[e.name] = InputErrors(mean, matrix)
         where, waves = error_waves(e, problem.input_noise)
         signals = _fourier.on_grid(waves, e.samples * e.periods)
         for name in set(where):
             mine = np.array([owner == name for owner in where])
-            values[e.name][name] -= errors[mine] @ signals[mine]
             variance = np.einsum("ip,ij,jp->p", signals[mine], covariance[np.ix_(mine, mine)], signals[mine])
             sd[e.name][name] = np.sqrt(variance)
-    return EstimatedInputs(values, sd, residuals, compared)
+    return InputEstimate(errors, sd, residuals)

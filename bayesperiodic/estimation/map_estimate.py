@@ -42,7 +42,7 @@ from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.posterior.density import NATURAL, RIDGE, Linearisation, LogPosterior
 from bayesperiodic.posterior.description import fingerprint
 from bayesperiodic.posterior.initial import InitialEstimate, measured_orbits, simultaneous_fit
-from bayesperiodic.posterior.input_noise import EXACT, MEASURED
+from bayesperiodic.posterior.input_noise import EXACT, MEASURED, true_inputs
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import Simulator
 
@@ -52,8 +52,8 @@ SHOWN = 3
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
 MOST_UNEXPLAINED = 0.5
-# Linearisations about the estimate, and its change [sds] that ends them.
-MOST_ROUNDS, SETTLED = 10, 0.01
+# Most linearisations of errors of the inputs, and the change [sds] that ends them.
+MOST_ROUNDS, SETTLED = 30, 1e-5
 # Value of a field of MapEstimate that is computed at its first use.
 deferred: Any = partial
 
@@ -155,7 +155,10 @@ def map_estimate(
     for draw in problem.joint_prior.sample(starts - 1, np.random.default_rng(_checks.integer("seed", seed, 0))):
         ends.append(_from_draw(objective, end.iterate, draw, progress))
     best = max((end for end in ends if end), key=preference)
-    problem, objective, best = _with_noisy_inputs(problem, objective, best, progress)
+    noisy, best = _with_noisy_inputs(problem, best, progress)
+    if noisy is not problem:
+        objective = _objective(noisy, best.iterate.here)
+        ends, problem = [best, *(_moved(noisy, end) for end in ends)], noisy
     objective, _ = corrected(objective, best)
     ends = [end and resumed(objective, end) for end in ends]
     modes = with_images(objective, [end for end in ends if end], partial(_climb, objective, progress=progress))
@@ -165,31 +168,47 @@ def map_estimate(
     return result
 
 
-def _with_noisy_inputs(
-    problem: Problem, objective: Objective, end: End, progress: bool
-) -> tuple[Problem, Objective, End]:
-    """Return problem, objective and end of the climb with the errors of the inputs linearised about the estimate."""
-    if problem.input_noise == EXACT:
-        return problem, objective, end
-    for _ in range(MOST_ROUNDS):
-        before, here = end.iterate.theta, end.iterate.here
-        loadings = input_loadings(problem, before, here.simulator.solutions(before), problem.input_noise)
-        problem = problem.with_loadings(loadings)
-        objective = Objective(LogPosterior(problem, here.simulator, coordinates=NATURAL))
-        first = objective.iterate(here, end.iterate.noise)
+def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Problem, End]:
+    """Return problem and end of the climb with the errors of the inputs, linearised about the estimate."""
+    for _ in range(MOST_ROUNDS if problem.input_noise != EXACT else 0):
+        now, before = end.iterate, problem.input_errors
+        loadings = input_loadings(problem, now.theta, now.here.simulator.solutions(now.theta), problem.input_noise)
+        errors = estimated_inputs(problem, now, loadings).errors
+        problem = problem.with_input_errors(errors)
+        objective, first = _of_problem(problem, now)
         if first is None:
             break
         end = _climb(objective, first, progress)
-        step = end.iterate.theta - before
-        if step @ objective.hessian_and_gradient(end.iterate)[0] @ step < SETTLED**2:
-            return problem, objective, end
-    warnings.warn(
-        "The errors of the inputs could not be linearised: the estimate still moves by more than a hundredth of its "
-        "standard deviation when this is repeated. Average more cycles, or keep fewer harmonics of the inputs.",
-        UserWarning,
-        stacklevel=4,
-    )
-    return problem, objective, end
+        step = end.iterate.theta - now.theta
+        moved = [own.expected - (before[n].expected if n in before else np.inf) for n, own in errors.items()]
+        still = all(np.abs(own).max(initial=0.0) < SETTLED for own in moved)
+        if still and step @ objective.hessian_and_gradient(end.iterate)[0] @ step < SETTLED**2:
+            return problem, end
+    if problem.input_noise != EXACT:
+        warnings.warn(
+            "The errors of the inputs could not be linearised: estimate or inputs still move by more than a "
+            "hundred thousandth of their standard deviations when this is repeated. Average more cycles, or keep fewer harmonics of the "
+            "inputs.",
+            UserWarning,
+            stacklevel=4,
+        )
+    return problem, end
+
+
+def _moved(problem: Problem, end: End | None) -> End | None:
+    """Return an end as one of a problem with other errors of the inputs; None if that is not finite."""
+    iterate = end and _of_problem(problem, end.iterate)[1]
+    return End(iterate, end.status, end.history) if end and iterate else None
+
+
+def _of_problem(problem: Problem, iterate: Iterate) -> tuple[Objective, Iterate | None]:
+    """Return objective and iterate, solved from the same orbits, of a problem with other errors of the inputs."""
+    if iterate.here.simulator.problem is problem:
+        return _objective(problem, iterate.here), iterate
+    guesses = {name: solution.states for name, solution in iterate.here.simulator.solutions(iterate.theta).items()}
+    near = LogPosterior(problem, Simulator.start(problem, iterate.theta, guesses)).linearise(iterate.theta)
+    objective = _objective(problem, near)
+    return objective, objective.iterate(near, iterate.noise)
 
 
 def _objective(problem: Problem, near: Linearisation) -> Objective:
@@ -290,8 +309,7 @@ def _describe(
     shift[lost] = np.nan
     covariance[lost], covariance[:, lost] = np.nan, np.nan
     covariance[lost, lost] = np.inf
-    found = estimated_inputs(problem, best)
-    residuals = found.compared
+    found, residuals = estimated_inputs(problem, best), best.here.compared()
     known = MEASURED if problem.input_noise == EXACT else problem.input_noise
     loadings = problem.likelihood.loadings or input_loadings(problem, best.theta, solutions, known)
     sampled = objective.density.with_settings(coordinates=RIDGE)
@@ -320,9 +338,11 @@ def _describe(
         whiteness=channel_whiteness(problem, best),
         noise_split=noise_split(problem, found.residuals, objective.log_variance_factor),
         input_noise=caused_by_inputs(problem, loadings),
-        inputs=found.values,
+        inputs={
+            e.name: true_inputs(e, problem.input_noise, problem.input_errors.get(e.name)) for e in problem.experiments
+        },
         input_sd=found.sd,
-        loadings=problem.likelihood.loadings,
+        input_errors=problem.input_errors,
         doubling_shift=dict(zip(names, shift.tolist(), strict=True)),
         other_orbits=best.here.other_orbits,
         at_ends=tuple(np.array(names)[acting & (at_ends(objective, best) != 0.0)].tolist()),
@@ -369,7 +389,7 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
         )
     rates = max(problem.model.input_derivatives().values(), default=0)
     kept = max((np.count_nonzero(v) for e in problem.experiments for v in e.amplitude_variance.values()), default=0)
-    for channel, noise in fit.input_noise.items() if not fit.loadings else ():
+    for channel, noise in fit.input_noise.items() if not fit.input_errors else ():
         if noise > NOISE_SHARE * fit.rms[channel]:
             remedies = ["average more cycles"] + ["keep fewer input harmonics (fold(harmonics=…))"] * int(kept > 2)
             yield (

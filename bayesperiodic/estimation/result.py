@@ -18,6 +18,7 @@ from bayesperiodic.estimation.conflict import PriorConflict
 from bayesperiodic.estimation.gauss_newton import Iterate
 from bayesperiodic.estimation.modes import Mode, notable
 from bayesperiodic.periodic.solution import PeriodicSolution
+from bayesperiodic.posterior.input_noise import InputErrors
 from bayesperiodic.posterior.joint_priors import MultivariateNormal
 from bayesperiodic.posterior.noise import POINTS, SPECTRAL
 from bayesperiodic.posterior.parameters import checked_key, in_experiment, local_hint, local_names
@@ -154,9 +155,10 @@ class MapEstimate(Result):
         By experiment and input, the estimated true inputs and their standard deviations given the estimate, in the
         inputs' units; the measured ones and zero where ``Problem(input_noise=…)`` takes them as exact. `residuals`,
         `rms`, `fvu` and `noise_split` are those with the estimated inputs.
-    loadings : dict of str to array (components, errors)
-        By experiment with noisy inputs, the derivatives L of the compared components by independent standard normal
-        errors of the inputs, at the estimate; L·Lᵀ is what these add to the covariance of the residual.
+    input_errors : dict of str to InputErrors
+        By experiment with noisy inputs: independent standard normal errors of the inputs, `expected` (errors,), and the
+        derivatives of the compared components by them, `loadings` L (components, errors), at the estimate; L·Lᵀ is what
+        they add to the covariance of the residual.
     doubling_shift : dict of str to float
         Change of each estimate on twice as many points, in standard deviations; NaN if those solves fail.
     at_ends : tuple of str
@@ -214,7 +216,7 @@ class MapEstimate(Result):
     input_noise: dict[str, float]
     inputs: dict[str, dict[str, np.ndarray]]
     input_sd: dict[str, dict[str, np.ndarray]]
-    loadings: dict[str, np.ndarray]
+    input_errors: dict[str, InputErrors]
     doubling_shift: dict[str, float]
     at_ends: tuple[str, ...]
     other_orbits: dict[str, str]

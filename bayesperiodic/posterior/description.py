@@ -15,7 +15,7 @@ from bayesperiodic.data.recording import Recording
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
-from bayesperiodic.posterior.input_noise import EXACT, InputNoise, checked
+from bayesperiodic.posterior.input_noise import EXACT, InputErrors, InputNoise, checked, same, true_inputs
 from bayesperiodic.posterior.joint_priors import JointPrior
 from bayesperiodic.posterior.likelihood import Likelihood
 from bayesperiodic.posterior.noise import EXPERIMENT, Noise, as_noise
@@ -50,6 +50,7 @@ class Description:
         find_scheme(self.scheme)
         self.experiments = _checked_experiments(model, experiments)
         self.input_noise = checked(input_noise, model.inputs, self.experiments)
+        self.input_errors: dict[str, InputErrors] = {}
         measured = {channel for experiment in self.experiments for channel in experiment.outputs}
         self.channels = tuple(channel for channel in model.outputs if channel in measured)
         runs = [e.name for e in self.experiments]
@@ -288,7 +289,7 @@ class Description:
         return {
             e.name: PeriodicEquations.build(
                 self.model,
-                e.inputs,
+                true_inputs(e, self.input_noise, self.input_errors.get(e.name)),
                 frequency=e.frequency,
                 samples=e.samples,
                 scheme=self.scheme,
@@ -399,19 +400,14 @@ def check_results(problem: Any, **results: Any) -> Any:
     for argument, result in results.items():
         here = here or fingerprint(problem)
         check_fingerprint(argument, result, here)
-    first, *others = [result.loadings for result in results.values()]
-    if any(not same_loadings(first, other) for other in others):
+    first, *others = [result.input_errors for result in results.values()]
+    if any(not same(first, other) for other in others):
         raise ValueError(
             "posterior: must be draws from the density of `fit`, got draws with other errors of the inputs, which "
             f"another estimate determined; give {RESULTS['Posterior']}."
         )
     given: Any = problem
-    return given.with_loadings(first)
-
-
-def same_loadings(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> bool:
-    """Return whether two loadings of the inputs' errors are equal."""
-    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+    return given.with_input_errors(first)
 
 
 def check_fingerprint(argument: str, result: Any, here: str) -> None:

@@ -1,15 +1,18 @@
 """Noise of measured inputs: its covariance, its effect on the outputs, and what it adds to the log-likelihood.
 
 The measured Fourier amplitudes of an input are those of the true one plus errors with a known normal distribution; the
-prior of the true ones is flat. To first order about an estimate, the residual is e − L·η: e is the error of the
-outputs, with the variances D(φ) of the noise model, η are independent standard normal errors of the input, and the
-loadings L are the derivatives of the predicted components by η. With the true input integrated out the residual has
-the covariance D(φ) + L·Lᵀ (W. A. Fuller, Measurement Error Models, Wiley, 1987). L is fixed once it is computed, so
-that the density depends on the parameters alone.
+prior of the true ones is flat. Let η be independent standard normal errors of the input, η̂ an estimate of them, and
+the loadings L the derivatives of the predicted components by the input along η. The periodic problem is solved with the
+input less η̂, and what η̂ causes, L·η̂, is taken from the measured outputs. To first order the residual is then
+e − L·η, e being the error of the outputs, with the variances D(φ) of the noise model. With the true input integrated
+out it has the covariance D(φ) + L·Lᵀ. η̂ and L are computed at an estimate, again until they do not change, and are then
+fixed, so that the density depends on the parameters alone. For a static model the estimate is that of orthogonal
+distance regression (W. A. Fuller, Measurement Error Models, Wiley, 1987). If L followed the parameters, the determinant
+of the covariance would draw the estimate towards models that pass on less of the input's noise.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,6 +27,34 @@ NEIGHBOURS = 2
 # Singular values of loadings, relative to the largest, that are left out.
 NEGLIGIBLE = 1e-9
 InputNoise = str | Mapping[str, Any]
+
+
+class InputErrors(NamedTuple):
+    """Errors of the inputs of one experiment, linearised about an estimate."""
+
+    expected: np.ndarray  # (errors,), η̂
+    loadings: np.ndarray  # (components of all blocks, errors), L
+
+    def parts(self, sizes: Sequence[int]) -> list[np.ndarray]:
+        """Return L·η̂, what the expected errors cause, one array (size,) a block."""
+        return np.split(self.loadings @ self.expected, np.cumsum(sizes)[:-1])
+
+
+def same(one: Mapping[str, InputErrors], other: Mapping[str, InputErrors]) -> bool:
+    """Return whether two linearisations are equal."""
+    pairs = ((one[name], other[name]) for name in one if name in other)
+    return one.keys() == other.keys() and all(np.array_equal(x, y) for a, b in pairs for x, y in zip(a, b, strict=True))
+
+
+def true_inputs(experiment: Experiment, noise: InputNoise, errors: InputErrors | None) -> dict[str, np.ndarray]:
+    """Return the measured inputs (points,) less their expected errors."""
+    result = {name: np.array(values) for name, values in experiment.inputs.items()}
+    if errors is not None:
+        where, waves = error_waves(experiment, noise)
+        signals = _fourier.on_grid(waves, experiment.samples * experiment.periods)
+        for name, error, signal in zip(where, errors.expected, signals, strict=True):
+            result[name] -= error * signal
+    return result
 
 
 def checked(given: InputNoise, inputs: Sequence[str], experiments: Sequence[Experiment]) -> InputNoise:

@@ -102,10 +102,12 @@ class Observation:
     angles : list of bool
         Which of the channels are angles.
     data : array (points, channels)
+    caused : list of array (size,), optional
+        What the expected errors of the inputs cause in the components of each block, see `input_noise`.
     """
 
-    def __init__(self, experiment: Experiment, model: Model, delayed: bool):
-        self.experiment = experiment
+    def __init__(self, experiment: Experiment, model: Model, delayed: bool, caused: Sequence[np.ndarray] | None = None):
+        self.experiment, self.caused = experiment, caused
         self.channels = tuple(channel for channel in model.outputs if channel in experiment.outputs)
         self.columns = [model.outputs.index(channel) for channel in self.channels]
         self.angles = [channel in model.angles for channel in self.channels]
@@ -187,8 +189,9 @@ class Observation:
         return scale - (math.log(self.experiment.frequency_se) if self._free_phase else 0.0)
 
     def data_components(self) -> list[np.ndarray]:
-        """Return the Fourier components (size,) of each measured channel."""
-        return [self._spectral(self.data[:, c], self._harmonics[name]) for c, name in enumerate(self.channels)]
+        """Return the Fourier components (size,) of each measured channel, without what errors of the inputs caused."""
+        measured = [self._spectral(self.data[:, c], self._harmonics[name]) for c, name in enumerate(self.channels)]
+        return measured if self.caused is None else [a - b for a, b in zip(measured, self.caused, strict=True)]
 
     def components(self, outputs: np.ndarray) -> list[np.ndarray]:
         """Return the Fourier components (…, size) of each measured channel of outputs (…, points, channels)."""
@@ -204,7 +207,8 @@ class Observation:
         e = self.experiment
         known = [] if e.multipliers is None else [np.log(np.abs(e.multipliers)) - response.log_multipliers]
         frequency = [e.frequency - response.frequency] if self._free_phase else []
-        return self._components(self._difference(response), known, frequency)
+        found = self._components(self._difference(response), known, frequency)
+        return found if self.caused is None else [a - b for a, b in zip(found, self.caused, strict=True)]
 
     @cached_property
     def layout(self) -> tuple[Any, ...] | None:
@@ -258,6 +262,8 @@ class Observation:
         turn of the data.
         """
         e, noise = self.experiment, np.full((len(components[0]), *self.data.shape), np.nan)
+        if self.caused is not None:
+            components = [a + b for a, b in zip(components, self.caused, strict=True)]
         if e.covariance is not None:
             values = solve_triangular(self._joint[0], components[0].T, lower=True).T
             mask = np.ones(self._points, dtype=bool) if e.mask is None else e.mask

@@ -11,7 +11,8 @@ from bayesperiodic import _checks
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.posterior.density import NATURAL, RIDGE, SAMPLED, Evaluation, LogPosterior
-from bayesperiodic.posterior.description import Description, same_loadings
+from bayesperiodic.posterior.description import Description
+from bayesperiodic.posterior.input_noise import InputErrors, same
 from bayesperiodic.posterior.likelihood import Likelihood
 from bayesperiodic.posterior.observation import Observation
 from bayesperiodic.posterior.simulator import Guesses, Simulator
@@ -60,7 +61,7 @@ class Problem(Description):
         Whether the measured inputs are the true ones, or have errors: with the variances that `fold` found (at least
         five cycles), averaged over neighbouring harmonics, or with the given standard deviation of one value of the
         mean period, white noise, or the covariance of mean, cosines and sines of the harmonics kept. The true inputs,
-        with a flat prior, are integrated out, linearised about the estimate; see `MapEstimate.loadings`.
+        with a flat prior, are integrated out, linearised about the estimate; see `MapEstimate.input_errors`.
 
     Raises
     ------
@@ -139,32 +140,42 @@ class Problem(Description):
         other._densities = {(density.coordinates, SAMPLED): density}
         return other
 
-    def with_loadings(self, loadings: Mapping[str, np.ndarray]) -> "Problem":
-        """Return the same problem with the errors of its inputs in the likelihood.
+    def with_input_errors(self, errors: Mapping[str, InputErrors]) -> "Problem":
+        """Return the same problem with the errors of its inputs, linearised about an estimate.
 
         `map_estimate`, `sample` and whatever takes their results do this themselves.
 
         Parameters
         ----------
-        loadings : mapping of str to array (components, errors)
-            By experiment, as `MapEstimate.loadings`; none for exact inputs.
+        errors : mapping of str to InputErrors
+            By experiment, as `MapEstimate.input_errors`; none for exact inputs.
 
         Returns
         -------
         Problem
         """
-        own = self.likelihood
-        if same_loadings(own.loadings, loadings):
+        if same(self.input_errors, errors):
             return self
-        other = copy(self)
+        if self._last and same(self._last[0].input_errors, errors):
+            return self._last[0]
+        other, own = copy(self), self.likelihood
+        for computed in ("equations", "_densities", "_last"):
+            other.__dict__.pop(computed, None)
+        other.input_errors = dict(errors)
+        other.observations = {}
+        for name, seen in self.observations.items():
+            caused = errors[name].parts([block.size for block in seen.blocks]) if name in errors else None
+            delayed = self.parameter_maps[name].delayed
+            other.observations[name] = Observation(seen.experiment, self.model, delayed, caused)
+        loadings = {name: one.loadings for name, one in errors.items()}
         other.likelihood = Likelihood(own.model, own.blocks, own.fixed, loadings)
-        other._densities = {
-            settings: LogPosterior(
-                other, d.simulator, coordinates=d.coordinates, variances=settings[1], comparisons=d.comparisons
-            )
-            for settings, d in self._densities.items()
-        }
+        self._last[:] = [other]
         return other
+
+    @cached_property
+    def _last(self) -> list["Problem"]:
+        """The last problem of `with_input_errors`, whose anchors are kept."""
+        return []
 
     def planned(self, experiment: Experiment, noise: Mapping[str, float]) -> "Problem":
         """Return the problem of an experiment that may be made, alone, with all parameters of this problem.

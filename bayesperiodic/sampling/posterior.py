@@ -17,6 +17,7 @@ from bayesperiodic._io import Result
 from bayesperiodic.periodic.compiled import CONVERGED, NOT_FINITE, STATUSES
 from bayesperiodic.posterior.density import LogPosterior
 from bayesperiodic.posterior.description import Description, fingerprint
+from bayesperiodic.posterior.input_noise import InputErrors
 from bayesperiodic.posterior.joint_priors import MultivariateNormal
 from bayesperiodic.posterior.noise import SCALE
 from bayesperiodic.posterior.parameters import (
@@ -125,10 +126,13 @@ class Posterior(Result):
         return str(self.tree.attrs.get("fingerprint", ""))
 
     @property
-    def loadings(self) -> dict[str, np.ndarray]:
-        """Effect of the inputs' errors by experiment, as `MapEstimate.loadings`; empty for exact inputs."""
-        group = self.tree.children.get(INPUT_NOISE)
-        return {} if group is None else {str(n): values.to_numpy() for n, values in group.data_vars.items()}
+    def input_errors(self) -> dict[str, InputErrors]:
+        """Errors of the inputs by experiment, as `MapEstimate.input_errors`; empty for exact inputs."""
+        if INPUT_NOISE not in self.tree.children:
+            return {}
+        group = self.tree[INPUT_NOISE].to_dataset()
+        names = [str(name).removesuffix(f" {EXPECTED}") for name in group if str(name).endswith(f" {EXPECTED}")]
+        return {n: InputErrors(*(group[f"{n} {kind}"].to_numpy() for kind in (EXPECTED, LOADINGS))) for n in names}
 
     @property
     def modes(self) -> pd.DataFrame:
@@ -401,7 +405,8 @@ def _some(problem: Description, posterior: xr.Dataset, most: int) -> tuple[xr.Da
     return chosen, theta, noise
 
 
-STEP, WALKER, OBSERVATION, MODE, INPUT_NOISE = "step", "walker", "observation", "mode", "input_noise"
+STEP, WALKER, OBSERVATION, MODE = "step", "walker", "observation", "mode"
+INPUT_NOISE, EXPECTED, LOADINGS = "input_noise", "expected errors", "loadings"
 
 
 def gather(
@@ -471,9 +476,12 @@ def tree(
         "observed_data": _signals(problem, "outputs", time),
         "constant_data": _signals(problem, "inputs", time),
     }
-    if problem.likelihood.loadings:
-        shapes = {name: (f"{name} component", f"{name} error") for name in problem.likelihood.loadings}
-        groups[INPUT_NOISE] = xr.Dataset({n: (shapes[n], own) for n, own in problem.likelihood.loadings.items()})
+    if problem.input_errors:
+        variables: dict[str, Any] = {}
+        for name, own in problem.input_errors.items():
+            variables[f"{name} {EXPECTED}"] = ((f"{name} error",), own.expected)
+            variables[f"{name} {LOADINGS}"] = ((f"{name} component", f"{name} error"), own.loadings)
+        groups[INPUT_NOISE] = xr.Dataset(variables)
     result = xr.DataTree.from_dict(groups)
     result.attrs = {
         "fingerprint": fingerprint(problem),

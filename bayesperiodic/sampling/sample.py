@@ -188,7 +188,7 @@ def sample(
     _checks.same_names("fit", fit.noise, problem.noise_names)
     runs = [e.name for e in problem.experiments]
     _checks.contains("fit", fit.solutions, runs, "give the estimate of this problem, map_estimate(problem)")
-    problem = problem.with_loadings(fit.loadings)
+    problem = problem.with_input_errors(fit.input_errors)
     executor = checked_executor(executor)
     if variances == COLLAPSED and not collapsible(problem):
         raise ValueError(
@@ -199,7 +199,7 @@ def sample(
         refuse_for_nuts(walkers, variances, checkpoint, executor)
     size = _checked_walkers(walkers, problem, variances)
     settings = f"seed {seed}, {ensembles} ensembles of {size} walkers, {start}, {coordinates}, {variances}"
-    settings += f", input noise {digest(fit.loadings)}" if fit.loadings else ""
+    settings += f", input noise {digest(fit.input_errors)}" if fit.input_errors else ""
     opened = nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings)
     with interrupted_by_termination(), opened as store:
         backend, saved = (emcee.backends.Backend(), {}) if store is None else store.load()
