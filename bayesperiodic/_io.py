@@ -36,6 +36,7 @@ MODULES = {
     "FourierScheme": "bayesperiodic.periodic.schemes",
     "HopfPoint": "bayesperiodic.periodic.hopf",
     "Identifiability": "bayesperiodic.diagnostics.identifiability",
+    "InputErrors": "bayesperiodic.posterior.input_noise",
     "MapEstimate": "bayesperiodic.estimation.result",
     "Mode": "bayesperiodic.estimation.modes",
     "ModelComparison": "bayesperiodic.diagnostics.model_comparison",

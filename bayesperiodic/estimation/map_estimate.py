@@ -186,8 +186,8 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
             return problem, end
     if problem.input_noise != EXACT:
         warnings.warn(
-            "The errors of the inputs could not be linearised: estimate or inputs still move by more than a "
-            "hundred thousandth of their standard deviations when this is repeated. Average more cycles, or keep fewer harmonics of the "
+            "The errors of the inputs could not be linearised: estimate or inputs still move when this is repeated, by "
+            f"more than {SETTLED:g} of their standard deviations. Average more cycles, or keep fewer harmonics of the "
             "inputs.",
             UserWarning,
             stacklevel=4,

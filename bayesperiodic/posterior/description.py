@@ -360,7 +360,7 @@ def fingerprint(problem: Description) -> str:
         "scheme": repr(find_scheme(problem.scheme)),
     }
     if problem.input_noise != EXACT:
-        parts["input noise"] = [problem.input_noise]
+        parts["input_noise"] = [problem.input_noise]
     return " ".join(f"{part}:{digest(value)}" for part, value in parts.items())
 
 

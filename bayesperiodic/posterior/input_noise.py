@@ -12,7 +12,8 @@ of the covariance would draw the estimate towards models that pass on less of th
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,8 @@ NEGLIGIBLE = 1e-9
 InputNoise = str | Mapping[str, Any]
 
 
-class InputErrors(NamedTuple):
+@dataclass(frozen=True)
+class InputErrors:
     """Errors of the inputs of one experiment, linearised about an estimate."""
 
     expected: np.ndarray  # (errors,), η̂
@@ -42,8 +44,10 @@ class InputErrors(NamedTuple):
 
 def same(one: Mapping[str, InputErrors], other: Mapping[str, InputErrors]) -> bool:
     """Return whether two linearisations are equal."""
-    pairs = ((one[name], other[name]) for name in one if name in other)
-    return one.keys() == other.keys() and all(np.array_equal(x, y) for a, b in pairs for x, y in zip(a, b, strict=True))
+    return one.keys() == other.keys() and all(
+        np.array_equal(own.expected, other[name].expected) and np.array_equal(own.loadings, other[name].loadings)
+        for name, own in one.items()
+    )
 
 
 def true_inputs(experiment: Experiment, noise: InputNoise, errors: InputErrors | None) -> dict[str, np.ndarray]:
@@ -152,7 +156,7 @@ def _root(experiment: Experiment, name: str, harmonics: int, noise: InputNoise) 
         return np.diag(float(noise[name]) * np.sqrt(np.r_[1.0, np.full(size - 1, 2.0)] / size))
     variance = experiment.amplitude_variance[name][: harmonics + 1]
     freedom = experiment.amplitude_freedom.get(name)
-    variance = pooled(variance, np.ones(variance.size) if freedom is None else freedom[: harmonics + 1])
+    variance = variance if freedom is None else pooled(variance, freedom[: harmonics + 1])
     variance = np.pad(variance, (0, harmonics + 1 - variance.size))
     return np.diag(np.sqrt(np.concatenate([variance[:1], 0.5 * variance[1:], 0.5 * variance[1:]])))
 

@@ -57,11 +57,12 @@ class Problem(Description):
         "independent", "measured" or "circulant", or a model of `bayesperiodic.noise`.
     scheme : str or Scheme, optional
         See `solve_periodic`.
-    input_noise : "exact", "measured" or mapping of str to float or array
+    input_noise : "exact", "measured" or mapping of str to float or array (amplitudes, amplitudes)
         Whether the measured inputs are the true ones, or have errors: with the variances that `fold` found (at least
         five cycles), averaged over neighbouring harmonics, or with the given standard deviation of one value of the
-        mean period, white noise, or the covariance of mean, cosines and sines of the harmonics kept. The true inputs,
-        with a flat prior, are integrated out, linearised about the estimate; see `MapEstimate.input_errors`.
+        mean period, white noise, or the covariance of mean, cosines and sines of the harmonics kept, as many amplitudes
+        as these. The true inputs, with a flat prior, are integrated out, linearised about the estimate; see
+        `MapEstimate.input_errors`.
 
     Raises
     ------

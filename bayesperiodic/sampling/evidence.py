@@ -21,9 +21,11 @@ from bayesperiodic.posterior.parameters import CHAIN, DRAW, SHIFT, local_name
 from bayesperiodic.posterior.priors import LOG_ROOT_TWO_PI, Uniform
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.ensemble import AffineTransform
 from bayesperiodic.sampling.posterior import Posterior
-from bayesperiodic.sampling.proposals import fit_mixture
+from bayesperiodic.sampling.proposals import (
+    AffineTransform,
+    fit_mixture,
+)
 
 # Draws of the posterior and of the mixture for each of the two estimates.
 DRAWS = 4000

@@ -16,8 +16,8 @@ from bayesperiodic.posterior.density import SAMPLED, LogPosterior
 from bayesperiodic.posterior.parameters import CHAIN, DRAW
 from bayesperiodic.sampling import convergence
 from bayesperiodic.sampling.convergence import PASSES, stop_rule
-from bayesperiodic.sampling.ensemble import AffineTransform, CallCount
 from bayesperiodic.sampling.posterior import Posterior, gather
+from bayesperiodic.sampling.proposals import AffineTransform, CallCount
 from bayesperiodic.sampling.starts import mode_of, sampling_axes, start_points
 
 TUNE = 300

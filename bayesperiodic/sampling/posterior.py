@@ -39,7 +39,7 @@ from bayesperiodic.posterior.parameters import (
     squared,
 )
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.ensemble import CallCount
+from bayesperiodic.sampling.proposals import CallCount
 
 SAMPLED_ONLY = "Only sampled parameters are part of the draws; write the value of a fixed one as a number."
 

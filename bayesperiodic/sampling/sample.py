@@ -38,10 +38,18 @@ from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import Simulator
 from bayesperiodic.sampling.checkpoint import Checkpoint
 from bayesperiodic.sampling.convergence import PASSES, stop_rule
-from bayesperiodic.sampling.ensemble import MIXTURE_STEPS, AffineTransform, CallCount, MixtureMove, moves
 from bayesperiodic.sampling.nuts import refuse_for_nuts, sample_nuts
 from bayesperiodic.sampling.posterior import Posterior, gather
-from bayesperiodic.sampling.proposals import StudentMixture, expected_time, fit_mixture
+from bayesperiodic.sampling.proposals import (
+    MIXTURE_STEPS,
+    AffineTransform,
+    CallCount,
+    MixtureMove,
+    StudentMixture,
+    expected_time,
+    fit_mixture,
+    moves,
+)
 from bayesperiodic.sampling.starts import LAPLACE, STARTS, laplace_mixture, mode_of, sampling_axes, start_points
 
 EMCEE, NUTS = "emcee", "nuts"
@@ -199,7 +207,8 @@ def sample(
         refuse_for_nuts(walkers, variances, checkpoint, executor)
     size = _checked_walkers(walkers, problem, variances)
     settings = f"seed {seed}, {ensembles} ensembles of {size} walkers, {start}, {coordinates}, {variances}"
-    settings += f", input noise {digest(fit.input_errors)}" if fit.input_errors else ""
+    if fit.input_errors:
+        settings += f", input noise {digest([[own.expected, own.loadings] for own in fit.input_errors.values()])}"
     opened = nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings)
     with interrupted_by_termination(), opened as store:
         backend, saved = (emcee.backends.Backend(), {}) if store is None else store.load()

@@ -10,8 +10,12 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.periodic.compiled import CONVERGED
 from bayesperiodic.posterior.density import LogPosterior, SamplingCoordinates
 from bayesperiodic.posterior.noise_estimate import estimate_noise
-from bayesperiodic.sampling.ensemble import AffineTransform, CallCount
-from bayesperiodic.sampling.proposals import HEAVY, StudentMixture
+from bayesperiodic.sampling.proposals import (
+    HEAVY,
+    AffineTransform,
+    CallCount,
+    StudentMixture,
+)
 
 LAPLACE, PRIOR, OVERDISPERSED = "laplace", "prior", "overdispersed"
 STARTS = (LAPLACE, PRIOR, OVERDISPERSED)

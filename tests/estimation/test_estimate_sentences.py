@@ -19,7 +19,7 @@ def fitted(**changes):
         "other_orbits": {}, "input_noise": {"y": 0.0}, "rms": {"y": 2.0}, "without_noise": (),
         "doubling_shift": {"a": 0.0, "b": np.nan}, "at_ends": (), "theta": {"a": 1.25, "b": 3.0},
         "prior_conflict": SimpleNamespace(text=""), "fvu": {"y": 0.1}, "converged": True, "other_modes": (),
-        "undetermined": (), "noise_split": {},
+        "undetermined": (), "noise_split": {}, "input_errors": {},
     }  # fmt: skip
     return SimpleNamespace(**(given | changes))
 
@@ -171,7 +171,7 @@ def test_noise_is_split_by_channel_and_whiteness_is_corrected_for_the_experiment
     likelihood = SimpleNamespace(blocks=blocks, whitened=lambda vectors, noise: vectors)
     given = SimpleNamespace(channels=("y", "z", "w"), likelihood=likelihood)
     estimate = SimpleNamespace(here=SimpleNamespace(residuals=residuals), noise=None)
-    split = result.noise_split(given, estimate, np.array([0.9, 0.7, 0.5, 1.0]))
+    split = result.noise_split(given, estimate.here.residuals, np.array([0.9, 0.7, 0.5, 1.0]))
     total = (residuals[0] @ residuals[0] + residuals[1] @ residuals[1]) / (7 * 0.9 + 7 * 0.7)
     assert list(split) == ["y", "z"]
     expected = NoiseSplit(np.sqrt(0.2), np.sqrt(total - 0.2), np.sqrt(total))

@@ -17,7 +17,9 @@ PRIORS = {"k": bp.LogNormal(800.0, 0.1), "c": bp.Normal(30.0, 20.0), "coulomb": 
 
 
 def description(model, free=("variance[y]",), counts=("variance[y]",), kinds=(SPECTRAL,)):
-    likelihood = SimpleNamespace(counts=dict.fromkeys(counts, 9.0), blocks=[SimpleNamespace(kind=k) for k in kinds])
+    likelihood = SimpleNamespace(
+        counts=dict.fromkeys(counts, 9.0), blocks=[SimpleNamespace(kind=k) for k in kinds], shared=[]
+    )
     return SimpleNamespace(noise=model, likelihood=likelihood, free_noise=free)
 
 

@@ -10,8 +10,8 @@ import bayesperiodic as bp
 from bayesperiodic import noise
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective, climb
 from bayesperiodic.posterior.likelihood import Likelihood
-from bayesperiodic.posterior.noise_estimate import estimate_noise
 from bayesperiodic.posterior.noise import CORRELATED, KNOWN, POINTS, SPECTRAL, Block
+from bayesperiodic.posterior.noise_estimate import estimate_noise
 from tests.known import LINEAR, difference, formula_model, grid, linear_experiment, linear_regressors
 
 TRUTH = np.array([900.0, 40.0, 25.0])

@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesperiodic.sampling.ensemble import MixtureMove, WithinEnsembles, moves
-from bayesperiodic.sampling.proposals import StudentMixture, expected_time, fit_mixture
+from bayesperiodic.sampling.proposals import (
+    MixtureMove,
+    StudentMixture,
+    WithinEnsembles,
+    expected_time,
+    fit_mixture,
+    moves,
+)
 
 
 def mixture(*means: float, weights: list[float] | None = None, width: float = 1.0) -> StudentMixture:

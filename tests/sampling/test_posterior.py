@@ -9,8 +9,8 @@ from scipy.special import digamma, polygamma
 
 import bayesperiodic as bp
 from bayesperiodic.sampling import convergence
-from bayesperiodic.sampling.ensemble import CallCount
 from bayesperiodic.sampling.posterior import gather
+from bayesperiodic.sampling.proposals import CallCount
 from tests.known import (
     LINEAR,
     SADDLE_NODE,
