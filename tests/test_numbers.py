@@ -173,7 +173,7 @@ def landing_gear_campaigns():
 
 def damper():
     d = results("damper")
-    laplace, robust, choices = d["laplace_sd"], d["robust_sd"], d["input_harmonics"]["choices"]
+    laplace, robust, tried = d["laplace_sd"], d["robust_sd"], d["harmonics"]
     assert [name for name, verdict in d["comparison"].items() if verdict != "fine"] == ["rho"]
     yield f"identified from {d['cycles']} measured cycles"
     end = d["map"]["rho"] + 1.645 * laplace["rho"]
@@ -186,12 +186,13 @@ def damper():
         f"{ratio['rho']:.1f} times as large for rho, {ratio['Kw']:.1f} for Kw, {ratio['Kx']:.1f} for Kx, "
         f"{ratio['K']:.1f} for K and {ratio['F0']:.0f} for F0"
     )
-    kept, rho = ([one[key] for one in choices] for key in ("harmonics", "map"))
-    values = listed(f"{one['rho']:,.0f}" for one in rho)
+    kept, exact, noisy = ([tried[i][key] for i in (0, -2, -1)] for key in ("kept", "rho_exact", "rho"))
     yield (
-        f"rho is {values} 1/m with {listed(kept)} displacement harmonics, at a "
+        f"rho is {listed(f'{one:,.0f}' for one in exact)} 1/m with {listed(kept)} displacement harmonics, at a "
         f"standard deviation of {laplace['rho']:,.0f} 1/m"
     )
+    shown = listed(f"{one:,.0f}" for one in noisy)
+    yield f"With the displacement's noise integrated out it is {shown} 1/m"
 
 
 def silverbox():
