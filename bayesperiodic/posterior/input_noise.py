@@ -197,6 +197,8 @@ class Shared:
         self.members = tuple(members)
         self.parts = np.split(vectors[:, large] * values[large], np.cumsum(sizes)[:-1])
         self._grams = [part.T @ part for part in self.parts]
+        # Lᵀ·L of all blocks together, a diagonal matrix.
+        self._squares = values[large] ** 2
 
     @property
     def covariances(self) -> list[np.ndarray]:
@@ -215,6 +217,10 @@ class Shared:
 
     def log_likelihood(self, r: Sequence[np.ndarray], p: Sequence[np.ndarray], factor: float) -> np.ndarray:
         """Return what is added (…,), the logarithm of the determinant multiplied by a factor; NaN if not finite."""
+        if len(r) == 1 and p[0].shape[-1] == 1:  # S is diagonal
+            diagonal = 1.0 + p[0] * self._squares
+            vector = p[0] * (self.parts[0].T @ r[0][..., None])[..., 0]
+            return 0.5 * np.sum(vector**2 / diagonal - factor * np.log(diagonal), axis=-1)
         matrix, vector = self._system(r, p)
         wrong = ~(np.isfinite(matrix).all(axis=(-2, -1)) & np.isfinite(vector).all(axis=-1))
         if np.any(wrong):

@@ -232,3 +232,18 @@ def test_results_carry_the_errors_of_their_inputs(tmp_path):
 def test_impossible_noise_is_refused(given, message):
     with pytest.raises(ValueError, match=message):
         static(static_run(0), given)
+
+
+def test_a_single_channel_has_the_dense_covariance_too():
+    random = np.random.default_rng(5)
+    loadings, r, v = (
+        0.3 * random.standard_normal((7, 5)),
+        random.standard_normal((3, 7)),
+        np.array([[0.3], [1.0], [9.0]]),
+    )
+    likelihood = Likelihood(bp.noise.Independent(), [block("x")], {}, {"run": loadings})
+    for i in range(3):
+        covariance = 0.25 * v[i] * np.eye(7) + loadings @ loadings.T
+        exact = stats.multivariate_normal(np.zeros(7), covariance).logpdf(r[i]) + 3.5 * np.log(2 * np.pi)
+        assert likelihood([r], v)[i] == pytest.approx(exact, rel=1e-10)
+        assert likelihood([r[i]], v[i]) == likelihood([r], v)[i]
