@@ -478,6 +478,7 @@ WITHOUT_RESULTS = {
         "θ16 < 0": DEFINITION,
         "Kluwer, 1997, 191-198. BSD-3-Clause": ELSEWHERE,
     },
+    "docs/noisy_inputs.md": {"instead of 1/V": DEFINITION, "with 1/V the posterior": DEFINITION},
     "docs/running.md": {
         "the scheduler's own address instead of 127.0.0.1": SETTING,
         "128 processes": SETTING,

@@ -28,6 +28,8 @@ FITTED: dict[str, Any] = {"color": COLOURS["map"], "ls": "--", "marker": "x"}
 BAND: dict[str, Any] = {"color": COLOURS["mcmc"], "alpha": 0.45}
 LEVELS, LEVELS_TEXT = (0.5, 0.9), "50% and 90%"
 FEWEST_BINS, MOST_BINS = 35, 200
+# Standard deviations of a normal distribution within which 90 % are.
+NINETY = 1.645
 BINS, SHOWN = 40, (0.0005, 0.9995)
 # Range of the powers of ten of ticks without an offset or a common factor.
 WHOLE = (-5, 10)
@@ -43,6 +45,9 @@ def fit(
     figure: Figure | None = None,
 ) -> Figure:
     """Draw each measured mean period with the fitted one, a predictive band and the residual below.
+
+    Where the noise of the inputs is estimated too, further panels show what it is: measured minus estimated input, with
+    a band of 90 % (1.645 standard deviations given the estimate).
 
     Parameters
     ----------
@@ -75,8 +80,16 @@ def fit(
             "prediction", prediction.median, runs, "give the one of this problem, predict(problem, posterior)"
         )
     shown = [(e, channel) for e in problem.experiments if e.name in runs for channel in e.outputs]
-    figure = figure or plt.figure(figsize=(7.0, 4.6 * len(shown)), layout="constrained")
-    grid = figure.add_gridspec(2 * len(shown), 1, height_ratios=[3, 1] * len(shown))
+    noisy = [
+        (e, name)
+        for e in problem.experiments
+        if e.name in runs and e.name in estimate.input_errors
+        for name, sd in estimate.input_sd[e.name].items()
+        if sd.any()
+    ]
+    heights = [3, 1] * len(shown) + [1] * len(noisy)
+    figure = figure or plt.figure(figsize=(7.0, 4.6 * len(shown) + 1.3 * len(noisy)), layout="constrained")
+    grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
     for row, (e, channel) in enumerate(shown):
         top = figure.add_subplot(grid[2 * row])
         below = figure.add_subplot(grid[2 * row + 1], sharex=top)
@@ -95,6 +108,17 @@ def fit(
         below.set(ylabel=axis_label("residual", unit), xlabel="time in the period [s]")
         top.tick_params(labelbottom=False)
         top.legend(frameon=False)
+    for row, (e, name) in enumerate(noisy, 2 * len(shown)):
+        axes, half = figure.add_subplot(grid[row]), NINETY * estimate.input_sd[e.name][name]
+        error = e.inputs[name] - estimate.inputs[e.name][name]
+        axes.fill_between(e.time, error - half, error + half, lw=0, label="90 %", **BAND)
+        axes.plot(e.time, error, lw=1.2, label="MAP", **FITTED | {"marker": None})
+        axes.axhline(0.0, lw=1.0, color=COLOURS["measured"])
+        if row == 2 * len(shown):
+            axes.legend(frameon=False, ncols=2, loc="upper right")
+        axes.set(
+            ylabel=axis_label(f"error of\n{name}", problem.model.units.get(name, "")), xlabel="time in the period [s]"
+        )
     return figure
 
 

@@ -50,6 +50,11 @@ class Description:
         find_scheme(self.scheme)
         self.experiments = _checked_experiments(model, experiments)
         self.input_noise = checked(input_noise, model.inputs, self.experiments)
+        if self.input_noise != EXACT and not self.noise.flat and any(e.mask is not None for e in self.experiments):
+            raise ValueError(
+                f"input_noise: must be 'exact' for points of a mask with {self.noise.name!r} noise, got "
+                f"{_checks.shortened(input_noise)}; take noise='independent' or 'measured', or whole periods."
+            )
         self.input_errors: dict[str, InputErrors] = {}
         measured = {channel for experiment in self.experiments for channel in experiment.outputs}
         self.channels = tuple(channel for channel in model.outputs if channel in measured)

@@ -1,5 +1,8 @@
 """Errors of the inputs in the likelihood: against dense normal distributions, differences and a static regression."""
 
+from dataclasses import replace
+
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
@@ -234,6 +237,20 @@ def test_impossible_noise_is_refused(given, message):
         static(static_run(0), given)
 
 
+def test_points_of_a_mask_need_white_noise():
+    run = replace(static_run(4), mask=np.arange(21) < 15, independent={}, harmonics={})
+    with pytest.raises(
+        ValueError, match="input_noise: must be 'exact' for points of a mask with 'circulant' noise, got"
+    ):
+        bp.Problem(STATIC, [run], priors=WIDE, noise="circulant", input_noise={"x": X_SD})
+    fit = bp.map_estimate(static(run, {"x": X_SD}), **QUIET)
+    odr = pytest.importorskip("odrpack").odr_fit(
+        lambda x, b: b[0] * x + b[1] * x**3, run.inputs["x"][:15], run.outputs["y"][:15], np.array([1.0, 0.3]),
+        weight_x=X_SD**-2, weight_y=Y_SD**-2, partol=1e-14, sstol=1e-14,
+    )  # fmt: skip
+    assert list(fit.theta.values()) == pytest.approx(odr.beta, rel=1e-5)
+
+
 def test_a_single_channel_has_the_dense_covariance_too():
     random = np.random.default_rng(5)
     loadings, r, v = (
@@ -247,3 +264,16 @@ def test_a_single_channel_has_the_dense_covariance_too():
         exact = stats.multivariate_normal(np.zeros(7), covariance).logpdf(r[i]) + 3.5 * np.log(2 * np.pi)
         assert likelihood([r], v)[i] == pytest.approx(exact, rel=1e-10)
         assert likelihood([r[i]], v[i]) == likelihood([r], v)[i]
+
+
+def test_the_fit_is_drawn_with_the_errors_of_the_input():
+    run = static_run(6)
+    problem = static(run, {"x": X_SD})
+    estimate = bp.map_estimate(problem, **QUIET)
+    figure = bp.plot.fit(problem, estimate)
+    assert [axes.get_ylabel() for axes in figure.axes] == ["y", "residual", "error of\nx"]
+    (drawn, _), error = figure.axes[-1].lines, run.inputs["x"] - estimate.inputs["run"]["x"]
+    assert drawn.get_ydata() == pytest.approx(error)
+    exact = static(run, "exact")
+    assert len(bp.plot.fit(exact, bp.map_estimate(exact, **QUIET)).axes) == 2
+    plt.close("all")
