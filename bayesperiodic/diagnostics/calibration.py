@@ -26,6 +26,7 @@ from bayesperiodic.diagnostics.adequacy import holm
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.description import fingerprint
+from bayesperiodic.posterior.input_noise import EXACT
 from bayesperiodic.posterior.joint_priors import as_prior
 from bayesperiodic.posterior.noise import EXPERIMENT, VARIANCE, Independent
 from bayesperiodic.posterior.problem import Problem
@@ -329,6 +330,11 @@ def check_supported(problem: Problem) -> None:
         raise ValueError(
             f"problem: must have proper priors, got the {noise.prior_text} of {problem.free_noise[0]!r}. Give "
             "noise.Independent(prior=bp.InverseGamma(…)) or another proper prior, or fix the variance."
+        )
+    if problem.input_noise != EXACT:
+        raise ValueError(
+            f"problem: must have input_noise='exact', got {_checks.shortened(problem.input_noise)}. Recordings are "
+            "simulated without noise of the inputs."
         )
     if problem.model.autonomous:
         raise ValueError(f"problem: must have a forced model, got the autonomous {problem.model.name!r}.")

@@ -179,7 +179,7 @@ class Problem(Description):
         return []
 
     def planned(self, experiment: Experiment, noise: Mapping[str, float]) -> "Problem":
-        """Return the problem of an experiment that may be made, alone, with all parameters of this problem.
+        """Return the problem of an experiment that may be made, alone, with exact inputs and this one's parameters.
 
         Parameters
         ----------
@@ -194,7 +194,7 @@ class Problem(Description):
         """
         other, seen = copy(self), Observation(experiment, self.model, self.parameter_maps[experiment.name].delayed)
         names = {name for block in seen.blocks for name in self.noise.parameter_names(block)}
-        other.experiments, other.observations = (experiment,), {experiment.name: seen}
+        other.experiments, other.observations, other.input_errors = (experiment,), {experiment.name: seen}, {}
         other.likelihood = Likelihood(self.noise, seen.blocks, {name: noise[name] for name in names})
         other._densities = {}
         return other

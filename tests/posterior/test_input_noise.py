@@ -237,6 +237,12 @@ def test_impossible_noise_is_refused(given, message):
         static(static_run(0), given)
 
 
+def test_a_calibration_of_noisy_inputs_is_refused():
+    known = {"variance[y]": Y_SD**2}
+    with pytest.raises(ValueError, match="problem: must have input_noise='exact', got {'x': 0.15}"):
+        bp.calibrate(static(static_run(0), {"x": X_SD}, fixed=known), replicates=1, seed=1)
+
+
 def test_points_of_a_mask_need_white_noise():
     run = replace(static_run(4), mask=np.arange(21) < 15, independent={}, harmonics={})
     with pytest.raises(
