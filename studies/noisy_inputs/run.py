@@ -6,7 +6,6 @@ its standard deviation, of logarithms where the parameter is positive.
 """
 
 import argparse
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,82 +14,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
-import bayesperiodic as bp
 from studies import common
-from studies.damper import run as damper
+from studies.noisy_inputs.cases import CASES, COVERED, KINDS, LEVELS, replicate, source
 
-LEVELS, KINDS = (0.01, 0.03, 0.1), ("exact", "measured")
 REPLICATES, QUICK, FILE = 200, 4, "replicates.jsonl"
-COVERED, FALSE_ALARM = 0.9, 0.01
-STRIDE = 10_000
-DUFFING = {"m": 1.0, "c": 0.2, "k": 1.0, "k3": 1.0}
-DUFFING_HARMONICS = {1: 2.0, 3: 0.6}
-CASES = ("duffing", "damper")
-
-Task = tuple[str, float, int, int]
-
-
-def duffing(level: float, seed: int) -> tuple[bp.Experiment, dict[str, Any], dict[str, float]]:
-    """Return an experiment, free parameters with priors, and the truth."""
-    force = _signal(DUFFING_HARMONICS)
-    recording = bp.simulate(
-        bp.models.duffing, DUFFING, {"force": force}, frequency=0.25, duration=120.0, sampling_rate=10.0,
-        noise={"force": level * float(force.std()), "displacement": 0.02}, seed=seed,
-    )  # fmt: skip
-    priors = {name: bp.LogNormal(value, 1.0) for name, value in DUFFING.items() if name != "m"}
-    return recording.fold(256, harmonics={"force": 9}), priors, DUFFING
-
-
-def dahl(level: float, seed: int) -> tuple[bp.Experiment, dict[str, Any], dict[str, float]]:
-    """Return an experiment, free parameters with priors, and the truth."""
-    displacement = _signal(damper.SYNTHETIC_SHAPE)
-    recording = bp.simulate(
-        bp.models.dahl, damper.PUBLISHED, {"displacement": displacement}, frequency=damper.SYNTHETIC_FREQUENCY,
-        duration=30.0, sampling_rate=100.0, seed=seed,
-        noise={"displacement": level * float(displacement.std()), "force": damper.SYNTHETIC_NOISE["force"]},
-    )  # fmt: skip
-    return recording.fold(512, harmonics={"displacement": 16}), damper.PRIORS, damper.PUBLISHED
-
-
-def _signal(harmonics: dict[int, Any]) -> np.ndarray:
-    """Return a signal on 64 points from the complex amplitudes of its harmonics."""
-    turn = 2j * np.pi * np.arange(64) / 64
-    return np.real(sum(amplitude * np.exp(order * turn) for order, amplitude in harmonics.items()))
-
-
-def replicate(task: Task) -> dict[str, Any]:
-    """Return the z, coverage by 90 % intervals and unexplained variance of one recording: case, level, number, seed."""
-    case, level, number, seed = task
-    line: dict[str, Any] = {"case": case, "level": level, "number": number, "seed": seed, "source": source()}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        experiment, priors, truth = (duffing if case == "duffing" else dahl)(level, STRIDE * seed + number)
-        model = bp.models.duffing if case == "duffing" else bp.models.dahl
-        fixed = {name: value for name, value in truth.items() if name not in priors}
-        start = {name: truth[name] for name in priors}
-        for kind in KINDS:
-            problem = bp.Problem(model, [experiment], priors=priors, fixed=fixed, input_noise=kind)
-            try:
-                fit = bp.map_estimate(problem, start=start, progress=False)
-            except (RuntimeError, ValueError) as error:
-                line[kind] = {"error": f"{type(error).__name__}: {error}"}
-                continue
-            z = {name: _deviation(fit, name, truth[name], priors[name]) for name in priors}
-            inside = {n: bool(2 * stats.t.sf(abs(z[n]), fit.degrees_of_freedom[n]) > 1 - COVERED) for n in z}
-            line[kind] = {"z": z, "covered": inside, "unexplained": next(iter(fit.fvu.values())), "status": fit.status}
-    return line
-
-
-def _deviation(fit: bp.MapEstimate, name: str, truth: float, prior: Any) -> float:
-    value, sd = fit.theta[name], fit.sd[name]
-    if isinstance(prior, bp.LogNormal):
-        return float(np.log(value / truth) * value / sd)
-    return (value - truth) / sd
-
-
-def source() -> str:
-    """Return a key that identifies version and cases of the replicates."""
-    return common.source_key(__file__, damper.__file__)
+FALSE_ALARM = 0.01
 
 
 def run(options: argparse.Namespace) -> None:
@@ -129,12 +57,15 @@ def summary(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
             for kind in KINDS:
                 good = [line[kind] for line in own if "error" not in line[kind]]
                 names = list(good[0]["z"]) if good else []
-                z = {name: np.array([one["z"][name] for one in good]) for name in names}
+                # Where an estimate has no standard deviation, z is NaN, and the interval does not cover.
+                every = {name: np.array([one["z"][name] for one in good]) for name in names}
+                z = {name: values[np.isfinite(values)] for name, values in every.items()}
                 found.setdefault(case, {}).setdefault(f"{level:.0%}", {})[kind] = {
                     "bias": {name: float(np.mean(values)) for name, values in z.items()},
                     "sd": {name: float(np.std(values)) for name, values in z.items()},
                     "coverage": {n: float(np.mean([one["covered"][n] for one in good])) for n in names},
                     "unexplained": float(np.median([one["unexplained"] for one in good])) if good else None,
+                    "without_sd": sum(len(every[name]) - len(z[name]) for name in names),
                     "errors": [line[kind]["error"] for line in own if "error" in line[kind]],
                     "not_converged": sum(one["status"] != "converged" for one in good),
                 }
@@ -162,18 +93,19 @@ def table(found: dict[str, Any]) -> str:
 
 def draw(found: dict[str, Any], band: Sequence[float]) -> Figure:
     """Return the coverage of 90 % intervals by the noise of the input."""
-    figure, grid = plt.subplots(1, len(found), figsize=(8.0, 3.4), sharey=True, layout="constrained")
+    figure, grid = plt.subplots(1, len(found), figsize=(8.0, 3.9), sharey=True, layout="constrained")
     for axes, (case, by_level) in zip(grid, found.items(), strict=True):
         names = list(next(iter(by_level.values()))["measured"]["coverage"])
         for number, name in enumerate(names):
             place = np.arange(len(by_level)) + 0.12 * (number - 0.5 * (len(names) - 1))
             for kind, filled in (("exact", "none"), ("measured", f"C{number}")):
                 share = [by_kind[kind]["coverage"][name] for by_kind in by_level.values()]
-                label = f"{name}" if kind == "measured" else None
+                label = name if kind == "measured" else None
                 axes.plot(place, share, ls="none", marker="o", mec=f"C{number}", mfc=filled, label=label)
         axes.axhspan(*band, color="0.85", zorder=0)
         axes.set(title=f"{case}, synthetic", xlabel="noise of the input [of its rms]", ylim=(0.0, 1.05))
         axes.set_xticks(np.arange(len(by_level)), list(by_level))
-        axes.legend(loc="lower left", frameon=False, title="filled: noise integrated out\nopen: taken as exact")
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=5, frameon=False, handletextpad=0.1)
     grid[0].set_ylabel("coverage of 90 % intervals")
+    figure.suptitle("filled: noise of the input integrated out; open: input taken as exact", fontsize="medium")
     return figure
