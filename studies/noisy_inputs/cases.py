@@ -15,6 +15,8 @@ COVERED = 0.9
 STRIDE = 10_000
 DUFFING = {"m": 1.0, "c": 0.2, "k": 1.0, "k3": 1.0}
 DUFFING_HARMONICS = {1: 2.0, 3: 0.6}
+# Time [s] after which the transient, with a time constant of 10 s, is gone; noise hides it from the fold.
+SETTLING = 100.0
 CASES = ("duffing", "damper")
 
 Task = tuple[str, float, int, int]
@@ -24,11 +26,12 @@ def duffing(level: float, seed: int) -> tuple[bp.Experiment, dict[str, Any], dic
     """Return an experiment, free parameters with priors, and the truth."""
     force = _signal(DUFFING_HARMONICS)
     recording = bp.simulate(
-        bp.models.duffing, DUFFING, {"force": force}, frequency=0.25, duration=120.0, sampling_rate=10.0,
+        bp.models.duffing, DUFFING, {"force": force}, frequency=0.25, duration=120.0 + SETTLING, sampling_rate=10.0,
         noise={"force": level * float(force.std()), "displacement": 0.02}, seed=seed,
     )  # fmt: skip
     priors = {name: bp.LogNormal(value, 1.0) for name, value in DUFFING.items() if name != "m"}
-    return recording.fold(256, harmonics={"force": 9}), priors, DUFFING
+    steady = recording.between(SETTLING, np.inf)
+    return steady.fold(256, harmonics={"force": 9}), priors, DUFFING
 
 
 def dahl(level: float, seed: int) -> tuple[bp.Experiment, dict[str, Any], dict[str, float]]:
