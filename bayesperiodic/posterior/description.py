@@ -305,8 +305,8 @@ class Description:
         }
 
     def __getstate__(self) -> dict[str, Any]:
-        # Compiled functions cannot be pickled; they are loaded again where they are needed.
-        return {key: value for key, value in self.__dict__.items() if key != "equations"}
+        # Compiled functions cannot be pickled; they are loaded again where they are needed. Copies have other anchors.
+        return {key: value for key, value in self.__dict__.items() if key not in ("equations", "_last")}
 
     def parameters(self, theta: np.ndarray, experiment: str) -> np.ndarray:
         """Return every parameter of the model in an experiment, free, fixed and tied.

@@ -160,8 +160,7 @@ class Problem(Description):
         if self._last and same(self._last[0].input_errors, errors):
             return self._last[0]
         other, own = copy(self), self.likelihood
-        for computed in ("equations", "_densities", "_last"):
-            other.__dict__.pop(computed, None)
+        other.__dict__.pop("_densities", None)
         other.input_errors = dict(errors)
         other.observations = {}
         for name, seen in self.observations.items():

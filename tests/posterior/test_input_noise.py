@@ -9,6 +9,7 @@ import xarray as xr
 from scipy import stats
 
 import bayesperiodic as bp
+from bayesperiodic import _fourier
 from bayesperiodic.posterior.input_noise import pooled, same
 from bayesperiodic.posterior.likelihood import Likelihood
 from bayesperiodic.posterior.noise import KNOWN, SPECTRAL, Block
@@ -283,3 +284,17 @@ def test_the_fit_is_drawn_with_the_errors_of_the_input():
     exact = static(run, "exact")
     assert len(bp.plot.fit(exact, bp.map_estimate(exact, **QUIET)).axes) == 2
     plt.close("all")
+
+
+def test_replicates_are_of_what_was_measured_with_the_noisy_input():
+    """Without noise a replicate plus the compared residual, without what the input's errors cause, is the data."""
+    run = static_run(7)
+    problem = static(run, {"x": X_SD})
+    fit = bp.map_estimate(problem, **QUIET)
+    frozen = problem.with_input_errors(fit.input_errors)
+    here = frozen.anchored(fit.theta).density().linearise(frozen.vector(fit.theta))
+    seen, (residual,) = frozen.observations["run"], here.residuals
+    response = here.simulator.solve(here.theta[None]).response("run")
+    (replicate,) = seen.replicates(response, [np.zeros((1, residual.size))])["y"]
+    assert np.abs(seen.caused[0]).max() > 0.05
+    assert replicate + _fourier.from_components(residual, 21) == pytest.approx(run.outputs["y"], abs=1e-9)
