@@ -91,7 +91,7 @@ def gear_problem(
     """
     model, inputs = bp.models.landing_gear(drive), gear_runs(drive, samples)[:runs]
     experiments = measured(model, GEAR, inputs, samples, seed, scheme, HARMONICS if cut else None)
-    return bp.Problem(model, experiments, **gear_priors(free), scheme=scheme)
+    return bp.Problem(model, experiments, **gear_priors(free), scheme=scheme, input_noise="exact")
 
 
 def gear_at_rest(experiment: bp.Experiment, p: Mapping[str, float]) -> np.ndarray:

@@ -46,6 +46,9 @@ class Experiment(Result):
         Variance of the mean's complex Fourier amplitudes.
     amplitude_freedom : mapping of str to array (harmonics + 1,), optional
         Degrees of freedom of ``amplitude_variance``; by default 2(cycles − 1), and cycles − 1 for harmonic 0.
+    error_slopes : mapping of str to mapping of str to complex array (harmonics + 1,), optional
+        By input and output, the regression of the errors of the output's complex amplitudes on those of the input's;
+        none where they are independent.
     frequency_se, periodicity, origin : float
         Standard error of the frequency [Hz], zero if it is known; fraction of the variance that the mean period
         explains, of the channel with the smallest one; time [s] of the recording at which τ = 0.
@@ -101,6 +104,7 @@ class Experiment(Result):
     harmonics: Mapping[str, int] = field(default_factory=dict, kw_only=True)
     amplitude_variance: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
     amplitude_freedom: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+    error_slopes: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict, kw_only=True)
     frequency_se: float = field(default=0.0, kw_only=True)
     periodicity: float = field(default=1.0, kw_only=True)
     drift: Mapping[str, float] = field(default_factory=dict, kw_only=True)
@@ -138,6 +142,10 @@ class Experiment(Result):
             object.__setattr__(self, argument, given)
             for key in given:
                 _checks.one_of(argument, key, (*self.inputs, *self.outputs))
+        for name, slopes in self.error_slopes.items():
+            _checks.one_of("error_slopes", name, self.inputs)
+            for channel in slopes:
+                _checks.one_of(f"error_slopes[{name!r}]", channel, self.outputs)
         measured = points if self.mask is None else int(self.mask.sum())
         _checks.integer("cycles", self.cycles, 1)
         if self.averaged is not None:

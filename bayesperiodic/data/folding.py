@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from scipy.signal import medfilt
-from scipy.special import fdtrc, softmax
+from scipy.special import chdtrc, fdtrc, softmax
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.harmonics import (
@@ -45,6 +45,8 @@ CROSSING = "crossing"
 # The spectrum of the noise: grid points a sample, and a cycle if there are not many harmonics; neighbouring lines on
 # each side of a harmonic.
 FINENESS, FINEST, NEIGHBOURS = 4, 1 << 14, 16
+# Neighbouring harmonics on each side with which variances and slopes of one are averaged.
+POOLED = 2
 # Degrees of freedom of the variance of repeated errors, less than of any measured one.
 REPEATED_FREEDOM = 3.0
 # Lines from which frequency zero is extrapolated: for the kind of noise, and for the level of white and slow noise.
@@ -142,6 +144,7 @@ def fold_signals(
         "harmonics": kept,
         "amplitude_variance": by_channel(v.variance[own] for v, own in zip(noise, used, strict=True)),
         "amplitude_freedom": by_channel(v.freedom[own] for v, own in zip(noise, used, strict=True)),
+        "error_slopes": _error_slopes(by_channel(noise), inputs, kept),
         "periodicity": periodicity,
         "drift": drift,
         "origin": start,
@@ -347,12 +350,13 @@ def _periodicity(signals: Signals, fit: HarmonicFit) -> float:
 class AmplitudeNoise:
     """Variances of the mean period's complex amplitudes, and their degrees of freedom, (harmonics + 1,) each.
 
-    `lines` are those of the part that was measured.
+    `lines` are those of the part that was measured, `beside` the amplitudes (lines, harmonics + 1) of the noise there.
     """
 
     variance: np.ndarray
     freedom: np.ndarray
     lines: np.ndarray
+    beside: np.ndarray
 
 
 def _noise(signals: Signals, fit: HarmonicFit, row: int, cycles: int) -> tuple[np.ndarray, AmplitudeNoise]:
@@ -375,10 +379,11 @@ def _noise(signals: Signals, fit: HarmonicFit, row: int, cycles: int) -> tuple[n
     size = np.bincount(place // points, minlength=cycles)[:, None]
     deviation = np.fft.rfft(signal.reshape(cycles, points), axis=1)[:, harmonic] / size
     sides = np.clip(cycles // 4, min(4, cycles // 2), NEIGHBOURS)
-    power = _between(signal.reshape(cycles, points)) / time.size**2
-    near = 0.5 * (power[:sides, harmonic] + power[:sides, -harmonic]).mean(axis=0)
+    amplitude = _between(signal.reshape(cycles, points)) / time.size
+    beside = np.concatenate([amplitude[:sides, harmonic], np.conj(amplitude[:sides, -harmonic])])
+    near = np.mean(np.abs(beside) ** 2, axis=0)
     freedom = np.full(harmonic.size, 4.0 * sides)
-    near[0], freedom[0] = _at_zero(power[:, : points // 2].T.ravel()[:LINES])
+    near[0], freedom[0] = _at_zero(np.abs(amplitude[:, : points // 2].T.ravel()[:LINES]) ** 2)
     repeated = _repeated_error(signals.values[row], residuals, fit.amplitudes[row], phase, grid)
     # Satterthwaite; how the repeated error is distributed over the harmonics is hardly known.
     uncertain = near**2 / freedom + repeated**2 / REPEATED_FREEDOM
@@ -386,11 +391,44 @@ def _noise(signals: Signals, fit: HarmonicFit, row: int, cycles: int) -> tuple[n
     near += repeated
     scale = np.where(harmonic == 0, 1.0, 4.0)
     one_cycle = scale * np.sum(np.abs(deviation) ** 2, axis=0) / (cycles - 1)
-    return one_cycle, AmplitudeNoise(scale * near, total, freedom)
+    return one_cycle, AmplitudeNoise(scale * near, total, freedom, beside)
+
+
+def _error_slopes(
+    noise: Mapping[str, AmplitudeNoise], inputs: Iterable[str], kept: Mapping[str, int]
+) -> dict[str, dict[str, np.ndarray]]:
+    """Return the regression of the errors of outputs on those of inputs, by input and output, where they correlate.
+
+    That none of the harmonics from the first on does is tested by their coherences γ², of which −2(n − 1)·ln(1 − γ²)
+    has the distribution χ² with two degrees of freedom for n lines. The slopes are averaged over neighbouring harmonics.
+    """
+    found: dict[str, dict[str, np.ndarray]] = {}
+    for name in inputs:
+        for channel in [other for other in noise if other not in inputs]:
+            one, two = (noise[c].beside[:, : 1 + min(kept[name], kept[channel])] for c in (name, channel))
+            common, own = np.sum(np.conj(one) * two, axis=0), np.sum(np.abs(one) ** 2, axis=0)
+            every = own * np.sum(np.abs(two) ** 2, axis=0)
+            coherence = np.divide(np.abs(common) ** 2, every, out=np.zeros(own.size), where=every > 0.0)[1:]
+            statistic = -2.0 * (len(one) - 1) * np.log1p(-np.minimum(coherence, 1.0 - np.finfo(float).eps)).sum()
+            if chdtrc(2 * coherence.size, statistic) < FALSE_ALARM_RATE:
+                slope = neighbours_mean(common, own)
+                slope[0] = slope[0].real
+                found.setdefault(name, {})[channel] = slope
+    return found
+
+
+def neighbours_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return Σ values/Σ weights (harmonics + 1,), the sums over neighbouring harmonics, but not with the mean value."""
+    window, result = np.ones(2 * POOLED + 1), np.zeros(values.shape, dtype=values.dtype)
+    np.divide(values[:1], weights[:1], out=result[:1], where=weights[:1] > 0.0)
+    middle = slice(POOLED, POOLED + values.size - 1)
+    total, weight = (np.convolve(own[1:], window)[middle] for own in (values, weights))
+    np.divide(total, weight, out=result[1:], where=weight > 0.0)
+    return result
 
 
 def _between(signal: np.ndarray) -> np.ndarray:
-    """Return the power of lines s = 1, 2, … above the harmonics 0 … points − 1 of a signal (cycles, points).
+    """Return the sums of lines s = 1, 2, … above the harmonics 0 … points − 1 of a signal (cycles, points).
 
     By sums over the cycles first, so that the time does not depend on the prime factors of their number.
     """
@@ -399,7 +437,7 @@ def _between(signal: np.ndarray) -> np.ndarray:
     turn = 2.0 * np.pi / cycles * side * np.arange(cycles)
     total = np.cos(turn) @ signal - 1j * (np.sin(turn) @ signal)
     total *= np.exp(-2j * np.pi / (cycles * points) * side * np.arange(points))
-    return np.abs(np.fft.fft(total, axis=1)) ** 2
+    return np.asarray(np.fft.fft(total, axis=1))
 
 
 def _repeated_error(

@@ -26,7 +26,7 @@ from bayesperiodic.diagnostics.adequacy import holm
 from bayesperiodic.estimation.map_estimate import map_estimate
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.description import fingerprint
-from bayesperiodic.posterior.input_noise import EXACT
+from bayesperiodic.posterior.input_noise import JOINT, MEASURED, error_waves, noisy_inputs
 from bayesperiodic.posterior.joint_priors import as_prior
 from bayesperiodic.posterior.noise import EXPERIMENT, VARIANCE, Independent
 from bayesperiodic.posterior.problem import Problem
@@ -199,7 +199,7 @@ def calibrate(
     as many cycles as the experiment has (at least three) with as many samples per cycle as its grid, adds white noise,
     folds with the harmonics and the frequency of the experiment, and computes the MAP estimate, the Laplace
     approximation and draws of emcee. The periodic solver is not used for the recording, so that its errors are
-    detected. Inputs are recorded without noise, as the likelihood assumes.
+    detected. Inputs have the noise that `Problem.input_noise` gives them: white, with the measured variance, or given.
 
     A likelihood that counts too many independent values, or a grid that is too coarse, results in "too narrow" or "not
     uniform". A wrong model is not detected: truths are drawn from the model.
@@ -331,11 +331,8 @@ def check_supported(problem: Problem) -> None:
             f"problem: must have proper priors, got the {noise.prior_text} of {problem.free_noise[0]!r}. Give "
             "noise.Independent(prior=bp.InverseGamma(…)) or another proper prior, or fix the variance."
         )
-    if problem.input_noise != EXACT:
-        raise ValueError(
-            f"problem: must have input_noise='exact', got {_checks.shortened(problem.input_noise)}. Recordings are "
-            "simulated without noise of the inputs."
-        )
+    if problem.input_noise == JOINT:
+        raise ValueError("problem: must have another input_noise than 'joint', whose errors are no parameters to draw.")
     if problem.model.autonomous:
         raise ValueError(f"problem: must have a forced model, got the autonomous {problem.model.name!r}.")
     for e in problem.experiments:
@@ -388,15 +385,29 @@ def _measured(
     limit, cycles = _fourier.highest_harmonic(e.samples), max(e.cycles, FEWEST_CYCLES)
     size = cycles * e.samples
     kept = {channel: e.harmonics.get(channel, limit) for channel in (*e.inputs, *e.outputs)}
-    inputs, outputs = {channel: np.tile(signal, cycles) for channel, signal in e.inputs.items()}, {}
+    outputs = {}
     for channel in e.outputs:
         place = f"{channel}, {e.name}" if problem.noise.per == EXPERIMENT else channel
         noise = np.sqrt(variances[f"{VARIANCE}[{place}]"]) * generator.standard_normal(size)
         outputs[channel] = np.tile(cycle[channel], cycles) + noise
     time = np.arange(size) / (e.samples * e.frequency)
+    inputs = {name: np.tile(signal, cycles) for name, signal in e.inputs.items()}
+    for name in noisy_inputs(e, problem.input_noise):
+        inputs[name] = inputs[name] + _input_noise(problem, e, name, size, generator)
     recording = Recording(time, outputs, inputs, name=e.name, synthetic=True)
     again = recording.fold(e.samples, frequency=e.frequency, harmonics=kept)
     return replace(again, independent=e.independent, guess=e.guess)
+
+
+def _input_noise(problem: Problem, e: Experiment, name: str, size: int, generator: Generator) -> np.ndarray:
+    """Return noise of an input (size,): white with the measured variance, or of given covariance in all cycles."""
+    if problem.input_noise == MEASURED:
+        variance = e.amplitude_variance[name]
+        total = variance[0] + 0.5 * variance[1:].sum()
+        return np.sqrt(total / (2 * variance.size - 1) * size) * generator.standard_normal(size)
+    where, waves = error_waves(e, problem.input_noise)
+    errors = generator.standard_normal(len(where)) * (np.array(where) == name)
+    return np.tile(_fourier.on_grid(errors @ waves, e.samples), size // e.samples)
 
 
 def _first_state(problem: Problem, e: Experiment) -> dict[str, float]:

@@ -159,7 +159,7 @@ def rank_candidates(
 
 def _added(problem: Problem, fit: MapEstimate, run: Experiment, candidate: Candidate) -> np.ndarray:
     """Return the information of a candidate in the coordinates of `Information`; NaN without an orbit."""
-    inputs = {name: u.mean() + candidate.scale * (u - u.mean()) for name, u in run.inputs.items()}
+    inputs = {name: u.mean() + candidate.scale * (u - u.mean()) for name, u in problem.true_inputs(run).items()}
     planned = problem.planned(replace(run, frequency=candidate.frequency, inputs=inputs), fit.noise)
     with warnings.catch_warnings():
         # The estimate has already warned about a coarse grid.

@@ -504,7 +504,7 @@ def _predicted(
     NaN where most draws have no periodic solution.
     """
     e = next(e for e in problem.experiments if e.name == run)
-    inputs = {name: u.mean() + scale * (u - u.mean()) for name, u in e.inputs.items()}
+    inputs = {name: u.mean() + scale * (u - u.mean()) for name, u in problem.true_inputs(e).items()}
     places = np.linspace(0, posterior.draws(problem.names[0]).size - 1, DRAWS).astype(int)
     theta, noise = draws_of(problem, posterior, places)
     level, guesses = np.median(noise, axis=0), posterior.guesses([run], problem.model.states)

@@ -1,6 +1,7 @@
 """Diagnostics of an estimate: robust covariance, uncertain noise parameters, discretisation, noise of the inputs."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from bayesperiodic.posterior.input_noise import (
     InputNoise,
     directions,
     error_waves,
+    errors_of_outputs,
     expected_errors,
     true_inputs,
 )
@@ -31,6 +33,8 @@ LENGTHSCALES = np.geomspace(1e-3, 3.0, 40)
 WHITE = 0.5
 ROUNDS, SETTLED = 10, 1e-3
 RIDGE = 1e-12
+# Pairs of errors of the inputs that are tried.
+PROBES = 8
 # Change of the logarithm of a variance in a difference.
 STEP = 1e-4
 
@@ -227,9 +231,11 @@ def with_uncertain_noise(
         result += 4.0 / part.freedom * _without_negative(part.once - part.twice, covariance)
     if not shaped:
         return result
-    total = information(problem, estimate)[0] + problem.joint_prior.curvature(estimate.theta)
+    fit = _with_errors(problem, estimate, covariance)
     for group, members in shaped:
-        result += _mixture(problem, estimate, total, covariance, (group, members, parts[group[0]].left)) - covariance
+        result += (
+            scaled(_mixture(problem, estimate, fit, (group, members, parts[group[0]].left)), fit.scale) - covariance
+        )
     return _without_negative(result, covariance)
 
 
@@ -246,29 +252,54 @@ def _is_shaped(problem: Problem, group: tuple[str, ...], members: list[int]) -> 
     return shaped and spectral and set(group) <= set(problem.free_noise)
 
 
+class _Linear(NamedTuple):
+    """Linear least squares for θ, in standard deviations (names,), together with the errors of the inputs."""
+
+    scale: np.ndarray  # (names,)
+    hessian: np.ndarray  # (names + errors, names + errors)
+    changes: list[np.ndarray]  # (names + errors, size) of the predicted components, one a block
+    residuals: list[np.ndarray]  # (size,) with the estimated inputs
+
+
+def _with_errors(problem: Problem, estimate: Iterate, covariance: np.ndarray) -> _Linear:
+    """Return the least squares whose solution, with the errors of the inputs eliminated, is the estimate."""
+    likelihood, scale = problem.likelihood, np.sqrt(np.diag(covariance))
+    count, first = sum(one.parts[0].shape[1] for one in likelihood.shared), scale.size
+    changes = [np.pad(s * scale[:, None], ((0, count), (0, 0))) for s in estimate.here.changes]
+    prior = problem.joint_prior.curvature(estimate.theta)
+    if not count:
+        hessian = scaled(information(problem, estimate)[0] + prior, scale)
+        return _Linear(scale, hessian, changes, list(estimate.here.residuals))
+    hessian = np.eye(scale.size + count)
+    hessian[:first, :first] = scaled(prior, scale)
+    for one in likelihood.shared:
+        last = first + one.parts[0].shape[1]
+        for b, part in zip(one.members, one.parts, strict=True):
+            changes[b][first:last] = part.T
+        first = last
+    for own, precision in zip(changes, likelihood.precisions(range(len(changes)), estimate.noise), strict=True):
+        hessian += (own * precision) @ own.T
+    return _Linear(scale, hessian, changes, estimated_inputs(problem, estimate).residuals)
+
+
 def _mixture(
-    problem: Problem,
-    estimate: Iterate,
-    hessian: np.ndarray,
-    covariance: np.ndarray,
-    shaped: tuple[tuple[str, ...], list[int], float],
+    problem: Problem, estimate: Iterate, fit: _Linear, shaped: tuple[tuple[str, ...], list[int], float]
 ) -> np.ndarray:
-    """Return the covariance of the mixture over the noise parameters of one group, the others fixed.
+    """Return the covariance of θ, in units of `fit`, for the mixture over one group's noise parameters, others fixed.
 
     `shaped` are these parameters, the indices of their blocks, and the values that determine the variance.
     """
     group, members, freedom = shaped
     likelihood, blocks = problem.likelihood, [problem.likelihood.blocks[b] for b in members]
-    scale = np.sqrt(np.diag(covariance))
-    s = np.concatenate([estimate.here.changes[b] for b in members], axis=1) * scale[:, None]
-    r = np.concatenate([estimate.here.residuals[b] for b in members])
+    s = np.concatenate([fit.changes[b] for b in members], axis=1)
+    r = np.concatenate([fit.residuals[b] for b in members])
     weight = np.concatenate([np.full(block.size, block.weight) for block in blocks])
     here = estimate.noise[[likelihood.names.index(name) for name in group]]
     now = weight / _spectra(problem, blocks, here)
-    others = scaled(hessian, scale) - (s * now) @ s.T + JITTER * np.eye(scale.size)
-    pull = -(s * now) @ r
+    others = fit.hessian - (s * now) @ s.T + JITTER * np.eye(len(s))
+    pull, names = -(s * now) @ r, fit.scale.size
     points, log_prior = _points(problem)
-    log_posterior, found = np.empty(len(points)), np.empty((len(points), *covariance.shape))
+    log_posterior, found = np.empty(len(points)), np.empty((len(points), names, names))
     for i, shape in enumerate(_spectra(problem, blocks, np.column_stack([np.ones(len(points)), points]))):
         own = weight / shape
         left, variance = r, float(np.sum(own * r**2)) / freedom
@@ -280,8 +311,8 @@ def _mixture(
         misfit = np.sum(own * left**2) / variance + step @ others @ step - 2.0 * step @ pull
         logarithms = float(np.sum(weight * np.log(variance * shape))) + np.linalg.slogdet(total)[1]
         log_posterior[i] = log_prior[i] - 0.5 * (misfit + logarithms)
-        found[i] = np.linalg.inv(total) + np.outer(step, step)
-    return scaled(np.tensordot(_probabilities(log_posterior), found, 1), scale)
+        found[i] = np.linalg.inv(total)[:names, :names] + np.outer(step[:names], step[:names])
+    return np.tensordot(_probabilities(log_posterior), found, 1)
 
 
 def _spectra(problem: Problem, blocks: list[Block], values: np.ndarray) -> np.ndarray:
@@ -311,11 +342,16 @@ def doubling_shift(
     """
     finer: list[np.ndarray] = []
     for e in problem.experiments:
-        response = _on_twice_the_points(problem, estimate.theta, e, solutions[e.name])
+        response = _solved(problem, estimate.theta, e, solutions[e.name], problem.true_inputs(e), finer=2)
         if response is None:
             return np.full(estimate.theta.size, np.nan)
         finer += problem.observations[e.name].residuals(response)
     moved = [there - here for there, here in zip(finer, estimate.here.residuals, strict=True)]
+    return _shift(problem, estimate, moved, covariance)
+
+
+def _shift(problem: Problem, estimate: Iterate, moved: list[np.ndarray], covariance: np.ndarray) -> np.ndarray:
+    """Return the Gauss-Newton step of θ, in sds (names,), for changes of the residuals, one array (size,) a block."""
     changes = problem.likelihood.whitened(estimate.here.changes, estimate.noise)
     white = problem.likelihood.whitened(moved, estimate.noise)
     right = np.sum([s @ r for s, r in zip(changes, white, strict=True)], axis=0)
@@ -323,17 +359,52 @@ def doubling_shift(
         return covariance @ right / np.sqrt(np.diag(covariance))
 
 
-def _on_twice_the_points(
-    problem: Problem, theta: np.ndarray, experiment: Experiment, coarse: PeriodicSolution
+def input_nonlinearity(
+    problem: Problem, estimate: Iterate, solutions: Mapping[str, PeriodicSolution], covariance: np.ndarray
+) -> np.ndarray:
+    """Return how much of an sd each estimate is changed by what is not linear in the errors of the inputs (names,).
+
+    The root mean square over pairs of opposite errors, normal given the estimate; NaN if one of the solves fails.
+    """
+    random, shifts = np.random.default_rng(0), []
+    roots = {name: np.linalg.cholesky(own) for name, own in estimated_inputs(problem, estimate).covariances.items()}
+    for _ in range(PROBES if roots else 0):
+        moved: list[np.ndarray] = []
+        for e in problem.experiments:
+            observation = problem.observations[e.name]
+            here = list(estimate.here.residuals)[len(moved) :][: len(observation.blocks)]
+            if e.name not in roots:
+                moved += [np.zeros_like(own) for own in here]
+                continue
+            errors, measured = roots[e.name] @ random.standard_normal(len(roots[e.name])), problem.input_errors[e.name]
+            ends = []
+            for sign in (1.0, -1.0):
+                other = replace(measured, expected=measured.expected + sign * errors)
+                inputs = true_inputs(e, problem.input_noise, other)
+                response = _solved(problem, estimate.theta, e, solutions[e.name], inputs)
+                if response is None:
+                    return np.full(estimate.theta.size, np.nan)
+                ends.append(observation.residuals(response))
+            moved += [0.5 * (up + down) - own for up, down, own in zip(*ends, here, strict=True)]
+        shifts.append(_shift(problem, estimate, moved, covariance))
+    return np.sqrt(np.mean(np.square(shifts), axis=0)) if shifts else np.zeros(estimate.theta.size)
+
+
+def _solved(
+    problem: Problem,
+    theta: np.ndarray,
+    experiment: Experiment,
+    near: PeriodicSolution,
+    inputs: Mapping[str, np.ndarray],
+    finer: int = 1,
 ) -> Response | None:
-    """Return the response on a grid of twice as many points, at every second of them; None if the solve fails."""
-    points = 2 * experiment.samples * experiment.periods
-    inputs = true_inputs(experiment, problem.input_noise, problem.input_errors.get(experiment.name))
+    """Return the response to inputs (points,), solved on a finer grid, at the points; None if the solve fails."""
+    points = finer * experiment.samples * experiment.periods
     equations = PeriodicEquations.build(
         problem.model,
         {n: _fourier.on_grid(_fourier.coefficients(u), points) for n, u in inputs.items()},
-        frequency=coarse.frequency,
-        samples=2 * experiment.samples,
+        frequency=near.frequency,
+        samples=finer * experiment.samples,
         scheme=problem.scheme,
         periods=experiment.periods,
         winding=experiment.winding,
@@ -341,14 +412,14 @@ def _on_twice_the_points(
     values = problem.parameter_maps[experiment.name].values(theta[None])[0]
     parameters, delay = np.ascontiguousarray(values[:-1]), values[-1]
     if problem.model.autonomous:
-        equations, solved, _ = solve_free(equations, parameters, coarse)
+        equations, solved, _ = solve_free(equations, parameters, near)
     else:
-        solved, _ = solve_driven(equations, parameters, coarse)
+        solved, _ = solve_driven(equations, parameters, near)
     if solved.code != CONVERGED:
         return None
     count = 0 if experiment.multipliers is None else experiment.multipliers.size
     found = orbit_multipliers(equations, parameters, solved.z, count)
-    outputs = equations.outputs(solved.z, parameters)[::2]
+    outputs = equations.outputs(solved.z, parameters)[::finer]
     return Response(outputs, np.array(equations.frequency), np.log(np.abs(found)), np.array(delay))
 
 
@@ -375,7 +446,10 @@ def input_loadings(
             equations.outputs(z, parameters), np.array(equations.frequency), np.empty(count), np.array(values[-1])
         )
         along = Response(moved.outputs, moved.frequency, np.zeros((len(changes), count)), none)
-        found[e.name] = np.concatenate(problem.observations[e.name].changes(here, along), axis=1).T
+        observation = problem.observations[e.name]
+        common = observation.errors(errors_of_outputs(e, observation.channels, noise))
+        caused = [a - b for a, b in zip(observation.changes(here, along), common, strict=True)]
+        found[e.name] = np.concatenate(caused, axis=1).T
     return found
 
 
@@ -397,6 +471,7 @@ class InputEstimate(NamedTuple):
     """Errors of the inputs given an estimate: expected ones with loadings there, and what has no errors of inputs."""
 
     errors: dict[str, InputErrors]
+    covariances: dict[str, np.ndarray]  # (errors, errors) of the errors
     sd: dict[str, dict[str, np.ndarray]]  # (points,) of the estimated inputs, by experiment and input
     residuals: list[np.ndarray]  # components y − ŷ with the estimated inputs, one array (size,) a block
 
@@ -405,7 +480,7 @@ def estimated_inputs(
     problem: Problem, estimate: Iterate, loadings: Mapping[str, np.ndarray] | None = None
 ) -> InputEstimate:
     """Return the errors of the inputs given the estimate, by default with the loadings of the problem."""
-    likelihood, errors, sd = problem.likelihood, {}, {}
+    likelihood, errors, covariances, sd = problem.likelihood, {}, {}, {}
     residuals = list(estimate.here.residuals)
     for e in problem.experiments:
         members = [b for b, block in enumerate(likelihood.blocks) if block.experiment == e.name]
@@ -415,19 +490,19 @@ def estimated_inputs(
             for b, part in zip(members, before.parts(sizes), strict=True):
                 residuals[b] = residuals[b] + part
         matrix = likelihood.loadings.get(e.name) if loadings is None else loadings.get(e.name)
-        sd[e.name] = {name: np.zeros_like(u) for name, u in e.inputs.items()}
-        if matrix is None:
-            continue
-        expected = np.zeros(matrix.shape[1]) if before is None else before.expected
-        sizes = [residuals[b].size for b in members]
-        moved = np.split(matrix @ expected, np.cumsum(sizes)[:-1])
-        own = [residuals[b] - part for b, part in zip(members, moved, strict=True)]
-        mean, covariance = expected_errors(matrix, own, likelihood.precisions(members, estimate.noise))
-        errors[e.name] = InputErrors(mean, matrix)
         where, waves = error_waves(e, problem.input_noise)
+        covariance = np.eye(len(where))
+        if matrix is not None:
+            expected = np.zeros(matrix.shape[1]) if before is None else before.expected
+            sizes = [residuals[b].size for b in members]
+            moved = np.split(matrix @ expected, np.cumsum(sizes)[:-1])
+            own = [residuals[b] - part for b, part in zip(members, moved, strict=True)]
+            found, covariance = expected_errors(matrix, own, likelihood.precisions(members, estimate.noise))
+            if found.loadings.any():
+                errors[e.name], covariances[e.name] = found, covariance
+        sd[e.name] = {name: np.zeros_like(u) for name, u in e.inputs.items()}
         signals = _fourier.on_grid(waves, e.samples * e.periods)
         for name in set(where):
             mine = np.array([owner == name for owner in where])
-            variance = np.einsum("ip,ij,jp->p", signals[mine], covariance[np.ix_(mine, mine)], signals[mine])
-            sd[e.name][name] = np.sqrt(variance)
-    return InputEstimate(errors, sd, residuals)
+            sd[e.name][name] = np.sqrt(np.sum((covariance[np.ix_(mine, mine)] @ signals[mine]) * signals[mine], axis=0))
+    return InputEstimate(errors, covariances, sd, residuals)

@@ -18,6 +18,7 @@ from bayesperiodic.estimation.covariance import (
     doubling_shift,
     estimated_inputs,
     input_loadings,
+    input_nonlinearity,
     robust_covariance,
     variance_parts,
     with_uncertain_noise,
@@ -42,12 +43,12 @@ from bayesperiodic.periodic.compiled import NOT_RESOLVED, OTHER_ORBIT, STATUSES
 from bayesperiodic.posterior.density import NATURAL, RIDGE, Linearisation, LogPosterior
 from bayesperiodic.posterior.description import fingerprint
 from bayesperiodic.posterior.initial import InitialEstimate, measured_orbits, simultaneous_fit
-from bayesperiodic.posterior.input_noise import EXACT, MEASURED, true_inputs
+from bayesperiodic.posterior.input_noise import EXACT, FEWEST_CYCLES, ROUGH
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.posterior.simulator import Simulator
 
 NOISE_SHARE = 0.1
-LARGEST_SHIFT = 0.1
+LARGEST_SHIFT, LARGEST_NONLINEARITY = 0.1, 0.3
 SHOWN = 3
 # Information of the data, relative to the prior's, below which an estimate at an end of the support is the prior's.
 INFORMED = 0.01
@@ -170,7 +171,7 @@ def map_estimate(
 
 def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Problem, End]:
     """Return problem and end of the climb with the errors of the inputs, linearised about the estimate."""
-    for _ in range(MOST_ROUNDS if problem.input_noise != EXACT else 0):
+    for _ in range(MOST_ROUNDS if problem.noisy_inputs else 0):
         now, before = end.iterate, problem.input_errors
         loadings = input_loadings(problem, now.theta, now.here.simulator.solutions(now.theta), problem.input_noise)
         errors = estimated_inputs(problem, now, loadings).errors
@@ -184,11 +185,11 @@ def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Prob
         still = all(np.abs(own).max(initial=0.0) < SETTLED for own in moved)
         if still and step @ objective.hessian_and_gradient(end.iterate)[0] @ step < SETTLED**2:
             return problem, end
-    if problem.input_noise != EXACT:
+    if problem.noisy_inputs:
         warnings.warn(
             "The errors of the inputs could not be linearised: estimate or inputs still move when this is repeated, by "
-            f"more than {SETTLED:g} of their standard deviations. Average more cycles, or keep fewer harmonics of the "
-            "inputs.",
+            f"more than {SETTLED:g} of their standard deviations. Average more cycles, or take input_noise='joint', in "
+            "which they are parameters.",
             UserWarning,
             stacklevel=4,
         )
@@ -307,11 +308,11 @@ def _describe(
     covariance = with_uncertain_noise(problem, best, inverse, parts).copy()
     shift = doubling_shift(problem, best, solutions, covariance)
     shift[lost] = np.nan
+    curved = input_nonlinearity(problem, best, solutions, covariance)
     covariance[lost], covariance[:, lost] = np.nan, np.nan
     covariance[lost, lost] = np.inf
     found, residuals = estimated_inputs(problem, best), best.here.compared()
-    known = MEASURED if problem.input_noise == EXACT else problem.input_noise
-    loadings = problem.likelihood.loadings or input_loadings(problem, best.theta, solutions, known)
+    loadings = problem.likelihood.loadings or input_loadings(problem, best.theta, solutions, ROUGH)
     sampled = objective.density.with_settings(coordinates=RIDGE)
     joint = cache(partial(in_one_thread(joint_laplace), sampled, best))
     others = [joint_laplace(sampled, end.iterate) for end in modes[1:]]
@@ -338,11 +339,10 @@ def _describe(
         whiteness=channel_whiteness(problem, best),
         noise_split=noise_split(problem, found.residuals, objective.log_variance_factor),
         input_noise=caused_by_inputs(problem, loadings),
-        inputs={
-            e.name: true_inputs(e, problem.input_noise, problem.input_errors.get(e.name)) for e in problem.experiments
-        },
+        inputs={e.name: problem.true_inputs(e) for e in problem.experiments},
         input_sd=found.sd,
         input_errors=problem.input_errors,
+        input_nonlinearity=dict(zip(names, curved.tolist(), strict=True)),
         doubling_shift=dict(zip(names, shift.tolist(), strict=True)),
         other_orbits=best.here.other_orbits,
         at_ends=tuple(np.array(names)[acting & (at_ends(objective, best) != 0.0)].tolist()),
@@ -388,15 +388,21 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             "another model."
         )
     rates = max(problem.model.input_derivatives().values(), default=0)
-    kept = max((np.count_nonzero(v) for e in problem.experiments for v in e.amplitude_variance.values()), default=0)
-    for channel, noise in fit.input_noise.items() if not fit.input_errors else ():
+    for channel, noise in fit.input_noise.items() if problem.input_noise == EXACT else ():
         if noise > NOISE_SHARE * fit.rms[channel]:
-            remedies = ["average more cycles"] + ["keep fewer input harmonics (fold(harmonics=…))"] * int(kept > 2)
             yield (
                 f"The noise of the measured inputs{', differentiated,' if rates else ''} causes {noise:.3g} in "
-                f"{channel!r}, {noise / fit.rms[channel]:.0%} of the residual's {fit.rms[channel]:.3g}; "
-                f"{', '.join(remedies)}{' or measure the derivative' if rates else ''}."
+                f"{channel!r}, {noise / fit.rms[channel]:.0%} of the residual's {fit.rms[channel]:.3g}, but the inputs "
+                f"are taken as exact. Fold at least {FEWEST_CYCLES} cycles, and take input_noise='measured', or give "
+                "the noise in input_noise={…}."
             )
+    if curved := {n: own for n, own in fit.input_nonlinearity.items() if not own < LARGEST_NONLINEARITY}:
+        worst = max(curved, key=lambda name: np.nan_to_num(curved[name], nan=np.inf))
+        yield (
+            "The errors of the inputs are too large to be linearised: what is not linear in them changes "
+            f"{worst!r} by {curved[worst]:.2g} of its standard deviation. Average more cycles, or compare with "
+            "input_noise='joint', in which they are parameters."
+        )
     for channel in fit.without_noise:
         yield (
             f"The data of {channel!r} contain no noise: the residual's rms of {fit.rms[channel]:.2g} is a rounding "

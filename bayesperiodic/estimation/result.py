@@ -159,6 +159,9 @@ class MapEstimate(Result):
         By experiment with noisy inputs: independent standard normal errors of the inputs, `expected` (errors,), and the
         derivatives of the compared components by them, `loadings` L (components, errors), at the estimate; L·Lᵀ is what
         they add to the covariance of the residual.
+    input_nonlinearity : dict of str to float
+        By what each estimate is changed by the part of the outputs that is not linear in the errors of the inputs, in
+        standard deviations: root mean square over errors drawn given the estimate. NaN if a solve fails.
     doubling_shift : dict of str to float
         Change of each estimate on twice as many points, in standard deviations; NaN if those solves fail.
     at_ends : tuple of str
@@ -217,6 +220,7 @@ class MapEstimate(Result):
     inputs: dict[str, dict[str, np.ndarray]]
     input_sd: dict[str, dict[str, np.ndarray]]
     input_errors: dict[str, InputErrors]
+    input_nonlinearity: dict[str, float]
     doubling_shift: dict[str, float]
     at_ends: tuple[str, ...]
     other_orbits: dict[str, str]

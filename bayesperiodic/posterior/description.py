@@ -15,7 +15,18 @@ from bayesperiodic.data.recording import Recording
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.equations import PeriodicEquations
 from bayesperiodic.periodic.schemes import Scheme, default_scheme, find_scheme
-from bayesperiodic.posterior.input_noise import EXACT, InputErrors, InputNoise, checked, same, true_inputs
+from bayesperiodic.posterior.input_noise import (
+    EXACT,
+    JOINT,
+    MEASURED,
+    InputErrors,
+    InputNoise,
+    checked,
+    noisy_inputs,
+    same,
+    true_inputs,
+    with_errors_as_parameters,
+)
 from bayesperiodic.posterior.joint_priors import JointPrior
 from bayesperiodic.posterior.likelihood import Likelihood
 from bayesperiodic.posterior.noise import EXPERIMENT, Noise, as_noise
@@ -41,28 +52,36 @@ class Description:
         local: Iterable[str] = (),
         noise: str | Noise = "independent",
         scheme: str | Scheme | None = None,
-        input_noise: InputNoise = EXACT,
+        input_noise: InputNoise = MEASURED,
     ):
         if not isinstance(model, Model):
             raise ValueError(f"model: must be a Model, got {_checks.shortened(model)}.")
-        self.model, self.noise = model, as_noise(noise)
-        self.scheme = scheme or default_scheme(model)
-        find_scheme(self.scheme)
-        self.experiments = _checked_experiments(model, experiments)
+        if not isinstance(priors, Mapping):
+            raise ValueError(f"priors: must be a mapping of names to priors, got {priors!r}.")
+        self.noise, self.experiments, local = as_noise(noise), _checked_experiments(model, experiments), tuple(local)
+        self._given: dict[str, Any] = {
+            "model": model, "priors": dict(priors), "fixed": dict(fixed or {}), "tied": tied, "local": local,
+            "noise": noise, "scheme": scheme, "input_noise": input_noise,
+        }  # fmt: skip
         self.input_noise = checked(input_noise, model.inputs, self.experiments)
-        if self.input_noise != EXACT and not self.noise.flat and any(e.mask is not None for e in self.experiments):
-            raise ValueError(
-                f"input_noise: must be 'exact' for points of a mask with {self.noise.name!r} noise, got "
-                f"{_checks.shortened(input_noise)}; take noise='independent' or 'measured', or whole periods."
-            )
+        if self.input_noise == JOINT:
+            model, errors, none = with_errors_as_parameters(model, self.experiments)
+            priors, fixed = {**priors, **errors}, {**(fixed or {}), **none}
+            local += tuple(name for name in model.parameters if name not in self._given["model"].parameters)
+        self.model, self.scheme = model, scheme or default_scheme(model)
+        find_scheme(self.scheme)
+        if not self.noise.flat and any(e.mask is not None for e in self.experiments):
+            if isinstance(self.input_noise, Mapping):
+                raise ValueError(
+                    f"input_noise: must be 'joint' or 'exact' for points of a mask with {self.noise.name!r} noise, got "
+                    f"{_checks.shortened(input_noise)}; take noise='independent' or 'measured', or whole periods."
+                )
+            self.input_noise = EXACT if self.input_noise == MEASURED else self.input_noise
         self.input_errors: dict[str, InputErrors] = {}
         measured = {channel for experiment in self.experiments for channel in experiment.outputs}
         self.channels = tuple(channel for channel in model.outputs if channel in measured)
         runs = [e.name for e in self.experiments]
-        if not isinstance(priors, Mapping):
-            raise ValueError(f"priors: must be a mapping of names to priors, got {priors!r}.")
         fixed, tied, every = dict(fixed or {}), dict(tied or {}), (*model.parameters, SHIFT)
-        self._given_priors, self._given_fixed = dict(priors), fixed
         self.local = _checked_local(local, every, priors, tied)
         self.fixed = {n: _constant(n, fixed[n], runs, n in self.local) for n in every if n in fixed}
         given = expand_priors(priors, self.local, runs, self.fixed) | self._free_phases(priors, fixed, tied)
@@ -183,22 +202,12 @@ class Description:
         ends = tuple(local_name("", name) for name in gone)
         priors, fixed = (
             {key: value for key, value in given.items() if not (isinstance(key, str) and key.endswith(ends))}
-            for given in (self._given_priors, self._given_fixed)
+            for given in (self._given["priors"], self._given["fixed"])
         )
         for name, value in fixed.items():
             if isinstance(value, Mapping):
                 fixed[name] = {run: number for run, number in value.items() if run not in gone}
-        return type(self)(
-            self.model,
-            chosen,
-            priors=priors,
-            fixed=fixed,
-            tied=self.tied,
-            local=self.local,
-            noise=self.noise,
-            scheme=self.scheme,
-            input_noise=self.input_noise,
-        )
+        return type(self)(experiments=chosen, **self._given | {"priors": priors, "fixed": fixed})
 
     @property
     def tied(self) -> dict[str, str]:
@@ -288,13 +297,33 @@ class Description:
         """Parameters sampled in their logarithm, those whose prior's support is (0, ∞): bool array (names,)."""
         return np.array([support == (0.0, np.inf) for support in self.joint_prior.supports.values()])
 
+    @property
+    def noisy_inputs(self) -> dict[str, list[str]]:
+        """Inputs whose errors are integrated out, by experiment; without experiments that have none."""
+        found = {e.name: noisy_inputs(e, self.input_noise) for e in self.experiments}
+        return {name: inputs for name, inputs in found.items() if inputs}
+
+    def true_inputs(self, experiment: Experiment) -> dict[str, np.ndarray]:
+        """Return the inputs of the model in an experiment: the measured ones less their expected errors.
+
+        Parameters
+        ----------
+        experiment : Experiment
+
+        Returns
+        -------
+        dict of str to array (points,)
+            In the inputs' units.
+        """
+        return true_inputs(experiment, self.input_noise, self.input_errors.get(experiment.name))
+
     @cached_property
     def equations(self) -> dict[str, PeriodicEquations]:
         """The discretised equations of every experiment."""
         return {
             e.name: PeriodicEquations.build(
                 self.model,
-                true_inputs(e, self.input_noise, self.input_errors.get(e.name)),
+                self.true_inputs(e),
                 frequency=e.frequency,
                 samples=e.samples,
                 scheme=self.scheme,

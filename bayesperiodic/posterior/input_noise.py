@@ -12,21 +12,27 @@ of the covariance would draw the estimate towards models that pass on less of th
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import sympy as sp
 
 from bayesperiodic import _checks, _fourier
 from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.data.folding import neighbours_mean
+from bayesperiodic.models.model import DERIVATIVES, Model
+from bayesperiodic.posterior.priors import Normal
 
-EXACT, MEASURED = "exact", "measured"
+EXACT, MEASURED, JOINT = "exact", "measured", "joint"
+# Measured noise in whatever number of cycles, to be compared with the residual where the inputs are taken as exact.
+ROUGH = "rough"
 # Cycles from which on the variances of an input's amplitudes are known well enough.
 FEWEST_CYCLES = 5
-# Neighbouring harmonics on each side that the variance of one is averaged with.
-NEIGHBOURS = 2
-# Singular values of loadings, relative to the largest, that are left out.
-NEGLIGIBLE = 1e-9
+# Variance of combined errors, relative to that of the outputs' errors, up to which they are left out; and squares of
+# singular values that are zero but for rounding, relative to the largest.
+NEGLIGIBLE, ROUNDING = 1e-3, 1e-18
 InputNoise = str | Mapping[str, Any]
 
 
@@ -50,6 +56,14 @@ def same(one: Mapping[str, InputErrors], other: Mapping[str, InputErrors]) -> bo
     )
 
 
+def noisy_inputs(experiment: Experiment, noise: InputNoise) -> list[str]:
+    """Return the inputs of an experiment whose noise is known: measured, in enough cycles, or given."""
+    if isinstance(noise, Mapping):
+        return [name for name in experiment.inputs if name in noise]
+    known = noise == ROUGH or (noise == MEASURED and experiment.cycles >= FEWEST_CYCLES)
+    return [name for name in experiment.inputs if known and name in experiment.amplitude_variance]
+
+
 def true_inputs(experiment: Experiment, noise: InputNoise, errors: InputErrors | None) -> dict[str, np.ndarray]:
     """Return the measured inputs (points,) less their expected errors."""
     result = {name: np.array(values) for name, values in experiment.inputs.items()}
@@ -64,19 +78,10 @@ def true_inputs(experiment: Experiment, noise: InputNoise, errors: InputErrors |
 def checked(given: InputNoise, inputs: Sequence[str], experiments: Sequence[Experiment]) -> InputNoise:
     """Return a valid argument `input_noise`, an array for each covariance, or raise a ValueError."""
     if isinstance(given, str):
-        _checks.one_of("input_noise", given, (EXACT, MEASURED))
-        if given == MEASURED:
-            for e in experiments:
-                missing = [name for name in inputs if name not in e.amplitude_variance]
-                if missing or (inputs and e.cycles < FEWEST_CYCLES):
-                    what = f"no amplitude_variance of {missing[0]!r}" if missing else f"only {e.cycles} cycles"
-                    raise ValueError(
-                        f"input_noise: must be 'exact' or a mapping where less than {FEWEST_CYCLES} cycles were "
-                        f"folded, got 'measured'; experiment {e.name!r} has {what}."
-                    )
-        return given
+        _checks.one_of("input_noise", given, (EXACT, MEASURED, JOINT))
+        return given if any(noisy_inputs(e, MEASURED) for e in experiments) else EXACT
     if not isinstance(given, Mapping):
-        raise ValueError(f"input_noise: must be 'exact', 'measured' or a mapping of inputs, got {given!r}.")
+        raise ValueError(f"input_noise: must be 'exact', 'measured', 'joint' or a mapping of inputs, got {given!r}.")
     for name in given:
         _checks.one_of("input_noise", name, inputs)
     return {name: _checked(name, value, experiments) for name, value in given.items()}
@@ -115,12 +120,57 @@ def pooled(variance: np.ndarray, freedom: np.ndarray) -> np.ndarray:
 
     The mean value, which slow noise moves, keeps its own.
     """
-    result = variance.copy()
-    window = np.ones(2 * NEIGHBOURS + 1)
-    middle = slice(NEIGHBOURS, NEIGHBOURS + variance.size - 1)
-    weighted, weight = (np.convolve(own[1:], window)[middle] for own in (variance * freedom, freedom))
-    result[1:] = np.divide(weighted, weight, out=variance[1:].copy(), where=weight > 0.0)
-    return result
+    return np.where(freedom > 0.0, neighbours_mean(variance * freedom, freedom), variance)
+
+
+def with_errors_as_parameters(
+    model: Model, experiments: Sequence[Experiment]
+) -> tuple[Model, dict[str, Normal], dict[str, dict[str, float]]]:
+    """Return the model of measured inputs less errors, and priors or fixed values of the errors, by experiment.
+
+    The parameters are the errors' amplitudes in the unit of the input, ``force_mean``, ``force_cos1``, ``force_sin1``,
+    ….
+    """
+    if len(periods := {e.periods for e in experiments}) > 1:
+        raise ValueError(
+            f"input_noise: must be 'measured' or 'exact' for experiments of {sorted(periods)} periods, got 'joint'."
+        )
+    if correlated := next((e for e in experiments if e.error_slopes), None):
+        raise ValueError(
+            f"input_noise: must be 'measured' where errors of inputs and outputs correlate, as in {correlated.name!r}, "
+            "got 'joint'."
+        )
+    tau, frequency = model.time_symbols["tau"], model.time_symbols["frequency"]
+    phase, other, changed = 2 * sp.pi * tau / periods.pop(), copy(model), {}
+    priors: dict[str, Normal] = {}
+    fixed: dict[str, dict[str, float]] = {}
+    for name in model.inputs:
+        own = [e for e in experiments if name in noisy_inputs(e, MEASURED)]
+        if not own:
+            continue
+        orders = range(1, 1 + max(kept(e, name) for e in own))
+        waves = {f"{name}_mean": sp.Integer(1)} | {f"{name}_cos{h}": sp.cos(h * phase) for h in orders}
+        waves |= {f"{name}_sin{h}": sp.sin(h * phase) for h in orders}
+        symbols = {label: sp.Symbol(f"p_{label}", real=True) for label in waves}
+        other.parameters += tuple(waves)
+        other.parameter_symbols = other.parameter_symbols | symbols
+        other.units = other.units | dict.fromkeys(waves, model.units.get(name, ""))
+        error = sum((symbols[label] * wave for label, wave in waves.items()), sp.Integer(0))
+        for order in DERIVATIVES:
+            symbol = model.input_symbols[order + name]
+            changed[symbol] = symbol - error
+            error = sp.diff(error, tau) * frequency
+        for e in experiments:
+            sd = np.diag(_root(e, name, orders.stop - 1, MEASURED)) if e in own else np.zeros(len(waves))
+            for label, value in zip(waves, sd.tolist(), strict=True):
+                if value > 0.0:
+                    priors[f"{label}[{e.name}]"] = Normal(0.0, value)
+                else:
+                    fixed.setdefault(label, {})[e.name] = 0.0
+    other.equations = tuple(g.xreplace(changed) for g in model.equations)
+    other.output_expressions = tuple(f.xreplace(changed) for f in model.output_expressions)
+    _checks.identifiers("parameters", other.parameters)
+    return other, priors, fixed
 
 
 def error_waves(experiment: Experiment, noise: InputNoise) -> tuple[list[str], np.ndarray]:
@@ -130,9 +180,7 @@ def error_waves(experiment: Experiment, noise: InputNoise) -> tuple[list[str], n
     """
     where: list[str] = []
     waves: list[np.ndarray] = []
-    for name in experiment.inputs:
-        if noise == EXACT or name not in (noise if isinstance(noise, Mapping) else experiment.amplitude_variance):
-            continue
+    for name in noisy_inputs(experiment, noise):
         harmonics = kept(experiment, name)
         root = _root(experiment, name, harmonics, noise)
         for real in root.T:
@@ -173,14 +221,33 @@ def directions(experiment: Experiment, names: Sequence[str], noise: InputNoise) 
     return result
 
 
+def errors_of_outputs(experiment: Experiment, channels: Sequence[str], noise: InputNoise) -> np.ndarray:
+    """Return the errors of measured outputs that go with a unit of each error of inputs (errors, points, channels)."""
+    where, waves = error_waves(experiment, noise)
+    points = experiment.samples * experiment.periods
+    result = np.zeros((len(where), points, len(channels)))
+    for i, (name, wave) in enumerate(zip(where, waves, strict=True)):
+        for channel, slope in experiment.error_slopes.get(name, {}).items() if noise == MEASURED else ():
+            size = min(slope.size, wave.size)
+            result[i, :, channels.index(channel)] = _fourier.on_grid(slope[:size] * wave[:size], points)
+    return result
+
+
 def expected_errors(
     matrix: np.ndarray, r: Sequence[np.ndarray], p: Sequence[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean (errors,) and the covariance of η given residuals r, p the precisions (size,) of e, by block."""
+) -> tuple[InputErrors, np.ndarray]:
+    """Return the expected errors given residuals r, and their covariance; p are the precisions (size,) of e, by block.
+
+    The loadings returned are L without the combinations of errors that are negligible against e.
+    """
     precision = np.concatenate([np.broadcast_to(own, own_r.shape) for own, own_r in zip(p, r, strict=True)])
-    weighted = matrix * precision[:, None]
-    covariance = np.linalg.inv(np.eye(matrix.shape[1]) + matrix.T @ weighted)
-    return -covariance @ (np.concatenate(r) @ weighted), covariance
+    root = np.sqrt(precision)[:, None]
+    vectors, values, axes = np.linalg.svd(root * matrix, full_matrices=False)
+    covariance = np.eye(matrix.shape[1]) - (axes.T * (values**2 / (1.0 + values**2))) @ axes
+    mean = -covariance @ (np.concatenate(r) @ (precision[:, None] * matrix))
+    large = values**2 > NEGLIGIBLE
+    loadings = (vectors[:, large] * values[large]) @ axes[large] / root
+    return InputErrors(mean, loadings), covariance
 
 
 class Shared:
@@ -193,7 +260,7 @@ class Shared:
 
     def __init__(self, members: Sequence[int], sizes: Sequence[int], matrix: np.ndarray):
         vectors, values, _ = np.linalg.svd(matrix, full_matrices=False)
-        large = values > NEGLIGIBLE * values.max(initial=0.0)
+        large = values**2 > ROUNDING * np.max(values**2, initial=0.0)
         self.members = tuple(members)
         self.parts = np.split(vectors[:, large] * values[large], np.cumsum(sizes)[:-1])
         self._grams = [part.T @ part for part in self.parts]
@@ -204,6 +271,14 @@ class Shared:
     def covariances(self) -> list[np.ndarray]:
         """L·Lᵀ of each block."""
         return [part @ part.T for part in self.parts]
+
+    def caused(self, p: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Return the mean variance (…,) of the components of each block that errors cause, given the data."""
+        inverse = np.linalg.inv(self._system([np.zeros(len(part)) for part in self.parts], p)[0])
+        return [
+            np.sum(inverse * gram, axis=(-2, -1)) / len(part)
+            for part, gram in zip(self.parts, self._grams, strict=True)
+        ]
 
     def _system(self, r: Sequence[np.ndarray], p: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return S (…, errors, errors) and b (…, errors), point by point: products must not depend on their number."""
@@ -239,7 +314,7 @@ class Shared:
         by_residual, by_logarithm = [], []
         for part, own, precision in zip(self.parts, r, p, strict=True):
             explained = part @ errors
-            taken = np.einsum("ij,jk,ik->i", part, inverse, part)
+            taken = np.sum((part @ inverse) * part, axis=1)
             by_residual.append(precision * explained)
             by_logarithm.append(precision * (explained * own - 0.5 * explained**2 - 0.5 * factor * taken))
         return by_residual, by_logarithm

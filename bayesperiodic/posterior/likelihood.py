@@ -170,7 +170,10 @@ class Likelihood:
         return result
 
     def value_variances(self, values: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
-        """Return the variance (…,) of one value of each channel, by (experiment, channel), where it has its own."""
+        """Return the variance (…,) of one value of each channel, by (experiment, channel), where it has its own.
+
+        With that which the errors of the inputs cause, given the data, averaged over the period.
+        """
         result = {}
         for block, columns in zip(self.blocks, self._columns, strict=True):
             if block.kind in (SPECTRAL, POINTS):
@@ -180,6 +183,11 @@ class Likelihood:
                     averaged = block.averaged * count / block.size
                     block = replace(block, harmonic=harmonic, size=count, averaged=averaged)
                 result[block.experiment, block.channel] = self.model.spectrum(block, own)[0].mean(axis=-1)
+        for one in self.shared:
+            caused = one.caused(self.precisions(one.members, values))
+            for b, own in zip(one.members, caused, strict=True):
+                if (key := (self.blocks[b].experiment, self.blocks[b].channel)) in result:
+                    result[key] = result[key] + own
         return result
 
     def complete(self, free: np.ndarray) -> np.ndarray:

@@ -210,6 +210,12 @@ class Observation:
         found = self._components(self._difference(response), known, frequency)
         return found if self.caused is None else [a - b for a, b in zip(found, self.caused, strict=True)]
 
+    def errors(self, values: np.ndarray) -> list[np.ndarray]:
+        """Return the components (…, size) of errors of the measured values (…, points, channels), an array a block."""
+        e, shape = self.experiment, values.shape[:-2]
+        known = [] if e.multipliers is None else [np.zeros((*shape, e.multipliers.size))]
+        return self._components(values, known, [np.zeros(shape)] if self._free_phase else [])
+
     @cached_property
     def layout(self) -> tuple[Any, ...] | None:
         """What experiments have in common that are compared all at once; None where there is more to compare."""

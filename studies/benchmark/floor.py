@@ -128,7 +128,7 @@ def _ratios(times: Mapping[str, np.ndarray], names: Iterable[str]) -> dict[str, 
 def with_all_free(setting: Setting, scheme: str) -> tuple[bp.Problem, np.ndarray]:
     """Return the problem of all 15 parameters, anchored at the estimate of the three, and these at the first draw."""
     stated = setting.problem
-    other = bp.Problem(stated.model, stated.experiments, **gear_priors(15), scheme=scheme)
+    other = bp.Problem(stated.model, stated.experiments, **gear_priors(15), scheme=scheme, input_noise="exact")
     both = stated.parameters(np.stack([setting.estimate, setting.theta[0]]), stated.experiments[0].name)
     estimate, at = (other.vector(dict(zip(stated.model.parameters, row, strict=True))) for row in both)
     return other.anchored(estimate), at

@@ -240,7 +240,7 @@ def duffing(count: int, seed: int, *, cut: bool = False) -> Setting:
     harmonics = dict.fromkeys(("force", "displacement"), DUFFING_HARMONICS) if cut else None
     experiments = measured(model, DUFFING_TRUTH, runs, samples, seed, harmonics=harmonics)
     priors = {name: bp.LogNormal(DUFFING_TRUTH[name], 0.5) for name in ("c", "k", "k3")}
-    problem = bp.Problem(model, experiments, priors=priors, fixed={"m": 1.0}, scheme=FINE)
+    problem = bp.Problem(model, experiments, priors=priors, fixed={"m": 1.0}, scheme=FINE, input_noise="exact")
     guess = {name: DUFFING_TRUTH[name] for name in priors}
     return _setting(DUFFING + FOLDED * cut, problem, count, seed, lambda *_: np.zeros(2), guess)
 
@@ -248,7 +248,9 @@ def duffing(count: int, seed: int, *, cut: bool = False) -> Setting:
 def damped(data: Path | None, count: int, seed: int) -> Setting:
     """Return the measured damper, or a synthetic one."""
     recording, about = damper.read_recording(data, seed)
-    problem = bp.Problem(bp.models.dahl, [recording.fold(DAMPER_SAMPLES)], priors=damper.PRIORS, scheme=FINE)
+    problem = bp.Problem(
+        bp.models.dahl, [recording.fold(DAMPER_SAMPLES)], priors=damper.PRIORS, scheme=FINE, input_noise="exact"
+    )
     return _setting(DAMPER, problem, count, seed, lambda *_: np.zeros(1), synthetic=about["synthetic"])
 
 

@@ -72,6 +72,8 @@ def problem(
         "tied": TIED,
         "local": [] if one_conduction or len(experiments) == 1 else [CONDUCTION],
         "noise": bp.noise.Independent(per="experiment"),
+        # The noise of a given force is propagated in `force`.
+        "input_noise": "exact",
     } | changes
     return bp.Problem(experiments=experiments, **settings)
 

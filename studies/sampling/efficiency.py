@@ -227,7 +227,8 @@ CONTENDERS = {
 def cases(data: Path | None, seed: int, quick: bool) -> tuple[dict[str, Case], dict[str, Any]]:
     """Return the cases, of a quick run the damper and the ridge, and a description of the damper's data."""
     recording, about = damper.read_recording(data, seed)
-    found = {DAMPER: Case(bp.Problem(bp.models.dahl, [recording.fold()], priors=damper.PRIORS))}
+    problem = bp.Problem(bp.models.dahl, [recording.fold()], priors=damper.PRIORS, input_noise="exact")
+    found = {DAMPER: Case(problem)}
     if not quick:
         setting, gear = duffing(1, seed, cut=True), gear_problem("displacement", seed, runs=2)
         start = {name: GEAR[name] for name in gear.names}

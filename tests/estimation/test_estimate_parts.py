@@ -211,7 +211,7 @@ def test_perturbations_are_waves_of_one_sd_and_their_derivatives():
     """The variance of a complex amplitude is shared by its cosine and its sine; that of the mean is its own."""
     variance = {"v": np.array([0.3, 0.02, 0.08])}
     e = bp.Experiment(
-        "run", 3.0, {"y": np.zeros(16)}, {"u": np.zeros(16), "v": np.zeros(16)}, samples=8, periods=2,
+        "run", 3.0, {"y": np.zeros(16)}, {"u": np.zeros(16), "v": np.zeros(16)}, samples=8, periods=2, cycles=5,
         amplitude_variance=variance, harmonics={"v": 2, "u": 1, "y": 1},
     )  # fmt: skip
     phase = 2 * np.pi * np.arange(16) / 16

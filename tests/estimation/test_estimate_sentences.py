@@ -19,26 +19,27 @@ def fitted(**changes):
         "other_orbits": {}, "input_noise": {"y": 0.0}, "rms": {"y": 2.0}, "without_noise": (),
         "doubling_shift": {"a": 0.0, "b": np.nan}, "at_ends": (), "theta": {"a": 1.25, "b": 3.0},
         "prior_conflict": SimpleNamespace(text=""), "fvu": {"y": 0.1}, "converged": True, "other_modes": (),
-        "undetermined": (), "noise_split": {}, "input_errors": {},
+        "undetermined": (), "noise_split": {}, "input_errors": {}, "input_nonlinearity": {"a": 0.29, "b": 0.0},
     }  # fmt: skip
     return SimpleNamespace(**(given | changes))
 
 
-def problem(rates=0, amplitudes=()):
+def problem(rates=0, noise="exact"):
     return SimpleNamespace(
         names=("a", "b"),
         logarithmic=np.array([True, False]),
+        input_noise=noise,
         model=SimpleNamespace(input_derivatives=lambda: {"u": rates} if rates else {}),
         experiments=[
-            SimpleNamespace(samples=40, amplitude_variance={"u": np.array(amplitudes)}),
-            SimpleNamespace(samples=64, amplitude_variance={}),
+            SimpleNamespace(samples=40),
+            SimpleNamespace(samples=64),
         ],
         joint_prior=SimpleNamespace(supports={"a": (0.0, 5.0), "b": (-np.inf, np.inf)}),
     )
 
 
-def warnings_of(rates=0, amplitudes=(), **changes):
-    return list(map_estimate.estimation_warnings(problem(rates, amplitudes), fitted(**changes)))
+def warnings_of(rates=0, noise="exact", **changes):
+    return list(map_estimate.estimation_warnings(problem(rates, noise), fitted(**changes)))
 
 
 def test_a_good_estimate_has_no_warning():
@@ -52,27 +53,22 @@ def test_another_orbit_is_named():
     )
 
 
-@pytest.mark.parametrize(
-    ("rates", "kept", "expected"),
-    [
-        (0, 2, "The noise of the measured inputs causes 0.21 in 'y', 10% of the residual's 2; average more cycles."),
-        (
-            0,
-            3,
-            "inputs causes 0.21 in 'y', 10% of the residual's 2; average more cycles, keep fewer input harmonics (f",
-        ),
-        (
-            1,
-            2,
-            "The noise of the measured inputs, differentiated, causes 0.21 in 'y', 10% of the residual's 2; average m",
-        ),
-    ],
-)
-def test_noise_of_the_inputs_counts_from_a_tenth_of_the_residual_on(rates, kept, expected):
-    (text,) = warnings_of(rates, [0.1] * kept + [0.0], input_noise={"y": 0.21})
-    assert expected in text
-    assert text.endswith(" or measure the derivative.") == (rates > 0)
-    assert warnings_of(rates, [0.1] * kept, input_noise={"y": 0.2}) == []
+@pytest.mark.parametrize(("rates", "how"), [(0, ""), (1, ", differentiated,")])
+def test_noise_of_the_inputs_counts_from_a_tenth_of_the_residual_on(rates, how):
+    (text,) = warnings_of(rates, input_noise={"y": 0.21})
+    assert text == (
+        f"The noise of the measured inputs{how} causes 0.21 in 'y', 10% of the residual's 2, but the inputs are taken "
+        "as exact. Fold at least 5 cycles, and take input_noise='measured', or give the noise in input_noise={…}."
+    )
+    assert warnings_of(rates, input_noise={"y": 0.2}) == []
+    assert warnings_of(rates, "measured", input_noise={"y": 0.21}) == []
+
+
+def test_errors_of_inputs_that_are_not_linear_are_named_by_the_largest_or_a_failed_solve():
+    (text,) = warnings_of(input_nonlinearity={"a": 0.31, "b": 0.2})
+    assert "changes 'a' by 0.31 of its standard deviation. Average more cycles, or compare with input_noise=" in text
+    (text,) = warnings_of(input_nonlinearity={"a": 0.31, "b": np.nan})
+    assert "changes 'b' by nan" in text
 
 
 def test_shifts_by_a_tenth_of_an_sd_are_named_by_the_largest():
