@@ -489,7 +489,12 @@ WITHOUT_RESULTS = {
         "θ16 < 0": DEFINITION,
         "Kluwer, 1997, 191-198. BSD-3-Clause": ELSEWHERE,
     },
-    "docs/noisy_inputs.md": {"instead of 1/V": DEFINITION, "with 1/V the posterior": DEFINITION},
+    "docs/noisy_inputs.md": {
+        "instead of 1/V": DEFINITION,
+        "with 1/V the posterior": DEFINITION,
+        "warns from 0.3 on": DEFINITION,
+        "false-alarm rate of 1 %": DEFINITION,
+    },
     "docs/running.md": {
         "the scheduler's own address instead of 127.0.0.1": SETTING,
         "128 processes": SETTING,

@@ -400,7 +400,7 @@ def _error_slopes(
     """Return the regression of the errors of outputs on those of inputs, by input and output, where they correlate.
 
     That none of the harmonics from the first on does is tested by their coherences γ², of which −2(n − 1)·ln(1 − γ²)
-    has the distribution χ² with two degrees of freedom for n lines. The slopes are averaged over neighbouring harmonics.
+    has the distribution χ² with two degrees of freedom for n lines. Slopes are averaged over neighbouring harmonics.
     """
     found: dict[str, dict[str, np.ndarray]] = {}
     for name in inputs:

@@ -387,22 +387,7 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
             "valid. Give the experiment a guess of its states (Experiment.guess), start={…} nearer to the truth, or "
             "another model."
         )
-    rates = max(problem.model.input_derivatives().values(), default=0)
-    for channel, noise in fit.input_noise.items() if problem.input_noise == EXACT else ():
-        if noise > NOISE_SHARE * fit.rms[channel]:
-            yield (
-                f"The noise of the measured inputs{', differentiated,' if rates else ''} causes {noise:.3g} in "
-                f"{channel!r}, {noise / fit.rms[channel]:.0%} of the residual's {fit.rms[channel]:.3g}, but the inputs "
-                f"are taken as exact. Fold at least {FEWEST_CYCLES} cycles, and take input_noise='measured', or give "
-                "the noise in input_noise={…}."
-            )
-    if curved := {n: own for n, own in fit.input_nonlinearity.items() if not own < LARGEST_NONLINEARITY}:
-        worst = max(curved, key=lambda name: np.nan_to_num(curved[name], nan=np.inf))
-        yield (
-            "The errors of the inputs are too large to be linearised: what is not linear in them changes "
-            f"{worst!r} by {curved[worst]:.2g} of its standard deviation. Average more cycles, or compare with "
-            "input_noise='joint', in which they are parameters."
-        )
+    yield from _input_noise(problem, fit)
     for channel in fit.without_noise:
         yield (
             f"The data of {channel!r} contain no noise: the residual's rms of {fit.rms[channel]:.2g} is a rounding "
@@ -442,6 +427,26 @@ def estimation_warnings(problem: Problem, fit: MapEstimate) -> Iterator[str]:
         named = ", ".join(repr(text.removesuffix(f": {SILENT}")) for text in silent)
         yield f"The data do not depend on {named}; its posterior equals its prior. Fix it."
     yield from _combined(problem, [text for text in fit.undetermined if text not in silent])
+
+
+def _input_noise(problem: Problem, fit: MapEstimate) -> Iterator[str]:
+    """Yield the warnings about inputs that are taken as exact, and about errors of inputs that are too large."""
+    rates = max(problem.model.input_derivatives().values(), default=0)
+    for channel, noise in fit.input_noise.items() if problem.input_noise == EXACT else ():
+        if noise > NOISE_SHARE * fit.rms[channel]:
+            yield (
+                f"The noise of the measured inputs{', differentiated,' if rates else ''} causes {noise:.3g} in "
+                f"{channel!r}, {noise / fit.rms[channel]:.0%} of the residual's {fit.rms[channel]:.3g}, but the inputs "
+                f"are taken as exact. Fold at least {FEWEST_CYCLES} cycles, and take input_noise='measured', or give "
+                "the noise in input_noise={…}."
+            )
+    if curved := {n: own for n, own in fit.input_nonlinearity.items() if not own < LARGEST_NONLINEARITY}:
+        worst = max(curved, key=lambda name: np.nan_to_num(curved[name], nan=np.inf))
+        yield (
+            "The errors of the inputs are too large to be linearised: what is not linear in them changes "
+            f"{worst!r} by {curved[worst]:.2g} of its standard deviation. Average more cycles, or compare with "
+            "input_noise='joint', in which they are parameters."
+        )
 
 
 def _combined(problem: Problem, found: Sequence[str]) -> Iterator[str]:

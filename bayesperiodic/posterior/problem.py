@@ -57,12 +57,13 @@ class Problem(Description):
         "independent", "measured" or "circulant", or a model of `bayesperiodic.noise`.
     scheme : str or Scheme, optional
         See `solve_periodic`.
-    input_noise : "exact", "measured" or mapping of str to float or array (amplitudes, amplitudes)
-        Whether the measured inputs are the true ones, or have errors: with the variances that `fold` found (at least
-        five cycles), averaged over neighbouring harmonics, or with the given standard deviation of one value of the
-        mean period, white noise, or the covariance of mean, cosines and sines of the harmonics kept, as many amplitudes
-        as these. The true inputs, with a flat prior, are integrated out, linearised about the estimate; see
-        `MapEstimate.input_errors`.
+    input_noise : "measured", "exact", "joint" or mapping of str to float or array (amplitudes, amplitudes)
+        Errors of the measured inputs. "measured": with the variances that `fold` found, averaged over neighbouring
+        harmonics, in experiments of at least five cycles; the inputs of others are exact. A mapping gives the standard
+        deviation of one value of the mean period, white noise, or the covariance of mean, cosines and sines of the
+        harmonics kept, as many amplitudes as these. The true inputs, with a flat prior, are integrated out, linearised
+        about the estimate; see `MapEstimate.input_errors`. "joint": as "measured", but the amplitudes of the errors are
+        parameters of each experiment, ``force_mean``, ``force_cos1``, ``force_sin1``, …, in the unit of the input.
 
     Raises
     ------

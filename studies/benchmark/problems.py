@@ -168,7 +168,7 @@ class Setting:
         stated = self.problem
         other = bp.Problem(
             stated.model, stated.experiments, priors=stated.priors, fixed=stated.fixed, tied=stated.tied,
-            noise=stated.noise, scheme=scheme,
+            noise=stated.noise, scheme=scheme, input_noise="exact",
         )  # fmt: skip
         guesses = {name: solution.states for name, solution in self.fit.solutions.items()}
         return other.anchored(self.fit.theta, guesses)
