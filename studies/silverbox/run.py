@@ -173,8 +173,11 @@ def fold(recording: bp.Recording, samples: int, response: int | None = None) -> 
 
 
 def problem(experiment: bp.Experiment, noise: str = "independent") -> bp.Problem:
-    """Return the problem with a noise model."""
-    return bp.Problem(bp.models.silverbox, [experiment], priors=PRIORS, fixed={"w0": W0}, scheme=SCHEME, noise=noise)
+    """Return the problem with a noise model, and the generator's drive as exact."""
+    return bp.Problem(
+        bp.models.silverbox, [experiment], priors=PRIORS, fixed={"w0": W0}, scheme=SCHEME, noise=noise,
+        input_noise="exact",
+    )  # fmt: skip
 
 
 def _medians() -> dict[str, float]:
