@@ -58,7 +58,8 @@ class Description:
             raise ValueError(f"model: must be a Model, got {_checks.shortened(model)}.")
         if not isinstance(priors, Mapping):
             raise ValueError(f"priors: must be a mapping of names to priors, got {priors!r}.")
-        self.noise, self.experiments, local = as_noise(noise), _checked_experiments(model, experiments), tuple(local)
+        self.noise, self.experiments = as_noise(noise), _checked_experiments(model, experiments)
+        local = local if isinstance(local, str) else tuple(local)
         self._given: dict[str, Any] = {
             "model": model, "priors": dict(priors), "fixed": dict(fixed or {}), "tied": tied, "local": local,
             "noise": noise, "scheme": scheme, "input_noise": input_noise,
@@ -67,7 +68,7 @@ class Description:
         if self.input_noise == JOINT:
             model, errors, none = with_errors_as_parameters(model, self.experiments)
             priors, fixed = {**priors, **errors}, {**(fixed or {}), **none}
-            local += tuple(name for name in model.parameters if name not in self._given["model"].parameters)
+            local = (*local,) + tuple(name for name in model.parameters if name not in self._given["model"].parameters)
         self.model, self.scheme = model, scheme or default_scheme(model)
         find_scheme(self.scheme)
         if not self.noise.flat and any(e.mask is not None for e in self.experiments):

@@ -149,14 +149,14 @@ def test_the_last_kept_harmonic_is_significant_at_one_percent_of_all_together(fa
     freedom = 6.0
     limit = 0.5 * freedom * ((0.01 / 5) ** (-2.0 / freedom) - 1.0)
     variance = np.full(6, 0.04)
-    noise = folding.AmplitudeNoise(variance, np.full(6, 99.0), np.full(6, freedom))
+    noise = folding.AmplitudeNoise(variance, np.full(6, 99.0), np.full(6, freedom), np.empty((0, 6)))
     size = np.array([5.0, 0.0, 3.0, 0.0, np.sqrt(factor * limit * 0.04), 0.0])
     assert folding._last_significant(size * np.exp(0.3j), noise) == kept
     assert folding._last_significant(np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0]) + 0j, noise) == 1
 
 
 def test_rounding_is_no_significant_harmonic_of_exact_data():
-    noise = folding.AmplitudeNoise(np.zeros(4), np.full(4, 8.0), np.full(4, 8.0))
+    noise = folding.AmplitudeNoise(np.zeros(4), np.full(4, 8.0), np.full(4, 8.0), np.empty((0, 4)))
     assert folding._last_significant(np.array([0.0, 2.0, 0.0, 1e-13]) + 0j, noise) == 1
     assert folding._last_significant(np.array([0.0, 2.0, 0.0, 1e-10]) + 0j, noise) == 3
 
