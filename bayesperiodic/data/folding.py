@@ -1,7 +1,7 @@
 """Estimation of the mean steady period of sampled signals, and of its uncertainty; division of records of several."""
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -395,7 +395,7 @@ def _noise(signals: Signals, fit: HarmonicFit, row: int, cycles: int) -> tuple[n
 
 
 def _error_slopes(
-    noise: Mapping[str, AmplitudeNoise], inputs: Iterable[str], kept: Mapping[str, int]
+    noise: Mapping[str, AmplitudeNoise], inputs: Sequence[str], kept: Mapping[str, int]
 ) -> dict[str, dict[str, np.ndarray]]:
     """Return the regression of the errors of outputs on those of inputs, by input and output, where they correlate.
 
