@@ -447,10 +447,15 @@ def input_loadings(
         )
         along = Response(moved.outputs, moved.frequency, np.zeros((len(changes), count)), none)
         observation = problem.observations[e.name]
-        common = observation.errors(errors_of_outputs(e, observation.channels, noise))
-        caused = [a - b for a, b in zip(observation.changes(here, along), common, strict=True)]
-        found[e.name] = np.concatenate(caused, axis=1).T
+        found[e.name] = (np.concatenate(observation.changes(here, along), axis=1) - _common(problem, e, noise)).T
     return found
+
+
+def _common(problem: Problem, experiment: Experiment, noise: InputNoise) -> np.ndarray:
+    """Return what goes with each error of inputs in the errors of the outputs' components (errors, components)."""
+    observation = problem.observations[experiment.name]
+    errors = errors_of_outputs(experiment, observation.channels, noise)
+    return np.concatenate(observation.errors(errors), axis=1)
 
 
 def caused_by_inputs(problem: Problem, loadings: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -494,12 +499,14 @@ def estimated_inputs(
         covariance = np.eye(len(where))
         if matrix is not None:
             expected = np.zeros(matrix.shape[1]) if before is None else before.expected
-            sizes = [residuals[b].size for b in members]
-            moved = np.split(matrix @ expected, np.cumsum(sizes)[:-1])
+            sizes, response = [residuals[b].size for b in members], matrix + _common(problem, e, problem.input_noise).T
+            moved = np.split(response @ expected, np.cumsum(sizes)[:-1])
             own = [residuals[b] - part for b, part in zip(members, moved, strict=True)]
-            found, covariance = expected_errors(matrix, own, likelihood.precisions(members, estimate.noise))
-            if found.loadings.any():
-                errors[e.name], covariances[e.name] = found, covariance
+            precisions = likelihood.precisions(members, estimate.noise)
+            expected, covariance, remaining = expected_errors(matrix, own, precisions)
+            if remaining.any():
+                errors[e.name] = InputErrors(expected, remaining, response @ expected)
+                covariances[e.name] = covariance
         sd[e.name] = {name: np.zeros_like(u) for name, u in e.inputs.items()}
         signals = _fourier.on_grid(waves, e.samples * e.periods)
         for name in set(where):

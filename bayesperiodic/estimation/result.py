@@ -156,9 +156,9 @@ class MapEstimate(Result):
         inputs' units; the measured ones and zero where ``Problem(input_noise=…)`` takes them as exact. `residuals`,
         `rms`, `fvu` and `noise_split` are those with the estimated inputs.
     input_errors : dict of str to InputErrors
-        By experiment with noisy inputs: independent standard normal errors of the inputs, `expected` (errors,), and the
-        derivatives of the compared components by them, `loadings` L (components, errors), at the estimate; L·Lᵀ is what
-        they add to the covariance of the residual.
+        By experiment with noisy inputs: independent standard normal errors of the inputs, `expected` (errors,), what
+        they cause in the predicted components, `caused` (components,), and the derivatives of the residual by them,
+        `loadings` L (components, errors), at the estimate; L·Lᵀ is what they add to the covariance of the residual.
     input_nonlinearity : dict of str to float
         By what each estimate is changed by the part of the outputs that is not linear in the errors of the inputs, in
         standard deviations: root mean square over errors drawn given the estimate. NaN if a solve fails.

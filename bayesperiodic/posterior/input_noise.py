@@ -2,18 +2,19 @@
 
 The measured Fourier amplitudes of an input are those of the true one plus errors with a known normal distribution; the
 prior of the true ones is flat. Let η be independent standard normal errors of the input, η̂ an estimate of them, and
-the loadings L the derivatives of the predicted components by the input along η. The periodic problem is solved with the
-input less η̂, and what η̂ causes, L·η̂, is taken from the measured outputs. To first order the residual is then
-e − L·η, e being the error of the outputs, with the variances D(φ) of the noise model. With the true input integrated
-out it has the covariance D(φ) + L·Lᵀ. η̂ and L are computed at an estimate, again until they do not change, and are then
-fixed, so that the density depends on the parameters alone. For a static model the estimate is that of orthogonal
-distance regression (W. A. Fuller, Measurement Error Models, Wiley, 1987). If L followed the parameters, the determinant
-of the covariance would draw the estimate towards models that pass on less of the input's noise.
+the loadings L the derivatives of the predicted components by the input along η, less the errors of the outputs that go
+with η. The periodic problem is solved with the input less η̂, and what η̂ causes in the prediction is taken from the
+measured outputs. To first order the residual is then e − L·η, e being the other errors of the outputs, with the
+variances D(φ) of the noise model. With the true input integrated out it has the covariance D(φ) + L·Lᵀ. η̂ and L are
+computed at an estimate, again until they do not change, and are then fixed, so that the density depends on the
+parameters alone. For a static model the estimate is that of orthogonal distance regression (W. A. Fuller, Measurement
+Error Models, Wiley, 1987). If L followed the parameters, the determinant of the covariance would draw the estimate
+towards models that pass on less of the input's noise.
 """
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -42,16 +43,17 @@ class InputErrors:
 
     expected: np.ndarray  # (errors,), η̂
     loadings: np.ndarray  # (components of all blocks, errors), L
+    caused: np.ndarray  # (components of all blocks,), what η̂ causes in the predicted components
 
     def parts(self, sizes: Sequence[int]) -> list[np.ndarray]:
-        """Return L·η̂, what the expected errors cause, one array (size,) a block."""
-        return np.split(self.loadings @ self.expected, np.cumsum(sizes)[:-1])
+        """Return what the expected errors cause, one array (size,) a block."""
+        return np.split(self.caused, np.cumsum(sizes)[:-1])
 
 
 def same(one: Mapping[str, InputErrors], other: Mapping[str, InputErrors]) -> bool:
     """Return whether two linearisations are equal."""
     return one.keys() == other.keys() and all(
-        np.array_equal(own.expected, other[name].expected) and np.array_equal(own.loadings, other[name].loadings)
+        all(np.array_equal(a, b) for a, b in zip(astuple(own), astuple(other[name]), strict=True))
         for name, own in one.items()
     )
 
@@ -235,10 +237,10 @@ def errors_of_outputs(experiment: Experiment, channels: Sequence[str], noise: In
 
 def expected_errors(
     matrix: np.ndarray, r: Sequence[np.ndarray], p: Sequence[np.ndarray]
-) -> tuple[InputErrors, np.ndarray]:
-    """Return the expected errors given residuals r, and their covariance; p are the precisions (size,) of e, by block.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the expected errors given residuals r, their covariance, and L without what is negligible against e.
 
-    The loadings returned are L without the combinations of errors that are negligible against e.
+    p are the precisions (size,) of e, by block.
     """
     precision = np.concatenate([np.broadcast_to(own, own_r.shape) for own, own_r in zip(p, r, strict=True)])
     root = np.sqrt(precision)[:, None]
@@ -247,7 +249,7 @@ def expected_errors(
     mean = -covariance @ (np.concatenate(r) @ (precision[:, None] * matrix))
     large = values**2 > NEGLIGIBLE
     loadings = (vectors[:, large] * values[large]) @ axes[large] / root
-    return InputErrors(mean, loadings), covariance
+    return mean, covariance, loadings
 
 
 class Shared:

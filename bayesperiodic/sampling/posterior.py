@@ -132,7 +132,9 @@ class Posterior(Result):
             return {}
         group = self.tree[INPUT_NOISE].to_dataset()
         names = [str(name).removesuffix(f" {EXPECTED}") for name in group if str(name).endswith(f" {EXPECTED}")]
-        return {n: InputErrors(*(group[f"{n} {kind}"].to_numpy() for kind in (EXPECTED, LOADINGS))) for n in names}
+        return {
+            n: InputErrors(*(group[f"{n} {kind}"].to_numpy() for kind in (EXPECTED, LOADINGS, CAUSED))) for n in names
+        }
 
     @property
     def modes(self) -> pd.DataFrame:
@@ -406,7 +408,7 @@ def _some(problem: Description, posterior: xr.Dataset, most: int) -> tuple[xr.Da
 
 
 STEP, WALKER, OBSERVATION, MODE = "step", "walker", "observation", "mode"
-INPUT_NOISE, EXPECTED, LOADINGS = "input_noise", "expected errors", "loadings"
+INPUT_NOISE, EXPECTED, LOADINGS, CAUSED = "input_noise", "expected errors", "loadings", "caused"
 
 
 def gather(
@@ -481,6 +483,7 @@ def tree(
         for name, own in problem.input_errors.items():
             variables[f"{name} {EXPECTED}"] = ((f"{name} error",), own.expected)
             variables[f"{name} {LOADINGS}"] = ((f"{name} component", f"{name} error"), own.loadings)
+            variables[f"{name} {CAUSED}"] = ((f"{name} component",), own.caused)
         groups[INPUT_NOISE] = xr.Dataset(variables)
     result = xr.DataTree.from_dict(groups)
     result.attrs = {

@@ -4,6 +4,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -208,7 +209,7 @@ def sample(
     size = _checked_walkers(walkers, problem, variances)
     settings = f"seed {seed}, {ensembles} ensembles of {size} walkers, {start}, {coordinates}, {variances}"
     if fit.input_errors:
-        settings += f", input noise {digest([[own.expected, own.loadings] for own in fit.input_errors.values()])}"
+        settings += f", input noise {digest([astuple(own) for own in fit.input_errors.values()])}"
     opened = nullcontext() if checkpoint is None else Checkpoint(checkpoint, problem, settings)
     with interrupted_by_termination(), opened as store:
         backend, saved = (emcee.backends.Backend(), {}) if store is None else store.load()

@@ -288,6 +288,21 @@ def test_correlated_noise_of_input_and_output_is_found_and_used():
         gained(runs[0], input_noise="joint")
 
 
+def test_correlated_errors_give_the_estimate_of_outputs_without_them():
+    """For y = a·x, errors 0.6 of those of x in y are none of those in y − 0.6·x = (a − 0.6)·x."""
+    run = noisy_gain(3, 0.6)
+    slope = np.full(run.error_slopes["x"]["y"].size, 0.6 + 0j)
+    fit = gained(replace(run, error_slopes={"x": {"y": slope}}))
+    x = _fourier.on_grid(_fourier.coefficients(run.inputs["x"])[: slope.size], 64)
+    other = replace(run, error_slopes={}, outputs={"y": run.outputs["y"] - 0.6 * x})
+    problem = bp.Problem(GAIN, [other], priors={"a": bp.Normal(-0.6, 10.0)})
+    without = bp.map_estimate(problem, starts=1, **QUIET)
+    assert fit.theta["a"] - 0.6 == pytest.approx(without.theta["a"], abs=1e-6 * fit.sd["a"])
+    assert fit.sd["a"] == pytest.approx(without.sd["a"], rel=1e-6)
+    assert fit.variances["y"] == pytest.approx(without.variances["y"], rel=1e-6)
+    assert fit.inputs["run"]["x"] == pytest.approx(without.inputs["run"]["x"], abs=1e-8)
+
+
 def test_errors_as_parameters_give_the_same_estimate():
     """Another route: amplitudes of the input's errors as parameters of an ordinary problem, all fitted together."""
     model = formula_model("lag", ["a", "b"], lambda p, u, s: {"y": p.a * s.w + p.b * s.w**3 + 0.1 * u.dx})
