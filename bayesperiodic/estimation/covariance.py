@@ -23,6 +23,7 @@ from bayesperiodic.posterior.input_noise import (
     expected_errors,
     true_inputs,
 )
+from bayesperiodic.posterior.likelihood import Likelihood
 from bayesperiodic.posterior.noise import LENGTHSCALE, SPECTRAL, VARIANCE, Block
 from bayesperiodic.posterior.observation import Response
 from bayesperiodic.posterior.problem import Problem
@@ -46,8 +47,9 @@ def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarra
     noise, is fitted to it, the residual is divided by that spectrum (prewhitening, [1]_), and the remaining spectrum is
     smoothed over neighbouring harmonics. Most outputs depend on the low harmonics, which the fit removes from the
     residual. Therefore the spectrum is fitted by restricted likelihood [2]_, with the parameters integrated out, J is
-    averaged over the posterior of the correlation length, and raised for the few values behind each smoothed one.
-    Components that are no Fourier components keep the variance of the noise model.
+    averaged over the posterior of the correlation length, and raised for the few values behind each smoothed one. It is
+    at least what the known noise of the inputs causes. Components that are no Fourier components keep the variance of
+    the noise model.
 
     References
     ----------
@@ -65,13 +67,25 @@ def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarra
     information = prior + sum(s @ s.T for s in changes)
     if not np.isfinite(information).all():
         return np.full_like(covariance, np.nan)
-    middle = prior
-    for block, s, r, unit in zip(likelihood.blocks, changes, residuals, units, strict=True):
+    middle, known = prior, _caused_variances(likelihood, estimate.noise)
+    for block, s, r, unit, least in zip(likelihood.blocks, changes, residuals, units, known, strict=True):
         variance = np.ones(block.size)
         if block.kind == SPECTRAL:
             variance = _residual_variance(block, s, r, unit, information) if r.any() else np.zeros(block.size)
-        middle = middle + (s * variance) @ s.T
+        middle = middle + (s * np.maximum(variance, least)) @ s.T
     return covariance @ middle @ covariance
+
+
+def _caused_variances(likelihood: Likelihood, noise: np.ndarray) -> list[np.ndarray]:
+    """Return the variances of whitened components that the noise of the inputs causes, one array (size,) a block."""
+    result = [np.zeros(block.size) for block in likelihood.blocks]
+    for shared in likelihood.shared:
+        vectors = [np.zeros((shared.parts[0].shape[1], block.size)) for block in likelihood.blocks]
+        for b, part in zip(shared.members, shared.parts, strict=True):
+            vectors[b] = part.T
+        white = likelihood.whitened(vectors, noise)
+        result = [own + np.sum(moved**2, axis=0) for own, moved in zip(result, white, strict=True)]
+    return result
 
 
 def _residual_variance(

@@ -106,7 +106,7 @@ def run(options: argparse.Namespace) -> None:
         "choices": [_by_noise(experiment, every), _by_noise(in_drive, within)],
     }
     results |= {"seconds": watch.total() | {"from_rest": seconds}, "versions": common.versions()}
-    print(f"\nSilverbox, {kind} data, w0 = 2π·65 rad/s: estimate ± Laplace sd (sandwich sd) by noise model")
+    print(f"\nSilverbox, {kind} data, w0 = 2π·65 rad/s: estimate ± Laplace sd (robust sd) by noise model")
     print("\n".join([*_fits_lines(every), *_check_lines(results)]))
     kept, fraction = in_drive.harmonics["response"], within["independent"].rms["response"] / spread(in_drive)
     print(f"\nThe same with {kept} harmonics of the response, up to the drive's last line: residual {fraction:.3%}")
@@ -173,11 +173,8 @@ def fold(recording: bp.Recording, samples: int, response: int | None = None) -> 
 
 
 def problem(experiment: bp.Experiment, noise: str = "independent") -> bp.Problem:
-    """Return the problem with a noise model, and the generator's drive as exact."""
-    return bp.Problem(
-        bp.models.silverbox, [experiment], priors=PRIORS, fixed={"w0": W0}, scheme=SCHEME, noise=noise,
-        input_noise="exact",
-    )  # fmt: skip
+    """Return the problem with a noise model; the noise of the drive is integrated out."""
+    return bp.Problem(bp.models.silverbox, [experiment], priors=PRIORS, fixed={"w0": W0}, scheme=SCHEME, noise=noise)
 
 
 def _medians() -> dict[str, float]:
@@ -401,7 +398,7 @@ def _estimates(choices: Mapping[str, Mapping[str, bp.MapEstimate]], truth: Mappi
             values, sds, robust = ([getattr(f, k)[name] for f in fits.values()] for k in ("theta", "sd", "robust_sd"))
             face = MAP if number == 0 else "white"
             axes.errorbar(at, values, sds, fmt="none", ecolor=LAPLACE, elinewidth=4.0, label="Laplace sd")
-            axes.errorbar(at, values, robust, fmt="none", ecolor="black", elinewidth=1, capsize=4, label="sandwich sd")
+            axes.errorbar(at, values, robust, fmt="none", ecolor="black", elinewidth=1, capsize=4, label="robust sd")
             axes.plot(at, values, "o", color=MAP, mfc=face, ms=6, zorder=5, label=f"MAP, {label}")
         if truth is not None:
             axes.axhline(truth[name], color=TRUTH, lw=1.2, ls="--", label="true value")

@@ -303,6 +303,19 @@ def test_correlated_errors_give_the_estimate_of_outputs_without_them():
     assert fit.inputs["run"]["x"] == pytest.approx(without.inputs["run"]["x"], abs=1e-8)
 
 
+def test_robust_sd_is_at_least_what_noise_of_the_inputs_causes():
+    """The mean of x, with an error of 0.2, is twice in the offset, which removes its residual from the data."""
+    model = formula_model("line", ["a", "b"], lambda p, u, s: {"y": p.a * u.x + p.b})
+    variance = np.full(17, 1e-6)
+    variance[0] = 0.04
+    problem = bp.Problem(
+        model, [noisy_gain(3, size=1e-3)], priors=dict.fromkeys("ab", bp.Normal(0.0, 10.0)),
+        input_noise={"x": np.diag(variance)},
+    )  # fmt: skip
+    fit = bp.map_estimate(problem, starts=1, **QUIET)
+    assert fit.sd["b"] == pytest.approx(0.4, rel=0.1) and fit.robust_sd["b"] == pytest.approx(0.4, rel=0.1)
+
+
 def test_errors_as_parameters_give_the_same_estimate():
     """Another route: amplitudes of the input's errors as parameters of an ordinary problem, all fitted together."""
     model = formula_model("lag", ["a", "b"], lambda p, u, s: {"y": p.a * s.w + p.b * s.w**3 + 0.1 * u.dx})
