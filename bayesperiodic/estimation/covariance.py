@@ -1,6 +1,6 @@
 """Diagnostics of an estimate: robust covariance, uncertain noise parameters, discretisation, noise of the inputs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from bayesperiodic._linalg import TINY, covariance_eigh, hessian_scale, scaled
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.estimation.gauss_newton import Iterate, changes_by_variance, information
 from bayesperiodic.periodic.compiled import CONVERGED
-from bayesperiodic.periodic.equations import PeriodicEquations, input_sensitivities
+from bayesperiodic.periodic.equations import PeriodicEquations, Sensitivities, input_sensitivities
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.posterior.input_noise import (
@@ -59,21 +59,37 @@ def robust_covariance(problem: Problem, estimate: Iterate, covariance: np.ndarra
        Journal of the American Statistical Association 72 (1977) 320-338.
     """
     likelihood, prior = problem.likelihood, problem.joint_prior.curvature(estimate.theta)
-    ones = [np.ones(block.size) for block in likelihood.blocks]
-    changes, residuals, units = (
-        likelihood.whitened(vectors, estimate.noise)
-        for vectors in (estimate.here.changes, estimate.here.residuals, ones)
+    changes, residuals = (
+        likelihood.whitened(vectors, estimate.noise) for vectors in (estimate.here.changes, estimate.here.residuals)
     )
     information = prior + sum(s @ s.T for s in changes)
     if not np.isfinite(information).all():
         return np.full_like(covariance, np.nan)
-    middle, known = prior, _caused_variances(likelihood, estimate.noise)
-    for block, s, r, unit, least in zip(likelihood.blocks, changes, residuals, units, known, strict=True):
+    variances = residual_variances(likelihood, changes, residuals, estimate.noise, information)
+    middle = prior + sum((s * variance) @ s.T for s, variance in zip(changes, variances, strict=True))
+    return covariance @ middle @ covariance
+
+
+def residual_variances(
+    likelihood: Likelihood,
+    changes: Sequence[np.ndarray],
+    residuals: Sequence[np.ndarray],
+    noise: np.ndarray,
+    information: np.ndarray,
+) -> list[np.ndarray]:
+    """Return the variances of whitened components, one array (size,) a block, as `robust_covariance` describes them.
+
+    `changes` (parameters, size) and residuals (size,) are whitened, `information` is that of all blocks and priors.
+    """
+    units, known = likelihood.whitened([np.ones(b.size) for b in likelihood.blocks], noise), []
+    for block, s, r, unit, least in zip(
+        likelihood.blocks, changes, residuals, units, _caused_variances(likelihood, noise), strict=True
+    ):
         variance = np.ones(block.size)
         if block.kind == SPECTRAL:
             variance = _residual_variance(block, s, r, unit, information) if r.any() else np.zeros(block.size)
-        middle = middle + (s * np.maximum(variance, least)) @ s.T
-    return covariance @ middle @ covariance
+        known.append(np.maximum(variance, least))
+    return known
 
 
 def _caused_variances(likelihood: Likelihood, noise: np.ndarray) -> list[np.ndarray]:
@@ -450,19 +466,32 @@ def input_loadings(
         if not len(changes):
             continue
         equations = problem.equations[e.name].at_frequency(solution.frequency)
-        values = problem.parameter_maps[e.name].values(theta[None])[0]
-        parameters, z = np.ascontiguousarray(values[:-1]), periodic_part(equations, solution.states)
+        parameters, z = problem.parameters(theta[None], e.name)[0], periodic_part(equations, solution.states)
         moved = input_sensitivities(equations, z, parameters, changes)
-        if moved is None:
-            continue
-        count, none = 0 if e.multipliers is None else e.multipliers.size, np.zeros(len(changes))
-        here = Response(
-            equations.outputs(z, parameters), np.array(equations.frequency), np.empty(count), np.array(values[-1])
-        )
-        along = Response(moved.outputs, moved.frequency, np.zeros((len(changes), count)), none)
-        observation = problem.observations[e.name]
-        found[e.name] = (np.concatenate(observation.changes(here, along), axis=1) - _common(problem, e, noise)).T
+        if moved is not None:
+            caused = predicted_changes(problem, e, equations, theta, z, moved)
+            found[e.name] = (caused - _common(problem, e, noise)).T
     return found
+
+
+def predicted_changes(
+    problem: Problem,
+    experiment: Experiment,
+    equations: PeriodicEquations,
+    theta: np.ndarray,
+    z: np.ndarray,
+    moved: Sensitivities,
+) -> np.ndarray:
+    """Return the changes of the predicted components of all blocks (directions, components) along sensitivities."""
+    values = problem.parameter_maps[experiment.name].values(theta[None])[0]
+    count, none = (
+        experiment.multipliers.size if experiment.multipliers is not None else 0,
+        np.zeros(len(moved.frequency)),
+    )
+    outputs = equations.outputs(z, np.ascontiguousarray(values[:-1]))
+    here = Response(outputs, np.array(equations.frequency), np.empty(count), np.array(values[-1]))
+    along = Response(moved.outputs, moved.frequency, np.zeros((none.size, count)), none)
+    return np.concatenate(problem.observations[experiment.name].changes(here, along), axis=1)
 
 
 def _common(problem: Problem, experiment: Experiment, noise: InputNoise) -> np.ndarray:

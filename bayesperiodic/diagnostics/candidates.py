@@ -1,0 +1,175 @@
+"""Candidate terms that a model may lack: products, absolute values and signs of what it contains, as expressions."""
+
+from collections.abc import Callable, Iterable, Mapping
+from copy import copy
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from bayesperiodic import _checks
+from bayesperiodic.models.model import DERIVATIVES, Model, Names, smooth_abs, smooth_sign
+
+DEGREE = 3
+# Widths of smooth absolute values and signs, relative to the standard deviation of their arguments.
+ABS_WIDTH, SIGN_WIDTH = 0.02, 0.2
+Factors = Mapping[str, sp.Expr]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A term that is added to an equation g or an output f with an unknown coefficient.
+
+    The place is the name of the output, or "equation of x" with the name of the state.
+    """
+
+    place: str
+    text: str
+    expression: sp.Expr
+
+    def __str__(self) -> str:
+        return f"{self.text} in {self.place}"
+
+
+def generated(model: Model, deviations: Mapping[str, float]) -> list[Candidate]:
+    """Return the terms from the model's own variables, for every equation and output.
+
+    `deviations` are the standard deviations of the variables along the measured orbits, by name; variables that are
+    constant are left out.
+    """
+    smooth, steepest = factors(model)
+    moving = {name: e for name, e in smooth.items() if deviations.get(name, 1.0) > 0.0}
+    found: dict[str, sp.Expr] = {"1": sp.Integer(1)}
+    for degree in range(1, DEGREE + 1):
+        for chosen in combinations_with_replacement(moving, degree):
+            found[_product(chosen)] = sp.Mul(*(moving[name] for name in chosen))
+    widths = {name: deviations.get(name, 1.0) for name in moving}
+    for name, e in moving.items():
+        size = smooth_abs(e, ABS_WIDTH * widths[name])
+        found[f"abs({name})"] = size
+        found |= {f"{other}*abs({name})": factor * size for other, factor in moving.items()}
+        found[f"sign({name})"] = smooth_sign(e, SIGN_WIDTH * widths[name])
+    found |= {name: e for name, e in steepest.items() if deviations.get(name, 1.0) > 0.0}
+    return [Candidate(place, text, e) for place in places(model) for text, e in found.items()]
+
+
+def places(model: Model) -> tuple[str, ...]:
+    """Return the names of outputs and equations, as `Candidate` has them."""
+    return *model.outputs, *(f"equation of {state}" for state in model.states)
+
+
+def factors(model: Model) -> tuple[dict[str, sp.Expr], dict[str, sp.Expr]]:
+    """Return the variables whose products are candidates, and the highest derivatives, which are so by themselves.
+
+    Of an angle these are its sine and cosine. Of an input its rate is a variable if the model contains it.
+    """
+    known: dict[str, sp.Expr] = {}
+    steepest: dict[str, sp.Expr] = {}
+    for state, order in model.orders.items():
+        symbol = model.state_symbols[state]
+        known |= (
+            {f"sin({state})": sp.sin(symbol), f"cos({state})": sp.cos(symbol)}
+            if state in model.angles
+            else {state: symbol}
+        )
+        for derivative in range(1, order + 1):
+            name = DERIVATIVES[derivative] + state
+            (known if derivative < order else steepest)[name] = model.state_symbols[name]
+    for name, highest in model.input_derivatives().items():
+        for derivative in range(min(highest + 2, len(DERIVATIVES))):
+            label = DERIVATIVES[derivative] + name
+            (known if derivative <= highest else steepest)[label] = model.input_symbols[label]
+    return known, steepest
+
+
+def given(model: Model, candidates: Mapping[str, Iterable[Any]]) -> list[Candidate]:
+    """Return candidates that were given by place, as texts or functions of (s, p, u)."""
+    _checks.mapping("candidates", candidates, "{'force': ['x**2']}")
+    spaces = (
+        Names("states", model.state_symbols | model.time_symbols),
+        Names("parameters", model.parameter_symbols),
+        Names("inputs", model.input_symbols),
+    )
+    found = []
+    for place, terms in candidates.items():
+        argument = f"candidates[{place!r}]"
+        _checks.one_of("candidates", place, places(model))
+        if isinstance(terms, str) or not isinstance(terms, Iterable):
+            raise ValueError(f"{argument}: must be a list of texts or functions of (s, p, u), got {terms!r}.")
+        for term in terms:
+            expression = model._expression(argument, term(*spaces) if callable(term) else term)
+            text = term.strip() if isinstance(term, str) else _written(model, expression)
+            _check_order(model, argument, text, expression, place)
+            found.append(Candidate(place, text, expression))
+    return found
+
+
+def _check_order(model: Model, argument: str, text: str, expression: sp.Expr, place: str) -> None:
+    """Refuse derivatives that the model's equations do not have."""
+    allowed = {model.state_symbols[d + s] for s, order in model.orders.items() for d in DERIVATIVES[: order + 1]}
+    for name, symbol in model.state_symbols.items():
+        if symbol in expression.free_symbols - allowed:
+            raise ValueError(
+                f"{argument}: must contain derivatives that the equations contain, got {name!r} in {text!r}."
+            )
+    inputs = {*model.input_symbols.values(), model.time_symbols["tau"]}
+    if model.autonomous and place not in model.outputs and expression.free_symbols & inputs:
+        raise ValueError(f"{argument}: must be without inputs and tau for an autonomous model, got {text!r}.")
+
+
+def _written(model: Model, expression: sp.Expr) -> str:
+    spaces = (model.state_symbols, model.input_symbols, model.parameter_symbols, model.time_symbols)
+    return str(expression.xreplace({symbol: sp.Symbol(name) for space in spaces for name, symbol in space.items()}))
+
+
+def _product(names: Iterable[str]) -> str:
+    powers: dict[str, int] = {}
+    for name in names:
+        powers[name] = powers.get(name, 0) + 1
+    return "*".join(name if power == 1 else f"{name}**{power}" for name, power in powers.items())
+
+
+def values(
+    model: Model, expressions: Iterable[sp.Expr], variables: np.ndarray, inputs: np.ndarray, parameters: np.ndarray,
+    tau: np.ndarray, frequency: float,
+) -> np.ndarray:  # fmt: skip
+    """Return expressions at points, (expressions, points).
+
+    `variables` (points, 3·states) are q, q̇, q̈, `inputs` (points, 3·inputs) u, u̇, ü, `parameters` those of the model.
+    """
+    symbols = [*model.state_symbols.values(), *model.input_symbols.values(), *model.parameter_symbols.values()]
+    symbols += model.time_symbols.values()
+    listed = list(expressions)
+    function: Callable[..., Any] = sp.lambdify(symbols, listed, modules="numpy", cse=True)
+    with np.errstate(all="ignore"):
+        found = function(*variables.T, *inputs.T, *parameters, tau, frequency)
+    return np.array([np.broadcast_to(np.asarray(one, dtype=float), tau.shape) for one in found]).reshape(-1, tau.size)
+
+
+def coefficient_names(model: Model, terms: Iterable[Candidate]) -> list[str]:
+    """Return a new parameter for the coefficient of each term: ``c1``, ``c2``, …, without those that exist."""
+    taken = {*model.parameters, *model.state_symbols, *model.input_symbols, *model.outputs}
+    names, number = [], 0
+    for _ in terms:
+        number += 1
+        while f"c{number}" in taken:
+            number += 1
+        names.append(f"c{number}")
+    return names
+
+
+def extended(model: Model, terms: Mapping[str, Candidate]) -> Model:
+    """Return the model with the terms, by the names of their coefficients."""
+    other = copy(model)
+    symbols = {name: sp.Symbol(f"p_{name}", real=True) for name in terms}
+    other.parameters = (*model.parameters, *_checks.identifiers("terms", terms, model.parameters))
+    other.parameter_symbols = model.parameter_symbols | symbols
+    equations, outputs = list(model.equations), list(model.output_expressions)
+    for name, term in terms.items():
+        index = places(model).index(term.place)
+        where, i = (outputs, index) if index < len(outputs) else (equations, index - len(outputs))
+        where[i] += symbols[name] * term.expression
+    other.equations, other.output_expressions = tuple(equations), tuple(outputs)
+    return other
