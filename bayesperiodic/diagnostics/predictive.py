@@ -200,7 +200,8 @@ class Prediction(Bands):
         Conflict of the prior with the data, in words, "" if there is none. If there is one, the model is tested where
         the data alone are fitted best, and the amplitude is not tested.
     note : str
-        Limitations: misfit that the noise model absorbs, draws that have not converged; "" without any.
+        Limitations: misfit that the noise model absorbs, draws that have not converged; and that the covariance of the
+        residual includes the noise of the inputs, where it does.
     other_orbits : dict of str to str
         Experiments in which the model's orbit is not the measured one, with the reason, see `MapEstimate`; their
         verdict is "misspecified", whatever the tests say.
@@ -362,6 +363,8 @@ def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:
     notes = []
     if not posterior.converged:
         notes.append(f"The draws have not converged ({posterior.reason}), so bands and p-values are provisional.")
+    if problem.input_errors:
+        notes.append("What the noise of the inputs can cause is part of the covariance of the residual, and no misfit.")
     if not problem.noise.flat and table["size"].drop(ALL).isna().any():
         notes.append(
             f"{problem.noise.name.capitalize()} noise takes a correlated misfit as noise; only the scatter of the "
