@@ -265,7 +265,8 @@ def predict(
     harmonics, under every noise model, so that slow noise, 1/f noise and hum are no misfit. Other experiments are
     tested against the spectrum that the noise model assumes; a rejection may then mean a wrong noise model.
     Quantisation errors that repeat in every cycle are part of that spectrum (see `Recording.fold`); other errors that
-    repeat in every cycle, as those of a sensor that is not linear, are taken for model errors.
+    repeat in every cycle, as those of a sensor that is not linear, are taken for model errors. What the noise of inputs
+    causes (``Problem(input_noise=…)``) is part of the covariance in all tests.
 
     The noise model determines which misfit is detectable. With unknown variance, misfit of any size is taken as noise,
     and only its shape along the period or the scatter of the measured cycles reveals it; circulant noise also absorbs

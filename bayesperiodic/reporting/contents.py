@@ -345,9 +345,10 @@ def input_noise(given: ReportInputs) -> str:
     elif noisy:
         names = ", ".join(dict.fromkeys(name for own in noisy.values() for name in own))
         source = "the scatter of the cycles" if problem.input_noise == MEASURED else "the problem, which states it"
-        text = (
-            f"The noise of the inputs ({names}), known from {source}, is integrated out: the covariance of the "
-            "residual includes it, and so do all standard deviations and intervals."
+        text = f"The noise of the inputs ({names}), known from {source}, is " + (
+            "integrated out: the covariance of the residual includes it, and so do standard deviations and intervals."
+            if fit.input_errors
+            else "negligible beside that of the outputs."
         )
         text += f" The inputs of {exact} are taken as exact." if exact else ""
     else:
@@ -358,7 +359,7 @@ def input_noise(given: ReportInputs) -> str:
         if caused:
             text += f" Their noise {before} a standard deviation of {sd}{unit} in {channel}; "
             text += f"the rms of the residual {after} is {rms}{unit}."
-    if noisy:
+    if fit.input_errors:
         worst = max(curved, key=lambda name: np.nan_to_num(curved[name], nan=np.inf))
         most = "less than 0.01" if curved[worst] < 0.01 else f"up to {number(curved[worst], 2)}"
         text += f" What is not linear in it changes estimates by {most} standard deviations ({worst})."

@@ -258,3 +258,13 @@ def test_errors_that_are_not_linear_are_stated_by_the_largest_or_a_failed_solve(
         other = replace(fit, input_nonlinearity={"a": curved})
         page = Page(bp.report(problem, other, None, tmp_path / "r.html").read_text(encoding="utf-8"))
         assert f"What is not linear in it changes estimates {stated}" in page.text
+
+
+def test_noise_of_inputs_that_is_negligible_is_said_to_be(tmp_path):
+    fit, page = gain_page(tmp_path, [gain_run()], {"x": 1e-6})
+    assert not fit.input_errors
+    assert (
+        "The noise of the inputs (x), known from the problem, which states it, is negligible beside that of the"
+        in page.text
+    )
+    assert "What is not linear" not in page.text and not any("error of x" in e.text for e in page.all("figcaption"))
