@@ -87,7 +87,9 @@ def gear_problem(
 ) -> bp.Problem:  # fmt: skip
     """Return the problem of theta4, theta6 and theta16, or of all 15 parameters under priors.
 
-    The experiments are mean periods with all harmonics, or with `cut` folded recordings with some.
+    The experiments are mean periods with all harmonics, or with `cut` folded recordings with some. Inputs are taken as
+    exact, because these problems measure the cost of densities and samplers that others have too, and variances are
+    integrated out of them, which is not possible with noisy inputs.
     """
     model, inputs = bp.models.landing_gear(drive), gear_runs(drive, samples)[:runs]
     experiments = measured(model, GEAR, inputs, samples, seed, scheme, HARMONICS if cut else None)

@@ -9,7 +9,9 @@ import pytest
 import bayesperiodic as bp
 from tests.notebooks import NOTEBOOKS, execute
 
-IMPORTED = {"bayesperiodic", "dataclasses", "matplotlib.pyplot", "numpy", "pandas", "pathlib", "sympy", "tempfile"}
+IMPORTED = {
+    "bayesperiodic", "dataclasses", "matplotlib.pyplot", "numpy", "pandas", "pathlib", "sympy", "tempfile", "warnings",
+}  # fmt: skip
 LARGEST = 300_000
 
 every = pytest.mark.parametrize("path", NOTEBOOKS, ids=[path.stem for path in NOTEBOOKS])

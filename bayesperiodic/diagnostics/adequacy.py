@@ -264,6 +264,7 @@ class _Whitened:
         self._plain = [
             _used(block, *both) for block, *both in zip(self.blocks, here.residuals, here.changes, strict=True)
         ]
+        self.loadings = {b: part.T for one in likelihood.shared for b, part in zip(one.members, one.parts, strict=True)}
         self._experiments = {e.name: e for e in problem.experiments}
 
     def spectrum(self, index: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -291,8 +292,20 @@ class _Whitened:
         if spectrum is None:
             return None
         r, j, harmonic = self._plain[index]
-        sd = np.sqrt(spectrum[0][harmonic])
-        return Unexplained.of_measured_noise(r / sd, j / sd, harmonic, spectrum[1])
+        r, j = self.over(index, np.sqrt(spectrum[0][harmonic]), r, j)
+        return Unexplained.of_measured_noise(r, j, harmonic, spectrum[1])
+
+    def over(self, index: int, sd: np.ndarray, *parts: np.ndarray, weight: float = 1.0) -> list[np.ndarray]:
+        """Return components (…, used) of a block over the sds (used,) of the noise and what inputs' errors cause.
+
+        These make components correlated; the root of the covariance is the symmetric one.
+        """
+        found = [part / sd for part in parts]
+        if index not in self.loadings:
+            return found
+        loadings = np.sqrt(weight) * _used(self.blocks[index], self.loadings[index])[0] / sd
+        values, vectors = np.linalg.eigh(np.eye(sd.size) + loadings.T @ loadings)
+        return [((part @ vectors) / np.sqrt(values)) @ vectors.T for part in found]
 
     def consistency(self) -> float:
         """Return p of the test of common parameters."""
@@ -322,7 +335,9 @@ def _size(problem: Problem, here: Linearisation, index: int, white: _Whitened) -
     if not _testable(r, j) or not (block.measured > 0.0 or white.groups[index] in white.known):
         return NOT_TESTED, NOT_TESTED
     if block.measured > 0.0:
-        unexplained, measured = Unexplained(r, j, harmonic), block.measured
+        measured, one = block.measured, np.sqrt(np.full(r.size, block.measured))
+        r, j = (one * part for part in white.over(index, one, r, j, weight=block.weight))
+        unexplained = Unexplained(r, j, harmonic)
         e = next(e for e in problem.experiments if e.name == block.experiment)
         # Unequal variances reduce the degrees of freedom of a sum of squares.
         evenness, behind = _evenness(e, block), measured_freedom(e, block.channel)

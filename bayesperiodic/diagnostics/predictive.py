@@ -200,7 +200,8 @@ class Prediction(Bands):
         Conflict of the prior with the data, in words, "" if there is none. If there is one, the model is tested where
         the data alone are fitted best, and the amplitude is not tested.
     note : str
-        Limitations: misfit that the noise model absorbs, draws that have not converged; "" without any.
+        Limitations: misfit that the noise model absorbs, draws that have not converged; and that the covariance of the
+        residual includes the noise of the inputs, where it does.
     other_orbits : dict of str to str
         Experiments in which the model's orbit is not the measured one, with the reason, see `MapEstimate`; their
         verdict is "misspecified", whatever the tests say.
@@ -264,7 +265,8 @@ def predict(
     harmonics, under every noise model, so that slow noise, 1/f noise and hum are no misfit. Other experiments are
     tested against the spectrum that the noise model assumes; a rejection may then mean a wrong noise model.
     Quantisation errors that repeat in every cycle are part of that spectrum (see `Recording.fold`); other errors that
-    repeat in every cycle, as those of a sensor that is not linear, are taken for model errors.
+    repeat in every cycle, as those of a sensor that is not linear, are taken for model errors. What the noise of inputs
+    causes (``Problem(input_noise=…)``) is part of the covariance in all tests.
 
     The noise model determines which misfit is detectable. With unknown variance, misfit of any size is taken as noise,
     and only its shape along the period or the scatter of the measured cycles reveals it; circulant noise also absorbs
@@ -362,6 +364,8 @@ def _note(problem: Problem, posterior: Posterior, table: pd.DataFrame) -> str:
     notes = []
     if not posterior.converged:
         notes.append(f"The draws have not converged ({posterior.reason}), so bands and p-values are provisional.")
+    if problem.input_errors:
+        notes.append("What the noise of the inputs can cause is part of the covariance of the residual, and no misfit.")
     if not problem.noise.flat and table["size"].drop(ALL).isna().any():
         notes.append(
             f"{problem.noise.name.capitalize()} noise takes a correlated misfit as noise; only the scatter of the "

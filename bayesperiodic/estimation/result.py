@@ -450,6 +450,9 @@ class MapEstimate(Result):
             if np.isfinite(self.whiteness[channel].p):
                 line += f", whiteness p = {self.whiteness[channel].p:.2g}"
             lines.append(line)
+        if self.input_errors:
+            caused = ", ".join(f"{sd:.3g} in {channel}" for channel, sd in self.input_noise.items())
+            lines.append(f"  noise of the inputs, included in the covariance, causes {caused}")
         lines += [
             f"  other orbit than the recorded one in {name!r}: {text}" for name, text in self.other_orbits.items()
         ]

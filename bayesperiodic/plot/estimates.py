@@ -115,7 +115,7 @@ def fit(
         axes.plot(e.time, error, lw=1.2, label="MAP", **FITTED | {"marker": None})
         axes.axhline(0.0, lw=1.0, color=COLOURS["measured"])
         if row == 2 * len(shown):
-            axes.legend(frameon=False, ncols=2, loc="upper right")
+            axes.legend(frameon=False, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 0.95), borderpad=0.0)
         axes.set(
             ylabel=axis_label(f"error of\n{name}", problem.model.units.get(name, "")), xlabel="time in the period [s]"
         )

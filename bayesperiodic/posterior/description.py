@@ -370,9 +370,11 @@ class Description:
         return dict(zip(self.names, draws.T.copy(), strict=True))
 
     def __repr__(self) -> str:
+        noisy = ", ".join(dict.fromkeys(name for own in self.noisy_inputs.values() for name in own))
         return (
             f"Problem({self.model.name!r}, {len(self.experiments)} experiments, free: {', '.join(self.names)}, "
-            f"channels: {', '.join(self.channels)} with {self.counted:.0f} independent values, {self.noise.name} noise)"
+            f"channels: {', '.join(self.channels)} with {self.counted:.0f} independent values, {self.noise.name} noise"
+            f"{f', noise of {noisy} integrated out' if noisy else ''})"
         )
 
 

@@ -24,6 +24,7 @@ from bayesperiodic.estimation.map_estimate import estimation_warnings
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.periodic.schemes import find_scheme
 from bayesperiodic.posterior.description import check_results, fingerprint
+from bayesperiodic.posterior.input_noise import JOINT, MEASURED
 from bayesperiodic.posterior.parameters import SHIFT, squared
 from bayesperiodic.posterior.problem import Problem
 from bayesperiodic.reporting import html
@@ -331,6 +332,38 @@ def residuals(given: ReportInputs) -> Rows:
             }
         )
     return rows
+
+
+def input_noise(given: ReportInputs) -> str:
+    """Return how the noise of the inputs was treated, what it causes, and how nonlinear that is; "" without inputs."""
+    problem, fit = given.problem, given.fit
+    noisy, curved = problem.noisy_inputs, fit.input_nonlinearity
+    exact = ", ".join(e.name for e in problem.experiments if e.name not in noisy)
+    before, after = "causes", "with the estimated inputs"
+    if problem.input_noise == JOINT:
+        text = "The errors of the inputs are parameters, with priors by the scatter of the cycles."
+    elif noisy:
+        names = ", ".join(dict.fromkeys(name for own in noisy.values() for name in own))
+        source = "the scatter of the cycles" if problem.input_noise == MEASURED else "the problem, which states it"
+        text = f"The noise of the inputs ({names}), known from {source}, is " + (
+            "integrated out: the covariance of the residual includes it, and so do standard deviations and intervals."
+            if fit.input_errors
+            else "negligible beside that of the outputs."
+        )
+        text += f" The inputs of {exact} are taken as exact." if exact else ""
+    else:
+        text, before, after = "The inputs are taken as exact.", "would cause", "with the measured inputs"
+    for channel, caused in fit.input_noise.items():
+        sd, rms = number(caused), number(fit.rms[channel])
+        unit = "" if (own := given.unit(channel)) == html.NOTHING else f" {own}"
+        if caused:
+            text += f" Their noise {before} a standard deviation of {sd}{unit} in {channel}; "
+            text += f"the rms of the residual {after} is {rms}{unit}."
+    if fit.input_errors:
+        worst = max(curved, key=lambda name: np.nan_to_num(curved[name], nan=np.inf))
+        most = "less than 0.01" if curved[worst] < 0.01 else f"up to {number(curved[worst], 2)}"
+        text += f" What is not linear in it changes estimates by {most} standard deviations ({worst})."
+    return text if problem.model.inputs else ""
 
 
 def _formatted(table: pd.DataFrame, **columns: tuple[str, Callable[[Any], Any]]) -> Rows:

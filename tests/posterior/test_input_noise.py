@@ -13,6 +13,7 @@ from scipy import stats
 import bayesperiodic as bp
 from bayesperiodic import _fourier
 from bayesperiodic.diagnostics import calibration
+from bayesperiodic.diagnostics.adequacy import misfit
 from bayesperiodic.posterior.input_noise import pooled, same
 from bayesperiodic.posterior.likelihood import Likelihood
 from bayesperiodic.posterior.noise import KNOWN, SPECTRAL, Block
@@ -314,6 +315,32 @@ def test_robust_sd_is_at_least_what_noise_of_the_inputs_causes():
     )  # fmt: skip
     fit = bp.map_estimate(problem, starts=1, **QUIET)
     assert fit.sd["b"] == pytest.approx(0.4, rel=0.1) and fit.robust_sd["b"] == pytest.approx(0.4, rel=0.1)
+
+
+def test_noise_of_inputs_is_no_misfit_of_the_model_and_a_wrong_model_is_one():
+    """60 recordings of the right model at the level 1 %: more than 4 rejections have a probability of 3e-4."""
+    priors = {"a": bp.Normal(0.0, 10.0)}
+    wrong = formula_model("stiff", ["a"], lambda p, u, s: {"y": p.a + 1.8 * u.x})
+    found = {GAIN: [], wrong: []}
+    for model, texts in found.items():
+        for seed in range(60 if model is GAIN else 5):
+            problem = bp.Problem(model, [noisy_gain(300 + seed)], priors=priors)
+            fit = bp.map_estimate(problem, starts=1, **QUIET)
+            texts.append(misfit(problem.with_input_errors(fit.input_errors), fit))
+    assert sum(map(bool, found[GAIN])) <= 4
+    assert all("the residual is larger than the measured noise" in text for text in found[wrong])
+
+
+def test_results_say_in_words_that_the_covariance_includes_the_noise_of_inputs():
+    problem = bp.Problem(GAIN, [noisy_gain(1)], priors={"a": bp.Normal(0.0, 10.0)})
+    fit = bp.map_estimate(problem, starts=1, **QUIET)
+    assert repr(problem).endswith("independent noise, noise of x integrated out)")
+    assert f"noise of the inputs, included in the covariance, causes {fit.input_noise['y']:.3g} in y" in repr(fit)
+    found = bp.predict(problem, bp.sample(problem, fit, seed=1, ensembles=2, max_steps=300, **QUIET))
+    assert "the noise of the inputs" in found.note and found.note in repr(found) and found.verdict == "adequate"
+    exact = bp.Problem(GAIN, problem.experiments, priors=problem.priors, input_noise="exact")
+    assert repr(exact).endswith("independent noise)")
+    assert "noise of the inputs" not in repr(bp.map_estimate(exact, starts=1, **QUIET))
 
 
 def test_errors_as_parameters_give_the_same_estimate():

@@ -1,12 +1,13 @@
 import os
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import bayesperiodic as bp
-from tests.known import LINEAR, linear_experiment
+from tests.known import LINEAR, formula_model, linear_experiment
 from tests.reporting.conftest import ATTACK, NAME
 from tests.reporting.reading import Page, value
 
@@ -197,3 +198,73 @@ def test_results_of_another_problem_are_rejected(solved, tmp_path):
     with pytest.raises(FileNotFoundError, match="path: must be in an existing folder"):
         bp.report(problem, fit, None, tmp_path / "nowhere" / "report.html")
     assert not os.listdir(tmp_path)
+
+
+GAIN = formula_model("gain", ["a"], lambda p, u, s: {"y": p.a * u.x})
+
+
+def gain_run(name="run", cycles=20):
+    """Return the mean period of y = 2·x with white noise of x and y."""
+    random, time = np.random.default_rng(cycles), np.arange(40 * cycles) / 40.0
+    x = np.cos(2 * np.pi * time)
+    y = 2.0 * x + 0.1 * random.standard_normal(time.size)
+    recording = bp.Recording(time, {"y": y}, {"x": x + 0.2 * random.standard_normal(time.size)}, name=name)
+    return recording.fold(64, frequency=1.0, harmonics={"x": 2, "y": 6})
+
+
+def gain_page(folder, runs, noise):
+    """Return the estimate and the report of a problem with noisy inputs."""
+    problem = bp.Problem(GAIN, runs, priors={"a": bp.Normal(0.0, 10.0)}, input_noise=noise)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        fit = bp.map_estimate(problem, starts=1, progress=False)
+    return fit, Page(bp.report(problem, fit, None, folder / "r.html").read_text(encoding="utf-8"))
+
+
+TREATED = {
+    "measured": "The noise of the inputs (x), known from the scatter of the cycles, is integrated out: the covariance",
+    "given": "The noise of the inputs (x), known from the problem, which states it, is integrated out:",
+    "exact": "The inputs are taken as exact. Their noise would cause a standard deviation of",
+    "joint": "The errors of the inputs are parameters, with priors by the scatter of the cycles. Their noise causes a",
+}
+
+
+@pytest.mark.parametrize("noise", TREATED)
+def test_treatment_of_the_inputs_noise_its_size_and_its_linearisation_are_stated(noise, tmp_path):
+    fit, page = gain_page(tmp_path, [gain_run()], {"x": 0.05} if noise == "given" else noise)
+    (text,) = [e.text for e in page.all("p") if e.attributes.get("id") == "input-noise"]
+    assert text.startswith(TREATED[noise])
+    assert [value(number) for number in re.findall(r"(?:deviation of|is) ([\d.×⁻⁰-⁹¹²³]+\d)", text)] == pytest.approx(
+        [fit.input_noise["y"], fit.rms["y"]], rel=0.01
+    )
+    integrated = noise in ("measured", "given")
+    linear = "What is not linear in it changes estimates by less than 0.01 standard deviations (a)."
+    assert text.endswith(linear) is integrated
+    (alt,) = [e.attributes["alt"] for e in page.all("img") if e.attributes["alt"].startswith("Line plot")]
+    assert ("estimated error of x, measured minus estimated input, with its 90 % band" in alt) is integrated
+
+
+def test_experiments_with_too_few_cycles_are_named_as_exact(tmp_path):
+    _, page = gain_page(tmp_path, [gain_run("long"), gain_run("short", cycles=4)], "measured")
+    assert "The inputs of short are taken as exact." in page.text
+    shown = [e.text for e in page.all("figcaption")]
+    assert "the estimated error of x" in shown[0] and "the estimated error" not in shown[1]
+
+
+def test_errors_that_are_not_linear_are_stated_by_the_largest_or_a_failed_solve(tmp_path):
+    fit, _ = gain_page(tmp_path, [gain_run()], "measured")
+    problem = bp.Problem(GAIN, [gain_run()], priors={"a": bp.Normal(0.0, 10.0)})
+    for curved, stated in ((0.35, "by up to 0.35 standard deviations (a)"), (np.nan, "by up to – standard deviations")):
+        other = replace(fit, input_nonlinearity={"a": curved})
+        page = Page(bp.report(problem, other, None, tmp_path / "r.html").read_text(encoding="utf-8"))
+        assert f"What is not linear in it changes estimates {stated}" in page.text
+
+
+def test_noise_of_inputs_that_is_negligible_is_said_to_be(tmp_path):
+    fit, page = gain_page(tmp_path, [gain_run()], {"x": 1e-6})
+    assert not fit.input_errors
+    assert (
+        "The noise of the inputs (x), known from the problem, which states it, is negligible beside that of the"
+        in page.text
+    )
+    assert "What is not linear" not in page.text and not any("error of x" in e.text for e in page.all("figcaption"))
