@@ -157,7 +157,7 @@ def adequacy(
     """
     shapes = np.median(noise, axis=0)[None] if problem.noise.flat else noise[:: max(1, len(noise) // SHAPES)]
     rows: dict[str, dict[str, Any]] = {}
-    white = [_Whitened(problem, here, shape) for shape in shapes]
+    white = [Whitened(problem, here, shape) for shape in shapes]
     for i, block in enumerate(problem.likelihood.blocks):
         if block.kind == KNOWN:
             continue
@@ -245,14 +245,14 @@ def adjusted_p(table: pd.DataFrame) -> np.ndarray:
     return holm(table[[*TESTS]].to_numpy(dtype=float).ravel()).reshape(len(table), -1)
 
 
-class _Whitened:
+class Whitened:
     """Residual components and their derivatives in units of the noise for parameters (names,) of the noise model.
 
     If there are fewer independent values than components, the measured period is a smooth curve, and only the
     components of the lowest harmonics are used, as many as independent values.
     """
 
-    def __init__(self, problem: Problem, here: Linearisation, noise: np.ndarray):
+    def __init__(self, problem: Problem, here: Any, noise: np.ndarray):
         likelihood = problem.likelihood
         self.blocks = likelihood.blocks
         names = [problem.noise.parameter_names(block) for block in self.blocks]
@@ -260,9 +260,9 @@ class _Whitened:
         each = zip(self.groups, names, strict=True)
         self.known = frozenset(group for group, own in each if set(own) <= set(likelihood.fixed))
         white = zip(*(likelihood.whitened(part, noise) for part in (here.residuals, here.changes)), strict=True)
-        self.parts = [_used(block, *both) for block, both in zip(self.blocks, white, strict=True)]
+        self.parts = [used(block, *both) for block, both in zip(self.blocks, white, strict=True)]
         self._plain = [
-            _used(block, *both) for block, *both in zip(self.blocks, here.residuals, here.changes, strict=True)
+            used(block, *both) for block, *both in zip(self.blocks, here.residuals, here.changes, strict=True)
         ]
         self.loadings = {b: part.T for one in likelihood.shared for b, part in zip(one.members, one.parts, strict=True)}
         self._experiments = {e.name: e for e in problem.experiments}
@@ -288,12 +288,18 @@ class _Whitened:
 
     def in_measured_units(self, index: int) -> Unexplained | None:
         """Return what is unexplained of a block in units of the measured spectrum; None if that is not known."""
+        spectrum, parts = self.spectrum(index), self.in_units_of_noise(index)
+        if spectrum is None or parts is None:
+            return None
+        return Unexplained.of_measured_noise(parts[0], parts[1], self.parts[index][2], spectrum[1])
+
+    def in_units_of_noise(self, index: int) -> list[np.ndarray] | None:
+        """Return components and derivatives of a block in units of the measured spectrum; None if it is not known."""
         spectrum = self.spectrum(index)
         if spectrum is None:
             return None
         r, j, harmonic = self._plain[index]
-        r, j = self.over(index, np.sqrt(spectrum[0][harmonic]), r, j)
-        return Unexplained.of_measured_noise(r, j, harmonic, spectrum[1])
+        return self.over(index, np.sqrt(spectrum[0][harmonic]), r, j)
 
     def over(self, index: int, sd: np.ndarray, *parts: np.ndarray, weight: float = 1.0) -> list[np.ndarray]:
         """Return components (…, used) of a block over the sds (used,) of the noise and what inputs' errors cause.
@@ -303,7 +309,7 @@ class _Whitened:
         found = [part / sd for part in parts]
         if index not in self.loadings:
             return found
-        loadings = np.sqrt(weight) * _used(self.blocks[index], self.loadings[index])[0] / sd
+        loadings = np.sqrt(weight) * used(self.blocks[index], self.loadings[index])[0] / sd
         values, vectors = np.linalg.eigh(np.eye(sd.size) + loadings.T @ loadings)
         return [((part @ vectors) / np.sqrt(values)) @ vectors.T for part in found]
 
@@ -317,7 +323,7 @@ def _testable(r: np.ndarray, j: np.ndarray) -> bool:
     return bool(np.isfinite(r).all() and np.isfinite(j).all())
 
 
-def _used(block: Block, *parts: np.ndarray) -> list[np.ndarray]:
+def used(block: Block, *parts: np.ndarray) -> list[np.ndarray]:
     """Return the components (…, used) for the tests, points as cosine components along the period, and harmonics."""
     harmonic = block.harmonic if block.kind == SPECTRAL else (np.arange(block.size) + 1) // 2
     number = min(block.size, int(np.rint(block.count))) if block.kind in (SPECTRAL, POINTS) else block.size
@@ -327,10 +333,10 @@ def _used(block: Block, *parts: np.ndarray) -> list[np.ndarray]:
     return [part[..., order] for part in (*parts, harmonic)]
 
 
-def _size(problem: Problem, here: Linearisation, index: int, white: _Whitened) -> tuple[float, float]:
+def _size(problem: Problem, here: Linearisation, index: int, white: Whitened) -> tuple[float, float]:
     """Return p of a residual larger than the measured or known noise, and the fraction of model error."""
     block = white.blocks[index]
-    r, j, harmonic = _used(block, here.residuals[index], here.changes[index])
+    r, j, harmonic = used(block, here.residuals[index], here.changes[index])
     r, j = np.sqrt(block.weight) * r, np.sqrt(block.weight) * j
     if not _testable(r, j) or not (block.measured > 0.0 or white.groups[index] in white.known):
         return NOT_TESTED, NOT_TESTED

@@ -1,7 +1,7 @@
-"""Search for terms that a misspecified model lacks: score tests of candidates, and refits of the best ones."""
+"""Search for terms that a misspecified model lacks: score tests of candidates, and fits with the best ones."""
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,35 +10,23 @@ import pandas as pd
 from scipy import stats
 
 from bayesperiodic import _checks
-from bayesperiodic._linalg import hessian_scale, in_one_thread
+from bayesperiodic._linalg import TINY, hessian_scale, in_one_thread, scaled
 from bayesperiodic.diagnostics.adequacy import ALL, adequacy
-from bayesperiodic.diagnostics.candidates import (
-    Candidate,
-    coefficient_names,
-    extended,
-    factors,
-    generated,
-    given,
-    places,
-    values,
-)
-from bayesperiodic.estimation.covariance import predicted_changes, residual_variances
-from bayesperiodic.estimation.map_estimate import map_estimate
+from bayesperiodic.diagnostics.candidates import Candidate, coefficient_names, extended, factors, generated, given
+from bayesperiodic.diagnostics.score_tests import ScoreTests, along_orbit
+from bayesperiodic.estimation.gauss_newton import Iterate, Objective
+from bayesperiodic.estimation.map_estimate import map_estimate, nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic.equations import respond
-from bayesperiodic.periodic.solution import periodic_part
-from bayesperiodic.posterior.density import Linearisation
+from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.posterior.description import check_results
 from bayesperiodic.posterior.priors import Normal
 from bayesperiodic.posterior.problem import Problem
 
-# Share of a candidate's effect that the parameters do not explain, below which it cannot be told from a change of these.
-UNIDENTIFIABLE = 1e-6
-# 1 − cos² of the angle between the effects of two candidates that are the same on the measured orbits.
-COLLINEAR = 1e-8
 # Candidates that are fitted at every step, and that are compiled together.
 FITTED, COMPILED = 4, 8
+# Robust standard deviations from zero of a coefficient.
+SIGNIFICANT = 2.0
 # Standard deviations of the difference of two log-likelihoods from which on the data tell two terms apart.
 DISTINCT = 2.0
 # Fewest experiments of which one is left out at a time.
@@ -268,34 +256,21 @@ def missing_terms(
     _checks.integer("max_terms", max_terms, 0)
     if not 0.0 < _checks.finite_number("false_discovery_rate", false_discovery_rate) < 1.0:
         raise ValueError(f"false_discovery_rate: must be between 0 and 1, got {false_discovery_rate!r}.")
-    model = stated._given["model"]
+    model = problem._given["model"]
     terms = given(model, candidates or {})
     if generate:
-        terms += generated(model, _deviations(model, stated, fit))
+        terms += generated(model, _deviations(stated, fit))
     left_out = {exclude} if isinstance(exclude, str) else set(exclude)
     chosen = {str(t): t for t in terms if not {t.text, t.place, str(t)} & left_out}
-    search = _Search(problem, model, list(chosen.values()), false_discovery_rate)
-    return search.run(_State(stated, fit, ()), max_terms)
+    return _Search(problem, list(chosen.values()), false_discovery_rate).run(fit, max_terms)
 
 
-def _deviations(model: Model, problem: Problem, fit: MapEstimate) -> dict[str, float]:
+def _deviations(problem: Problem, fit: MapEstimate) -> dict[str, float]:
     """Return the standard deviations of the model's variables along the orbits of all experiments."""
-    variables = {name: e for part in factors(model) for name, e in part.items()}
-    each = [_evaluated(problem, fit, name, list(variables.values())) for name in fit.solutions]
-    deviations = np.std(np.concatenate(each, axis=1), axis=1)
-    return dict(zip(variables, deviations.tolist(), strict=True))
-
-
-def _evaluated(problem: Problem, fit: MapEstimate, run: str, expressions: Sequence[Any]) -> np.ndarray:
-    """Return expressions of the model's symbols along the orbit of an experiment (expressions, points)."""
-    solution = fit.solutions[run]
-    equations = problem.equations[run].at_frequency(solution.frequency)
-    z = periodic_part(equations, solution.states)
-    parameters = problem.parameters(problem.vector(fit.theta)[None], run)[0]
-    return values(
-        problem.model, expressions, equations.states(z), equations.inputs, parameters, equations.grid.tau,
-        equations.frequency,
-    )  # fmt: skip
+    variables = {name: e for part in factors(problem.model) for name, e in part.items()}
+    theta, listed = problem.vector(fit.theta), list(variables.values())
+    each = [along_orbit(problem, theta, e, fit.solutions[e.name], listed) for e in problem.experiments]
+    return dict(zip(variables, np.std(np.concatenate(each, axis=1), axis=1).tolist(), strict=True))
 
 
 def _problem_of(problem: Problem, model: Model, widths: Mapping[str, float], zero: Iterable[str] = ()) -> Problem:
@@ -308,173 +283,188 @@ def _problem_of(problem: Problem, model: Model, widths: Mapping[str, float], zer
 
 @dataclass(frozen=True)
 class _State:
-    """A problem with some of the terms, its estimate, and the coefficients of the terms."""
+    """A problem with some of the terms and the optimum of its density, errors of inputs fixed."""
 
     problem: Problem
-    fit: MapEstimate
-    names: tuple[str, ...]
+    objective: Objective
+    iterate: Iterate
+    names: tuple[str, ...]  # of the terms' coefficients
+
+    @property
+    def solutions(self) -> dict[str, PeriodicSolution]:
+        return self.iterate.here.simulator.solutions(self.iterate.theta)
 
     @property
     def evidence(self) -> float:
-        """The logarithm of the evidence by Laplace, but for constants."""
-        sd = np.sqrt(np.diag(self.fit.covariance))
-        _, size = np.linalg.slogdet(self.fit.covariance / np.outer(sd, sd))
-        return float(self.fit.history[-1] + 0.5 * size + np.sum(np.log(sd)) + 0.5 * sd.size * np.log(2.0 * np.pi))
+        """The logarithm of the evidence by Laplace, but for a constant."""
+        hessian, _ = self.objective.hessian_and_gradient(self.iterate)
+        scale = hessian_scale(hessian)
+        values = np.linalg.eigvalsh(scaled(hessian, scale))
+        size = np.sum(np.log(np.maximum(values, TINY))) - 2.0 * np.sum(np.log(scale))
+        return float(self.iterate.objective - 0.5 * size + 0.5 * scale.size * np.log(2.0 * np.pi))
 
-    def here(self) -> Linearisation:
-        """Return residuals and derivatives at the estimate."""
-        theta = self.problem.vector(self.fit.theta)
-        guesses = {name: solution.states for name, solution in self.fit.solutions.items()}
-        return self.problem.anchored(theta, guesses).density().linearise(theta)
-
-    @property
-    def noise(self) -> np.ndarray:
-        return self.problem.noise_values({name: self.fit.noise[name] for name in self.problem.noise_names})
+    def with_problem(self, problem: Problem, names: tuple[str, ...]) -> "_State | None":
+        """Return the optimum of a problem with other terms, from here on; None if there is none."""
+        known = dict(zip(self.problem.names, self.iterate.theta.tolist(), strict=True))
+        theta = np.array([known.get(name, 0.0) for name in problem.names])
+        guesses = {e.name: self.solutions[e.name].states for e in problem.experiments}
+        found = nearest_optimum(problem, theta, guesses)
+        if found is None or found[1].status != "converged":
+            return None
+        return _State(problem, found[0], found[1].iterate, names)
 
 
 class _Search:
     """Candidates of one problem, and the steps."""
 
-    def __init__(self, problem: Problem, model: Model, terms: list[Candidate], rate: float):
-        self.problem, self.model, self.terms, self.rate = problem, model, terms, rate
+    def __init__(self, problem: Problem, terms: list[Candidate], rate: float):
+        self.problem, self.model, self.rate = problem, problem._given["model"], rate
+        self.terms = {str(term): term for term in terms}
+        self.names = dict(zip(self.terms, coefficient_names(self.model, terms), strict=True))
         self.refused: dict[str, str] = {}
-        self.names = dict(zip(map(str, terms), coefficient_names(model, terms), strict=True))
         self.widths: dict[str, float] = {}
-        self.compiled: tuple[Model, dict[str, Candidate]] = model, {}
+        self.compiled: tuple[Model, dict[str, Candidate]] = self.model, {}
 
-    def run(self, state: _State, max_terms: int) -> MissingTerms:
-        """Return what was found from a state without terms on."""
-        first, steps, ranking = state, [], None
+    def run(self, fit: MapEstimate, max_terms: int) -> MissingTerms:
+        """Return what was found from the estimate of the model without terms on."""
+        state = self.at(fit, ())
+        ranking = self.scores(state)
+        steps: list[Step] = []
+        table, before = ranking, _step(state, fit, fit, None, _held_out(state))
+        stopped = f"The search ended after {max_terms} terms, as asked for by max_terms."
         chosen: dict[str, Candidate] = {}
-        stopped, count = f"The search ended after {max_terms} terms, as asked.", 0
-        while True:
-            table = self.scores(state, chosen)
-            if ranking is None:
-                ranking, count = table, len(table)
-            if len(steps) == max_terms:
-                break
+        while len(steps) < max_terms:
             found = self.best(state, table, chosen)
             if isinstance(found, str):
                 stopped = found
                 break
-            term, after, others, p = found
-            held_out = _held_out(after)
-            if held_out > (last := steps[-1].held_out if steps else _held_out(state)):
+            key, others, p, after = found
+            term, name = self.terms[key], self.names[key]
+            fit_after = self.estimate({**chosen, name: term}, after)
+            state_after = self.at(fit_after, (*chosen, name))
+            held_out, last = _held_out(state_after), steps[-1].held_out if steps else before.held_out
+            if abs(fit_after.theta[name]) < SIGNIFICANT * fit_after.robust_sd[name]:
+                stopped = f"{key} fits best, but its coefficient is less than {SIGNIFICANT:g} robust sds from zero."
+                break
+            if held_out > last:
                 stopped = (
-                    f"{term} would improve the fit, but not the prediction of experiments that are left out "
+                    f"{key} would improve the fit, but not the prediction of experiments that are left out "
                     f"({last:.3%} unexplained without it, {held_out:.3%} with it)."
                 )
                 break
-            chosen[self.names[str(term)]] = term
-            steps.append(_step(term, self.names[str(term)], others, p, state, after, held_out))
-            state = after
-        steps, dropped = self.without_needless(steps, state, chosen)
+            gain = after.evidence - state.evidence
+            steps.append(_step(state_after, fit_after, fit, (term, name, others, p, gain), held_out))
+            chosen[name], state, fit = term, state_after, fit_after
+            table = self.scores(state)
+        steps, dropped = self.without_needless(steps, state)
         kept = {step.name: (chosen[step.name], self.widths[step.name]) for step in steps}
-        before = _step(None, "", (), np.nan, first, first, _held_out(first))
-        return MissingTerms(tuple(steps), ranking, count, self.refused, before, dropped, stopped, self.problem, kept)
+        return MissingTerms(
+            tuple(steps), ranking, len(ranking), self.refused, before, dropped, stopped, self.problem, kept
+        )
 
-    def scores(self, state: _State, chosen: Mapping[str, Candidate]) -> pd.DataFrame:
+    def at(self, fit: MapEstimate, names: tuple[str, ...]) -> _State:
+        """Return the optimum at an estimate of the model with terms."""
+        problem = self.with_terms(names).with_input_errors(fit.input_errors)
+        theta, guesses = problem.vector(fit.theta), {n: solution.states for n, solution in fit.solutions.items()}
+        found = nearest_optimum(problem, theta, guesses)
+        if found is None:
+            raise ValueError("fit: must be an estimate with a periodic solution of every experiment, got one without.")
+        return _State(problem, found[0], found[1].iterate, names)
+
+    def with_terms(self, names: Iterable[str]) -> Problem:
+        """Return the problem with coefficients of the compiled model, the others zero."""
+        model, known = self.compiled
+        zero = [name for name in known if name not in {*names}]
+        return _problem_of(self.problem, model, {name: self.widths[name] for name in names}, zero)
+
+    def estimate(self, terms: Mapping[str, Candidate], near: _State) -> MapEstimate:
+        """Return the estimate of the model with terms, their names given, from a near optimum."""
+        problem = self.with_terms(terms)
+        start = dict(zip(near.problem.names, near.iterate.theta.tolist(), strict=True))
+        guesses = {name: solution.states for name, solution in near.solutions.items()}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            return map_estimate(problem.anchored(start, guesses), start=start, progress=False)
+
+    def scores(self, state: _State) -> pd.DataFrame:
         """Return the table of the score tests of candidates that are not yet chosen, the best first."""
-        open_terms = [t for t in self.terms if self.names[str(t)] not in chosen and str(t) not in self.refused]
-        tests = _ScoreTests(state, open_terms)
-        for i in np.flatnonzero(~tests.identifiable):
-            self.refused[str(open_terms[i])] = NOT_TOLD
+        left = [key for key in self.terms if self.names[key] not in state.names and key not in self.refused]
+        tests = ScoreTests(state.problem, state.iterate, [self.terms[key] for key in left])
+        self.refused |= {left[i]: NOT_TOLD for i in np.flatnonzero(~tests.identifiable)}
+        self.widths |= {self.names[key]: width for key, width in zip(left, tests.widths.tolist(), strict=True)}
         rows = []
-        for members in tests.groups():
-            first = open_terms[members[0]]
-            same = tuple(str(open_terms[i]) for i in members[1:])
-            rows.append((first.place, first.text, same, tests.explained[members[0]], tests.p[members[0]], str(first)))
-            self.widths[self.names[str(first)]] = float(tests.widths[members[0]])
-        columns = ["place", "term", "same", "explains", "p", "key"]
-        table = pd.DataFrame(rows, columns=columns).sort_values("explains", ascending=False, ignore_index=True)
-        table["p_adjusted"] = stats.false_discovery_control(table["p"]) if len(table) else []
+        for first, *others in tests.groups():
+            term, same = self.terms[left[first]], tuple(left[i] for i in others)
+            rows.append((left[first], term.place, term.text, same, tests.explained[first], tests.p[first]))
+        table = pd.DataFrame(rows, columns=["candidate", "place", "term", "same", "explains", "p"])
+        table["p_adjusted"] = stats.false_discovery_control(table["p"]) if len(table) else table["p"]
         return table
 
     def best(
         self, state: _State, table: pd.DataFrame, chosen: Mapping[str, Candidate]
-    ) -> tuple[Candidate, _State, tuple[str, ...], float] | str:
-        """Return the term to be added, the estimate with it, its alternatives and p; or why there is none."""
+    ) -> tuple[str, tuple[str, ...], float, _State] | str:
+        """Return the term to be added, its alternatives, p, and the optimum with it; or why there is none."""
         significant = table[table["p_adjusted"] < self.rate]
-        by_key = {str(t): t for t in self.terms}
-        fitted: list[tuple[_State, pd.Series]] = []
-        for row in significant.itertuples():
-            after = self.fitted(state, chosen, by_key[str(row.key)], table)
-            if after is None:
-                self.refused[str(row.key)] = VANISHED
-                continue
-            fitted.append((after, row))
-            if len(fitted) == FITTED:
-                break
-        if not fitted:
+        if not len(significant):
             return (
-                f"No further candidate is significant at a false discovery rate of {self.rate:g}"
-                f" (the smallest adjusted p is {table['p_adjusted'].min():.2g})."
+                f"No further candidate is significant at a false discovery rate of {self.rate:g} (the smallest "
+                f"adjusted p is {table['p_adjusted'].min():.2g})."
             )
-        fitted.sort(key=lambda pair: pair[0].evidence, reverse=True)
-        after, row = fitted[0]
-        if after.evidence <= state.evidence:
-            return f"{row.key} is significant, but the evidence does not increase with it."
-        here = after.here()
-        others = list(row.same)
-        for other, own in fitted[1:]:
-            if not _distinct(after, here, other):
-                others += [str(own.key), *own.same]
-        return by_key[str(row.key)], after, tuple(others), float(row.p_adjusted)
+        tried = list(significant["candidate"][:FITTED])
+        self.compile(tried, list(significant["candidate"][:COMPILED]), chosen)
+        fitted: dict[str, _State] = {}
+        for key in tried:
+            names = (*chosen, self.names[key])
+            problem = self.with_terms(names).with_input_errors(state.problem.input_errors)
+            if (after := state.with_problem(problem, names)) is None:
+                self.refused[key] = VANISHED
+            else:
+                fitted[key] = after
+        if not fitted:
+            return f"With {', '.join(tried)}, the best candidates, no periodic solution was found."
+        first, *others = sorted(fitted, key=lambda key: fitted[key].evidence, reverse=True)
+        # Each of the candidates is as likely to be the missing one.
+        needed = np.log(len(self.terms))
+        if (gain := fitted[first].evidence - state.evidence) < needed:
+            return (
+                f"{first} fits best, but the logarithm of the evidence increases only by {gain:.1f}, where "
+                f"{len(self.terms)} candidates require {needed:.1f}."
+            )
+        same, p = (dict(zip(table["candidate"], table[column], strict=True)) for column in ("same", "p_adjusted"))
+        alternatives = list(same[first])
+        for other in others:
+            if not _distinct(fitted[first], fitted[other]):
+                alternatives += [other, *same[other]]
+        return first, tuple(alternatives), float(p[first]), fitted[first]
 
-    def fitted(
-        self, state: _State, chosen: Mapping[str, Candidate], term: Candidate, table: pd.DataFrame
-    ) -> _State | None:
-        """Return the estimate with one more term, from the present one; None if it has no periodic solution."""
-        name = self.names[str(term)]
-        model, known = self.compiled
-        if not {*chosen, name} <= set(known):
-            by_key = {str(t): t for t in self.terms}
-            wanted = [str(term), *table["key"][:COMPILED]]
-            known = dict(chosen) | {self.names[key]: by_key[key] for key in dict.fromkeys(wanted)}
-            model = extended(self.model, known)
-            self.compiled = model, known
-        names = (*chosen, name)
-        return _estimated(
-            _problem_of(self.problem, model, {n: self.widths[n] for n in names}, set(known) - {*names}), state, names
-        )
+    def compile(self, wanted: Sequence[str], more: Sequence[str], chosen: Mapping[str, Candidate]) -> None:
+        """Take a model with all wanted terms; where the present one lacks any, one with more terms."""
+        if not {self.names[key] for key in wanted} <= set(self.compiled[1]):
+            terms = dict(chosen) | {self.names[key]: self.terms[key] for key in dict.fromkeys([*wanted, *more])}
+            self.compiled = extended(self.model, terms), terms
 
-    def without_needless(
-        self, steps: list[Step], state: _State, chosen: dict[str, Candidate]
-    ) -> tuple[list[Step], tuple[str, ...]]:
+    def without_needless(self, steps: list[Step], state: _State) -> tuple[list[Step], tuple[str, ...]]:
         """Return the steps without terms, but for the last one, that the evidence is no longer in favour of."""
         dropped: list[str] = []
         for step in steps[:-1]:
             names = tuple(n for n in state.names if n != step.name)
-            model, known = self.compiled
-            without = _problem_of(self.problem, model, {n: self.widths[n] for n in names}, set(known) - {*names})
-            other = _estimated(without, state, names)
+            problem = self.with_terms(names).with_input_errors(state.problem.input_errors)
+            other = state.with_problem(problem, names)
             if other is not None and other.evidence > state.evidence:
-                state = other
+                state, steps = other, [s for s in steps if s.name != step.name]
                 dropped.append(f"{step.term} in {step.place}")
-                steps = [s for s in steps if s.name != step.name]
         return steps, tuple(dropped)
 
 
-def _estimated(problem: Problem, near: _State, names: tuple[str, ...]) -> _State | None:
-    """Return the estimate of a problem from that of a similar one; None if there is none."""
-    start = {name: near.fit.theta.get(name, 0.0) for name in problem.names}
-    guesses = {name: solution.states for name, solution in near.fit.solutions.items()}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        try:
-            fit = map_estimate(problem.anchored(start, guesses), start=start, progress=False)
-        except ValueError:
-            return None
-    if not fit.converged:
-        return None
-    return _State(problem.with_input_errors(fit.input_errors), fit, names)
-
-
 def _step(
-    term: Candidate | None, name: str, others: tuple[str, ...], p: float, before: _State, after: _State, held_out: float
+    state: _State,
+    fit: MapEstimate,
+    before: MapEstimate,
+    added: tuple[Candidate, str, tuple[str, ...], float, float] | None,
+    held_out: float,
 ) -> Step:
-    fit, same = after.fit, before is after
-    table = adequacy(after.problem, after.here(), after.noise[None], {})
+    table = adequacy(state.problem, state.iterate.here, state.iterate.noise[None], {})
+    term, name, others, p, gain = added or (None, "", (), np.nan, np.nan)
     return Step(
         term.text if term else "",
         term.place if term else "",
@@ -487,19 +477,19 @@ def _step(
         fit.fvu,
         {channel: white.p for channel, white in fit.whiteness.items()},
         str(table.loc[ALL, "verdict"]),
-        0.0 if same else after.evidence - before.evidence,
+        gain,
         held_out,
-        {n: (fit.theta[n] - value) / before.fit.sd[n] for n, value in before.fit.theta.items()},
+        {n: (fit.theta[n] - value) / before.sd[n] for n, value in before.theta.items()},
     )
 
 
-def _distinct(one: _State, here: Linearisation, other: _State) -> bool:
+def _distinct(one: _State, other: _State) -> bool:
     """Return whether the data tell two fits apart, by the test of Q. H. Vuong, Econometrica 57 (1989) 307-333."""
     likelihood = one.problem.likelihood
-    own, others = (likelihood.whitened(r, one.noise) for r in (here.residuals, other.here().residuals))
-    weight = np.concatenate([np.full(b.size, b.weight) for b in likelihood.blocks])
+    own, others = (likelihood.whitened(state.iterate.here.residuals, one.iterate.noise) for state in (one, other))
+    weight = np.concatenate([np.full(b.size, min(b.weight, 1.0)) for b in likelihood.blocks])
     change = np.concatenate(others) ** 2 - np.concatenate(own) ** 2
-    error = np.sqrt(np.sum((change - change.mean()) ** 2 / np.maximum(weight, 1e-3)))
+    error = np.sqrt(np.sum((change - change.mean()) ** 2 / np.maximum(weight, TINY)))
     return bool(change.sum() > DISTINCT * error)
 
 
@@ -510,124 +500,17 @@ def _held_out(state: _State) -> float:
         return np.nan
     fractions = []
     for e in problem.experiments:
-        rest = problem.with_experiments([other for other in problem.experiments if other is not e])
-        found = _estimated(rest, state, state.names)
+        rest = [other for other in problem.experiments if other is not e]
+        errors = {name: own for name, own in problem.input_errors.items() if name != e.name}
+        found = state.with_problem(problem.with_experiments(rest).with_input_errors(errors), state.names)
         if found is None:
             return np.inf
-        states = {e.name: state.fit.solutions[e.name].states}
-        single = problem.with_experiments([e]).anchored(found.fit.theta, states)
-        outputs, converged = single.outputs(single.vector(found.fit.theta)[None])
+        theta = found.iterate.theta
+        single = problem.with_experiments([e]).anchored(theta, {e.name: state.solutions[e.name].states})
+        outputs, converged = single.outputs(theta[None])
         if not converged.all():
             return np.inf
         for channel, measured in e.outputs.items():
             left = measured - e.project(channel, outputs[e.name][channel][0])
             fractions.append(float(np.mean(left**2) / np.var(measured)))
     return float(np.mean(fractions))
-
-
-class _ScoreTests:
-    """Score tests of the coefficients of several terms at zero.
-
-    `explained` (terms,) is the part of the misfit r·r that each explains, linearised; `widths` are the coefficients
-    whose effect is as large as the measured outputs.
-    """
-
-    def __init__(self, state: _State, terms: Sequence[Candidate]):
-        problem, here, noise = state.problem, state.here(), state.noise
-        likelihood = problem.likelihood
-        effects = _effects(state, terms)
-        s, r, c = (likelihood.whitened(part, noise) for part in (here.changes, here.residuals, effects))
-        data = likelihood.whitened(_centred_data(problem), noise)
-        self.widths = _widths(data, c)
-        prior = problem.joint_prior.curvature(problem.vector(state.fit.theta))
-        joined_s, joined_r, joined_c = (np.concatenate(part, axis=-1) for part in (s, r, c))
-        information = prior + joined_s @ joined_s.T
-        scale = hessian_scale(information)
-        inverse = np.linalg.pinv(information * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
-        slopes = inverse @ (joined_s @ joined_c.T)
-        self.rest = joined_c - slopes.T @ joined_s
-        own = np.sum(self.rest * joined_c, axis=1)
-        size = np.sum(joined_c**2, axis=1)
-        finite = np.isfinite(size) & (size > 0.0)
-        self.identifiable = finite & (own > UNIDENTIFIABLE * np.where(finite, size, 1.0))
-        score = joined_c @ joined_r
-        total = float(joined_r @ joined_r)
-        gain = np.divide(score**2, own, out=np.zeros(len(terms)), where=self.identifiable)
-        self.explained = gain / total if total > 0.0 else gain
-        cuts = np.cumsum([block.size for block in likelihood.blocks])[:-1]
-        freedom = max(problem.counted - len(problem.names) - 1.0, 1.0)
-        self.p = np.ones(len(terms))
-        for j in np.flatnonzero(self.identifiable):
-            coefficient = score[j] / own[j]
-            left = np.split(joined_r - coefficient * self.rest[j], cuts)
-            further = [np.concatenate([a, b[j][None]]) for a, b in zip(s, c, strict=True)]
-            full = np.block(
-                [
-                    [information, (joined_s @ joined_c[j])[:, None]],
-                    [joined_c[j] @ joined_s.T, joined_c[j] @ joined_c[j]],
-                ]
-            )
-            variances = residual_variances(likelihood, further, left, noise, full)
-            spread = float(np.sum(self.rest[j] ** 2 * np.concatenate(variances)))
-            statistic = score[j] ** 2 / spread if spread > 0.0 else np.inf
-            self.p[j] = stats.f.sf(statistic, 1.0, freedom)
-
-    def groups(self) -> Iterator[list[int]]:
-        """Yield the indices of identifiable terms with the same effect on the data."""
-        size = np.sqrt(np.sum(self.rest**2, axis=1))
-        left = list(np.flatnonzero(self.identifiable))
-        while left:
-            first = left[0]
-            cosine = self.rest[left] @ self.rest[first] / (size[left] * size[first])
-            same = 1.0 - cosine**2 < COLLINEAR
-            yield [int(i) for i, own in zip(left, same, strict=True) if own]
-            left = [i for i, own in zip(left, same, strict=True) if not own]
-
-
-def _effects(state: _State, terms: Sequence[Candidate]) -> list[np.ndarray]:
-    """Return the changes of the predicted components by each coefficient, one array (terms, size) a block.
-
-    NaN for terms that are not finite along an orbit.
-    """
-    problem, fit, found = state.problem, state.fit, []
-    theta = problem.vector(fit.theta)
-    where = np.array([places(problem.model).index(term.place) for term in terms], dtype=int)
-    outputs, states = len(problem.model.outputs), len(problem.model.states)
-    for e in problem.experiments:
-        equations = problem.equations[e.name].at_frequency(fit.solutions[e.name].frequency)
-        z = periodic_part(equations, fit.solutions[e.name].states)
-        along = _evaluated(problem, fit, e.name, [term.expression for term in terms])
-        finite = np.isfinite(along).all(axis=1)
-        added = np.zeros((len(terms), len(z), outputs + states))
-        added[np.arange(len(terms)), :, where] = np.where(finite[:, None], along, 0.0)
-        parameters = problem.parameters(theta[None], e.name)[0]
-        columns, derivatives = equations.residual_jacobian(z, parameters), equations.derivatives(z, parameters)
-        f, g = np.ascontiguousarray(added[..., :outputs]), np.ascontiguousarray(added[..., outputs:])
-        moved = respond(equations, z, columns, derivatives, g, f)
-        sizes = [block.size for block in problem.observations[e.name].blocks]
-        if moved is None:
-            caused = np.full((len(terms), sum(sizes)), np.nan)
-        else:
-            caused = predicted_changes(problem, e, equations, theta, z, moved)
-            caused[~finite] = np.nan
-        found += np.split(caused, np.cumsum(sizes)[:-1], axis=1)
-    return found
-
-
-def _centred_data(problem: Problem) -> list[np.ndarray]:
-    """Return the measured components less their means, one array (size,) a block; zero where there are no components."""
-    found: list[np.ndarray] = []
-    for e in problem.experiments:
-        seen = problem.observations[e.name]
-        shown = np.stack([e.outputs[c] - e.outputs[c].mean() for c in seen.channels], axis=-1)
-        found += seen.errors(shown)
-    return found
-
-
-def _widths(data: Sequence[np.ndarray], effects: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the coefficients (terms,) whose effect on one of the blocks is as large as its data."""
-    sizes = np.array([np.linalg.norm(c, axis=1) for c in effects])
-    wanted = np.array([np.linalg.norm(own) for own in data])[:, None]
-    ratio = np.divide(wanted, sizes, out=np.full(sizes.shape, np.inf), where=(sizes > 0.0) & (wanted > 0.0))
-    least = ratio.min(axis=0)
-    return np.where(np.isfinite(least) & (least > 0.0), least, 1.0)

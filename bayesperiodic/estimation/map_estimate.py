@@ -169,6 +169,20 @@ def map_estimate(
     return result
 
 
+@in_one_thread
+def nearest_optimum(
+    problem: Problem, theta: np.ndarray, guesses: Mapping[str, Mapping[str, np.ndarray]]
+) -> tuple[Objective, End] | None:
+    """Return objective and end of the iteration from θ and orbits near it, errors of inputs as the problem has them.
+
+    None if there is no orbit or no finite density.
+    """
+    near = LogPosterior(problem, Simulator.start(problem, theta, guesses)).linearise(theta)
+    objective = _objective(problem, near)
+    first = objective.iterate(near, problem.likelihood.guess())
+    return None if first is None else (objective, climb(objective, first))
+
+
 def _with_noisy_inputs(problem: Problem, end: End, progress: bool) -> tuple[Problem, End]:
     """Return problem and end of the climb with the errors of the inputs, linearised about the estimate."""
     for _ in range(MOST_ROUNDS if problem.noisy_inputs else 0):

@@ -1,0 +1,189 @@
+"""Score tests of terms that a model may lack: the effect of each on the outputs against the residual, without a fit."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import sympy as sp
+from scipy import stats
+
+from bayesperiodic._linalg import column_space
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.diagnostics.adequacy import Whitened, used
+from bayesperiodic.diagnostics.candidates import Candidate, places, values
+from bayesperiodic.estimation.covariance import predicted_changes, residual_variances
+from bayesperiodic.estimation.gauss_newton import Iterate
+from bayesperiodic.periodic.equations import PeriodicEquations, respond
+from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
+from bayesperiodic.posterior.noise import KNOWN
+from bayesperiodic.posterior.problem import Problem
+
+# Part of the square of an effect that the parameters cannot have instead, below which the two cannot be told apart.
+UNIDENTIFIABLE = 1e-6
+# 1 − cos² of the angle between two effects that are the same on the measured orbits.
+COLLINEAR = 1e-8
+
+
+class Compared(NamedTuple):
+    """Residual components (size,) and their derivatives (directions, size), one array a block."""
+
+    residuals: list[np.ndarray]
+    changes: list[np.ndarray]
+
+
+class ScoreTests:
+    """Score tests of the coefficients of terms at zero, given an optimum.
+
+    Attributes
+    ----------
+    identifiable : array (terms,) of bool
+        Whether the parameters cannot have the same effect.
+    explained : array (terms,)
+        Part of the sum of squares of the whitened residual that each term would explain, linearised.
+    p : array (terms,)
+        Of the tests. Where the spectrum of the noise of all outputs was measured between the harmonics, the residual is
+        compared with it, the noise of the inputs included; otherwise with its own smoothed spectrum.
+    widths : array (terms,)
+        Coefficients whose effect is as large as the measured output, in the channel where it is largest.
+    """
+
+    def __init__(self, problem: Problem, optimum: Iterate, terms: Sequence[Candidate]):
+        likelihood, noise, here = problem.likelihood, optimum.noise, optimum.here
+        solutions = here.simulator.solutions(optimum.theta)
+        effects = _effects(problem, optimum.theta, solutions, terms)
+        finite = np.isfinite(np.concatenate(effects, axis=1)).all(axis=1)
+        effects = [np.where(finite[:, None], own, 0.0) for own in effects]
+        self.widths = _widths(likelihood.whitened(_deviations(problem), noise), likelihood.whitened(effects, noise))
+        joined = [np.concatenate([s, c]) for s, c in zip(here.changes, effects, strict=True)]
+        white, parameters = Whitened(problem, Compared(list(here.residuals), joined), noise), len(problem.names)
+        plain = _projected([part[:2] for part in white.parts], parameters)
+        self._effects, self.identifiable = plain.effects, finite & plain.identifiable
+        self.explained = plain.gains() / max(plain.square, np.finfo(float).tiny)
+        self.p = self._p(problem, optimum, white, parameters)
+
+    def _p(self, problem: Problem, optimum: Iterate, white: Whitened, parameters: int) -> np.ndarray:
+        """Return the p-values (terms,)."""
+        blocks, known = white.blocks, [white.spectrum(i) for i in range(len(white.blocks))]
+        if all(own is not None or block.kind == KNOWN for own, block in zip(known, blocks, strict=True)):
+            parts = [white.in_units_of_noise(i) or white.parts[i][:2] for i in range(len(blocks))]
+            tests, weights = _projected(parts, parameters), [np.full(r.size, np.inf) for r, _ in parts]
+            for i, own in enumerate(known):
+                if own is not None:
+                    weights[i] = own[1][white.parts[i][2]]
+            # Degrees of freedom of the measured variances that the variance of a score consists of.
+            shares = tests.effects**2 / np.maximum(np.sum(tests.effects**2, axis=1), np.finfo(float).tiny)[:, None]
+            freedom = 1.0 / np.maximum(shares @ (1.0 / np.concatenate(weights)), 1e-9)
+            statistic = tests.gains()
+        else:
+            likelihood, noise, here = problem.likelihood, optimum.noise, optimum.here
+            changes, residuals = (likelihood.whitened(part, noise) for part in (here.changes, here.residuals))
+            information = problem.joint_prior.curvature(optimum.theta) + sum(s @ s.T for s in changes)
+            variances = residual_variances(likelihood, changes, residuals, noise, information)
+            sds = [np.sqrt(np.maximum(used(b, v)[0], 1e-12)) for b, v in zip(blocks, variances, strict=True)]
+            parts = [[r / sd, j / sd] for (r, j, _), sd in zip(white.parts, sds, strict=True)]
+            tests = _projected(parts, parameters)
+            freedom = np.full(len(tests.effects), max(tests.freedom - 1.0, 1.0))
+            gains = tests.gains()
+            statistic = gains * freedom / np.maximum(tests.square - gains, np.finfo(float).tiny)
+        return np.where(self.identifiable, stats.f.sf(statistic, 1.0, freedom), 1.0)
+
+    def groups(self) -> Iterator[list[int]]:
+        """Yield the indices of identifiable terms with the same effect on the data, by decreasing `explained`."""
+        size = np.sqrt(np.sum(self._effects**2, axis=1))
+        left = [i for i in np.argsort(-self.explained, kind="stable") if self.identifiable[i]]
+        while left:
+            cosine = self._effects[left] @ self._effects[left[0]] / (size[left] * size[left[0]])
+            same = 1.0 - cosine**2 < COLLINEAR
+            yield [int(i) for i, own in zip(left, same, strict=True) if own]
+            left = [i for i, own in zip(left, same, strict=True) if not own]
+
+
+class _Projected(NamedTuple):
+    """Residual and effects without what the parameters can do, in units in which the components are independent."""
+
+    residual: np.ndarray  # (size,)
+    effects: np.ndarray  # (terms, size)
+    identifiable: np.ndarray  # (terms,)
+    freedom: int  # components less parameters
+
+    @property
+    def square(self) -> float:
+        return float(self.residual @ self.residual)
+
+    def gains(self) -> np.ndarray:
+        """Return the part of the residual's square that each effect explains (terms,)."""
+        own = np.sum(self.effects**2, axis=1)
+        score = (self.effects @ self.residual) ** 2
+        return np.divide(score, own, out=np.zeros(own.size), where=self.identifiable)
+
+
+def _projected(parts: Sequence[Sequence[np.ndarray]], parameters: int) -> _Projected:
+    """Return what is left of residuals (size,) and derivatives by parameters and terms, (directions, size) a block."""
+    r, j = (np.concatenate([part[i] for part in parts], axis=-1) for i in (0, 1))
+    basis, effects = column_space(j[:parameters]), j[parameters:]
+    left = effects - (effects @ basis) @ basis.T
+    identifiable = np.sum(left**2, axis=1) > UNIDENTIFIABLE * np.sum(effects**2, axis=1)
+    return _Projected(r - basis @ (basis.T @ r), left, identifiable, r.size - basis.shape[1])
+
+
+def along_orbit(
+    problem: Problem, theta: np.ndarray, experiment: Experiment, solution: PeriodicSolution, terms: Sequence[sp.Expr]
+) -> np.ndarray:
+    """Return expressions of the model's symbols along an orbit (terms, points)."""
+    equations, z, parameters = _at(problem, theta, experiment, solution)
+    return values(
+        problem.model, terms, equations.states(z), equations.inputs, parameters, equations.grid.tau, equations.frequency
+    )
+
+
+def _at(
+    problem: Problem, theta: np.ndarray, experiment: Experiment, solution: PeriodicSolution
+) -> tuple[PeriodicEquations, np.ndarray, np.ndarray]:
+    """Return equations, z (points, states) and the model's parameters of an orbit."""
+    equations = problem.equations[experiment.name].at_frequency(solution.frequency)
+    parameters = problem.parameters(theta[None], experiment.name)[0]
+    return equations, periodic_part(equations, solution.states), parameters
+
+
+def _effects(
+    problem: Problem, theta: np.ndarray, solutions: Mapping[str, PeriodicSolution], terms: Sequence[Candidate]
+) -> list[np.ndarray]:
+    """Return the changes of the predicted components by each coefficient, one array (terms, size) a block.
+
+    NaN for terms that are not finite along an orbit.
+    """
+    where = np.array([places(problem.model).index(term.place) for term in terms], dtype=int)
+    outputs, found = len(problem.model.outputs), []
+    for e in problem.experiments:
+        equations, z, parameters = _at(problem, theta, e, solutions[e.name])
+        along = along_orbit(problem, theta, e, solutions[e.name], [term.expression for term in terms])
+        finite = np.isfinite(along).all(axis=1)
+        added = np.zeros((len(terms), len(z), outputs + equations.count))
+        added[np.arange(len(terms)), :, where] = np.where(finite[:, None], along, 0.0)
+        f, g = np.ascontiguousarray(added[..., :outputs]), np.ascontiguousarray(added[..., outputs:])
+        columns, derivatives = equations.residual_jacobian(z, parameters), equations.derivatives(z, parameters)
+        moved = respond(equations, z, columns, derivatives, g, f)
+        sizes = [block.size for block in problem.observations[e.name].blocks]
+        caused = np.full((len(terms), sum(sizes)), np.nan)
+        if moved is not None:
+            caused[finite] = predicted_changes(problem, e, equations, theta, z, moved)[finite]
+        found += np.split(caused, np.cumsum(sizes)[:-1], axis=1)
+    return found
+
+
+def _deviations(problem: Problem) -> list[np.ndarray]:
+    """Return the components of the measured outputs less their means, one array (size,) a block."""
+    found: list[np.ndarray] = []
+    for e in problem.experiments:
+        seen = problem.observations[e.name]
+        found += seen.errors(np.stack([e.outputs[c] - e.outputs[c].mean() for c in seen.channels], axis=-1))
+    return found
+
+
+def _widths(data: Sequence[np.ndarray], effects: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the coefficients (terms,) whose effect on one of the blocks is as large as its data."""
+    sizes = np.array([np.linalg.norm(c, axis=1) for c in effects])
+    wanted = np.array([np.linalg.norm(own) for own in data])[:, None]
+    ratio = np.divide(wanted, sizes, out=np.full(sizes.shape, np.inf), where=(sizes > 0.0) & (wanted > 0.0))
+    least = ratio.min(axis=0)
+    return np.where(np.isfinite(least), least, 1.0)
