@@ -13,6 +13,8 @@ from .diagnostics.comparison import Comparison as Comparison
 from .diagnostics.comparison import compare as compare
 from .diagnostics.identifiability import Identifiability as Identifiability
 from .diagnostics.identifiability import identifiability as identifiability
+from .diagnostics.missing_terms import MissingTerms as MissingTerms
+from .diagnostics.missing_terms import missing_terms as missing_terms
 from .diagnostics.model_comparison import ModelComparison as ModelComparison
 from .diagnostics.model_comparison import compare_models as compare_models
 from .diagnostics.predictive import Prediction as Prediction

@@ -12,7 +12,7 @@ import sympy as sp
 from bayesperiodic import _checks
 from bayesperiodic.models.model import DERIVATIVES, Model, Names, smooth_abs, smooth_sign
 
-DEGREE = 3
+DEGREE, HIGHEST_POWER = 3, 5
 # Widths of smooth absolute values and signs, relative to the standard deviation of their arguments.
 ABS_WIDTH, SIGN_WIDTH = 0.02, 0.2
 Factors = Mapping[str, sp.Expr]
@@ -45,6 +45,8 @@ def generated(model: Model, deviations: Mapping[str, float]) -> list[Candidate]:
     for degree in range(1, DEGREE + 1):
         for chosen in combinations_with_replacement(moving, degree):
             found[_product(chosen)] = sp.Mul(*(moving[name] for name in chosen))
+    for name, e in moving.items():
+        found |= {f"{name}**{power}": e**power for power in range(DEGREE + 1, HIGHEST_POWER + 1)}
     widths = {name: deviations.get(name, 1.0) for name in moving}
     for name, e in moving.items():
         size = smooth_abs(e, ABS_WIDTH * widths[name])

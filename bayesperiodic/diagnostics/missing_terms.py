@@ -20,6 +20,7 @@ from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.posterior.description import check_results
+from bayesperiodic.posterior.parameters import local_names
 from bayesperiodic.posterior.priors import Normal
 from bayesperiodic.posterior.problem import Problem
 
@@ -213,9 +214,9 @@ def missing_terms(
     and the search is repeated. It ends if none is significant, if the evidence does not increase, or if the prediction
     of experiments that are left out gets worse. At the end, terms that later ones have made needless are removed.
 
-    Candidates are products of states, inputs and their rates up to the third degree, absolute values, products with
-    these, signs, a constant, and the highest derivatives, in every equation and output. An absolute value is rounded
-    within 2 % of its argument's standard deviation, a sign within 20 %.
+    Candidates are products of states, inputs and their rates up to the third degree, powers up to the fifth, absolute
+    values, products with these, signs, a constant, and the highest derivatives, in every equation and output. An
+    absolute value is rounded within 2 % of its argument's standard deviation, a sign within 20 %.
 
     Parameters
     ----------
@@ -496,7 +497,7 @@ def _distinct(one: _State, other: _State) -> bool:
 def _held_out(state: _State) -> float:
     """Return the mean fraction unexplained in experiments that are left out, one at a time; NaN for few experiments."""
     problem = state.problem
-    if len(problem.experiments) < FEWEST_EXPERIMENTS or problem.local or problem.model.autonomous:
+    if len(problem.experiments) < FEWEST_EXPERIMENTS or any(local_names(problem.names)):
         return np.nan
     fractions = []
     for e in problem.experiments:
