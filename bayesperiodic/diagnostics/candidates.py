@@ -33,8 +33,8 @@ class Candidate:
         return f"{self.text} in {self.place}"
 
 
-def generated(model: Model, deviations: Mapping[str, float]) -> list[Candidate]:
-    """Return the terms from the model's own variables, for every equation and output.
+def generated(model: Model, where: Iterable[str], deviations: Mapping[str, float]) -> list[Candidate]:
+    """Return the terms from the model's own variables, for every place.
 
     `deviations` are the standard deviations of the variables along the measured orbits, by name; variables that are
     constant are left out.
@@ -54,7 +54,7 @@ def generated(model: Model, deviations: Mapping[str, float]) -> list[Candidate]:
         found |= {f"{other}*abs({name})": factor * size for other, factor in moving.items()}
         found[f"sign({name})"] = smooth_sign(e, SIGN_WIDTH * widths[name])
     found |= {name: e for name, e in steepest.items() if deviations.get(name, 1.0) > 0.0}
-    return [Candidate(place, text, e) for place in places(model) for text, e in found.items()]
+    return [Candidate(place, text, e) for place in where for text, e in found.items()]
 
 
 def places(model: Model) -> tuple[str, ...]:

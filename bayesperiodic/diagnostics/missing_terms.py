@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,15 @@ from scipy import stats
 from bayesperiodic import _checks
 from bayesperiodic._linalg import TINY, hessian_scale, in_one_thread, scaled
 from bayesperiodic.diagnostics.adequacy import ALL, adequacy
-from bayesperiodic.diagnostics.candidates import Candidate, coefficient_names, extended, factors, generated, given
+from bayesperiodic.diagnostics.candidates import (
+    Candidate,
+    coefficient_names,
+    extended,
+    factors,
+    generated,
+    given,
+    places,
+)
 from bayesperiodic.diagnostics.score_tests import ScoreTests, along_orbit
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective
 from bayesperiodic.estimation.map_estimate import map_estimate, nearest_optimum
@@ -24,12 +33,12 @@ from bayesperiodic.posterior.parameters import local_names
 from bayesperiodic.posterior.priors import Normal
 from bayesperiodic.posterior.problem import Problem
 
-# Candidates that are fitted at every step, and that are compiled together.
-FITTED, COMPILED = 4, 8
 # Robust standard deviations from zero of a coefficient.
 SIGNIFICANT = 2.0
 # Standard deviations of the difference of two log-likelihoods from which on the data tell two terms apart.
 DISTINCT = 2.0
+# Ratio of the errors in experiments that are left out from which on these tell two terms apart.
+WORSE = 2.0
 # Fewest experiments of which one is left out at a time.
 FEWEST_EXPERIMENTS = 3
 
@@ -200,8 +209,10 @@ def missing_terms(
     fit: MapEstimate,
     candidates: Mapping[str, Iterable[Any]] | None = None,
     *,
+    equations: bool = True,
+    outputs: bool = True,
     exclude: Iterable[str] = (),
-    generate: bool = True,
+    keep: int = 4,
     max_terms: int = 5,
     false_discovery_rate: float = 0.01,
 ) -> MissingTerms:
@@ -210,8 +221,9 @@ def missing_terms(
     Each candidate is a term with an unknown coefficient in an equation or an output. Its score test needs no fit: with
     c its effect on the whitened outputs, less what the parameters can do instead, and r the residual, the statistic is
     c·r over its standard deviation from the spectrum of the residual. The p-values are adjusted for the false discovery
-    rate (Benjamini and Hochberg [1]_). The best significant ones are fitted, the best of these by evidence is added,
-    and the search is repeated. It ends if none is significant, if the evidence does not increase, or if the prediction
+    rate (Benjamini and Hochberg [1]_). The best significant ones are fitted, the best of these by evidence is added, and
+    the search is repeated. Of those whose likelihoods do not differ significantly (Vuong [2]_), the one is added that
+    predicts experiments best that are left out of the fit, one at a time, if there are at least three. It ends if none is significant, if the evidence does not increase, or if the prediction
     of experiments that are left out gets worse. At the end, terms that later ones have made needless are removed.
 
     Candidates are products of states, inputs and their rates up to the third degree, powers up to the fifth, absolute
@@ -224,11 +236,14 @@ def missing_terms(
     fit : MapEstimate
     candidates : mapping of str to list, optional
         Further terms by place, an output or "equation of x": texts in the model's names, or functions of (s, p, u).
+    equations, outputs : bool
+        Whether terms of the model's variables are candidates in the equations, and in the outputs.
     exclude : iterable of str
         Terms, places, or terms at places (``"w**2 in force"``) to be left out.
-    generate : bool
-        False: only the given candidates.
+    keep : int
+        Number of the best candidates that are fitted at every step.
     max_terms : int
+        Number of terms after which the search ends.
     false_discovery_rate : float
         Expected share of terms that are not missing among those found; of a model that lacks nothing, the probability
         that any is found at the first step.
@@ -246,6 +261,8 @@ def missing_terms(
     ----------
     .. [1] Y. Benjamini, Y. Hochberg, Controlling the false discovery rate, Journal of the Royal Statistical Society B
        57 (1995) 289-300.
+    .. [2] Q. H. Vuong, Likelihood ratio tests for model selection and non-nested hypotheses, Econometrica 57 (1989)
+       307-333.
 
     Examples
     --------
@@ -255,15 +272,16 @@ def missing_terms(
     """
     stated = check_results(problem, fit=fit)
     _checks.integer("max_terms", max_terms, 0)
+    _checks.integer("keep", keep, 1)
     if not 0.0 < _checks.finite_number("false_discovery_rate", false_discovery_rate) < 1.0:
         raise ValueError(f"false_discovery_rate: must be between 0 and 1, got {false_discovery_rate!r}.")
     model = problem._given["model"]
     terms = given(model, candidates or {})
-    if generate:
-        terms += generated(model, _deviations(stated, fit))
+    wanted = (outputs,) * len(model.outputs) + (equations,) * len(model.states)
+    terms += generated(model, list(compress(places(model), wanted)), _deviations(stated, fit))
     left_out = {exclude} if isinstance(exclude, str) else set(exclude)
     chosen = {str(t): t for t in terms if not {t.text, t.place, str(t)} & left_out}
-    return _Search(problem, list(chosen.values()), false_discovery_rate).run(fit, max_terms)
+    return _Search(problem, list(chosen.values()), false_discovery_rate, keep).run(fit, max_terms)
 
 
 def _deviations(problem: Problem, fit: MapEstimate) -> dict[str, float]:
@@ -318,8 +336,8 @@ class _State:
 class _Search:
     """Candidates of one problem, and the steps."""
 
-    def __init__(self, problem: Problem, terms: list[Candidate], rate: float):
-        self.problem, self.model, self.rate = problem, problem._given["model"], rate
+    def __init__(self, problem: Problem, terms: list[Candidate], rate: float, keep: int):
+        self.problem, self.model, self.rate, self.keep = problem, problem._given["model"], rate, keep
         self.terms = {str(term): term for term in terms}
         self.names = dict(zip(self.terms, coefficient_names(self.model, terms), strict=True))
         self.refused: dict[str, str] = {}
@@ -411,8 +429,8 @@ class _Search:
                 f"No further candidate is significant at a false discovery rate of {self.rate:g} (the smallest "
                 f"adjusted p is {table['p_adjusted'].min():.2g})."
             )
-        tried = list(significant["candidate"][:FITTED])
-        self.compile(tried, list(significant["candidate"][:COMPILED]), chosen)
+        tried = list(significant["candidate"][: self.keep])
+        self.compile(tried, list(significant["candidate"][: 2 * self.keep]), chosen)
         fitted: dict[str, _State] = {}
         for key in tried:
             names = (*chosen, self.names[key])
@@ -423,7 +441,10 @@ class _Search:
                 fitted[key] = after
         if not fitted:
             return f"With {', '.join(tried)}, the best candidates, no periodic solution was found."
-        first, *others = sorted(fitted, key=lambda key: fitted[key].evidence, reverse=True)
+        best = max(fitted, key=lambda key: fitted[key].evidence)
+        alike = [key for key in fitted if key == best or not _distinct(fitted[best], fitted[key])]
+        errors = {key: _held_out(fitted[key]) for key in alike} if len(alike) > 1 else {best: np.nan}
+        first = best if np.isnan(errors[best]) else min(errors, key=lambda key: errors[key])
         # Each of the candidates is as likely to be the missing one.
         needed = np.log(len(self.terms))
         if (gain := fitted[first].evidence - state.evidence) < needed:
@@ -433,8 +454,8 @@ class _Search:
             )
         same, p = (dict(zip(table["candidate"], table[column], strict=True)) for column in ("same", "p_adjusted"))
         alternatives = list(same[first])
-        for other in others:
-            if not _distinct(fitted[first], fitted[other]):
+        for other in alike:
+            if other != first and not errors[other] > WORSE * errors[first]:
                 alternatives += [other, *same[other]]
         return first, tuple(alternatives), float(p[first]), fitted[first]
 
@@ -485,7 +506,7 @@ def _step(
 
 
 def _distinct(one: _State, other: _State) -> bool:
-    """Return whether the data tell two fits apart, by the test of Q. H. Vuong, Econometrica 57 (1989) 307-333."""
+    """Return whether the likelihood of one fit is significantly larger than that of another."""
     likelihood = one.problem.likelihood
     own, others = (likelihood.whitened(state.iterate.here.residuals, one.iterate.noise) for state in (one, other))
     weight = np.concatenate([np.full(b.size, min(b.weight, 1.0)) for b in likelihood.blocks])
@@ -499,16 +520,18 @@ def _held_out(state: _State) -> float:
     problem = state.problem
     if len(problem.experiments) < FEWEST_EXPERIMENTS or any(local_names(problem.names)):
         return np.nan
-    fractions = []
+    guesses = {name: solution.states for name, solution in state.solutions.items()}
+    whole, fractions = problem.anchored(state.iterate.theta, guesses), []
     for e in problem.experiments:
-        rest = [other for other in problem.experiments if other is not e]
         errors = {name: own for name, own in problem.input_errors.items() if name != e.name}
-        found = state.with_problem(problem.with_experiments(rest).with_input_errors(errors), state.names)
+        try:
+            rest = problem.with_experiments([other for other in problem.experiments if other is not e])
+        except ValueError:  # fewer values than the parameters need
+            return np.nan
+        found = state.with_problem(rest.with_input_errors(errors), state.names)
         if found is None:
             return np.inf
-        theta = found.iterate.theta
-        single = problem.with_experiments([e]).anchored(theta, {e.name: state.solutions[e.name].states})
-        outputs, converged = single.outputs(theta[None])
+        outputs, converged = whole.outputs(found.iterate.theta[None])
         if not converged.all():
             return np.inf
         for channel, measured in e.outputs.items():
