@@ -220,11 +220,14 @@ def missing_terms(
 
     Each candidate is a term with an unknown coefficient in an equation or an output. Its score test needs no fit: with
     c its effect on the whitened outputs, less what the parameters can do instead, and r the residual, the statistic is
-    c·r over its standard deviation from the spectrum of the residual. The p-values are adjusted for the false discovery
-    rate (Benjamini and Hochberg [1]_). The best significant ones are fitted, the best of these by evidence is added, and
-    the search is repeated. Of those whose likelihoods do not differ significantly (Vuong [2]_), the one is added that
-    predicts experiments best that are left out of the fit, one at a time, if there are at least three. It ends if none is significant, if the evidence does not increase, or if the prediction
-    of experiments that are left out gets worse. At the end, terms that later ones have made needless are removed.
+    c·r over its standard deviation by the measured noise, or by the spectrum of the residual where that was not
+    measured. The p-values are adjusted for the false discovery rate (Benjamini and Hochberg [1]_). The best significant
+    candidates are fitted, the best of these by evidence is added, and the search is repeated. Of those whose
+    likelihoods do not differ significantly (Vuong [2]_), the one is added that predicts experiments best that are left
+    out of the fit, one at a time, if there are at least three. The search ends if no candidate is significant, if the
+    evidence increases by less than the logarithm of the number of candidates, if the coefficient is within two robust
+    standard deviations of zero, or if the prediction of experiments that are left out gets worse. At the end, terms
+    that later ones have made needless are removed.
 
     Candidates are products of states, inputs and their rates up to the third degree, powers up to the fifth, absolute
     values, products with these, signs, a constant, and the highest derivatives, in every equation and output. An
