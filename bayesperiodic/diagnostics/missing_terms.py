@@ -192,8 +192,6 @@ class MissingTerms:
                 f"{k}. {step.name}·{step.term} in {step.place} (p = {step.p:.2g}){others}."
                 + f" It moves {shifted} of its standard deviations." * bool(moved)
             )
-        if not self.steps:
-            lines.append("No candidate is significant.")
         lines += [f"Removed again: {', '.join(self.dropped)}."] if self.dropped else []
         lines += [f"{text}: left out, {why}." for text, why in self.refused.items() if why != NOT_TOLD]
         return "\n".join([*lines, self.stopped])
