@@ -122,6 +122,7 @@ class MissingTerms:
     stopped: str
     _problem: Problem
     _terms: dict[str, tuple[Candidate, float]]
+    _fits: tuple[MapEstimate, ...]
 
     def model(self, k: int | None = None) -> Model:
         """Return the model with the terms of the first k steps, by default of all.
@@ -152,7 +153,7 @@ class MissingTerms:
         -------
         Problem
             The prior of each coefficient is normal about zero, with an effect as large as the measured outputs at one
-            standard deviation.
+            standard deviation. Its estimate is that of `fit`.
 
         Raises
         ------
@@ -160,6 +161,24 @@ class MissingTerms:
             If there are fewer steps.
         """
         return _problem_of(self._problem, self.model(k), {name: width for name, (_, width) in self._first(k).items()})
+
+    def fit(self, k: int | None = None) -> MapEstimate:
+        """Return the estimate of `problem`.
+
+        Parameters
+        ----------
+        k : int, optional
+
+        Returns
+        -------
+        MapEstimate
+
+        Raises
+        ------
+        ValueError
+            If there are fewer steps.
+        """
+        return self._fits[len(self._first(k))]
 
     def _first(self, k: int | None) -> dict[str, tuple[Candidate, float]]:
         count = len(self.steps) if k is None else _checks.integer("k", k, 0)
@@ -353,6 +372,7 @@ class _Search:
         table, before = ranking, _step(state, fit, fit, None, _held_out(state))
         stopped = f"The search ended after {max_terms} terms, as asked for by max_terms."
         chosen: dict[str, Candidate] = {}
+        fits = [fit]
         while len(steps) < max_terms:
             found = self.best(state, table, chosen)
             if isinstance(found, str):
@@ -361,6 +381,9 @@ class _Search:
             key, others, p, after = found
             term, name = self.terms[key], self.names[key]
             fit_after = self.estimate({**chosen, name: term}, after)
+            if fit_after is None:
+                stopped = f"{key} fits best, but the estimate with it was lost."
+                break
             state_after = self.at(fit_after, (*chosen, name))
             held_out, last = _held_out(state_after), steps[-1].held_out if steps else before.held_out
             if abs(fit_after.theta[name]) < SIGNIFICANT * fit_after.robust_sd[name]:
@@ -375,11 +398,12 @@ class _Search:
             gain = after.evidence - state.evidence
             steps.append(_step(state_after, fit_after, fit, (term, name, others, p, gain), held_out))
             chosen[name], state, fit = term, state_after, fit_after
+            fits.append(fit)
             table = self.scores(state)
-        steps, dropped = self.without_needless(steps, state)
+        steps, fits, dropped = self.without_needless(steps, fits, state)
         kept = {step.name: (chosen[step.name], self.widths[step.name]) for step in steps}
         return MissingTerms(
-            tuple(steps), ranking, len(ranking), self.refused, before, dropped, stopped, self.problem, kept
+            tuple(steps), ranking, len(ranking), self.refused, before, dropped, stopped, self.problem, kept, tuple(fits)
         )
 
     def at(self, fit: MapEstimate, names: tuple[str, ...]) -> _State:
@@ -397,14 +421,17 @@ class _Search:
         zero = [name for name in known if name not in {*names}]
         return _problem_of(self.problem, model, {name: self.widths[name] for name in names}, zero)
 
-    def estimate(self, terms: Mapping[str, Candidate], near: _State) -> MapEstimate:
-        """Return the estimate of the model with terms, their names given, from a near optimum."""
-        problem = self.with_terms(terms)
+    def estimate(self, terms: Mapping[str, Candidate], near: _State) -> MapEstimate | None:
+        """Return the estimate of the model with terms, by name, from a near optimum; None if it cannot start there."""
+        problem = _problem_of(self.problem, extended(self.model, terms), {name: self.widths[name] for name in terms})
         start = dict(zip(near.problem.names, near.iterate.theta.tolist(), strict=True))
         guesses = {name: solution.states for name, solution in near.solutions.items()}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            return map_estimate(problem.anchored(start, guesses), start=start, progress=False)
+            try:
+                return map_estimate(problem.anchored(start, guesses), start=start, progress=False)
+            except ValueError:
+                return None
 
     def scores(self, state: _State) -> pd.DataFrame:
         """Return the table of the score tests of candidates that are not yet chosen, the best first."""
@@ -466,17 +493,40 @@ class _Search:
             terms = dict(chosen) | {self.names[key]: self.terms[key] for key in dict.fromkeys([*wanted, *more])}
             self.compiled = extended(self.model, terms), terms
 
-    def without_needless(self, steps: list[Step], state: _State) -> tuple[list[Step], tuple[str, ...]]:
-        """Return the steps without terms, but for the last one, that the evidence is no longer in favour of."""
+    def without_needless(
+        self, steps: list[Step], fits: list[MapEstimate], state: _State
+    ) -> tuple[list[Step], list[MapEstimate], tuple[str, ...]]:
+        """Return steps and estimates without terms, but for the last, that the evidence is no longer in favour of."""
         dropped: list[str] = []
-        for step in steps[:-1]:
+        for i, step in reversed([*enumerate(steps[:-1])]):
             names = tuple(n for n in state.names if n != step.name)
             problem = self.with_terms(names).with_input_errors(state.problem.input_errors)
             other = state.with_problem(problem, names)
-            if other is not None and other.evidence > state.evidence:
-                state, steps = other, [s for s in steps if s.name != step.name]
+            if other is None or other.evidence <= state.evidence:
+                continue
+            left = steps[:i] + steps[i + 1 :]
+            again = self.again(left, fits[: i + 1], other)
+            if again is not None:
+                steps, fits, state = *again, other
                 dropped.append(f"{step.term} in {step.place}")
-        return steps, tuple(dropped)
+        return steps, fits, tuple(dropped)
+
+    def again(
+        self, steps: list[Step], fits: list[MapEstimate], near: _State
+    ) -> tuple[list[Step], list[MapEstimate]] | None:
+        """Return steps with the estimates of their models, the first ones of which are known; None if one is lost."""
+        known, found = len(fits) - 1, list(fits)
+        for k in range(known, len(steps)):
+            names = tuple(step.name for step in steps[: k + 1])
+            keys = {name: key for key, name in self.names.items()}
+            fit = self.estimate({name: self.terms[keys[name]] for name in names}, near)
+            if fit is None:
+                return None
+            state, term, old = self.at(fit, names), self.terms[keys[names[-1]]], steps[k]
+            added = term, old.name, old.alternatives, old.p, old.evidence_gain
+            steps = [*steps[:k], _step(state, fit, found[-1], added, _held_out(state)), *steps[k + 1 :]]
+            found.append(fit)
+        return steps, found
 
 
 def _step(

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 import bayesperiodic as bp
 from studies import common
-from studies.flutter import questions, rig
+from studies.flutter import missing, questions, rig
 from studies.flutter.questions import CHANNELS, closed, contraction, drawn_sizes, laplace_draws, sizes
 from studies.flutter.reference import hopf, settled
 from studies.flutter.rig import AUTHORS, RIG, SENSORS, Experiments, Fitted, Speeds, cycles
@@ -63,6 +63,8 @@ def run(options: argparse.Namespace) -> None:
         both = rig.estimate(experiments, speeds)
     with watch.part("parts", "estimating from stable or unstable cycles alone, and with wind speeds left out"):
         fits, results["predictions"] = _parts(experiments, speeds, both, options.quick, draws)
+    with watch.part("missing terms", "looking for the terms that the model lacks"):
+        results["missing_terms"] = missing.search(both, speeds, quick=options.quick)
     with watch.part("structure", "structural identifiability"):
         known = (*RIG, "U", "c_h", "c_alpha")
         structure = bp.structure(rig.MODEL, fixed=[name for name in rig.MODEL.parameters if name in known])
@@ -85,7 +87,18 @@ def run(options: argparse.Namespace) -> None:
         "verdicts": verdict and verdict.table["verdict"].to_dict(),
         "posterior": posterior and compared and _of_draws(posterior, fit, compared),
     }
-    print("\n".join(["", _tables(results), str(structure), *(str(one) for one in (verdict, compared) if one), ""]))
+    print(
+        "\n".join(
+            [
+                "",
+                _tables(results),
+                missing.line(results["missing_terms"]),
+                str(structure),
+                *(str(one) for one in (verdict, compared) if one),
+                "",
+            ]
+        )
+    )
     common.finish(options.out, results, watch, paths, synthetic=data["synthetic"])
 
 
