@@ -1,5 +1,6 @@
 """Candidate terms that a model may lack: products, absolute values and signs of what it contains, as expressions."""
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass
@@ -151,14 +152,17 @@ def values(
 
 
 def coefficient_names(model: Model, terms: Iterable[Candidate]) -> list[str]:
-    """Return a new parameter for the coefficient of each term: ``c1``, ``c2``, …, without those that exist."""
+    """Return a new parameter for the coefficient of each term, such as ``c_w_x_2`` for ``w*x**2``."""
     taken = {*model.parameters, *model.state_symbols, *model.input_symbols, *model.outputs}
-    names, number = [], 0
-    for _ in terms:
-        number += 1
-        while f"c{number}" in taken:
+    names: list[str] = []
+    for term in terms:
+        plain = first = "c_" + re.sub(r"\W+", "_", term.text).strip("_")
+        number = 1
+        while plain in taken:
             number += 1
-        names.append(f"c{number}")
+            plain = f"{first}_{number}" if number > 2 else "c_" + re.sub(r"\W+", "_", str(term)).strip("_")
+        taken.add(plain)
+        names.append(plain)
     return names
 
 

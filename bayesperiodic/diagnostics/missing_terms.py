@@ -451,6 +451,8 @@ class _Search:
         self, state: _State, table: pd.DataFrame, chosen: Mapping[str, Candidate]
     ) -> tuple[str, tuple[str, ...], float, _State] | str:
         """Return the term to be added, its alternatives, p, and the optimum with it; or why there is none."""
+        if not len(table):
+            return "No candidate is left."
         significant = table[table["p_adjusted"] < self.rate]
         if not len(significant):
             return (
