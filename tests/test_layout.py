@@ -13,11 +13,14 @@ MOST_PARAMETERS = 8
 REASONS = {
     "Experiment": "one field per measured quantity; four are required, the rest are keywords with defaults",
     "sample": "settings of the sampler; two arguments and the seed are required, the rest are keywords with defaults",
+    "MissingTerms": "a result, which the package makes",
     "Model": "the definition of a model: name, variables, equations, outputs, units; five are required",
     "Problem": "model, experiments, parameters and noise; two and the priors are required, the rest are keywords",
     "Recording.from_csv": "the columns of a file, gaps in them and several records; path and outputs are required",
     "calibrate": "the settings of a campaign and of the estimates in it; three are required",
     "plot.branch": "options of a figure; one argument is required",
+    "missing_terms": "settings of the search; two arguments are required, the rest are keywords with defaults",
+    "report": "results that are computed where they are not given; four arguments are required, the rest are keywords",
     "simulate": "a problem (model, parameters, inputs, frequency), a time grid, and the noise",
     "solve_periodic": "a problem (model, parameters, inputs, frequency), a grid, and a guess",
 }
