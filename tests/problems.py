@@ -145,3 +145,28 @@ CASES = {
         [1.52, 1.003, 0.05],
     ),
 }
+
+
+C2 = 0.3
+
+
+@cache
+def quadratic_damping() -> tuple[bp.Problem, bp.MapEstimate]:
+    """Return three synthetic recordings of a Duffing oscillator with C2·ẋ·|ẋ|, and the estimate without that term."""
+    model = bp.Model(
+        "duffing_with_quadratic_damping", states=["x"], inputs=["force"], parameters=["m", "c", "k", "k3", "c2"],
+        equations=lambda s, p, u: [
+            p.m * s.ddx + p.c * s.dx + p.c2 * s.dx * abs(s.dx) + p.k * s.x + p.k3 * s.x**3 - u.force
+        ],
+        outputs=lambda s, p, u: {"displacement": s.x},
+    )  # fmt: skip
+    runs = []
+    for number, (frequency, size) in enumerate(((0.12, 0.6), (0.17, 1.0), (0.22, 1.4))):
+        recording = bp.simulate(
+            model, DUFFING | {"c2": C2}, {"force": size * np.cos(2 * np.pi * grid(64))}, frequency=frequency,
+            duration=24 / frequency, sampling_rate=40 * frequency, noise={"displacement": 0.002}, seed=number,
+        ).between(12 / frequency, 24 / frequency)  # fmt: skip
+        runs.append(replace(recording.fold(64), name=f"run {number}"))
+    priors = DUFFING_PRIORS | {"c": bp.LogNormal(0.4, 1.0)}
+    problem = bp.Problem(bp.models.duffing, runs, priors=priors, fixed={"m": 1.0}, scheme="fourier")
+    return problem, bp.map_estimate(problem, progress=False)

@@ -145,6 +145,7 @@ TESTS = ("whiteness", "harmonics", "size", "amplitude", "consistency")
 ADEQUATE, MISSPECIFIED, UNTESTED = "adequate", "misspecified", "not tested"
 MEASURED, ASSUMED = "measured", "assumed"
 ALL = "all"
+SEARCH = "bp.missing_terms(problem, fit) looks for the term that is missing"
 
 
 def adequacy(
@@ -225,9 +226,9 @@ def misfit(problem: Problem, fit: MapEstimate) -> str:
     noise = problem.noise_values({name: fit.noise[name] for name in problem.noise_names})
     if not here.converged or not (found := rejections(table := adequacy(problem, here, noise[None], {}))):
         return ""
-    subject = "model or the noise model" if concerns_noise(table) else "model"
     reasons = "; ".join(f"{label}: {text}" for label, text in found.items())
-    return f"The {subject} is misspecified, which the verdicts take for right ({reasons})"
+    subject, remedy = ("model or the noise model", "") if concerns_noise(table) else ("model", f"; {SEARCH}")
+    return f"The {subject} is misspecified, which the verdicts take for right ({reasons}){remedy}"
 
 
 def concerns_noise(table: pd.DataFrame) -> bool:

@@ -111,6 +111,12 @@ class MissingTerms:
         Terms that were added and removed again, since the later ones made them needless.
     stopped : str
         Why no further term was added.
+
+    Examples
+    --------
+    >>> found = bp.missing_terms(problem, fit, max_terms=0)
+    >>> len(found.table), found.before.verdict
+    (1, 'adequate')
     """
 
     steps: tuple[Step, ...]

@@ -19,6 +19,7 @@ from bayesperiodic.diagnostics.adequacy import (
     ALL,
     LEVEL,
     MISSPECIFIED,
+    SEARCH,
     UNTESTED,
     adequacy,
     concerns_noise,
@@ -235,6 +236,12 @@ class Prediction(Bands):
         """Whether a wrong noise model would explain the rejections as well as a wrong model."""
         return concerns_noise(self.table)
 
+    @property
+    def remedy(self) -> str:
+        """What finds the error of a misspecified model; "" where noise model, prior or orbit may be what is wrong."""
+        elsewhere = self.concerns_noise or self.other_orbits or self.prior_conflict
+        return "" if self.verdict != MISSPECIFIED or elsewhere else f"{SEARCH}."
+
     def __repr__(self) -> str:
         subject = "model or the noise model" if self.concerns_noise else "model"
         verdict = f"The {subject} is {self.verdict} (overall false alarm rate {LEVEL:.0%})."
@@ -243,6 +250,7 @@ class Prediction(Bands):
             self.table.to_string(float_format="{:.2g}".format, na_rep="-"),
             "There are too few values to test the model." if self.verdict == UNTESTED else verdict,
             *(f"{label}: {text}." for label, text in self.findings.items()),
+            self.remedy,
             self.note,
             repr(self.transient) if self.transient else "",
         ]

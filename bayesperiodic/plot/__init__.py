@@ -7,8 +7,9 @@ from bayesperiodic.plot.branches import branch, orbits, section
 from bayesperiodic.plot.diagnostics import comparison, models, profile, ranks
 from bayesperiodic.plot.estimates import corner, fit, loops, marginals, traces
 from bayesperiodic.plot.style import COLOURS
+from bayesperiodic.plot.terms import missing_terms
 
 __all__ = [
-    "COLOURS", "branch", "comparison", "corner", "fit", "loops", "marginals", "models", "orbits", "profile", "ranks",
-    "section", "traces",
+    "COLOURS", "branch", "comparison", "corner", "fit", "loops", "marginals", "missing_terms", "models", "orbits",
+    "profile", "ranks", "section", "traces",
 ]  # fmt: skip

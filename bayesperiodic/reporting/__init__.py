@@ -8,6 +8,7 @@ from bayesperiodic._io import in_folder, written_whole
 from bayesperiodic.diagnostics.adequacy import LEVEL
 from bayesperiodic.diagnostics.comparison import Comparison
 from bayesperiodic.diagnostics.identifiability import Identifiability
+from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.predictive import Prediction
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.posterior.problem import Problem
@@ -25,6 +26,7 @@ def report(
     comparison: Comparison | None = None,
     identifiability: Identifiability | None = None,
     prediction: Prediction | None = None,
+    missing: MissingTerms | None = None,
 ) -> Path:
     """Write an HTML report of an identification.
 
@@ -34,7 +36,8 @@ def report(
     text is escaped. An existing file is replaced only by a complete one.
 
     Diagnostics that are not given are computed in a few seconds, except the profiles of `identifiability`, which solve
-    anew for every parameter: to include them, give ``identifiability=bp.identifiability(problem, fit, posterior)``.
+    anew for every parameter, and the search for missing terms: to include them, give
+    ``identifiability=bp.identifiability(problem, fit, posterior)`` and ``missing=bp.missing_terms(problem, fit)``.
 
     Parameters
     ----------
@@ -49,6 +52,8 @@ def report(
     comparison : Comparison, optional
     identifiability : Identifiability, optional
     prediction : Prediction, optional
+    missing : MissingTerms, optional
+        By default there is no section on missing terms.
 
     Returns
     -------
@@ -73,7 +78,7 @@ def report(
     target = in_folder(path)
     text = html.page(
         title=title or problem.model.name,
-        given=contents.ReportInputs.of(problem, fit, posterior, identifiability, comparison, prediction),
+        given=contents.ReportInputs.of(problem, fit, posterior, identifiability, comparison, prediction, missing),
         content=contents,
         plot=plot,
         level=LEVEL,

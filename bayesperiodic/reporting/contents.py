@@ -18,6 +18,7 @@ from bayesperiodic import _checks
 from bayesperiodic.diagnostics.adequacy import ADEQUATE, MISSPECIFIED, TESTS, UNTESTED
 from bayesperiodic.diagnostics.comparison import Comparison, compare
 from bayesperiodic.diagnostics.identifiability import CONFLICT, DETERMINED, NOTHING, Identifiability, identifiability
+from bayesperiodic.diagnostics.missing_terms import MissingTerms
 from bayesperiodic.diagnostics.predictive import PROBABILITY, Prediction, predict
 from bayesperiodic.diagnostics.verdicts import FINE, MODE, UNCONVERGED
 from bayesperiodic.estimation.map_estimate import estimation_warnings
@@ -52,6 +53,7 @@ class ReportInputs:
     identifiability: Identifiability
     comparison: Comparison | None
     prediction: Prediction | None
+    missing: MissingTerms | None
     no_prediction: str
 
     @classmethod
@@ -63,6 +65,7 @@ class ReportInputs:
         found: Identifiability | None,
         comparison: Comparison | None,
         prediction: Prediction | None,
+        missing: MissingTerms | None,
     ) -> "ReportInputs":
         """Check that all inputs belong to one problem, and compute the diagnostics that are not given."""
         runs, no_prediction = [e.name for e in problem.experiments], ""
@@ -80,7 +83,11 @@ class ReportInputs:
             _checks.contains("comparison", comparison.table.index, problem.names, remedy)
         if prediction is not None:
             _checks.same_names("prediction", prediction.median, runs)
-        return cls(problem, fit, posterior, found, comparison, prediction, no_prediction)
+        if missing is not None:
+            _checks.instance("missing", missing, MissingTerms)
+            if fingerprint(missing._problem) != fingerprint(problem):
+                raise ValueError("missing: must be missing_terms(problem, fit) of this problem, got that of another.")
+        return cls(problem, fit, posterior, found, comparison, prediction, missing, no_prediction)
 
     @property
     def synthetic(self) -> bool:
@@ -398,6 +405,24 @@ def adequacy(found: Prediction) -> Rows:
     columns: dict[str, Any] = {"label": ("Experiment and channel", str), "verdict": ("Verdict", badge)}
     columns |= {test: (f"p-values: {test}", html.p_value) for test in TESTS}
     return _formatted(found.table, **columns, model_error_share=("Fraction of model error", html.percent))
+
+
+def missing_terms(found: MissingTerms) -> Rows:
+    """Return the table of the models with more and more terms, the given one first."""
+    return [
+        {
+            "Term": code(step.term) if step.term else "given model",
+            "Place": step.place or html.NOTHING,
+            **{f"Unexplained variance: {channel}": html.percent(left) for channel, left in step.unexplained.items()},
+            "Unexplained variance: left out": html.percent(step.held_out),
+            **{f"Whiteness p: {channel}": html.p_value(p) for channel, p in step.p_white.items()},
+            "Tests of the model": badge(step.verdict),
+            "Gain of log evidence": number(step.evidence_gain),
+            "Coefficient": number(step.coefficient, 4),
+            "Robust sd": number(step.robust_sd),
+        }
+        for step in (found.before, *found.steps)
+    ]
 
 
 def sampling(given: ReportInputs) -> Rows:

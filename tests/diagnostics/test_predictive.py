@@ -168,6 +168,10 @@ def test_plenty_of_data_and_a_missing_stiffness_is_misspecified():
     said = repr(prediction)
     assert "The model is misspecified" in said and "excess power in some harmonics" in said
     assert "of the residual variance is model error" in said
+    assert prediction.remedy == "bp.missing_terms(problem, fit) looks for the term that is missing."
+    assert f"\n{prediction.remedy}" in said
+    for change in ({"other_orbits": {"run": "period 2"}}, {"prior_conflict": "conflict"}):
+        assert not replace(prediction, **change).remedy
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -272,6 +276,8 @@ def test_a_misspecified_model_is_named_beside_all_other_verdicts(coulomb, said):
     found = bp.compare(problem, fit, draw(problem, fit, 1, draws=400))
     assert (text in repr(found)) is said
     odd = "its strongest harmonic is 3, as where a force odd in the motion is missing, if the drive is a sine"
+    search = "; bp.missing_terms(problem, fit) looks for the term that is missing"
+    assert all(one.endswith(search) for one in found.limitations)
     assert all(odd in one for one in found.limitations) and len(found.limitations) == said
 
 
@@ -294,7 +300,7 @@ def test_undetermined_parameters_do_not_make_the_model_inadequate():
     low, high = np.quantile(posterior.draws("a"), [0.05, 0.95])
     assert high > 50 * low
     prediction = bp.predict(problem, posterior)
-    assert prediction.verdict == "adequate"
+    assert prediction.verdict == "adequate" and not prediction.remedy
     assert "The model is adequate" in repr(prediction)
 
 
@@ -303,6 +309,7 @@ def test_undetermined_and_misspecified_is_misspecified():
     assert prediction.verdict == "misspecified"
     assert prediction.table.loc["run force", "harmonic"] == 1.0
     assert prediction.concerns_noise and "The model or the noise model is misspecified" in repr(prediction)
+    assert "missing_terms" not in repr(prediction)
 
 
 def test_a_parameter_fixed_at_a_wrong_value_is_misspecified_and_a_strong_prior_is_not():

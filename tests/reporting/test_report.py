@@ -8,6 +8,7 @@ import pytest
 
 import bayesperiodic as bp
 from tests.known import LINEAR, formula_model, linear_experiment
+from tests.problems import quadratic_damping
 from tests.reporting.conftest import ATTACK, NAME
 from tests.reporting.reading import Page, value
 
@@ -268,3 +269,37 @@ def test_noise_of_inputs_that_is_negligible_is_said_to_be(tmp_path):
         in page.text
     )
     assert "What is not linear" not in page.text and not any("error of x" in e.text for e in page.all("figcaption"))
+
+
+def test_missing_terms_have_a_section_where_they_are_given(solved, page, tmp_path):
+    problem, fit = quadratic_damping()
+    found = bp.missing_terms(problem, fit, {"equation of x": ["x**5"]}, outputs=False)
+    read = Page(bp.report(problem, fit, None, tmp_path / "report.html", missing=found).read_text("utf-8"))
+    rows = read.rows("table-missing")
+    assert list(rows) == ["given model", "dx*abs(dx)"] and len(rows["given model"]) == len(rows["dx*abs(dx)"]) == 8
+    step, cells = found.steps[0], rows["dx*abs(dx)"]
+    assert cells[0] == "equation of x" and cells[4] == f"✓ {step.verdict}"
+    assert rows["given model"][4:] == ["✕ misspecified", "–", "–", "–"]
+    assert value(cells[2].removesuffix(" %")) == pytest.approx(100 * step.held_out, rel=0.01)
+    assert [value(cells[i]) for i in (5, 6, 7)] == pytest.approx(
+        [step.evidence_gain, step.coefficient, step.robust_sd], rel=0.01
+    )
+    assert found.stopped in read.text and f"Of {found.tested} candidates" in read.text
+    ids = {e.attributes.get("id") for e in read.elements}
+    assert {"missing", "figure-missing"} <= ids
+    assert "Missing terms" not in page.text
+    none = bp.missing_terms(problem, fit, max_terms=0)
+    plain = Page(bp.report(problem, fit, None, tmp_path / "report.html", missing=none).read_text("utf-8"))
+    assert "None was added. The search ended after 0 terms" in plain.text
+    assert "figure-missing" not in {e.attributes.get("id") for e in plain.elements}
+    with pytest.raises(ValueError, match="missing: must be missing_terms.* of this problem"):
+        bp.report(*solved, tmp_path / "report.html", missing=found)
+
+
+def test_a_misspecified_model_is_pointed_to_the_search(solved, scored, tmp_path):
+    problem, fit, posterior = solved
+    table = bp.predict(problem, posterior, draws=20).table.copy()
+    table.loc["run force", "size"], table["verdict"] = 1e-9, "misspecified"
+    rejected = replace(bp.predict(problem, posterior, draws=20), table=table)
+    path = bp.report(*solved, tmp_path / "report.html", comparison=scored, prediction=rejected)
+    assert "bp.missing_terms(problem, fit) looks for the term" in Page(path.read_text("utf-8")).text

@@ -1,0 +1,181 @@
+"""Figure of the terms that a model lacks: what each leaves unexplained, and the residual that led to the first."""
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import sympy as sp
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+
+from bayesperiodic import _checks
+from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.diagnostics.missing_terms import MissingTerms
+from bayesperiodic.diagnostics.score_tests import along_orbit
+from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.plot import style
+from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label
+from bayesperiodic.posterior.description import check_fingerprint, check_results, fingerprint
+from bayesperiodic.posterior.problem import Problem
+
+# Colours without another meaning, one for each channel; and that of the residual with the terms.
+CHANNELS, AFTER = ("#E69F00", "#009E73", "#CC79A7"), ENSEMBLES[2]
+HELD_OUT: dict[str, Any] = {"color": "grey", "ls": ":", "marker": "s", "ms": 4, "mfc": "white"}
+# Part of the axis to the left of the points, for their values.
+ROOM = 0.5
+
+
+def missing_terms(
+    problem: Problem,
+    fit: MapEstimate,
+    found: MissingTerms,
+    after: MapEstimate | None = None,
+    *,
+    figure: Figure | None = None,
+) -> Figure:
+    """Draw what each term leaves unexplained, and the residual against the variables of the first term.
+
+    Left: fraction of the variance of each channel that is unexplained, and the mean of it in experiments that were left
+    out of the fit, where known. Right: the residual of the channel that the term acts on (for a term in an equation,
+    the channel that is explained worst), in the experiment where it is largest, against the variable of the first term.
+    Of a term of several variables the one with the highest power is across, and the first of the others is the colour.
+    For a constant, or if no term was found, the residual is drawn over the time in the period. Variables are those of
+    the given fit.
+
+    Parameters
+    ----------
+    problem : Problem
+    fit : MapEstimate
+    found : MissingTerms
+    after : MapEstimate, optional
+        Of ``found.problem()``, or of ``found.problem(k)`` with fewer terms: a further panel has its residual.
+    figure : Figure, optional
+        With a constrained layout.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    ValueError
+        For a fit or terms of another problem, or an estimate of a model without the first term.
+
+    Examples
+    --------
+    >>> figure = bp.plot.missing_terms(problem, fit, bp.missing_terms(problem, fit, max_terms=0))
+    >>> [axes.get_xlabel() for axes in figure.axes]
+    ['unexplained variance', 'time in the period [s]']
+    """
+    problem = check_results(problem, fit=fit)
+    _checks.instance("found", found, MissingTerms)
+    if fingerprint(found._problem) != fingerprint(problem):
+        raise ValueError(
+            "found: must be what missing_terms(problem, fit) returns for this problem, got terms of another problem."
+        )
+    shown = {"given model": fit}
+    if after is not None:
+        shown[_added(found, after)] = after
+    size = (3.6 + 3.4 * len(shown), 3.2 + 0.35 * len(found.steps))
+    figure = figure or plt.figure(figsize=size, layout="constrained")
+    left, *right = figure.subplots(1, 1 + len(shown))
+    _steps(left, found)
+    _residuals(right, problem, found, shown)
+    figure.suptitle(style.caveats(any(e.synthetic for e in problem.experiments), converged=True), fontsize="medium")
+    return figure
+
+
+def _added(found: MissingTerms, after: MapEstimate) -> str:
+    """Return a title for an estimate of the model with terms; raise a ValueError for one of another model."""
+    _checks.instance("after", after, MapEstimate)
+    count = sum(step.name in after.theta for step in found.steps)
+    if not count:
+        raise ValueError("after: must be an estimate of a model with the first term, map_estimate(found.problem()).")
+    check_fingerprint("after", after, fingerprint(found.problem(count)))
+    return f"with {found.steps[0].term}" if count == 1 else f"with {count} terms"
+
+
+def _steps(axes: Axes, found: MissingTerms) -> None:
+    """Draw the fraction of the variance that every model leaves unexplained, the given one at the top."""
+    models = (found.before, *found.steps)
+    rows = np.arange(len(models))
+    held_out = np.array([step.held_out for step in models])
+    if np.isfinite(held_out).any():
+        axes.plot(held_out, rows, label="experiments left out", **HELD_OUT)
+    values = {channel: np.array([step.unexplained[channel] for step in models]) for channel in found.before.unexplained}
+    for number, (channel, left) in enumerate(values.items()):
+        axes.plot(left, rows, "o-", color=CHANNELS[number % len(CHANNELS)], lw=1.6, ms=5, label=axis_label(channel))
+        for row, value in zip(rows, left, strict=True):
+            text = f"{100.0 * value:.2g} %"
+            axes.annotate(text, (value, row), (-5, 1), textcoords="offset points", ha="right", va="bottom")
+    known = np.concatenate([held_out, *values.values()])
+    known = known[np.isfinite(known) & (known > 0.0)]
+    axes.set(xscale="log", xlabel="unexplained variance", ylim=(len(models) - 0.6, -0.6))
+    if known.size:
+        low, high = np.log10([known.min(), known.max()])
+        axes.set_xlim(10.0 ** (low - ROOM * max(high - low, 1.0)), 10.0 ** (high + 0.1 * max(high - low, 1.0)))
+    axes.set_yticks(rows, ["given model", *(axis_label(f"+ {step.term}\nin {step.place}") for step in found.steps)])
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(axis="x", color="0.9")
+    axes.legend(frameon=False, fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+
+
+def _residuals(panels: list[Axes], problem: Problem, found: MissingTerms, shown: dict[str, MapEstimate]) -> None:
+    """Draw one channel's residual of each estimate against a variable of the first term, coloured by another."""
+    fit = next(iter(shown.values()))
+    place = found.steps[0].place if found.steps else ""
+    channel = place if place in problem.channels else max(fit.fvu, key=lambda name: fit.fvu[name])
+    having = [e for e in problem.experiments if channel in e.outputs]
+    e = max(having, key=lambda own: float(np.sum(fit.residuals[own.name][channel] ** 2)))
+    (across, x), *others = _variables(problem, fit, found, e).items()
+    mask = slice(None) if e.mask is None else e.mask
+    reach = 1.08 * max(float(np.abs(own.residuals[e.name][channel][mask]).max()) for own in shown.values())
+    points: Any = None
+    for number, (axes, (title, own)) in enumerate(zip(panels, shown.items(), strict=True)):
+        residual = own.residuals[e.name][channel]
+        axes.axhline(0.0, color="grey", lw=0.8, zorder=0)
+        if others:
+            colour = others[0][1][mask]
+            points = axes.scatter(x[mask], residual[mask], 10, colour, cmap="coolwarm", linewidths=0)
+        else:
+            axes.plot(x[mask], residual[mask], ".", ms=4, color=AFTER if number else COLOURS["measured"])
+        axes.set(xlabel=across, ylim=(-reach, reach))
+        axes.set_title(axis_label(title), fontsize="medium")
+        axes.locator_params(axis="x", nbins=4)
+        if number:
+            axes.tick_params(labelleft=False)
+    where = f" in {e.name}" * (len(problem.experiments) > 1)
+    panels[0].set_ylabel(axis_label(f"residual of {channel}{where}", problem.model.units.get(channel, "")))
+    if others:
+        panels[0].figure.colorbar(points, ax=panels, label=others[0][0], pad=0.02)
+
+
+def _variables(problem: Problem, fit: MapEstimate, found: MissingTerms, e: Experiment) -> dict[str, np.ndarray]:
+    """Return the variables of the first term along an orbit, by their labels; the time for a term without any."""
+    model = problem.model
+    if found.steps:
+        expression = found._terms[found.steps[0].name][0].expression
+        names = model.state_symbols | model.input_symbols
+        powers = {
+            name: sp.degree(expression, symbol) if expression.is_polynomial(symbol) else 1
+            for name, symbol in names.items()
+            if symbol in expression.free_symbols
+        }
+        chosen = sorted(powers, key=lambda name: -powers[name])
+        if chosen:
+            listed = [names[name] for name in chosen]
+            values = along_orbit(problem, problem.vector(fit.theta), e, fit.solutions[e.name], listed)
+            return {_label(problem, name): own for name, own in zip(chosen, values, strict=True)}
+    return {"time in the period [s]": e.time}
+
+
+def _label(problem: Problem, name: str) -> str:
+    """Return the label of a variable of the model by its name there, of a derivative as that of the variable."""
+    model, order = problem.model, 0
+    while name[order:] not in (*model.states, *model.inputs):
+        order += 1
+    plain, rate = name[order:], ("", "/s", "/s²")[order]
+    unit = model.units.get(plain, "")
+    text = ("", "rate of ", "second derivative of ")[order] + plain
+    return axis_label(text, f"{unit or '1'}{rate}" if order else unit)
