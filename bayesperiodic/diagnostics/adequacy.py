@@ -1,6 +1,6 @@
 """Tests of the model: discrepancy of every experiment and channel, and the verdict."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import compress
 from typing import Any
@@ -262,10 +262,7 @@ class Whitened:
         self.known = frozenset(group for group, own in each if set(own) <= set(likelihood.fixed))
         white = zip(*(likelihood.whitened(part, noise) for part in (here.residuals, here.changes)), strict=True)
         self.parts = [used(block, *both) for block, both in zip(self.blocks, white, strict=True)]
-        self._plain = [
-            used(block, *both) for block, *both in zip(self.blocks, here.residuals, here.changes, strict=True)
-        ]
-        self.loadings = {b: part.T for one in likelihood.shared for b, part in zip(one.members, one.parts, strict=True)}
+        self._plain, self._likelihood, self._noise = (here.residuals, here.changes), likelihood, noise
         self._experiments = {e.name: e for e in problem.experiments}
 
     def spectrum(self, index: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -289,30 +286,44 @@ class Whitened:
 
     def in_measured_units(self, index: int) -> Unexplained | None:
         """Return what is unexplained of a block in units of the measured spectrum; None if that is not known."""
-        spectrum, parts = self.spectrum(index), self.in_units_of_noise(index)
-        if spectrum is None or parts is None:
-            return None
-        return Unexplained.of_measured_noise(parts[0], parts[1], self.parts[index][2], spectrum[1])
-
-    def in_units_of_noise(self, index: int) -> list[np.ndarray] | None:
-        """Return components and derivatives of a block in units of the measured spectrum; None if it is not known."""
         spectrum = self.spectrum(index)
         if spectrum is None:
             return None
-        r, j, harmonic = self._plain[index]
-        return self.over(index, np.sqrt(spectrum[0][harmonic]), r, j)
+        r, j, harmonic = self.in_units_of_noise(index)
+        return Unexplained.of_measured_noise(r, j, harmonic, spectrum[1])
 
-    def over(self, index: int, sd: np.ndarray, *parts: np.ndarray, weight: float = 1.0) -> list[np.ndarray]:
-        """Return components (…, used) of a block over the sds (used,) of the noise and what inputs' errors cause.
+    def in_units_of_noise(self, index: int) -> list[np.ndarray]:
+        """Return components, derivatives and harmonics of a block in units of the measured spectrum, if it is known."""
+        return self._in_units_of(index, self._by_spectrum)
 
-        These make components correlated; the root of the covariance is the symmetric one.
+    def in_measured_sd(self, index: int) -> Unexplained:
+        """Return what is unexplained of a block in units of the measured standard deviation of its values."""
+        return Unexplained(*self._in_units_of(index, self._by_scatter))
+
+    def _in_units_of(self, index: int, precision: Callable[[int], np.ndarray]) -> list[np.ndarray]:
+        """Return components, derivatives and harmonics of a block in units of noise with precisions (size,) by block.
+
+        The noise of inputs is added; components of all blocks of an experiment that it moves together are decorrelated.
         """
-        found = [part / sd for part in parts]
-        if index not in self.loadings:
-            return found
-        loadings = np.sqrt(weight) * used(self.blocks[index], self.loadings[index])[0] / sd
-        values, vectors = np.linalg.eigh(np.eye(sd.size) + loadings.T @ loadings)
-        return [((part @ vectors) / np.sqrt(values)) @ vectors.T for part in found]
+        shared = next((one for one in self._likelihood.shared if index in one.members), None)
+        members = shared.members if shared else (index,)
+        p, found = [precision(b) for b in members], []
+        for vectors in self._plain:
+            scaled = [vectors[b] * np.sqrt(own) for b, own in zip(members, p, strict=True)]
+            found.append((shared.whitened(scaled, p) if shared else scaled)[members.index(index)])
+        return used(self.blocks[index], *found)
+
+    def _by_spectrum(self, index: int) -> np.ndarray:
+        """Return the inverse of the measured variances of the components, of one value's where these are not known."""
+        spectrum = self.spectrum(index)
+        return self._by_scatter(index) if spectrum is None else 1.0 / spectrum[0][self.blocks[index].harmonic]
+
+    def _by_scatter(self, index: int) -> np.ndarray:
+        """Return the weight over the measured variance of a value, over the estimated one where it is not known."""
+        block = self.blocks[index]
+        if block.measured > 0.0:
+            return np.full(block.size, block.weight / block.measured)
+        return np.broadcast_to(self._likelihood.precisions([index], self._noise)[0], (block.size,))
 
     def consistency(self) -> float:
         """Return p of the test of common parameters."""
@@ -337,26 +348,24 @@ def used(block: Block, *parts: np.ndarray) -> list[np.ndarray]:
 def _size(problem: Problem, here: Linearisation, index: int, white: Whitened) -> tuple[float, float]:
     """Return p of a residual larger than the measured or known noise, and the fraction of model error."""
     block = white.blocks[index]
-    r, j, harmonic = used(block, here.residuals[index], here.changes[index])
-    r, j = np.sqrt(block.weight) * r, np.sqrt(block.weight) * j
-    if not _testable(r, j) or not (block.measured > 0.0 or white.groups[index] in white.known):
+    if not _testable(here.residuals[index], here.changes[index]):
+        return NOT_TESTED, NOT_TESTED
+    if not (block.measured > 0.0 or white.groups[index] in white.known):
         return NOT_TESTED, NOT_TESTED
     if block.measured > 0.0:
-        measured, one = block.measured, np.sqrt(np.full(r.size, block.measured))
-        r, j = (one * part for part in white.over(index, one, r, j, weight=block.weight))
-        unexplained = Unexplained(r, j, harmonic)
+        unexplained = white.in_measured_sd(index)
         e = next(e for e in problem.experiments if e.name == block.experiment)
         # Unequal variances reduce the degrees of freedom of a sum of squares.
         evenness, behind = _evenness(e, block), measured_freedom(e, block.channel)
     else:
-        unexplained, measured, evenness, behind = Unexplained(*white.parts[index]), 1.0, 1.0, np.inf
+        unexplained, evenness, behind = Unexplained(*white.parts[index]), 1.0, np.inf
     if not unexplained.freedom:
         return NOT_TESTED, NOT_TESTED
     variance = unexplained.square / unexplained.freedom
-    share = max(0.0, 1.0 - measured / variance) if variance > 0.0 else 0.0
+    share = max(0.0, 1.0 - 1.0 / variance) if variance > 0.0 else 0.0
     if (relative := white.in_measured_units(index)) is not None:
         return float(stats.chi2.sf(relative.square, relative.freedom)), share
-    return excess(variance, unexplained.freedom * evenness, measured, behind), share
+    return excess(variance, unexplained.freedom * evenness, 1.0, behind), share
 
 
 def _evenness(experiment: Experiment, block: Block) -> float:

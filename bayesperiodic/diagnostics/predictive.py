@@ -189,12 +189,13 @@ class Prediction(Bands):
         and ``harmonics`` of the residual along the period, in units of the noise; ``size``, the residual variance
         against the measured scatter of the cycles (assumed exact for one cycle) or a given variance; ``amplitude``, the
         rms of the period against replicates; ``consistency`` (row "all"), common parameters against separate ones for
-        each experiment and channel. ``harmonic``: the one with the largest residual power in units of the noise (the
-        index of the cosine wave for masked data). ``model_error_share``: the fraction of the residual variance beyond
-        that of ``size``, NaN if unknown. ``spectrum``: "measured" if whiteness and harmonics are tested in units of the
-        noise that was measured between the harmonics, "assumed" if in those of the noise model. ``p``: the smallest of
-        the row, adjusted by Holm's method for all tests of the table; ``verdict``: "misspecified" if it is below 1 %,
-        "adequate", or "not tested".
+        each experiment and channel. The noise of the inputs, where it is integrated out, is part of that noise.
+        ``harmonic``: the one with the largest residual power in units of the noise (the index of the cosine wave for
+        masked data). ``model_error_share``: the fraction of the residual variance beyond that of ``size``, NaN if
+        unknown. ``spectrum``: "measured" if whiteness and harmonics are tested in units of the noise that was measured
+        between the harmonics, "assumed" if in those of the noise model. ``p``: the smallest of the row, adjusted by
+        Holm's method for all tests of the table; ``verdict``: "misspecified" if it is below 1 %, "adequate", or "not
+        tested".
     transient : Transient or None
         Bands of the recordings of `run`.
     prior_conflict : str

@@ -56,7 +56,7 @@ class ScoreTests:
         self.widths = _widths(likelihood.whitened(_deviations(problem), noise), likelihood.whitened(effects, noise))
         joined = [np.concatenate([s, c]) for s, c in zip(here.changes, effects, strict=True)]
         white, parameters = Whitened(problem, Compared(list(here.residuals), joined), noise), len(problem.names)
-        plain = _projected([part[:2] for part in white.parts], parameters)
+        plain = _projected(white.parts, parameters)
         self._effects, self.identifiable = plain.effects, finite & plain.identifiable
         self.explained = plain.gains() / max(plain.square, np.finfo(float).tiny)
         self.p = self._p(problem, optimum, white, parameters)
@@ -65,8 +65,8 @@ class ScoreTests:
         """Return the p-values (terms,)."""
         blocks, known = white.blocks, [white.spectrum(i) for i in range(len(white.blocks))]
         if all(own is not None or block.kind == KNOWN for own, block in zip(known, blocks, strict=True)):
-            parts = [white.in_units_of_noise(i) or white.parts[i][:2] for i in range(len(blocks))]
-            tests, weights = _projected(parts, parameters), [np.full(r.size, np.inf) for r, _ in parts]
+            parts = [white.in_units_of_noise(i) for i in range(len(blocks))]
+            tests, weights = _projected(parts, parameters), [np.full(part[0].size, np.inf) for part in parts]
             for i, own in enumerate(known):
                 if own is not None:
                     weights[i] = own[1][white.parts[i][2]]

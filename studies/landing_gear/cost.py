@@ -2,8 +2,9 @@
 
 All fourteen experiments at draws of their joint posterior, interleaved in one run. The periodic solver is timed with
 the whole log-posterior, by scheme; compiled methods, and SciPy's LSODA and Radau on the same compiled right-hand side,
-with the integration alone. For each experiment the largest steps and loosest tolerances are chosen with which the
-outputs of all draws are as accurate as those of the periodic solver, compared with the finest integration.
+with the integration alone. Inputs are the estimated ones. For each experiment the largest steps and loosest tolerances
+are chosen with which the outputs of all draws are as accurate as those of the periodic solver, compared with the finest
+integration.
 
 The compiled methods are the classical Runge-Kutta method with fixed steps, and the pair of orders 5 and 4 of Dormand
 and Prince with error control (Hairer, Nørsett & Wanner, Solving Ordinary Differential Equations I, 1993, table 5.2).
@@ -14,7 +15,7 @@ cycle, which decrease geometrically. States are the gas temperature T [K], prece
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from types import SimpleNamespace
 from typing import Any
@@ -309,7 +310,8 @@ def choose_scipy(gear: Gear, method: str, allowed: float) -> float | None:
 
 def measure(drive: str, identified: Identified, seed: int, *, quick: bool) -> dict[str, Any]:
     """Return times and their ratios for one direction, from the joint posterior of all experiments."""
-    experiments = identified.problem.experiments
+    stated = with_errors(identified)
+    experiments = [replace(e, inputs=stated.true_inputs(e)) for e in stated.experiments]
 
     def steady(theta: np.ndarray) -> bool:
         return all(_gear(drive, experiment, identified, theta).steady for experiment in experiments)
@@ -323,6 +325,11 @@ def measure(drive: str, identified: Identified, seed: int, *, quick: bool) -> di
         "samples": SAMPLES,
         "schemes": {scheme: _by_scheme(scheme, identified, theta, gears, quick) for scheme in SCHEMES[drive]},
     }
+
+
+def with_errors(identified: Identified) -> bp.Problem:
+    """Return the problem whose log-posterior was sampled, with the estimated errors of its inputs."""
+    return identified.problem.with_input_errors(identified.fit.input_errors)
 
 
 def draws(
@@ -360,7 +367,7 @@ def _by_scheme(
     scheme: str, identified: Identified, theta: np.ndarray, gears: Sequence[Gear], quick: bool
 ) -> dict[str, Any]:
     """Return the times of the other methods at the accuracy of one scheme of the periodic solver."""
-    stated, fit = identified.problem, identified.fit
+    stated, fit = with_errors(identified), identified.fit
     if scheme != stated.scheme:
         stated = problem(stated.experiments, gears[0].drive, scheme=scheme)
     warm = stated.anchored(fit.theta)

@@ -1,11 +1,7 @@
-"""The landing gear with the force given, as in eq. (9), with the noise of the measured force propagated.
+"""The landing gear with the force given, as in eq. (9), with the noise of the measured force integrated out.
 
 The noise of the force moves displacement and pressure together, by more than their own noise and like heat conduction:
-a fit that treats the force as exact is confident of wrong signs. Here displacement and pressure have the covariance
-B S Bᵀ + J F Jᵀ, with S and F the variances of the amplitudes of outputs and force from the scatter of the cycles, B the
-harmonics kept, and J the derivatives of the steady motion by the force's amplitudes, at an estimate that is computed
-twice; up to one common factor, which is 1 if the model is adequate. (Errors in variables, to first order: W. A. Fuller,
-Measurement Error Models, Wiley, 1987.)
+a fit that treats the force as exact is confident of wrong signs.
 
 Joint fits share theta4 and theta6; theta16 is local to each experiment. The steepness of the friction, theta10, is
 varied from 30 to 3000 s/m, solved from static equilibrium.
@@ -18,7 +14,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 import bayesperiodic as bp
 from studies.landing_gear import identification
@@ -68,70 +63,18 @@ def slope_line(found: Mapping[str, Any]) -> str:
     )
 
 
-# Points compared: as many as the harmonics kept allow, but for one. They are compared with the whole motion, so that
-# harmonics must be kept as long as there are any.
-POINTS = 80
-# Of the force's amplitudes, in their standard deviations, for derivatives by differences.
-STEP = 3.0
-# The covariance is computed at a fit that treats the force as exact, then again at the resulting fit.
-ROUNDS = 2
-# Noise "independent": one factor of the covariances.
-SETTINGS: dict[str, Any] = {"noise": "independent", "scheme": "central4"}
+# As accurate as the time integration with which `cost` compares it.
+SETTINGS = {"scheme": "central4"}
 
 
 def judge(recording: bp.Recording, seed: int, quick: bool) -> Verdict:
-    """Return the verdict with the noise of the force propagated, and the fit that treats the force as exact."""
+    """Return the verdict with the noise of the force integrated out, and the fit that treats the force as exact."""
+    experiments = [fold(recording, FORCE)]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The noise of the measured inputs")
-        exact = found = estimate([fold(recording, FORCE)], FORCE)
-        for _ in range(ROUNDS):
-            experiment = with_noise_of_the_input(exact.problem.experiments[0], found.fit.theta)
-            found = estimate([experiment], FORCE, **SETTINGS)
-    identified = identification.draw(found, seed, quick=quick)
-    # p-value of residuals as large as these, if the covariance is right: χ² of n − l values, eq. (7).
-    free = identified.problem.counted - len(identified.problem.names)
-    p = float(chi2.sf(identified.fit.noise["scale"] * free, free))
-    return Verdict(identified, identification.identifiability(identified), p < identification.FALSE_ALARM, p, exact)
-
-
-def with_noise_of_the_input(experiment: bp.Experiment, theta: Mapping[str, float]) -> bp.Experiment:
-    """Return the experiment at points over the period, with the covariance at θ of all that was measured."""
-    model, force = bp.models.landing_gear(FORCE), experiment.inputs[FORCE]
-    parameters = identification.FIXED | dict(theta) | {"theta11": -1e5 * theta["theta4"]}
-    at = np.arange(SAMPLES) % (SAMPLES // POINTS) == 0
-
-    def moved(change: np.ndarray | float, guess: str | Mapping[str, np.ndarray]) -> bp.PeriodicSolution:
-        return bp.solve_periodic(
-            model, parameters, {FORCE: force + change}, frequency=experiment.frequency, samples=SAMPLES,
-            scheme=SETTINGS["scheme"], guess=guess,
-        )  # fmt: skip
-
-    columns = []
-    with warnings.catch_warnings():
-        # The fit itself warns of a grid that is coarse for the friction.
-        warnings.filterwarnings("ignore", "The transition of a smooth sign")
-        centre = moved(0.0, "static")
-        for wave in amplitudes(experiment, FORCE).T:
-            ends = [moved(sign * STEP * wave, centre.states) for sign in (1.0, -1.0)]
-            up, down = ([experiment.project(c, end.outputs[c])[at] for c in model.outputs] for end in ends)
-            columns.append((np.stack(up, axis=-1) - np.stack(down, axis=-1)).ravel() / (2.0 * STEP))
-    response = np.stack(columns, axis=-1)
-    covariance = response @ response.T
-    for c, channel in enumerate(model.outputs):
-        own = amplitudes(experiment, channel)[at]
-        covariance[c :: len(model.outputs), c :: len(model.outputs)] += own @ own.T
-    return replace(experiment, mask=at, covariance=covariance, independent={}, harmonics={})
-
-
-def amplitudes(experiment: bp.Experiment, channel: str) -> np.ndarray:
-    """Return cosines and sines of the harmonics kept (points, 2·harmonics + 1), each as large as its noise.
-
-    The scatter of the cycles is pooled over the harmonics, for the noise is white.
-    """
-    harmonics = KEPT[FORCE][channel]
-    sd = np.sqrt(0.5 * np.mean(experiment.amplitude_variance[channel][1 : harmonics + 1]))
-    phase = 2 * np.pi * np.outer(np.arange(SAMPLES) / SAMPLES, np.arange(1, harmonics + 1))
-    return sd * np.hstack([np.full((SAMPLES, 1), np.sqrt(0.5)), np.cos(phase), np.sin(phase)])
+        exact = estimate(experiments, FORCE, input_noise="exact", **SETTINGS)
+    found = identification.judge(identification.draw(estimate(experiments, FORCE, **SETTINGS), seed, quick=quick))
+    return replace(found, exact=exact)
 
 
 # With the force given a log-posterior costs more, and the draws are fewer than the stop rule asks for.
@@ -139,10 +82,7 @@ STEPS_WITH_FORCE = 1000
 
 
 def given_force(forced: Mapping[str, Verdict], seed: int, *, quick: bool) -> Identified | None:
-    """Return estimate and draws with the force given, its noise propagated as in the single fits.
-
-    None for one experiment.
-    """
+    """Return estimate and draws with the force given; None for one experiment."""
     experiments = [verdict.identified.problem.experiments[0] for verdict in forced.values()]
     if len(experiments) < 2:
         return None

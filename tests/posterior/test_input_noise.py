@@ -241,12 +241,12 @@ def test_impossible_noise_is_refused(given, message):
         static(static_run(0), given)
 
 
-def noisy_gain(seed: int, shared: float = 0.0, cycles: int = 40, size: float = 0.3) -> bp.Experiment:
-    """Return the mean period of y = 2·x with white noise of both, some of that of x also in y."""
+def noisy_gain(seed: int, shared: float = 0.0, cycles: int = 40, size: float = 0.3, bend: float = 0.0) -> bp.Experiment:
+    """Return the mean period of y = 2·x + bend·x² with white noise of both, some of that of x also in y."""
     random, time = np.random.default_rng(seed), np.arange(40 * cycles) / 40.0
     x = np.cos(2 * np.pi * time) + 0.5 * np.sin(6 * np.pi * time)
     error = size * random.standard_normal(time.size)
-    y = 2.0 * x + 0.1 * random.standard_normal(time.size) + shared * error
+    y = 2.0 * x + bend * x**2 + 0.1 * random.standard_normal(time.size) + shared * error
     return bp.Recording(time, {"y": y}, {"x": x + error}, name="run").fold(64, frequency=1.0, harmonics=8)
 
 
