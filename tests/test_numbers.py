@@ -193,6 +193,15 @@ def damper():
     )
     shown = listed(f"{one:,.0f}" for one in noisy)
     yield f"With the displacement's noise integrated out it is {shown} 1/m"
+    first, second = d["missing_terms"]
+    assert (first["term"], second["term"]) == ("w*displacement**2", "ddisplacement**3")
+    assert "w*displacement in force" in first["alternatives"] and second["verdict"] == "misspecified"
+    yield f"lowers the unexplained variance from {100 * d['fvu']:.2f} % to {100 * first['unexplained']:.2f} %"
+    yield f"do not tell it from {len(first['alternatives'])} other terms"
+    yield (
+        f"in the equation of w it is {100 * second['unexplained']:.2f} %, and still no white noise "
+        f"(p = {second['p_white']:.3f})"
+    )
 
 
 def silverbox():

@@ -64,6 +64,9 @@ def run(options: argparse.Namespace) -> None:
     print(f"  periodic solution at the published parameters: {solution.status} in {solution.iterations} iterations")
     with watch.part("map", "finding the MAP point and the Laplace covariance"):
         fit = bp.map_estimate(problem)
+    with watch.part("missing", "searching for terms that the model lacks"):
+        found = bp.missing_terms(problem, fit)
+        after = bp.map_estimate(found.problem(1), progress=False) if found.steps else None
     with watch.part(
         "harmonics", "repeating it with other numbers of harmonics of an exact and of a noisy displacement"
     ):
@@ -80,11 +83,13 @@ def run(options: argparse.Namespace) -> None:
             "corner": bp.plot.corner(posterior, laplace=fit),
             "traces": bp.plot.traces(posterior),
             "harmonics": _harmonics_figure(choices, synthetic=data["synthetic"]),
+            "missing_terms": bp.plot.missing_terms(problem, fit, found, after),
         }
         paths = common.save_figures(options.out, figures)
 
     results = {"data": data, "seed": options.seed} | _collect(experiment, fit, posterior, comparison, choices)
-    print("\n" + _tables(results, fit, comparison) + "\n")
+    results["missing_terms"] = _missing(found)
+    print(f"\n{_tables(results, fit, comparison)}\n\n{found}\n")
     common.finish(options.out, results, watch, paths, synthetic=data["synthetic"])
 
 
@@ -187,6 +192,24 @@ def _collect(
         "failures": posterior.failures,
         "log_posterior_calls": posterior.log_posterior_calls,
     }
+
+
+def _missing(found: bp.MissingTerms) -> list[dict[str, Any]]:
+    """Return what is stored of each term that the model lacks."""
+    return [
+        {
+            "term": step.term,
+            "place": step.place,
+            "alternatives": list(step.alternatives),
+            "unexplained": step.unexplained["force"],
+            "p_white": step.p_white["force"],
+            "coefficient": step.coefficient,
+            "robust_sd": step.robust_sd,
+            "evidence_gain": step.evidence_gain,
+            "verdict": step.verdict,
+        }
+        for step in found.steps
+    ]
 
 
 def _tables(results: dict[str, Any], fit: bp.MapEstimate, comparison: bp.Comparison) -> str:

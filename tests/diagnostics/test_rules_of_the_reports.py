@@ -229,11 +229,11 @@ def block(kind, size, count, harmonic=()):
 def test_components_of_the_lowest_harmonics_are_used():
     values = np.arange(14.0).reshape(2, 7)
     spectral = block(SPECTRAL, 7, 4.6, [0, 1, 2, 3, 1, 2, 3])
-    part, harmonic = adequacy._used(spectral, values)
+    part, harmonic = adequacy.used(spectral, values)
     assert harmonic.tolist() == [0, 1, 2, 1, 2] and part.tolist() == values[:, [0, 1, 2, 4, 5]].tolist()
-    points, harmonic = adequacy._used(block(POINTS, 7, 5.4), values)
+    points, harmonic = adequacy.used(block(POINTS, 7, 5.4), values)
     assert points == pytest.approx(dct(values, norm="ortho")[:, :5]) and harmonic.tolist() == [0, 1, 1, 2, 2]
-    same, harmonic = adequacy._used(block(CORRELATED, 7, 3.0), values)
+    same, harmonic = adequacy.used(block(CORRELATED, 7, 3.0), values)
     assert same.tolist() == values.tolist() and harmonic.tolist() == [0, 1, 1, 2, 2, 3, 3]
 
 

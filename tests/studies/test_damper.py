@@ -57,8 +57,9 @@ def test_synthetic_data_are_labelled_and_the_truth_is_recovered(quick):
         assert abs(results["map"][name] - damper.PUBLISHED[name]) < 4 * results["laplace_sd"][name]
     assert results["map"]["rho"] == pytest.approx(damper.PUBLISHED["rho"], rel=0.1)
     figures = sorted(path.name for path in folder.glob("*.png"))
-    assert figures == ["corner.png", "fit.png", "harmonics.png", "loops.png", "traces.png"]
+    assert figures == ["corner.png", "fit.png", "harmonics.png", "loops.png", "missing_terms.png", "traces.png"]
     assert all(name in printed.splitlines()[-2] for name in figures)
+    assert results["missing_terms"] == []
 
 
 @pytest.mark.slow
@@ -66,7 +67,7 @@ def test_same_seed_same_results_but_for_seconds_and_versions(quick, synthetic, t
     folder, first, _ = quick
     kept = [{k: v for k, v in r.items() if k not in ("seconds", "versions")} for r in (first, run(tmp_path, "--quick"))]
     assert json.dumps(kept[0]) == json.dumps(kept[1])
-    for name in ("corner", "fit", "harmonics", "loops", "traces"):
+    for name in ("corner", "fit", "harmonics", "loops", "missing_terms", "traces"):
         assert (folder / f"{name}.png").read_bytes() == (tmp_path / f"{name}.png").read_bytes()
 
 
@@ -101,6 +102,11 @@ def test_the_measured_damper(tmp_path, capsys):
     assert [one["kept"] for one in tried] == [7, 11, 16, 22, 28, 56] and "rho runs from" in printed
     assert all(one["unexplained"] <= one["unexplained_exact"] <= 0.008 for one in tried)
     assert tried[-1]["rho"] - tried[0]["rho"] < 0.8 * (tried[-1]["rho_exact"] - tried[0]["rho_exact"])
+    first, second = results["missing_terms"]
+    assert (first["term"], first["place"]) == ("w*displacement**2", "force")
+    assert second["unexplained"] < 0.6 * first["unexplained"] < 0.15 * results["fvu"]
+    assert all(step["evidence_gain"] > np.log(80) for step in (first, second))
+    assert "·w*displacement**2 in force" in printed
     assert all(path.stat().st_size <= 200_000 for path in tmp_path.glob("*.png"))
 
 
