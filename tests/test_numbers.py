@@ -221,6 +221,14 @@ def silverbox():
         f"the robust ones are {min(independent):.1f} to {max(independent):.1f} times as large with independent noise, "
         f"{min(circulant):.3f} to {max(circulant):.1f} times with circulant noise"
     )
+    terms = [f"`{step['term']}`" for step in d["missing_terms"][1:]]
+    last = d["missing_terms"][-1]
+    assert last["verdict"] == "misspecified" and last["p_white"] < 0.01
+    yield f"{terms[0]} and {terms[1]} in the response,"
+    yield (
+        f"{terms[2]} in the equation lower the residual to {100 * last['unexplained'] ** 0.5:.3f} % of the response's "
+        "standard deviation"
+    )
 
 
 def flutter():
@@ -261,6 +269,15 @@ def flutter():
         yield f"the {order} one lies between {max(low, 0.0):,.0f} and {high:,.0f}"
     apart = listed(f"{one['largest_difference_in_sds']:.0f}" for one in d["springs"].values())
     yield f"These estimates are up to {apart} of their standard deviations apart."
+    missing = d["missing_terms"]
+    models, terms = missing["models"], [f"`{step['term']}`" for step in missing["steps"]]
+    fitted, left_out = ([f"{100 * model[key]:.1f} %" for model in models] for key in ("errors_rms", "left_out_rms"))
+    yield f"of {missing['candidates']} candidates in the equations: with {terms[0]} and {terms[1]} in the moment and"
+    yield f"{terms[2]} in the equation of the wake, fitted amplitudes miss by {fitted[3]} and those of"
+    yield f"left out by {left_out[3]}, where the given model misses these by {left_out[0]}."
+    yield f"improves the fit to {fitted[4]} and the prediction to {left_out[4]} only"
+    assert len({model["without_a_cycle"] for model in models}) == 1
+    yield f"With all of these models {models[0]['without_a_cycle']} cycles have no counterpart"
 
 
 def flutter_campaigns():

@@ -57,6 +57,7 @@ WRONG_PHASE = 0.5
 HUM, OVERSTATED = 50.0, 0.7
 ERROR_OF_MEAN, GRID, TRUTH = "#999999", "#009E73", "#CC79A7"
 MAP, LAPLACE = bp.plot.COLOURS["map"], bp.plot.COLOURS["laplace"]
+MOST_TERMS = 3
 # Of the spectrum's ordinate [V].
 LOWEST = 1e-11
 
@@ -93,6 +94,8 @@ def run(options: argparse.Namespace) -> None:
             "repetition": _repetition(experiment, fit, second),
             "beyond_drive": _beyond_drive(experiment, fit),
         }
+    with watch.part("missing terms", "looking for the terms that the model lacks"):
+        checks["missing_terms"] = missing_terms(recording)
     with watch.part("figures", "drawing"):
         choices = {f"{e.harmonics['response']} harmonics": f for e, f in ((experiment, every), (in_drive, within))}
         truth = TRUE if data["synthetic"] else None
@@ -172,9 +175,26 @@ def fold(recording: bp.Recording, samples: int, response: int | None = None) -> 
     return recording.fold(samples, frequency=FREQUENCY, harmonics=harmonics, origin=float(recording.time[0]))
 
 
-def problem(experiment: bp.Experiment, noise: str = "independent") -> bp.Problem:
-    """Return the problem with a noise model; the noise of the drive is integrated out."""
-    return bp.Problem(bp.models.silverbox, [experiment], priors=PRIORS, fixed={"w0": W0}, scheme=SCHEME, noise=noise)
+def problem(experiment: bp.Experiment, noise: str = "independent", **changes: Any) -> bp.Problem:
+    """Return the problem with a noise model, or other arguments changed; the noise of the drive is integrated out."""
+    settings: dict[str, Any] = {"priors": PRIORS, "fixed": {"w0": W0}, "scheme": SCHEME, "noise": noise}
+    return bp.Problem(bp.models.silverbox, [experiment], **settings | changes)
+
+
+def missing_terms(recording: bp.Recording) -> list[dict[str, Any]]:
+    """Return the terms that the model lacks, one after the other, and what they leave unexplained.
+
+    The drive is taken as exact, for its noise hardly matters.
+    """
+    stated = problem(fold(recording, QUICK_SAMPLES), input_noise="exact")
+    found = bp.missing_terms(stated, bp.map_estimate(stated, progress=False), max_terms=MOST_TERMS)
+    return [
+        {
+            "term": step.term, "place": step.place, "alternatives": list(step.alternatives), "verdict": step.verdict,
+            "unexplained": step.unexplained["response"], "p_white": step.p_white["response"],
+        }
+        for step in (found.before, *found.steps)
+    ]  # fmt: skip
 
 
 def _medians() -> dict[str, float]:
@@ -345,6 +365,12 @@ def _check_lines(results: dict[str, Any]) -> list[str]:
         pd.DataFrame(results["from_rest"]).assign(seconds=results["seconds"]["from_rest"]).to_string(index=False),
         f"from another start ({other['status']}) the estimates differ by at most "
         f"{max(map(abs, other['shift'].values())):.1g} standard deviations",
+    ]
+    lines.append("unexplained part of the response's variance with missing terms, in the response or the equation:")
+    lines += [
+        f"  {'+ ' + step['term'] + ' in ' + step['place'] if step['term'] else 'the model as it is'}: "
+        f"{step['unexplained']:.2e}, {step['verdict']}"
+        for step in results["missing_terms"]
     ]
     if repeat["does_not"] < OVERSTATED * split["measurement"]:
         lines.append(
