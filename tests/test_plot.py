@@ -356,15 +356,15 @@ def test_comparison_plot_names_the_verdict_and_the_coordinates(solved):
 
 @pytest.fixture(scope="module")
 def lacking():
-    """Return a problem without its quadratic damping, the estimate, what is missing, and the estimate with it."""
+    """Return a problem without its quadratic damping, the estimate, and what is missing."""
     problem, fit = quadratic_damping()
     found = bp.missing_terms(problem, fit, equations=False, candidates={"equation of x": ["dx*abs(dx)", "x**5"]})
-    return problem, fit, found, bp.map_estimate(found.problem(), progress=False)
+    return problem, fit, found
 
 
 def test_missing_terms_show_what_each_leaves_and_the_residual_against_its_variable(lacking):
-    problem, fit, found, after = lacking
-    left, before, with_it = bp.plot.missing_terms(problem, fit, found, after).axes
+    problem, fit, found = lacking
+    left, before, with_it = bp.plot.missing_terms(problem, fit, found).axes
     names = [t.get_text() for t in left.get_yticklabels()]
     assert names == ["given model", "+ dx*abs(dx)\nin equation of x"] and left.get_xscale() == "log"
     held_out, own = (line.get_xdata() for line in left.lines)
@@ -374,34 +374,28 @@ def test_missing_terms_show_what_each_leaves_and_the_residual_against_its_variab
     assert before.get_ylabel() == "residual of displacement in run 0 [m]" and before.get_ylim() == with_it.get_ylim()
     speed = fit.solutions["run 0"].states["x"]
     rate = np.gradient(np.tile(speed, 3), 1 / 64 / 0.12)[64:128]
-    for axes, estimate in ((before, fit), (with_it, after)):
+    for axes, estimate in ((before, fit), (with_it, found.fit())):
         x, y = axes.lines[1].get_data()
         assert np.array_equal(y, estimate.residuals["run 0"]["displacement"])
         assert x == pytest.approx(rate, abs=0.02 * np.ptp(rate))
 
 
 def test_missing_terms_of_two_variables_are_drawn_by_colour(lacking):
-    problem, fit, found, _ = lacking
+    problem, fit, found = lacking
     x, dx = (problem.model.state_symbols[name] for name in ("x", "dx"))
     [(name, (term, width))] = found._terms.items()
     for expression in (dx * x**2, x**2 * dx):
         other = replace(found, _terms={name: (replace(term, expression=expression), width)})
         axes = bp.plot.missing_terms(problem, fit, other).axes[1:]
-        assert [a.get_xlabel() for a in axes] == ["x [m]", ""] and axes[1].get_ylabel() == "rate of x [m/s]"
+        assert [a.get_xlabel() for a in axes] == ["x [m]", "x [m]", ""] and axes[2].get_ylabel() == "rate of x [m/s]"
         (points,) = axes[0].collections
         assert np.array_equal(points.get_offsets()[:, 1], fit.residuals["run 0"]["displacement"])
 
 
 def test_missing_terms_without_any_or_of_another_problem(lacking, solved):
-    problem, fit, found, after = lacking
+    problem, fit, found = lacking
     none = replace(found, steps=(), _terms={})
     left, right = bp.plot.missing_terms(problem, fit, none).axes
     assert right.get_xlabel() == "time in the period [s]" and len(left.get_yticks()) == 1
-    with pytest.raises(ValueError, match="after: must be an estimate of a model with the first term"):
-        bp.plot.missing_terms(problem, fit, none, after)
-    with pytest.raises(ValueError, match="after: must be an estimate of a model with the first term"):
-        bp.plot.missing_terms(problem, fit, found, fit)
-    with pytest.raises(ValueError, match="after: must be a result of this problem"):
-        bp.plot.missing_terms(problem, fit, found, replace(after, fingerprint=fit.fingerprint))
     with pytest.raises(ValueError, match="found: must be what missing_terms.* returns for this problem"):
         bp.plot.missing_terms(*solved[:2], found)

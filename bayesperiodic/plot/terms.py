@@ -16,7 +16,7 @@ from bayesperiodic.diagnostics.score_tests import along_orbit
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot import style
 from bayesperiodic.plot.style import COLOURS, ENSEMBLES, axis_label
-from bayesperiodic.posterior.description import check_fingerprint, check_results, fingerprint
+from bayesperiodic.posterior.description import check_results, fingerprint
 from bayesperiodic.posterior.problem import Problem
 
 # Colours without another meaning, one for each channel; and that of the residual with the terms.
@@ -26,30 +26,21 @@ HELD_OUT: dict[str, Any] = {"color": "grey", "ls": ":", "marker": "s", "ms": 4, 
 ROOM = 0.5
 
 
-def missing_terms(
-    problem: Problem,
-    fit: MapEstimate,
-    found: MissingTerms,
-    after: MapEstimate | None = None,
-    *,
-    figure: Figure | None = None,
-) -> Figure:
-    """Draw what each term leaves unexplained, and the residual against the variables of the first term.
+def missing_terms(problem: Problem, fit: MapEstimate, found: MissingTerms, *, figure: Figure | None = None) -> Figure:
+    """Draw what each term leaves unexplained, and the residual before and after.
 
     Left: fraction of the variance of each channel that is unexplained, and the mean of it in experiments that were left
-    out of the fit, where known. Right: the residual of the channel that the term acts on (for a term in an equation,
-    the channel that is explained worst), in the experiment where it is largest, against the variable of the first term.
-    Of a term of several variables the one with the highest power is across, and the first of the others is the colour.
-    For a constant, or if no term was found, the residual is drawn over the time in the period. Variables are those of
-    the given fit.
+    out of the fit, where known. Right: the residuals of the given model and with all terms, of the channel that the
+    first term acts on (for a term in an equation, the channel that is explained worst), in the experiment where it is
+    largest, against the variable of the first term. Of a term of several variables the one with the highest power is
+    across, and the first of the others is the colour. For a constant, or if no term was found, the residual is drawn
+    over the time in the period. Variables are those of the given fit.
 
     Parameters
     ----------
     problem : Problem
     fit : MapEstimate
     found : MissingTerms
-    after : MapEstimate, optional
-        Of ``found.problem()``, or of ``found.problem(k)`` with fewer terms: a further panel has its residual.
     figure : Figure, optional
         With a constrained layout.
 
@@ -60,7 +51,7 @@ def missing_terms(
     Raises
     ------
     ValueError
-        For a fit or terms of another problem, or an estimate of a model without the first term.
+        For a fit or terms of another problem.
 
     Examples
     --------
@@ -75,8 +66,8 @@ def missing_terms(
             "found: must be what missing_terms(problem, fit) returns for this problem, got terms of another problem."
         )
     shown = {"given model": fit}
-    if after is not None:
-        shown[_added(found, after)] = after
+    if count := len(found.steps):
+        shown[f"with {found.steps[0].term}" if count == 1 else f"with {count} terms"] = found.fit()
     size = (3.6 + 3.4 * len(shown), 3.2 + 0.35 * len(found.steps))
     figure = figure or plt.figure(figsize=size, layout="constrained")
     left, *right = figure.subplots(1, 1 + len(shown))
@@ -84,16 +75,6 @@ def missing_terms(
     _residuals(right, problem, found, shown)
     figure.suptitle(style.caveats(any(e.synthetic for e in problem.experiments), converged=True), fontsize="medium")
     return figure
-
-
-def _added(found: MissingTerms, after: MapEstimate) -> str:
-    """Return a title for an estimate of the model with terms; raise a ValueError for one of another model."""
-    _checks.instance("after", after, MapEstimate)
-    count = sum(step.name in after.theta for step in found.steps)
-    if not count:
-        raise ValueError("after: must be an estimate of a model with the first term, map_estimate(found.problem()).")
-    check_fingerprint("after", after, fingerprint(found.problem(count)))
-    return f"with {found.steps[0].term}" if count == 1 else f"with {count} terms"
 
 
 def _steps(axes: Axes, found: MissingTerms) -> None:

@@ -66,7 +66,6 @@ def run(options: argparse.Namespace) -> None:
         fit = bp.map_estimate(problem)
     with watch.part("missing", "searching for terms that the model lacks"):
         found = bp.missing_terms(problem, fit)
-        after = bp.map_estimate(found.problem(1), progress=False) if found.steps else None
     with watch.part(
         "harmonics", "repeating it with other numbers of harmonics of an exact and of a noisy displacement"
     ):
@@ -83,7 +82,7 @@ def run(options: argparse.Namespace) -> None:
             "corner": bp.plot.corner(posterior, laplace=fit),
             "traces": bp.plot.traces(posterior),
             "harmonics": _harmonics_figure(choices, synthetic=data["synthetic"]),
-            "missing_terms": bp.plot.missing_terms(problem, fit, found, after),
+            "missing_terms": bp.plot.missing_terms(problem, fit, found),
         }
         paths = common.save_figures(options.out, figures)
 

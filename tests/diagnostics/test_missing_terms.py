@@ -239,11 +239,11 @@ def test_candidates_of_angles_are_sines_and_cosines():
 
 def test_names_of_coefficients_are_new():
     model = bp.Model(
-        "named", states=["w"], inputs=["x"], parameters=["c1", "c3"],
-        equations=lambda s, p, u: [s.dw + p.c1 * s.w - u.x],
+        "named", states=["w"], inputs=["x"], parameters=["c_w", "c3"],
+        equations=lambda s, p, u: [s.dw + p.c_w * s.w - u.x],
         outputs=lambda s, p, u: {"c2": p.c3 * s.w},
     )  # fmt: skip
-    assert coefficient_names(model, generated(model, ["c2"], {})[:3]) == ["c4", "c5", "c6"]
+    assert coefficient_names(model, generated(model, ["c2"], {})[:3]) == ["c_1", "c_w_in_c2", "c_x"]
 
 
 def test_a_missing_output_term_of_one_static_record_is_found():
