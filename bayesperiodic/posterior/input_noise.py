@@ -255,9 +255,10 @@ def expected_errors(
 class Shared:
     """Errors of the inputs of one experiment, which its blocks share, and what they add to the log-likelihood.
 
-    `members` are the indices of the blocks, `parts` the loadings L of each, (size, errors). What is added to that of
-    independent components r with variances 1/p is, summed over the blocks, ½·(b·S⁻¹·b − ln|S|), with
-    S = 1 + Lᵀ·p·L and b = Lᵀ·p·r (Woodbury). The precisions p (…, size) may be (…, 1) where all are the same.
+    `members` are the indices of the blocks, `parts` the loadings L of each, (size, errors). With the variances 1/p of
+    the components r, S = 1 + Lᵀ·p·L, b = Lᵀ·p·r, and the estimated errors η̂ = S⁻¹·b, the logarithm of the determinant
+    is ln|S| − Σ ln p, and the sum of squares Σ p·(r − L·η̂)² + η̂·η̂. This is r·p·r − b·S⁻¹·b (Woodbury), but has no
+    difference of large numbers where errors explain r. The precisions p (…, size) may be (…, 1) where all are the same.
     """
 
     def __init__(self, members: Sequence[int], sizes: Sequence[int], matrix: np.ndarray):
@@ -293,18 +294,23 @@ class Shared:
         return matrix, vector
 
     def log_likelihood(self, r: Sequence[np.ndarray], p: Sequence[np.ndarray], factor: float) -> np.ndarray:
-        """Return what is added (…,), the logarithm of the determinant multiplied by a factor; NaN if not finite."""
+        """Return −½ (sum of squares + ln|S|) (…,), the logarithm multiplied by a factor; NaN if not finite."""
         if len(r) == 1 and p[0].shape[-1] == 1:  # S is diagonal
-            diagonal = 1.0 + p[0] * self._squares
-            vector = p[0] * (self.parts[0].T @ r[0][..., None])[..., 0]
-            return 0.5 * np.sum(vector**2 / diagonal - factor * np.log(diagonal), axis=-1)
+            part, diagonal = self.parts[0], 1.0 + p[0] * self._squares
+            along = (part.T @ r[0][..., None])[..., 0] / self._squares
+            left = r[0] - (part @ along[..., None])[..., 0]
+            square = np.sum(p[0] * left**2, axis=-1) + np.sum(p[0] * self._squares * along**2 / diagonal, axis=-1)
+            return -0.5 * (square + factor * np.sum(np.log(diagonal), axis=-1))
         matrix, vector = self._system(r, p)
         wrong = ~(np.isfinite(matrix).all(axis=(-2, -1)) & np.isfinite(vector).all(axis=-1))
         if np.any(wrong):
             matrix = np.where(wrong[..., None, None], np.eye(matrix.shape[-1]), matrix)
         logarithms = np.log(np.diagonal(np.linalg.cholesky(matrix), axis1=-2, axis2=-1)).sum(axis=-1)
-        squares = np.sum(vector * np.linalg.solve(matrix, vector[..., None])[..., 0], axis=-1)
-        return np.where(wrong, np.nan, 0.5 * squares - factor * logarithms)
+        errors = np.linalg.solve(matrix, vector[..., None])
+        square = np.sum(errors[..., 0] ** 2, axis=-1)
+        for part, own, precision in zip(self.parts, r, p, strict=True):
+            square = square + np.sum(precision * (own - (part @ errors)[..., 0]) ** 2, axis=-1)
+        return np.where(wrong, np.nan, -0.5 * square - factor * logarithms)
 
     def gradients(
         self, r: Sequence[np.ndarray], p: Sequence[np.ndarray], factor: float

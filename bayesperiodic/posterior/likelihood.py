@@ -251,7 +251,11 @@ class Likelihood:
         bias correction of eq. (7), see `gauss_newton.bias_correction`.
         """
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            total = (self._flat if self.model.flat else self._by_kind)(residuals, values, log_variance_factor)
+            with_errors = {b for one in self.shared for b in one.members}
+            rest = [np.zeros_like(r) if b in with_errors else r for b, r in enumerate(residuals)]
+            total = (self._flat if self.model.flat else self._by_kind)(
+                rest if with_errors else residuals, values, log_variance_factor
+            )
             for one in self.shared:
                 own, precisions = [residuals[b] for b in one.members], self.precisions(one.members, values)
                 total = total + one.log_likelihood(own, precisions, _mean(log_variance_factor, one))

@@ -69,6 +69,22 @@ def test_the_likelihood_is_that_of_a_normal_distribution_with_the_dense_covarian
     assert white @ white == pytest.approx(joined @ solved, rel=1e-10)
 
 
+def test_the_likelihood_is_exact_where_errors_explain_all_and_the_variance_vanishes():
+    """As many errors as components: for V → 0 it tends to that of the errors alone, from every side."""
+    random = np.random.default_rng(4)
+    for noise, blocks in ((bp.noise.Independent(), BLOCKS[:1]), (bp.noise.Independent(), BLOCKS[:2])):
+        size = sum(b.size for b in blocks)
+        loadings = random.standard_normal((size, size))
+        likelihood = Likelihood(noise, blocks, {}, {"run": loadings})
+        residuals = [random.standard_normal(b.size) for b in blocks]
+        alone = stats.multivariate_normal(np.zeros(size), loadings @ loadings.T).logpdf(np.concatenate(residuals))
+        for v in 10.0 ** np.array([-12, -16, -22]):
+            found = float(likelihood(residuals, np.full(len(likelihood.names), v)))
+            assert found == pytest.approx(alone + 0.5 * size * np.log(2 * np.pi), abs=1e-3)
+        for v in 10.0 ** np.array([-30, -40, -100, -200, -300]):
+            assert likelihood(residuals, np.full(len(likelihood.names), v)) < found + 1e-3
+
+
 def test_several_points_at_once_give_the_same_bits_as_single_ones(case):
     likelihood, residuals, values, _ = case
     many = [np.stack([r, 2 * r, -r]) for r in residuals]
