@@ -12,6 +12,7 @@ import sympy as sp
 
 from bayesperiodic import _checks
 from bayesperiodic.models.model import DERIVATIVES, Model, Names, smooth_abs, smooth_sign
+from bayesperiodic.models.units import Unit, parsed, product, unit_of, written
 
 DEGREE, HIGHEST_POWER = 3, 5
 # Widths of smooth absolute values and signs, relative to the standard deviation of their arguments.
@@ -106,6 +107,10 @@ def given(model: Model, candidates: Mapping[str, Iterable[Any]]) -> list[Candida
             text = term.strip() if isinstance(term, str) else _written(model, expression)
             _check_order(model, argument, text, expression, place)
             found.append(Candidate(place, text, expression))
+            try:
+                coefficient_unit(model, found[-1])
+            except ValueError as error:
+                raise ValueError(f"{argument}: must add quantities of the same unit, got {text!r}: {error}.") from None
     return found
 
 
@@ -151,6 +156,41 @@ def values(
     return np.array([np.broadcast_to(np.asarray(one, dtype=float), tau.shape) for one in found]).reshape(-1, tau.size)
 
 
+def symbol_units(model: Model) -> dict[sp.Symbol, Unit]:
+    """Return the units of the model's symbols, where they are known: states, inputs, their rates, and parameters."""
+    found = {model.time_symbols["tau"]: {}, model.time_symbols["frequency"]: {"Hz": 1.0}}
+    for space, names in ((model.state_symbols, model.states), (model.input_symbols, model.inputs)):
+        for name in names:
+            if (unit := parsed(model.units.get(name, ""))) is not None:
+                found |= {space[d + name]: product(unit, {"s": 1.0}, -i) for i, d in enumerate(DERIVATIVES)}
+    for name, symbol in model.parameter_symbols.items():
+        if (unit := parsed(model.units.get(name, ""))) is not None:
+            found[symbol] = unit
+    return found
+
+
+def coefficient_unit(model: Model, term: Candidate) -> str:
+    """Return the unit of the coefficient of a term as text; "" where units are missing.
+
+    A ValueError is raised for a term that adds quantities of different dimensions.
+    """
+    units, index = symbol_units(model), places(model).index(term.place)
+    own = unit_of(term.expression, units)
+    if index < len(model.outputs):
+        whole = parsed(model.units.get(term.place, ""))
+    else:
+        parts = sp.Add.make_args(sp.expand(model.equations[index - len(model.outputs)]))
+        whole = next((unit for part in parts if (unit := _unit_or_none(part, units)) is not None), None)
+    return "" if own is None or whole is None else written(product(whole, own, -1.0))
+
+
+def _unit_or_none(expression: sp.Expr, units: Mapping[sp.Symbol, Unit]) -> Unit | None:
+    try:
+        return unit_of(expression, units)
+    except ValueError:
+        return None
+
+
 def coefficient_names(model: Model, terms: Iterable[Candidate]) -> list[str]:
     """Return a new parameter for the coefficient of each term, such as ``c_w_x_2`` for ``w*x**2``."""
     taken = {*model.parameters, *model.state_symbols, *model.input_symbols, *model.outputs}
@@ -178,4 +218,5 @@ def extended(model: Model, terms: Mapping[str, Candidate]) -> Model:
         where, i = (outputs, index) if index < len(outputs) else (equations, index - len(outputs))
         where[i] += symbols[name] * term.expression
     other.equations, other.output_expressions = tuple(equations), tuple(outputs)
+    other.units = model.units | {name: coefficient_unit(model, term) for name, term in terms.items()}
     return other

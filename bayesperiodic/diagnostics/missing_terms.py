@@ -16,6 +16,7 @@ from bayesperiodic.diagnostics.adequacy import ALL, adequacy
 from bayesperiodic.diagnostics.candidates import (
     Candidate,
     coefficient_names,
+    coefficient_unit,
     extended,
     factors,
     generated,
@@ -55,8 +56,10 @@ class Step:
         Terms of the same effect on the data, or whose fit the data do not tell from this one.
     name : str
         Of the coefficient.
+    unit : str
+        Of the coefficient; empty where the model's units do not tell.
     coefficient, sd, robust_sd : float
-        Estimate and standard deviations, in the place's unit over the term's.
+        Estimate and standard deviations.
     p : float
         Of the score test before it was added, adjusted for the number of candidates.
     unexplained : dict of str to float
@@ -78,6 +81,7 @@ class Step:
     place: str
     alternatives: tuple[str, ...]
     name: str
+    unit: str
     coefficient: float
     sd: float
     robust_sd: float
@@ -214,7 +218,9 @@ class MissingTerms:
             moved = {name: shift for name, shift in step.shifts.items() if abs(shift) > 1.0}
             shifted = ", ".join(f"{name} by {shift:+.1f}" for name, shift in moved.items())
             lines.append(
-                f"{k}. {step.name}·{step.term} in {step.place} (p = {step.p:.2g}){others}."
+                f"{k}. {step.name}·{step.term} in {step.place}, {step.name} = {step.coefficient:.3g} ± "
+                f"{step.robust_sd:.2g} {step.unit}".rstrip()
+                + f" (p = {step.p:.2g}){others}."
                 + f" It moves {shifted} of its standard deviations." * bool(moved)
             )
         lines += [f"Removed again: {', '.join(self.dropped)}."] if self.dropped else []
@@ -551,6 +557,7 @@ def _step(
         term.place if term else "",
         others,
         name,
+        coefficient_unit(state.problem.model, term) if term else "",
         fit.theta[name] if term else np.nan,
         fit.sd[name] if term else np.nan,
         fit.robust_sd[name] if term else np.nan,
