@@ -200,7 +200,9 @@ class MissingTerms:
 
 
 NOT_TOLD = "its effect is that of the parameters"
-VANISHED = "with it the fit found no periodic solution"
+VANISHED = "with it the fit found no periodic solution, or no optimum"
+# Where the search for an optimum ends by itself; "stalled" steps are limited by the accuracy of the periodic solutions.
+ENDED = ("converged", "stalled")
 
 
 @in_one_thread
@@ -222,12 +224,13 @@ def missing_terms(
     c its effect on the whitened outputs, less what the parameters can do instead, and r the residual, the statistic is
     c·r over its standard deviation by the measured noise, or by the spectrum of the residual where that was not
     measured. The p-values are adjusted for the false discovery rate (Benjamini and Hochberg [1]_). The best significant
-    candidates are fitted, the best of these by evidence is added, and the search is repeated. Of those whose
-    likelihoods do not differ significantly (Vuong [2]_), the one is added that predicts experiments best that are left
-    out of the fit, one at a time, if there are at least three. The search ends if no candidate is significant, if the
-    evidence increases by less than the logarithm of the number of candidates, if the coefficient is within two robust
-    standard deviations of zero, or if the prediction of experiments that are left out gets worse. At the end, terms
-    that later ones have made needless are removed.
+    candidates are fitted, the best of these by evidence is added, and the search is repeated. Where likelihoods do not
+    differ significantly (as by Vuong [2]_, for normal errors) and there are at least three experiments, these are left
+    out of the fit, one at a time, and only terms are eligible whose predictions of them are off by less than twice the
+    smallest error. The search ends if no candidate is significant, if the evidence increases by less than the logarithm
+    of the number of candidates, if the coefficient is within two robust standard deviations of zero, or if the
+    prediction of experiments that are left out gets worse. At the end, terms that later ones have made needless are
+    removed.
 
     Candidates are products of states, inputs and their rates up to the third degree, powers up to the fifth, absolute
     values, products with these, signs, a constant, and the highest derivatives, in every equation and output. An
@@ -331,7 +334,7 @@ class _State:
         theta = np.array([known.get(name, 0.0) for name in problem.names])
         guesses = {e.name: self.solutions[e.name].states for e in problem.experiments}
         found = nearest_optimum(problem, theta, guesses)
-        if found is None or found[1].status != "converged":
+        if found is None or found[1].status not in ENDED:
             return None
         return _State(problem, found[0], found[1].iterate, names)
 
@@ -447,7 +450,9 @@ class _Search:
         best = max(fitted, key=lambda key: fitted[key].evidence)
         alike = [key for key in fitted if key == best or not _distinct(fitted[best], fitted[key])]
         errors = {key: _held_out(fitted[key]) for key in alike} if len(alike) > 1 else {best: np.nan}
-        first = best if np.isnan(errors[best]) else min(errors, key=lambda key: errors[key])
+        # Errors that are nearly equal are in an order by chance: of these, the evidence tells which is best.
+        well = [key for key in alike if not errors[key] > WORSE * min(errors.values())]
+        first = max(well, key=lambda key: fitted[key].evidence)
         # Each of the candidates is as likely to be the missing one.
         needed = np.log(len(self.terms))
         if (gain := fitted[first].evidence - state.evidence) < needed:
@@ -457,8 +462,8 @@ class _Search:
             )
         same, p = (dict(zip(table["candidate"], table[column], strict=True)) for column in ("same", "p_adjusted"))
         alternatives = list(same[first])
-        for other in alike:
-            if other != first and not errors[other] > WORSE * errors[first]:
+        for other in well:
+            if other != first:
                 alternatives += [other, *same[other]]
         return first, tuple(alternatives), float(p[first]), fitted[first]
 
@@ -511,11 +516,11 @@ def _step(
 def _distinct(one: _State, other: _State) -> bool:
     """Return whether the likelihood of one fit is significantly larger than that of another."""
     likelihood = one.problem.likelihood
-    own, others = (likelihood.whitened(state.iterate.here.residuals, one.iterate.noise) for state in (one, other))
-    weight = np.concatenate([np.full(b.size, min(b.weight, 1.0)) for b in likelihood.blocks])
-    change = np.concatenate(others) ** 2 - np.concatenate(own) ** 2
-    error = np.sqrt(np.sum((change - change.mean()) ** 2 / np.maximum(weight, TINY)))
-    return bool(change.sum() > DISTINCT * error)
+    fits = (likelihood.whitened(state.iterate.here.residuals, one.iterate.noise) for state in (one, other))
+    own, others = (np.concatenate(parts) for parts in fits)
+    # |r + d|² − |r|² varies by 2 d·r, r being normal. Its scatter over the components, as Vuong has it, says nothing
+    # where one of them, such as the frequency of a cycle, makes the whole difference.
+    return bool(others @ others - own @ own > DISTINCT * 2.0 * np.linalg.norm(others - own))
 
 
 def _held_out(state: _State) -> float:
