@@ -11,7 +11,7 @@ import pandas as pd
 from scipy import stats
 
 from bayesperiodic import _checks
-from bayesperiodic._linalg import TINY, hessian_scale, in_one_thread, scaled
+from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics.adequacy import ALL, adequacy
 from bayesperiodic.diagnostics.candidates import (
     Candidate,
@@ -23,25 +23,18 @@ from bayesperiodic.diagnostics.candidates import (
     given,
     places,
 )
+from bayesperiodic.diagnostics.optima import Optimum, distinct, held_out_error, problem_of
 from bayesperiodic.diagnostics.score_tests import ScoreTests, along_orbit
-from bayesperiodic.estimation.gauss_newton import Iterate, Objective
 from bayesperiodic.estimation.map_estimate import map_estimate, nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
-from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.posterior.description import check_results
-from bayesperiodic.posterior.parameters import local_names
-from bayesperiodic.posterior.priors import Normal
 from bayesperiodic.posterior.problem import Problem
 
 # Robust standard deviations from zero of a coefficient.
 SIGNIFICANT = 2.0
-# Standard deviations of the difference of two log-likelihoods from which on the data tell two terms apart.
-DISTINCT = 2.0
 # Ratio of the errors in experiments that are left out from which on these tell two terms apart.
 WORSE = 2.0
-# Fewest experiments of which one is left out at a time.
-FEWEST_EXPERIMENTS = 3
 
 
 @dataclass(frozen=True)
@@ -170,7 +163,7 @@ class MissingTerms:
         ValueError
             If there are fewer steps.
         """
-        return _problem_of(self._problem, self.model(k), {name: width for name, (_, width) in self._first(k).items()})
+        return problem_of(self._problem, self.model(k), {name: width for name, (_, width) in self._first(k).items()})
 
     def fit(self, k: int | None = None) -> MapEstimate:
         """Return the estimate of `problem`.
@@ -229,7 +222,7 @@ class MissingTerms:
 
 
 NOT_TOLD = "its effect is that of the parameters"
-VANISHED = "with it the fit found no periodic solution"
+VANISHED = "with it the fit found no periodic solution, or no optimum"
 
 
 @in_one_thread
@@ -251,12 +244,13 @@ def missing_terms(
     c its effect on the whitened outputs, less what the parameters can do instead, and r the residual, the statistic is
     c·r over its standard deviation by the measured noise, or by the spectrum of the residual where that was not
     measured. The p-values are adjusted for the false discovery rate (Benjamini and Hochberg [1]_). The best significant
-    candidates are fitted, the best of these by evidence is added, and the search is repeated. Of those whose
-    likelihoods do not differ significantly (Vuong [2]_), the one is added that predicts experiments best that are left
-    out of the fit, one at a time, if there are at least three. The search ends if no candidate is significant, if the
-    evidence increases by less than the logarithm of the number of candidates, if the coefficient is within two robust
-    standard deviations of zero, or if the prediction of experiments that are left out gets worse. At the end, terms
-    that later ones have made needless are removed.
+    candidates are fitted, the best of these by evidence is added, and the search is repeated. Where likelihoods do not
+    differ significantly (as by Vuong [2]_, for normal errors) and there are at least three experiments, these are left
+    out of the fit, one at a time, and only terms are eligible whose predictions of them are off by less than twice the
+    smallest error. The search ends if no candidate is significant, if the evidence increases by less than the logarithm
+    of the number of candidates, if the coefficient is within two robust standard deviations of zero, or if the
+    prediction of experiments that are left out gets worse. At the end, terms that later ones have made needless are
+    removed.
 
     Candidates are products of states, inputs and their rates up to the third degree, powers up to the fifth, absolute
     values, products with these, signs, a constant, and the highest derivatives, in every equation and output. An
@@ -324,47 +318,6 @@ def _deviations(problem: Problem, fit: MapEstimate) -> dict[str, float]:
     return dict(zip(variables, np.std(np.concatenate(each, axis=1), axis=1).tolist(), strict=True))
 
 
-def _problem_of(problem: Problem, model: Model, widths: Mapping[str, float], zero: Iterable[str] = ()) -> Problem:
-    """Return the problem with another model, whose new coefficients have priors of these widths or are zero."""
-    settings = dict(problem._given)
-    settings["priors"] = settings["priors"] | {name: Normal(0.0, width) for name, width in widths.items()}
-    settings["fixed"] = settings["fixed"] | dict.fromkeys(zero, 0.0)
-    return Problem(experiments=problem.experiments, **settings | {"model": model})
-
-
-@dataclass(frozen=True)
-class _State:
-    """A problem with some of the terms and the optimum of its density, errors of inputs fixed."""
-
-    problem: Problem
-    objective: Objective
-    iterate: Iterate
-    names: tuple[str, ...]  # of the terms' coefficients
-
-    @property
-    def solutions(self) -> dict[str, PeriodicSolution]:
-        return self.iterate.here.simulator.solutions(self.iterate.theta)
-
-    @property
-    def evidence(self) -> float:
-        """The logarithm of the evidence by Laplace, but for a constant."""
-        hessian, _ = self.objective.hessian_and_gradient(self.iterate)
-        scale = hessian_scale(hessian)
-        values = np.linalg.eigvalsh(scaled(hessian, scale))
-        size = np.sum(np.log(np.maximum(values, TINY))) - 2.0 * np.sum(np.log(scale))
-        return float(self.iterate.objective - 0.5 * size + 0.5 * scale.size * np.log(2.0 * np.pi))
-
-    def with_problem(self, problem: Problem, names: tuple[str, ...]) -> "_State | None":
-        """Return the optimum of a problem with other terms, from here on; None if there is none."""
-        known = dict(zip(self.problem.names, self.iterate.theta.tolist(), strict=True))
-        theta = np.array([known.get(name, 0.0) for name in problem.names])
-        guesses = {e.name: self.solutions[e.name].states for e in problem.experiments}
-        found = nearest_optimum(problem, theta, guesses)
-        if found is None or found[1].status != "converged":
-            return None
-        return _State(problem, found[0], found[1].iterate, names)
-
-
 class _Search:
     """Candidates of one problem, and the steps."""
 
@@ -381,7 +334,7 @@ class _Search:
         state = self.at(fit, ())
         ranking = self.scores(state)
         steps: list[Step] = []
-        table, before = ranking, _step(state, fit, fit, None, _held_out(state))
+        table, before = ranking, _step(state, fit, fit, None, held_out_error(state))
         stopped = f"The search ended after {max_terms} terms, as asked for by max_terms."
         chosen: dict[str, Candidate] = {}
         fits = [fit]
@@ -397,7 +350,7 @@ class _Search:
                 stopped = f"{key} fits best, but the estimate with it was lost."
                 break
             state_after = self.at(fit_after, (*chosen, name))
-            held_out, last = _held_out(state_after), steps[-1].held_out if steps else before.held_out
+            held_out, last = held_out_error(state_after), steps[-1].held_out if steps else before.held_out
             if abs(fit_after.theta[name]) < SIGNIFICANT * fit_after.robust_sd[name]:
                 stopped = f"{key} fits best, but its coefficient is less than {SIGNIFICANT:g} robust sds from zero."
                 break
@@ -418,24 +371,24 @@ class _Search:
             tuple(steps), ranking, len(ranking), self.refused, before, dropped, stopped, self.problem, kept, tuple(fits)
         )
 
-    def at(self, fit: MapEstimate, names: tuple[str, ...]) -> _State:
+    def at(self, fit: MapEstimate, names: tuple[str, ...]) -> Optimum:
         """Return the optimum at an estimate of the model with terms."""
         problem = self.with_terms(names).with_input_errors(fit.input_errors)
         theta, guesses = problem.vector(fit.theta), {n: solution.states for n, solution in fit.solutions.items()}
         found = nearest_optimum(problem, theta, guesses)
         if found is None:
             raise ValueError("fit: must be an estimate with a periodic solution of every experiment, got one without.")
-        return _State(problem, found[0], found[1].iterate, names)
+        return Optimum(problem, found[0], found[1].iterate, names)
 
     def with_terms(self, names: Iterable[str]) -> Problem:
         """Return the problem with coefficients of the compiled model, the others zero."""
         model, known = self.compiled
         zero = [name for name in known if name not in {*names}]
-        return _problem_of(self.problem, model, {name: self.widths[name] for name in names}, zero)
+        return problem_of(self.problem, model, {name: self.widths[name] for name in names}, zero)
 
-    def estimate(self, terms: Mapping[str, Candidate], near: _State) -> MapEstimate | None:
+    def estimate(self, terms: Mapping[str, Candidate], near: Optimum) -> MapEstimate | None:
         """Return the estimate of the model with terms, by name, from a near optimum; None if it cannot start there."""
-        problem = _problem_of(self.problem, extended(self.model, terms), {name: self.widths[name] for name in terms})
+        problem = problem_of(self.problem, extended(self.model, terms), {name: self.widths[name] for name in terms})
         start = dict(zip(near.problem.names, near.iterate.theta.tolist(), strict=True))
         guesses = {name: solution.states for name, solution in near.solutions.items()}
         with warnings.catch_warnings():
@@ -445,7 +398,7 @@ class _Search:
             except ValueError:
                 return None
 
-    def scores(self, state: _State) -> pd.DataFrame:
+    def scores(self, state: Optimum) -> pd.DataFrame:
         """Return the table of the score tests of candidates that are not yet chosen, the best first."""
         left = [key for key in self.terms if self.names[key] not in state.names and key not in self.refused]
         tests = ScoreTests(state.problem, state.iterate, [self.terms[key] for key in left])
@@ -460,8 +413,8 @@ class _Search:
         return table
 
     def best(
-        self, state: _State, table: pd.DataFrame, chosen: Mapping[str, Candidate]
-    ) -> tuple[str, tuple[str, ...], float, _State] | str:
+        self, state: Optimum, table: pd.DataFrame, chosen: Mapping[str, Candidate]
+    ) -> tuple[str, tuple[str, ...], float, Optimum] | str:
         """Return the term to be added, its alternatives, p, and the optimum with it; or why there is none."""
         if not len(table):
             return "No candidate is left."
@@ -473,7 +426,7 @@ class _Search:
             )
         tried = list(significant["candidate"][: self.keep])
         self.compile(tried, list(significant["candidate"][: 2 * self.keep]), chosen)
-        fitted: dict[str, _State] = {}
+        fitted: dict[str, Optimum] = {}
         for key in tried:
             names = (*chosen, self.names[key])
             problem = self.with_terms(names).with_input_errors(state.problem.input_errors)
@@ -484,9 +437,11 @@ class _Search:
         if not fitted:
             return f"With {', '.join(tried)}, the best candidates, no periodic solution was found."
         best = max(fitted, key=lambda key: fitted[key].evidence)
-        alike = [key for key in fitted if key == best or not _distinct(fitted[best], fitted[key])]
-        errors = {key: _held_out(fitted[key]) for key in alike} if len(alike) > 1 else {best: np.nan}
-        first = best if np.isnan(errors[best]) else min(errors, key=lambda key: errors[key])
+        alike = [key for key in fitted if key == best or not distinct(fitted[best], fitted[key])]
+        errors = {key: held_out_error(fitted[key]) for key in alike} if len(alike) > 1 else {best: np.nan}
+        # Errors that are nearly equal are in an order by chance: of these, the evidence tells which is best.
+        well = [key for key in alike if not errors[key] > WORSE * min(errors.values())]
+        first = max(well, key=lambda key: fitted[key].evidence)
         # Each of the candidates is as likely to be the missing one.
         needed = np.log(len(self.terms))
         if (gain := fitted[first].evidence - state.evidence) < needed:
@@ -496,8 +451,8 @@ class _Search:
             )
         same, p = (dict(zip(table["candidate"], table[column], strict=True)) for column in ("same", "p_adjusted"))
         alternatives = list(same[first])
-        for other in alike:
-            if other != first and not errors[other] > WORSE * errors[first]:
+        for other in well:
+            if other != first:
                 alternatives += [other, *same[other]]
         return first, tuple(alternatives), float(p[first]), fitted[first]
 
@@ -508,7 +463,7 @@ class _Search:
             self.compiled = extended(self.model, terms), terms
 
     def without_needless(
-        self, steps: list[Step], fits: list[MapEstimate], state: _State
+        self, steps: list[Step], fits: list[MapEstimate], state: Optimum
     ) -> tuple[list[Step], list[MapEstimate], tuple[str, ...]]:
         """Return steps and estimates without terms, but for the last, that the evidence is no longer in favour of."""
         dropped: list[str] = []
@@ -526,7 +481,7 @@ class _Search:
         return steps, fits, tuple(dropped)
 
     def again(
-        self, steps: list[Step], fits: list[MapEstimate], near: _State
+        self, steps: list[Step], fits: list[MapEstimate], near: Optimum
     ) -> tuple[list[Step], list[MapEstimate]] | None:
         """Return steps with the estimates of their models, the first ones of which are known; None if one is lost."""
         known, found = len(fits) - 1, list(fits)
@@ -538,13 +493,13 @@ class _Search:
                 return None
             state, term, old = self.at(fit, names), self.terms[keys[names[-1]]], steps[k]
             added = term, old.name, old.alternatives, old.p, old.evidence_gain
-            steps = [*steps[:k], _step(state, fit, found[-1], added, _held_out(state)), *steps[k + 1 :]]
+            steps = [*steps[:k], _step(state, fit, found[-1], added, held_out_error(state)), *steps[k + 1 :]]
             found.append(fit)
         return steps, found
 
 
 def _step(
-    state: _State,
+    state: Optimum,
     fit: MapEstimate,
     before: MapEstimate,
     added: tuple[Candidate, str, tuple[str, ...], float, float] | None,
@@ -569,38 +524,3 @@ def _step(
         held_out,
         {n: (fit.theta[n] - value) / before.sd[n] for n, value in before.theta.items()},
     )
-
-
-def _distinct(one: _State, other: _State) -> bool:
-    """Return whether the likelihood of one fit is significantly larger than that of another."""
-    likelihood = one.problem.likelihood
-    own, others = (likelihood.whitened(state.iterate.here.residuals, one.iterate.noise) for state in (one, other))
-    weight = np.concatenate([np.full(b.size, min(b.weight, 1.0)) for b in likelihood.blocks])
-    change = np.concatenate(others) ** 2 - np.concatenate(own) ** 2
-    error = np.sqrt(np.sum((change - change.mean()) ** 2 / np.maximum(weight, TINY)))
-    return bool(change.sum() > DISTINCT * error)
-
-
-def _held_out(state: _State) -> float:
-    """Return the mean fraction unexplained in experiments that are left out, one at a time; NaN for few experiments."""
-    problem = state.problem
-    if len(problem.experiments) < FEWEST_EXPERIMENTS or any(local_names(problem.names)):
-        return np.nan
-    guesses = {name: solution.states for name, solution in state.solutions.items()}
-    whole, fractions = problem.anchored(state.iterate.theta, guesses), []
-    for e in problem.experiments:
-        errors = {name: own for name, own in problem.input_errors.items() if name != e.name}
-        try:
-            rest = problem.with_experiments([other for other in problem.experiments if other is not e])
-        except ValueError:  # fewer values than the parameters need
-            return np.nan
-        found = state.with_problem(rest.with_input_errors(errors), state.names)
-        if found is None:
-            return np.inf
-        outputs, converged = whole.outputs(found.iterate.theta[None])
-        if not converged.all():
-            return np.inf
-        for channel, measured in e.outputs.items():
-            left = measured - e.project(channel, outputs[e.name][channel][0])
-            fractions.append(float(np.mean(left**2) / np.var(measured)))
-    return float(np.mean(fractions))

@@ -24,7 +24,7 @@ def parsed(text: str) -> Unit | None:
     if not over.strip() or len(under) > 1:
         return None
     found: Unit = {}
-    for sign, part in ((1.0, over), (-1.0, *under) if under else (1.0, "")):
+    for sign, part in zip((1.0, -1.0), (over, *under), strict=False):
         for word in part.split():
             if word == "1":
                 continue
