@@ -7,10 +7,20 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
-from bayesperiodic.diagnostics.candidates import Candidate, coefficient_names, extended, factors, generated, places
-from bayesperiodic.diagnostics.missing_terms import _problem_of
+from bayesperiodic.diagnostics.candidates import (
+    Candidate,
+    coefficient_names,
+    coefficient_unit,
+    extended,
+    factors,
+    generated,
+    given,
+    places,
+)
+from bayesperiodic.diagnostics.optima import problem_of
 from bayesperiodic.diagnostics.score_tests import ScoreTests, _effects
 from bayesperiodic.estimation.map_estimate import nearest_optimum
+from bayesperiodic.models import units
 from tests.known import LINEAR, linear_experiment
 from tests.problems import C2, quadratic_damping
 
@@ -222,7 +232,7 @@ def test_effects_of_the_parameters_are_refused(found):
 def test_a_coefficient_of_zero_does_not_change_the_model(damped):
     problem, fit = damped
     term = Candidate("displacement", "force", problem.model.input_symbols["force"])
-    other = _problem_of(problem, extended(problem.model, {"c9": term}), {}, zero=["c9"])
+    other = problem_of(problem, extended(problem.model, {"c9": term}), {}, zero=["c9"])
     assert other.names == problem.names
     theta = problem.vector(fit.theta)
     one, two = (p.outputs(theta[None])[0]["run 0"]["displacement"] for p in (problem, other))
@@ -258,3 +268,30 @@ def test_a_missing_output_term_of_one_static_record_is_found():
     assert step.place == "force" and np.isnan(step.held_out) and np.isnan(found.before.held_out)
     assert step.term == "tanh(dx/0.1)" or "tanh(dx/0.1) in force" in step.alternatives
     assert step.verdict == "adequate" and found.before.verdict == "misspecified"
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [("N s/m^2", "N s/m^2"), ("J/(kg K)", "J/(kg K)"), ("1/V²", "1/V^2"), ("rad·m", "rad m"), ("1", "1")],
+)
+def test_units_are_read_and_written(text, unit):
+    assert units.written(units.parsed(text)) == unit
+
+
+def test_units_are_compared_in_base_units():
+    assert units.same(units.parsed("N m"), units.parsed("J")) and units.same(units.parsed("V A"), units.parsed("W"))
+    assert not units.same(units.parsed("N"), units.parsed("J"))
+    assert units.parsed("") is None and units.parsed("m/s/s") is None
+
+
+def test_coefficients_have_units_and_sums_of_different_dimensions_are_refused():
+    place = {"force": ["w*displacement**2", "tanh(ddisplacement/0.01)"], "equation of w": ["w*ddisplacement"]}
+    found = given(bp.models.dahl, place)
+    assert [coefficient_unit(bp.models.dahl, term) for term in found] == ["N/m^2", "N", "1/m"]
+    assert extended(bp.models.dahl, {"c": found[0]}).units["c"] == "N/m^2"
+    for text, what in (
+        ("displacement + ddisplacement", "a sum of m and m/s"),
+        ("exp(displacement)", "exp of a .* in m"),
+    ):
+        with pytest.raises(ValueError, match=rf"candidates\['force'\]: must add quantities of the same unit, .*{what}"):
+            given(bp.models.dahl, {"force": [text]})
