@@ -112,7 +112,6 @@ def jointly(recordings: Iterable[bp.Recording], seed: int, *, quick: bool, one_c
 
 SIGNS = POSITIVE, UNDETERMINED, NEGATIVE = "positive", "undetermined", "negative"
 ONE_SIGN, MONTE_CARLO_ERRORS = 0.975, 3.0
-FALSE_ALARM = 0.01
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class OfTruth:
     verdicts: dict[str, Verdict]  # The displacement given
     joint: dict[str, Identified]  # All experiments, theta4 and theta6 in common, by the given signal
     sensitivity: dict[str, dict[str, Any]]  # The other parameters under priors, by experiment
-    forced: dict[str, Verdict]  # The force given, with its noise propagated
+    forced: dict[str, Verdict]  # The force given, its noise integrated out
     dropped: Dropped
 
 
