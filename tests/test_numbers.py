@@ -479,9 +479,25 @@ def noisy_inputs():
     yield f"{d['replicates']} recordings a point"
 
 
+def missing_terms():
+    d = results("missing_terms")
+    cases = d["cases"].values()
+    found = [100 * one["shares"]["right term first"] for one in cases if one["missing"]]
+    left_alone = [100 * one["shares"]["none"] for one in cases if not one["missing"]]
+    yield f"In {d['replicates']} data sets a case the true term comes first in {span(found)} %"
+    yield f"where nothing is missing no term is found in {span(left_alone)} %"
+
+
+def span(values):
+    """Return "a to b", or one number if all are equal."""
+    low, high = (f"{value:.0f}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
+
+
 SUBJECTS = (
     pendulum, landing_gear, landing_gear_cost, landing_gear_campaigns, damper, silverbox, flutter, flutter_campaigns,
     solver, benchmark, benchmark_table, calibration, verdicts, sampling, noisy_inputs,
+    missing_terms,
 )  # fmt: skip
 
 SETTING, DEFINITION, ELSEWHERE, UNSTORED, DATE = (
