@@ -204,7 +204,9 @@ class MissingTerms:
         return pd.DataFrame.from_dict(rows, orient="index")
 
     def __repr__(self) -> str:
-        lines = [f"Missing terms, of {self.tested} candidates (false discovery rate of the score tests, see p):"]
+        lines = [
+            f"Missing terms, of {self.tested} candidates; variance unexplained in the fit and in what was left out:"
+        ]
         lines.append(self.table.to_string(float_format="{:.3g}".format, na_rep="-"))
         for k, step in enumerate(self.steps, 1):
             others = f"; the data do not tell it from {', '.join(step.alternatives)}" * bool(step.alternatives)
@@ -354,7 +356,7 @@ class _Search:
             if abs(fit_after.theta[name]) < SIGNIFICANT * fit_after.robust_sd[name]:
                 stopped = f"{key} fits best, but its coefficient is less than {SIGNIFICANT:g} robust sds from zero."
                 break
-            if held_out > last:
+            if np.isfinite(held_out) and held_out > last:
                 stopped = (
                     f"{key} would improve the fit, but not the prediction of experiments that are left out "
                     f"({last:.3%} unexplained without it, {held_out:.3%} with it)."

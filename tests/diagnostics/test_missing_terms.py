@@ -123,7 +123,10 @@ def test_the_printed_result_says_what_was_found(found):
     said = repr(found)
     (step,) = found.steps
     assert f"Missing terms, of {found.tested} candidates" in said
-    assert f"1. {step.name}·dx*abs(dx) in equation of x (p = " in said and "of its standard deviations." in said
+    assert (
+        f"1. {step.name}·dx*abs(dx) in equation of x, {step.name} = 0.3 ± " in said
+        and "of its standard deviations." in said
+    )
     assert "No further candidate is significant at a false discovery rate of 0.01" in said
     dropped = replace(found, dropped=("x in displacement",), refused={"x**5 in equation of x": "it is unwanted"})
     assert "Removed again: x in displacement." in repr(dropped)
