@@ -267,6 +267,8 @@ class Shared:
         self.members = tuple(members)
         self.parts = np.split(vectors[:, large] * values[large], np.cumsum(sizes)[:-1])
         self._grams = [part.T @ part for part in self.parts]
+        # Unit vectors of the components that errors move, and whether these are all components.
+        self._axes, self._complete = np.ascontiguousarray(vectors[:, large]), int(large.sum()) == len(vectors)
         # Lᵀ·L of all blocks together, a diagonal matrix.
         self._squares = values[large] ** 2
 
@@ -296,11 +298,13 @@ class Shared:
     def log_likelihood(self, r: Sequence[np.ndarray], p: Sequence[np.ndarray], factor: float) -> np.ndarray:
         """Return −½ (sum of squares + ln|S|) (…,), the logarithm multiplied by a factor; NaN if not finite."""
         if len(r) == 1 and p[0].shape[-1] == 1:  # S is diagonal
-            part, diagonal = self.parts[0], 1.0 + p[0] * self._squares
-            along = (part.T @ r[0][..., None])[..., 0] / self._squares
-            left = r[0] - (part @ along[..., None])[..., 0]
-            square = np.sum(p[0] * left**2, axis=-1) + np.sum(p[0] * self._squares * along**2 / diagonal, axis=-1)
-            return -0.5 * (square + factor * np.sum(np.log(diagonal), axis=-1))
+            diagonal = 1.0 + p[0] * self._squares
+            along = (self._axes.T @ r[0][..., None])[..., 0]
+            total = np.add.reduce(factor * np.log(diagonal) + along * along * (p[0] / diagonal), axis=-1)
+            if not self._complete:
+                left = r[0] - (self._axes @ along[..., None])[..., 0]
+                total = total + p[0][..., 0] * np.add.reduce(left * left, axis=-1)
+            return -0.5 * total
         matrix, vector = self._system(r, p)
         wrong = ~(np.isfinite(matrix).all(axis=(-2, -1)) & np.isfinite(vector).all(axis=-1))
         if np.any(wrong):

@@ -251,11 +251,7 @@ class Likelihood:
         bias correction of eq. (7), see `gauss_newton.bias_correction`.
         """
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            with_errors = {b for one in self.shared for b in one.members}
-            rest = [np.zeros_like(r) if b in with_errors else r for b, r in enumerate(residuals)]
-            total = (self._flat if self.model.flat else self._by_kind)(
-                rest if with_errors else residuals, values, log_variance_factor
-            )
+            total = (self._flat if self.model.flat else self._by_kind)(residuals, values, log_variance_factor)
             for one in self.shared:
                 own, precisions = [residuals[b] for b in one.members], self.precisions(one.members, values)
                 total = total + one.log_likelihood(own, precisions, _mean(log_variance_factor, one))
@@ -349,8 +345,12 @@ class Likelihood:
     def _by_kind(
         self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
     ) -> np.ndarray:
-        """Return the log-likelihood (…,) of errors whose spectrum is not flat, alike blocks together."""
+        """Return the log-likelihood (…,) of errors whose spectrum is not flat, alike blocks together.
+
+        Without the squares of blocks that share errors of inputs.
+        """
         total = np.zeros(values.shape[:-1])
+        residuals = [r * alone if self.shared else r for r, alone in zip(residuals, self._alone, strict=True)]
         for members in self._alike:
             own = values[..., self._columns[members[0]]]
             factor = float(np.broadcast_to(log_variance_factor, len(residuals))[members[0]])
@@ -360,9 +360,13 @@ class Likelihood:
     def _flat(
         self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
     ) -> np.ndarray:
-        """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat."""
+        """Return the log-likelihood (…,) of all blocks under errors whose spectrum is flat.
+
+        Without the squares of blocks that share errors of inputs.
+        """
         at, known, columns, sizes, weights, measured = self._levels
         squares = Residuals.of(residuals).squares
+        squares = squares * self._alone if self.shared else squares
         v = self.model.level(values[..., columns] * self._gains[at], measured)
         # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
         factor = log_variance_factor if isinstance(log_variance_factor, float) else log_variance_factor[at]
@@ -371,6 +375,12 @@ class Likelihood:
         if known.size:
             total = total + np.add.reduce(np.ascontiguousarray(squares[..., known]), axis=-1)
         return -0.5 * total
+
+    @cached_property
+    def _alone(self) -> np.ndarray:
+        """Zero for blocks that share errors of inputs, one for the others, (blocks,)."""
+        with_errors = {b for one in self.shared for b in one.members}
+        return np.array([0.0 if b in with_errors else 1.0 for b in range(len(self.blocks))])
 
     @cached_property
     def _levels(self) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -418,6 +428,9 @@ class Likelihood:
     def precisions(self, members: Sequence[int], values: np.ndarray) -> list[np.ndarray]:
         """Return weights over variances of the components of some blocks, (…, size), or (…, 1) if they are the same."""
         result = []
+        if self.model.flat and len(members) == 1 and (block := self.blocks[members[0]]).kind == SPECTRAL:
+            v = values[..., self._columns[members[0]][:1]] * self._gains[members[0]]
+            return [block.weight / self.model.level(v, block.measured)]
         for b in members:
             block, phi = self.blocks[b], values[..., self._columns[b]]
             if block.kind == KNOWN:
