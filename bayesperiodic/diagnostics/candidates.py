@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
+from itertools import chain, combinations_with_replacement, count
 from typing import Any
 
 import numpy as np
@@ -196,13 +196,10 @@ def coefficient_names(model: Model, terms: Iterable[Candidate]) -> list[str]:
     taken = {*model.parameters, *model.state_symbols, *model.input_symbols, *model.outputs}
     names: list[str] = []
     for term in terms:
-        plain = first = "c_" + re.sub(r"\W+", "_", term.text).strip("_")
-        number = 1
-        while plain in taken:
-            number += 1
-            plain = f"{first}_{number}" if number > 2 else "c_" + re.sub(r"\W+", "_", str(term)).strip("_")
-        taken.add(plain)
-        names.append(plain)
+        short, long = ("c_" + re.sub(r"\W+", "_", text).strip("_") for text in (term.text, str(term)))
+        choices = chain((short, long), (f"{long}_{number}" for number in count(2)))
+        names.append(next(name for name in choices if name not in taken))
+        taken.add(names[-1])
     return names
 
 

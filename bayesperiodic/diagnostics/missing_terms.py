@@ -26,7 +26,7 @@ from bayesperiodic.diagnostics.candidates import (
 from bayesperiodic.diagnostics.optima import Optimum, distinct, held_out_error, problem_of
 from bayesperiodic.diagnostics.score_tests import ScoreTests, along_orbit
 from bayesperiodic.estimation.map_estimate import map_estimate, nearest_optimum
-from bayesperiodic.estimation.result import MapEstimate
+from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
 from bayesperiodic.posterior.description import check_results
 from bayesperiodic.posterior.problem import Problem
@@ -283,7 +283,8 @@ def missing_terms(
     Raises
     ------
     ValueError
-        If the fit is not that of the problem, or for unknown places, names, and derivatives.
+        If the fit is not that of the problem or on other orbits than the measured ones, or for unknown places, names,
+        and derivatives.
 
     References
     ----------
@@ -299,6 +300,8 @@ def missing_terms(
     ()
     """
     stated = check_results(problem, fit=fit)
+    if advice := orbit_advice(fit):
+        raise ValueError(f"fit: must be an estimate on the measured orbits, got one on others; {advice}.")
     _checks.integer("max_terms", max_terms, 0)
     _checks.integer("keep", keep, 1)
     if not 0.0 < _checks.finite_number("false_discovery_rate", false_discovery_rate) < 1.0:

@@ -428,11 +428,11 @@ class Likelihood:
     def precisions(self, members: Sequence[int], values: np.ndarray) -> list[np.ndarray]:
         """Return weights over variances of the components of some blocks, (…, size), or (…, 1) if they are the same."""
         result = []
-        if self.model.flat and len(members) == 1 and (block := self.blocks[members[0]]).kind == SPECTRAL:
-            v = values[..., self._columns[members[0]][:1]] * self._gains[members[0]]
-            return [block.weight / self.model.level(v, block.measured)]
         for b in members:
             block, phi = self.blocks[b], values[..., self._columns[b]]
+            if self.model.flat and block.kind == SPECTRAL:
+                result.append(block.weight / self.model.level(phi[..., :1] * self._gains[b], block.measured))
+                continue
             if block.kind == KNOWN:
                 result.append(np.ones((*values.shape[:-1], 1)))
                 continue

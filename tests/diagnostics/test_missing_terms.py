@@ -7,6 +7,7 @@ import pytest
 import sympy as sp
 
 import bayesperiodic as bp
+from bayesperiodic.diagnostics import missing_terms
 from bayesperiodic.diagnostics.candidates import (
     Candidate,
     coefficient_names,
@@ -298,3 +299,28 @@ def test_coefficients_have_units_and_sums_of_different_dimensions_are_refused():
     ):
         with pytest.raises(ValueError, match=rf"candidates\['force'\]: must add quantities of the same unit, .*{what}"):
             given(bp.models.dahl, {"force": [text]})
+
+
+def test_an_estimate_on_another_orbit_is_refused(damped):
+    problem, fit = damped
+    with pytest.raises(ValueError, match="fit: must be an estimate on the measured orbits, .* 'run 0', see"):
+        bp.missing_terms(problem, replace(fit, other_orbits={"run 0": "it has another period"}))
+
+
+def test_prediction_of_experiments_left_out_decides_between_terms_that_fit_alike(monkeypatch, damped):
+    """Of fits that are not distinct, one with twice the error in left-out experiments is no alternative."""
+    problem, fit = damped
+    errors = {"dx*abs(dx)": 2.1e-7, "dx**3": 1e-7}
+    wanted = {"equation of x": list(errors)}
+    monkeypatch.setattr(missing_terms, "distinct", lambda one, other: False)
+
+    def error(state):
+        terms = [name for name in state.names if state.iterate.theta[state.problem.names.index(name)] != 0.0]
+        return 1.0 if not terms else errors["dx**3" if "3" in terms[0] else "dx*abs(dx)"]
+
+    monkeypatch.setattr(missing_terms, "held_out_error", error)
+    found = bp.missing_terms(problem, fit, wanted, equations=False, outputs=False, max_terms=1)
+    assert found.steps[0].term == "dx**3" and found.steps[0].alternatives == ()
+    errors["dx*abs(dx)"] = 1.9e-7
+    found = bp.missing_terms(problem, fit, wanted, equations=False, outputs=False, max_terms=1)
+    assert found.steps[0].term == "dx*abs(dx)" and found.steps[0].alternatives == ("dx**3 in equation of x",)
