@@ -352,8 +352,9 @@ class _Search:
             term, name = self.terms[key], self.names[key]
             fit_after = self.estimate({**chosen, name: term}, after)
             if fit_after is None:
-                stopped = f"{key} fits best, but the estimate with it was lost."
-                break
+                self.refused[key] = VANISHED
+                table = table[table["candidate"] != key]
+                continue
             state_after = self.at(fit_after, (*chosen, name))
             held_out, last = held_out_error(state_after), steps[-1].held_out if steps else before.held_out
             if abs(fit_after.theta[name]) < SIGNIFICANT * fit_after.robust_sd[name]:

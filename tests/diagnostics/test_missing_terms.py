@@ -324,3 +324,17 @@ def test_prediction_of_experiments_left_out_decides_between_terms_that_fit_alike
     errors["dx*abs(dx)"] = 1.9e-7
     found = bp.missing_terms(problem, fit, wanted, equations=False, outputs=False, max_terms=1)
     assert found.steps[0].term == "dx*abs(dx)" and found.steps[0].alternatives == ("dx**3 in equation of x",)
+
+
+def test_a_term_whose_estimate_is_lost_is_refused_and_the_next_one_taken(monkeypatch, damped):
+    problem, fit = damped
+    estimate = missing_terms._Search.estimate
+
+    def lost(self, terms, near):
+        return None if any(term.text == "dx*abs(dx)" for term in terms.values()) else estimate(self, terms, near)
+
+    monkeypatch.setattr(missing_terms._Search, "estimate", lost)
+    wanted = {"equation of x": ["dx*abs(dx)", "dx**3"]}
+    found = bp.missing_terms(problem, fit, wanted, equations=False, outputs=False, max_terms=1)
+    assert [step.term for step in found.steps] == ["dx**3"]
+    assert "no periodic solution" in found.refused["dx*abs(dx) in equation of x"]
