@@ -275,13 +275,18 @@ def flutter():
     yield f"These estimates are up to {apart} of their standard deviations apart."
     missing = d["missing_terms"]
     models, terms = missing["models"], [f"`{step['term']}`" for step in missing["steps"]]
-    fitted, left_out = ([f"{100 * model[key]:.1f} %" for model in models] for key in ("errors_rms", "left_out_rms"))
-    yield f"of {missing['candidates']} candidates in the equations: with {terms[0]} and {terms[1]} in the moment and"
-    yield f"{terms[2]} in the equation of the wake, fitted amplitudes miss by {fitted[3]} and those of"
-    yield f"left out by {left_out[3]}, where the given model misses these by {left_out[0]}."
-    yield f"improves the fit to {fitted[4]} and the prediction to {left_out[4]} only"
-    assert len({model["without_a_cycle"] for model in models}) == 1
-    yield f"With all of these models {models[0]['without_a_cycle']} cycles have no counterpart"
+    assert [step["place"] for step in missing["steps"]][:3] == ["equation of alpha", "equation of w", "equation of w"]
+    assert {step["verdict"] for step in missing["steps"]} == {"misspecified"}
+    fitted, left_out = ([f"{100 * model[key]:.1f}" for model in models] for key in ("errors_rms", "left_out_rms"))
+    yield f"of {missing['candidates']} candidates in the equations: with {terms[0]} in the moment,"
+    yield f"{terms[1]} and {terms[2]} in the equation of the wake, fitted amplitudes miss by {fitted[3]} % and those of"
+    yield (
+        f"left out by {left_out[3]} %, where the given model misses these by {left_out[0]} % and lacks "
+        f"{models[0]['without_a_cycle']} of them"
+    )
+    assert models[3]["without_a_cycle"] == 0 and float(fitted[4]) > float(fitted[3])
+    yield f"A fourth term makes it worse, {fitted[4]} and {left_out[4]} %."
+    yield f"first two terms alone predict no better than {left_out[2]} %"
 
 
 def flutter_campaigns():
