@@ -199,18 +199,21 @@ class Likelihood:
 
     def log_prior(self, values: np.ndarray) -> np.ndarray:
         """Return the log-density of the free noise parameters over their logarithms, (…,)."""
-        return self._log_prior(values)[0]
-
-    def _log_prior(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        total, slopes = np.zeros(values.shape[:-1]), np.zeros(values.shape)
+        total = np.zeros(values.shape[:-1])
         for kind, columns, measured in self._kinds:
-            value, slopes[..., columns] = self.model.log_prior(kind, values[..., columns], measured)
-            total = total + value.sum(axis=-1)
+            total = total + self.model.log_prior(kind, values[..., columns], measured)[0].sum(axis=-1)
         for column, block, spectrum in self._spectra_of_errors:
-            value, slope = self.model.jeffreys_factor(block, values[..., column], spectrum)
-            total = total + value
-            slopes[..., column] += slope
-        return total, slopes
+            total = total + self.model.jeffreys_factor(block, values[..., column], spectrum)
+        return total
+
+    def _prior_slopes(self, values: np.ndarray) -> np.ndarray:
+        """Return the derivatives of `log_prior` by the logarithms of the parameters, (…, names)."""
+        slopes = np.zeros(values.shape)
+        for kind, columns, measured in self._kinds:
+            slopes[..., columns] = self.model.log_prior(kind, values[..., columns], measured)[1]
+        for column, block, spectrum in self._spectra_of_errors:
+            slopes[..., column] += self.model.jeffreys_slope(block, values[..., column], spectrum)
+        return slopes
 
     @cached_property
     def _spectra_of_errors(self) -> list[tuple[int, Block, np.ndarray]]:
@@ -365,12 +368,16 @@ class Likelihood:
         Without the squares of blocks that share errors of inputs.
         """
         at, known, columns, sizes, weights, measured = self._levels
-        squares = Residuals.of(residuals).squares
-        squares = squares * self._alone if self.shared else squares
         v = self.model.level(values[..., columns] * self._gains[at], measured)
-        # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
         factor = log_variance_factor if isinstance(log_variance_factor, float) else log_variance_factor[at]
-        terms = np.ascontiguousarray(weights * (factor * sizes * np.log(v) + squares[..., at] / v))
+        terms = factor * sizes * np.log(v)
+        squares = np.zeros(len(self.blocks))
+        if np.any(self._alone):
+            squares = Residuals.of(residuals).squares
+            squares = squares * self._alone if self.shared else squares
+            terms = terms + squares[..., at] / v
+        # Row by row in memory, and not by BLAS: the rounding of a sum must not depend on how many rows there are.
+        terms = np.ascontiguousarray(weights * terms)
         total = np.add.reduce(terms, axis=-1)
         if known.size:
             total = total + np.add.reduce(np.ascontiguousarray(squares[..., known]), axis=-1)
@@ -492,7 +499,7 @@ class Likelihood:
         self, residuals: Sequence[np.ndarray], values: np.ndarray, log_variance_factor: float | np.ndarray
     ) -> tuple[list[np.ndarray], np.ndarray]:
         """Return the gradients by each block's residual and by ln φ (names,) under errors that are not white."""
-        slopes = self._log_prior(values)[1]
+        slopes = self._prior_slopes(values)
         by_residual: list[np.ndarray] = [np.empty(0)] * len(self.blocks)
         for members in self._alike:
             block, columns = self.blocks[members[0]], self._columns[members[0]]
@@ -515,7 +522,7 @@ class Likelihood:
         self, residuals: Residuals, values: np.ndarray, log_variance_factor: float | np.ndarray
     ) -> tuple[Residuals, np.ndarray]:
         """Return the gradients by each block's residual and by ln φ (names,) under errors whose spectrum is flat."""
-        by_value, squares = self._log_prior(values)[1], residuals.squares
+        by_value, squares = self._prior_slopes(values), residuals.squares
         at, _, columns, sizes, weights, measured = self._levels
         raised = values[columns] * self._gains[at]
         v = self.model.level(raised, measured)

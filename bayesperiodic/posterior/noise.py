@@ -289,7 +289,7 @@ class Noise(ABC):
             return np.log(value), np.ones_like(value)
         return _over_logarithm(self._proper_prior, value)
 
-    def jeffreys_factor(self, block: Block, value: np.ndarray, added: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def jeffreys_factor(self, block: Block, value: np.ndarray, added: np.ndarray) -> np.ndarray:
         """Return by what Jeffreys' prior of a variance is smaller where errors of the inputs add variances.
 
         With components of variances V + λ it is √(Σ 1/(V + λ)²), the root of the information, instead of 1/V; without
@@ -306,16 +306,24 @@ class Noise(ABC):
 
         Returns
         -------
-        log_factor : array (…)
-        slope : array (…)
-            By the logarithm of the variance.
+        array (…)
+            The logarithm.
         """
-        from_value = value * (self.gain(block) if self.flat else block.size / block.points)
-        total = self.level(from_value, block.measured) if block.kind != CORRELATED else from_value
+        total = self._mean_variance(block, value)[0][..., None]
+        share = total / (total + added)
+        return np.asarray(0.5 * np.log(np.add.reduce(share * share, axis=-1) / added.size))
+
+    def jeffreys_slope(self, block: Block, value: np.ndarray, added: np.ndarray) -> np.ndarray:
+        """Return the derivative (…,) of `jeffreys_factor`, whose arguments it has, by the logarithm of the variance."""
+        total, from_value = self._mean_variance(block, value)
         share = total[..., None] / (total[..., None] + added)
-        mean = np.mean(share**2, axis=-1)
-        slope = np.mean(share**2 * (1.0 - share), axis=-1) / mean * from_value / total
-        return 0.5 * np.log(mean), slope
+        slope = np.mean(share**2 * (1.0 - share), axis=-1) / np.mean(share**2, axis=-1)
+        return np.asarray(slope * from_value / total)
+
+    def _mean_variance(self, block: Block, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean variance (…,) of a block's components, and the part of it that the variance causes."""
+        from_value = value * (self.gain(block) if self.flat else block.size / block.points)
+        return self.level(from_value, block.measured) if block.kind != CORRELATED else from_value, from_value
 
     @cached_property
     def _proper_prior(self) -> Prior:
