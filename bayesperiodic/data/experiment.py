@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,6 +10,9 @@ from numpy.typing import ArrayLike
 from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import covariance_cholesky
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 MEANING = "samples·periods"
 
@@ -56,6 +60,11 @@ class Experiment(Result):
         Relative growth of the strongest harmonic of each channel over the recording.
     period_drift : float
         Relative change of the period over the averaged cycles, by linear regression.
+    period_test : DataFrame, optional
+        Evidence of ``fold(periods="auto")``, a row for each response period tested: drive ``periods``, ``cycles``
+        used, ``explained`` fraction of the variance (smallest of the channels), share of the variance ``between`` the
+        lines (largest, of ``channel``; 0 if white), ``p`` of the lines that divisors lack, and ``verdict``: "chosen",
+        "not periodic", "adds no lines" or "lacks lines".
     synthetic : bool
         True if the data were simulated.
     mask : bool array (samples·periods,), optional
@@ -110,6 +119,7 @@ class Experiment(Result):
     drift: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     period_drift: float = field(default=0.0, kw_only=True)
     origin: float = field(default=0.0, kw_only=True)
+    period_test: "pd.DataFrame | None" = field(default=None, kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
     covariance: np.ndarray | None = field(default=None, kw_only=True)
@@ -292,9 +302,16 @@ class Experiment(Result):
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
+        found = ""
+        if self.period_test is not None:
+            row = self.period_test.loc[self.period_test.periods == self.periods].iloc[0]
+            found = f"; response period {self.periods} drive periods, chosen of 1 to {self.period_test.periods.max()}: "
+            found += f"it explains {row.explained:.1%} of the variance"
+            found += f", p = {row.p:.1g} without the lines it adds to its divisors" if self.periods > 1 else ""
         return (
             f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples per "
-            f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''})"
+            f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
+            f"{found})"
         )
 
 
