@@ -14,7 +14,7 @@ from bayesperiodic._linalg import covariance_cholesky
 if TYPE_CHECKING:
     import pandas as pd
 
-MEANING = "samples·periods"
+MEANING, DATA = "samples·periods", "data"
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,11 @@ class Experiment(Result):
     multipliers, multiplier_sd : array (multipliers,), optional
         Measured Floquet multipliers, real and signed, largest modulus first, which are compared as log|μ|, and the
         standard deviations of log|μ|, if ``covariance`` has no rows for them.
-    guess : mapping of str to array (samples·periods,), optional
+    guess : "data" or mapping of str to array (samples·periods,), optional
         States of the model, including turns of angles, from which the first periodic solve starts; by default the
-        equilibrium. An unstable orbit needs a guess.
+        equilibrium. An unstable orbit needs a guess, and so does a subharmonic one. "data", for driven models, finds
+        the states that give the measured outputs and, where the outputs leave them free, solve the equations best at
+        the parameters of the start.
 
     Raises
     ------
@@ -125,7 +127,7 @@ class Experiment(Result):
     covariance: np.ndarray | None = field(default=None, kw_only=True)
     multipliers: np.ndarray | None = field(default=None, kw_only=True)
     multiplier_sd: np.ndarray | None = field(default=None, kw_only=True)
-    guess: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+    guess: str | Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
 
     def __post_init__(self) -> None:
         if not _checks.text("name", self.name) or any(c in self.name for c in "/[]"):
@@ -142,11 +144,14 @@ class Experiment(Result):
             }
             _checks.identifiers(kind, channels)
             object.__setattr__(self, kind, channels)
-        guess = {
-            key: _checks.finite_vector(f"guess[{key!r}]", values, points, MEANING)
-            for key, values in (self.guess or {}).items()
-        }
-        object.__setattr__(self, "guess", guess)
+        if isinstance(self.guess, str):
+            _checks.one_of("guess", self.guess, (DATA,))
+        else:
+            guess = {
+                key: _checks.finite_vector(f"guess[{key!r}]", values, points, MEANING)
+                for key, values in (self.guess or {}).items()
+            }
+            object.__setattr__(self, "guess", guess)
         for argument in ("scatter", "independent", "harmonics", "amplitude_variance", "amplitude_freedom", "drift"):
             given = dict(getattr(self, argument) or {})
             object.__setattr__(self, argument, given)

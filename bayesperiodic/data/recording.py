@@ -411,6 +411,7 @@ class Recording(Result):
         harmonics: int | Mapping[str, int] | None = None,
         origin: float | str = 0.0,
         largest_drift: float | None = None,
+        guess: str | Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> Experiment:
         """Fold the steady part of the recording into its mean period on an equidistant grid.
@@ -451,6 +452,8 @@ class Recording(Result):
             at which the fundamental of the first output crosses zero upwards.
         largest_drift : float, optional
             Limit of the relative change of a channel's strongest harmonic over the recording, by linear regression.
+        guess : "data" or mapping of str to array (samples·periods,), optional
+            See `Experiment`.
         name : str, optional
             By default the recording's name.
 
@@ -504,7 +507,9 @@ class Recording(Result):
                 f"recording: must have samples in all parts of its periods, got {self.name!r}, which has too few; "
                 "check the frequency and the gaps, or fold a part by `between` or `split`."
             ) from None
-        return Experiment(name or self.name, synthetic=self.synthetic, period_test=evidence, **folded)
+        return Experiment(
+            name or self.name, synthetic=self.synthetic, period_test=evidence, guess=guess or {}, **folded
+        )
 
     def __repr__(self) -> str:
         kind = "synthetic recording" if self.synthetic else "recording"
