@@ -159,7 +159,7 @@ def fold_signals(
     }
 
 
-def tested_periods(signals: Signals, frequency: float | None) -> "tuple[int, pd.DataFrame]":
+def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, pd.DataFrame]":
     """Return the response period in drive periods, and its evidence, of the signals or else of their later half."""
     if frequency is None and not signals.inputs:
         raise ValueError(

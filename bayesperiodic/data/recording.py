@@ -11,7 +11,7 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.files import Units, convert, read_csv, read_mat, read_npz
-from bayesperiodic.data.folding import AUTO, Signals, fold_signals, parts, tested_periods
+from bayesperiodic.data.folding import AUTO, Signals, automatic_periods, fold_signals, parts
 
 DROP, INTERPOLATE = "drop", "interpolate"
 # Successive samples that may be interpolated.
@@ -499,7 +499,7 @@ class Recording(Result):
         evidence = None
         try:
             if periods == AUTO:
-                periods, evidence = tested_periods(signals, frequency)
+                periods, evidence = automatic_periods(signals, frequency)
             periods = _checks.integer("periods", periods, 1)
             folded = fold_signals(signals, samples, periods, frequency, harmonics, origin, largest_drift)
         except np.linalg.LinAlgError:

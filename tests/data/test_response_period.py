@@ -11,7 +11,7 @@ import bayesperiodic as bp
 from bayesperiodic.data import response_period
 
 DATA = Path(os.environ.get("BAYESPERIODIC_DATA", "data"))
-RATE, SEEDS = 50, 200
+RATE, SEEDS = 50, 400
 # Amplitude of the force, and response period in drive periods, of x'' + 0.3 x' - x + x³ = a cos 1.2 t (None: chaos).
 TWO_WELLS = {0.2: 1, 0.28: 2, 0.29: 4, 0.37: 5, 0.5: None}
 
@@ -70,7 +70,7 @@ def test_chaos_is_refused_with_what_to_do(motions):
 
 @pytest.mark.parametrize("noise", ["white", "slow", "drift"])
 def test_false_alarm_rate_is_the_nominal_one(noise):
-    """Of 200 recordings of period 1 at most 6 have another one (binomial, 99 % at 1 %), also with 20 % of drift."""
+    """Of 400 recordings of period 1 at most 9 have another one (binomial, 99 % at 1 %), also with 20 % of drift."""
     wrong = 0
     for seed in range(SEEDS):
         generator = np.random.default_rng(seed)
