@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,7 +11,10 @@ from bayesperiodic import _checks, _fourier
 from bayesperiodic._io import Result
 from bayesperiodic._linalg import covariance_cholesky
 
-MEANING = "samples·periods"
+if TYPE_CHECKING:
+    import pandas as pd
+
+MEANING, DATA = "samples·periods", "data"
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,11 @@ class Experiment(Result):
         Relative growth of the strongest harmonic of each channel over the recording.
     period_drift : float
         Relative change of the period over the averaged cycles, by linear regression.
+    period_test : DataFrame, optional
+        Evidence of ``fold(periods="auto")``, a row for each response period tested: drive ``periods``, ``cycles``
+        used, ``explained`` fraction of the variance (smallest of the channels), share of the variance ``between`` the
+        lines (largest, of ``channel``; 0 if white), ``p`` of the lines that divisors lack, and ``verdict``: "chosen",
+        "not periodic", "adds no lines" or "lacks lines".
     synthetic : bool
         True if the data were simulated.
     mask : bool array (samples·periods,), optional
@@ -67,9 +76,11 @@ class Experiment(Result):
     multipliers, multiplier_sd : array (multipliers,), optional
         Measured Floquet multipliers, real and signed, largest modulus first, which are compared as log|μ|, and the
         standard deviations of log|μ|, if ``covariance`` has no rows for them.
-    guess : mapping of str to array (samples·periods,), optional
+    guess : "data" or mapping of str to array (samples·periods,), optional
         States of the model, including turns of angles, from which the first periodic solve starts; by default the
-        equilibrium. An unstable orbit needs a guess.
+        equilibrium. An unstable orbit needs a guess, and so does a subharmonic one. "data", for driven models, finds
+        the states that give the measured outputs and, where the outputs leave them free, solve the equations best at
+        the parameters of the start.
 
     Raises
     ------
@@ -110,12 +121,13 @@ class Experiment(Result):
     drift: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     period_drift: float = field(default=0.0, kw_only=True)
     origin: float = field(default=0.0, kw_only=True)
+    period_test: "pd.DataFrame | None" = field(default=None, kw_only=True)
     synthetic: bool = field(default=False, kw_only=True)
     mask: np.ndarray | None = field(default=None, kw_only=True)
     covariance: np.ndarray | None = field(default=None, kw_only=True)
     multipliers: np.ndarray | None = field(default=None, kw_only=True)
     multiplier_sd: np.ndarray | None = field(default=None, kw_only=True)
-    guess: Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
+    guess: str | Mapping[str, np.ndarray] = field(default_factory=dict, kw_only=True)
 
     def __post_init__(self) -> None:
         if not _checks.text("name", self.name) or any(c in self.name for c in "/[]"):
@@ -132,11 +144,14 @@ class Experiment(Result):
             }
             _checks.identifiers(kind, channels)
             object.__setattr__(self, kind, channels)
-        guess = {
-            key: _checks.finite_vector(f"guess[{key!r}]", values, points, MEANING)
-            for key, values in (self.guess or {}).items()
-        }
-        object.__setattr__(self, "guess", guess)
+        if isinstance(self.guess, str):
+            _checks.one_of("guess", self.guess, (DATA,))
+        else:
+            guess = {
+                key: _checks.finite_vector(f"guess[{key!r}]", values, points, MEANING)
+                for key, values in (self.guess or {}).items()
+            }
+            object.__setattr__(self, "guess", guess)
         for argument in ("scatter", "independent", "harmonics", "amplitude_variance", "amplitude_freedom", "drift"):
             given = dict(getattr(self, argument) or {})
             object.__setattr__(self, argument, given)
@@ -292,9 +307,16 @@ class Experiment(Result):
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{k} ({n} independent values)" for k, n in self.independent.items())
+        found = ""
+        if self.period_test is not None:
+            row = self.period_test.loc[self.period_test.periods == self.periods].iloc[0]
+            found = f"; response period {self.periods} drive periods, chosen of 1 to {self.period_test.periods.max()}: "
+            found += f"it explains {row.explained:.1%} of the variance"
+            found += f", p = {row.p:.1g} without the lines it adds to its divisors" if self.periods > 1 else ""
         return (
             f"Experiment({self.name!r}: {self.cycles} cycles at {self.frequency:.6g} Hz, {self.samples} samples per "
-            f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''})"
+            f"period, outputs {counts}, periodicity {self.periodicity:.4f}{', synthetic' if self.synthetic else ''}"
+            f"{found})"
         )
 
 

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.signal import medfilt
@@ -22,6 +22,10 @@ from bayesperiodic.data.harmonics import (
     track_frequency,
 )
 from bayesperiodic.data.quantisation import repeated_variance
+from bayesperiodic.data.response_period import aperiodic, response_period
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # Steps of time that are gaps, in periods, if they are longer than so many usual steps; if the period is unknown,
 # in usual steps.
@@ -37,10 +41,14 @@ MINIMUM_PERIODICITY = 0.5
 CLEARLY = 4.0
 # Difference of two phases [cycles] at the ends of a recording that selects other cycles.
 OTHER_CYCLES = 0.05
-# Distance of a cycle from the steady ones, in medians of their own, in harmonics and in the mean value.
+# Largest distance of a cycle from the steady ones, relative to their own, in harmonics and in the mean value.
 STEADY, STEADY_MEAN = 3.0, 12.0
+# Cycles from which the median of their distances is taken, the largest one of fewer.
+FEW = 9
+# Response cycles of the later half of a recording that show a period which the whole has not.
+LATER_CYCLES = 6
 FALSE_ALARM_RATE = 0.01
-CROSSING = "crossing"
+CROSSING, AUTO = "crossing", "auto"
 
 # The spectrum of the noise: grid points a sample, and a cycle if there are not many harmonics; neighbouring lines on
 # each side of a harmonic.
@@ -149,6 +157,30 @@ def fold_signals(
         "drift": drift,
         "origin": start,
     }
+
+
+def automatic_periods(signals: Signals, frequency: float | None) -> "tuple[int, pd.DataFrame]":
+    """Return the response period in drive periods, and its evidence, of the signals or else of their later half."""
+    if frequency is None and not signals.inputs:
+        raise ValueError(
+            f"frequency: must be given for periods={AUTO!r}, because {signals.name!r} has no input that shows the "
+            "drive period, got None."
+        )
+    drive = _first_guess(signals, frequency, 1)
+    _refuse_gaps(signals, drive)
+    time, values = signals.time, signals.values
+    if frequency is None:
+        driven = values[: signals.inputs]
+        tracked = track_frequency(time, driven, drive)
+        drive = refine_frequency(time, driven, tracked, resolved_harmonics(time, tracked, time.size))[0].frequency
+    chosen, evidence = response_period(time, values, signals.channels, drive)
+    later = time >= 0.5 * (time[0] + time[-1])
+    if chosen is None and _cycles(time[later], drive) >= LATER_CYCLES:
+        chosen, again = response_period(time[later], values[:, later], signals.channels, drive, LATER_CYCLES)
+        evidence = evidence if chosen is None else again
+    if chosen is None:
+        raise aperiodic(signals.name, drive, evidence)
+    return chosen, evidence
 
 
 def _first_guess(signals: Signals, frequency: float | None, periods: int) -> float:
@@ -324,9 +356,11 @@ def _steady_part(cycle: np.ndarray, shape: np.ndarray) -> np.ndarray:
     half = max(total // 2, MINIMUM_CYCLES)
     middle = np.median(shape[:half].real, axis=0) + 1j * np.median(shape[:half].imag, axis=0)
     away, settled = np.abs(shape - middle) ** 2, np.ones(total, dtype=bool)
+    # The median of few cycles is one of them in every component, and the median distance from it is no scale.
+    usual = np.median if half >= FEW else np.max
     for squares, factor in ((away[:, :, 1:].sum(axis=2), STEADY), (away[:, :, 0], STEADY_MEAN)):
         distance = np.sqrt(squares.max(axis=1))
-        settled &= distance <= factor * np.median(distance[:half]) + 1e-9
+        settled &= distance <= factor * usual(distance[:half]) + 1e-9
     used = total
     while used > MINIMUM_CYCLES and not settled[used - 1 - min(2, used - 1) : used].all():
         used -= 1

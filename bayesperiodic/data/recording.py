@@ -11,7 +11,7 @@ from bayesperiodic import _checks
 from bayesperiodic._io import Result
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.data.files import Units, convert, read_csv, read_mat, read_npz
-from bayesperiodic.data.folding import Signals, fold_signals, parts
+from bayesperiodic.data.folding import AUTO, Signals, automatic_periods, fold_signals, parts
 
 DROP, INTERPOLATE = "drop", "interpolate"
 # Successive samples that may be interpolated.
@@ -407,10 +407,11 @@ class Recording(Result):
         samples: int = 800,
         *,
         frequency: float | None = None,
-        periods: int = 1,
+        periods: int | str = 1,
         harmonics: int | Mapping[str, int] | None = None,
         origin: float | str = 0.0,
         largest_drift: float | None = None,
+        guess: str | Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> Experiment:
         """Fold the steady part of the recording into its mean period on an equidistant grid.
@@ -434,8 +435,14 @@ class Recording(Result):
             Exact forcing frequency [Hz]; by default it is estimated, with a standard error. A value that differs from
             the estimate significantly (false-alarm rate 1e-4) and by a drift of more than one degree of phase over the
             cycles used is refused.
-        periods : int
-            Forcing periods per response period.
+        periods : int or "auto"
+            Forcing periods per response period. "auto" tests 1 to 8, as far as the recording has three cycles of them,
+            and stores the evidence in ``Experiment.period_test``. A period is refused where more than 0.5 % of a
+            channel's variance is between the lines of its spectrum, noise apart that is as strong above half of the
+            resolved band. Of the others the longest one is taken whose lines are all needed: F-tests of those that its
+            divisors lack against the lines beside them, with a false-alarm rate of 1 % over all periods. If there is
+            none, the later half is tested, with at least six cycles. Without ``frequency``, the drive period is that of
+            the inputs.
         harmonics : int or mapping of str to int, optional
             Harmonics of the response period to keep, for all channels or by channel. By default each channel keeps all
             harmonics up to the last one that is significant relative to the noise around it: an F-test on the
@@ -445,6 +452,8 @@ class Recording(Result):
             at which the fundamental of the first output crosses zero upwards.
         largest_drift : float, optional
             Limit of the relative change of a channel's strongest harmonic over the recording, by linear regression.
+        guess : "data" or mapping of str to array (samples·periods,), optional
+            See `Experiment`.
         name : str, optional
             By default the recording's name.
 
@@ -456,7 +465,8 @@ class Recording(Result):
         Raises
         ------
         ValueError
-            For fewer than three cycles, a constant channel, a signal that is not periodic, a gap of more than a quarter
+            For fewer than three cycles, a constant channel, a signal that is not periodic, ``periods="auto"`` without
+            frequency and inputs, a gap of more than a quarter
             of a period, a frequency that is not that of the recording, more harmonics than the samples resolve, an
             unknown channel in `harmonics`, a drift beyond the limit.
 
@@ -474,18 +484,32 @@ class Recording(Result):
         >>> run = recording.fold(samples=64, harmonics={"displacement": 9}, name="run 1")
         >>> print(f"{run.frequency:.4f} Hz, {run.independent['displacement']} independent values")
         0.1000 Hz, 19 independent values
+
+        The response period of a period-doubled oscillator:
+
+        >>> t = np.arange(0, 30, 0.02)
+        >>> drive, x = np.cos(2 * np.pi * t), np.cos(2 * np.pi * t) + 0.3 * np.cos(np.pi * t)
+        >>> doubled = bp.Recording.from_arrays(t, {"x": x.round(2)}, {"force": drive}).fold(64, periods="auto")
+        >>> doubled.periods, doubled.period_test.verdict.tolist()[:2]
+        (2, ['not periodic', 'chosen'])
         """
-        periods, samples = _checks.integer("periods", periods, 1), _checks.integer("samples", samples, 4)
+        samples = _checks.integer("samples", samples, 4)
         channels = self.inputs | self.outputs
         signals = Signals(self.name, self.time, tuple(channels), np.stack([*channels.values()]), len(self.inputs))
+        evidence = None
         try:
+            if periods == AUTO:
+                periods, evidence = automatic_periods(signals, frequency)
+            periods = _checks.integer("periods", periods, 1)
             folded = fold_signals(signals, samples, periods, frequency, harmonics, origin, largest_drift)
         except np.linalg.LinAlgError:
             raise ValueError(
                 f"recording: must have samples in all parts of its periods, got {self.name!r}, which has too few; "
                 "check the frequency and the gaps, or fold a part by `between` or `split`."
             ) from None
-        return Experiment(name or self.name, synthetic=self.synthetic, **folded)
+        return Experiment(
+            name or self.name, synthetic=self.synthetic, period_test=evidence, guess=guess or {}, **folded
+        )
 
     def __repr__(self) -> str:
         kind = "synthetic recording" if self.synthetic else "recording"

@@ -380,7 +380,7 @@ def _measured(
 ) -> Experiment:
     """Return a simulated repetition of an experiment."""
     model, (row,) = problem.model, problem.parameters(problem.vector(theta)[None], e.name).tolist()
-    values, start = dict(zip(model.parameters, row, strict=True)), _first_state(problem, e)
+    values, start = dict(zip(model.parameters, row, strict=True)), _first_state(problem, e, theta)
     cycle = steady_cycle(model, values, e.inputs, frequency=e.frequency, samples=e.samples, start=start)
     limit, cycles = _fourier.highest_harmonic(e.samples), max(e.cycles, FEWEST_CYCLES)
     size = cycles * e.samples
@@ -410,10 +410,11 @@ def _input_noise(problem: Problem, e: Experiment, name: str, size: int, generato
     return np.tile(_fourier.on_grid(errors @ waves, e.samples), size // e.samples)
 
 
-def _first_state(problem: Problem, e: Experiment) -> dict[str, float]:
+def _first_state(problem: Problem, e: Experiment, theta: dict[str, float]) -> dict[str, float]:
     """Return the states and rates at τ = 0 of the guess of an experiment; empty without a guess."""
-    found = {}
-    for state, values in e.guess.items():
+    found: dict[str, float] = {}
+    states = problem.solve(theta)[e.name].states if isinstance(e.guess, str) else e.guess
+    for state, values in states.items():
         found[state] = float(values[0])
         if problem.model.orders[state] == 2:
             rate = _fourier.derivative(_fourier.coefficients(values), e.frequency)

@@ -10,7 +10,7 @@ import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic.data.experiment import Experiment
+from bayesperiodic.data.experiment import DATA, Experiment
 from bayesperiodic.data.recording import Recording
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.equations import PeriodicEquations
@@ -528,7 +528,11 @@ def _checked_experiments(model: Model, experiments: Iterable[Experiment]) -> tup
                     f"outputs of experiment {e.name!r}: {channel!r} is constant ({values[0]:g}); a channel must vary "
                     "over the period, or tells nothing about its variance."
                 )
-        if e.guess:
+        if e.guess == DATA and model.autonomous:
+            raise ValueError(
+                f"guess of experiment {e.name!r}: must be states for {model.name!r}, which is autonomous, got {DATA!r}."
+            )
+        if e.guess and not isinstance(e.guess, str):
             _checks.same_names(f"guess of experiment {e.name!r}", e.guess, model.states)
         if model.autonomous and not e.frequency_se > 0.0:
             raise ValueError(

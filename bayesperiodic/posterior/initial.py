@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesperiodic._linalg import hessian_eigh, scaled
-from bayesperiodic.data.experiment import Experiment
+from bayesperiodic._linalg import hessian_eigh, in_one_thread, scaled
+from bayesperiodic.data.experiment import DATA, Experiment
 from bayesperiodic.periodic.equations import CyclicFactors, PeriodicEquations
 from bayesperiodic.posterior.description import Description
 from bayesperiodic.posterior.likelihood import Likelihood
@@ -32,7 +32,9 @@ LARGEST_STEP = 0.7
 NONLINEAR, SMALLEST_SHARE = 0.5, 1e-3
 ON_ORBIT, SMALL_STEP = 1e-6, 1e-2
 # Of the orbits that outputs show: harmonics of the forcing, weight of the equations, iterations; turns with θ.
-SEEN, EQUATIONS, ROUNDS, TURNS = 8, 0.03, 5, 100
+SEEN, EQUATIONS, ROUNDS, TURNS, FEW_TURNS = 8, 0.03, 5, 100, 5
+# Means of a state that are tried, in standard deviations from the one found.
+MEANS = (1.0, -1.0, 2.0, -2.0)
 
 
 @dataclass(frozen=True)
@@ -62,12 +64,39 @@ def simultaneous_fit(problem: Description, theta: np.ndarray) -> InitialEstimate
     """
     if problem.model.autonomous or not all(e.guess for e in problem.experiments):
         return None
-    fit = _SimultaneousFit(problem)
+    fit = _SimultaneousFit(with_guesses(problem, theta))
     return fit.iterate(fit.parameters_along_guesses(theta))
 
 
+@in_one_thread
+def with_guesses(problem: Description, theta: np.ndarray) -> Description:
+    """Return the problem with states in place of ``guess="data"``, found from a θ (names,); see `measured_orbits`."""
+    if all(e.guess != DATA for e in problem.experiments):
+        return problem
+    near: dict[str, dict[str, np.ndarray]] = {}
+    for e in problem.experiments:
+        equations = problem.equations[e.name]
+        z = equations.static_guess(problem.parameters(theta[None], e.name)[0])
+        states = z + equations.drift * equations.grid.tau[:, None]
+        near[e.name] = dict(zip(problem.model.states, states.T.copy(), strict=True))
+    fit = _SimultaneousFit(problem.with_experiments(replace(e, guess=near[e.name]) for e in problem.experiments))
+    for e in problem.experiments:
+        if e.guess == DATA:
+            near[e.name] = fit._states(e.name, fit.orbit_of_any_mean(e.name, theta))
+    _, found = measured_orbits(problem, theta, near, FEW_TURNS)
+    for name, states in found.states.items():
+        if lost := [state for state, values in states.items() if not np.isfinite(values).all()]:
+            raise ValueError(
+                f"guess of experiment {name!r}: must be finite, got nan for {lost[0]!r} from the data; give the states "
+                "as a mapping, or start nearer to the truth."
+            )
+    return problem.with_experiments(
+        replace(e, guess=found.states[e.name]) if e.guess == DATA else e for e in problem.experiments
+    )
+
+
 def measured_orbits(
-    problem: Description, theta: np.ndarray, near: dict[str, dict[str, np.ndarray]]
+    problem: Description, theta: np.ndarray, near: dict[str, dict[str, np.ndarray]], most: int = TURNS
 ) -> tuple[Description, InitialEstimate]:
     """Return orbits of a driven model that give the measured outputs, and the θ that fits them, in turns from a θ.
 
@@ -76,7 +105,7 @@ def measured_orbits(
     """
     fit = _SimultaneousFit(problem.with_experiments(replace(e, guess=near[e.name]) for e in problem.experiments))
     misfit, before, turns = np.inf, np.inf, 0
-    while turns < TURNS and not before - misfit < SMALL_STEP:
+    while turns < most and not before - misfit < SMALL_STEP:
         fit.guess = {name: fit.measured_orbit(name, theta) for name in fit.guess}
         theta = fit.parameters_along_guesses(theta)
         misfit, before, turns = fit._misfit(theta), misfit, turns + 1
@@ -96,8 +125,8 @@ class _SimultaneousFit:
         self.guess = {e.name: self._periodic_part(e) for e in experiments}
 
     def _periodic_part(self, e: Experiment) -> np.ndarray:
-        equations = self.equations[e.name]
-        states = np.stack([e.guess[name] for name in self.problem.model.states], axis=-1)
+        equations, guess = self.equations[e.name], {} if isinstance(e.guess, str) else e.guess
+        states = np.stack([guess[name] for name in self.problem.model.states], axis=-1)
         return states - equations.drift * equations.grid.tau[:, None]
 
     def parameters_along_guesses(self, theta: np.ndarray) -> np.ndarray:
@@ -166,17 +195,30 @@ class _SimultaneousFit:
             z = z + np.tensordot(np.linalg.lstsq(rows, right, rcond=1e-9)[0], basis, 1)
         return z
 
+    def orbit_of_any_mean(self, name: str, theta: np.ndarray) -> np.ndarray:
+        """Return the measured orbit that solves the equations best, from means of each state on both sides.
+
+        Outputs such as a velocity leave the mean of a state to the equations, which may have several solutions.
+        """
+        best = self.measured_orbit(name, theta)
+        error = self._equation_error(name, best, theta)
+        for shift in np.kron(np.eye(best.shape[1]), np.array(MEANS)[:, None]):
+            self.guess[name] = best + shift * np.std(best, axis=0)
+            z = self.measured_orbit(name, theta)
+            if (other := self._equation_error(name, z, theta)) < error:
+                best, error = z, other
+        return best
+
+    def _equation_error(self, name: str, z: np.ndarray, theta: np.ndarray) -> float:
+        at, equations = np.ascontiguousarray(self.maps[name].values(theta[None])[0, :-1]), self.equations[name]
+        return float(np.sum(_weighed(equations, equations.residual_jacobian(z, at)[:, : equations.count, None]) ** 2))
+
     def _misfit(self, theta: np.ndarray) -> float:
         """Return −log of the prior's density and of that of the equations' errors along the guesses."""
         prior = float(self.problem.joint_prior.log_prob(theta))
         if not np.isfinite(prior):
             return np.inf
-        total = 0.0
-        for name, z in self.guess.items():
-            at = np.ascontiguousarray(self.maps[name].values(theta[None])[0, :-1])
-            equations = self.equations[name]
-            g = _weighed(equations, equations.residual_jacobian(z, at)[:, : equations.count, None])
-            total += float(np.sum(g**2))
+        total = sum(self._equation_error(name, z, theta) for name, z in self.guess.items())
         return 0.5 * self.problem.counted * np.log(max(total, np.finfo(float).tiny)) - prior
 
     def _there(self, theta: np.ndarray, step: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from bayesperiodic.periodic.floquet import first_order_matrix, leading_multiplie
 from bayesperiodic.periodic.solution import PeriodicSolution, describe, logarithmic_changes
 from bayesperiodic.periodic.solve import solve_driven, solve_free
 from bayesperiodic.posterior.description import Description
+from bayesperiodic.posterior.initial import with_guesses
 from bayesperiodic.posterior.observation import GroupSolution, Response, Simulation
 from bayesperiodic.posterior.parameters import ParameterMaps
 
@@ -44,9 +45,9 @@ class Simulator:
         """Return the simulator anchored at θ (names,), solved from guesses, the experiments' own or the equilibrium."""
         if guesses is not None:
             _checks.same_names("guesses", guesses, [e.name for e in problem.experiments])
+        experiments = with_guesses(problem, theta).experiments if guesses is None else problem.experiments
         own = {
-            e.name: (e if guesses is None else replace(e, guess=guesses[e.name])).guess or "static"
-            for e in problem.experiments
+            e.name: (e if guesses is None else replace(e, guess=guesses[e.name])).guess or "static" for e in experiments
         }
         return cls(problem, own, {}, {}).anchored(theta)
 

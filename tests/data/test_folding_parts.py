@@ -76,7 +76,7 @@ def test_a_single_odd_cycle_in_the_middle_is_kept_and_one_near_the_start_is_not(
 
 
 def test_at_least_three_cycles_are_steady():
-    assert steady([0.0, 0.0, 90.0, 90.0], 1) == 3
+    assert steady([0.0, 0.1, 0.0, 90.0, 90.0], 1) == 3
 
 
 @pytest.mark.parametrize("row", [0, 1])
