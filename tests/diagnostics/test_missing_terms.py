@@ -236,7 +236,7 @@ def test_effects_of_the_parameters_are_refused(found):
 def test_a_coefficient_of_zero_does_not_change_the_model(damped):
     problem, fit = damped
     term = Candidate("displacement", "force", problem.model.input_symbols["force"])
-    other = problem_of(problem, extended(problem.model, {"c9": term}), {}, zero=["c9"])
+    other = problem_of(problem, extended(problem.model, {"c9": term}), {}, zero={"c9": term})
     assert other.names == problem.names
     theta = problem.vector(fit.theta)
     one, two = (p.outputs(theta[None])[0]["run 0"]["displacement"] for p in (problem, other))
