@@ -17,6 +17,8 @@ from bayesperiodic.models.units import Unit, parsed, product, unit_of, written
 DEGREE, HIGHEST_POWER = 3, 5
 # Widths of smooth absolute values and signs, relative to the standard deviation of their arguments.
 ABS_WIDTH, SIGN_WIDTH = 0.02, 0.2
+# Characters of a term in the name of its coefficient.
+LONGEST_NAME = 30
 # Stands in the expression of a term for the state of its lag.
 MEMORY = sp.Symbol("s__memory", real=True)
 Factors = Mapping[str, sp.Expr]
@@ -63,7 +65,7 @@ def generated(model: Model, where: Iterable[str], deviations: Mapping[str, float
     found |= {name: e for name, e in steepest.items() if deviations.get(name, 1.0) > 0.0}
     plain = [Candidate(place, text, e) for place in where for text, e in found.items()]
     return plain + [
-        Candidate(place, f"lag({name}) - {f'({name})' if e.is_Add else name}", MEMORY - e, e)
+        Candidate(place, f"lag({name}) - {f'({name})' if ' ' in name else name}", MEMORY - e, e)
         for place in where
         for name, e in (moving | _forces(model, place)).items()
     ]
@@ -246,7 +248,8 @@ def coefficient_names(model: Model, terms: Iterable[Candidate]) -> list[str]:
     names: list[str] = []
     for term in terms:
         plain = term.text if term.force is None else term.text.partition(") - ")[0]
-        short, long = ("c_" + re.sub(r"\W+", "_", t).strip("_") for t in (plain, f"{plain} in {term.place}"))
+        choice = plain[:LONGEST_NAME], f"{plain[:LONGEST_NAME]} in {term.place}"
+        short, long = ("c_" + re.sub(r"\W+", "_", text).strip("_") for text in choice)
         choices = chain((short, long), (f"{long}_{number}" for number in count(2)))
         names.append(next(name for name in choices if not taken & {name, *lag_names(name)}))
         taken |= {names[-1], *lag_names(names[-1])}
