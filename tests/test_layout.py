@@ -7,8 +7,8 @@ from tests import layout
 # The package had 25,000 lines when it was last shortened; the rest is room for the statistics and the checks of input
 # that were missing then, of the evidence and comparison of models, of proposals for curved posteriors, and of errors of
 # the inputs, integrated out, as parameters, and correlated with those of the outputs; of the search for missing terms,
-# its candidates, tests, units and figure.
-MOST_FILES, MOST_LINES, LONGEST_FILE = 112, 32_100, 600
+# its candidates, with memory too, tests, units and figure.
+MOST_FILES, MOST_LINES, LONGEST_FILE = 112, 32_260, 600
 MOST_PARAMETERS = 8
 REASONS = {
     "Experiment": "one field per measured quantity; four are required, the rest are keywords with defaults",

@@ -150,12 +150,13 @@ def given(model: Model, candidates: Mapping[str, Iterable[Any]]) -> list[Candida
 
 def _lagged(argument: str, text: str) -> tuple[str | None, str]:
     """Return force and rest of a text such as ``"lag(x**2) - x**2"``; None and the text if there is no lag in it."""
+    start, _, inner = text.strip().partition("(")
     if not re.search(r"\blag\s*\(", text):
         return None, text
-    depths = np.cumsum([(c == "(") - (c == ")") for c in text.strip()])
-    end = int(np.argmax((depths == 0) & (np.arange(depths.size) > text.strip().find("("))))
-    start, force, rest = *text.strip()[:end].split("(", 1), text.strip()[end + 1 :].strip()
-    if start.strip() != "lag" or "lag" in re.findall(r"\w+", force + " " + rest) or rest[:1] not in ("", "+", "-"):
+    depths = np.cumsum([(c == "(") - (c == ")") for c in inner])
+    end = int(np.argmax(depths < 0))
+    force, rest = inner[:end], inner[end + 1 :].strip()
+    if start.strip() != "lag" or not end or re.search(r"\blag\b", force + rest) or rest[:1] not in ("", "+", "-"):
         raise ValueError(f"{argument}: must be lag(…), alone or plus or minus a term without a lag, got {text!r}.")
     return force, f"0 {rest}"
 

@@ -2,9 +2,8 @@
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import compress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import pandas as pd
 from scipy import stats
 
 from bayesperiodic import _checks
-from bayesperiodic._io import Result
+from bayesperiodic._io import NOT_STORED, Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics.adequacy import ALL, adequacy
 from bayesperiodic.diagnostics.candidates import (
@@ -106,6 +105,9 @@ class Step:
 class MissingTerms(Result):
     """What `missing_terms` found.
 
+    A file written by `save` contains the estimates but not the models: what `load` returns prints itself and has
+    `table`, `ranking` and `fit`; its `model` and `problem` raise a ValueError.
+
     Parameters
     ----------
     steps : tuple of Step
@@ -139,27 +141,9 @@ class MissingTerms(Result):
     before: Step
     dropped: tuple[str, ...]
     stopped: str
-    _problem: Problem | None
-    _terms: dict[str, tuple[Candidate, float]]
     _fits: tuple[MapEstimate, ...]
-
-    def save(self, path: str | Path) -> None:
-        """Write the result to an HDF5 file; an existing file is replaced when the new one is complete.
-
-        It contains the estimates but not the models: what `load` returns prints itself and has `table`, `ranking` and
-        `fit`; its `model` and `problem` raise a ValueError.
-
-        Parameters
-        ----------
-        path : path
-            The folder must exist.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        """
-        super(MissingTerms, replace(self, _problem=None, _terms={})).save(path)
+    _problem: Problem | None = field(default=None, metadata=NOT_STORED)
+    _terms: dict[str, tuple[Candidate, float]] = field(default_factory=dict, metadata=NOT_STORED)
 
     def model(self, k: int | None = None) -> Model:
         """Return the model with the terms of the first k steps, by default of all.
@@ -280,17 +264,10 @@ VANISHED = "with it the fit found no periodic solution, or no optimum"
 
 @in_one_thread
 def missing_terms(
-    problem: Problem,
-    fit: MapEstimate,
-    candidates: Mapping[str, Iterable[Any]] | None = None,
-    *,
-    equations: bool = True,
-    outputs: bool = True,
-    exclude: Iterable[str] = (),
-    keep: int = 4,
-    max_terms: int = 5,
+    problem: Problem, fit: MapEstimate, candidates: Mapping[str, Iterable[Any]] | None = None, *,
+    equations: bool = True, outputs: bool = True, exclude: Iterable[str] = (), keep: int = 4, max_terms: int = 5,
     false_discovery_rate: float = 0.01,
-) -> MissingTerms:
+) -> MissingTerms:  # fmt: skip
     """Search for terms that the model lacks.
 
     Each candidate is a term with an unknown coefficient in an equation or an output. Its score test needs no fit: with
@@ -301,7 +278,7 @@ def missing_terms(
     differ significantly (as by Vuong [2]_, for normal errors) and there are at least three experiments, these are left
     out of the fit, one at a time, and only terms are eligible whose predictions of them are off by less than twice the
     smallest error. The search ends if no candidate is significant, if the evidence increases by less than the logarithm
-    of the number of candidates, if the coefficient is within two robust standard deviations of zero, or if the
+    of the number of candidates, if the coefficient is within two robust standard deviations of zero, if the
     prediction of experiments that are left out gets worse, or if the coefficient changes by more than half on twice as
     many points, so that the grid's error looks like the term. At the end, terms that later ones have made needless are
     removed.
@@ -425,7 +402,7 @@ class _Search:
         steps, fits, dropped = self.without_needless(steps, fits, state)
         kept = self.priors(step.name for step in steps)
         return MissingTerms(
-            tuple(steps), ranking, len(ranking), self.refused, before, dropped, stopped, self.problem, kept, tuple(fits)
+            tuple(steps), ranking, len(ranking), self.refused, before, dropped, stopped, tuple(fits), self.problem, kept
         )
 
     def at(self, fit: MapEstimate, names: tuple[str, ...]) -> Optimum:
@@ -579,23 +556,12 @@ def _step(
     table = adequacy(state.problem, state.iterate.here, state.iterate.noise[None], {})
     term, name, others, worse, p, gain = added or (None, "", (), (), np.nan, np.nan)
     lag = lag_names(name)[0] if term and term.force is not None else ""
+    unknown: dict[str, float] = {"": np.nan}
+    theta, sd, robust = (unknown | own for own in (fit.theta, fit.sd, fit.robust_sd))
     return Step(
-        term.text if term else "",
-        term.place if term else "",
-        others,
-        worse,
-        name,
+        term.text if term else "", term.place if term else "", others, worse, name,
         coefficient_unit(state.problem.model, term) if term else "",
-        fit.theta[name] if term else np.nan,
-        fit.sd[name] if term else np.nan,
-        fit.robust_sd[name] if term else np.nan,
-        fit.theta[lag] if lag else np.nan,
-        fit.sd[lag] if lag else np.nan,
-        p,
-        fit.fvu,
-        {channel: white.p for channel, white in fit.whiteness.items()},
-        str(table.loc[ALL, "verdict"]),
-        gain,
-        held_out,
-        {n: (fit.theta[n] - value) / before.sd[n] for n, value in before.theta.items()},
-    )
+        theta[name], sd[name], robust[name], theta[lag], sd[lag],
+        p, fit.fvu, {channel: white.p for channel, white in fit.whiteness.items()}, str(table.loc[ALL, "verdict"]),
+        gain, held_out, {n: (fit.theta[n] - value) / before.sd[n] for n, value in before.theta.items()},
+    )  # fmt: skip

@@ -51,11 +51,10 @@ def problem_of(
 
 def guesses_of(model: Model, orbits: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
     """Return orbits of a model with other lags as guesses; new lags, which do not act on the others, start at zero."""
-    found = {}
-    for name, states in orbits.items():
-        rest = np.zeros_like(next(iter(states.values())))
-        found[name] = {state: states.get(state, rest) for state in model.states}
-    return found
+    return {
+        name: {state: states.get(state, np.zeros_like(next(iter(states.values())))) for state in model.states}
+        for name, states in orbits.items()
+    }
 
 
 @dataclass(frozen=True)

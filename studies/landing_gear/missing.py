@@ -1,10 +1,9 @@
 """What `bp.missing_terms` finds in eq. (9) for the data of both truths, all experiments with one theta16.
 
-In truth B the missing terms are known. The effect of each on the outputs, the difference of the periodic solutions with
-a hundredth of it and without it at the estimate, is compared with that of the candidates and of the terms that the search adds: the
-fraction of the effect, in units of the residual's standard deviations and less what the parameters can do instead, that
-the term explains. Effects are linearised: strong ones change the mean temperature, for which theta16 of the estimate has
-already made up.
+In truth B the missing terms are known. The effect of each on the outputs is that of a hundredth of it at the estimate:
+strong ones change the mean temperature, for which theta16 of the estimate has already made up. It is compared with that
+of the candidates and of the terms that the search adds: the fraction of the effect, in units of the residual's standard
+deviations and less what the parameters can do instead, that the term explains (cos²).
 """
 
 import time
