@@ -11,7 +11,7 @@ from bayesperiodic import _fourier
 from bayesperiodic.diagnostics import missing_terms
 from bayesperiodic.diagnostics.candidates import coefficient_names, coefficient_unit, extended, generated, given
 from bayesperiodic.diagnostics.score_tests import lags_to_try
-from tests.known import grid
+from tests.known import LINEAR, grid, linear_experiment
 from tests.problems import DUFFING, DUFFING_PRIORS, quadratic_damping
 
 SPRING, LAG = 0.3, 1.5
@@ -122,15 +122,16 @@ def test_lags_are_given_as_texts():
             given(bp.models.duffing, {"equation of x": [text]})
 
 
-def test_a_term_without_memory_comes_before_one_of_the_same_fit(monkeypatch):
-    """Of the lags of ẋ|ẋ| a short one has its effect, less a constant factor."""
-    monkeypatch.setattr(missing_terms, "distinct", lambda one, other: False)
-    monkeypatch.setattr(missing_terms, "held_out_error", lambda state: np.nan)
-    problem, fit = quadratic_damping()
-    terms = {"equation of x": ["lag(dx*abs(dx))", "dx*abs(dx)"]}
+def test_a_term_without_memory_comes_before_one_of_the_same_fit():
+    """A long lag of the friction is its mean: of the difference, friction is left, and its evidence is larger here."""
+    run = linear_experiment([900.0, 40.0, 25.0], 1.0, seed=2)
+    priors = {"k": bp.Normal(900, 300), "c": bp.LogNormal(40, 1)}
+    problem = bp.Problem(LINEAR, [run], priors=priors, fixed={"coulomb": 0})
+    fit = bp.map_estimate(problem, progress=False)
+    terms = {"force": ["lag(tanh(10*dx)) - tanh(10*dx)", "tanh(10*dx)"]}
     found = bp.missing_terms(problem, fit, terms, equations=False, outputs=False, max_terms=1)
-    assert found.steps[0].term == "dx*abs(dx)" and np.isnan(found.steps[0].lag)
-    assert found.steps[0].alternatives == ("lag(dx*abs(dx)) in equation of x",)
+    assert found.steps[0].term == "tanh(10*dx)" and np.isnan(found.steps[0].lag)
+    assert found.steps[0].alternatives == ("lag(tanh(10*dx)) - tanh(10*dx) in force",)
 
 
 @pytest.mark.filterwarnings("ignore:Twice as many points")
