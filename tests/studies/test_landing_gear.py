@@ -306,7 +306,7 @@ def test_campaigns_are_counted_and_resumed(tmp_path, monkeypatch):
 
 
 def test_terms_are_compared_with_the_effects_that_the_truth_has():
-    """The heat of friction, a nearly constant force, is abs(ddisplacement); a short lag of the pressure is the delay."""
+    """The heat of friction, nearly a constant force, is abs(ddisplacement); a short lag is the delay."""
     runs = [run for run in RUNS if run.name in ("3 Hz 4 mm", "1 Hz 18 mm")]
     experiments = [fold(measure(run, TRUTHS["B"], 1), "displacement") for run in runs]
     start = estimate(experiments, "displacement", one_conduction=True, scheme="central4")
