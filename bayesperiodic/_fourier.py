@@ -31,6 +31,13 @@ def on_grid(amplitudes: np.ndarray, points: int) -> np.ndarray:
     return np.fft.irfft(spectrum, n=points, axis=-1)
 
 
+def lagged(values: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """Return the periodic solutions m (signals, points) of lag·ṁ = value − m; the lags (signals,) are in periods."""
+    points = values.shape[-1]
+    rate = 2j * np.pi * np.arange(points // 2 + 1)
+    return np.fft.irfft(np.fft.rfft(values, axis=-1) / (1.0 + rate * lags[:, None]), n=points, axis=-1)
+
+
 def from_components(components: np.ndarray, points: int) -> np.ndarray:
     """Return signals (…, points) from real components (…, size), whose mean square is that of the signal.
 

@@ -24,6 +24,8 @@ ARRAYS = "arrays"
 SEAL = b"\nbayesperiodic sha256 "
 OTHER = "path: must contain a result of this version of bayesperiodic"
 REMEDY = "load it with the version that saved it, or compute it again"
+# Metadata of fields that are left out of files; they have defaults.
+NOT_STORED = {"stored": False}
 # Module of every class in files. Modules are named, not imported: this module is below them.
 MODULES = {
     "Bands": "bayesperiodic.diagnostics.predictive",
@@ -38,6 +40,7 @@ MODULES = {
     "Identifiability": "bayesperiodic.diagnostics.identifiability",
     "InputErrors": "bayesperiodic.posterior.input_noise",
     "MapEstimate": "bayesperiodic.estimation.result",
+    "MissingTerms": "bayesperiodic.diagnostics.missing_terms",
     "Mode": "bayesperiodic.estimation.modes",
     "ModelComparison": "bayesperiodic.diagnostics.model_comparison",
     "NoiseSplit": "bayesperiodic.estimation.result",
@@ -52,6 +55,7 @@ MODULES = {
     "Profile": "bayesperiodic.estimation.profile",
     "Recording": "bayesperiodic.data.recording",
     "Scheme": "bayesperiodic.periodic.schemes",
+    "Step": "bayesperiodic.diagnostics.missing_terms",
     "Structure": "bayesperiodic.symmetry.structure",
     "Symmetry": "bayesperiodic.symmetry.structure",
     "Transient": "bayesperiodic.diagnostics.predictive",
@@ -194,7 +198,8 @@ def _encode(value: Any, arrays: dict[str, Any], trees: list[Any]) -> Any:
         kind = type(value)
         if MODULES.get(kind.__name__) != kind.__module__:
             raise TypeError(f"result: must consist of plain data and results of bayesperiodic, got {kind.__name__}.")
-        content = {f.name: _encode(getattr(value, f.name), arrays, trees) for f in fields(value)}
+        stored = [f.name for f in fields(value) if f.metadata.get("stored", True)]
+        content = {name: _encode(getattr(value, name), arrays, trees) for name in stored}
         return {"result": kind.__name__, "fields": content}
     if isinstance(value, np.ndarray):
         key = str(len(arrays))

@@ -33,6 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
     workers.add_argument("--dask", metavar="ADDRESS", help="calibration: a Dask scheduler, such as tcp://host:8786")
     workers.add_argument("--mpi", action="store_true", help="calibration: MPI, below mpiexec … -m mpi4py.futures")
     parser.add_argument("--truth", choices=("A", "B"), help="landing-gear: which damper (default both)")
+    parser.add_argument("--missing", action="store_true", help="landing-gear: what missing_terms finds, only that")
     parser.add_argument("--scaling", action="store_true", help="calibration: measure what two workers gain, only that")
     parser.add_argument("--guard", action="store_true", help="benchmark: a quick run's ratios against those kept")
     options = parser.parse_args(arguments)

@@ -203,7 +203,8 @@ def classes_in_files() -> list[tuple[str, str]]:
                 found.add(kind)
                 hints = typing.get_type_hints(kind)
                 for field in dataclasses.fields(kind):
-                    visit(hints[field.name])
+                    if field.metadata != _io.NOT_STORED:
+                        visit(hints[field.name])
             for subclass in kind.__subclasses__():
                 visit(subclass)
 

@@ -493,6 +493,27 @@ def missing_terms():
     yield f"where nothing is missing no term is found in {span(left_alone)} %"
 
 
+def landing_gear_missing():
+    d = results("landing_gear/missing_terms")
+    one, (*_, last) = d["B"], d["B"]["steps"]
+    assert d["A"]["steps"] == [] and d["A"]["before"]["verdict"] == "adequate" and last["verdict"] == "misspecified"
+    assert [step["term"].split("(")[0] for step in one["steps"]] == ["lag", "lag", "displacement*abs"]
+    heat, convection, flexure, line = (
+        one["effects"][name] for name in ("friction_heat", "convection", "flexure", "line")
+    )
+    yield f"which explains {100 * heat['steps_shares'][-1]:.1f} % of the friction heat's effect"
+    force, pressure = (
+        [100 * model["unexplained"][channel] for model in (one["before"], last)] for channel in ("force", "pressure")
+    )
+    yield f"of the pressure falls from {pressure[0]:.4f} % to {pressure[1]:.4f} %"
+    yield f"that of the force only from {force[0]:.2f} % to {force[1]:.2f} %"
+    best = [f"{100 * effect['best_share']:.0f} %" for effect in (heat, convection, flexure, line)]
+    yield (
+        f"of the first {len(one['ranking'])} candidates the best explains {best[0]} of the effect of friction heat, "
+        f"{best[1]} of that of convection, {best[2]} of that of lost motion and {best[3]} of that of the pressure line"
+    )
+
+
 def span(values):
     """Return "a to b", or one number if all are equal."""
     low, high = (f"{value:.0f}" for value in (min(values), max(values)))
@@ -502,7 +523,7 @@ def span(values):
 SUBJECTS = (
     pendulum, landing_gear, landing_gear_cost, landing_gear_campaigns, damper, silverbox, flutter, flutter_campaigns,
     solver, benchmark, benchmark_table, calibration, verdicts, sampling, noisy_inputs,
-    missing_terms,
+    missing_terms, landing_gear_missing,
 )  # fmt: skip
 
 SETTING, DEFINITION, ELSEWHERE, UNSTORED, DATE = (

@@ -1,4 +1,4 @@
-"""Candidate terms that a model may lack: products, absolute values and signs of what it contains, as expressions."""
+"""Candidate terms that a model may lack: products, absolute values, signs and lags of what it contains."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -11,12 +11,16 @@ import numpy as np
 import sympy as sp
 
 from bayesperiodic import _checks
-from bayesperiodic.models.model import DERIVATIVES, Model, Names, smooth_abs, smooth_sign
+from bayesperiodic.models.model import DERIVATIVES, Model, Names, smooth_abs, smooth_sign, with_derivatives
 from bayesperiodic.models.units import Unit, parsed, product, unit_of, written
 
 DEGREE, HIGHEST_POWER = 3, 5
 # Widths of smooth absolute values and signs, relative to the standard deviation of their arguments.
 ABS_WIDTH, SIGN_WIDTH = 0.02, 0.2
+# Characters of a term in the name of its coefficient.
+LONGEST_NAME = 30
+# Stands in the expression of a term for the state of its lag.
+MEMORY = sp.Symbol("s__memory", real=True)
 Factors = Mapping[str, sp.Expr]
 
 
@@ -24,12 +28,15 @@ Factors = Mapping[str, sp.Expr]
 class Candidate:
     """A term that is added to an equation g or an output f with an unknown coefficient.
 
-    The place is the name of the output, or "equation of x" with the name of the state.
+    The place is the name of the output, or "equation of x" with the name of the state. A term with memory contains
+    `MEMORY` with factor one, the solution of lag·ṁ = force − m; the lag [s] is where its estimation starts.
     """
 
     place: str
     text: str
     expression: sp.Expr
+    force: sp.Expr | None = None
+    lag: float = np.nan
 
     def __str__(self) -> str:
         return f"{self.text} in {self.place}"
@@ -56,7 +63,30 @@ def generated(model: Model, where: Iterable[str], deviations: Mapping[str, float
         found |= {f"{other}*abs({name})": factor * size for other, factor in moving.items()}
         found[f"sign({name})"] = smooth_sign(e, SIGN_WIDTH * widths[name])
     found |= {name: e for name, e in steepest.items() if deviations.get(name, 1.0) > 0.0}
-    return [Candidate(place, text, e) for place in where for text, e in found.items()]
+    plain = [Candidate(place, text, e) for place in where for text, e in found.items()]
+    return plain + [
+        Candidate(place, f"lag({name}) - {f'({name})' if ' ' in name else name}", MEMORY - e, e)
+        for place in where
+        for name, e in (moving | _forces(model, place)).items()
+    ]
+
+
+def _forces(model: Model, place: str) -> dict[str, sp.Expr]:
+    """Return the summands of an equation or output, of the latter also the whole, without constant factors, by text.
+
+    Those with highest derivatives of states are left out. The names of outputs stand for their expressions.
+    """
+    index, outputs = places(model).index(place), model.output_expressions
+    whole = (*outputs, *model.equations)[index]
+    steepest = {model.state_symbols[DERIVATIVES[order] + state] for state, order in model.orders.items()}
+    moving = {*model.state_symbols.values(), *model.input_symbols.values()}
+    names = {e: sp.Symbol(name) for e, name in zip(outputs, model.outputs, strict=True) if not e.is_Symbol}
+    found: dict[str, sp.Expr] = {}
+    for part in (*sp.Add.make_args(whole), *outputs[index : index + 1]):
+        force = part if part in names else part.as_independent(*moving, as_Add=False)[1]
+        if force.free_symbols & moving and not force.free_symbols & steepest:
+            found[_written(model, force.xreplace(names))] = force
+    return found
 
 
 def places(model: Model) -> tuple[str, ...]:
@@ -103,15 +133,32 @@ def given(model: Model, candidates: Mapping[str, Iterable[Any]]) -> list[Candida
         if isinstance(terms, str) or not isinstance(terms, Iterable):
             raise ValueError(f"{argument}: must be a list of texts or functions of (s, p, u), got {terms!r}.")
         for term in terms:
-            expression = model._expression(argument, term(*spaces) if callable(term) else term)
+            force, rest = _lagged(argument, term) if isinstance(term, str) else (None, term)
+            expression = model._expression(argument, rest(*spaces) if callable(rest) else rest)
             text = term.strip() if isinstance(term, str) else _written(model, expression)
-            _check_order(model, argument, text, expression, place)
-            found.append(Candidate(place, text, expression))
+            memory = None if force is None else model._expression(argument, force)
+            for own in (expression, memory):
+                if own is not None:
+                    _check_order(model, argument, text, own, place)
+            found.append(Candidate(place, text, expression if memory is None else MEMORY + expression, memory))
             try:
                 coefficient_unit(model, found[-1])
             except ValueError as error:
                 raise ValueError(f"{argument}: must add quantities of the same unit, got {text!r}: {error}.") from None
     return found
+
+
+def _lagged(argument: str, text: str) -> tuple[str | None, str]:
+    """Return force and rest of a text such as ``"lag(x**2) - x**2"``; None and the text if there is no lag in it."""
+    start, _, inner = text.strip().partition("(")
+    if not re.search(r"\blag\s*\(", text):
+        return None, text
+    depths = np.cumsum([(c == "(") - (c == ")") for c in inner])
+    end = int(np.argmax(depths < 0))
+    force, rest = inner[:end], inner[end + 1 :].strip()
+    if start.strip() != "lag" or not end or re.search(r"\blag\b", force + rest) or rest[:1] not in ("", "+", "-"):
+        raise ValueError(f"{argument}: must be lag(…), alone or plus or minus a term without a lag, got {text!r}.")
+    return force, f"0 {rest}"
 
 
 def _check_order(model: Model, argument: str, text: str, expression: sp.Expr, place: str) -> None:
@@ -175,6 +222,8 @@ def coefficient_unit(model: Model, term: Candidate) -> str:
     A ValueError is raised for a term that adds quantities of different dimensions.
     """
     units, index = symbol_units(model), places(model).index(term.place)
+    if term.force is not None and (memory := unit_of(term.force, units)) is not None:
+        units[MEMORY] = memory
     own = unit_of(term.expression, units)
     if index < len(model.outputs):
         whole = parsed(model.units.get(term.place, ""))
@@ -192,28 +241,49 @@ def _unit_or_none(expression: sp.Expr, units: Mapping[sp.Symbol, Unit]) -> Unit 
 
 
 def coefficient_names(model: Model, terms: Iterable[Candidate]) -> list[str]:
-    """Return a new parameter for the coefficient of each term, such as ``c_w_x_2`` for ``w*x**2``."""
+    """Return a new parameter for the coefficient of each term, such as ``c_w_x_2`` for ``w*x**2``.
+
+    Those of terms with memory are ``c_lag_x`` for ``lag(x) - x``, with lag and state as `lag_names` has them.
+    """
     taken = {*model.parameters, *model.state_symbols, *model.input_symbols, *model.outputs}
     names: list[str] = []
     for term in terms:
-        short, long = ("c_" + re.sub(r"\W+", "_", text).strip("_") for text in (term.text, str(term)))
+        plain = term.text if term.force is None else term.text.partition(") - ")[0]
+        choice = plain[:LONGEST_NAME], f"{plain[:LONGEST_NAME]} in {term.place}"
+        short, long = ("c_" + re.sub(r"\W+", "_", text).strip("_") for text in choice)
         choices = chain((short, long), (f"{long}_{number}" for number in count(2)))
-        names.append(next(name for name in choices if name not in taken))
-        taken.add(names[-1])
+        names.append(next(name for name in choices if not taken & {name, *lag_names(name)}))
+        taken |= {names[-1], *lag_names(names[-1])}
     return names
+
+
+def lag_names(name: str) -> tuple[str, str]:
+    """Return the names of the lag and of the state of a term with memory, by that of its coefficient."""
+    return "tau" + name[1:], "m" + name[1:]
 
 
 def extended(model: Model, terms: Mapping[str, Candidate]) -> Model:
     """Return the model with the terms, by the names of their coefficients."""
     other = copy(model)
-    symbols = {name: sp.Symbol(f"p_{name}", real=True) for name in terms}
-    other.parameters = (*model.parameters, *_checks.identifiers("terms", terms, model.parameters))
-    other.parameter_symbols = model.parameter_symbols | symbols
+    lags = {name: lag_names(name) for name, term in terms.items() if term.force is not None}
+    new = _checks.identifiers("terms", [*terms, *(lag for lag, _ in lags.values())], model.parameters)
+    symbols = {name: sp.Symbol(f"p_{name}", real=True) for name in new}
+    other.parameters, other.parameter_symbols = (*model.parameters, *new), model.parameter_symbols | symbols
+    other.states = *model.states, *(state for _, state in lags.values())
+    other.state_symbols = with_derivatives("s", other.states)
+    other.orders = model.orders | dict.fromkeys(other.states[len(model.states) :], 1)
+    other.units = model.units | {name: coefficient_unit(model, term) for name, term in terms.items()}
     equations, outputs = list(model.equations), list(model.output_expressions)
     for name, term in terms.items():
-        index = places(model).index(term.place)
+        index, expression = places(model).index(term.place), term.expression
+        if term.force is not None:
+            lag, state = lags[name]
+            memory, rate = other.state_symbols[state], other.state_symbols[f"d{state}"]
+            equations.append(symbols[lag] * rate + memory - term.force)
+            expression = expression.xreplace({MEMORY: memory})
+            unit = unit_of(term.force, symbol_units(model))
+            other.units |= {lag: "s", state: "" if unit is None else written(unit)}
         where, i = (outputs, index) if index < len(outputs) else (equations, index - len(outputs))
-        where[i] += symbols[name] * term.expression
+        where[i] += symbols[name] * expression
     other.equations, other.output_expressions = tuple(equations), tuple(outputs)
-    other.units = model.units | {name: coefficient_unit(model, term) for name, term in terms.items()}
     return other

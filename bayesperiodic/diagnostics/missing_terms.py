@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import compress
 from typing import Any
 
@@ -11,6 +11,7 @@ import pandas as pd
 from scipy import stats
 
 from bayesperiodic import _checks
+from bayesperiodic._io import NOT_STORED, Result
 from bayesperiodic._linalg import in_one_thread
 from bayesperiodic.diagnostics.adequacy import ALL, adequacy
 from bayesperiodic.diagnostics.candidates import (
@@ -18,21 +19,27 @@ from bayesperiodic.diagnostics.candidates import (
     coefficient_names,
     coefficient_unit,
     extended,
-    factors,
     generated,
     given,
+    lag_names,
     places,
 )
-from bayesperiodic.diagnostics.optima import Optimum, distinct, held_out_error, problem_of
-from bayesperiodic.diagnostics.score_tests import ScoreTests, along_orbit
+from bayesperiodic.diagnostics.optima import (
+    SIGNIFICANT,
+    Optimum,
+    distinct,
+    doubt,
+    guesses_of,
+    held_out_error,
+    problem_of,
+)
+from bayesperiodic.diagnostics.score_tests import ScoreTests, lags_to_try, variable_deviations
 from bayesperiodic.estimation.map_estimate import map_estimate, nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate, orbit_advice
 from bayesperiodic.models.model import Model
 from bayesperiodic.posterior.description import check_results
 from bayesperiodic.posterior.problem import Problem
 
-# Robust standard deviations from zero of a coefficient.
-SIGNIFICANT = 2.0
 # Ratio of the errors in experiments that are left out from which on these tell two terms apart.
 WORSE = 2.0
 
@@ -47,12 +54,16 @@ class Step:
         Text of the term in the model's names, and the output or equation that it is added to.
     alternatives : tuple of str
         Terms of the same effect on the data, or whose fit the data do not tell from this one.
+    worse : tuple of str
+        Terms whose fit the data do not tell from this one, but which predict experiments left out worse.
     name : str
         Of the coefficient.
     unit : str
         Of the coefficient; empty where the model's units do not tell.
     coefficient, sd, robust_sd : float
         Estimate and standard deviations.
+    lag, lag_sd : float
+        Estimate and standard deviation [s] of the lag of a term with memory; NaN for the others.
     p : float
         Of the score test before it was added, adjusted for the number of candidates.
     unexplained : dict of str to float
@@ -65,7 +76,7 @@ class Step:
         Change of the log evidence in the Laplace approximation.
     held_out : float
         Mean fraction of the variance unexplained in experiments that were left out of the fit, one at a time; NaN for
-        fewer than three experiments, or local parameters.
+        fewer than three experiments, or local parameters; infinite where an experiment has no prediction.
     shifts : dict of str to float
         Changes of the other estimates, in standard deviations before the step.
     """
@@ -73,11 +84,14 @@ class Step:
     term: str
     place: str
     alternatives: tuple[str, ...]
+    worse: tuple[str, ...]
     name: str
     unit: str
     coefficient: float
     sd: float
     robust_sd: float
+    lag: float
+    lag_sd: float
     p: float
     unexplained: dict[str, float]
     p_white: dict[str, float]
@@ -88,16 +102,20 @@ class Step:
 
 
 @dataclass(frozen=True)
-class MissingTerms:
+class MissingTerms(Result):
     """What `missing_terms` found.
+
+    A file written by `save` contains the estimates but not the models: what `load` returns prints itself and has
+    `table`, `ranking` and `fit`; its `model` and `problem` raise a ValueError.
 
     Parameters
     ----------
     steps : tuple of Step
         Terms that were added, in this order.
     ranking : DataFrame
-        Candidates at the given estimate, the best first: place, term, same (others of the same effect), explains
-        (fraction of the misfit, linearised), p, and p_adjusted for the false discovery rate.
+        Candidates at the given estimate, the best first: place, term, lag (the best one of those tried [s], NaN without
+        memory), same (others of the same effect), explains (fraction of the misfit, linearised), p, and p_adjusted for
+        the false discovery rate.
     tested : int
         Number of candidates of different effect that were tested.
     refused : dict of str to str
@@ -123,9 +141,9 @@ class MissingTerms:
     before: Step
     dropped: tuple[str, ...]
     stopped: str
-    _problem: Problem
-    _terms: dict[str, tuple[Candidate, float]]
     _fits: tuple[MapEstimate, ...]
+    _problem: Problem | None = field(default=None, metadata=NOT_STORED)
+    _terms: dict[str, tuple[Candidate, float]] = field(default_factory=dict, metadata=NOT_STORED)
 
     def model(self, k: int | None = None) -> Model:
         """Return the model with the terms of the first k steps, by default of all.
@@ -141,9 +159,10 @@ class MissingTerms:
         Raises
         ------
         ValueError
-            If there are fewer steps.
+            If there are fewer steps, or the result was loaded from a file.
         """
-        return extended(self._problem._given["model"], {name: term for name, (term, _) in self._first(k).items()})
+        problem, terms = self._first(k)
+        return extended(problem._given["model"], {name: term for name, (term, _) in terms.items()})
 
     def problem(self, k: int | None = None) -> Problem:
         """Return the problem of that model, ready to be fitted and sampled.
@@ -156,14 +175,16 @@ class MissingTerms:
         -------
         Problem
             The prior of each coefficient is normal about zero, with an effect as large as the measured outputs at one
-            standard deviation. Its estimate is that of `fit`.
+            standard deviation; that of a lag is log-normal about the best one of those tried. Its estimate is that of
+            `fit`.
 
         Raises
         ------
         ValueError
-            If there are fewer steps.
+            If there are fewer steps, or the result was loaded from a file.
         """
-        return problem_of(self._problem, self.model(k), {name: width for name, (_, width) in self._first(k).items()})
+        problem, terms = self._first(k)
+        return problem_of(problem, self.model(k), terms, {})
 
     def fit(self, k: int | None = None) -> MapEstimate:
         """Return the estimate of `problem`.
@@ -181,13 +202,18 @@ class MissingTerms:
         ValueError
             If there are fewer steps.
         """
-        return self._fits[len(self._first(k))]
+        return self._fits[self._count(k)]
 
-    def _first(self, k: int | None) -> dict[str, tuple[Candidate, float]]:
+    def _count(self, k: int | None) -> int:
         count = len(self.steps) if k is None else _checks.integer("k", k, 0)
         if count > len(self.steps):
             raise ValueError(f"k: must be at most {len(self.steps)}, the number of steps, got {count}.")
-        return {step.name: self._terms[step.name] for step in self.steps[:count]}
+        return count
+
+    def _first(self, k: int | None) -> tuple[Problem, dict[str, tuple[Candidate, float]]]:
+        if self._problem is None:
+            raise ValueError("found: must be what missing_terms has returned, got one of a file, which has no models.")
+        return self._problem, {step.name: self._terms[step.name] for step in self.steps[: self._count(k)]}
 
     @property
     def table(self) -> pd.DataFrame:
@@ -204,23 +230,32 @@ class MissingTerms:
         return pd.DataFrame.from_dict(rows, orient="index")
 
     def __repr__(self) -> str:
+        shown = self.table.astype({"held out": object}).replace({"held out": {np.inf: "no prediction"}})
         lines = [
-            f"Missing terms, of {self.tested} candidates; variance unexplained in the fit and in what was left out:"
+            f"Missing terms, of {self.tested} candidates; variance unexplained in the fit and in what was left out:",
+            shown.to_string(float_format="{:.3g}".format, na_rep="-"),
         ]
-        lines.append(self.table.to_string(float_format="{:.3g}".format, na_rep="-"))
-        for k, step in enumerate(self.steps, 1):
-            others = f"; the data do not tell it from {', '.join(step.alternatives)}" * bool(step.alternatives)
-            moved = {name: shift for name, shift in step.shifts.items() if abs(shift) > 1.0}
-            shifted = ", ".join(f"{name} by {shift:+.1f}" for name, shift in moved.items())
-            lines.append(
-                f"{k}. {step.name}·{step.term} in {step.place}, {step.name} = {step.coefficient:.3g} ± "
-                f"{step.robust_sd:.2g} {step.unit}".rstrip()
-                + f" (p = {step.p:.2g}){others}."
-                + f" It moves {shifted} of its standard deviations." * bool(moved)
-            )
+        lines += [_sentence(k, step) for k, step in enumerate(self.steps, 1)]
         lines += [f"Removed again: {', '.join(self.dropped)}."] if self.dropped else []
         lines += [f"{text}: left out, {why}." for text, why in self.refused.items() if why != NOT_TOLD]
         return "\n".join([*lines, self.stopped])
+
+
+def _sentence(k: int, step: Step) -> str:
+    """Return what a step has added, in words."""
+    size = f"{step.name} = {step.coefficient:.3g} ± {step.robust_sd:.2g} {step.unit}".rstrip()
+    others = f"; the data do not tell it from {', '.join(step.alternatives)}" * bool(step.alternatives)
+    text = f"{k}. {step.name}·({step.term})" if " - " in step.term else f"{k}. {step.name}·{step.term}"
+    text += f" in {step.place}, {size} (p = {step.p:.2g}){others}."
+    if np.isfinite(step.lag):
+        text += f" Its lag is {step.lag:.3g} ± {step.lag_sd:.2g} s."
+        if abs(step.coefficient) < SIGNIFICANT * step.robust_sd:
+            text += " The data determine the product of coefficient and lag, but not both."
+    if step.worse:
+        text += f" As good a fit, but worse in experiments left out: {', '.join(step.worse)}."
+    moved = {name: shift for name, shift in step.shifts.items() if abs(shift) > 1.0}
+    shifted = ", ".join(f"{name} by {shift:+.1f}" for name, shift in moved.items())
+    return text + f" It moves {shifted} of its standard deviations." * bool(moved)
 
 
 NOT_TOLD = "its effect is that of the parameters"
@@ -229,17 +264,10 @@ VANISHED = "with it the fit found no periodic solution, or no optimum"
 
 @in_one_thread
 def missing_terms(
-    problem: Problem,
-    fit: MapEstimate,
-    candidates: Mapping[str, Iterable[Any]] | None = None,
-    *,
-    equations: bool = True,
-    outputs: bool = True,
-    exclude: Iterable[str] = (),
-    keep: int = 4,
-    max_terms: int = 5,
+    problem: Problem, fit: MapEstimate, candidates: Mapping[str, Iterable[Any]] | None = None, *,
+    equations: bool = True, outputs: bool = True, exclude: Iterable[str] = (), keep: int = 4, max_terms: int = 5,
     false_discovery_rate: float = 0.01,
-) -> MissingTerms:
+) -> MissingTerms:  # fmt: skip
     """Search for terms that the model lacks.
 
     Each candidate is a term with an unknown coefficient in an equation or an output. Its score test needs no fit: with
@@ -250,13 +278,19 @@ def missing_terms(
     differ significantly (as by Vuong [2]_, for normal errors) and there are at least three experiments, these are left
     out of the fit, one at a time, and only terms are eligible whose predictions of them are off by less than twice the
     smallest error. The search ends if no candidate is significant, if the evidence increases by less than the logarithm
-    of the number of candidates, if the coefficient is within two robust standard deviations of zero, or if the
-    prediction of experiments that are left out gets worse. At the end, terms that later ones have made needless are
+    of the number of candidates, if the coefficient is within two robust standard deviations of zero, if the
+    prediction of experiments that are left out gets worse, or if the coefficient changes by more than half on twice as
+    many points, so that the grid's error looks like the term. At the end, terms that later ones have made needless are
     removed.
 
     Candidates are products of states, inputs and their rates up to the third degree, powers up to the fifth, absolute
     values, products with these, signs, a constant, and the highest derivatives, in every equation and output. An
-    absolute value is rounded within 2 % of its argument's standard deviation, a sign within 20 %.
+    absolute value is rounded within 2 % of its argument's standard deviation, a sign within 20 %. Terms with memory are
+    ``lag(x) - x`` of each variable x, of each summand of the equation or output, and of the whole output. The lag m of
+    x is a state of the extended model, τ·ṁ = x − m. Its score test is the best of those with several τ, from 0.3 rad of
+    the fastest experiment to 3 rad of the slowest, its p-value multiplied by their number (Bonferroni); in fits τ is
+    a free parameter. Where the data determine only the product of coefficient and τ, the coefficient is tested at the
+    estimate of τ.
 
     Parameters
     ----------
@@ -264,6 +298,7 @@ def missing_terms(
     fit : MapEstimate
     candidates : mapping of str to list, optional
         Further terms by place, an output or "equation of x": texts in the model's names, or functions of (s, p, u).
+        A text may begin with the lag of an expression, ``"lag(x**2)"`` or ``"lag(x**2) - x**2"``.
     equations, outputs : bool
         Whether terms of the model's variables are candidates in the equations, and in the outputs.
     exclude : iterable of str
@@ -309,27 +344,20 @@ def missing_terms(
     model = problem._given["model"]
     terms = given(model, candidates or {})
     wanted = (outputs,) * len(model.outputs) + (equations,) * len(model.states)
-    terms += generated(model, list(compress(places(model), wanted)), _deviations(stated, fit))
+    terms += generated(model, list(compress(places(model), wanted)), variable_deviations(stated, fit))
     left_out = {exclude} if isinstance(exclude, str) else set(exclude)
     chosen = {str(t): t for t in terms if not {t.text, t.place, str(t)} & left_out}
-    return _Search(problem, list(chosen.values()), false_discovery_rate, keep).run(fit, max_terms)
-
-
-def _deviations(problem: Problem, fit: MapEstimate) -> dict[str, float]:
-    """Return the standard deviations of the model's variables along the orbits of all experiments."""
-    variables = {name: e for part in factors(problem.model) for name, e in part.items()}
-    theta, listed = problem.vector(fit.theta), list(variables.values())
-    each = [along_orbit(problem, theta, e, fit.solutions[e.name], listed) for e in problem.experiments]
-    return dict(zip(variables, np.std(np.concatenate(each, axis=1), axis=1).tolist(), strict=True))
+    return _Search(problem, list(chosen.values()), false_discovery_rate, keep, lags_to_try(fit)).run(fit, max_terms)
 
 
 class _Search:
     """Candidates of one problem, and the steps."""
 
-    def __init__(self, problem: Problem, terms: list[Candidate], rate: float, keep: int):
+    def __init__(self, problem: Problem, terms: list[Candidate], rate: float, keep: int, lags: list[float]):
         self.problem, self.model, self.rate, self.keep = problem, problem._given["model"], rate, keep
-        self.terms = {str(term): term for term in terms}
+        self.lags, self.terms = lags, {str(term): term for term in terms}
         self.names = dict(zip(self.terms, coefficient_names(self.model, terms), strict=True))
+        self.keys = {name: key for key, name in self.names.items()}
         self.refused: dict[str, str] = {}
         self.widths: dict[str, float] = {}
         self.compiled: tuple[Model, dict[str, Candidate]] = self.model, {}
@@ -348,18 +376,18 @@ class _Search:
             if isinstance(found, str):
                 stopped = found
                 break
-            key, others, p, after = found
+            key, others, worse, p, after = found
             term, name = self.terms[key], self.names[key]
             fit_after = self.estimate({**chosen, name: term}, after)
-            if fit_after is None:
-                self.refused[key] = VANISHED
-                table = table[table["candidate"] != key]
+            why = doubt(fit_after, name, term) if fit_after else VANISHED
+            if fit_after is None or (why and term.force is not None):
+                self.refused[key], table = why, table[table["candidate"] != key]
                 continue
+            if why:
+                stopped = f"{key} fits best, but {why}."
+                break
             state_after = self.at(fit_after, (*chosen, name))
             held_out, last = held_out_error(state_after), steps[-1].held_out if steps else before.held_out
-            if abs(fit_after.theta[name]) < SIGNIFICANT * fit_after.robust_sd[name]:
-                stopped = f"{key} fits best, but its coefficient is less than {SIGNIFICANT:g} robust sds from zero."
-                break
             if np.isfinite(held_out) and held_out > last:
                 stopped = (
                     f"{key} would improve the fit, but not the prediction of experiments that are left out "
@@ -367,21 +395,21 @@ class _Search:
                 )
                 break
             gain = after.evidence - state.evidence
-            steps.append(_step(state_after, fit_after, fit, (term, name, others, p, gain), held_out))
+            steps.append(_step(state_after, fit_after, fit, (term, name, others, worse, p, gain), held_out))
             chosen[name], state, fit = term, state_after, fit_after
             fits.append(fit)
             table = self.scores(state)
         steps, fits, dropped = self.without_needless(steps, fits, state)
-        kept = {step.name: (chosen[step.name], self.widths[step.name]) for step in steps}
+        kept = self.priors(step.name for step in steps)
         return MissingTerms(
-            tuple(steps), ranking, len(ranking), self.refused, before, dropped, stopped, self.problem, kept, tuple(fits)
+            tuple(steps), ranking, len(ranking), self.refused, before, dropped, stopped, tuple(fits), self.problem, kept
         )
 
     def at(self, fit: MapEstimate, names: tuple[str, ...]) -> Optimum:
         """Return the optimum at an estimate of the model with terms."""
         problem = self.with_terms(names).with_input_errors(fit.input_errors)
-        theta, guesses = problem.vector(fit.theta), {n: solution.states for n, solution in fit.solutions.items()}
-        found = nearest_optimum(problem, theta, guesses)
+        orbits = {name: solution.states for name, solution in fit.solutions.items()}
+        found = nearest_optimum(problem, problem.vector(fit.theta), guesses_of(self.compiled[0], orbits))
         if found is None:
             raise ValueError("fit: must be an estimate with a periodic solution of every experiment, got one without.")
         return Optimum(problem, found[0], found[1].iterate, names)
@@ -389,39 +417,54 @@ class _Search:
     def with_terms(self, names: Iterable[str]) -> Problem:
         """Return the problem with coefficients of the compiled model, the others zero."""
         model, known = self.compiled
-        zero = [name for name in known if name not in {*names}]
-        return problem_of(self.problem, model, {name: self.widths[name] for name in names}, zero)
+        terms = self.priors(names)
+        return problem_of(self.problem, model, terms, {n: self.terms[self.keys[n]] for n in known if n not in terms})
+
+    def priors(self, names: Iterable[str]) -> dict[str, tuple[Candidate, float]]:
+        """Return terms and widths of the priors of their coefficients, by these."""
+        return {name: (self.terms[self.keys[name]], self.widths[name]) for name in names}
 
     def estimate(self, terms: Mapping[str, Candidate], near: Optimum) -> MapEstimate | None:
         """Return the estimate of the model with terms, by name, from a near optimum; None if it cannot start there."""
-        problem = problem_of(self.problem, extended(self.model, terms), {name: self.widths[name] for name in terms})
+        model = extended(self.model, terms)
+        problem = problem_of(self.problem, model, self.priors(terms), {})
         start = dict(zip(near.problem.names, near.iterate.theta.tolist(), strict=True))
-        guesses = {name: solution.states for name, solution in near.solutions.items()}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             try:
-                return map_estimate(problem.anchored(start, guesses), start=start, progress=False)
+                return map_estimate(
+                    problem.anchored(start, guesses_of(model, near.orbits)), start=start, progress=False
+                )
             except ValueError:
                 return None
 
     def scores(self, state: Optimum) -> pd.DataFrame:
         """Return the table of the score tests of candidates that are not yet chosen, the best first."""
         left = [key for key in self.terms if self.names[key] not in state.names and key not in self.refused]
-        tests = ScoreTests(state.problem, state.iterate, [self.terms[key] for key in left])
-        self.refused |= {left[i]: NOT_TOLD for i in np.flatnonzero(~tests.identifiable)}
-        self.widths |= {self.names[key]: width for key, width in zip(left, tests.widths.tolist(), strict=True)}
-        rows = []
-        for first, *others in tests.groups():
-            term, same = self.terms[left[first]], tuple(left[i] for i in others)
-            rows.append((left[first], term.place, term.text, same, tests.explained[first], tests.p[first]))
-        table = pd.DataFrame(rows, columns=["candidate", "place", "term", "same", "explains", "p"])
+        lags = [self.lags if self.terms[key].force is not None else [np.nan] for key in left]
+        each = [replace(self.terms[key], lag=lag) for key, own in zip(left, lags, strict=True) for lag in own]
+        tests, rows, at = ScoreTests(state.problem, state.iterate, each), [], {}
+        ends = np.cumsum([len(own) for own in lags])
+        for key, own, end in zip(left, lags, ends.tolist(), strict=True):
+            tried = range(end - len(own), end)
+            i = max(tried, key=lambda i: tests.explained[i] if tests.identifiable[i] else -1.0)
+            at[i], self.terms[key], self.widths[self.names[key]] = key, each[i], float(tests.widths[i])
+            tests.p[i] = min(1.0, len(own) * tests.p[i])
+            if not tests.identifiable[i]:
+                self.refused[key] = NOT_TOLD
+        for group in tests.groups(at):
+            key, *same = (at[i] for i in group)
+            term, most = self.terms[key], max(group, key=lambda i: tests.explained[i])
+            rows.append((key, term.place, term.text, term.lag, same, tests.explained[most], tests.p[most]))
+        columns = ["candidate", "place", "term", "lag", "same", "explains", "p"]
+        table = pd.DataFrame(rows, [str(i) for i in range(1, len(rows) + 1)], columns)
         table["p_adjusted"] = stats.false_discovery_control(table["p"]) if len(table) else table["p"]
         return table
 
     def best(
         self, state: Optimum, table: pd.DataFrame, chosen: Mapping[str, Candidate]
-    ) -> tuple[str, tuple[str, ...], float, Optimum] | str:
-        """Return the term to be added, its alternatives, p, and the optimum with it; or why there is none."""
+    ) -> tuple[str, tuple[str, ...], tuple[str, ...], float, Optimum] | str:
+        """Return the term to be added, alternatives, worse ones, p, and the optimum with it; or why there is none."""
         if not len(table):
             return "No candidate is left."
         significant = table[table["p_adjusted"] < self.rate]
@@ -447,7 +490,8 @@ class _Search:
         errors = {key: held_out_error(fitted[key]) for key in alike} if len(alike) > 1 else {best: np.nan}
         # Errors that are nearly equal are in an order by chance: of these, the evidence tells which is best.
         well = [key for key in alike if not errors[key] > WORSE * min(errors.values())]
-        first = max(well, key=lambda key: fitted[key].evidence)
+        # Of a term with memory, short and long lags have the effect of one without.
+        first = max(well, key=lambda key: (self.terms[key].force is None, fitted[key].evidence))
         # Each of the candidates is as likely to be the missing one.
         needed = np.log(len(self.terms))
         if (gain := fitted[first].evidence - state.evidence) < needed:
@@ -456,11 +500,10 @@ class _Search:
                 f"{len(self.terms)} candidates require {needed:.1f}."
             )
         same, p = (dict(zip(table["candidate"], table[column], strict=True)) for column in ("same", "p_adjusted"))
-        alternatives = list(same[first])
-        for other in well:
-            if other != first:
-                alternatives += [other, *same[other]]
-        return first, tuple(alternatives), float(p[first]), fitted[first]
+        others = [[key, *same[key]] for key in alike]
+        alternatives = [*same[first], *(o for own in others if own[0] in well and own[0] != first for o in own)]
+        worse = tuple(other for own in others if own[0] not in well for other in own)
+        return first, tuple(alternatives), worse, float(p[first]), fitted[first]
 
     def compile(self, wanted: Sequence[str], more: Sequence[str], chosen: Mapping[str, Candidate]) -> None:
         """Take a model with all wanted terms; where the present one lacks any, one with more terms."""
@@ -493,12 +536,11 @@ class _Search:
         known, found = len(fits) - 1, list(fits)
         for k in range(known, len(steps)):
             names = tuple(step.name for step in steps[: k + 1])
-            keys = {name: key for key, name in self.names.items()}
-            fit = self.estimate({name: self.terms[keys[name]] for name in names}, near)
+            fit = self.estimate({name: self.terms[self.keys[name]] for name in names}, near)
             if fit is None:
                 return None
-            state, term, old = self.at(fit, names), self.terms[keys[names[-1]]], steps[k]
-            added = term, old.name, old.alternatives, old.p, old.evidence_gain
+            state, term, old = self.at(fit, names), self.terms[self.keys[names[-1]]], steps[k]
+            added = term, old.name, old.alternatives, old.worse, old.p, old.evidence_gain
             steps = [*steps[:k], _step(state, fit, found[-1], added, held_out_error(state)), *steps[k + 1 :]]
             found.append(fit)
         return steps, found
@@ -508,25 +550,18 @@ def _step(
     state: Optimum,
     fit: MapEstimate,
     before: MapEstimate,
-    added: tuple[Candidate, str, tuple[str, ...], float, float] | None,
+    added: tuple[Candidate, str, tuple[str, ...], tuple[str, ...], float, float] | None,
     held_out: float,
 ) -> Step:
     table = adequacy(state.problem, state.iterate.here, state.iterate.noise[None], {})
-    term, name, others, p, gain = added or (None, "", (), np.nan, np.nan)
+    term, name, others, worse, p, gain = added or (None, "", (), (), np.nan, np.nan)
+    lag = lag_names(name)[0] if term and term.force is not None else ""
+    unknown: dict[str, float] = {"": np.nan}
+    theta, sd, robust = (unknown | own for own in (fit.theta, fit.sd, fit.robust_sd))
     return Step(
-        term.text if term else "",
-        term.place if term else "",
-        others,
-        name,
+        term.text if term else "", term.place if term else "", others, worse, name,
         coefficient_unit(state.problem.model, term) if term else "",
-        fit.theta[name] if term else np.nan,
-        fit.sd[name] if term else np.nan,
-        fit.robust_sd[name] if term else np.nan,
-        p,
-        fit.fvu,
-        {channel: white.p for channel, white in fit.whiteness.items()},
-        str(table.loc[ALL, "verdict"]),
-        gain,
-        held_out,
-        {n: (fit.theta[n] - value) / before.sd[n] for n, value in before.theta.items()},
-    )
+        theta[name], sd[name], robust[name], theta[lag], sd[lag],
+        p, fit.fvu, {channel: white.p for channel, white in fit.whiteness.items()}, str(table.loc[ALL, "verdict"]),
+        gain, held_out, {n: (fit.theta[n] - value) / before.sd[n] for n, value in before.theta.items()},
+    )  # fmt: skip

@@ -1,17 +1,19 @@
-"""Optima of the models with and without candidate terms, and how well they predict experiments that are left out."""
+"""Optima of the models with and without candidate terms, and whether to believe them."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bayesperiodic._linalg import TINY, hessian_scale, scaled
+from bayesperiodic.diagnostics.candidates import Candidate, lag_names
 from bayesperiodic.estimation.gauss_newton import Iterate, Objective
 from bayesperiodic.estimation.map_estimate import nearest_optimum
+from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
 from bayesperiodic.periodic.solution import PeriodicSolution
 from bayesperiodic.posterior.parameters import local_names
-from bayesperiodic.posterior.priors import Normal
+from bayesperiodic.posterior.priors import LogNormal, Normal
 from bayesperiodic.posterior.problem import Problem
 
 # Standard deviations of the difference of two log-likelihoods from which on the data tell two terms apart.
@@ -22,12 +24,37 @@ FEWEST_EXPERIMENTS = 3
 ENDED = ("converged", "stalled")
 
 
-def problem_of(problem: Problem, model: Model, widths: Mapping[str, float], zero: Iterable[str] = ()) -> Problem:
-    """Return the problem with another model, whose new coefficients have priors of these widths or are zero."""
+# Robust standard deviations from zero of a coefficient.
+SIGNIFICANT = 2.0
+# Fraction by which a coefficient may change on twice as many points.
+COARSE = 0.5
+# Standard deviation of the logarithm of a lag about where its estimation starts.
+LAG_SPREAD = 1.5
+
+
+def problem_of(
+    problem: Problem, model: Model, terms: Mapping[str, tuple[Candidate, float]], zero: Mapping[str, Candidate]
+) -> Problem:
+    """Return the problem with another model, whose coefficients have normal priors of given widths or are zero."""
     settings = dict(problem._given)
-    settings["priors"] = settings["priors"] | {name: Normal(0.0, width) for name, width in widths.items()}
-    settings["fixed"] = settings["fixed"] | dict.fromkeys(zero, 0.0)
-    return Problem(experiments=problem.experiments, **settings | {"model": model})
+    priors, fixed = dict(settings["priors"]), dict(settings["fixed"])
+    for name, (term, width) in terms.items():
+        priors[name] = Normal(0.0, width)
+        if term.force is not None:
+            priors[lag_names(name)[0]] = LogNormal(term.lag, LAG_SPREAD)
+    for name, term in zero.items():
+        fixed |= {name: 0.0} | ({lag_names(name)[0]: term.lag} if term.force is not None else {})
+    orbits = guesses_of(model, {e.name: e.guess for e in problem.experiments if e.guess})
+    experiments = [replace(e, guess=orbits[e.name]) if e.guess else e for e in problem.experiments]
+    return Problem(experiments=experiments, **settings | {"priors": priors, "fixed": fixed, "model": model})
+
+
+def guesses_of(model: Model, orbits: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
+    """Return orbits of a model with other lags as guesses; new lags, which do not act on the others, start at zero."""
+    return {
+        name: {state: states.get(state, np.zeros_like(next(iter(states.values())))) for state in model.states}
+        for name, states in orbits.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -45,6 +72,11 @@ class Optimum:
         return self.iterate.here.simulator.solutions(self.iterate.theta)
 
     @property
+    def orbits(self) -> dict[str, dict[str, np.ndarray]]:
+        """The states of the periodic solutions by experiment."""
+        return {name: solution.states for name, solution in self.solutions.items()}
+
+    @property
     def evidence(self) -> float:
         """The logarithm of the evidence by Laplace, but for a constant."""
         hessian, _ = self.objective.hessian_and_gradient(self.iterate)
@@ -56,9 +88,10 @@ class Optimum:
     def with_problem(self, problem: Problem, names: tuple[str, ...]) -> "Optimum | None":
         """Return the optimum of a problem with other terms, from here on; None if there is none."""
         known = dict(zip(self.problem.names, self.iterate.theta.tolist(), strict=True))
-        theta = np.array([known.get(name, 0.0) for name in problem.names])
-        guesses = {e.name: self.solutions[e.name].states for e in problem.experiments}
-        found = nearest_optimum(problem, theta, guesses)
+        known |= {n: float(problem._given["priors"][n].quantile(0.5)) for n in problem.names if n not in known}
+        orbits = {e.name: self.orbits[e.name] for e in problem.experiments}
+        theta = np.array([known[name] for name in problem.names])
+        found = nearest_optimum(problem, theta, guesses_of(problem._given["model"], orbits))
         if found is None or found[1].status not in ENDED:
             return None
         return Optimum(problem, found[0], found[1].iterate, names)
@@ -79,8 +112,7 @@ def held_out_error(state: Optimum) -> float:
     problem = state.problem
     if len(problem.experiments) < FEWEST_EXPERIMENTS or any(local_names(problem.names)):
         return np.nan
-    guesses = {name: solution.states for name, solution in state.solutions.items()}
-    whole, fractions = problem.anchored(state.iterate.theta, guesses), []
+    whole, fractions = problem.anchored(state.iterate.theta, state.orbits), []
     for e in problem.experiments:
         errors = {name: own for name, own in problem.input_errors.items() if name != e.name}
         try:
@@ -97,3 +129,20 @@ def held_out_error(state: Optimum) -> float:
             left = measured - e.project(channel, outputs[e.name][channel][0])
             fractions.append(float(np.mean(left**2) / np.var(measured)))
     return float(np.mean(fractions))
+
+
+def doubt(fit: MapEstimate, name: str, term: Candidate) -> str:
+    """Return why the coefficient of a term is not believed, in words; "" if it is."""
+    size, sd, robust = abs(fit.theta[name]), fit.sd[name], fit.robust_sd[name]
+    if term.force is not None:
+        # Of a short or a long lag, the data determine only its product with the coefficient, or the quotient.
+        joint = fit.covariance.loc[[name, lag_names(name)[0]], [name, lag_names(name)[0]]].to_numpy()
+        robust *= np.sqrt(max(1.0 - joint[0, 1] ** 2 / (joint[0, 0] * joint[1, 1]), 0.0))
+    if size < SIGNIFICANT * robust:
+        return f"its coefficient is less than {SIGNIFICANT:g} robust sds from zero"
+    if (change := abs(fit.doubling_shift[name]) * sd / size) > COARSE:
+        return (
+            f"on twice as many points its coefficient changes by {change:.0%}: the error of the grid looks like this "
+            "term. Take more samples in fold(), or a scheme of higher order"
+        )
+    return ""

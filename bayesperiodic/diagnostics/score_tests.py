@@ -1,18 +1,20 @@
 """Score tests of terms that a model may lack: the effect of each on the outputs against the residual, without a fit."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import sympy as sp
 from scipy import stats
 
+from bayesperiodic import _fourier
 from bayesperiodic._linalg import column_space
 from bayesperiodic.data.experiment import Experiment
 from bayesperiodic.diagnostics.adequacy import Whitened, used
-from bayesperiodic.diagnostics.candidates import Candidate, places, values
+from bayesperiodic.diagnostics.candidates import MEMORY, Candidate, factors, places, values
 from bayesperiodic.estimation.covariance import predicted_changes, residual_variances
 from bayesperiodic.estimation.gauss_newton import Iterate
+from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.periodic.equations import PeriodicEquations, respond
 from bayesperiodic.periodic.solution import PeriodicSolution, periodic_part
 from bayesperiodic.posterior.noise import KNOWN
@@ -22,6 +24,8 @@ from bayesperiodic.posterior.problem import Problem
 UNIDENTIFIABLE = 1e-6
 # 1 − cos² of the angle between two effects that are the same on the measured orbits.
 COLLINEAR = 1e-8
+# Lags that are tried: in radians of the fastest and of the slowest experiment, with this factor or less between them.
+SHORTEST, LONGEST, FACTOR = 0.3, 3.0, 3.5
 
 
 class Compared(NamedTuple):
@@ -87,14 +91,14 @@ class ScoreTests:
             statistic = gains * freedom / np.maximum(tests.square - gains, np.finfo(float).tiny)
         return np.where(self.identifiable, stats.f.sf(statistic, 1.0, freedom), 1.0)
 
-    def groups(self) -> Iterator[list[int]]:
-        """Yield the indices of identifiable terms with the same effect on the data, by decreasing `explained`."""
+    def groups(self, among: Container[int]) -> Iterator[list[int]]:
+        """Yield the indices of identifiable terms with the same effect on the data, sorted, by what they explain."""
         size = np.sqrt(np.sum(self._effects**2, axis=1))
-        left = [i for i in np.argsort(-self.explained, kind="stable") if self.identifiable[i]]
+        left = [i for i in np.argsort(-self.explained, kind="stable") if self.identifiable[i] and i in among]
         while left:
             cosine = self._effects[left] @ self._effects[left[0]] / (size[left] * size[left[0]])
             same = 1.0 - cosine**2 < COLLINEAR
-            yield [int(i) for i, own in zip(left, same, strict=True) if own]
+            yield sorted(int(i) for i, own in zip(left, same, strict=True) if own)
             left = [i for i, own in zip(left, same, strict=True) if not own]
 
 
@@ -136,6 +140,21 @@ def along_orbit(
     )
 
 
+def variable_deviations(problem: Problem, fit: MapEstimate) -> dict[str, float]:
+    """Return the standard deviations of the model's variables along the orbits of all experiments."""
+    variables = {name: e for part in factors(problem.model) for name, e in part.items()}
+    theta, listed = problem.vector(fit.theta), list(variables.values())
+    each = [along_orbit(problem, theta, e, fit.solutions[e.name], listed) for e in problem.experiments]
+    return dict(zip(variables, np.std(np.concatenate(each, axis=1), axis=1).tolist(), strict=True))
+
+
+def lags_to_try(fit: MapEstimate) -> list[float]:
+    """Return lags [s] of terms with memory, which cover all experiments."""
+    rates = [2.0 * np.pi * own.frequency / own.periods for own in fit.solutions.values()]
+    ends = SHORTEST / max(rates), LONGEST / min(rates)
+    return np.geomspace(*ends, 1 + int(np.ceil(np.log(ends[1] / ends[0]) / np.log(FACTOR)))).tolist()
+
+
 def _at(
     problem: Problem, theta: np.ndarray, experiment: Experiment, solution: PeriodicSolution
 ) -> tuple[PeriodicEquations, np.ndarray, np.ndarray]:
@@ -156,7 +175,11 @@ def _effects(
     outputs, found = len(problem.model.outputs), []
     for e in problem.experiments:
         equations, z, parameters = _at(problem, theta, e, solutions[e.name])
-        along = along_orbit(problem, theta, e, solutions[e.name], [term.expression for term in terms])
+        listed = [term.expression.xreplace({MEMORY: sp.Integer(0)}) for term in terms]
+        forces, lagging = [t.force for t in terms if t.force is not None], [t.force is not None for t in terms]
+        along, memory = np.split(along_orbit(problem, theta, e, solutions[e.name], listed + forces), [len(terms)])
+        lags = np.array([t.lag for t in terms])[lagging] * equations.frequency / equations.grid.periods
+        along[lagging] += _fourier.lagged(memory, lags)
         finite = np.isfinite(along).all(axis=1)
         added = np.zeros((len(terms), len(z), outputs + equations.count))
         added[np.arange(len(terms)), :, where] = np.where(finite[:, None], along, 0.0)

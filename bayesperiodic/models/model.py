@@ -125,8 +125,8 @@ class Model:
         if not self.states:
             raise ValueError("states: must have at least one name, got none.")
 
-        self.state_symbols = _with_derivatives("s", self.states)
-        self.input_symbols = _with_derivatives("u", self.inputs)
+        self.state_symbols = with_derivatives("s", self.states)
+        self.input_symbols = with_derivatives("u", self.inputs)
         self.parameter_symbols = {n: sp.Symbol(f"p_{n}", real=True) for n in self.parameters}
         self.time_symbols = {n: sp.Symbol(f"t_{n}", real=True) for n in ("tau", "frequency")}
         spaces = (
@@ -351,7 +351,8 @@ def _check_derivative_names(argument: str, space: str, names: tuple[str, ...]) -
     _checks.identifiers(argument, [d + n for d in DERIVATIVES for n in names], RESERVED)
 
 
-def _with_derivatives(space: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]:
+def with_derivatives(space: str, names: tuple[str, ...]) -> dict[str, sp.Symbol]:
+    """Return the symbols of names and their derivatives, by name."""
     return {d + n: sp.Symbol(f"{space}_{d}_{n}", real=True) for d in DERIVATIVES for n in names}
 
 

@@ -34,7 +34,7 @@ def missing_terms(problem: Problem, fit: MapEstimate, found: MissingTerms, *, fi
     first term acts on (for a term in an equation, the channel that is explained worst), in the experiment where it is
     largest, against the variable of the first term. Of a term of several variables the one with the highest power is
     across, and the first of the others is the colour. For a constant, or if no term was found, the residual is drawn
-    over the time in the period. Variables are those of the given fit.
+    over the time in the period, as for terms that were loaded from a file. Variables are those of the given fit.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def missing_terms(problem: Problem, fit: MapEstimate, found: MissingTerms, *, fi
     """
     problem = check_results(problem, fit=fit)
     _checks.instance("found", found, MissingTerms)
-    if fingerprint(found._problem) != fingerprint(problem):
+    if found.fit(0).fingerprint != fingerprint(problem):
         raise ValueError(
             "found: must be what missing_terms(problem, fit) returns for this problem, got terms of another problem."
         )
@@ -135,8 +135,9 @@ def _residuals(panels: list[Axes], problem: Problem, found: MissingTerms, shown:
 def _variables(problem: Problem, fit: MapEstimate, found: MissingTerms, e: Experiment) -> dict[str, np.ndarray]:
     """Return the variables of the first term along an orbit, by their labels; the time for a term without any."""
     model = problem.model
-    if found.steps:
-        expression = found._terms[found.steps[0].name][0].expression
+    if found._terms:
+        term, _ = found._terms[found.steps[0].name]
+        expression = term.force or term.expression
         names = model.state_symbols | model.input_symbols
         powers = {
             name: sp.degree(expression, symbol) if expression.is_polynomial(symbol) else 1

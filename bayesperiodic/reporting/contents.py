@@ -85,7 +85,7 @@ class ReportInputs:
             _checks.same_names("prediction", prediction.median, runs)
         if missing is not None:
             _checks.instance("missing", missing, MissingTerms)
-            if fingerprint(missing._problem) != fingerprint(problem):
+            if missing.fit(0).fingerprint != fingerprint(problem):
                 raise ValueError("missing: must be missing_terms(problem, fit) of this problem, got that of another.")
         return cls(problem, fit, posterior, found, comparison, prediction, missing, no_prediction)
 

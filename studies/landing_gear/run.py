@@ -19,7 +19,7 @@ from scipy.stats import binom
 
 import bayesperiodic as bp
 from studies import common
-from studies.landing_gear import cost, drop, force, identification, quality, repair, rig
+from studies.landing_gear import cost, drop, force, identification, missing, quality, repair, rig
 from studies.landing_gear import figures as landing_gear_figures
 from studies.landing_gear.drop import Dropped
 from studies.landing_gear.identification import CONDUCTION, DISPLACEMENT, FORCE, PRIORS, Identified, Verdict
@@ -48,7 +48,7 @@ class OfTruth:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the study, or with ``--replicates`` campaigns of truth A alone."""
+    """Run the study, or with ``--replicates`` campaigns of truth A, with ``--missing`` searches for missing terms."""
     watch, runs = common.Stopwatch(), QUICK if options.quick else RUNS
     if options.replicates:
         with watch.part("campaigns", f"{options.replicates} SYNTHETIC campaigns of truth A"):
@@ -59,6 +59,14 @@ def run(options: argparse.Namespace) -> None:
         common.finish(options.out / "campaigns", found, watch, synthetic=True)
         return
     truths = [options.truth] if options.truth else list(TRUTHS)
+    if options.missing:
+        searches: dict[str, Any] = {"synthetic": True, "seed": options.seed}
+        for truth in truths:
+            with watch.part(f"search {truth}", f"terms that eq. (9) lacks for SYNTHETIC data of truth {truth}"):
+                searches[truth] = missing.search(truth, options.seed, quick=options.quick, runs=runs)
+            print(missing.table(truth, searches[truth]))
+        common.finish(options.out / "missing_terms", searches, watch, synthetic=True)
+        return
     print("All data are SYNTHETIC: a simulated rig, see studies/landing_gear/rig.py.")
     every: dict[str, OfTruth] = {}
     results: dict[str, Any] = {}

@@ -16,9 +16,10 @@ from bayesperiodic.diagnostics.candidates import (
     factors,
     generated,
     given,
+    lag_names,
     places,
 )
-from bayesperiodic.diagnostics.optima import problem_of
+from bayesperiodic.diagnostics.optima import guesses_of, problem_of
 from bayesperiodic.diagnostics.score_tests import ScoreTests, _effects
 from bayesperiodic.estimation.map_estimate import nearest_optimum
 from bayesperiodic.models import units
@@ -51,13 +52,15 @@ def effects_by_differences(problem, fit, terms):
     names = coefficient_names(problem.model, terms)
     model, step, each = extended(problem.model, dict(zip(names, terms, strict=True))), 1e-4, []
     known = {"m": 1.0} | fit.theta | dict.fromkeys(names, 0.0)
+    known |= {lag_names(n)[0]: term.lag for n, term in zip(names, terms, strict=True) if term.force is not None}
+    guesses = guesses_of(model, {name: solution.states for name, solution in fit.solutions.items()})
     for e in problem.experiments:
         ends = []
         for name in names:
             for sign in (1.0, -1.0):
                 solution = bp.solve_periodic(
                     model, known | {name: sign * step}, e.inputs, frequency=e.frequency, samples=e.samples,
-                    scheme="fourier", guess=fit.solutions[e.name].states,
+                    scheme="fourier", guess=guesses[e.name],
                 )  # fmt: skip
                 assert solution.converged
                 values = np.stack([solution.outputs[channel] for channel in e.outputs], axis=-1)
@@ -67,12 +70,15 @@ def effects_by_differences(problem, fit, terms):
 
 
 def test_effects_are_the_derivatives_of_the_outputs_by_the_coefficients(damped):
-    """Terms in the equation and in the output, with a derivative of the highest order and the rate of the input."""
+    """Terms in equation and output, with highest derivatives, rates of the input, and lags short and long."""
     problem, fit = damped
     model = problem.model
     wanted = {"x*abs(dx)", "dx*abs(dx)", "ddx", "x**2*force", "x**2", "force", "1"}
     terms = [c for c in generated(model, places(model), {}) if c.text in wanted]
     assert len(terms) == 2 * len(wanted)
+    lags = [c for c in generated(model, places(model), {}) if c.text in {"lag(dx) - dx", "lag(x**3) - x**3"}]
+    terms += [replace(c, lag=lag) for c in lags for lag in (0.2, 5.0)]
+    assert len(lags) == 3
     theta = problem.vector(fit.theta)
     effects = _effects(problem, theta, fit.solutions, terms)
     for one, other in zip(effects, effects_by_differences(problem, fit, terms), strict=True):
@@ -236,7 +242,7 @@ def test_effects_of_the_parameters_are_refused(found):
 def test_a_coefficient_of_zero_does_not_change_the_model(damped):
     problem, fit = damped
     term = Candidate("displacement", "force", problem.model.input_symbols["force"])
-    other = problem_of(problem, extended(problem.model, {"c9": term}), {}, zero=["c9"])
+    other = problem_of(problem, extended(problem.model, {"c9": term}), {}, zero={"c9": term})
     assert other.names == problem.names
     theta = problem.vector(fit.theta)
     one, two = (p.outputs(theta[None])[0]["run 0"]["displacement"] for p in (problem, other))

@@ -12,7 +12,7 @@ from scipy import integrate, optimize, stats
 import bayesperiodic as bp
 from studies import common
 from studies.__main__ import main
-from studies.landing_gear import force
+from studies.landing_gear import force, missing
 from studies.landing_gear import run as landing_gear
 from studies.landing_gear.drop import MASS, drop
 from studies.landing_gear.identification import FORCE, PRIORS, estimate, fold
@@ -303,3 +303,18 @@ def test_campaigns_are_counted_and_resumed(tmp_path, monkeypatch):
     tail = 0.005 / 3
     assert found["band"] == [stats.binom.ppf(tail, 56, 0.9), stats.binom.ppf(1 - tail, 56, 0.9)]
     assert "called negative 2 times" in landing_gear.table(found)
+
+
+def test_terms_are_compared_with_the_effects_that_the_truth_has():
+    """The heat of friction, nearly a constant force, is abs(ddisplacement); a short lag is the delay."""
+    runs = [run for run in RUNS if run.name in ("3 Hz 4 mm", "1 Hz 18 mm")]
+    experiments = [fold(measure(run, TRUTHS["B"], 1), "displacement") for run in runs]
+    start = estimate(experiments, "displacement", one_conduction=True, scheme="central4")
+    text, lagging = "abs(ddisplacement)", "lag(pressure) - pressure"
+    ranked = [("equation of T", text, np.nan), ("pressure", lagging, 1e-3)]
+    moved = missing.columns(start, ranked)
+    assert len(moved["parameters"]) == 3 and len(moved["terms"]) == 2 and len(moved["effects"]) == 5
+    found = missing.compare(start, ranked, ranked[1:])
+    assert found["friction_heat"]["best"] == f"{text} in equation of T" and found["friction_heat"]["best_share"] > 0.9
+    assert found["line"]["best"] == f"{lagging} in pressure" and found["line"]["all_steps_share"] > 0.99
+    assert found["line"]["steps_shares"] == [found["line"]["best_share"]] and found["line"]["first_share"] < 0.9
