@@ -44,8 +44,10 @@ def problem_of(
             priors[lag_names(name)[0]] = LogNormal(term.lag, LAG_SPREAD)
     for name, term in zero.items():
         fixed |= {name: 0.0} | ({lag_names(name)[0]: term.lag} if term.force is not None else {})
-    orbits = guesses_of(model, {e.name: e.guess for e in problem.experiments if e.guess})
-    experiments = [replace(e, guess=orbits[e.name]) if e.guess else e for e in problem.experiments]
+    orbits = guesses_of(
+        model, {e.name: e.guess for e in problem.experiments if e.guess and not isinstance(e.guess, str)}
+    )
+    experiments = [replace(e, guess=orbits.get(e.name, e.guess)) for e in problem.experiments]
     return Problem(experiments=experiments, **settings | {"priors": priors, "fixed": fixed, "model": model})
 
 

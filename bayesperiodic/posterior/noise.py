@@ -314,7 +314,17 @@ class Noise(ABC):
         return np.asarray(0.5 * np.log(np.add.reduce(share * share, axis=-1) / added.size))
 
     def jeffreys_slope(self, block: Block, value: np.ndarray, added: np.ndarray) -> np.ndarray:
-        """Return the derivative (…,) of `jeffreys_factor`, whose arguments it has, by the logarithm of the variance."""
+        """Return the derivative of `jeffreys_factor` by the logarithm of the variance.
+
+        Parameters
+        ----------
+        block, value, added
+            As for `jeffreys_factor`.
+
+        Returns
+        -------
+        array (…)
+        """
         total, from_value = self._mean_variance(block, value)
         share = total[..., None] / (total[..., None] + added)
         slope = np.mean(share**2 * (1.0 - share), axis=-1) / np.mean(share**2, axis=-1)

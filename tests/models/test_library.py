@@ -14,6 +14,7 @@ LIBRARY = {
     "duffing": lambda: bp.models.duffing,
     "dahl": lambda: bp.models.dahl,
     "pendulum": lambda: bp.models.pendulum,
+    "rl_diode": lambda: bp.models.rl_diode,
     "silverbox": lambda: bp.models.silverbox,
     "van_der_pol": lambda: bp.models.van_der_pol,
     "landing_gear_force": lambda: bp.models.landing_gear("force"),
@@ -48,6 +49,11 @@ TYPICAL = {
     "chain_3": (CHAIN, {"x1": 0.1, "x2": 0.1, "x3": 0.1, "force": 2.0}),
     "flutter": (FLUTTER, {"h": 0.03, "alpha": 0.1, "w": 0.02}),
 }
+DIODE = {
+    "L": 4.5e-3, "R": 1e3, "R_L": 60.0, "C_L": 6e-12, "V_f": 0.7, "C_j": 4e-12, "Q_0": 1e-9, "transit": 6e-7,
+    "lifetime": 3e-6, "drift": 3e8, "C_s": -5e-12, "offset": 0.3,
+}  # fmt: skip
+TYPICAL["rl_diode"] = DIODE, {"i": 1e-3, "v": 5.0, "q": 2e-9, "m": 2e-9, "source": 10.0}
 POINTS, FREQUENCY = 20, 1.4
 
 
@@ -81,6 +87,20 @@ def by_hand_silverbox(q, u, p, tau):
     y, v, a = q
     spring = p["k1"] * y + p["k2"] * y**2 + p["k3"] * y**3
     return [a / p["w0"] ** 2 + p["c"] * v / p["w0"] + spring - p["g"] * u[0] - p["u0"]], [y]
+
+
+def by_hand_rl_diode(q, u, p, tau):
+    i, v, junction, base = q[:4]
+    injected = 0.5 * (junction + np.sqrt(junction**2 + p["Q_0"] ** 2))
+    blocked = (injected - junction) / p["C_j"]
+    current = (u[0] - v - p["V_f"] + blocked) / p["R"]
+    to_base = (injected - base) / p["transit"]
+    return [
+        p["L"] * q[4] - (v - p["R_L"] * i),
+        p["C_L"] * q[5] - (current - i),
+        q[6] - (current - to_base),
+        q[7] - (to_base - base / p["lifetime"] - p["drift"] * i * base),
+    ], [p["R"] * current + p["R"] * p["C_s"] * u[1] + p["offset"]]
 
 
 def by_hand_van_der_pol(q, u, p, tau):
@@ -119,6 +139,7 @@ def by_hand_flutter(q, u, p, tau):
 
 BY_HAND = {
     "pendulum": by_hand_pendulum,
+    "rl_diode": by_hand_rl_diode,
     "silverbox": by_hand_silverbox,
     "van_der_pol": by_hand_van_der_pol,
     "landing_gear_force": by_hand_landing_gear_force,

@@ -1,0 +1,96 @@
+import json
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import bayesperiodic as bp
+from studies import common
+from studies.__main__ import main
+from studies.diode import prediction, rig
+
+REAL = common.find_data(None, rig.FILE)
+VALUES = rig.TRUE | {"C_s": 0.0}
+FREQUENCY, MEAN, AMPLITUDE = 140e3, 0.1, 10.5
+
+
+def test_stroboscopic_values_are_those_of_an_adaptive_implicit_integration():
+    p = VALUES
+
+    def rates(t, y):
+        i, v, q, m = np.array([1e-3, 1.0, 1e-9, 1e-9]) * y
+        plus = 0.5 * (q + np.hypot(q, p["Q_0"]))
+        source = MEAN + AMPLITUDE * np.cos(2 * np.pi * FREQUENCY * t)
+        current = (source - v - p["V_f"] + (plus - q) / p["C_j"]) / p["R"]
+        flow = (plus - m) / p["transit"]
+        rate = (
+            (v - p["R_L"] * i) / p["L"], (current - i) / p["C_L"], current - flow,
+            flow - m / p["lifetime"] - p["drift"] * i * m,
+        )  # fmt: skip
+        return np.array(rate) / np.array([1e-3, 1.0, 1e-9, 1e-9])
+
+    periods = prediction.TRANSIENT + 4
+    at = np.arange(prediction.TRANSIENT, periods) / FREQUENCY
+    path = solve_ivp(rates, (0.0, at[-1]), np.zeros(4), "Radau", at, rtol=1e-8, atol=1e-8).y
+    v, q = path[1], 1e-9 * path[2]
+    depleted = 0.5 * (np.hypot(q, p["Q_0"]) - q)
+    expected = MEAN + AMPLITUDE - v - p["V_f"] + depleted / p["C_j"]
+    found = prediction.sweep(p, [FREQUENCY], [(MEAN, AMPLITUDE)], kept=4)[0]
+    assert np.allclose(np.diff(found), np.diff(expected), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("values", "period"),
+    [([2.0], 1), ([1.0, 2.0], 2), ([1.0, 2.0, 2.5], 3), ([1.0, 2.0, 1.1, 2.05], 4), ([1.0, 2.0, 1.01, 2.0], 2)],
+)
+def test_period_of_repeated_values(values, period):
+    assert prediction.period_of(np.tile(values, 30)[:64]) == period
+
+
+def test_values_of_the_logistic_map_in_chaos_have_no_period():
+    x = [0.3]
+    for _ in range(63):
+        x.append(3.9 * x[-1] * (1.0 - x[-1]))
+    assert prediction.period_of(np.array(x)) is None
+
+
+def test_an_orbit_is_found_from_the_current_of_a_synthetic_record_of_period_two():
+    record = rig.folded(FREQUENCY, rig.generate(FREQUENCY, seed=1))
+    assert record.period == 2
+    experiment, mean = rig.guessed(record.experiment, VALUES)
+    solution = bp.solve_periodic(
+        rig.MODEL, VALUES, experiment.inputs, frequency=FREQUENCY, periods=2, samples=rig.SAMPLES,
+        guess=experiment.guess,
+    )  # fmt: skip
+    assert solution.status == "converged"
+    assert rig.unexplained(experiment, solution) < 0.002
+    assert rig.RESISTOR * mean == pytest.approx(solution.outputs["resistor"].mean(), rel=0.05)
+
+
+def test_an_orbit_of_period_one_doubles_where_its_multiplier_passes_minus_one():
+    record = rig.folded(100e3, rig.generate(100e3, seed=1))
+    experiment = rig.guessed(record.experiment, VALUES)[0]
+    at = prediction.doubling(VALUES, experiment, 130e3)
+    least = []
+    for frequency in (at - 300.0, at + 300.0):
+        solution = bp.solve_periodic(
+            rig.MODEL, VALUES, experiment.inputs, frequency=frequency, samples=rig.SAMPLES, guess=experiment.guess
+        )
+        least.append(solution.multipliers.real.min())
+    assert least[0] > -1.0 > least[1]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(REAL is None, reason="the measured file is missing, see studies/diode/rig.py")
+def test_measured_records_are_fitted_to_their_noise_and_most_are_predicted(tmp_path, capsys):
+    assert main(["diode", "--quick", "--out", str(tmp_path)]) == 0
+    found = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
+    assert len(found["records"]) == 41
+    assert sum(row["used"] for row in found["records"]) == 6
+    assert all(row["unexplained"] < 0.01 for row in found["records"] if row["used"])
+    by_frequency = {row["frequency_Hz"] / 1e3: row for row in found["records"]}
+    for frequency, period in {120: 2, 150: 2, 220: 3, 225: 3}.items():
+        assert by_frequency[frequency]["predicted"].get(str(period), 0.0) > 0.5
+    for frequency in (190, 275, 295, 470):
+        assert by_frequency[frequency]["predicted"].get("chaos", 0.0) > 0.5
+    assert "Most probable motion right" in capsys.readouterr().out
