@@ -200,7 +200,7 @@ def _bifurcation(
     for draw, colour in [*((d, "#E69F00") for d in sample[:SHOWN]), (estimate, "#000000")]:
         values = prediction.sweep(draw, fine.tolist(), [tuple(row) for row in sources], DRAWN)
         at = np.repeat(1e-3 * fine, DRAWN)
-        axes[0].plot(at, values.ravel(), ",", color=colour, alpha=1.0 if colour == "#000000" else 0.25, rasterized=True)
+        axes[0].plot(at, values.ravel(), ".", ms=0.9, mew=0.0, color=colour, rasterized=True)
     fitted = {record.frequency for record in used}
     for record in records:
         kind = "fitted" if record.frequency in fitted else "periodic, not fitted" if record.period else "not periodic"
