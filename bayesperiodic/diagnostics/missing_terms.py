@@ -260,6 +260,7 @@ def _sentence(k: int, step: Step) -> str:
 
 NOT_TOLD = "its effect is that of the parameters"
 VANISHED = "with it the fit found no periodic solution, or no optimum"
+VAGUE = "its evidence cannot be approximated, for the data hardly determine its parameters"
 
 
 @in_one_thread
@@ -278,9 +279,9 @@ def missing_terms(
     differ significantly (as by Vuong [2]_, for normal errors) and there are at least three experiments, these are left
     out of the fit, one at a time, and only terms are eligible whose predictions of them are off by less than twice the
     smallest error. The search ends if no candidate is significant, if the evidence increases by less than the logarithm
-    of the number of candidates, if the coefficient is within two robust standard deviations of zero, if the
-    prediction of experiments that are left out gets worse, or if the coefficient changes by more than half on twice as
-    many points, so that the grid's error looks like the term. At the end, terms that later ones have made needless are
+    of the number of candidates, if the coefficient is within two robust standard deviations of zero, if the prediction
+    of experiments that are left out gets worse, or if the coefficient changes by more than half on twice as many
+    points, so that the grid's error looks like the term. At the end, terms that later ones have made needless are
     removed.
 
     Candidates are products of states, inputs and their rates up to the third degree, powers up to the fifth, absolute
@@ -476,13 +477,18 @@ class _Search:
         tried = list(significant["candidate"][: self.keep])
         self.compile(tried, list(significant["candidate"][: 2 * self.keep]), chosen)
         fitted: dict[str, Optimum] = {}
+        curved, vague = state.curved, False
         for key in tried:
             names = (*chosen, self.names[key])
             problem = self.with_terms(names).with_input_errors(state.problem.input_errors)
-            if (after := state.with_problem(problem, names)) is None:
-                self.refused[key] = VANISHED
-            else:
+            after = state.with_problem(problem, names)
+            if after is not None and (after.curved or not curved):
                 fitted[key] = after
+            else:
+                self.refused[key] = VANISHED if after is None else VAGUE
+                vague = vague or after is not None
+        if vague:  # The next candidates take the places of those without an evidence.
+            return self.best(state, table[~table["candidate"].isin(self.refused)], chosen)
         if not fitted:
             return f"With {', '.join(tried)}, the best candidates, no periodic solution was found."
         best = max(fitted, key=lambda key: fitted[key].evidence)
@@ -520,7 +526,7 @@ class _Search:
             names = tuple(n for n in state.names if n != step.name)
             problem = self.with_terms(names).with_input_errors(state.problem.input_errors)
             other = state.with_problem(problem, names)
-            if other is None or other.evidence <= state.evidence:
+            if other is None or (state.curved and not other.curved) or other.evidence <= state.evidence:
                 continue
             left = steps[:i] + steps[i + 1 :]
             again = self.again(left, fits[: i + 1], other)

@@ -7,7 +7,7 @@ import numpy as np
 
 from bayesperiodic._linalg import TINY, hessian_scale, scaled
 from bayesperiodic.diagnostics.candidates import Candidate, lag_names
-from bayesperiodic.estimation.gauss_newton import Iterate, Objective
+from bayesperiodic.estimation.gauss_newton import SINGULAR, Iterate, Objective
 from bayesperiodic.estimation.map_estimate import nearest_optimum
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.models.model import Model
@@ -79,13 +79,27 @@ class Optimum:
         return {name: solution.states for name, solution in self.solutions.items()}
 
     @property
+    def curved(self) -> bool:
+        """Whether the Hessian matrix is positive definite, without which the evidence by Laplace has no meaning.
+
+        It need not be where the data hardly determine a lag: the density of the lag's prior can be curved upwards, and
+        the second derivatives of the outputs, which make it a maximum, are neglected.
+        """
+        values, _ = self._curvature()
+        return bool(values[0] > SINGULAR * values[-1])
+
+    @property
     def evidence(self) -> float:
         """The logarithm of the evidence by Laplace, but for a constant."""
-        hessian, _ = self.objective.hessian_and_gradient(self.iterate)
-        scale = hessian_scale(hessian)
-        values = np.linalg.eigvalsh(scaled(hessian, scale))
+        values, scale = self._curvature()
         size = np.sum(np.log(np.maximum(values, TINY))) - 2.0 * np.sum(np.log(scale))
         return float(self.iterate.objective - 0.5 * size + 0.5 * scale.size * np.log(2.0 * np.pi))
+
+    def _curvature(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return eigenvalues, sorted, of the Hessian matrix in the units in which it has a unit diagonal, and these."""
+        hessian, _ = self.objective.hessian_and_gradient(self.iterate)
+        scale = hessian_scale(hessian)
+        return np.linalg.eigvalsh(scaled(hessian, scale)), scale
 
     def with_problem(self, problem: Problem, names: tuple[str, ...]) -> "Optimum | None":
         """Return the optimum of a problem with other terms, from here on; None if there is none."""
