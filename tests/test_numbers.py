@@ -514,6 +514,37 @@ def landing_gear_missing():
     )
 
 
+def diode():
+    d = results("diode")
+    first, *_, last = d["steps"].values()
+    low, high = ([f"{100 * f(own['unexplained'].values()):.2f}" for own in (first, last)] for f in (min, max))
+    frequencies = [row["frequency_Hz"] / 1e3 for row in d["records"]]
+    yield (
+        f"{len(frequencies)} records by an 8-bit oscilloscope between {min(frequencies):.0f} and "
+        f"{max(frequencies):.0f} kHz"
+    )
+    *some, longest = sorted({row["measured_period"] for row in d["records"] if row["used"]})
+    yield f"of {', '.join(map(str, some))} and {longest} periods of the source"
+    unseen = d["score"]["largest_unexplained"]["not_used"]
+    yield (
+        f"The first model leaves {low[0]} to {high[0]} % of the variance of the resistor's voltage, with two terms "
+        f"that `bp.missing_terms` ranks high {low[1]} to {high[1]} %, about what the cycles of a record differ by, and "
+        f"at most {100 * unseen:.2f} % of periodic records that were not fitted."
+    )
+    right = d["score"]["right"]
+    yield (
+        f"The most probable motion of posterior draws is the measured one in {right['periodic'][0]} of "
+        f"{right['periodic'][1]} periodic records and in {right['others'][0]} of {right['others'][1]} others."
+    )
+    one, two, three = (
+        f"{1e-3 * row['interval_Hz'][0]:.0f} to {1e-3 * row['interval_Hz'][1]:.0f}" for row in d["doublings"]
+    )
+    yield (
+        f"Periods double at {one} kHz (90 %; the records bracket it by 110 and 120), {two} kHz (170 and 185) and "
+        f"{three} kHz (230 and 240)."
+    )
+
+
 def span(values):
     """Return "a to b", or one number if all are equal."""
     low, high = (f"{value:.0f}" for value in (min(values), max(values)))
@@ -523,7 +554,7 @@ def span(values):
 SUBJECTS = (
     pendulum, landing_gear, landing_gear_cost, landing_gear_campaigns, damper, silverbox, flutter, flutter_campaigns,
     solver, benchmark, benchmark_table, calibration, verdicts, sampling, noisy_inputs,
-    missing_terms, landing_gear_missing,
+    missing_terms, landing_gear_missing, diode,
 )  # fmt: skip
 
 SETTING, DEFINITION, ELSEWHERE, UNSTORED, DATE = (

@@ -10,7 +10,6 @@ import numpy as np
 from numba import njit
 
 import bayesperiodic as bp
-from bayesperiodic import _fourier
 from studies import common
 
 FILE = "rl_diode/rl_diode_run_1.npz"
@@ -192,15 +191,13 @@ def solved(record: Record, final: Fitted) -> tuple[bp.PeriodicSolution | None, f
 
 def _phase(experiment: bp.Experiment) -> float:
     """Return the phase of the source [periods of the source]."""
-    return float(np.angle(_fourier.coefficients(experiment.inputs["source"])[experiment.periods]) / (2 * np.pi))
+    return float(np.angle(np.fft.rfft(experiment.inputs["source"])[experiment.periods]) / (2 * np.pi))
 
 
 def _moved(values: np.ndarray, ahead: float) -> np.ndarray:
     """Return values over a period as they are `ahead` periods later."""
-    amplitudes = _fourier.coefficients(values)
-    return np.asarray(
-        _fourier.on_grid(amplitudes * np.exp(2j * np.pi * ahead * np.arange(amplitudes.size)), values.size)
-    )
+    amplitudes = np.fft.rfft(values)
+    return np.fft.irfft(amplitudes * np.exp(2j * np.pi * ahead * np.arange(amplitudes.size)), values.size)
 
 
 def _solution(
@@ -253,11 +250,11 @@ def guessed(experiment: bp.Experiment, values: Mapping[str, float]) -> tuple[bp.
         depleted = 0.5 * (np.sqrt(q**2 + values["Q_0"] ** 2) - q)
         total = (RESISTOR + values["R_L"]) * mean + values["V_f"] - float(depleted.mean()) / values["C_j"]
         low, high = (low, mean) if total > source else (mean, high)
-    amplitudes = _fourier.coefficients(current + mean)
+    amplitudes = np.fft.rfft(current + mean)
     turn = 2j * np.pi * rate * np.arange(amplitudes.size)
     coil = turn * values["L"] + values["R_L"]
     through = amplitudes / (1.0 + turn * values["C_L"] * coil)
-    i, v = (_fourier.on_grid(own, points) for own in (through, coil * through))
+    i, v = (np.fft.irfft(own, points) for own in (through, coil * through))
     return replace(experiment, guess={"i": i, "v": v, "q": q, "m": m}), mean
 
 
