@@ -148,15 +148,15 @@ van_der_pol = Model(
 )
 
 _RL_DIODE_UNITS = {
-    "L": "H", "R": "ohm", "R_L": "ohm", "C_L": "F", "V_f": "V", "C_j": "F", "Q_0": "C", "transit": "s", "lifetime": "s",
-    "drift": "1/C", "C_s": "F", "offset": "V",
+    "L": "H", "R": "ohm", "R_s": "ohm", "R_L": "ohm", "C_L": "F", "V_f": "V", "C_j": "F", "Q_0": "C", "transit": "s",
+    "lifetime": "s", "drift": "1/C", "C_s": "F", "offset": "V",
 }  # fmt: skip
 
 
 def _rl_diode(s: Any, p: Any, u: Any) -> tuple[sp.Expr, sp.Expr]:
     """Return the charge injected into the diode's base and the current of the source."""
     root = sp.sqrt(s.q**2 + p.Q_0**2)
-    return (root + s.q) / 2, (u.source - s.v - p.V_f + (root - s.q) / (2 * p.C_j)) / p.R
+    return (root + s.q) / 2, (u.source - s.v - p.V_f + (root - s.q) / (2 * p.C_j)) / (p.R + p.R_s)
 
 
 def _rl_diode_equations(s: Any, p: Any, u: Any) -> list[sp.Expr]:
@@ -186,18 +186,19 @@ rl_diode = Model(
     charge of the depleted junction, with the capacitance C_j. The diode conducts at the voltage V_f until its stored
     charge is removed, and blocks then::
 
-        source = R I + v + V_f − q⁻/C_j              R: resistor, v: voltage of the coil
+        source = (R + R_s) I + v + V_f − q⁻/C_j      R: resistor, R_s: in the source, v: voltage of the coil
         L i̇ + R_L i = v,  C_L v̇ = I − i              coil with its resistance and the capacitance of its winding
         q̇ = I − (q⁺ − m)/transit
         ṁ = (q⁺ − m)/transit − m/lifetime − drift i m
 
     transit is the time of diffusion into the base, lifetime that of recombination. The last term is empirical: current
     carries stored charge away. The output is R I + R C_s d(source)/dt + offset, with a stray capacitance C_s of the
-    instrument. Only ratios to R follow from voltages. The diode blocks within R C_j, a small part of a period.
+    instrument. R_s is zero if the source is its voltage under load; for stability and other motions it has to be the
+    voltage without load. Only ratios to R follow from voltages. The diode blocks within R C_j, far below a period.
 
     Examples
     --------
-    >>> theta = {"L": 4.5e-3, "R": 1e3, "R_L": 55, "C_L": 6.4e-12, "V_f": 0.7, "C_j": 4.3e-12, "Q_0": 1.6e-11,
+    >>> theta = {"L": 4.5e-3, "R": 1e3, "R_s": 0, "R_L": 55, "C_L": 6.4e-12, "V_f": 0.7, "C_j": 4.3e-12, "Q_0": 1.6e-11,
     ...          "transit": 5.7e-7, "lifetime": 2.8e-6, "drift": 3.4e8, "C_s": 0, "offset": 0}
     >>> wave = 10.6 * np.cos(2 * np.pi * np.arange(16) / 16)
     >>> run = bp.simulate(bp.models.rl_diode, theta, {"source": wave}, frequency=1.4e5, duration=1e-3,

@@ -12,15 +12,16 @@ from studies.diode import rig
 # Longest step of the integration [s]: the diode blocks within R·C_j.
 STEP = 4e-9
 TRANSIENT, KEPT, LONGEST = 120, 64, 8
-# Share of the variance of stroboscopic values that a period leaves: of a motion with this period, and of any periodic
-# one as the test of the records sees it.
-EXACT, PERIODIC = 1e-4, 5e-3
-ORDER = ("R", "L", "R_L", "C_L", "V_f", "C_j", "Q_0", "transit", "lifetime", "drift")
+# Instants a period at which motions are compared, and the share of the variance that a period may leave: smaller
+# alternations are not counted, for they begin at zero.
+PHASES, LEFT = 16, 1e-2
+ORDER = ("R", "R_s", "L", "R_L", "C_L", "V_f", "C_j", "Q_0", "transit", "lifetime", "drift")
 Draw = Mapping[str, float]
 
 
-def draws_of(fit: bp.MapEstimate, count: int, seed: int) -> list[dict[str, float]]:
+def draws_of(final: rig.Fitted, count: int, seed: int) -> list[dict[str, float]]:
     """Return draws of the parameters: log-normal with the robust standard deviations and Laplace's correlations."""
+    fit, known = final.fit, rig.values_of(final)
     names = [name for name in ORDER if name in fit.theta]
     covariance = fit.covariance.loc[names, names].to_numpy()
     sd = np.sqrt(np.diag(covariance))
@@ -30,7 +31,7 @@ def draws_of(fit: bp.MapEstimate, count: int, seed: int) -> list[dict[str, float
     generator = np.random.default_rng(seed)
     normal = generator.multivariate_normal(np.zeros(len(names)), correlation, size=count, method="eigh")
     values = estimate * np.exp(normal * relative)
-    return [dict(zip(names, row.tolist(), strict=True)) | {"R": rig.RESISTOR} for row in values]
+    return [dict(zip(names, row.tolist(), strict=True)) | {n: known[n] for n in ("R", "R_s")} for row in values]
 
 
 def source_of(record: rig.Record) -> tuple[float, float]:
@@ -45,13 +46,14 @@ def source_of(record: rig.Record) -> tuple[float, float]:
 def sweep(
     draw: Draw, frequencies: Sequence[float], sources: Sequence[tuple[float, float]], kept: int = KEPT
 ) -> np.ndarray:
-    """Return the resistor's voltage [V] when the source is largest, in successive periods (frequencies, kept).
+    """Return the resistor's voltage [V] in successive periods of the source (frequencies, kept, phases).
 
-    The mean over these periods is subtracted, as by the instrument. Each motion starts from the end of the one at the
-    frequency before, as in a sweep in the laboratory; the first from that at 90 % of its frequency.
+    The first phase is that of the largest source. The mean over these periods is subtracted, as by the instrument. Each
+    motion starts from the end of the one at the frequency before, as in a sweep in the laboratory; the first from that
+    at 90 % of its frequency.
     """
     values = tuple(float(draw[name]) for name in ORDER)
-    found = np.empty((len(frequencies), kept))
+    found = np.empty((len(frequencies), kept, PHASES))
     state, _ = _run(values, 0.9 * frequencies[0], *sources[0], (0.0, 0.0, 0.0, 0.0), TRANSIENT, found[0])
     for row, frequency, (mean, amplitude) in zip(found, frequencies, sources, strict=True):
         state, average = _run(values, frequency, mean, amplitude, state, TRANSIENT, row)
@@ -62,9 +64,9 @@ def sweep(
 @njit(cache=True, inline="always")
 def _rates(values, source, i, v, q, m):
     """Return the rates of the four states, and the resistor's voltage; numbers, for arrays would be allocated."""
-    resistor, coil, losses, winding, forward, junction, corner, transit, lifetime, drift = values
+    resistor, internal, coil, losses, winding, forward, junction, corner, transit, lifetime, drift = values
     root = np.sqrt(q * q + corner * corner)
-    current = (source - v - forward + 0.5 * (root - q) / junction) / resistor
+    current = (source - v - forward + 0.5 * (root - q) / junction) / (resistor + internal)
     flow = (0.5 * (root + q) - m) / transit
     return (
         (v - losses * i) / coil, (current - i) / winding, current - flow, flow - m / lifetime - drift * i * m,
@@ -74,19 +76,19 @@ def _rates(values, source, i, v, q, m):
 
 @njit(cache=True)
 def _run(values, frequency, mean, amplitude, state, transient, found):
-    """Fill stroboscopic values (periods,) after a transient by the classical Runge-Kutta method; return state, mean."""
+    """Fill values (periods, phases) after a transient by the classical Runge-Kutta method; return state, mean."""
     steps = int(np.ceil(1.0 / (frequency * STEP)))
     h = 1.0 / (frequency * steps)
     source = mean + amplitude * np.cos(np.pi * np.arange(2 * steps + 1) / steps)
     i, v, q, m = state
     total = 0.0
-    for period in range(transient + found.size):
+    for period in range(transient + len(found)):
         for j in range(steps):
             a1, b1, c1, d1, output = _rates(values, source[2 * j], i, v, q, m)
             if period >= transient:
                 total += output
-                if j == 0:
-                    found[period - transient] = output
+                if j * PHASES // steps != (j - 1) * PHASES // steps:
+                    found[period - transient, j * PHASES // steps] = output
             half, s = 0.5 * h, source[2 * j + 1]
             a2, b2, c2, d2, _ = _rates(values, s, i + half * a1, v + half * b1, q + half * c1, m + half * d1)
             a3, b3, c3, d3, _ = _rates(values, s, i + half * a2, v + half * b2, q + half * c2, m + half * d2)
@@ -95,21 +97,27 @@ def _run(values, frequency, mean, amplitude, state, transient, found):
             v += h / 6.0 * (b1 + 2.0 * b2 + 2.0 * b3 + b4)
             q += h / 6.0 * (c1 + 2.0 * c2 + 2.0 * c3 + c4)
             m += h / 6.0 * (d1 + 2.0 * d2 + 2.0 * d3 + d4)
-    return (i, v, q, m), total / (steps * found.size)
+    return (i, v, q, m), total / (steps * len(found))
 
 
 def period_of(values: np.ndarray) -> int | None:
-    """Return the period of stroboscopic values, None for chaos or a period above the longest that is tested."""
-    spread = float(np.var(values))
-    if spread < 1e-6:
-        return 1
-    rests = {}
+    """Return the period of values (periods, phases), None for chaos or a period above the longest that is tested.
+
+    It is the shortest whose mean leaves at most 1 % of the variance.
+    """
     for period in range(1, LONGEST + 1):
-        whole = values[: values.size // period * period].reshape(-1, period)
-        rests[period] = float(np.mean((whole - whole.mean(axis=0)) ** 2)) / spread
-    exact = [period for period, rest in rests.items() if rest <= EXACT]
-    near = [period for period, rest in rests.items() if rest <= PERIODIC]
-    return next(iter(exact or near), None)
+        whole = values[: len(values) // period * period].reshape(-1, period, values.shape[1])
+        if np.mean((whole - whole.mean(axis=0)) ** 2) <= LEFT * np.var(values):
+            return period
+    return None
+
+
+def measured_period(record: rig.Record) -> int | None:
+    """Return the period of a record by the same rule, None if the test found none."""
+    if record.experiment is None:
+        return None
+    every = record.experiment.outputs["resistor"].reshape(record.experiment.periods, -1)
+    return period_of(np.tile(every, (LONGEST, 1)))
 
 
 def probabilities(motions: Sequence[int | None]) -> dict[str, float]:

@@ -19,7 +19,7 @@ MODEL = bp.models.rl_diode
 # The file does not state the resistor; L, R_L, 1/C_L, 1/C_j, 1/Q_0 and drift are proportional to it.
 RESISTOR = 1000.0
 START = {
-    "L": 4.5e-3, "R_L": 80.0, "C_L": 6e-12, "V_f": 0.7, "C_j": 3e-12, "Q_0": 2e-11, "transit": 8e-7, "lifetime": 3e-6,
+    "L": 4.5e-3, "R_L": 80.0, "C_L": 6e-12, "V_f": 0.5, "C_j": 3e-12, "Q_0": 2e-11, "transit": 8e-7, "lifetime": 3e-6,
 }  # fmt: skip
 # Terms that the first model lacks, and where their estimation starts.
 STARTS = {"drift": 3e8, "C_s": 0.0, "R_L": 60.0, "C_j": 4e-12, "Q_0": 1.6e-11, "transit": 6e-7}
@@ -38,7 +38,15 @@ FITTED = (110.0, 140.0, 170.0, 210.0, 230.0, 350.0)
 RULE_OF_CHOICE = "fitted are the periodic records nearest to 110, 140, 170, 210, 230 and 350 kHz"
 SAMPLES = 256
 # Of the generated records: values, frequencies [kHz], samples, and the step of the 8-bit instruments [V].
-TRUE = START | {"drift": 3.4e8, "R": RESISTOR, "C_s": 0.0, "offset": 0.0, "transit": 5.7e-7, "C_j": 4.3e-12}
+TRUE = START | {
+    "R_s": 0.26 * RESISTOR,
+    "drift": 3.4e8,
+    "R": RESISTOR,
+    "C_s": 0.0,
+    "offset": 0.0,
+    "transit": 5.7e-7,
+    "C_j": 4.3e-12,
+}
 SYNTHETIC = (110, 120, 140, 150, 170, 185, 190, 210, 220, 230, 250, 260, 285, 300, 320, 345, 350, 370, 400, 450, 500)
 LENGTH, STEPS, AMPLITUDE, MEAN = 2500, {"source": 0.4, "resistor": 0.08}, 10.6, 0.12
 SETTLED = 150
@@ -49,10 +57,11 @@ REPEATED, INSIDE, HALVINGS = 14, 4, 30
 
 
 class Fitted(NamedTuple):
-    """A problem and its MAP point."""
+    """A problem, its MAP point, and the internal resistance of the source over the resistor."""
 
     problem: bp.Problem
     fit: bp.MapEstimate
+    share: float
 
 
 class Record(NamedTuple):
@@ -69,8 +78,11 @@ class Record(NamedTuple):
         return self.experiment.periods if self.experiment else None
 
 
-def read(given: Path | None, seed: int) -> tuple[list[Record], dict[str, Any]]:
-    """Return all records by frequency, folded where they are periodic, and the description of the file."""
+def read(given: Path | None, seed: int) -> tuple[list[Record], dict[str, Any], float]:
+    """Return all records by frequency, folded where periodic, the file's description, and the source's resistance.
+
+    The latter is relative to the resistor; the source is its voltage without load.
+    """
     found = common.find_data(given, FILE)
     if found is None:
         recordings = [(1e3 * f, generate(1e3 * f, seed)) for f in SYNTHETIC]
@@ -88,8 +100,38 @@ def read(given: Path | None, seed: int) -> tuple[list[Record], dict[str, Any]]:
                     data["frequency_Hz"], data["interval_s"], data["source_V"], data["resistor_V"], strict=True
                 )
             ]  # fmt: skip
-    records = [folded(frequency, recording) for frequency, recording in sorted(recordings, key=lambda own: own[0])]
-    return records, common.described(found)
+    under_load = [folded(frequency, own) for frequency, own in sorted(recordings, key=lambda one: one[0])]
+    share = internal_share([record.experiment for record in under_load if record.experiment])
+    return [folded(r.frequency, unloaded(r.recording, share)) for r in under_load], common.described(found), share
+
+
+def internal_share(experiments: Sequence[bp.Experiment]) -> float:
+    """Return the internal resistance of the source over the resistor, from the lines between the drive's harmonics.
+
+    The source contains none of these; its voltage under load has them, times minus the ratio of the resistances. The
+    ratio is the one of least squares over all records of more than one period.
+    """
+    common_part, power = 0.0, 0.0
+    for experiment in experiments:
+        source, resistor = (np.fft.rfft(own) for own in (experiment.inputs["source"], experiment.outputs["resistor"]))
+        between = np.arange(source.size) % experiment.periods != 0
+        weight = experiment.periods / experiment.inputs["source"].size
+        common_part -= weight * float(np.sum((source * np.conj(resistor))[between].real))
+        power += weight * float(np.sum(np.abs(resistor[between]) ** 2))
+    if not power > 0.0:
+        raise ValueError(
+            "--data: must have records of more than one period, got none; they show the source's resistance."
+        )
+    return common_part / power
+
+
+def unloaded(recording: bp.Recording, share: float) -> bp.Recording:
+    """Return the recording with the voltage that the source has without load, less the mean, which is not measured."""
+    resistor = recording.outputs["resistor"]
+    source = recording.inputs["source"] + share * resistor
+    return bp.Recording.from_arrays(
+        recording.time, {"resistor": resistor}, {"source": source - source.mean()}, name=recording.name
+    )
 
 
 def folded(frequency: float, recording: bp.Recording) -> Record:
@@ -112,6 +154,7 @@ def generate(frequency: float, seed: int) -> bp.Recording:
     run = bp.simulate(
         MODEL, TRUE, {"source": wave}, frequency=frequency, duration=settled + (LENGTH - 1) / rate, sampling_rate=rate
     )
+    run.inputs["source"] -= TRUE["R_s"] / RESISTOR * run.outputs["resistor"]  # under load
     values = {
         name: step * np.round((own[-LENGTH:] + 0.3 * step * generator.standard_normal(LENGTH)) / step)
         for (name, own), step in zip((run.inputs | run.outputs).items(), STEPS.values(), strict=True)
@@ -130,9 +173,9 @@ def fitted_records(records: Sequence[Record]) -> list[Record]:
     return [record for record in periodic if record.frequency in chosen]
 
 
-def estimate(records: Sequence[Record], free: Sequence[str]) -> Fitted:
+def estimate(records: Sequence[Record], free: Sequence[str], share: float) -> Fitted:
     """Return the MAP point of some records with some of the model's two further terms."""
-    values = START | dict.fromkeys(TERMS, 0.0)
+    values = START | dict.fromkeys(TERMS, 0.0) | {"R_s": share * RESISTOR}
     if free:
         values |= {name: value for name, value in STARTS.items() if name in START or name in free}
     start = {name: value for name, value in values.items() if name in START or name in free}
@@ -143,14 +186,15 @@ def estimate(records: Sequence[Record], free: Sequence[str]) -> Fitted:
         experiments.append(experiment)
         start[f"offset[{experiment.name}]"] = -RESISTOR * mean
     priors = {name: prior for name, prior in PRIORS.items() if name not in TERMS or name in free}
-    fixed = {"R": RESISTOR} | {name: 0.0 for name in TERMS if name not in free}
+    fixed = {"R": RESISTOR, "R_s": share * RESISTOR} | {name: 0.0 for name in TERMS if name not in free}
     problem = bp.Problem(MODEL, experiments, priors=priors, fixed=fixed, local=["offset"])
-    return Fitted(problem, bp.map_estimate(problem, start=start))
+    return Fitted(problem, bp.map_estimate(problem, start=start), share)
 
 
 def values_of(final: Fitted) -> dict[str, float]:
     """Return all parameters at the MAP point, without the offset."""
-    return {name: final.fit.theta.get(name, 0.0) for name in MODEL.parameters} | {"R": RESISTOR, "offset": 0.0}
+    known = {"R": RESISTOR, "R_s": final.share * RESISTOR, "offset": 0.0}
+    return {name: final.fit.theta.get(name, 0.0) for name in MODEL.parameters} | known
 
 
 def orbit(record: Record, values: Mapping[str, float]) -> bp.Experiment:
@@ -248,7 +292,9 @@ def guessed(experiment: bp.Experiment, values: Mapping[str, float]) -> tuple[bp.
         mean = 0.5 * (low + high)
         q, m = _charges(current + mean, 1.0 / (rate * points), *constants)
         depleted = 0.5 * (np.sqrt(q**2 + values["Q_0"] ** 2) - q)
-        total = (RESISTOR + values["R_L"]) * mean + values["V_f"] - float(depleted.mean()) / values["C_j"]
+        total = (
+            (RESISTOR + values["R_s"] + values["R_L"]) * mean + values["V_f"] - float(depleted.mean()) / values["C_j"]
+        )
         low, high = (low, mean) if total > source else (mean, high)
     amplitudes = np.fft.rfft(current + mean)
     turn = 2j * np.pi * rate * np.arange(amplitudes.size)

@@ -28,8 +28,8 @@ SEARCHED, KEPT = (110.0, 170.0, 230.0), 2
 # Period doublings: the orbit's record [kHz], and the frequency [kHz] up to which it is followed.
 DOUBLINGS = ((110.0, 130.0), (170.0, 200.0), (230.0, 290.0))
 RULE = (
-    "period: the largest P up to 8 whose lines are all significant (F-tests, 1 %) and that leaves at most 0.5 % of the "
-    "variance between its lines"
+    "tested_period: the largest P up to 8 whose lines are all significant (F-tests, 1 %) and that leaves at most 0.5 % "
+    "of the variance between its lines; measured_period and predicted: the smallest P that leaves at most 1 %"
 )
 
 
@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
     """Run the study."""
     watch, draws = common.Stopwatch(), QUICK_DRAWS if options.quick else DRAWS
     with watch.part("read", "reading the records, testing their periods and folding the periodic ones"):
-        records, data = rig.read(options.data, options.seed)
+        records, data, share = rig.read(options.data, options.seed)
         used = rig.fitted_records(records)
     kind = "SYNTHETIC" if data["synthetic"] else "measured"
     print(f"  {kind} records {data['path']}: {len(records)}, of which {sum(r.period is not None for r in records)} are "
@@ -47,13 +47,13 @@ def run(options: argparse.Namespace) -> None:
     fits = {}
     for step, free in rig.STEPS_OF_MODEL.items():
         with watch.part(f"map {step}", f"finding the MAP point of the model {step}"):
-            fits[step] = rig.estimate(used, free)
+            fits[step] = rig.estimate(used, free, share)
     with watch.part("missing terms", "searching for terms that the first model lacks"):
-        first = rig.estimate([r for r in used if r.frequency / 1e3 in SEARCHED], ())
+        first = rig.estimate([r for r in used if r.frequency / 1e3 in SEARCHED], (), share)
         found = bp.missing_terms(first.problem, first.fit, max_terms=1, keep=KEPT)
     final = fits[list(fits)[-1]]
     with watch.part("predict", f"integrating {draws} draws at the frequencies of all records"):
-        sample = prediction.draws_of(final.fit, draws, options.seed)
+        sample = prediction.draws_of(final, draws, options.seed)
         frequencies, sources = [r.frequency for r in records], [prediction.source_of(r) for r in records]
         motions = [[prediction.period_of(v) for v in prediction.sweep(d, frequencies, sources)] for d in sample]
     with watch.part("orbits", "solving the orbits of periodic records that were not fitted, and their multipliers"):
@@ -67,6 +67,7 @@ def run(options: argparse.Namespace) -> None:
         paths = common.save_figures(options.out, figures)
     results: dict[str, Any] = {"data": data, "seed": options.seed, "quick": options.quick, "rule": RULE}
     results |= {
+        "internal_resistance": share,
         "records": table,
         "steps": {step: _summary(own) for step, own in fits.items()},
         "missing_terms": _missing(found),
@@ -88,7 +89,8 @@ def _records(
         rows.append({
             "frequency_Hz": record.frequency,
             "used": at,
-            "measured_period": record.period,
+            "measured_period": prediction.measured_period(record),
+            "tested_period": record.period,
             "predicted": prediction.probabilities([own[number] for own in motions]),
             "unexplained": unexplained,
             "multiplier": None if solution is None else float(solution.multipliers.real[0]),
@@ -154,8 +156,9 @@ def _tables(results: Mapping[str, Any], final: rig.Fitted, found: bp.MissingTerm
     rows = pd.DataFrame(results["records"])
     rows["predicted"] = [", ".join(f"{k}: {v:.0%}" for k, v in sorted(p.items())) for p in rows["predicted"]]
     rows["kHz"] = rows["frequency_Hz"] / 1e3
-    rows["measured_period"] = ["-" if pd.isna(p) else f"{p:.0f}" for p in rows["measured_period"]]
-    shown = rows[["kHz", "used", "measured_period", "predicted", "unexplained", "multiplier"]]
+    for kind in ("measured_period", "tested_period"):
+        rows[kind] = ["-" if pd.isna(p) else f"{p:.0f}" for p in rows[kind]]
+    shown = rows[["kHz", "used", "measured_period", "tested_period", "predicted", "unexplained", "multiplier"]]
     steps = pd.DataFrame({step: own["unexplained"] for step, own in results["steps"].items()}).T
     right, largest = results["score"]["right"], results["score"]["largest_unexplained"]
     return "\n".join([
@@ -195,12 +198,12 @@ def _bifurcation(
     own = np.array([prediction.source_of(record) for record in records])
     fine = np.arange(max(frequencies[0] - 10e3, 0.0), frequencies[-1] + 10e3, FINE)
     sources = np.stack([np.interp(fine, frequencies, column) for column in own.T], axis=1)
-    estimate = {name: final.fit.theta.get(name, 0.0) for name in prediction.ORDER} | {"R": rig.RESISTOR}
+    estimate = rig.values_of(final)
     figure, axes = plt.subplots(2, 1, figsize=(8.0, 6.6), sharex=True, sharey=True, layout="constrained")
     for draw, colour in [*((d, "#E69F00") for d in sample[:SHOWN]), (estimate, "#000000")]:
         values = prediction.sweep(draw, fine.tolist(), [tuple(row) for row in sources], DRAWN)
         at = np.repeat(1e-3 * fine, DRAWN)
-        axes[0].plot(at, values.ravel(), ".", ms=0.9, mew=0.0, color=colour, rasterized=True)
+        axes[0].plot(at, values[:, :, 0].ravel(), ".", ms=0.9, mew=0.0, color=colour, rasterized=True)
     fitted = {record.frequency for record in used}
     for record in records:
         kind = "fitted" if record.frequency in fitted else "periodic, not fitted" if record.period else "not periodic"
@@ -209,7 +212,7 @@ def _bifurcation(
         axes[1].plot(np.full(values.size, 1e-3 * record.frequency), values, ".", ms=3, color=colour, label=kind)
         for ax in axes if record.frequency in fitted else ():
             ax.axvline(1e-3 * record.frequency, color="#0072B2", lw=0.6, alpha=0.5, zorder=0)
-    axes[0].set_title(f"Predicted from {len(used)} periodic records (black: MAP point, orange: posterior draws)")
+    axes[0].set_title(f"Predicted from {len(used)} periodic records (black: MAP point, orange: draws)")
     axes[1].set_title("SYNTHETIC records" if synthetic else "Measured")
     axes[1].set_xlabel("drive frequency [kHz]")
     for ax in axes:

@@ -50,8 +50,8 @@ TYPICAL = {
     "flutter": (FLUTTER, {"h": 0.03, "alpha": 0.1, "w": 0.02}),
 }
 DIODE = {
-    "L": 4.5e-3, "R": 1e3, "R_L": 60.0, "C_L": 6e-12, "V_f": 0.7, "C_j": 4e-12, "Q_0": 1e-9, "transit": 6e-7,
-    "lifetime": 3e-6, "drift": 3e8, "C_s": -5e-12, "offset": 0.3,
+    "L": 4.5e-3, "R": 1e3, "R_s": 250.0, "R_L": 60.0, "C_L": 6e-12, "V_f": 0.7, "C_j": 4e-12, "Q_0": 1e-9,
+    "transit": 6e-7, "lifetime": 3e-6, "drift": 3e8, "C_s": -5e-12, "offset": 0.3,
 }  # fmt: skip
 TYPICAL["rl_diode"] = DIODE, {"i": 1e-3, "v": 5.0, "q": 2e-9, "m": 2e-9, "source": 10.0}
 POINTS, FREQUENCY = 20, 1.4
@@ -93,7 +93,7 @@ def by_hand_rl_diode(q, u, p, tau):
     i, v, junction, base = q[:4]
     injected = 0.5 * (junction + np.sqrt(junction**2 + p["Q_0"] ** 2))
     blocked = (injected - junction) / p["C_j"]
-    current = (u[0] - v - p["V_f"] + blocked) / p["R"]
+    current = (u[0] - v - p["V_f"] + blocked) / (p["R"] + p["R_s"])
     to_base = (injected - base) / p["transit"]
     return [
         p["L"] * q[4] - (v - p["R_L"] * i),
