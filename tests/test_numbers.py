@@ -523,7 +523,8 @@ def diode():
         f"{len(frequencies)} records by an 8-bit oscilloscope between {min(frequencies):.0f} and "
         f"{max(frequencies):.0f} kHz"
     )
-    *some, longest = sorted({row["measured_period"] for row in d["records"] if row["used"]})
+    yield f"is {d['internal_resistance']:.2f} of the resistor"
+    *some, longest = sorted({row["tested_period"] for row in d["records"] if row["used"]})
     yield f"of {', '.join(map(str, some))} and {longest} periods of the source"
     unseen = d["score"]["largest_unexplained"]["not_used"]
     yield (
@@ -533,7 +534,7 @@ def diode():
     )
     right = d["score"]["right"]
     yield (
-        f"The most probable motion of posterior draws is the measured one in {right['periodic'][0]} of "
+        f"The most probable motion over the draws is the measured one in {right['periodic'][0]} of "
         f"{right['periodic'][1]} periodic records and in {right['others'][0]} of {right['others'][1]} others."
     )
     one, two, three = (
@@ -571,6 +572,7 @@ WITHOUT_RESULTS = {
         "doi 10.5281/zenodo.4445334": ELSEWHERE,
         "a gas charge lower by 2 %, friction by 20 % and oil leaked by 1 %": SETTING,
         "(counted on 21 November 2026)": DATE,
+        "Alternations of less than 1 % of the variance": SETTING,
         "T. Wigren, J. Schoukens, 2013": ELSEWHERE,
         "K. H. Lee, D. A. W. Barton, L. Renson, 2023": ELSEWHERE,
         "two states on 800 points: a batch takes twice as long, and errors are 300 to 1000 times smaller": UNSTORED,
