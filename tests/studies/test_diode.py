@@ -104,6 +104,6 @@ def test_measured_records_are_fitted_to_their_noise_and_most_are_predicted(tmp_p
     by_frequency = {row["frequency_Hz"] / 1e3: row for row in found["records"]}
     for frequency, period in {120: 2, 150: 2, 220: 3, 225: 3}.items():
         assert by_frequency[frequency]["predicted"].get(str(period), 0.0) > 0.5
-    for frequency in (190, 275, 295, 470):
+    for frequency in (190, 285, 295, 470):
         assert by_frequency[frequency]["predicted"].get("chaos", 0.0) > 0.5
     assert "Most probable motion right" in capsys.readouterr().out
