@@ -528,10 +528,13 @@ def diode():
     yield f"of {', '.join(map(str, some))} and {longest} periods of the source"
     unseen = d["score"]["largest_unexplained"]["not_used"]
     yield (
-        f"The first model leaves {low[0]} to {high[0]} % of the variance of the resistor's voltage, with two terms "
-        f"that `bp.missing_terms` ranks high {low[1]} to {high[1]} %, about what the cycles of a record differ by, and "
-        f"at most {100 * unseen:.2f} % of periodic records that were not fitted."
+        f"The first model leaves {low[0]} to {high[0]} % of the variance of the resistor's voltage, with two further "
+        f"terms {low[1]} to {high[1]} %, about what the cycles of a record differ by, and at most {100 * unseen:.2f} % of "
+        "periodic records that were not fitted."
     )
+    search = d["missing_terms"]
+    rank = [row["candidate"] for row in search["best_before_refitting"]].index("i*m in equation of m") + 1
+    yield f"which is number {rank} of the {search['candidates']} candidates of `bp.missing_terms`"
     right = d["score"]["right"]
     yield (
         f"The most probable motion over the draws is the measured one in {right['periodic'][0]} of "

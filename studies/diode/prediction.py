@@ -148,3 +148,17 @@ def doubling(draw: Draw, experiment: bp.Experiment, until: float, step: float = 
         before, guess = (frequency, least), solution.states
         frequency += way
     return None
+
+
+def multiplier_sd(record: rig.Record, solution: bp.PeriodicSolution, sample: Sequence[Draw]) -> float | None:
+    """Return the standard deviation over draws of the real part of the largest multiplier of a record's orbit."""
+    experiment, found = record.experiment, []
+    assert experiment
+    for draw in sample:
+        own = bp.solve_periodic(
+            rig.MODEL, {**draw, "C_s": 0.0, "offset": 0.0}, experiment.inputs, frequency=experiment.frequency,
+            periods=experiment.periods, samples=experiment.samples, guess=solution.states,
+        )  # fmt: skip
+        if own.status == "converged":
+            found.append(float(own.multipliers[0].real))
+    return float(np.std(found, ddof=1)) if len(found) > 1 else None

@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> None:
         frequencies, sources = [r.frequency for r in records], [prediction.source_of(r) for r in records]
         motions = [[prediction.period_of(v) for v in prediction.sweep(d, frequencies, sources)] for d in sample]
     with watch.part("orbits", "solving the orbits of periodic records that were not fitted, and their multipliers"):
-        table = _records(records, used, final, motions)
+        table = _records(records, used, final, motions, sample[:FOLLOWED])
         doublings = _doublings(records, final, sample[:FOLLOWED])
     with watch.part("figures", "drawing"):
         figures = {
@@ -79,7 +79,11 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _records(
-    records: Sequence[rig.Record], used: Sequence[rig.Record], final: rig.Fitted, motions: list[list[int | None]]
+    records: Sequence[rig.Record],
+    used: Sequence[rig.Record],
+    final: rig.Fitted,
+    motions: list[list[int | None]],
+    sample: list[dict[str, float]],
 ) -> list[dict[str, Any]]:
     """Return the row of every record."""
     fitted, rows = {record.frequency for record in used}, []
@@ -94,6 +98,7 @@ def _records(
             "predicted": prediction.probabilities([own[number] for own in motions]),
             "unexplained": unexplained,
             "multiplier": None if solution is None else float(solution.multipliers.real[0]),
+            "multiplier_sd": prediction.multiplier_sd(record, solution, sample) if at and solution else None,
             "evidence": record.evidence,
         })  # fmt: skip
     return rows
@@ -144,6 +149,7 @@ def _missing(found: bp.MissingTerms) -> dict[str, Any]:
     best = found.ranking.head(10)
     return {
         "candidates": found.tested,
+        "refused": {str(term): reason for term, reason in found.refused.items()},
         "steps": [
             {"term": s.term, "place": s.place, "alternatives": list(s.alternatives), "unexplained": s.unexplained}
             for s in found.steps
@@ -158,7 +164,9 @@ def _tables(results: Mapping[str, Any], final: rig.Fitted, found: bp.MissingTerm
     rows["kHz"] = rows["frequency_Hz"] / 1e3
     for kind in ("measured_period", "tested_period"):
         rows[kind] = ["-" if pd.isna(p) else f"{p:.0f}" for p in rows[kind]]
-    shown = rows[["kHz", "used", "measured_period", "tested_period", "predicted", "unexplained", "multiplier"]]
+    shown = rows[
+        ["kHz", "used", "measured_period", "tested_period", "predicted", "unexplained", "multiplier", "multiplier_sd"]
+    ]
     steps = pd.DataFrame({step: own["unexplained"] for step, own in results["steps"].items()}).T
     right, largest = results["score"]["right"], results["score"]["largest_unexplained"]
     return "\n".join([
