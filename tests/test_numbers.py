@@ -529,8 +529,8 @@ def diode():
     unseen = d["score"]["largest_unexplained"]["not_used"]
     yield (
         f"The first model leaves {low[0]} to {high[0]} % of the variance of the resistor's voltage, with two further "
-        f"terms {low[1]} to {high[1]} %, about what the cycles of a record differ by, and at most {100 * unseen:.2f} % of "
-        "periodic records that were not fitted."
+        f"terms {low[1]} to {high[1]} %, about what the cycles of a record differ by, and at most "
+        f"{100 * unseen:.2f} % of periodic records that were not fitted."
     )
     search = d["missing_terms"]
     rank = [row["candidate"] for row in search["best_before_refitting"]].index("i*m in equation of m") + 1
