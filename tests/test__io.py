@@ -201,7 +201,7 @@ def classes_in_files() -> list[tuple[str, str]]:
         if isinstance(kind, type) and kind.__module__.startswith("bayesperiodic.") and kind not in found:
             if dataclasses.is_dataclass(kind):
                 found.add(kind)
-                hints = typing.get_type_hints(kind)
+                hints = typing.get_type_hints(kind, localns={"pd": pd})  # which some modules import for types alone
                 for field in dataclasses.fields(kind):
                     if field.metadata != _io.NOT_STORED:
                         visit(hints[field.name])
