@@ -14,7 +14,8 @@ from studies import common
 
 FILE = "rl_diode/rl_diode_run_1.npz"
 ADDRESS = "github.com/saul-diaz-mansilla/coupled-rlc-circuits (commit bfba72b4), RL_diode_run_1"
-SHA256 = "not checked: the file is an extract of the CSV files there"
+# Of the arrays frequency_Hz, interval_s, source_V and resistor_V made of the CSV files there.
+SHA256 = "912e35104651f59265267e1bf345152f5e5c7878e1a72972a37ff802d430fa6e"
 MODEL = bp.models.rl_diode
 # The file does not state the resistor; L, R_L, 1/C_L, 1/C_j, 1/Q_0 and drift are proportional to it.
 RESISTOR = 1000.0
@@ -25,8 +26,10 @@ START = {
 STARTS = {"drift": 3e8, "C_s": 0.0, "R_L": 60.0, "C_j": 4e-12, "Q_0": 1.6e-11, "transit": 6e-7}
 TERMS = ("drift", "C_s")
 STEPS_OF_MODEL = {
-    "two charges": (), "and drift of the stored charge": ("drift",), "and stray capacitance": ("drift", "C_s"),
-}  # fmt: skip
+    "two charges": (),
+    "with drift of the stored charge": ("drift",),
+    "with drift and a stray capacitance": ("drift", "C_s"),
+}
 PRIORS: dict[str, Any] = {name: bp.LogNormal(value, 0.7) for name, value in START.items()} | {
     # The instrument removes the mean of the current.
     "offset": bp.Normal(0.0, 1.0),
@@ -127,11 +130,8 @@ def internal_share(experiments: Sequence[bp.Experiment]) -> float:
 
 def unloaded(recording: bp.Recording, share: float) -> bp.Recording:
     """Return the recording with the voltage that the source has without load, less the mean, which is not measured."""
-    resistor = recording.outputs["resistor"]
-    source = recording.inputs["source"] + share * resistor
-    return bp.Recording.from_arrays(
-        recording.time, {"resistor": resistor}, {"source": source - source.mean()}, name=recording.name
-    )
+    source = recording.inputs["source"] + share * recording.outputs["resistor"]
+    return replace(recording, inputs={"source": source - source.mean()})
 
 
 def folded(frequency: float, recording: bp.Recording) -> Record:
@@ -160,10 +160,10 @@ def generate(frequency: float, seed: int) -> bp.Recording:
         for (name, own), step in zip((run.inputs | run.outputs).items(), STEPS.values(), strict=True)
     }
     values["resistor"] = values["resistor"] - values["resistor"].mean()
-    time = np.arange(LENGTH) / rate
-    return bp.Recording.from_arrays(
-        time, {"resistor": values["resistor"]}, {"source": values["source"]}, name=f"synthetic {frequency / 1e3:g} kHz"
-    )
+    return replace(
+        run, time=np.arange(LENGTH) / rate, outputs={"resistor": values["resistor"]},
+        inputs={"source": values["source"]}, name=f"synthetic {frequency / 1e3:g} kHz",
+    )  # fmt: skip
 
 
 def fitted_records(records: Sequence[Record]) -> list[Record]:

@@ -43,10 +43,10 @@ def run(options: argparse.Namespace) -> None:
     print(f"  {kind} records {data['path']}: {len(records)}, of which {sum(r.period is not None for r in records)} are "
           f"periodic and {len(used)} are fitted; {rig.RULE_OF_CHOICE}")  # fmt: skip
     if data["synthetic"]:
-        print(f"  the measured file was not found; it is at {rig.ADDRESS}; true values {rig.TRUE}")
+        print(f"  the measured file was not found; it is at {rig.ADDRESS}, sha256 {rig.SHA256}; true values {rig.TRUE}")
     fits = {}
     for step, free in rig.STEPS_OF_MODEL.items():
-        with watch.part(f"map {step}", f"finding the MAP point of the model {step}"):
+        with watch.part(f"map {step}", f"finding the MAP point of the model: {step}"):
             fits[step] = rig.estimate(used, free, share)
     with watch.part("missing terms", "searching for terms that the first model lacks"):
         first = rig.estimate([r for r in used if r.frequency / 1e3 in SEARCHED], (), share)
@@ -122,12 +122,14 @@ def _doublings(records: Sequence[rig.Record], final: rig.Fitted, sample: list[di
 
 
 def _score(table: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return how many records are predicted right: the most probable motion is the measured one."""
+    """Return how many records are predicted right: the measured motion is more probable than any other."""
     right = {"periodic": [0, 0], "others": [0, 0]}
     for row in table:
         truth = "chaos" if row["measured_period"] is None else str(row["measured_period"])
         counts = right["others" if row["measured_period"] is None else "periodic"]
-        counts[0] += max(row["predicted"], key=row["predicted"].get) == truth
+        counts[0] += all(
+            p < row["predicted"].get(truth, 0.0) for motion, p in row["predicted"].items() if motion != truth
+        )
         counts[1] += 1
     unexplained = {
         key: max((r["unexplained"] for r in table if r["used"] is own and r["unexplained"] is not None), default=None)
