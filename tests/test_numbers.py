@@ -535,8 +535,8 @@ def diode():
     first, second = d["missing_terms"]
     yield f"which is number {first['rank_of_chosen']} of the {first['candidates']} candidates of `bp.missing_terms`"
     yield (
-        f"stray capacitance of the instrument, number {second['rank_of_chosen']} of {second['candidates']} in the search "
-        f"for what the second model lacks"
+        f"stray capacitance of the instrument, number {second['rank_of_chosen']} of {second['candidates']} in the "
+        f"search for what the second model lacks"
     )
     right = d["score"]["right"]
     yield (
