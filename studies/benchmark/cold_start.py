@@ -21,6 +21,7 @@ from statistics import median
 from typing import Any
 
 from studies import common
+from studies.benchmark import large
 
 ROOT = Path(__file__).parents[2]
 FILE = "cold_start.json"
@@ -34,6 +35,8 @@ TARGETS = {
     "first solve, empty cache": 5.0,
     "new model's first solve": 1.5,
     "new model's first MAP": 3.0,
+    f"fold, {large.FOLD_TARGET[0]:,}": large.FOLD_TARGET[1],
+    f"orbits, {large.ORBIT_TARGET[0]:,}": large.ORBIT_TARGET[1],
 }
 DATA = """
 import json, time
@@ -151,12 +154,15 @@ def run(options: argparse.Namespace) -> None:
         for name, (package, code) in PEERS.items():
             with watch.part(name, f"installing {name}, and its first evaluation of a posterior, {repeats} times"):
                 found["peers"][name] = _peer(folder / package, package, code, repeats)
+        with watch.part("large", "folding long recordings, and orbits in large sections"):
+            found["large"] = large.measure(quick=options.quick)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     found["targets"] = _targets(found)
     print(common.table_of_rows(found["targets"]))
     print(common.shown("other packages", found["peers"]))
-    options.out.mkdir(parents=True, exist_ok=True)
+    paths = common.save_figures(options.out, {"large": large.draw(found["large"])})
+    print(f"figures (synthetic data): {paths[0]}")
     path = options.out / FILE
     path.write_text(json.dumps(found | {"seconds": watch.total(), "versions": common.versions()}, indent=2) + "\n")
     print(f"results: {path}")
