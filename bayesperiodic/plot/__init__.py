@@ -5,7 +5,8 @@ Every function returns the matplotlib Figure; an empty one to draw into can be g
 
 from bayesperiodic.plot.branches import branch, orbits, section
 from bayesperiodic.plot.diagnostics import comparison, models, profile, ranks
-from bayesperiodic.plot.estimates import corner, fit, loops, marginals, traces
+from bayesperiodic.plot.estimates import fit, loops, traces
+from bayesperiodic.plot.pairs import corner, marginals
 from bayesperiodic.plot.style import COLOURS
 from bayesperiodic.plot.terms import missing_terms
 
