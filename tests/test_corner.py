@@ -143,7 +143,9 @@ def test_regions_contain_their_share_of_the_draws_and_have_the_true_area(case):
         (path,) = contours.get_paths()
         assert path.contains_points(draws).mean() == pytest.approx(probability, abs=0.01)
         found = abs(sum(map(shoelace, path.to_polygons())))
-        print(f"MEASURED {case}: {probability:.0%}: inside {path.contains_points(draws).mean():.4f}, area {found / area(probability) - 1:+.3f}")
+        print(
+            f"MEASURED {case}: {probability:.0%}: inside {path.contains_points(draws).mean():.4f}, area {found / area(probability) - 1:+.3f}"
+        )
         assert found == pytest.approx(area(probability), rel=room)
 
 

@@ -268,12 +268,11 @@ class _Panels:
 
     def write_legend(self, handles: list[Any], title: str) -> None:
         """Write the legend into the upper right corner, or above a single panel."""
-        place: dict[str, Any] = {"loc": "upper right", "bbox_to_anchor": (1.0, 1.0)}
         if len(self.names) == 1:
-            place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.02 + 0.1 * bool(self.grid[0, 0].get_title()))}
-        legend = self.grid[0, -1].legend(handles=handles, title=title or None, borderaxespad=0.0, **place)
-        if len(self.names) > 1:
-            legend.set_in_layout(False)
+            self.grid[0, 0].figure.legend(handles=handles, title=title or None, loc="outside upper center")
+            return
+        place: dict[str, Any] = {"loc": "upper right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0}
+        self.grid[0, -1].legend(handles=handles, title=title or None, **place).set_in_layout(False)
 
 
 def _groups(posterior: Posterior) -> list[_Group]:
@@ -325,7 +324,7 @@ def _with_errors(low: float, middle: float, high: float) -> str:
         power = int(np.floor(np.log10(max(abs(middle), shorter))))
         scaled = [value / 10.0**power for value in (low, middle, high)]
         return rf"{_with_errors(*scaled)} $\times\,10^{{{power}}}$"
-    texts = [f"{round(value, digits):.{max(digits, 0)}f}" for value in (middle, high - middle, middle - low)]
+    texts = [f"{round(value, digits) + 0.0:.{max(digits, 0)}f}" for value in (middle, high - middle, middle - low)]
     return rf"${texts[0]}^{{+{texts[1]}}}_{{-{texts[2]}}}$"
 
 

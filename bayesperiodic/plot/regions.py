@@ -10,6 +10,7 @@ support. The density at the level is exceeded by the density at exactly the frac
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.fft import dctn, idctn
@@ -23,8 +24,8 @@ NODES, FINE, RESOLVED = 256, 1024, 3.0
 FINE_1D = 8192
 # Draws beyond these quantiles widen no mesh; half-widths of the kernels that are tried, in cells and in sds.
 ENDS, ROOM, NARROWEST, WIDEST, WIDTHS = (0.0003, 0.9997), 0.08, 0.7, 0.6, 32
-# Smooth a little more than cross-validation, which is noisy; it hardly affects regions of a given share of the draws.
-WIDER = 1.3
+# Cross-validation is noisy: the widest kernel with an error larger by this fraction of ∫f² is as good.
+TOLERANCE = 0.001
 # Factors on the width of the kernels, where the density is high and low.
 FACTORS = np.geomspace(0.7, 10.0, 8)
 # Ends of supports that are nearer than this many sds to a draw are edges of the mesh.
@@ -193,14 +194,18 @@ class KernelEstimate:
         counter = _Counter(nodes, points.shape[1], ends[:, 1] - ends[:, 0])
         halves = [counter.spectrum(part[keep]) for part, keep in zip(_halves(places), _halves(inside), strict=True)]
         widths = np.geomspace(NARROWEST * steps.max(), WIDEST, WIDTHS)
-        width = WIDER * float(widths[np.argmax([counter.score(halves, width) for width in widths])])
+        scores = np.array([counter.score(halves, width) for width in widths])
+        width = float(widths[scores >= scores.max() - TOLERANCE * abs(scores.max())].max())
         pilot = counter.smooth(0.5 * (halves[0] + halves[1]), width)
         places = places[inside]
         at = np.maximum(pilot[tuple(places.T)], 1e-9 * pilot.max())
         factor = np.sqrt(at.mean() / at)
-        group = np.digitize(factor, np.sqrt(FACTORS[1:] * FACTORS[:-1]))
-        parts = [(places[group == g], FACTORS[g]) for g in np.unique(group)]
-        whole = sum(counter.spectrum(own, len(points)) * counter.kernel(width * factor) for own, factor in parts)
+        group = np.clip(np.log(factor / FACTORS[0]) / np.log(FACTORS[1] / FACTORS[0]), 0.0, len(FACTORS) - 1.0)
+        whole: Any = 0.0
+        for number, own in enumerate(FACTORS):
+            weight = np.maximum(1.0 - np.abs(group - number), 0.0) / len(points)
+            if weight.any():
+                whole = whole + counter.spectrum(places, weight) * counter.kernel(width * own)
         values = np.maximum(idctn(whole, norm="ortho"), 0.0) / np.prod(steps)
         return cls(ends[:, 0], steps, values, float(width * FACTORS[0] / steps.max()))
 
@@ -239,11 +244,11 @@ class _Counter:
         self._shape = (nodes,) * axes
         self._frequencies = [np.pi * np.arange(nodes) / length for length in lengths]
 
-    def spectrum(self, places: np.ndarray, size: int | None = None) -> np.ndarray:
-        """Return the coefficients of the fractions of draws per cell."""
+    def spectrum(self, places: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+        """Return the coefficients of the sums of weights per cell, by default of the fractions of draws."""
         flat = np.ravel_multi_index(tuple(places.T), self._shape)
-        counts = np.bincount(flat, minlength=int(np.prod(self._shape))).reshape(self._shape)
-        return dctn(counts / (size or max(len(places), 1)), norm="ortho")
+        counts = np.bincount(flat, weights, minlength=int(np.prod(self._shape))).reshape(self._shape)
+        return dctn(counts / (max(len(places), 1) if weights is None else 1.0), norm="ortho")
 
     def kernel(self, width: float) -> np.ndarray:
         """Return the transform of a normal kernel."""
