@@ -1,41 +1,24 @@
 """Regions of corner plots contain their share of the draws, and are as large as those of the true density."""
 
-import warnings
+import re
 from dataclasses import replace
 
+import corner
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-import xarray as xr
 from matplotlib.contour import ContourSet
 from scipy.stats import multivariate_normal, norm
 
 import bayesperiodic as bp
-from bayesperiodic.plot import regions
+from bayesperiodic.plot import pairs, regions
+from bayesperiodic.plot.style import ENSEMBLES
 from bayesperiodic.posterior.parameters import support
+from bayesperiodic.sampling.convergence import arviz
+from tests.drawn import posterior_of
 
 COUNT = 20_000
 REAL, POSITIVE = (-np.inf, np.inf), (0.0, np.inf)
-
-
-def posterior_of(draws, supports=None, modes=None, units=None):
-    """Return a posterior of given draws, by name, and their supports."""
-    group = {}
-    for name, values in draws.items():
-        attributes = {"units": (units or {}).get(name, "m")}
-        if supports is not None:
-            attributes[f"support of {name}"] = list(supports[name])
-        group[name] = (("chain", "draw"), np.reshape(values, (2, -1)), attributes)
-    size = {"step": ("draw", np.arange(COUNT // 2) // 10), "walker": ("draw", np.arange(COUNT // 2) % 10)}
-    data = xr.Dataset(group, coords={name: (dim, index[: data_size(group)]) for name, (dim, index) in size.items()})
-    stats = {} if modes is None else {"mode": (("chain", "draw"), np.reshape(modes, (2, -1)))}
-    numbers = dict.fromkeys(draws, 1.0)
-    tree = xr.DataTree.from_dict({"posterior": data, "sample_stats": xr.Dataset(stats)})
-    return bp.Posterior(tree, True, "made for a test", numbers, numbers, numbers, 0.5, {}, 1, 1)
-
-
-def data_size(group):
-    return next(iter(group.values()))[1].shape[1]
 
 
 def quadrature_area(density, x, y, probability):
@@ -138,15 +121,11 @@ def test_regions_contain_their_share_of_the_draws_and_have_the_true_area(case):
     draws, area = make(np.random.default_rng(7))
     names = dict(zip("ab", draws.T, strict=True))
     figure = bp.plot.corner(posterior_of(names, dict(zip("ab", supports, strict=True))))
-    filled = [c for c in figure.axes[2].collections if isinstance(c, ContourSet) and c.filled]
-    for contours, probability, room in zip(filled, (0.9, 0.5), (0.15, 0.25), strict=True):
-        (path,) = contours.get_paths()
+    for region, probability in zip(contours(figure.axes[2]), (0.9, 0.5), strict=True):
+        (path,) = region.get_paths()
         assert path.contains_points(draws).mean() == pytest.approx(probability, abs=0.01)
         found = abs(sum(map(shoelace, path.to_polygons())))
-        print(
-            f"MEASURED {case}: {probability:.0%}: inside {path.contains_points(draws).mean():.4f}, area {found / area(probability) - 1:+.3f}"
-        )
-        assert found == pytest.approx(area(probability), rel=room)
+        assert found == pytest.approx(area(probability), rel=0.15)
 
 
 @pytest.mark.parametrize("case", ["truncated twice", "exponential", "round"])
@@ -158,3 +137,128 @@ def test_marginal_densities_reach_the_end_of_the_support(case):
     density = exact.get(case, lambda x: norm.pdf(x, 5.0))(found.nodes[0])
     assert np.abs(found.values - density).max() < 0.08 * density.max()
     assert np.trapezoid(found.values, found.nodes[0]) == pytest.approx(1.0, abs=0.01)
+
+
+def contours(axes):
+    """Return the filled regions of a panel."""
+    return [c for c in axes.collections if isinstance(c, ContourSet) and c.filled]
+
+
+def test_each_optimum_has_its_own_regions_colour_and_number():
+    draws, area = mirrored(np.random.default_rng(5), 1e-3)
+    modes = (draws[:, 0] < 0.0).astype(np.int8)
+    figure = bp.plot.corner(posterior_of({"a": draws[:, 0], "b": draws[:, 1]}, modes=modes))
+    panel, first, second = figure.axes[2], *contours(figure.axes[2])[::2]
+    assert not np.array_equal(first.get_facecolor(), second.get_facecolor())
+    for region, mode in ((first, 0), (second, 1)):
+        inside = region.get_paths()[0].contains_points(draws)
+        assert inside[modes == mode].mean() == pytest.approx(0.9, abs=0.01) and not inside[modes != mode].any()
+        found = abs(sum(map(shoelace, region.get_paths()[0].to_polygons())))
+        assert found == pytest.approx(0.5 * area(0.9), rel=0.15)
+    marks = {line.get_marker(): line.get_xydata()[0] for line in panel.lines if str(line.get_marker()).startswith("$")}
+    assert marks["$0$"] == pytest.approx([1.0, 1.0], abs=1e-3) and marks["$1$"] == pytest.approx([-1, -1], abs=1e-3)
+    legend = [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
+    share = 100.0 * np.mean(modes == 0)
+    assert legend[0].startswith(f"optimum 0: {share:.1f} ±") and len(legend) == 2
+
+
+def positions(axes, colour):
+    """Return where lines of a colour cross the axes."""
+    lines = [line for line in axes.lines if line.get_color() == colour]
+    across = [line.get_xdata()[0] for line in lines if list(line.get_ydata()) == [0, 1]]
+    return across, [line.get_ydata()[0] for line in lines if list(line.get_xdata()) == [0, 1]]
+
+
+def test_zero_is_marked_where_the_sign_matters_and_truths_are_shown_also_beyond_the_draws():
+    x, y = np.random.default_rng(2).standard_normal((2, 2000))
+    figure = bp.plot.corner(posterior_of({"a": x, "b": 50.0 + y}), truths={"b": 70.0})
+    top, _, panel, below = figure.axes
+    assert positions(panel, "0.75") == ([0.0], []) and positions(top, "0.75") == ([0.0], [])
+    assert positions(panel, "#000000") == ([], [70.0]) and positions(below, "#000000") == ([70.0], [])
+    assert panel.get_ylim()[1] > 70.0 > 55.0 > panel.get_ylim()[0] > 40.0
+    assert "truth" in [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
+
+
+def test_priors_are_thin_lines_on_the_diagonal(solved):
+    problem, _, posterior = solved
+    axes = bp.plot.corner(posterior, problem=problem, names=["k", "variance[force]"]).axes
+    x, density = axes[0].lines[-1].get_data()
+    assert density == pytest.approx(norm.pdf(x, 800.0, 60.0)) and axes[0].lines[-1].get_linewidth() < 1.0
+    assert len(axes[3].lines) == 1
+    with pytest.raises(ValueError, match="posterior: must be a result of this problem"):
+        bp.plot.corner(posterior, problem=problem.with_experiments([replace(problem.experiments[0], name="other")]))
+
+
+def test_labels_quantiles_and_titles_are_those_of_corner():
+    x = np.random.default_rng(2).standard_normal(20_000)
+    draws = {"a": 10.0 + 0.1 * x, "b": -x}
+    figure = bp.plot.corner(posterior_of(draws), labels=["one", "two"], quantiles=[0.16, 0.84], show_titles=True)
+    assert [figure.axes[k].get_xlabel() for k in (2, 3)] == ["one", "two"]
+    dashed = [line.get_xdata()[0] for line in figure.axes[0].lines if line.get_linestyle() == "--"]
+    assert dashed == pytest.approx(np.quantile(draws["a"], [0.16, 0.84]))
+    value, more, less = map(float, re.findall(r"[\d.]+", figure.axes[0].get_title()))
+    assert [value, value + more, value - less] == pytest.approx(np.quantile(draws["a"], [0.5, 0.95, 0.05]), abs=0.006)
+    for arguments, message in (
+        ({"labels": ["one"]}, "labels: must be 2, one per name, got 1"),
+        ({"quantiles": [16]}, r"quantiles: must be between 0 and 1, got \[16\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            bp.plot.corner(posterior_of(draws), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("interval", "title"),
+    [
+        ((1.0, 2.0, 4.5), "$2.0^{+2.5}_{-1.0}$"),
+        ((4.361e3, 9.912e3, 22.263e3), "$9900^{+12400}_{-5600}$"),
+        ((-0.0016, -0.00001, 0.0016), "$0.0000^{+0.0016}_{-0.0016}$"),
+        ((1.2e-9, 1.5e-9, 1.9e-9), r"$1.50^{+0.40}_{-0.30}$ $\times\,10^{-9}$"),
+    ],
+)
+def test_titles_have_two_digits_of_the_shorter_error(interval, title):
+    assert pairs.with_errors(*interval) == title
+
+
+def test_many_quantities_need_a_choice():
+    draws = {f"p{k}": values for k, values in enumerate(np.random.default_rng(1).standard_normal((9, 400)))}
+    with pytest.warns(UserWarning, match=r"names: 9 quantities are many for one figure; choose some, such as names="):
+        bp.plot.corner(posterior_of(draws))
+    assert len(bp.plot.corner(posterior_of(draws), names=[*draws]).axes) == 81
+
+
+def test_figures_and_draws_work_with_corner_and_arviz(solved):
+    _, _, posterior = solved
+    names = ["k", "c"]
+    figure = bp.plot.corner(posterior, names=names)
+    corner.overplot_lines(figure, [800.0, None], color="C1")
+    corner.overplot_points(figure, np.array([[800.0, 30.0]]), color="C1")
+    assert positions(figure.axes[0], "C1")[0] == [800.0]
+    assert figure.axes[2].lines[-1].get_xydata().tolist() == [[800.0, 30.0]]
+    theirs = corner.corner(posterior.data, var_names=names, bins=10)
+    assert [theirs.axes[k].get_xlabel() for k in (2, 3)] == names
+    assert arviz().plot_pair(posterior.data, var_names=names) is not None
+
+
+def test_supports_are_stored_with_the_draws_and_guessed_without(solved):
+    _, _, posterior = solved
+    group = posterior.tree["posterior"].to_dataset()
+    assert [support(group, name) for name in posterior.names] == [REAL, POSITIVE, REAL, POSITIVE]
+    old = posterior_of({"a": np.arange(1.0, 9.0), "b": np.arange(-4.0, 4.0)}).tree["posterior"].to_dataset()
+    assert [support(old, name) for name in "ab"] == [POSITIVE, REAL]
+
+
+def test_quantities_that_do_not_vary_and_few_draws_are_drawn():
+    draws = {"a": np.full(40, 3.0), "b": np.linspace(0.0, 1.0, 40)}
+    bp.plot.corner(posterior_of(draws)).canvas.draw()
+
+
+def test_the_style_is_applied_in_figures_only():
+    before = dict(plt.rcParams)
+    figure = bp.plot.corner(posterior_of({"a": np.linspace(1.0, 2.0, 100)}))
+    assert dict(plt.rcParams) == before
+    figure.canvas.draw()
+    sizes = {label.get_size() for label in figure.axes[0].get_xticklabels()}
+    assert sizes == {8.0} != {plt.rcParams["font.size"]}
+    with plt.style.context("bayesperiodic.plot.figures"):
+        colours = {entry["color"].upper() for entry in plt.rcParams["axes.prop_cycle"]}
+    assert colours == {*ENSEMBLES}

@@ -21,7 +21,7 @@ def test_fit_shows_units_the_band_and_the_residual(solved):
     figure = bp.plot.fit(problem, fit, bp.predict(problem, posterior))
     assert labels(figure) == {"force [N]", "residual [N]", "time in the period [s]"}
     legend = [t.get_text() for t in figure.axes[0].get_legend().get_texts()]
-    assert legend == ["90 % predictive band", "measured, mean of 1 cycles", "MAP"]
+    assert legend == ["90 % predictive band", "measured, 1 cycle", "MAP"]
 
 
 def test_fit_draws_the_experiments_asked_for_and_single_points_as_such(solved):
@@ -265,7 +265,7 @@ def test_profiles_are_drawn_over_their_parabolas_with_the_level_of_the_interval(
         assert peak.get_xydata().tolist() == [[fit.theta[name], 0.0]]
         low, high = fit.theta[name] + np.array([-1.0, 1.0]) * 1.6449 * fit.sd[name]
         assert np.interp([low, high], *parabola.get_data()) == pytest.approx(level.get_ydata(), abs=1e-3)
-        assert [text.get_text() for text in axes.texts] == ["90%"]
+        assert [text.get_text() for text in axes.texts] == ["90 %"]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["profile", "MAP", "Laplace"]
     assert len(bp.plot.profile(profile, names=["c"]).axes) == 1
     other = plt.figure()
@@ -289,7 +289,7 @@ def test_open_failed_and_improved_profiles_are_distinguished(solved):
     )
     left, right = bp.plot.profile(profile).axes
     assert (left.get_xscale(), right.get_xscale()) == ("log", "linear")
-    assert [text.get_text() for text in left.texts] == ["90%", "flat"]
+    assert [text.get_text() for text in left.texts] == ["90 %", "flat"]
     assert len(left.lines) == 3
     marks = next(line for line in right.lines if line.get_marker() == "x")
     assert list(marks.get_xdata()) == list(coulomb[-2:])

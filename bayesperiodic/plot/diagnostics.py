@@ -269,7 +269,7 @@ def _profile_panel(axes: Axes, profile: Profile, name: str) -> None:
         axes.plot(values[~found], low, "x", color=COLOURS["measured"], ms=5, label=failed)
     axes.axhline(AT_90, color="grey", lw=0.8, ls=":", zorder=1)
     places = ("axes fraction", "data"), "offset points"
-    axes.annotate("90%", (1, AT_90), (-3, 1), *places, color="grey", ha="right", va="bottom")
+    axes.annotate("90 %", (1, AT_90), (-3, 1), *places, color="grey", ha="right", va="bottom")
     if profile.shape[name] != CLOSED:
         axes.annotate(profile.shape[name], (0.5, 0.03), xycoords="axes fraction", ha="center", va="bottom")
     if wide:

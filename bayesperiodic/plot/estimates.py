@@ -187,7 +187,7 @@ def loops(
 
 def _measured(problem: Problem, cycles: int) -> str:
     synthetic = any(e.synthetic for e in problem.experiments)
-    return f"{'synthetic' if synthetic else 'measured'}, mean of {cycles} cycles"
+    return f"{'synthetic' if synthetic else 'measured'}, {f'mean of {cycles} cycles' if cycles > 1 else '1 cycle'}"
 
 
 @styled

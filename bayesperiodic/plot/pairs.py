@@ -17,7 +17,17 @@ from scipy.stats import norm
 from bayesperiodic import _checks
 from bayesperiodic.estimation.result import MapEstimate
 from bayesperiodic.plot import regions, style
-from bayesperiodic.plot.style import COLOURS, ENSEMBLES, LAPLACE, caveats_of, chosen, draws_label, styled
+from bayesperiodic.plot.style import (
+    COLOURS,
+    ENSEMBLES,
+    LABEL_LENGTH,
+    LAPLACE,
+    SUPERSCRIPTS,
+    caveats_of,
+    chosen,
+    draws_label,
+    styled,
+)
 from bayesperiodic.posterior.description import check_fingerprint, check_results
 from bayesperiodic.posterior.parameters import support
 from bayesperiodic.posterior.problem import Problem
@@ -26,6 +36,10 @@ from bayesperiodic.sampling.posterior import MODE, Posterior
 LEVELS = (0.5, 0.9)
 LEVELS_TEXT = "50 and 90 %"
 MOST_NAMES = 8
+# Panels of more names are smaller, and their labels have this size [points] and length.
+MANY, SMALL, SHORT = 6, 7, 18
+# Room between panels [inches]; part of an axis at each end without ticks, whose labels would touch those of the next.
+ROOM, FREE = 0.06, 0.08
 # Quantiles that a panel shows, and the margin around them; quantiles of titles.
 SHOWN, MARGIN, TITLE = (0.003, 0.997), 0.06, (0.05, 0.5, 0.95)
 BINS, TAILS = 40, (0.0005, 0.9995)
@@ -118,10 +132,9 @@ def corner(
         raise ValueError(f"labels: must be {len(names)}, one per name, got {len(labels)}.")
     if not all(0.0 < q < 1.0 for q in quantiles):
         raise ValueError(f"quantiles: must be between 0 and 1, got {list(quantiles)}.")
-    side = (1.9, 1.55, 1.25)[(len(names) > 3) + (len(names) > 6)] * len(names) + 0.8
+    side = (1.9, 1.55, 1.25)[(len(names) > 3) + (len(names) > MANY)] * len(names) + 0.8
     figure = figure or plt.figure(figsize=(max(side, 3.2), max(side, 3.2)))
-    if figure.get_layout_engine() is None:
-        figure.set_layout_engine("constrained", h_pad=0.03, w_pad=0.03, hspace=0.0, wspace=0.0)
+    figure.set_layout_engine("none")
     panels = _Panels.of(figure, posterior, names, dict(truths or {}))
     handles = [*panels.draw_draws(quantiles, show_titles)]
     if laplace is not None:
@@ -129,8 +142,9 @@ def corner(
     if problem is not None:
         handles += panels.draw_priors(problem)
     handles += panels.draw_lines()
-    panels.write_labels([draws_label(posterior, name) for name in names] if labels is None else labels)
-    panels.write_legend(handles, caveats_of(posterior))
+    length = SHORT if len(names) > MANY else LABEL_LENGTH
+    panels.write_labels([draws_label(posterior, name, length) for name in names] if labels is None else labels)
+    panels.arrange(panels.write_legend(handles, caveats_of(posterior)))
     return figure
 
 
@@ -207,7 +221,7 @@ class _Panels:
                 axes.axvline(value, color="black", lw=0.8, ls="--")
             if show_titles:
                 low, middle, high = np.quantile(self.draws[:, k], TITLE)
-                axes.set_title(_with_errors(low, middle, high))
+                axes.set_title(with_errors(low, middle, high))
 
     def draw_laplace(self, mean: np.ndarray, covariance: np.ndarray) -> Iterator[Any]:
         """Draw ellipses and densities of the normal distribution, and yield the entry of the legend."""
@@ -250,29 +264,43 @@ class _Panels:
 
     def write_labels(self, labels: Sequence[str]) -> None:
         """Write the names and the ticks at the left and the lower edge."""
-        last = len(self.names) - 1
+        last, small = len(self.names) - 1, {"size": SMALL} if len(self.names) > MANY else {}
         for (i, j), axes in np.ndenumerate(self.grid):
             if j > i:
                 continue
             for axis in (axes.xaxis, axes.yaxis) if j < i else (axes.xaxis,):
-                axis.set_major_locator(MaxNLocator(4, prune="both", min_n_ticks=2))
-                _write_out_ticks(axis)
+                _set_ticks(axis)
             axes.tick_params(axis="x", labelbottom=i == last, labelrotation=45)
             axes.tick_params(axis="y", labelleft=j == 0 and i > 0)
+            plt.setp(axes.get_xticklabels(), ha="right", rotation_mode="anchor")
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.get_offset_text().set_visible(False)
             if i == last:
-                axes.set_xlabel(_with_factor(axes.xaxis, labels[j]))
+                axes.set_xlabel(_with_factor(axes.xaxis, labels[j]), **small)
             if j == 0 and i > 0:
-                axes.set_ylabel(_with_factor(axes.yaxis, labels[i]))
-        figure = self.grid[0, 0].figure
-        figure.align_labels()
+                axes.set_ylabel(_with_factor(axes.yaxis, labels[i]), **small)
+        self.grid[0, 0].figure.align_labels()
 
-    def write_legend(self, handles: list[Any], title: str) -> None:
-        """Write the legend into the upper right corner, or above a single panel."""
-        if len(self.names) == 1:
-            self.grid[0, 0].figure.legend(handles=handles, title=title or None, loc="outside upper center")
-            return
-        place: dict[str, Any] = {"loc": "upper right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0}
-        self.grid[0, -1].legend(handles=handles, title=title or None, **place).set_in_layout(False)
+    def write_legend(self, handles: list[Any], title: str) -> float:
+        """Write the legend into the upper right corner, and return the height that it needs above a single panel."""
+        figure = self.grid[0, 0].figure
+        legend = figure.legend(handles=handles, title=title or None, loc="upper right", handlelength=1.4)
+        return legend.get_window_extent().height if len(self.names) == 1 else 0.0
+
+    def arrange(self, above: float) -> None:
+        """Put panels of one size as closely as their labels allow; `above` is the height of the legend [pixels]."""
+        figure, last = self.grid[0, 0].figure, len(self.names) - 1
+        boxes = {place: (axes.get_tightbbox(), axes.bbox) for place, axes in np.ndenumerate(self.grid)}
+        column, row = [boxes[i, 0] for i in range(last + 1)], [boxes[last, j] for j in range(last + 1)]
+        left, bottom = (max(inner.p0[k] - outer.p0[k] for outer, inner in line) for k, line in enumerate((column, row)))
+        outer, inner = boxes[0, 0]
+        title, gap, (width, height) = outer.y1 - inner.y1, ROOM * figure.dpi, figure.bbox.size
+        x, y = (left + 2.0 * gap) / width, (bottom + 2.0 * gap) / height
+        top = 1.0 - (title + above + 2.0 * gap) / height
+        each = [(1.0 - x - gap / width + gap / width) / (last + 1), (top - y + (title + gap) / height) / (last + 1)]
+        for (i, j), axes in np.ndenumerate(self.grid):
+            size = each[0] - gap / width, each[1] - (title + gap) / height
+            axes.set_position((x + j * each[0], y + (last - i) * each[1], *size))
 
 
 def _groups(posterior: Posterior) -> list[_Group]:
@@ -316,33 +344,42 @@ def _draw_ellipses(axes: Axes, mean: np.ndarray, covariance: np.ndarray) -> None
         axes.plot(x, y, zorder=5, **LAPLACE | {"lw": 1.2})
 
 
-def _with_errors(low: float, middle: float, high: float) -> str:
+def with_errors(low: float, middle: float, high: float) -> str:
     """Return a value and the distances to the ends of an interval, to two digits of the shorter one."""
     shorter = min(high - middle, middle - low)
     digits = 1 - int(np.floor(np.log10(shorter))) if shorter > 0.0 else 4
     if digits < -3 or digits > 6:
         power = int(np.floor(np.log10(max(abs(middle), shorter))))
         scaled = [value / 10.0**power for value in (low, middle, high)]
-        return rf"{_with_errors(*scaled)} $\times\,10^{{{power}}}$"
+        return rf"{with_errors(*scaled)} $\times\,10^{{{power}}}$"
     texts = [f"{round(value, digits) + 0.0:.{max(digits, 0)}f}" for value in (middle, high - middle, middle - low)]
     return rf"${texts[0]}^{{+{texts[1]}}}_{{-{texts[2]}}}$"
 
 
-def _write_out_ticks(axis: Any) -> None:
-    """Write ticks without an offset."""
+def _set_ticks(axis: Any) -> None:
+    """Set two or three ticks, away from the ends, and write them without an offset."""
+    low, high = axis.get_view_interval()
+    room = FREE * (high - low)
+    for count in (3, 4, 5, 7):
+        ticks = MaxNLocator(count, steps=[1, 2, 5, 10]).tick_values(low, high)
+        ticks = ticks[(ticks >= low + room) & (ticks <= high - room)]
+        if len(ticks) > 1:
+            break
+    axis.set_ticks(ticks)
     formatter = ScalarFormatter(useOffset=False)
     formatter.set_powerlimits(WHOLE)
     axis.set_major_formatter(formatter)
-    axis.get_offset_text().set_visible(False)
 
 
 def _with_factor(axis: Any, label: str) -> str:
     """Return a label with the common factor of the ticks in its unit, because it would overlap the panels."""
     formatter = axis.get_major_formatter()
     formatter.set_locs(axis.get_majorticklocs().tolist())
-    name, _, unit = label.partition("\n[")
-    factor = formatter.get_offset()
-    return f"{name}\n[{' '.join(filter(None, [factor, unit or ']']))}" if factor else label
+    factor, (name, _, unit) = formatter.get_offset(), label.rpartition("\n[")
+    if not factor:
+        return label
+    power = "10" + factor.removeprefix("1e").translate(SUPERSCRIPTS)
+    return f"{name}\n[{power} {unit}" if name else f"{label}\n[{power}]"
 
 
 def normal_approximation(

@@ -24,8 +24,9 @@ NODES, FINE, RESOLVED = 256, 1024, 3.0
 FINE_1D = 8192
 # Draws beyond these quantiles widen no mesh; half-widths of the kernels that are tried, in cells and in sds.
 ENDS, ROOM, NARROWEST, WIDEST, WIDTHS = (0.0003, 0.9997), 0.08, 0.7, 0.6, 32
-# Cross-validation is noisy: the widest kernel with an error larger by this fraction of ∫f² is as good.
-TOLERANCE = 0.001
+# Cross-validation is noisy: the widest kernel with an error larger by this fraction of ∫f² is as good, for n draws the
+# larger one of the first number and the second times n to the power of the third.
+TOLERANCE = 0.001, 2.0, -0.8
 # Factors on the width of the kernels, where the density is high and low.
 FACTORS = np.geomspace(0.7, 10.0, 8)
 # Ends of supports that are nearer than this many sds to a draw are edges of the mesh.
@@ -195,7 +196,8 @@ class KernelEstimate:
         halves = [counter.spectrum(part[keep]) for part, keep in zip(_halves(places), _halves(inside), strict=True)]
         widths = np.geomspace(NARROWEST * steps.max(), WIDEST, WIDTHS)
         scores = np.array([counter.score(halves, width) for width in widths])
-        width = float(widths[scores >= scores.max() - TOLERANCE * abs(scores.max())].max())
+        tolerance = max(TOLERANCE[0], TOLERANCE[1] * len(points) ** TOLERANCE[2])
+        width = float(widths[scores >= scores.max() - tolerance * abs(scores.max())].max())
         pilot = counter.smooth(0.5 * (halves[0] + halves[1]), width)
         places = places[inside]
         at = np.maximum(pilot[tuple(places.T)], 1e-9 * pilot.max())

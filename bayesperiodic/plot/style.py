@@ -49,17 +49,19 @@ def caveats(synthetic: bool, converged: bool) -> str:
     return ", ".join((["synthetic data"] if synthetic else []) + ([] if converged else ["NOT CONVERGED"]))
 
 
-def draws_label(posterior: Posterior, name: str) -> str:
+def draws_label(posterior: Posterior, name: str, length: int = LABEL_LENGTH) -> str:
     """Return the label of a quantity by its full name."""
-    return wrapped_label(name, unit(posterior.tree["posterior"].to_dataset(), name))
+    return wrapped_label(name, unit(posterior.tree["posterior"].to_dataset(), name), length)
 
 
-def wrapped_label(name: str, unit: str) -> str:
-    """Return a label in short lines, with the unit on the last one."""
-    return axis_label(textwrap.fill(name, LABEL_LENGTH), unit).replace(" [", "\n[")
+def wrapped_label(name: str, unit: str, length: int = LABEL_LENGTH) -> str:
+    """Return a label in short lines, broken also at _ and [, with the unit on the last one."""
+    breakable = re.sub(r"(?<=_)(?=\w)|(?=\[)", "\v", name)
+    lines = textwrap.fill(breakable, length, replace_whitespace=False).replace("\v", "")
+    return axis_label(lines, unit).replace(" [", "\n[")
 
 
-SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+SUPERSCRIPTS = str.maketrans("-−0123456789", "⁻⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def axis_label(name: str, unit: str = "") -> str:
