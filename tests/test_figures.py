@@ -122,6 +122,10 @@ def missing_terms(count, draws, results):
     return bp.plot.missing_terms(problem, estimate, found)
 
 
+def summary(count, draws, results):
+    return bp.plot.summary(results["problem"], results["fit"], results["posterior"])
+
+
 def branch(count, draws, results):
     force = {"force": np.cos(2 * np.pi * np.arange(32) / 32)}
     parameters = {"m": 1.0, "c": 0.2, "k": 1.0, "k3": 0.5}
@@ -149,7 +153,7 @@ def orbits(count, draws, results):
 
 DRAWERS = [
     branch, comparison, corner, fit, loops, marginals, missing_terms, models, modes, orbits, profile, ranks, section,
-    traces,
+    summary, traces,
 ]  # fmt: skip
 
 
@@ -161,10 +165,7 @@ def test_every_public_figure_is_looked_at():
 @pytest.mark.parametrize("count", [1, 2, 9])
 @pytest.mark.parametrize("drawer", DRAWERS)
 def test_no_text_is_clipped_or_overlaps_another(drawer, count, draws, results):
-    figure = drawer(count, draws, results)
-    wrong = faults(figure)
-    figure.savefig(f"/tmp/fig/{drawer.__name__}_{count}.png", dpi=100)
-    assert not wrong
+    assert not faults(drawer(count, draws, results))
 
 
 def test_clipped_and_overlapping_texts_are_found():
@@ -176,3 +177,23 @@ def test_clipped_and_overlapping_texts_are_found():
     axes.text(0.32, 0.2, "beside", rotation=45)
     assert faults(figure) == ["clipped: 'too long'", "overlap: 'one' and 'other'"]
     assert {"one", "turned"} <= {text.get_text() for text in texts(figure)}
+
+
+def test_summary_shows_the_worst_parameters_and_the_verdicts(results):
+    problem, fit, posterior = (results[name] for name in ("problem", "fit", "posterior"))
+    found = bp.identifiability(problem, fit, posterior, profile=False).table
+    worst = found["contraction"].nsmallest(2).index
+    figure = bp.plot.summary(problem, fit, posterior)
+    top, below, *panels = figure.axes
+    assert np.array_equal(below.lines[0].get_ydata(), fit.residuals["run"]["force"])
+    assert (top.get_ylabel(), below.get_ylabel()) == ("force [N]", "residual [N]")
+    shown = [panels[2].get_xlabel(), panels[3].get_xlabel()]
+    assert [label.split("\n")[0] for label in shown] == [name for name in problem.names if name in worst]
+    (words,) = figure.subfigs[1].subfigs[1].texts
+    text = " ".join(words.get_text().split())
+    assert f"Fit: {100 * (1 - fit.fvu['force']):.4g} % of the variance of force explained" in text
+    assert "Determined: k, c, coulomb." in text and "Laplace approximation: fine." in text and "converged" in text
+    bad = bp.plot.summary(problem, fit, replace(posterior, converged=False))
+    assert "Draws: NOT CONVERGED" in bad.subfigs[1].subfigs[1].texts[0].get_text()
+    with pytest.raises(ValueError, match="fit: must be a result of this problem"):
+        bp.plot.summary(problem, replace(fit, fingerprint="model:1"), posterior)

@@ -73,8 +73,8 @@ def test_corner_ticks_show_complete_values(solved, middle, spread):
     """Also for values that differ in their last digits only or are large, for which matplotlib prints offsets."""
     _, _, posterior = solved
     data = posterior.tree.copy()
-    group = data["posterior"].to_dataset().map(lambda values: (middle + spread * values / values.std()).drop_attrs())
-    data["posterior"] = group
+    group = data["posterior"].to_dataset().map(lambda values: middle + spread * values / values.std())
+    data["posterior"] = group.drop_attrs()
     figure = bp.plot.corner(replace(posterior, tree=data), names=["k", "c"])
     figure.canvas.draw()
     assert not [

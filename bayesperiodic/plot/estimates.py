@@ -83,21 +83,7 @@ def fit(
     for row, (e, channel) in enumerate(shown):
         top = figure.add_subplot(grid[2 * row])
         below = figure.add_subplot(grid[2 * row + 1], sharex=top)
-        residual = estimate.residuals[e.name][channel]
-        predicted = e.outputs[channel] - residual
-        if prediction is not None:
-            low, high = prediction.low[e.name][channel], prediction.high[e.name][channel]
-            _band(top, e, low, high, f"{100 * prediction.probability:.0f} % predictive band")
-            _band(below, e, low - predicted, high - predicted, "_")
-        _curve(top, e, e.time, e.outputs[channel], lw=1.6, label=_measured(problem, e.cycles), **MEASURED)
-        _curve(top, e, e.time, predicted, lw=1.2, label="MAP", **FITTED)
-        _curve(below, e, e.time, residual, lw=1.0, **MEASURED)
-        below.axhline(0.0, lw=1.0, color=COLOURS["map"], ls="--")
-        unit = problem.model.units.get(channel, "")
-        top.set(ylabel=axis_label(channel, unit), title=axis_label(e.name))
-        below.set(ylabel=axis_label("residual", unit), xlabel="time in the period [s]")
-        top.tick_params(labelbottom=False)
-        top.legend(frameon=False)
+        draw_period(top, below, problem, estimate, e, channel, prediction)
     for row, (e, name) in enumerate(noisy, 2 * len(shown)):
         axes, half = figure.add_subplot(grid[row]), NINETY * estimate.input_sd[e.name][name]
         error = e.inputs[name] - estimate.inputs[e.name][name]
@@ -110,6 +96,33 @@ def fit(
             ylabel=axis_label(f"error of\n{name}", problem.model.units.get(name, "")), xlabel="time in the period [s]"
         )
     return figure
+
+
+def draw_period(
+    top: Axes,
+    below: Axes,
+    problem: Problem,
+    estimate: MapEstimate,
+    e: Experiment,
+    channel: str,
+    prediction: Prediction | None = None,
+) -> None:
+    """Draw a measured mean period with the fitted one, and the residual below."""
+    residual = estimate.residuals[e.name][channel]
+    predicted = e.outputs[channel] - residual
+    if prediction is not None:
+        low, high = prediction.low[e.name][channel], prediction.high[e.name][channel]
+        _band(top, e, low, high, f"{100 * prediction.probability:.0f} % predictive band")
+        _band(below, e, low - predicted, high - predicted, "_")
+    _curve(top, e, e.time, e.outputs[channel], lw=1.6, label=_measured(problem, e.cycles), **MEASURED)
+    _curve(top, e, e.time, predicted, lw=1.2, label="MAP", **FITTED)
+    _curve(below, e, e.time, residual, lw=1.0, **MEASURED)
+    below.axhline(0.0, lw=1.0, color=COLOURS["map"], ls="--")
+    unit = problem.model.units.get(channel, "")
+    top.set(ylabel=axis_label(channel, unit), title=axis_label(e.name))
+    below.set(ylabel=axis_label("residual", unit), xlabel="time in the period [s]")
+    top.tick_params(labelbottom=False)
+    top.legend(frameon=False)
 
 
 def _curve(axes: Axes, e: Experiment, x: np.ndarray, y: np.ndarray, closed: bool = False, **look: Any) -> None:

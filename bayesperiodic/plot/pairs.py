@@ -134,7 +134,8 @@ def corner(
         raise ValueError(f"quantiles: must be between 0 and 1, got {list(quantiles)}.")
     side = (1.9, 1.55, 1.25)[(len(names) > 3) + (len(names) > MANY)] * len(names) + 0.8
     figure = figure or plt.figure(figsize=(max(side, 3.2), max(side, 3.2)))
-    figure.set_layout_engine("none")
+    if isinstance(figure, Figure):  # and no part of one
+        figure.set_layout_engine("none")
     panels = _Panels.of(figure, posterior, names, dict(truths or {}))
     handles = [*panels.draw_draws(quantiles, show_titles)]
     if laplace is not None:
