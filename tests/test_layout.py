@@ -7,8 +7,8 @@ from tests import layout
 # The package had 25,000 lines when it was last shortened; the rest is room for the statistics and the checks of input
 # that were missing then, of the evidence and comparison of models, of proposals for curved posteriors, and of errors of
 # the inputs, integrated out, as parameters, and correlated with those of the outputs; of the search for missing terms,
-# its candidates, with memory too, tests, units and figure; of the test of response periods; a model of a circuit; and of
-# the regions of corner plots and the summary in one page.
+# its candidates, with memory too, tests, units and figure; of the test of response periods; a model of a circuit; and
+# of the regions of corner plots and the summary on one page.
 MOST_FILES, MOST_LINES, LONGEST_FILE = 116, 33_330, 600
 MOST_PARAMETERS = 8
 REASONS = {

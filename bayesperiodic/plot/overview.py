@@ -55,12 +55,14 @@ def summary(problem: Problem, fit: MapEstimate, posterior: Posterior, *, figure:
     problem = check_results(problem, fit=fit, posterior=posterior)
     found, compared = identifiability(problem, fit, posterior, profile=False), compare(problem, fit, posterior)
     figure = figure or plt.figure(figsize=(10.0, 5.6))
-    left, right = figure.subfigures(1, 2, width_ratios=[1.15, 1.0])
+    parts: Any = figure.subfigures(1, 2, width_ratios=[1.15, 1.0])
+    left, right = parts
     above, below = right.subfigures(2, 1, height_ratios=[1.7, 1.0])
     channel = max(fit.fvu, key=lambda name: fit.fvu[name])
     having = [e for e in problem.experiments if channel in e.outputs]
     worst = max(having, key=lambda e: float((fit.residuals[e.name][channel] ** 2).sum()))
-    draw_period(*_fit_and_residual(left), problem, fit, worst, channel)
+    top, bottom = _fit_and_residual(left)
+    draw_period(top, bottom, problem, fit, worst, channel)
     names = _worst(problem, posterior, found, compared)
     corner(posterior, laplace=fit, problem=problem, names=names, figure=cast(Figure, above))
     text = "\n".join(
@@ -77,13 +79,9 @@ def _fit_and_residual(figure: SubFigure) -> Any:
 
 def _worst(problem: Problem, posterior: Posterior, found: Identifiability, compared: Comparison) -> list[str]:
     """Return the two worst parameters in the order of the problem; of one parameter it and a noise parameter."""
-    table, verdicts = found.table, compared.table["verdict"]
-
-    def key(name: str) -> tuple[bool, bool, float]:
-        fine = verdicts.get(name, FINE) == FINE
-        return table.loc[name, "verdict"] == DETERMINED, fine, float(table.loc[name, "contraction"])
-
-    worst = sorted(problem.names, key=key)[:2]
+    fine = compared.table["verdict"].reindex(found.table.index, fill_value=FINE) == FINE
+    ranks = found.table.assign(determined=found.table["verdict"] == DETERMINED, fine=fine)
+    worst = ranks.sort_values(["determined", "fine", "contraction"], kind="stable").index[:2]
     others = [name for name in posterior.names if name not in problem.names]
     return [*(name for name in problem.names if name in worst), *others][:2]
 
