@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> None:
             "loops": bp.plot.loops(problem, fit),
             "corner": common.titled(
                 bp.plot.corner(posterior, laplace=fit, problem=problem),
-                "Magnetorheological damper, Dahl's model: the data determine every parameter, and Laplace agrees",
+                "Magnetorheological damper: posterior of Dahl's model",
             ),
             "traces": bp.plot.traces(posterior),
             "harmonics": _harmonics_figure(choices, synthetic=data["synthetic"]),
