@@ -307,7 +307,7 @@ def figures(
     }
     kind = f" ({SYNTHETIC})" * section.synthetic
     drawn["section"].suptitle(f"Unstable orbits found in the pendulum's chaotic motion{kind}", fontsize="medium")
-    drawn["orbits"].suptitle(f"Unstable orbits, measured and of the model{kind}", x=0.01, ha="left", fontsize="medium")
+    drawn["orbits"].suptitle(f"Unstable orbits of the pendulum{kind}", x=0.01, ha="left", fontsize="medium")
     if table:
         drawn["eigenvalues"] = eigenvalues(table)
     return drawn
