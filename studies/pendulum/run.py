@@ -302,15 +302,23 @@ def figures(
     drawn = {
         "section": bp.plot.section(section, found.polished, units=UNITS),
         "orbits": bp.plot.orbits(found.selected, units=UNITS),
-        "corner": bp.plot.corner(ridge.posterior, laplace=ridge.fit, names=pendulum_estimates.NATURAL),
+        "corner": corner(ridge, truth=section.synthetic),
         "ridge": marginals(ridge, truth=section.synthetic),
     }
-    if section.synthetic:
-        drawn["section"].suptitle(SYNTHETIC, fontsize="medium")
-        drawn["orbits"].suptitle(SYNTHETIC, x=0.99, ha="right", fontsize="medium")
+    kind = f" ({SYNTHETIC})" * section.synthetic
+    drawn["section"].suptitle(f"Unstable orbits found in the pendulum's chaotic motion{kind}", fontsize="medium")
+    drawn["orbits"].suptitle(f"Unstable orbits of the pendulum{kind}", x=0.01, ha="left", fontsize="medium")
     if table:
         drawn["eigenvalues"] = eigenvalues(table)
     return drawn
+
+
+def corner(ridge: Ridge, *, truth: bool) -> Figure:
+    """Draw the posterior of all five parameters."""
+    names = pendulum_estimates.NATURAL
+    truths = {name: TRUTH[name] for name in names} if truth else None
+    figure = bp.plot.corner(ridge.posterior, laplace=ridge.fit, names=names, truths=truths)
+    return common.titled(figure, "m, k1, k2 and k3 are determined only up to a common factor; l by itself")
 
 
 def marginals(ridge: Ridge, *, truth: bool) -> Figure:
