@@ -95,7 +95,8 @@ def eigenvalues(jacobian: np.ndarray) -> np.ndarray:
 
 def shift_between(one: np.ndarray, other: np.ndarray, wrap: Wrap) -> tuple[float, int]:
     """Return the smallest distance of two cycles (p, 2) under cyclic shifts of the other, and that shift."""
-    distances = [np.abs(wrap(np.roll(other, -shift, axis=0) - one)).max() for shift in range(len(one))]
+    steps = np.arange(len(one))
+    distances = np.abs(wrap(other[(steps[:, None] + steps) % len(one)] - one)).max((1, 2))
     best = int(np.argmin(distances))
     return float(distances[best]), best
 
@@ -103,7 +104,8 @@ def shift_between(one: np.ndarray, other: np.ndarray, wrap: Wrap) -> tuple[float
 def has_shorter_period(points: np.ndarray, wrap: Wrap, tolerance: float) -> bool:
     """Return whether the points (p, 2) repeat after a divisor of p."""
     p = len(points)
-    return any(p % d == 0 and np.abs(wrap(np.roll(points, -d, axis=0) - points)).max() < tolerance for d in range(1, p))
+    divisors = [d for d in range(1, p) if p % d == 0]
+    return any(np.abs(wrap(np.concatenate([points[d:], points[:d]]) - points)).max() < tolerance for d in divisors)
 
 
 def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) -> list[Candidate]:
