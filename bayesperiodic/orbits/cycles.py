@@ -27,7 +27,8 @@ AGREEMENT, SIZES, WIDENED = 2.5, 6, 2.0**0.5
 DEGREE = 3
 # Smallest bandwidth in standard deviations of the noise.
 ROOM = 2.5
-REFINING_STEPS, REFINED = 12, 1e-6
+# Refinement ends below this step, or this fraction of the noise.
+REFINING_STEPS, REFINED, REFINED_NOISE = 12, 1e-6, 1e-3
 # The bias of slopes is proportional to the third power of the bandwidth. That of values is in theory to the fourth;
 # measured, the error is two thirds of the difference between the points.
 SLOPE_GROWTH, VALUE_GROWTH = WIDENED**3 - 1.0, 1.5
@@ -230,9 +231,9 @@ def _turns(maps: ReturnMap, run: np.ndarray) -> float:
 
 def _close(maps: ReturnMap, points: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, list[LocalFit]] | None:
     """Return the points at which the chained fits close, and the fits; None without convergence."""
-    cycle, last = points.copy(), np.inf
+    cycle, last, refined = points.copy(), np.inf, max(REFINED, REFINED_NOISE * float(maps.noise.max()))
     for step in range(REFINING_STEPS):
-        final = last < REFINED or step == REFINING_STEPS - 1
+        final = last < refined or step == REFINING_STEPS - 1
         fits = [maps.fit(point[None], int(n), DEGREE, influence=final) for point, n in zip(cycle, counts, strict=True)]
         defect = maps.wrap(np.concatenate([fit.value for fit in fits]) - np.roll(cycle, -1, axis=0))
         correction = newton_step(defect[None], np.concatenate([fit.jacobian for fit in fits])[None])[0]
@@ -253,13 +254,14 @@ def _bandwidths(maps: ReturnMap, points: np.ndarray, neighbours: int) -> np.ndar
     ladder = smallest[:, None] * WIDENED ** np.arange(SIZES)
     counts = [maps.count_within(points, bandwidths) for bandwidths in ladder.T]
     most = len(maps.arguments) // 8
-    start = np.concatenate([maps.fit(p[None], n, DEGREE).jacobian for p, n in zip(points, counts[0], strict=True)])
-    right, left = _eigenvectors(start, 0)
+    narrowest = [maps.fit(point[None], int(n), DEGREE) for point, n in zip(points, counts[0], strict=True)]
+    right, left = _eigenvectors(np.concatenate([fit.jacobian for fit in narrowest]), 0)
     chosen = []
     for j, point in enumerate(points):
         accepted: list[tuple[np.ndarray, np.ndarray]] = []
         for count in (int(n[j]) for n in counts if n[j] <= most):
-            target, sd = _along(maps.fit(point[None], count, DEGREE), left[j : j + 1], right[j : j + 1])
+            fit = maps.fit(point[None], count, DEGREE) if accepted else narrowest[j]
+            target, sd = _along(fit, left[j : j + 1], right[j : j + 1])
             if any(np.any(np.abs(target - other) > AGREEMENT * other_sd) for other, other_sd in accepted):
                 break
             accepted.append((target, sd))
