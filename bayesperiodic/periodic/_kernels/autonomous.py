@@ -14,7 +14,7 @@ MAX_SECANTS, SECANT_RATE = 12, 0.5
 ANCHOR = types.Tuple([VECTOR, MATRIX, NUMBER, CUBE, VECTOR])
 
 
-@njit(
+@kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
         FUNCTIONS, GRID, SETTING, MATRIX, PLACES, BORDER, NUMBER, MATRIX, MATRIX, MATRIX
     ),
@@ -80,7 +80,7 @@ def broyden(functions, grid, setting, band, pivots, border, target, z, states, c
     return False, MAX_SECANTS, frequency
 
 
-@njit(NUMBER(NUMBER, VECTOR, VECTOR, VECTOR, NUMBER), **OPTIONS)
+@njit(NUMBER(NUMBER, VECTOR, VECTOR, VECTOR, NUMBER), **INTERNAL)
 def predicted_frequency(frequency, sensitivities, anchor_parameters, parameters, fraction):
     """Return the anchor's linear prediction of the frequency, or its own where that is not positive."""
     result = frequency
@@ -89,7 +89,7 @@ def predicted_frequency(frequency, sensitivities, anchor_parameters, parameters,
     return result if result > 0.0 else frequency
 
 
-@njit(FLAG(MATRIX, MATRIX, MATRIX, NUMBER, NUMBER), **OPTIONS)
+@njit(FLAG(MATRIX, MATRIX, MATRIX, NUMBER, NUMBER), **INTERNAL)
 def has_leapt(z, predicted, start, frequency, expected):
     """Return whether an orbit is not a continuation of `start`: unpredicted, shrunk, or of a shorter period."""
     if is_far(z, predicted, start) or abs(frequency - expected) > FAR * expected:
@@ -97,9 +97,9 @@ def has_leapt(z, predicted, start, frequency, expected):
     return has_shrunk(z, start) or has_shorter_period(z)
 
 
-@njit(
+@kernel(
     types.Tuple([COUNT, COUNT, NUMBER])(FUNCTIONS, GRID, SETTING, ANCHOR, NUMBER, BORDER, MATRIX, MATRIX, WORKSPACE),
-    **OPTIONS,
+    **INTERNAL,
 )
 def continue_from_anchor(functions, grid, setting, anchor, orientation, border, z, history, work):
     """Follow an orbit from the anchor's parameters to those of the setting; return status, iterations and frequency.
@@ -154,7 +154,7 @@ def continue_from_anchor(functions, grid, setting, anchor, orientation, border, 
     return CONVERGED, used, now
 
 
-@njit(types.void(FUNCTIONS, GRID, SETS, ORBITS, CUBE, COUNT, COUNT, FLAG, WORKSPACE, SOLUTION), **OPTIONS)
+@kernel(types.void(FUNCTIONS, GRID, SETS, ORBITS, CUBE, COUNT, COUNT, FLAG, WORKSPACE, SOLUTION), **OPTIONS)
 def follow_many(functions, grid, sets, orbits, parameters, start, stop, whole, work, solution):
     """Follow every orbit to its parameter vectors start … stop: by `broyden`, or else by `continue_from_anchor`.
 

@@ -17,7 +17,7 @@ POLISHED = 1e-12
 LARGEST_PART = 1.0 / 16.0
 
 
-@njit(NUMBER(VECTOR, VECTOR), **OPTIONS)
+@njit(NUMBER(VECTOR, VECTOR), **INTERNAL)
 def in_units(reached, amplitude):
     """Return the largest of the values of each state in units of its amplitude; zeros do not count."""
     result = 0.0
@@ -27,11 +27,11 @@ def in_units(reached, amplitude):
     return result
 
 
-@njit(
+@kernel(
     types.Tuple([FLAG, COUNT, NUMBER])(
         FUNCTIONS, GRID, SETTING, VECTOR, NUMBER, NUMBER, FLAG, MATRIX, MATRIX, MATRIX, FACTORS, MATRIX, MATRIX
     ),
-    **OPTIONS,
+    **INTERNAL,
 )
 def newton_chord(
     functions, grid, setting, amplitude, stiffness, predicted, polish, z, states, change, factors, left, right
@@ -86,7 +86,7 @@ def newton_chord(
     return converged, MAX_CHORDS, moved
 
 
-@njit(FLAG(MATRIX, COUNT), **OPTIONS)
+@njit(FLAG(MATRIX, COUNT), **INTERNAL)
 def was_damped(history, iterations):
     """Return whether the Newton iteration took a shortened step."""
     for iteration in range(iterations):
@@ -95,11 +95,11 @@ def was_damped(history, iterations):
     return False
 
 
-@njit(
+@kernel(
     types.Tuple([COUNT, COUNT])(
         FUNCTIONS, GRID, COUNT, SETTING, UNKNOWNS, BORDER, VECTOR, MATRIX, CUBE, FLAG, MATRIX, MATRIX, WORKSPACE
     ),
-    **OPTIONS,
+    **INTERNAL,
 )
 def continue_from_anchor(
     functions, grid, periods, setting, unknowns, border, anchor_parameters, anchor_z, sensitivities, leapt, z, history,
@@ -137,7 +137,7 @@ def continue_from_anchor(
     return CONVERGED, used
 
 
-@njit(types.void(FUNCTIONS, GRID, COUNT, SETS, ANCHORS, CUBE, COUNT, COUNT, FLAG, FLAG, SOLUTION), **OPTIONS)
+@kernel(types.void(FUNCTIONS, GRID, COUNT, SETS, ANCHORS, CUBE, COUNT, COUNT, FLAG, FLAG, SOLUTION), **OPTIONS)
 def solve_many(functions, grid, periods, sets, anchors, parameters, start, stop, polish, rates, solution):
     """Solve for input sets times parameter vectors, those of the flat indices start … stop (vectors run fastest).
 
@@ -259,7 +259,7 @@ def substitute_transposed(flat, pivots, below, reach, x):
         x[pivot] = value
 
 
-@njit(types.void(MATRIX, COUNT, COUNT, PLACES, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, COUNT, COUNT, PLACES, MATRIX), **OPTIONS)
 def solve_transposed(band, lower, upper, pivots, right):
     """Solve Aᵀ·x = b in place for right-hand sides (count, size), with the factors of `factor`."""
     flat = band.reshape(band.size)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
     from bayesperiodic.periodic._kernels.linear import *
 
 
-@njit(NUMBER(MATRIX, PLACES), **OPTIONS)
+@njit(NUMBER(MATRIX, PLACES), **INTERNAL)
 def determinant_sign(band, pivots):
     """Return the sign of the determinant, without the last pivot, of a matrix factored by `factor`."""
     sign, lower = 1.0, (band.shape[1] - 1) // 3
@@ -25,7 +25,7 @@ def determinant_sign(band, pivots):
     return sign
 
 
-@njit(NUMBER(MATRIX, PLACES, BORDER), **OPTIONS)
+@kernel(NUMBER(MATRIX, PLACES, BORDER), **OPTIONS)
 def factor_bordered(band, pivots, border):
     """Factor [∂g/∂z, B; C, D] in place; return the sign of its determinant, 0 where it is singular.
 
@@ -73,7 +73,7 @@ def factor_bordered(band, pivots, border):
     return -determinant_sign(band, pivots) * determinant_sign(small, border.pivots) * last
 
 
-@njit(types.void(MATRIX, PLACES, BORDER, MATRIX, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, PLACES, BORDER, MATRIX, MATRIX), **OPTIONS)
 def solve_bordered(band, pivots, border, right, below):
     """Solve [∂g/∂z, B; C, D]·(x, y) = (right, below) in place with the factors of `factor_bordered`.
 
@@ -98,7 +98,7 @@ def solve_bordered(band, pivots, border, right, below):
             right[r, i] += known[0, borders] * columns[borders, i]
 
 
-@njit(NUMBER(MATRIX, MATRIX, GRID, VECTOR), **OPTIONS)
+@kernel(NUMBER(MATRIX, MATRIX, GRID, VECTOR), **OPTIONS)
 def phase_row(z, states, grid, row):
     """Fill the row (size,), folded, of the phase condition ∫ q_z'·(q − q_z) dτ = 0 against z; return row · z.
 
@@ -124,7 +124,7 @@ def phase_row(z, states, grid, row):
     return target
 
 
-@njit(types.void(MATRIX, NUMBER, MATRIX), **OPTIONS)
+@njit(types.void(MATRIX, NUMBER, MATRIX), **INTERNAL)
 def scale_rates(inputs, ratio, result):
     """Fill u, u̇, ü at another frequency, `ratio` times as high."""
     count = inputs.shape[1] // 3
@@ -135,7 +135,7 @@ def scale_rates(inputs, ratio, result):
             result[i, 2 * count + k] = inputs[i, 2 * count + k] * ratio**2
 
 
-@njit(NUMBER(SETTING, UNKNOWNS, VECTOR, MATRIX, VECTOR), **OPTIONS)
+@kernel(NUMBER(SETTING, UNKNOWNS, VECTOR, MATRIX, VECTOR), **INTERNAL)
 def fill_setting(setting, unknowns, values, inputs, parameters):
     """Fill inputs and parameters at values of the unknowns, from the setting at zeros; return the frequency."""
     frequency = setting.frequency
@@ -155,7 +155,7 @@ def fill_setting(setting, unknowns, values, inputs, parameters):
     return frequency
 
 
-@njit(types.void(FUNCTIONS, GRID, SETTING, UNKNOWNS, MATRIX, MATRIX, MATRIX, MATRIX), **OPTIONS)
+@kernel(types.void(FUNCTIONS, GRID, SETTING, UNKNOWNS, MATRIX, MATRIX, MATRIX, MATRIX), **OPTIONS)
 def fill_slopes(functions, grid, setting, unknowns, states, columns, table, slopes):
     """Fill the first rows of `slopes` with ∂g/∂(unknowns), z held as a function of tau, folded.
 
@@ -184,7 +184,7 @@ def fill_slopes(functions, grid, setting, unknowns, states, columns, table, slop
                 slopes[k, grid.place[i] * count + e] = value
 
 
-@njit(NUMBER(MATRIX, VECTOR, GRID), **OPTIONS)
+@njit(NUMBER(MATRIX, VECTOR, GRID), **INTERNAL)
 def folded_product(z, row, grid):
     """Return row · z, the row (size,) in the folded order."""
     total, count = 0.0, z.shape[1]
@@ -194,7 +194,7 @@ def folded_product(z, row, grid):
     return total
 
 
-@njit(
+@kernel(
     types.Tuple([NUMBER, NUMBER])(
         FUNCTIONS, GRID, SETTING, UNKNOWNS, BORDER, MATRIX, MATRIX, MATRIX, MATRIX, WORKSPACE, VECTOR
     ),
@@ -236,7 +236,7 @@ def has_shrunk(z, start):
     return True
 
 
-@njit(NUMBER(MATRIX, COUNT), **OPTIONS)
+@njit(NUMBER(MATRIX, COUNT), **INTERNAL)
 def power(z, harmonic):
     """Return the power of a harmonic, summed over the states."""
     points, total = z.shape[0], 0.0
@@ -250,7 +250,7 @@ def power(z, harmonic):
     return total
 
 
-@njit(FLAG(MATRIX), **OPTIONS)
+@kernel(FLAG(MATRIX), **OPTIONS)
 def has_shorter_period(z):
     """Return whether only every k-th harmonic is present, for a k of 2 or more."""
     points, whole = z.shape[0], 0.0

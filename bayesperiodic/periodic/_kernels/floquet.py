@@ -3,6 +3,8 @@
 import numpy as np
 from numba import njit
 
+from bayesperiodic.models.linking import kernel
+
 STAGES = 3
 MATRIX, CUBE = "float64[:,::1]", "float64[:,:,::1]"
 OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
@@ -41,7 +43,7 @@ def solve(matrix, right):
     return True
 
 
-@njit(f"void({CUBE}, {CUBE}, int64, float64, {MATRIX}, float64[::1], {CUBE})", **OPTIONS)
+@kernel(f"void({CUBE}, {CUBE}, int64, float64, {MATRIX}, float64[::1], {CUBE})", **OPTIONS)
 def transfer_matrices(matrix, weights, first, step, gauss, sums, result):
     """Fill the transfer matrices (points, size, size) from each grid point to the next; NaN where singular.
 
@@ -92,7 +94,7 @@ def transfer_matrices(matrix, weights, first, step, gauss, sums, result):
                     result[point, p, q] = product[p, q]
 
 
-@njit(f"void({CUBE}, complex128[:,::1], int64, boolean, complex128[:,::1])", **OPTIONS)
+@kernel(f"void({CUBE}, complex128[:,::1], int64, boolean, complex128[:,::1])", **OPTIONS)
 def eigenfunction(steps, at, length, adjoint, result):
     """Fill an eigenfunction (points, size) of unit length from its values `at` every `length`-th point.
 
@@ -115,7 +117,7 @@ def eigenfunction(steps, at, length, adjoint, result):
             result[k, p] /= norm
 
 
-@njit(f"Tuple((boolean, float64, float64))({CUBE}, float64[::1], int64, float64)", **OPTIONS)
+@kernel(f"Tuple((boolean, float64, float64))({CUBE}, float64[::1], int64, float64)", **OPTIONS)
 def dominant_multiplier(steps, vector, sweeps, tolerance):
     """Iterate a vector over the period until its direction is constant; return whether it is, log|μ|, the sign of μ."""
     points, size, _ = steps.shape

@@ -28,7 +28,7 @@ FAR = 0.3
 SMALLEST_PART = 1.0 / 256.0  # smallest step of a continuation from an anchor
 
 
-@njit(types.void(MATRIX, VECTOR, GRID, NUMBER, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, VECTOR, GRID, NUMBER, MATRIX), **OPTIONS)
 def differentiate(z, drift, grid, frequency, states):
     """Fill `states` (points, 3·states) with q = z + drift·tau and its time derivatives by the scheme."""
     first, second, neighbours, tau = grid.first, grid.second, grid.neighbours, grid.tau
@@ -62,7 +62,7 @@ def differentiate(z, drift, grid, frequency, states):
             states[i, 2 * count + s] = acceleration * squared
 
 
-@njit(types.void(MATRIX, MATRIX, GRID, VECTOR, NUMBER, VECTOR, VECTOR, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, MATRIX, GRID, VECTOR, NUMBER, VECTOR, VECTOR, MATRIX), **OPTIONS)
 def scales(columns, states, grid, amplitude, frequency, size, rounding, weight):
     """Fill, for each equation, the size of its terms and the rounding error that its residual cannot fall below.
 
@@ -97,7 +97,7 @@ def scales(columns, states, grid, amplitude, frequency, size, rounding, weight):
         rounding[e] *= ROUNDING
 
 
-@njit(types.void(MATRIX, VECTOR), **OPTIONS)
+@njit(types.void(MATRIX, VECTOR), **INTERNAL)
 def largest(z, amplitude):
     """Fill the largest absolute value of each state; four independent maxima at a time."""
     points = z.shape[0]
@@ -112,7 +112,7 @@ def largest(z, amplitude):
         amplitude[s] = max(a, b, c, d)
 
 
-@njit(NUMBER(VECTOR, VECTOR), fastmath={"reassoc"}, **OPTIONS)
+@njit(NUMBER(VECTOR, VECTOR), fastmath={"reassoc"}, **INTERNAL)
 def dot(one, other):
     """Return the sum of products, in any order."""
     total = 0.0
@@ -121,7 +121,7 @@ def dot(one, other):
     return total
 
 
-@njit(NUMBER(MATRIX, VECTOR), **OPTIONS)
+@njit(NUMBER(MATRIX, VECTOR), **INTERNAL)
 def norm(columns, size):
     """Return the root of the mean square of the residuals, each in units of its equation's size.
 
@@ -137,7 +137,7 @@ def norm(columns, size):
     return np.sqrt(total / (columns.shape[0] * count))
 
 
-@njit(types.void(VECTOR, VECTOR, VECTOR, MATRIX, types.boolean[::1]), **OPTIONS)
+@njit(types.void(VECTOR, VECTOR, VECTOR, MATRIX, types.boolean[::1]), **INTERNAL)
 def find_resting(amplitude, moved, size, weight, resting):
     """Mark the states that change no equation noticeably, neither by their values nor by their step.
 
@@ -150,7 +150,7 @@ def find_resting(amplitude, moved, size, weight, resting):
                 resting[s] = False
 
 
-@njit(NUMBER(MATRIX, MATRIX, types.boolean[::1]), **OPTIONS)
+@njit(NUMBER(MATRIX, MATRIX, types.boolean[::1]), **INTERNAL)
 def scaled_step(z, step, resting):
     """Return the largest step of any moving state in units of its largest value; infinite if not finite."""
     result = 0.0
@@ -167,7 +167,7 @@ def scaled_step(z, step, resting):
     return result
 
 
-@njit(COUNT(GRID, FACTORS, VECTOR, VECTOR, types.boolean[::1], MATRIX, MATRIX), **OPTIONS)
+@kernel(COUNT(GRID, FACTORS, VECTOR, VECTOR, types.boolean[::1], MATRIX, MATRIX), **INTERNAL)
 def ending(grid, factors, rounding, reached, resting, z, change):
     """Set the states at rest to zero, and return the status of a settled iteration: "singular" if undetermined.
 
@@ -191,7 +191,7 @@ def ending(grid, factors, rounding, reached, resting, z, change):
     return CONVERGED
 
 
-@njit(
+@kernel(
     types.Tuple([COUNT, COUNT, NUMBER])(FUNCTIONS, GRID, SETTING, UNKNOWNS, BORDER, COUNT, MATRIX, MATRIX, WORKSPACE),
     **OPTIONS,
 )
@@ -298,7 +298,7 @@ def newton(functions, grid, setting, unknowns, border, halvings, z, history, wor
     return STALLED, MAX_ITERATIONS, orientation
 
 
-@njit(types.void(MATRIX, CUBE, VECTOR, VECTOR, NUMBER, MATRIX), **OPTIONS)
+@kernel(types.void(MATRIX, CUBE, VECTOR, VECTOR, NUMBER, MATRIX), **INTERNAL)
 def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fraction, z):
     """Fill z with the anchor's linear prediction, at a fraction of the way from the anchor's parameters."""
     copy(anchor_z, z)
@@ -310,7 +310,7 @@ def predict(anchor_z, anchor_sensitivities, anchor_parameters, parameters, fract
                 flat[k] += slope[k] * change
 
 
-@njit(FLAG(MATRIX, MATRIX, MATRIX), **OPTIONS)
+@kernel(FLAG(MATRIX, MATRIX, MATRIX), **INTERNAL)
 def is_far(z, predicted, anchor_z):
     """Return whether z is off the prediction by more than `FAR` of the anchor's range and of the change.
 
@@ -328,7 +328,7 @@ def is_far(z, predicted, anchor_z):
     return False
 
 
-@njit(NUMBER(MATRIX, VECTOR, COUNT), **OPTIONS)
+@njit(NUMBER(MATRIX, VECTOR, COUNT), **INTERNAL)
 def fourth_differences(z, fourth, s):
     """Fill the cyclic fourth differences of column s of z, over 16; return the sum of their squares."""
     last = z.shape[0] - 1
@@ -341,7 +341,7 @@ def fourth_differences(z, fourth, s):
     return dot(fourth, fourth)
 
 
-@njit(FLAG(MATRIX, COUNT, NUMBER, NUMBER), **OPTIONS)
+@njit(FLAG(MATRIX, COUNT, NUMBER, NUMBER), **INTERNAL)
 def is_large(z, s, energy, share):
     """Return whether an energy exceeds that of a share of the variation of column s of z, and its accuracy."""
     total, square, reached = 0.0, 0.0, 0.0
@@ -353,7 +353,7 @@ def is_large(z, s, energy, share):
     return energy > max(variation, z.shape[0] * (10.0 * STEP_TOLERANCE * reached) ** 2)
 
 
-@njit(FLAG(MATRIX, MATRIX), **OPTIONS)
+@kernel(FLAG(MATRIX, MATRIX), **OPTIONS)
 def is_jagged(z, inputs):
     """Return whether a state has energy at the grid's highest harmonics that the inputs (points, 3·inputs) lack.
 
@@ -381,7 +381,7 @@ def is_jagged(z, inputs):
     return jagged
 
 
-@njit(COUNT(MATRIX, COUNT), **OPTIONS)
+@kernel(COUNT(MATRIX, COUNT), **OPTIONS)
 def repetitions(z, periods):
     """Return how often z repeats itself in a number of forcing periods: once if that is its shortest period."""
     points, count = z.shape[0], STATES if STATES > 0 else z.shape[1]
