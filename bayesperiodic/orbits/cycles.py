@@ -116,10 +116,12 @@ def candidates(maps: ReturnMap, atlas: Atlas, section: np.ndarray, period: int) 
     step, heir = _converge(maps, atlas, chains)
     kept = np.array([k for k in np.unique(heir) if step[k] < NEARLY], dtype=int)
     members = [np.concatenate([members[i] for i in np.flatnonzero(heir == k)]) for k in kept]
-    chains = chains[kept]
+    chains, step = chains[kept], step[kept]
     # The maps of the atlas are discontinuous between centres, so the last steps fit about the points themselves.
     for _ in range(EXACT_STEPS):
         step = _newton(maps, chains, atlas.exactly)[0]
+        near = np.flatnonzero(step < NEARLY)
+        chains, step, members = chains[near], step[near], [members[k] for k in near]
     return _distinct(maps, section, chains, step, members)
 
 

@@ -3,7 +3,6 @@
 All coordinates are in units of the attractor's size.
 """
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +18,6 @@ REACH = 3.0
 # Largest noise as a fraction of the bandwidth; deconvolution needs less than one.
 MOST_NOISE = 0.75
 MOST_LEVERAGE = 0.9
-# The value and the slopes, whose errors are estimated; smallest eigenvalue of the normal equations that is inverted.
-INFLUENCED, SINGULAR = 3, 1e-10
 # Limits of memory: products of regressors in one call, neighbours of all fits of an atlas.
 BLOCK, MOST_NEIGHBOURS = 4_000_000, 6_000_000
 
@@ -32,7 +29,7 @@ class LocalFit(NamedTuple):
     derivatives: np.ndarray  # of the image by the argument: order 0 (relative), u, v, uu, uv, vv, …, (m, terms, 2)
     bandwidth: np.ndarray  # (m,)
     neighbours: np.ndarray  # positions among the arguments, (m, n)
-    influence: np.ndarray  # of each neighbour on the error of the value and the slopes in `derivatives`, (m, n, 3, 2)
+    influence: np.ndarray  # contribution of each neighbour to the error of `derivatives`, (m, n, terms, 2)
     effective: np.ndarray  # effective number of neighbours, (m,)
 
     @property
@@ -135,48 +132,25 @@ class ReturnMap:
         if not self.winds:
             image = self.wrap(image)
         moments, weight = _deconvoluted(away / bandwidth[:, None, None], self.noise / bandwidth[:, None], 2 * degree)
-        powers, products, place = POWERS[: TERMS[degree]], *_products(degree)
+        powers = POWERS[: TERMS[degree]]
+        sums = powers[:, None] + powers[None]
         weighted = weight[..., None] * moments[0]
+        normal = (weighted.transpose(0, 2, 1) @ moments[1])[:, sums[..., 0], sums[..., 1]]
         regressors = weighted[..., powers[:, 0]] * moments[1][..., powers[:, 1]]
-        normal = (weighted.transpose(0, 2, 1) @ moments[1])[:, products[:, 0], products[:, 1]][:, place]
-        inverse = _pseudo_inverse(normal)
+        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
         solution = inverse @ (regressors.transpose(0, 2, 1) @ image)
         effective = weight.sum(1) ** 2 / (weight**2).sum(1)
         scale = (FACTORIALS[: len(powers)] / bandwidth[:, None] ** powers.sum(1))[..., None]
-        influence = np.empty((len(centres), 0, INFLUENCED, 2))
+        influence = np.empty((len(centres), 0, len(powers), 2))
         if wants_influence:
             # Residuals of each neighbour's normal equations at the solution, corrected for its leverage.
-            rows, of_products = inverse[:, :INFLUENCED], np.zeros((len(centres), len(products), 2 * INFLUENCED + 1))
-            for k, row in enumerate(place):
-                change = rows[:, None, :, k, None] * solution[:, :, None]
-                of_products[:, row, :-1] += change.reshape(len(centres), len(powers), -1)
-                of_products[:, row, -1] += inverse[:, k]
-            found = (weighted[..., products[:, 0]] * moments[1][..., products[:, 1]]) @ of_products
-            own = (regressors @ rows.transpose(0, 2, 1))[..., None] * image[:, :, None]
-            own -= found[..., :-1].reshape(own.shape)
-            free = 1.0 - np.clip(found[..., -1], 0.0, MOST_LEVERAGE)
-            influence = own * scale[:, None, :INFLUENCED] / free[..., None, None]
+            product = weighted[..., sums[..., 0]] * moments[1][..., sums[..., 1]]
+            residual = regressors[..., None] * image[:, :, None] - product @ solution[:, None]
+            leverage = np.clip(np.einsum("mab,mnab->mn", inverse, product), 0.0, MOST_LEVERAGE)
+            influence = (inverse[:, None] @ residual) * scale[:, None] / (1.0 - leverage)[..., None, None]
         derivatives = solution * scale
         value = centres + reference[:, 0] + derivatives[:, 0]
         return LocalFit(value, derivatives, bandwidth, index, influence, effective)
-
-
-@cache
-def _products(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the powers of products of two regressors, and the place of every pair's product among them."""
-    powers = POWERS[: TERMS[degree]]
-    sums = powers[:, None] + powers[None]
-    products, place = np.unique(sums.reshape(-1, 2), axis=0, return_inverse=True)
-    return products, place.reshape(sums.shape[:2])
-
-
-def _pseudo_inverse(matrices: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverses of symmetric matrices (m, size, size)."""
-    values, vectors = np.linalg.eigh(matrices)
-    size = np.abs(values)
-    kept = size > SINGULAR * size.max(axis=1, keepdims=True)
-    inverse = np.divide(1.0, values, out=np.zeros_like(values), where=kept)
-    return (vectors * inverse[:, None]) @ vectors.transpose(0, 2, 1)
 
 
 def _deconvoluted(

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.stats import binom
+from tqdm import tqdm
 
 import bayesperiodic as bp
 from studies import shooting
@@ -91,15 +92,23 @@ class Reference:
     off: float  # By how much the polished orbit's section points differ [rad, 5 rad/s]
 
 
-def true_orbits(orbits: bp.Orbits) -> tuple[bp.Orbits, list[Reference], list[str]]:
-    """Return polished orbits, those to which shooting from them converges, and the names of unconfirmed ones.
+class Confirmed(NamedTuple):
+    """Polished orbits, those to which shooting from them converges, and the names of unconfirmed ones."""
+
+    polished: bp.Orbits
+    truths: list[Reference]
+    refuted: list[str]
+
+
+def true_orbits(orbits: bp.Orbits) -> Confirmed:
+    """Return polished orbits and those that shooting confirms.
 
     Of a pair of symmetric partners one is integrated and the other mirrored.
     """
     polished = bp.polish_orbits(bp.models.pendulum, orbits, TRUTH, samples=SAMPLES)
     found: dict[int, Reference] = {}
     refuted = []
-    for number, orbit in enumerate(polished):
+    for number, orbit in enumerate(tqdm(polished, desc="shooting", unit="orbit")):
         assert orbit.solution is not None
         points = np.stack([orbit.solution.outputs[c][:: orbit.solution.samples] for c in COORDINATES], axis=-1)
         if orbit.partner is not None and orbit.partner in found:
@@ -113,7 +122,7 @@ def true_orbits(orbits: bp.Orbits) -> tuple[bp.Orbits, list[Reference], list[str
             found[number] = Reference(orbit.period, shot.winding, shot.points, shot.multipliers, equilibrium, off)
         else:
             refuted.append(orbit.name)
-    return polished, list(found.values()), refuted
+    return Confirmed(polished, list(found.values()), refuted)
 
 
 def _nearest(truth: Reference, points: np.ndarray) -> Reference:

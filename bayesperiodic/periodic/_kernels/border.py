@@ -15,7 +15,7 @@ if TYPE_CHECKING:  # defined in this module by `compiled.kernels`
     from bayesperiodic.periodic._kernels.linear import *
 
 
-@njit(NUMBER(MATRIX, PLACES), **INTERNAL)
+@njit(NUMBER(MATRIX, PLACES), **OPTIONS)
 def determinant_sign(band, pivots):
     """Return the sign of the determinant, without the last pivot, of a matrix factored by `factor`."""
     sign, lower = 1.0, (band.shape[1] - 1) // 3
@@ -124,7 +124,7 @@ def phase_row(z, states, grid, row):
     return target
 
 
-@njit(types.void(MATRIX, NUMBER, MATRIX), **INTERNAL)
+@njit(types.void(MATRIX, NUMBER, MATRIX), **OPTIONS)
 def scale_rates(inputs, ratio, result):
     """Fill u, u̇, ü at another frequency, `ratio` times as high."""
     count = inputs.shape[1] // 3
@@ -135,7 +135,7 @@ def scale_rates(inputs, ratio, result):
             result[i, 2 * count + k] = inputs[i, 2 * count + k] * ratio**2
 
 
-@kernel(NUMBER(SETTING, UNKNOWNS, VECTOR, MATRIX, VECTOR), **INTERNAL)
+@kernel(NUMBER(SETTING, UNKNOWNS, VECTOR, MATRIX, VECTOR), **OPTIONS)
 def fill_setting(setting, unknowns, values, inputs, parameters):
     """Fill inputs and parameters at values of the unknowns, from the setting at zeros; return the frequency."""
     frequency = setting.frequency
@@ -184,7 +184,7 @@ def fill_slopes(functions, grid, setting, unknowns, states, columns, table, slop
                 slopes[k, grid.place[i] * count + e] = value
 
 
-@njit(NUMBER(MATRIX, VECTOR, GRID), **INTERNAL)
+@njit(NUMBER(MATRIX, VECTOR, GRID), **OPTIONS)
 def folded_product(z, row, grid):
     """Return row · z, the row (size,) in the folded order."""
     total, count = 0.0, z.shape[1]
@@ -236,7 +236,7 @@ def has_shrunk(z, start):
     return True
 
 
-@njit(NUMBER(MATRIX, COUNT), **INTERNAL)
+@njit(NUMBER(MATRIX, COUNT), **OPTIONS)
 def power(z, harmonic):
     """Return the power of a harmonic, summed over the states."""
     points, total = z.shape[0], 0.0

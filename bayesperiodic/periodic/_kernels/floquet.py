@@ -3,11 +3,11 @@
 import numpy as np
 from numba import njit
 
-from bayesperiodic.models.linking import kernel
+from bayesperiodic.models.cache import kernel
 
 STAGES = 3
 MATRIX, CUBE = "float64[:,::1]", "float64[:,:,::1]"
-OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
+OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
 
 
 @njit(f"boolean({MATRIX}, {MATRIX})", **OPTIONS)

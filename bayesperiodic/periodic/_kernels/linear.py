@@ -15,7 +15,7 @@ period:
 import numpy as np
 from numba import njit, types
 
-from bayesperiodic.models.linking import kernel
+from bayesperiodic.models.cache import kernel
 from bayesperiodic.periodic.compiled import *
 
 STATES, REACH, WIDTH, HALF = globals().get("SIZES", (0, 0, 0, 0))  # 0: any number, taken from the arrays
@@ -24,10 +24,9 @@ NARROW = 5
 GROWTH, TOO_MUCH_GROWTH = 1e4, 1e8
 CHECK_EVERY = 8
 OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-INTERNAL = OPTIONS | {"no_cpython_wrapper": True}  # of functions that Python does not call
 
 
-@njit(types.void(MATRIX, MATRIX), **INTERNAL)
+@njit(types.void(MATRIX, MATRIX), **OPTIONS)
 def copy(source, target):
     """Copy one array into another of the same shape; compiles faster than a slice assignment."""
     one, other = source.reshape(source.size), target.reshape(target.size)
@@ -35,7 +34,7 @@ def copy(source, target):
         other[k] = one[k]
 
 
-@njit(types.void(MATRIX, GRID, VECTOR), **INTERNAL)
+@njit(types.void(MATRIX, GRID, VECTOR), **OPTIONS)
 def fold(values, grid, folded):
     """Copy an array (points, states) into the folded order (size,)."""
     place, count = grid.place, values.shape[1]
@@ -44,7 +43,7 @@ def fold(values, grid, folded):
             folded[place[i] * count + s] = values[i, s]
 
 
-@njit(types.void(VECTOR, GRID, MATRIX), **INTERNAL)
+@njit(types.void(VECTOR, GRID, MATRIX), **OPTIONS)
 def unfold(folded, grid, values):
     """Copy from the folded order (size,) into an array (points, states)."""
     place, count = grid.place, values.shape[1]
@@ -53,7 +52,7 @@ def unfold(folded, grid, values):
             values[i, s] = folded[place[i] * count + s]
 
 
-@njit(FLAG(VECTOR, types.uint64, PLACES), **INTERNAL)
+@njit(FLAG(VECTOR, types.uint64, PLACES), **OPTIONS)
 def factor_narrow(flat, stop, pivots):
     """Factor the rows before `stop` of a band of half-width `LOWER`, with loops of constant length."""
     one, below, row = np.uint64(1), np.uint64(LOWER), np.uint64(3 * LOWER)
@@ -202,7 +201,7 @@ def assemble(columns, grid, states, frequency, band):
                 flat[np.uint64(diagonal + j)] += source[column + s]
 
 
-@njit(FLAG(MATRIX, MATRIX, COUNT), **INTERNAL)
+@njit(FLAG(MATRIX, MATRIX, COUNT), **OPTIONS)
 def invert(matrix, inverse, size):
     """Invert by Gauss-Jordan elimination with row exchanges; `matrix` is destroyed. Return False if singular."""
     count = STATES if STATES > 0 else size
@@ -233,7 +232,7 @@ def invert(matrix, inverse, size):
     return True
 
 
-@kernel(FLAG(MATRIX, GRID, NUMBER, VECTOR, FACTORS), **INTERNAL)
+@kernel(FLAG(MATRIX, GRID, NUMBER, VECTOR, FACTORS), **OPTIONS)
 def condense_segments(columns, grid, frequency, amplitude, factors):
     """Express every point by the start points of its segment; return False if the march grows or is singular.
 
@@ -298,7 +297,7 @@ def condense_segments(columns, grid, frequency, amplitude, factors):
     return start == points
 
 
-@kernel(FLAG(FACTORS), **INTERNAL)
+@kernel(FLAG(FACTORS), **OPTIONS)
 def factor_interface(factors):
     """Factor the cyclic system that couples the start points of the segments; return False if it is singular."""
     transfer, ends = factors.transfer, factors.ends
