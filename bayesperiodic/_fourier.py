@@ -63,34 +63,40 @@ def at_times(amplitudes: np.ndarray, phase: np.ndarray) -> np.ndarray:
     """
     points = _fine(amplitudes.shape[-1] - 1)
     rate = 2j * np.pi * np.arange(amplitudes.shape[-1]) / points
-    tables = [on_grid(amplitudes * rate**p / factorial(p), points) for p in range(TAYLOR)]
+    tables = np.stack([on_grid(amplitudes * rate**p / factorial(p), points) for p in range(TAYLOR)])
     values = np.empty((*amplitudes.shape[:-1], phase.size))
+    flat, rows = tables.reshape(TAYLOR, -1, points), values.reshape(-1, phase.size)
     for first in range(0, phase.size, CHUNK):
         part = slice(first, first + CHUNK)
         place, offset = _places(phase[part], points)
-        total = tables[-1][..., place]
-        for table in tables[-2::-1]:
-            total *= offset
-            total += table[..., place]
-        values[..., part] = total
+        for channel, row in enumerate(rows):
+            total = flat[-1, channel].take(place, mode="clip")
+            for table in flat[-2::-1]:
+                total *= offset
+                total += table[channel].take(place, mode="clip")
+            row[part] = total
     return values
 
 
 def sums(values: np.ndarray, phase: np.ndarray, harmonics: int) -> np.ndarray:
     """Return Σ_t y(t) exp(−2πi h phase(t)), h = 0 … harmonics, of signals (channels, times), by the same grid."""
     points = _fine(harmonics)
-    place, offset = _places(phase, points)
+    tables, length = np.zeros((TAYLOR, len(values), points)), max(CHUNK, 4 * points)
+    for first in range(0, phase.size, length):
+        part = slice(first, first + length)
+        place, offset = _places(phase[part], points)
+        for channel, own in enumerate(values):
+            weighted = np.array(own[part], dtype=float)
+            for table in tables:
+                table[channel] += np.bincount(place, weighted, points)
+                weighted *= offset
     rate = -2j * np.pi * np.arange(harmonics + 1) / points
-    total = np.zeros((len(values), harmonics + 1), dtype=complex)
-    for own, weighted in zip(total, np.array(values, dtype=float), strict=True):
-        for p in range(TAYLOR):
-            own += rate**p / factorial(p) * np.fft.rfft(np.bincount(place, weighted, points))[: harmonics + 1]
-            weighted *= offset
-    return total
+    spectra = np.fft.rfft(tables)[..., : harmonics + 1]
+    return np.asarray(sum(rate**p / factorial(p) * spectrum for p, spectrum in enumerate(spectra)))
 
 
 def _fine(harmonics: int) -> int:
-    """Return the number of grid points from which Taylor series of all harmonics are exact to rounding."""
+    """Return the number of grid points, a power of two, from which Taylor series of all harmonics are exact to rounding."""
     return 256 << max(harmonics - 1, 1).bit_length()
 
 
@@ -99,7 +105,7 @@ def _places(phase: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:
     offset = (phase - np.floor(phase)) * points
     place = np.rint(offset)
     offset -= place
-    return place.astype(int) % points, offset
+    return place.astype(int) & (points - 1), offset
 
 
 def derivative(amplitudes: np.ndarray, frequency: float, order: int = 1) -> np.ndarray:

@@ -15,7 +15,7 @@ import platform
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -102,6 +102,12 @@ def each(work: Callable[..., Value], tasks: Sequence[Task], *, here: bool = Fals
             while following in done:
                 yield cloudpickle.loads(done.pop(following))
                 following += 1
+
+
+def in_threads(work: Callable[[Any], Value], items: Sequence[Any]) -> list[Value]:
+    """Return work(item) of every item in order, in one thread per core; of use where compiled code takes the time."""
+    with ThreadPoolExecutor(available_cores()) as pool:
+        return list(pool.map(work, items))
 
 
 def _run_task(work: Callable[..., Value], task: Task) -> bytes:

@@ -532,9 +532,12 @@ def diode():
         f"terms {low[1]} to {high[1]} %, about what the cycles of a record differ by, and at most "
         f"{100 * unseen:.2f} % of periodic records that were not fitted."
     )
-    search = d["missing_terms"]
-    rank = [row["candidate"] for row in search["best_before_refitting"]].index("i*m in equation of m") + 1
-    yield f"which is number {rank} of the {search['candidates']} candidates of `bp.missing_terms`"
+    first, second = d["missing_terms"]
+    yield f"which is number {first['rank_of_chosen']} of the {first['candidates']} candidates of `bp.missing_terms`"
+    yield (
+        f"stray capacitance of the instrument, number {second['rank_of_chosen']} of {second['candidates']} in the "
+        f"search for what the second model lacks"
+    )
     right = d["score"]["right"]
     yield (
         f"The most probable motion over the draws is the measured one in {right['periodic'][0]} of "
@@ -547,6 +550,15 @@ def diode():
         f"Periods double at {one} kHz (90 %; the records bracket it by 110 and 120), {two} kHz (170 and 185) and "
         f"{three} kHz (230 and 240)."
     )
+    orbits = d["unstable_orbits"]
+    least, *_, most = sorted(abs(o["multiplier"]) for o in orbits)
+    yield f"{len(orbits)} unstable orbits of 1 to 4 periods, with multipliers of {least:.1f} to {most:.0f}"
+    nearest, usual = ([100 * o[key] for o in orbits] for key in ("nearest", "median"))
+    yield (
+        f"within {min(nearest):.2f} to {max(nearest):.2f} % of the variance, where half of its parts are more than "
+        f"{min(usual):.1f} to {max(usual):.0f} % away"
+    )
+    yield f"In the {len({o['frequency_Hz'] for o in orbits})} records without a period"
 
 
 def span(values):

@@ -211,13 +211,11 @@ def _invariant_bases(groups: np.ndarray, splits: list[int] | None = None) -> tup
     the basis before each factor, (factors, size, size).
     """
     size = groups.shape[1]
-    basis = np.linalg.qr(np.random.default_rng(0).standard_normal((size, size)))[0]
-    before = np.empty_like(groups)
+    basis = np.ascontiguousarray(np.linalg.qr(np.random.default_rng(0).standard_normal((size, size)))[0])
+    before = np.empty(groups.shape)
     for _ in range(SWEEPS if len(groups) > 1 else 0):
-        start = basis
-        for g, group in enumerate(groups):
-            before[g] = basis
-            basis = np.linalg.qr(group @ basis)[0]
+        start = basis.copy()
+        _kernels().sweep(np.ascontiguousarray(groups), basis, before)
         turned = start.T @ basis
         if all(np.linalg.norm(turned[j:, :j]) < DECOUPLED for j in (range(1, size) if splits is None else splits)):
             break
@@ -243,6 +241,14 @@ def _block(groups: np.ndarray, x: np.ndarray, y: np.ndarray) -> list[tuple[compl
     """Return for each multiplier of a block its logarithm and the eigenfunctions (factors, size) before the factors."""
     after, width = np.roll(y, -1, axis=0), x.shape[2]
     small = np.linalg.solve(np.swapaxes(after, 1, 2) @ np.roll(x, -1, axis=0), np.swapaxes(after, 1, 2) @ groups @ x)
+    gram = np.linalg.inv(np.swapaxes(y, 1, 2) @ x)
+    if width == 1:  # one real multiplier: the bases are its eigenfunctions but for the signs
+        factors = small[:, 0, 0]
+        with np.errstate(divide="ignore"):
+            exponent = np.log(complex(np.prod(np.sign(factors)))) + np.sum(np.log(np.abs(factors)))
+        signs, back = np.cumprod([1.0, *np.sign(factors[:-1])]), np.cumprod(np.sign(factors[::-1]))[::-1]
+        along, across = x[:, :, 0] * signs[:, None], y[:, :, 0] * (gram[:, 0, 0] * back)[:, None]
+        return [(complex(exponent), along.astype(complex), across.astype(complex))]
     product, growth = np.eye(width), 0.0
     for matrix in small:
         product = matrix @ product
@@ -250,7 +256,6 @@ def _block(groups: np.ndarray, x: np.ndarray, y: np.ndarray) -> list[tuple[compl
         product, growth = product / scale, growth + np.log(scale)
     values, vectors = np.linalg.eig(product)
     adjoint = np.linalg.inv(vectors)
-    gram = np.linalg.inv(np.swapaxes(y, 1, 2) @ x)
     found = []
     for value, c, d in zip(values, vectors.T, adjoint, strict=True):
         with np.errstate(divide="ignore"):

@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 import bayesperiodic as bp
 from studies import common
-from studies.benchmark import contenders, peers, posteriors, scaling, targets
+from studies.benchmark import cold_start, contenders, peers, posteriors, scaling, targets
 from studies.benchmark import floor as floors
 from studies.benchmark import problems as made
 from studies.benchmark.integration import PREDICTED, SHOOTING, refer
@@ -46,7 +46,10 @@ SIZE, MARKERS, COLOURS = (18.0, 10.0), "osD^vP*X", [colormaps["tab20"](k) for k 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def run(options: argparse.Namespace) -> None:
-    """Run the study."""
+    """Run the study, or with ``--cold-start`` measure first results in new environments."""
+    if options.cold_start:
+        cold_start.run(options)
+        return
     before = read_kept(KEPT) if options.guard else None
     if options.guard:
         options.quick, options.out = True, KEPT.parent.parent / "quick" / "benchmark"

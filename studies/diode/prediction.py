@@ -74,10 +74,10 @@ def _rates(values, source, i, v, q, m):
     )  # fmt: skip
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _run(values, frequency, mean, amplitude, state, transient, found):
     """Fill values (periods, phases) after a transient by the classical Runge-Kutta method; return state, mean."""
-    steps = int(np.ceil(1.0 / (frequency * STEP)))
+    steps = PHASES * int(np.ceil(1.0 / (frequency * STEP * PHASES)))
     h = 1.0 / (frequency * steps)
     source = mean + amplitude * np.cos(np.pi * np.arange(2 * steps + 1) / steps)
     i, v, q, m = state
@@ -87,7 +87,7 @@ def _run(values, frequency, mean, amplitude, state, transient, found):
             a1, b1, c1, d1, output = _rates(values, source[2 * j], i, v, q, m)
             if period >= transient:
                 total += output
-                if j * PHASES // steps != (j - 1) * PHASES // steps:
+                if j * PHASES % steps == 0:
                     found[period - transient, j * PHASES // steps] = output
             half, s = 0.5 * h, source[2 * j + 1]
             a2, b2, c2, d2, _ = _rates(values, s, i + half * a1, v + half * b1, q + half * c1, m + half * d1)

@@ -173,11 +173,14 @@ def fitted_records(records: Sequence[Record]) -> list[Record]:
     return [record for record in periodic if record.frequency in chosen]
 
 
-def estimate(records: Sequence[Record], free: Sequence[str], share: float) -> Fitted:
-    """Return the MAP point of some records with some of the model's two further terms."""
+def estimate(
+    records: Sequence[Record], free: Sequence[str], share: float, near: Mapping[str, float] | None = None
+) -> Fitted:
+    """Return the MAP point of some records with some of the model's two further terms; it starts near given values."""
     values = START | dict.fromkeys(TERMS, 0.0) | {"R_s": share * RESISTOR}
     if free:
         values |= {name: value for name, value in STARTS.items() if name in START or name in free}
+    values |= near or {}
     start = {name: value for name, value in values.items() if name in START or name in free}
     experiments = []
     for record in records:
@@ -215,38 +218,36 @@ def solved(record: Record, final: Fitted) -> tuple[bp.PeriodicSolution | None, f
         solution = final.fit.solutions[experiment.name]
         return solution, unexplained(experiment, solution)
     values = values_of(final)
-    found = [_solution(experiment, experiment.frequency, values, orbit(record, values).guess)]
+    found = [solve(experiment, experiment.frequency, values, orbit(record, values).guess)]
     near = [e for e in final.problem.experiments if experiment.periods % e.periods == 0]
     if near:
         nearest = min(near, key=lambda own: abs(own.frequency - experiment.frequency))
-        ahead = (_phase(experiment) - _phase(nearest)) / nearest.periods
+        ahead = (source_phase(experiment) - source_phase(nearest)) / nearest.periods
         guess: Any = {
-            name: np.tile(_moved(own, ahead), experiment.periods // nearest.periods)
+            name: np.tile(moved(own, ahead), experiment.periods // nearest.periods)
             for name, own in final.fit.solutions[nearest.name].states.items()
         }
         steps = int(np.ceil(abs(nearest.frequency - experiment.frequency) / FOLLOWED)) + 1
         for frequency in np.linspace(nearest.frequency, experiment.frequency, steps):
-            followed = _solution(experiment, float(frequency), values, guess)
+            followed = solve(experiment, float(frequency), values, guess)
             guess = followed.states if followed.status == "converged" else guess
         found.append(followed)
     right = [(own, unexplained(experiment, own)) for own in found if own.status == "converged"]
     return min(right, key=lambda own: own[1], default=(None, None))
 
 
-def _phase(experiment: bp.Experiment) -> float:
+def source_phase(experiment: bp.Experiment) -> float:
     """Return the phase of the source [periods of the source]."""
     return float(np.angle(np.fft.rfft(experiment.inputs["source"])[experiment.periods]) / (2 * np.pi))
 
 
-def _moved(values: np.ndarray, ahead: float) -> np.ndarray:
+def moved(values: np.ndarray, ahead: float) -> np.ndarray:
     """Return values over a period as they are `ahead` periods later."""
     amplitudes = np.fft.rfft(values)
     return np.fft.irfft(amplitudes * np.exp(2j * np.pi * ahead * np.arange(amplitudes.size)), values.size)
 
 
-def _solution(
-    experiment: bp.Experiment, frequency: float, values: Mapping[str, float], guess: Any
-) -> bp.PeriodicSolution:
+def solve(experiment: bp.Experiment, frequency: float, values: Mapping[str, float], guess: Any) -> bp.PeriodicSolution:
     """Return the periodic solution under the source of an experiment, at a frequency."""
     return bp.solve_periodic(
         MODEL, values, experiment.inputs, frequency=frequency, periods=experiment.periods,
@@ -264,12 +265,18 @@ def unexplained(experiment: bp.Experiment, solution: bp.PeriodicSolution) -> flo
     return float(min(np.var(own - measured) for own in turned) / np.var(measured))
 
 
+def phase_of(record: Record) -> float:
+    """Return the phase of the source at the begin of a record [periods of the source]."""
+    time = record.recording.time - record.recording.time[0]
+    turn = np.exp(-2j * np.pi * record.frequency * time)
+    return float(np.angle(np.sum(record.recording.inputs["source"] * turn)) / (2 * np.pi))
+
+
 def stroboscopic(record: Record) -> np.ndarray:
     """Return the measured voltages of the resistor at the maxima of the source."""
     time = record.recording.time - record.recording.time[0]
-    source, resistor = (next(iter(own.values())) for own in (record.recording.inputs, record.recording.outputs))
-    phase = np.angle(np.sum(source * np.exp(-2j * np.pi * record.frequency * time))) / (2 * np.pi)
-    at = (np.arange(int(time[-1] * record.frequency) + 2) - phase) / record.frequency
+    resistor = record.recording.outputs["resistor"]
+    at = (np.arange(int(time[-1] * record.frequency) + 2) - phase_of(record)) / record.frequency
     at = at[(at >= time[1]) & (at <= time[-2])]
     smooth = np.convolve(resistor, np.ones(3) / 3.0, "same")
     return np.interp(at, time, smooth)
@@ -304,7 +311,7 @@ def guessed(experiment: bp.Experiment, values: Mapping[str, float]) -> tuple[bp.
     return replace(experiment, guess={"i": i, "v": v, "q": q, "m": m}), mean
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _charges(current, step, corner, transit, lifetime, drift):
     """Return the charges (2, points) that follow a periodic current [A], by Heun's method."""
     points, h = current.size, step / INSIDE

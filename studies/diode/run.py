@@ -7,24 +7,24 @@ periodic records, of periods 1, 2, 3 and 8, are fitted; the motion at all other 
 
 import argparse
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib import pyplot as plt
-from matplotlib.figure import Figure
 
 import bayesperiodic as bp
 from studies import common
-from studies.diode import prediction, rig
+from studies.diode import chaos, figures, prediction, rig
 
 DRAWS, QUICK_DRAWS = 40, 8
-# The model's diagram: frequencies [Hz], periods that are drawn.
-FINE, DRAWN = 2_000.0, 40
-# Draws whose orbits are followed to their period doublings, and those that are drawn.
-FOLLOWED, SHOWN = 16, 6
+# Draws whose orbits are followed to their period doublings.
+FOLLOWED = 16
 # Records of the search for missing terms [kHz], and how many terms are tried.
 SEARCHED, KEPT = (110.0, 170.0, 230.0), 2
+# The term that is added to each model, of those that the search cannot tell apart, for its physical meaning.
+FIRST, *_ = rig.STEPS_OF_MODEL
+CHOSEN = dict(zip(rig.STEPS_OF_MODEL, ("i*m in equation of m", "dsource in resistor"), strict=False))
 # Period doublings: the orbit's record [kHz], and the frequency [kHz] up to which it is followed.
 DOUBLINGS = ((110.0, 130.0), (170.0, 200.0), (230.0, 290.0))
 RULE = (
@@ -48,33 +48,44 @@ def run(options: argparse.Namespace) -> None:
     for step, free in rig.STEPS_OF_MODEL.items():
         with watch.part(f"map {step}", f"finding the MAP point of the model: {step}"):
             fits[step] = rig.estimate(used, free, share)
-    with watch.part("missing terms", "searching for terms that the first model lacks"):
-        first = rig.estimate([r for r in used if r.frequency / 1e3 in SEARCHED], (), share)
-        found = bp.missing_terms(first.problem, first.fit, max_terms=1, keep=KEPT)
+    with watch.part("missing terms", "searching for the term that each model lacks"):
+        three = list(
+            {r.frequency: r for r in (min(used, key=lambda u: abs(u.frequency - 1e3 * f)) for f in SEARCHED)}.values()
+        )
+        searches = {
+            model: _searched(rig.estimate(three, free, share, fits[model].fit.theta), model)
+            for model, free in list(rig.STEPS_OF_MODEL.items())[:-1]
+        }
     final = fits[list(fits)[-1]]
     with watch.part("predict", f"integrating {draws} draws at the frequencies of all records"):
         sample = prediction.draws_of(final, draws, options.seed)
         frequencies, sources = [r.frequency for r in records], [prediction.source_of(r) for r in records]
-        motions = [[prediction.period_of(v) for v in prediction.sweep(d, frequencies, sources)] for d in sample]
+        swept = common.in_threads(lambda draw: prediction.sweep(draw, frequencies, sources), sample)
+        motions = [[prediction.period_of(v) for v in own] for own in swept]
     with watch.part("orbits", "solving the orbits of periodic records that were not fitted, and their multipliers"):
         table = _records(records, used, final, motions, sample[:FOLLOWED])
         doublings = _doublings(records, final, sample[:FOLLOWED])
+    with watch.part("chaos", "finding unstable orbits in the records without a period"):
+        unstable = _unstable(records, final)
     with watch.part("figures", "drawing"):
-        figures = {
-            "bifurcation": _bifurcation(records, used, final, sample, synthetic=data["synthetic"]),
-            "steps": _steps(fits, used, synthetic=data["synthetic"]),
+        drawn = {
+            "bifurcation": figures.bifurcation(records, used, final, sample, synthetic=data["synthetic"]),
+            "steps": figures.steps(fits, used, synthetic=data["synthetic"]),
         }
-        paths = common.save_figures(options.out, figures)
+        if unstable:
+            drawn["chaos"] = figures.unstable_orbits(records, unstable, synthetic=data["synthetic"])
+        paths = common.save_figures(options.out, drawn)
     results: dict[str, Any] = {"data": data, "seed": options.seed, "quick": options.quick, "rule": RULE}
     results |= {
         "internal_resistance": share,
         "records": table,
         "steps": {step: _summary(own) for step, own in fits.items()},
-        "missing_terms": _missing(found),
+        "missing_terms": [_missing(model, found) for model, found in searches.items()],
         "doublings": doublings,
+        "unstable_orbits": [{key: value for key, value in row.items() if key != "orbit"} for row in unstable],
         "score": _score(table),
     }
-    print("\n" + _tables(results, final, found) + "\n")
+    print("\n" + _tables(results, final, searches) + "\n")
     common.finish(options.out, results, watch, paths, synthetic=data["synthetic"])
 
 
@@ -109,7 +120,7 @@ def _doublings(records: Sequence[rig.Record], final: rig.Fitted, sample: list[di
     rows = []
     for start, until in DOUBLINGS:
         record = min((r for r in records if r.experiment), key=lambda own: abs(own.frequency - 1e3 * start))
-        found = [prediction.doubling(draw, rig.orbit(record, draw), 1e3 * until) for draw in sample]
+        found = common.in_threads(partial(_doubling, record, 1e3 * until), sample)
         at = np.array([own for own in found if own is not None])
         rows.append({
             "orbit": f"{record.frequency / 1e3:g} kHz, period {record.period}",
@@ -119,6 +130,19 @@ def _doublings(records: Sequence[rig.Record], final: rig.Fitted, sample: list[di
             "interval_Hz": np.quantile(at, [0.05, 0.95]).tolist() if at.size else None,
         })  # fmt: skip
     return rows
+
+
+def _doubling(record: rig.Record, until: float, draw: dict[str, float]) -> float | None:
+    return prediction.doubling(draw, rig.orbit(record, draw), until)
+
+
+def _unstable(records: Sequence[rig.Record], final: rig.Fitted) -> list[dict[str, Any]]:
+    """Return the unstable orbits in the records without a period."""
+    values, chaotic = rig.values_of(final), [record for record in records if record.period is None]
+    found = common.in_threads(partial(chaos.orbits, values=values), chaotic)
+    return [
+        {"frequency_Hz": record.frequency, **row} for record, own in zip(chaotic, found, strict=True) for row in own
+    ]
 
 
 def _score(table: list[dict[str, Any]]) -> dict[str, Any]:
@@ -147,20 +171,37 @@ def _summary(own: rig.Fitted) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _missing(found: bp.MissingTerms) -> dict[str, Any]:
-    best = found.ranking.head(10)
+def _searched(own: rig.Fitted, model: str) -> bp.MissingTerms:
+    """Return the search for a term that a model lacks; the second search ranks the candidates only."""
+    return bp.missing_terms(own.problem, own.fit, max_terms=int(model == FIRST), keep=KEPT)
+
+
+def _missing(model: str, found: bp.MissingTerms) -> dict[str, Any]:
+    best, chosen = found.ranking[["candidate", "explains", "p"]].astype({"p": float}), CHOSEN[model]
+    names = list(best["candidate"])
     return {
+        "model": model,
         "candidates": found.tested,
+        "chosen": chosen,
+        "rank_of_chosen": names.index(chosen) + 1 if chosen in names else None,
+        "best_before_refitting": best.head(10).to_dict("records"),
         "refused": {str(term): reason for term, reason in found.refused.items()},
         "steps": [
             {"term": s.term, "place": s.place, "alternatives": list(s.alternatives), "unexplained": s.unexplained}
             for s in found.steps
         ],
-        "best_before_refitting": best[["candidate", "explains", "p"]].astype({"p": float}).to_dict("records"),
     }
 
 
-def _tables(results: Mapping[str, Any], final: rig.Fitted, found: bp.MissingTerms) -> str:
+def _ranked(found: bp.MissingTerms) -> str:
+    """Return the best candidates before refitting as a table."""
+    best = found.ranking[["candidate", "explains", "p"]].head(6)
+    return "Candidates that explain most of what is left, before refitting:\n" + best.to_string(
+        float_format="{:.3g}".format
+    )
+
+
+def _tables(results: Mapping[str, Any], final: rig.Fitted, searches: Mapping[str, bp.MissingTerms]) -> str:
     rows = pd.DataFrame(results["records"])
     rows["predicted"] = [", ".join(f"{k}: {v:.0%}" for k, v in sorted(p.items())) for p in rows["predicted"]]
     rows["kHz"] = rows["frequency_Hz"] / 1e3
@@ -174,7 +215,8 @@ def _tables(results: Mapping[str, Any], final: rig.Fitted, found: bp.MissingTerm
     return "\n".join([
         str(final.fit), "", "Unexplained variance by model and fitted record:",
         steps.to_string(float_format="{:.2%}".format), "",
-        "What the first model lacks, from three records:", str(found), "",
+        *(f"What the model '{model}' lacks, from three records:\n{found}\n{_ranked(found)}\n"
+          for model, found in searches.items()),
         "All records; probabilities of the motion over the draws:",
         shown.to_string(index=False, float_format="{:.4g}".format, na_rep="-"), "",
         f"Most probable motion right at {right['periodic'][0]} of {right['periodic'][1]} periodic records and "
@@ -182,7 +224,26 @@ def _tables(results: Mapping[str, Any], final: rig.Fitted, found: bp.MissingTerm
         f"Largest unexplained variance: {_percent(largest['used'])} of fitted records, "
         f"{_percent(largest['not_used'])} of periodic ones that were not fitted.",
         *(_doubling_line(row) for row in results["doublings"]),
+        "Unstable orbits in records without a period, of periods 1 to 4; distances in % of the variance:",
+        _unstable_table(results["unstable_orbits"]),
     ])  # fmt: skip
+
+
+def _unstable_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    if not rows:
+        return "none was found."
+    columns = {"period": [], "orbits": [], "multipliers": [], "nearest": [], "median": []}  # type: dict[str, list[str]]
+    for period, own in pd.DataFrame(rows).groupby("period"):
+        for name, text in zip(columns, (
+            f"{period}", f"{len(own)}", _between(own["multiplier"], "{:.1f}"), _between(100 * own["nearest"], "{:.2f}"),
+            _between(100 * own["median"], "{:.1f}"),
+        ), strict=True):  # fmt: skip
+            columns[name].append(text)
+    return pd.DataFrame(columns).to_string(index=False)
+
+
+def _between(values: pd.Series, form: str) -> str:
+    return f"{form.format(values.min())} to {form.format(values.max())}"
 
 
 def _percent(value: float | None) -> str:
@@ -197,52 +258,3 @@ def _doubling_line(row: Mapping[str, Any]) -> str:
         f"The orbit of {row['orbit']} doubles its period at {1e-3 * row['median_Hz']:.1f} kHz "
         f"(90 %: {low} to {high}; {row['found']} of {row['draws']} draws)."
     )
-
-
-def _bifurcation(
-    records: Sequence[rig.Record], used: Sequence[rig.Record], final: rig.Fitted, sample: list[dict[str, float]], *,
-    synthetic: bool,
-) -> Figure:  # fmt: skip
-    """Return the predicted bifurcation diagram above the measured one."""
-    frequencies = np.array([record.frequency for record in records])
-    own = np.array([prediction.source_of(record) for record in records])
-    fine = np.arange(max(frequencies[0] - 10e3, 0.0), frequencies[-1] + 10e3, FINE)
-    sources = np.stack([np.interp(fine, frequencies, column) for column in own.T], axis=1)
-    estimate = rig.values_of(final)
-    figure, axes = plt.subplots(2, 1, figsize=(8.0, 6.6), sharex=True, sharey=True, layout="constrained")
-    for draw, colour in [*((d, "#E69F00") for d in sample[:SHOWN]), (estimate, "#000000")]:
-        values = prediction.sweep(draw, fine.tolist(), [tuple(row) for row in sources], DRAWN)
-        at = np.repeat(1e-3 * fine, DRAWN)
-        axes[0].plot(at, values[:, :, 0].ravel(), ".", ms=0.9, mew=0.0, color=colour, rasterized=True)
-    fitted = {record.frequency for record in used}
-    for record in records:
-        kind = "fitted" if record.frequency in fitted else "periodic, not fitted" if record.period else "not periodic"
-        colour = {"fitted": "#0072B2", "periodic, not fitted": "#56B4E9", "not periodic": "#555555"}[kind]
-        values = rig.stroboscopic(record)
-        axes[1].plot(np.full(values.size, 1e-3 * record.frequency), values, ".", ms=3, color=colour, label=kind)
-        for ax in axes if record.frequency in fitted else ():
-            ax.axvline(1e-3 * record.frequency, color="#0072B2", lw=0.6, alpha=0.5, zorder=0)
-    axes[0].set_title(f"Predicted from {len(used)} periodic records (black: MAP point, orange: draws)")
-    axes[1].set_title("SYNTHETIC records" if synthetic else "Measured")
-    axes[1].set_xlabel("drive frequency [kHz]")
-    for ax in axes:
-        ax.set_ylabel("resistor voltage at the\nmaximum of the source, less mean [V]")
-    handles, labels = axes[1].get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    axes[1].legend(unique.values(), unique, loc="upper right", frameon=False, markerscale=2)
-    return figure
-
-
-def _steps(fits: Mapping[str, rig.Fitted], used: Sequence[rig.Record], *, synthetic: bool) -> Figure:
-    """Return the unexplained variance of the fitted records by model."""
-    figure, ax = plt.subplots(figsize=(6.4, 3.4), layout="constrained")
-    names = [f"{record.frequency / 1e3:g} kHz\nP = {record.period}" for record in used]
-    for (step, own), marker, colour in zip(fits.items(), "osD", ("#D55E00", "#E69F00", "#0072B2"), strict=False):
-        values = [100 * rig.unexplained(e, own.fit.solutions[e.name]) for e in own.problem.experiments]
-        ax.plot(names, values, marker, ls="-", lw=0.8, color=colour, label=step)
-    floor = [100 * (1.0 - record.experiment.periodicity) for record in used if record.experiment]
-    ax.plot(names, floor, "_", ms=14, color="#555555", label="between the cycles of the record")
-    ax.set(yscale="log", ylabel="unexplained variance [%]")
-    ax.set_title("What each term explains" + (" (synthetic data)" if synthetic else ""))
-    ax.legend(frameon=False, fontsize="small")
-    return figure

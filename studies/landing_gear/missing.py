@@ -27,16 +27,61 @@ EFFECTS: dict[str, frozenset[str]] = {effect: frozenset({effect}) for effect in 
 # Widths of smooth signs [1] relative to their argument's standard deviation, as in `bp.missing_terms`.
 SIGN_WIDTH = 0.2
 PART = 0.01
+# Share (cos²) from which on a step counts as a missing effect in another name.
+SAME = 0.95
 
 
-def search(truth: str, seed: int, *, quick: bool, runs: Sequence[Run] = RUNS) -> dict[str, Any]:
+def replicate(task: tuple[str, int]) -> dict[str, Any]:
+    """Return the first step of the search in the data of a seed, and the share of each missing effect in it."""
+    truth, seed = task
+    found = search(truth, seed, quick=False, most=1)
+    step = found["steps"][0] if found["steps"] else {"term": None}
+    shares = {effect: own["steps_shares"][0] for effect, own in found["effects"].items() if own["steps_shares"]}
+    return {
+        "truth": truth, "seed": seed, "source": source(), "first": step["term"], "shares": shares,
+        "stopped": found["stopped"],
+    }  # fmt: skip
+
+
+def source() -> str:
+    """Return a key that identifies the version of the replicates."""
+    return common.source_key(__file__)
+
+
+def counted(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return by truth how many first steps are a missing effect, and how many searches added nothing."""
+    return {
+        truth: {
+            "count": len(own),
+            "nothing": sum(line["first"] is None for line in own),
+            "one_of_the_effects": sum(_nearest(line)[1] >= SAME for line in own),
+            "which": {
+                effect: sum(_nearest(line)[0] == effect and _nearest(line)[1] >= SAME for line in own)
+                for effect in STRENGTHS
+            },
+            "terms": {
+                text: sum(line["first"] == text for line in own) for text in {line["first"] or "" for line in own}
+            },
+        }
+        for truth in TRUTHS
+        if (own := [line for line in lines if line["truth"] == truth])
+    }
+
+
+def _nearest(line: Mapping[str, Any]) -> tuple[str, float]:
+    """Return the single effect with which the first step has most in common, and that share."""
+    single = {effect: share for effect, share in line["shares"].items() if effect in STRENGTHS}
+    return max(single.items(), key=lambda item: item[1], default=("", 0.0))
+
+
+def search(truth: str, seed: int, *, quick: bool, runs: Sequence[Run] = RUNS, most: int = MOST) -> dict[str, Any]:
     """Return the ranking, the steps, and what they have in common with the terms that the truth has."""
     experiments = [fold(measure(run, TRUTHS[truth], seed), DISPLACEMENT) for run in runs]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         start = identification.estimate(experiments, DISPLACEMENT, one_conduction=True, scheme=SCHEME)
         begin = time.perf_counter()
-        found = bp.missing_terms(start.problem, start.fit, max_terms=0 if quick else MOST)
+        found = bp.missing_terms(start.problem, start.fit, max_terms=0 if quick else most)
         seconds = time.perf_counter() - begin
         table = found.ranking.head(QUICK_SHOWN if quick else SHOWN)
         rows = [(row["place"], row["term"], row["lag"]) for _, row in table.iterrows()]

@@ -48,8 +48,24 @@ class OfTruth:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the study, or with ``--replicates`` campaigns of truth A, with ``--missing`` searches for missing terms."""
+    """Run the study, or with ``--replicates`` campaigns of truth A, with ``--missing`` searches for missing terms.
+
+    Both together repeat the first step of these searches on new data.
+    """
     watch, runs = common.Stopwatch(), QUICK if options.quick else RUNS
+    if options.replicates and options.missing:
+        with watch.part("searches", f"terms that eq. (9) lacks, in {options.replicates} SYNTHETIC data sets a truth"):
+            tasks = [(truth, options.seed + n) for n in range(options.replicates) for truth in TRUTHS]
+            folder = options.out / "missing_terms_replicates"
+            folder.mkdir(parents=True, exist_ok=True)
+            lines = common.resumed(
+                folder / "replicates.jsonl", tasks, missing.replicate, lambda line: (line["truth"], line["seed"]),
+                missing.source(),
+            )  # fmt: skip
+        counts: dict[str, Any] = {"synthetic": True, "seed": options.seed, "truths": missing.counted(lines)}
+        print(common.shown("first step of the search", counts["truths"]))
+        common.finish(folder, counts, watch, synthetic=True)
+        return
     if options.replicates:
         with watch.part("campaigns", f"{options.replicates} SYNTHETIC campaigns of truth A"):
             lines = campaigns(options.out / "campaigns", options.replicates, options.seed)

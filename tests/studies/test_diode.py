@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 import bayesperiodic as bp
 from studies import common
 from studies.__main__ import main
-from studies.diode import prediction, rig
+from studies.diode import chaos, prediction, rig
 
 REAL = common.find_data(None, rig.FILE)
 # The mean of the source is not measured, and acts as V_f does.
@@ -107,3 +107,51 @@ def test_measured_records_are_fitted_to_their_noise_and_most_are_predicted(tmp_p
     for frequency in (190, 285, 295, 470):
         assert by_frequency[frequency]["predicted"].get("chaos", 0.0) > 0.5
     assert "Most probable motion right" in capsys.readouterr().out
+
+
+def test_the_passage_of_an_orbit_is_found_whatever_its_period_begins_with_and_its_mean():
+    generator = np.random.default_rng(3)
+    orbit = generator.standard_normal(2 * chaos.PHASES)
+    values = generator.standard_normal(12 * chaos.PHASES)
+    # Passed by from index 70 on, which is six phases after a maximum of the source, in its second period.
+    values[70 : 70 + orbit.size] = np.roll(orbit, -(70 % chaos.PHASES) - chaos.PHASES) + 0.3
+    far = chaos.passages(values, orbit)
+    assert far.argmin() == 70
+    assert far.min() < 1e-20
+    assert np.sort(far)[1] > 0.01
+    assert np.allclose(chaos.aligned(orbit, values, 70), values[70 : 70 + orbit.size])
+
+
+def test_a_part_that_repeats_is_found():
+    values = np.random.default_rng(4).standard_normal(14 * chaos.PHASES)
+    values[100 + 3 * chaos.PHASES : 100 + 6 * chaos.PHASES] = values[100 : 100 + 3 * chaos.PHASES]
+    (start, difference), *others = chaos.recurrences(values, 3)
+    assert (start, difference) == (100, 0.0)
+    assert min(other for _, other in others) > 0.1
+
+
+def test_an_unstable_orbit_is_found_in_a_synthetic_record_of_chaos():
+    """Its multiplier is that of a map: motions next to the orbit, integrated in time, leave it by that factor."""
+    frequency, share = 300e3, VALUES["R_s"] / rig.RESISTOR
+    record = rig.folded(frequency, rig.unloaded(rig.generate(frequency, seed=1), share))
+    assert record.period is None
+    values = VALUES | {"C_s": 0.0, "offset": 0.0}
+    own = next(row for row in chaos.orbits(record, values) if row["period"] == 1)
+    assert own["nearest"] < 0.01 < own["median"]
+    mean, amplitude = prediction.source_of(record)
+    guess = rig.guessed(chaos._part(record, own["index"] // chaos.PHASES * chaos.PHASES, 1), values)[0]
+    solution = rig.solve(guess, frequency, values, guess.guess)
+    numbers = tuple(values[name] for name in prediction.ORDER)
+    start = np.array([solution.states[name][0] for name in ("i", "v", "q", "m")])
+    found = np.empty((1, prediction.PHASES))
+
+    def after(state):
+        return np.array(prediction._run(numbers, frequency, mean, amplitude, tuple(state), 0, found)[0])
+
+    scale = np.array([1e-3, 1.0, 1e-10, 1e-10])
+    columns = [
+        (after(start + 1e-4 * scale * unit) - after(start - 1e-4 * scale * unit)) / (2e-4 * scale)
+        for unit in np.eye(4)
+    ]  # fmt: skip
+    multipliers = np.linalg.eigvals(np.stack(columns, axis=1))
+    assert np.max(np.abs(multipliers)) == pytest.approx(abs(own["multiplier"]), rel=0.05)

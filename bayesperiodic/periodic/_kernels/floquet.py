@@ -3,11 +3,9 @@
 import numpy as np
 from numba import njit
 
-from bayesperiodic.models.cache import kernel
-
 STAGES = 3
 MATRIX, CUBE = "float64[:,::1]", "float64[:,:,::1]"
-OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+OPTIONS = {"cache": globals().get("CACHE", False), "nogil": True, "error_model": "numpy"}
 
 
 @njit(f"boolean({MATRIX}, {MATRIX})", **OPTIONS)
@@ -43,7 +41,7 @@ def solve(matrix, right):
     return True
 
 
-@kernel(f"void({CUBE}, {CUBE}, int64, float64, {MATRIX}, float64[::1], {CUBE})", **OPTIONS)
+@njit(f"void({CUBE}, {CUBE}, int64, float64, {MATRIX}, float64[::1], {CUBE})", **OPTIONS)
 def transfer_matrices(matrix, weights, first, step, gauss, sums, result):
     """Fill the transfer matrices (points, size, size) from each grid point to the next; NaN where singular.
 
@@ -94,7 +92,62 @@ def transfer_matrices(matrix, weights, first, step, gauss, sums, result):
                     result[point, p, q] = product[p, q]
 
 
-@kernel(f"void({CUBE}, complex128[:,::1], int64, boolean, complex128[:,::1])", **OPTIONS)
+@njit(f"void({MATRIX}, {MATRIX})", **OPTIONS)
+def orthogonalise(matrix, basis):
+    """Fill the orthogonal factor of QR by Householder's reflections; the matrix is overwritten."""
+    size = matrix.shape[0]
+    for p in range(size):
+        for q in range(size):
+            basis[p, q] = 1.0 if p == q else 0.0
+    mirror = np.empty(size)
+    for j in range(size - 1):
+        square = 0.0
+        for p in range(j, size):
+            mirror[p] = matrix[p, j]
+            square += mirror[p] ** 2
+        if not square > 0.0:
+            continue
+        length = np.sqrt(square)
+        mirror[j] += length if mirror[j] >= 0.0 else -length
+        factor = 1.0 / (length * abs(mirror[j]))
+        for q in range(j, size):
+            along = 0.0
+            for p in range(j, size):
+                along += mirror[p] * matrix[p, q]
+            for p in range(j, size):
+                matrix[p, q] -= factor * along * mirror[p]
+        for q in range(size):
+            along = 0.0
+            for p in range(j, size):
+                along += basis[q, p] * mirror[p]
+            for p in range(j, size):
+                basis[q, p] -= factor * along * mirror[p]
+
+
+@njit(f"void({CUBE}, {MATRIX}, {CUBE})", **OPTIONS)
+def sweep(factors, basis, before):
+    """Carry an orthogonal basis (size, size) through the factors, in place; fill the basis before each factor."""
+    count, size, _ = factors.shape
+    product = np.empty((size, size))
+    for k in range(count):
+        for p in range(size):
+            for q in range(size):
+                before[k, p, q] = basis[p, q]
+                product[p, q] = 0.0
+        largest = 0.0
+        for p in range(size):
+            for q in range(size):
+                for other in range(size):
+                    product[p, q] += factors[k, p, other] * basis[other, q]
+                largest = max(largest, abs(product[p, q]))
+        if largest > 0.0:
+            for p in range(size):
+                for q in range(size):
+                    product[p, q] /= largest
+        orthogonalise(product, basis)
+
+
+@njit(f"void({CUBE}, complex128[:,::1], int64, boolean, complex128[:,::1])", **OPTIONS)
 def eigenfunction(steps, at, length, adjoint, result):
     """Fill an eigenfunction (points, size) of unit length from its values `at` every `length`-th point.
 
@@ -117,7 +170,7 @@ def eigenfunction(steps, at, length, adjoint, result):
             result[k, p] /= norm
 
 
-@kernel(f"Tuple((boolean, float64, float64))({CUBE}, float64[::1], int64, float64)", **OPTIONS)
+@njit(f"Tuple((boolean, float64, float64))({CUBE}, float64[::1], int64, float64)", **OPTIONS)
 def dominant_multiplier(steps, vector, sweeps, tolerance):
     """Iterate a vector over the period until its direction is constant; return whether it is, log|μ|, the sign of μ."""
     points, size, _ = steps.shape
